@@ -1,0 +1,251 @@
+"""All settings, one pydantic model per section. Defaults are the paper's where it gives one.
+
+Precedence: defaults < settings file (TOML) < command line (``--set section.key=value``).
+Rooms below never see these models: the drivers hand them plain values.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.records import POINTS
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class Section(BaseModel):
+    """A group of settings: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class Decoder(Section):
+    """How to read skeletons from a message type the package does not know."""
+
+    topic: str
+    """Topic of the messages."""
+    camera: str
+    """Name that the sensor gets."""
+    points: str
+    """Path to the array of points inside the message, fields joined by dots; its elements have x, y, z."""
+    index: dict[str, int]
+    """Which element is which body point: body point -> index."""
+    unit: Literal["m", "mm"] = "m"
+    """Unit of the points."""
+    stamp: str | None = "header.stamp"
+    """Path to the capture time; none: the arrival time is used."""
+    confidence: str | None = None
+    """Path to an array of confidences in [0, 1], one a point; none: every finite point has confidence 1."""
+
+    def model_post_init(self, _context: Any) -> None:
+        """Refuses body points that are not in POINTS."""
+        unknown = sorted(set(self.index) - set(POINTS))
+        if unknown:
+            raise ValueError(f"unknown body point {unknown[0]!r}; known are {', '.join(POINTS)}")
+
+
+class Logs(Section):
+    """Reading logs."""
+
+    topics: tuple[str, ...] = ()
+    """Skeleton topics to read; none: all that a decoder knows."""
+    decoders: tuple[Decoder, ...] = ()
+    """Decoders for message types the package does not know."""
+    joints_topic: str | None = None
+    """Topic of the robot's joint states; none: the first sensor_msgs/JointState or our own."""
+    person_jump_m: Positive = 0.8
+    """A body further than this from where the person was last seen is somebody else [m]."""
+    person_memory_s: Positive = 2.0
+    """After this long without the person, the nearest body becomes the person [s]."""
+    gap_s: Positive = 0.2
+    """A camera silent for longer has a gap [s]."""
+
+
+class Fusion(Section):
+    """Section 4: the Kalman filter."""
+
+    rate_hz: Positive = 250.0
+    """Ticks a second of the filter and the controller [Hz]."""
+    stale: Literal["skip", "reuse"] = "skip"
+    """Between two frames: skip the camera's rows, or re-use them with the sawtooth covariance of 4.1.1."""
+    delay: Literal["compensate", "ignore"] = "compensate"
+    """Relate a frame to the state at its capture time, or take it for the state at the tick."""
+    confidence_min: Share = 0.2
+    """An angle is used when the product of the confidences of its points is at least this."""
+    outlier_m: Positive = 0.30
+    """A point further than this from the predicted skeleton is an outlier [m]."""
+    point_std_m: Positive = 0.02
+    """Standard deviation of a skeleton point at full confidence [m]."""
+    sigma_position: Positive = 100.0
+    """Process noise of x, y in Eq. (44), on each derivative's own remainder [m/s^4]."""
+    sigma_angle: Positive = 500.0
+    """Process noise of the angles in Eq. (44), on each derivative's own remainder [rad/s^4]."""
+    memory_s: Positive = 0.5
+    """Without a valid row for longer than this the person counts as lost [s]."""
+
+
+class Limits(Section):
+    """Named limit sets (paper, human) or paths of TOML files."""
+
+    tracking: str = "human"
+    """Bounds the filter's state, Eq. (62)-(65)."""
+    prediction: str = "paper"
+    """Bounds the reachable sets, Alg. 1."""
+
+
+class Occupancy(Section):
+    """Section 3: what the person can reach."""
+
+    method: Literal["paper", "positions"] = "paper"
+    """paper: Eq. (20)-(30) and Alg. 1, 2; positions: reachable sets from positions and velocity bounds alone [26]."""
+    stop_s: Positive = 0.377
+    """Worst-case braking time T_s of the robot, Eq. (70) [s]."""
+    store_hz: Positive | Literal["all"] = 25.0
+    """Ticks a second whose volumes are stored, or "all" [Hz]."""
+    radius_head_m: NotNegative = 0.12
+    """Table 2 [m]."""
+    radius_thorax_m: NotNegative = 0.15
+    """Table 2 [m]."""
+    radius_upper_arm_m: NotNegative = 0.07
+    """Table 2 [m]."""
+    radius_lower_arm_m: NotNegative = 0.07
+    """Table 2 [m]."""
+
+
+class LinkSettings(Section):
+    """One link segment of a robot."""
+
+    name: str
+    """Name in outputs."""
+    body: str
+    """Body (URDF link or joint frame) that both ends are fixed on."""
+    start_m: tuple[float, float, float]
+    """First end in that body's frame [m]."""
+    end_m: tuple[float, float, float]
+    """Second end in that body's frame [m]."""
+    radius_m: Positive
+    """Radius of the capsule [m]."""
+
+
+class Robot(Section):
+    """The manipulator. Default: ABB IRB 140."""
+
+    urdf: Path | None = None
+    """Another robot's URDF; none: the IRB 140."""
+    tcp_frame: str | None = None
+    """Frame of that URDF that carries the tool; none: its last frame."""
+    tool_m: NotNegative = 0.10
+    """TCP beyond the flange, along its z axis [m]."""
+    links: tuple[LinkSettings, ...] = ()
+    """Link segments; none: the IRB 140's, or derived from the URDF's collision shapes."""
+    acceleration: tuple[Positive, ...] = ()
+    """Joint acceleration limits [rad/s^2]; none: top speed / T_s of every axis."""
+
+
+class Plan(Section):
+    """Section 5: the trajectory generator."""
+
+    method: Literal["qp", "scaling"] = "qp"
+    """qp: Eq. (66); scaling: the largest factor on the programmed speed that meets the same constraints [24]."""
+    baselines: tuple[Literal["qp", "scaling"], ...] = ("scaling",)
+    """Methods run beside it on the same volumes, for comparison."""
+    task: Path | None = None
+    """Task file (TOML); none: the one inside the log, else the joint track inside the log."""
+    reference: Literal["time", "path"] = "path"
+    """time: the reference runs with the clock; path: only as far as the robot has followed."""
+    leash_m: Positive = 0.05
+    """path: the reference waits when the TCP is this far behind [m]."""
+    q_p: tuple[NotNegative, NotNegative] = (0.10, 0.10)
+    """Eq. (71): weights of the position error, translation and orientation."""
+    q_v: tuple[NotNegative, NotNegative] = (1.0, 1.0)
+    """Eq. (72): weights of the velocity error, translation and orientation."""
+    path_gain_per_s: NotNegative = 5.0
+    """Position error fed into the reference velocity; 0 as printed, where an error never decays [1/s]."""
+    clearance_m: NotNegative = 0.0
+    """Clearance beyond limb radius + link radius [m]."""
+    tcp_speed_max: Positive = 2.5
+    """Eq. (66g), each axis of the world [m/s]; the rotation's bound is 2 pi rad/s for each 2.5 m/s."""
+    tcp_acceleration_max: Positive = 25.0
+    """Eq. (66h), corrected, each axis of the world [m/s^2]."""
+
+
+class Report(Section):
+    """What is computed and drawn."""
+
+    near_m: Positive = 0.50
+    """The stationary share counts ticks with a separation of at most this [m]."""
+    stationary_m_per_s: Positive = 0.001
+    """A TCP slower than this stands [m/s]."""
+
+
+class Settings(Section):
+    """Everything a run depends on beside the log and the cell."""
+
+    logs: Logs = Logs()
+    fusion: Fusion = Fusion()
+    limits: Limits = Limits()
+    occupancy: Occupancy = Occupancy()
+    robot: Robot = Robot()
+    plan: Plan = Plan()
+    report: Report = Report()
+
+
+def load_settings(path: Path | None = None, overrides: tuple[str, ...] = ()) -> Settings:
+    """Settings from a TOML file and ``section.key=value`` overrides.
+
+    Raises:
+        SettingsError: The file cannot be read, or a key or value is not known.
+    """
+    table: dict[str, Any] = {}
+    where = "settings"
+    if path is not None:
+        where = str(path)
+        try:
+            table = tomllib.loads(path.read_text())
+        except OSError as error:
+            raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a TOML file") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise SettingsError(f"{path}: not TOML ({error})") from error
+    for override in overrides:
+        _override(table, override)
+    try:
+        return Settings.model_validate(table)
+    except ValidationError as error:
+        raise SettingsError(f"{where}: {_first_problem(error)}") from error
+
+
+def _override(table: dict[str, Any], text: str) -> None:
+    key, equals, value = text.partition("=")
+    parts = key.strip().split(".")
+    if not equals or len(parts) != 2:
+        raise SettingsError(f"--set {text}: not of the form section.key=value; e.g. --set fusion.rate_hz=100")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    section = table.setdefault(parts[0], {})
+    if not isinstance(section, dict):
+        raise SettingsError(f"--set {text}: {parts[0]} is not a section of the settings file")
+    section[parts[1]] = parsed
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    loc = [str(part) for part in problem["loc"]]
+    if problem["type"] == "extra_forbidden":
+        known = Settings.model_fields if len(loc) == 1 else _section_keys(loc[0])
+        return f"unknown setting {'.'.join(loc)!r}; known here: {', '.join(known)}"
+    return f"{'.'.join(loc)}: found {problem['input']!r}; {problem['msg'][0].lower()}{problem['msg'][1:]}"
+
+
+def _section_keys(name: str) -> list[str]:
+    field = Settings.model_fields.get(name)
+    section = field.annotation if field else None
+    return list(section.model_fields) if isinstance(section, type) and issubclass(section, BaseModel) else []

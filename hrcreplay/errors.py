@@ -1,0 +1,30 @@
+"""What a user can get wrong, each with its exit code.
+
+A message says *where: what was found; what would be right*. A bug keeps its traceback.
+"""
+
+from __future__ import annotations
+
+
+class HrcReplayError(Exception):
+    """Something the user can mend. The command prints the message and leaves with ``exit_code``."""
+
+    exit_code = 1
+
+
+class SettingsError(HrcReplayError):
+    """A setting, an argument, a cell file, a task or an output folder that cannot be used."""
+
+    exit_code = 2
+
+
+class LogError(HrcReplayError):
+    """A log that cannot be read, or that lacks what a stage needs."""
+
+    exit_code = 3
+
+
+class LiveStopped(HrcReplayError):
+    """A live session that ended by a stop reason."""
+
+    exit_code = 4

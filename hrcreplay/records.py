@@ -1,0 +1,193 @@
+"""The nouns that pass between stages. Read this first.
+
+Every record is a table of ticks (or of frames): arrays whose first axis is time. A live tick is a table of one
+row, so each stage is written once. Arrays are read-only; what is missing is NaN, never 0.
+Instants are int nanoseconds, durations float seconds; everything else is SI.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+#: Joints of the human model in the order of Eq. (37): right arm before left.
+JOINTS = ("x", "y", "theta", "rho", "ar1", "ar2", "ar3", "ar4", "al1", "al2", "al3", "al4")
+
+#: Limb lengths pi that the filter estimates with the joints [m].
+LENGTHS = (
+    "pi_pelvis_height",
+    "pi_torso",
+    "pi_head",
+    "pi_half_shoulder",
+    "pi_upper_arm_l",
+    "pi_upper_arm_r",
+    "pi_forearm_l",
+    "pi_forearm_r",
+)
+
+#: Limbs of Alg. 2 whose swept volumes are predicted.
+LIMBS = ("HD", "THX", "URA", "LRA", "ULA", "LLA")
+
+#: Body points of a camera's skeleton. A camera that lacks one leaves it NaN with confidence 0.
+POINTS = (
+    "pelvis",
+    "chest",
+    "neck",
+    "head",
+    "shoulder_l",
+    "elbow_l",
+    "wrist_l",
+    "hand_l",
+    "shoulder_r",
+    "elbow_r",
+    "wrist_r",
+    "hand_r",
+    "hip_l",
+    "knee_l",
+    "ankle_l",
+    "foot_l",
+    "hip_r",
+    "knee_r",
+    "ankle_r",
+    "foot_r",
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows over time: every array field has time as its first axis, every other field belongs to the whole table."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                view = value.view()
+                view.flags.writeable = False
+                object.__setattr__(self, field.name, view)
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray)}
+
+    def __len__(self) -> int:
+        return len(next(iter(self._arrays().values())))
+
+    def rows(self, which: slice | Ints | Bools) -> Self:
+        """The table with only the rows that ``which`` selects."""
+        return replace(self, **{name: array[which] for name, array in self._arrays().items()})
+
+    @classmethod
+    def join(cls, tables: Sequence[Self]) -> Self:
+        """One table of all the rows, in the given order; whole-table fields are those of the first."""
+        first = tables[0]
+        names = [f.name for f in fields(first) if isinstance(getattr(first, f.name), np.ndarray)]
+        return replace(first, **{name: np.concatenate([getattr(t, name) for t in tables]) for name in names})
+
+
+@dataclass(frozen=True)
+class CameraFrames(Table):
+    """Skeletons as the cameras saw them, a row a body a frame, in order of arrival."""
+
+    capture_ns: Ints  #: (n,) when the camera took it
+    arrival_ns: Ints  #: (n,) when it reached the logger; no tick before this may use it
+    camera: Ints  #: (n,) index into ``cameras``
+    body: Ints  #: (n,) the tracker's body id; may change in mid-recording
+    points_m: Floats  #: (n, 20, 3) POINTS in that camera's own frame [m]
+    confidence: Floats  #: (n, 20) in [0, 1]
+    cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Measurements(Table):
+    """What the closed-form inverse kinematics makes of the frames, a row a frame, in order of arrival."""
+
+    capture_ns: Ints  #: (n,)
+    arrival_ns: Ints  #: (n,)
+    camera: Ints  #: (n,) index into ``cameras``
+    angles: Floats  #: (n, 12) JOINTS [m, m, rad...]; NaN where not observable
+    angles_std: Floats  #: (n, 12) sigma_z of Eq. (47) [m, m, rad...]; NaN where the angle is
+    lengths_m: Floats  #: (n, 8) LENGTHS [m]; NaN where not observable
+    lengths_std_m: Floats  #: (n, 8) [m]
+    points_m: Floats  #: (n, 20, 3) POINTS in the world [m]
+    confidence: Floats  #: (n, 20) in [0, 1]
+    cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class HumanStates(Table):
+    """The fused person, a row a tick. Rows before the first measurement are NaN."""
+
+    t_ns: Ints  #: (n,)
+    p: Floats  #: (n, 12) JOINTS [m, m, rad...]; heading is unwrapped
+    v: Floats  #: (n, 12) [m/s, m/s, rad/s...]; x and y in the world frame
+    a: Floats  #: (n, 12) [.../s^2]
+    j: Floats  #: (n, 12) [.../s^3]
+    p_std: Floats  #: (n, 12) standard deviation of ``p``
+    v_std: Floats  #: (n, 12) standard deviation of ``v``
+    lengths_m: Floats  #: (n, 8) LENGTHS [m]
+    lengths_std_m: Floats  #: (n, 8) [m]
+    valid: Bools  #: (n, c) whether a row of this camera entered the update of this tick
+    cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SweptVolumes:
+    """What the person can reach within the horizon: per tick and limb the convex hull of ``vertices`` + a ball.
+
+    ``vertices_m[offsets[i * len(limbs) + l] : offsets[i * len(limbs) + l + 1]]`` belong to tick i, limb l.
+    A limb that cannot be predicted (no state yet) has one NaN vertex: whoever plans against it must brake.
+    """
+
+    t_ns: Ints  #: (n,)
+    offsets: Ints  #: (n * len(limbs) + 1,)
+    vertices_m: Floats  #: (m, 3) world [m]
+    radius_m: Floats  #: (n, len(limbs)) radius of the ball, Eq. (41) [m]
+    limbs: tuple[str, ...]
+    method: str
+
+    def __post_init__(self) -> None:
+        for name in ("t_ns", "offsets", "vertices_m", "radius_m"):
+            view = getattr(self, name).view()
+            view.flags.writeable = False
+            object.__setattr__(self, name, view)
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def vertices(self, tick: int, limb: int) -> Floats:
+        """(m, 3) vertices of one limb at one tick, world [m]."""
+        first = tick * len(self.limbs) + limb
+        return self.vertices_m[self.offsets[first] : self.offsets[first + 1]]
+
+
+#: What a tick of the plan was: free tracking, held by a safety constraint or a limit, or Eq. (67).
+STATUSES = ("tracking", "limited", "braking")
+
+
+@dataclass(frozen=True)
+class Motion(Table):
+    """What the robot was told, a row a tick."""
+
+    t_ns: Ints  #: (n,)
+    q: Floats  #: (n, nv) at the tick [rad]
+    dq: Floats  #: (n, nv) at the tick [rad/s]
+    u: Floats  #: (n, nv) applied from the tick on [rad/s^2]
+    ref_m: Floats  #: (n, 3) programmed TCP position, world [m]
+    tcp_m: Floats  #: (n, 3) TCP position, world [m]
+    tcp_speed: Floats  #: (n,) [m/s]
+    ref_speed: Floats  #: (n,) [m/s]
+    distance_m: Floats  #: (n,) surface to surface, smallest over all pairs; 0 in contact [m]
+    limb: Ints  #: (n,) index into ``limbs`` of the nearest pair; -1 without one
+    link: Ints  #: (n,) index into ``links`` of the nearest pair; -1 without one
+    status: Ints  #: (n,) index into STATUSES
+    reason: Ints  #: (n,) index into ``reasons``: why it braked, 0 where it did not
+    limbs: tuple[str, ...]
+    links: tuple[str, ...]
+    reasons: tuple[str, ...]

@@ -1,0 +1,1 @@
+"""The robot: model, programmed path, separation, constraints, controllers. Pure."""
