@@ -1,0 +1,214 @@
+"""The robot's kinematics in the world frame. The only module that imports pinocchio."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numba import njit
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.records import Bools, Floats
+from hrcreplay.robot import irb140 as irb140_data
+from hrcreplay.robot.segments import Segment, Vector
+from hrcreplay.robot.urdf import capsules, describe
+
+__all__ = ["RobotModel", "RobotPose", "Segment", "from_urdf", "irb140"]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotPose:
+    """Everything the controller needs of one instant, world frame. Rows of twists: linear, then angular."""
+
+    T_world_tcp: Floats  #: (4, 4)
+    J_tcp: Floats  #: (6, nv) velocity of the TCP's origin and angular velocity [m/rad, rad/rad]
+    dJdq_tcp: Floats  # noqa: N815  #: (6,) acceleration of the TCP at zero joint acceleration [m/s^2, rad/s^2]
+    ends_m: Floats  #: (s, 2, 3) ends of the segments [m]
+    J_ends: Floats  #: (s, 2, 3, nv) their position Jacobians [m/rad]
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """A serial robot on its base. Arrays are (nv,) [rad] and derivatives; an endless axis has infinite ``q_max``.
+
+    ``pose`` works in buffers that belong to the model: one thread at a time.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    q_min: Floats
+    q_max: Floats
+    dq_max: Floats
+    ddq_max: Floats
+    segments: tuple[Segment, ...]
+    T_world_base: Floats  #: (4, 4)
+    _kinematics: _Kinematics = field(repr=False, compare=False)
+
+    @property
+    def nv(self) -> int:
+        """Number of axes."""
+        return len(self.joint_names)
+
+    def pose(self, q: Floats, dq: Floats) -> RobotPose:
+        """Forward kinematics, Jacobians and Jdot dq of Eq. (66b) at one instant.
+
+        Args:
+            q: (nv,) [rad].
+            dq: (nv,) [rad/s].
+        """
+        return self._kinematics.pose(q, dq)
+
+
+class _Kinematics:
+    """pinocchio's model and data, and views of the data that stay valid as long as it lives."""
+
+    def __init__(self, model: Any, points: Sequence[int], tcp: int) -> None:
+        self._model, self._data = model, model.createData()
+        self._J = self._data.J.reshape(6, model.nv)  # pinocchio gives (6,) when nv == 1
+        self._dJ = self._data.dJ.reshape(6, model.nv)
+        self._points = tuple(self._data.oMf[frame].translation for frame in points)
+        self._tcp = self._data.oMf[tcp].rotation, self._data.oMf[tcp].translation
+        self._moves = np.array([_support(model, frame) for frame in points]).reshape(len(points), model.nv)
+
+    def pose(self, q: Floats, dq: Floats) -> RobotPose:
+        pin.computeJointJacobiansTimeVariation(self._model, self._data, q, dq)
+        pin.updateFramePlacements(self._model, self._data)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = self._tcp
+        points = np.array(self._points).reshape(-1, 3)
+        J_tcp, dJdq, J_points = _jacobians(self._J, self._dJ, dq, T[:3, 3].copy(), points, self._moves)
+        shape = (len(points) // 2, 2, 3)
+        return RobotPose(T, J_tcp, dJdq, points.reshape(shape), J_points.reshape((*shape, self._model.nv)))
+
+
+@njit(cache=True)
+def _jacobians(
+    J: Floats, dJ: Floats, dq: Floats, tcp: Floats, points: Floats, moves: Bools
+) -> tuple[Floats, Floats, Floats]:
+    """Jacobians at points of the world from pinocchio's, which are those of the points now at the world's origin."""
+    nv = J.shape[1]
+    J_points = np.zeros((len(points), 3, nv))
+    for i in range(len(points)):
+        for j in range(nv):
+            if moves[i, j]:
+                J_points[i, :, j] = J[:3, j] + _cross(J[3:, j], points[i])
+    J_tcp = np.empty((6, nv))
+    twist = np.zeros(6)
+    dJdq = np.zeros(6)
+    for j in range(nv):
+        J_tcp[:3, j] = J[:3, j] + _cross(J[3:, j], tcp)
+        J_tcp[3:, j] = J[3:, j]
+        twist += J_tcp[:, j] * dq[j]
+        dJdq += dJ[:, j] * dq[j]
+    # acceleration of the TCP itself from the spatial one: d/dt (v_O + w x p) = a_O + dw x p + w x v_p
+    dJdq[:3] += _cross(dJdq[3:], tcp) + _cross(twist[3:], twist[:3])
+    return J_tcp, dJdq, J_points
+
+
+@njit(cache=True)
+def _cross(a: Floats, b: Floats) -> Floats:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def irb140(
+    T_world_base: Floats, *, stop_s: float, tool_m: float = 0.10, acceleration: Sequence[float] = ()
+) -> RobotModel:
+    """The ABB IRB 140; its TCP lies ``tool_m`` beyond the flange, along the flange's z axis.
+
+    Args:
+        T_world_base: (4, 4) robot base in the world [m].
+        stop_s: T_s of Eq. (70) [s].
+        tool_m: [m].
+        acceleration: (6,) limits [rad/s^2]; none: top speed / T_s, so that every axis can stop within T_s.
+    """
+    segments = irb140_data.segments(tool_m)
+    return from_urdf(
+        irb140_data.urdf(),
+        T_world_base,
+        stop_s=stop_s,
+        tcp_frame="flange",
+        tool_m=tool_m,
+        segments=segments,
+        acceleration=acceleration,
+    )
+
+
+def from_urdf(
+    xml: str,
+    T_world_base: Floats,
+    *,
+    stop_s: float,
+    tcp_frame: str | None = None,
+    tool_m: float = 0.0,
+    segments: Sequence[Segment] = (),
+    acceleration: Sequence[float] = (),
+) -> RobotModel:
+    """A robot from URDF text. Joints that do not move the tool (fingers, a second arm) are held at their zero.
+
+    Args:
+        xml: URDF text; meshes it names are not read.
+        T_world_base: (4, 4) robot base (the URDF's root link) in the world [m].
+        stop_s: T_s of Eq. (70) [s].
+        tcp_frame: Link that carries the tool; none: the last link of the longest chain.
+        tool_m: TCP beyond that frame, along its z axis [m].
+        segments: Link capsules; none: derived from the collision shapes.
+        acceleration: (nv,) limits [rad/s^2]; none: top speed / T_s.
+
+    Raises:
+        SettingsError: The URDF, a segment's body or the number of accelerations cannot be used.
+    """
+    robot = describe(xml, tcp_frame)
+    segments = tuple(segments) or capsules(xml, tcp_frame)
+    ddq_max = np.array(acceleration, dtype=float) if len(acceleration) else robot.dq_max / stop_s
+    if ddq_max.shape != robot.dq_max.shape:
+        raise SettingsError(
+            f"robot.acceleration: found {len(acceleration)} values; {robot.name} has {len(robot.joints)} axes"
+        )
+    model = pin.buildModelFromXML(robot.text)
+    _place_base(model, pin.SE3(T_world_base))
+    tcp = _add_frame(model, robot.tcp, (0.0, 0.0, tool_m), "robot.tcp_frame")
+    points = [
+        _add_frame(model, s.body, end, f"robot.links: {s.name}") for s in segments for end in (s.start_m, s.end_m)
+    ]
+    return RobotModel(
+        name=robot.name,
+        joint_names=robot.joints,
+        q_min=robot.q_min,
+        q_max=robot.q_max,
+        dq_max=robot.dq_max,
+        ddq_max=ddq_max,
+        segments=segments,
+        T_world_base=np.array(T_world_base, dtype=float),
+        _kinematics=_Kinematics(model, points, tcp),
+    )
+
+
+def _place_base(model: Any, T_world_base: Any) -> None:
+    """Moves what hangs on the root from the origin to the base, so that pinocchio's world is ours."""
+    for joint in range(1, model.njoints):
+        if model.parents[joint] == 0:
+            model.jointPlacements[joint] = T_world_base * model.jointPlacements[joint]
+    for frame in model.frames:
+        if frame.parentJoint == 0:
+            frame.placement = T_world_base * frame.placement
+
+
+def _add_frame(model: Any, body: str, offset_m: Vector, where: str) -> int:
+    """Index of a new frame at a point of a link (or of a joint's frame)."""
+    known = {frame.name: i for i, frame in reversed(list(enumerate(model.frames)))}
+    known |= {frame.name: i for i, frame in enumerate(model.frames) if frame.type == pin.FrameType.BODY}
+    if body not in known:
+        raise SettingsError(f"{where}: the robot has no link {body!r}; it has {', '.join(sorted(known))}")
+    frame = model.frames[known[body]]
+    placement = frame.placement * pin.SE3(np.eye(3), np.array(offset_m, dtype=float))
+    name = f"point {model.nframes}"
+    return int(model.addFrame(pin.Frame(name, frame.parentJoint, placement, pin.FrameType.OP_FRAME)))
+
+
+def _support(model: Any, frame: int) -> list[bool]:
+    """Which axes move a frame."""
+    moving = set(model.supports[model.frames[frame].parentJoint])
+    return [joint in moving for joint in range(1, model.njoints)]
