@@ -1,0 +1,33 @@
+# The two commands of the README are `make demo` and `make test`. Both need python3 (3.11 to 3.13) and nothing else.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test bench lock clean
+
+demo: $(VENV)/made
+	@$(BIN)/hrcreplay demo
+
+test: $(VENV)/made
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/pytest
+
+bench: $(VENV)/made
+	$(BIN)/pytest tests/benchmarks --benchmark-only
+
+# Everything from the lock, by hash and without a compiler; then the project itself.
+$(VENV)/made: requirements.lock pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# Needs uv. Writes versions and hashes, never an index's address.
+lock:
+	uv pip compile --quiet --universal --generate-hashes --fork-strategy fewest --no-emit-index-url --python-version 3.11 \
+		--extra dev --custom-compile-command 'make lock' pyproject.toml --output-file requirements.lock
+
+clean:
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .benchmarks

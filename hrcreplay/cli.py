@@ -1,0 +1,239 @@
+"""Commands: parse, call, print the run folder. Heavy imports stand inside the commands, so that --help is quick."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hrcreplay import __version__
+from hrcreplay.errors import HrcReplayError, SettingsError
+
+app = typer.Typer(
+    name="hrcreplay",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="""Had this controller been running, would the person have been safe, and what would it have cost the task?
+
+Replays a recorded human-robot session through three stages, fuse, predict and plan, and reports.
+Each stage takes a log (MCAP, ROS 1 or ROS 2 bag) or the run folder of an earlier stage.
+
+A research and engineering tool, not a certified safety function.""",
+    epilog="Try it: hrcreplay demo",
+)
+
+Source = Annotated[Path, typer.Argument(metavar="LOG_OR_RUN", help="A log, or the run folder of an earlier stage.")]
+Config = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings file.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting; wins over the file. May be repeated."),
+]
+CellFile = Annotated[
+    Path | None,
+    typer.Option("--cell", metavar="CELL.toml", help="Poses of cameras and robot, as written by calibrate."),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="DIR", help="Run folder to make; default reports/<log>/<UTC>-<command>."),
+]
+Start = Annotated[float | None, typer.Option("--start", metavar="S", help="First second of the log to use [s].")]
+End = Annotated[float | None, typer.Option("--end", metavar="S", help="Last second of the log to use [s].")]
+Smooth = Annotated[
+    bool, typer.Option("--smooth", help="Also write smooth.parquet: Rauch-Tung-Striebel pass, for reference.")
+]
+Chunk = Annotated[
+    int, typer.Option("--chunk-ticks", min=1, metavar="N", help="Ticks worked on at once; changes no result [ticks].")
+]
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        sys.stdout.write(f"hrcreplay {__version__}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    _: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
+) -> None:
+    pass
+
+
+def _stage(command: str, source: Path, out: Path | None, options: dict[str, Any]) -> None:
+    from hrcreplay import replay
+
+    sys.stdout.write(f"{replay.run(command, source, out=out, **options)}\n")
+
+
+@app.command()
+def info(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log (MCAP, ROS 1 or ROS 2 bag).")],
+    config: Config = None,
+    settings: Set = None,
+) -> None:
+    """What a log holds, and what is missing for the next step."""
+    from hrcreplay import replay
+
+    sys.stdout.write("\n".join(replay.describe(log, config, tuple(settings or ()))) + "\n")
+
+
+@app.command(name="import")
+def import_(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="azure, kinect2 or keraal.")],
+    files: Annotated[
+        list[str],
+        typer.Argument(metavar="[CAMERA=]FILE...", help="One file a camera; keraal: Kinect text, then optical text."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="LOG.mcap", help="Log to write.")],
+    rate: Annotated[
+        float, typer.Option("--rate", metavar="HZ", help="keraal: frames a second of the Kinect [Hz].")
+    ] = 30.0,
+) -> None:
+    """Make our log from Azure Kinect CSV, Kinect v2 CSV or KERAAL text files."""
+    from hrcreplay import ingest
+
+    sys.stdout.write(f"{ingest.run(kind, files, out, rate)}\n")
+
+
+@app.command()
+def calibrate(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log whose cameras saw one person.")],
+    out: Annotated[Path, typer.Option("--out", metavar="CELL.toml", help="Cell file to write.")],
+    config: Config = None,
+    settings: Set = None,
+    camera: Annotated[
+        str | None,
+        typer.Option("--reference", metavar="CAMERA", help="Camera that defines the world; default the first."),
+    ] = None,
+    up: Annotated[
+        str | None,
+        typer.Option("--up", metavar="X,Y,Z", help="Up in the reference camera's frame; default from the feet."),
+    ] = None,
+    height: Annotated[
+        float | None,
+        typer.Option("--height", metavar="M", help="Reference camera above the floor [m]; default from the feet."),
+    ] = None,
+    base: Annotated[
+        str | None, typer.Option("--base", metavar="X,Y,Z,YAW", help="Robot base in the world [m, m, m, deg].")
+    ] = None,
+) -> None:
+    """Find the poses and clock offsets of the cameras from the skeletons themselves."""
+    from hrcreplay import replay
+
+    for line in replay.calibrate(
+        log, out, config, tuple(settings or ()), reference=camera, up=up, height_m=height, base=base
+    ):
+        sys.stderr.write(line + "\n")
+    sys.stdout.write(f"{out}\n")
+
+
+@app.command()
+def fuse(
+    source: Source,
+    config: Config = None,
+    settings: Set = None,
+    cell: CellFile = None,
+    out: Out = None,
+    start: Start = None,
+    end: End = None,
+    smooth: Smooth = False,
+    chunk_ticks: Chunk = 250,
+) -> None:
+    """Stage 1: merge the cameras' skeletons into one person (state.parquet)."""
+    _stage("fuse", source, out, _options(config, settings, cell, start, end, chunk_ticks) | {"smooth": smooth})
+
+
+@app.command()
+def predict(
+    source: Source,
+    config: Config = None,
+    settings: Set = None,
+    cell: CellFile = None,
+    out: Out = None,
+    start: Start = None,
+    end: End = None,
+    chunk_ticks: Chunk = 250,
+) -> None:
+    """Stages 1 and 2: the space the person can reach within the braking time (occupancy.parquet)."""
+    _stage("predict", source, out, _options(config, settings, cell, start, end, chunk_ticks))
+
+
+@app.command()
+def plan(
+    source: Source,
+    config: Config = None,
+    settings: Set = None,
+    cell: CellFile = None,
+    out: Out = None,
+    start: Start = None,
+    end: End = None,
+    chunk_ticks: Chunk = 250,
+) -> None:
+    """Stages 1 to 3: what the robot would have done (motion.parquet)."""
+    _stage("plan", source, out, _options(config, settings, cell, start, end, chunk_ticks))
+
+
+@app.command()
+def report(
+    source: Source,
+    config: Config = None,
+    settings: Set = None,
+    cell: CellFile = None,
+    out: Out = None,
+    start: Start = None,
+    end: End = None,
+    chunk_ticks: Chunk = 250,
+) -> None:
+    """All stages, then metrics.json, figures and report.html."""
+    _stage("report", source, out, _options(config, settings, cell, start, end, chunk_ticks))
+
+
+@app.command()
+def demo(
+    out: Out = None,
+    config: Config = None,
+    settings: Set = None,
+    chunk_ticks: Chunk = 250,
+) -> None:
+    """Report on the log that ships with hrcreplay: a worker beside a pick-and-place robot, two cameras, 60 s."""
+    from hrcreplay import replay
+
+    folder = replay.run(
+        "report", replay.demo_log(), out=out, **_options(config, settings, None, None, None, chunk_ticks)
+    )
+    sys.stdout.write(f"{folder / 'report.html'}\n")
+
+
+def _options(
+    config: Path | None,
+    settings: list[str] | None,
+    cell: Path | None,
+    start: float | None,
+    end: float | None,
+    chunk_ticks: int,
+) -> dict[str, Any]:
+    if start is not None and end is not None and end <= start:
+        raise SettingsError(f"--end {end:g}: not after --start {start:g}; give a later second")
+    return {
+        "config": config,
+        "overrides": tuple(settings or ()),
+        "cell_file": cell,
+        "start_s": start,
+        "end_s": end,
+        "chunk_ticks": chunk_ticks,
+    }
+
+
+def main() -> None:
+    """Runs the command line. A user's error is one line and an exit code, a bug keeps its traceback."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        app()
+    except HrcReplayError as error:
+        sys.stderr.write(f"hrcreplay: {error}\n")
+        sys.exit(error.exit_code)
