@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -41,13 +41,18 @@ Out = Annotated[
     Path | None,
     typer.Option("--out", metavar="DIR", help="Run folder to make; default reports/<log>/<UTC>-<command>."),
 ]
-Start = Annotated[float | None, typer.Option("--start", metavar="S", help="First second of the log to use [s].")]
-End = Annotated[float | None, typer.Option("--end", metavar="S", help="Last second of the log to use [s].")]
+Start = Annotated[
+    float | None,
+    typer.Option("--start", metavar="S", help="First second of the log to use, in seconds from its start."),
+]
+End = Annotated[
+    float | None, typer.Option("--end", metavar="S", help="Last second of the log to use, in seconds from its start.")
+]
 Smooth = Annotated[
     bool, typer.Option("--smooth", help="Also write smooth.parquet: Rauch-Tung-Striebel pass, for reference.")
 ]
 Chunk = Annotated[
-    int, typer.Option("--chunk-ticks", min=1, metavar="N", help="Ticks worked on at once; changes no result [ticks].")
+    int, typer.Option("--chunk-ticks", min=1, metavar="N", help="Number of ticks worked on at once; changes no result.")
 ]
 
 
@@ -62,12 +67,6 @@ def _root(
     _: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
 ) -> None:
     pass
-
-
-def _stage(command: str, source: Path, out: Path | None, options: dict[str, Any]) -> None:
-    from hrcreplay import replay
-
-    sys.stdout.write(f"{replay.run(command, source, out=out, **options)}\n")
 
 
 @app.command()
@@ -90,9 +89,7 @@ def import_(
         typer.Argument(metavar="[CAMERA=]FILE...", help="One file a camera; keraal: Kinect text, then optical text."),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="LOG.mcap", help="Log to write.")],
-    rate: Annotated[
-        float, typer.Option("--rate", metavar="HZ", help="keraal: frames a second of the Kinect [Hz].")
-    ] = 30.0,
+    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="keraal: rate of the Kinect, in Hz.")] = 30.0,
 ) -> None:
     """Make our log from Azure Kinect CSV, Kinect v2 CSV or KERAAL text files."""
     from hrcreplay import ingest
@@ -116,10 +113,12 @@ def calibrate(
     ] = None,
     height: Annotated[
         float | None,
-        typer.Option("--height", metavar="M", help="Reference camera above the floor [m]; default from the feet."),
+        typer.Option(
+            "--height", metavar="M", help="Reference camera above the floor, in metres; default from the feet."
+        ),
     ] = None,
     base: Annotated[
-        str | None, typer.Option("--base", metavar="X,Y,Z,YAW", help="Robot base in the world [m, m, m, deg].")
+        str | None, typer.Option("--base", metavar="X,Y,Z,YAW", help="Robot base in the world, in metres and degrees.")
     ] = None,
 ) -> None:
     """Find the poses and clock offsets of the cameras from the skeletons themselves."""
@@ -132,65 +131,44 @@ def calibrate(
     sys.stdout.write(f"{out}\n")
 
 
-@app.command()
-def fuse(
-    source: Source,
-    config: Config = None,
-    settings: Set = None,
-    cell: CellFile = None,
-    out: Out = None,
-    start: Start = None,
-    end: End = None,
-    smooth: Smooth = False,
-    chunk_ticks: Chunk = 250,
-) -> None:
-    """Stage 1: merge the cameras' skeletons into one person (state.parquet)."""
-    _stage("fuse", source, out, _options(config, settings, cell, start, end, chunk_ticks) | {"smooth": smooth})
+def _stage(command: str, text: str) -> None:
+    """Registers a command that runs the stages up to its own."""
+
+    @app.command(name=command, help=text)
+    def stage(
+        source: Source,
+        config: Config = None,
+        settings: Set = None,
+        cell: CellFile = None,
+        out: Out = None,
+        start: Start = None,
+        end: End = None,
+        smooth: Smooth = False,
+        chunk_ticks: Chunk = 250,
+    ) -> None:
+        from hrcreplay import replay
+
+        if start is not None and end is not None and end <= start:
+            raise SettingsError(f"--end {end:g}: not after --start {start:g}; give a later second")
+        folder = replay.run(
+            command,
+            source,
+            out=out,
+            config=config,
+            overrides=tuple(settings or ()),
+            cell_file=cell,
+            start_s=start,
+            end_s=end,
+            smooth=smooth,
+            chunk_ticks=chunk_ticks,
+        )
+        sys.stdout.write(f"{folder}\n")
 
 
-@app.command()
-def predict(
-    source: Source,
-    config: Config = None,
-    settings: Set = None,
-    cell: CellFile = None,
-    out: Out = None,
-    start: Start = None,
-    end: End = None,
-    chunk_ticks: Chunk = 250,
-) -> None:
-    """Stages 1 and 2: the space the person can reach within the braking time (occupancy.parquet)."""
-    _stage("predict", source, out, _options(config, settings, cell, start, end, chunk_ticks))
-
-
-@app.command()
-def plan(
-    source: Source,
-    config: Config = None,
-    settings: Set = None,
-    cell: CellFile = None,
-    out: Out = None,
-    start: Start = None,
-    end: End = None,
-    chunk_ticks: Chunk = 250,
-) -> None:
-    """Stages 1 to 3: what the robot would have done (motion.parquet)."""
-    _stage("plan", source, out, _options(config, settings, cell, start, end, chunk_ticks))
-
-
-@app.command()
-def report(
-    source: Source,
-    config: Config = None,
-    settings: Set = None,
-    cell: CellFile = None,
-    out: Out = None,
-    start: Start = None,
-    end: End = None,
-    chunk_ticks: Chunk = 250,
-) -> None:
-    """All stages, then metrics.json, figures and report.html."""
-    _stage("report", source, out, _options(config, settings, cell, start, end, chunk_ticks))
+_stage("fuse", "Stage 1: merge the cameras' skeletons into one person (state.parquet).")
+_stage("predict", "Stages 1, 2: the space the person can reach within the braking time (occupancy.parquet).")
+_stage("plan", "Stages 1 to 3: what the robot would have done (motion.parquet).")
+_stage("report", "All stages, then metrics.json, figures and report.html.")
 
 
 @app.command()
@@ -203,30 +181,11 @@ def demo(
     """Report on the log that ships with hrcreplay: a worker beside a pick-and-place robot, two cameras, 60 s."""
     from hrcreplay import replay
 
+    overrides = tuple(settings or ())
     folder = replay.run(
-        "report", replay.demo_log(), out=out, **_options(config, settings, None, None, None, chunk_ticks)
+        "report", replay.demo_log(), out=out, config=config, overrides=overrides, chunk_ticks=chunk_ticks
     )
     sys.stdout.write(f"{folder / 'report.html'}\n")
-
-
-def _options(
-    config: Path | None,
-    settings: list[str] | None,
-    cell: Path | None,
-    start: float | None,
-    end: float | None,
-    chunk_ticks: int,
-) -> dict[str, Any]:
-    if start is not None and end is not None and end <= start:
-        raise SettingsError(f"--end {end:g}: not after --start {start:g}; give a later second")
-    return {
-        "config": config,
-        "overrides": tuple(settings or ()),
-        "cell_file": cell,
-        "start_s": start,
-        "end_s": end,
-        "chunk_ticks": chunk_ticks,
-    }
 
 
 def main() -> None:
