@@ -197,18 +197,21 @@ class Settings(Section):
     report: Report = Report()
 
 
-def load_settings(path: Path | None = None, overrides: tuple[str, ...] = ()) -> Settings:
-    """Settings from a TOML file and ``section.key=value`` overrides.
+def load_settings(
+    path: Path | None = None, overrides: tuple[str, ...] = (), base: dict[str, Any] | None = None
+) -> Settings:
+    """Settings from a TOML file and ``section.key=value`` overrides, over those of an earlier run (``base``).
 
     Raises:
         SettingsError: The file cannot be read, or a key or value is not known.
     """
-    table: dict[str, Any] = {}
+    table: dict[str, Any] = {name: dict(section) for name, section in (base or {}).items()}
     where = "settings"
     if path is not None:
         where = str(path)
         try:
-            table = tomllib.loads(path.read_text())
+            for name, section in tomllib.loads(path.read_text()).items():
+                table[name] = table.get(name, {}) | section if isinstance(section, dict) else section
         except OSError as error:
             raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a TOML file") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

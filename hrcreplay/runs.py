@@ -104,6 +104,7 @@ class RunWriter:
             ) from error
         except OSError as error:
             raise SettingsError(f"{self.folder}: cannot be made ({error.strerror}); name another --out") from error
+        self.text("run.json", to_json({"complete": False}))
         return self
 
     def table(self, name: str, columns: Mapping[str, Any]) -> None:

@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hrcreplay.config import Settings, load_settings
+from hrcreplay.errors import SettingsError
+
+
+def test_defaults_are_the_papers() -> None:
+    settings = Settings()
+    assert settings.occupancy.stop_s == 0.377  # Eq. (70)
+    assert settings.plan.q_p == (0.10, 0.10)  # Eq. (71)
+    assert settings.plan.q_v == (1.0, 1.0)  # Eq. (72)
+    occupancy = settings.occupancy
+    assert (occupancy.radius_head_m, occupancy.radius_thorax_m) == (0.12, 0.15)  # Table 2
+    assert (occupancy.radius_upper_arm_m, occupancy.radius_lower_arm_m) == (0.07, 0.07)
+
+
+def test_command_line_wins_over_file_and_file_over_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "s.toml"
+    file.write_text("[fusion]\nrate_hz = 100\noutlier_m = 0.5\n")
+    settings = load_settings(file, ("fusion.rate_hz=50", "plan.method=scaling"))
+    assert settings.fusion.rate_hz == 50
+    assert settings.fusion.outlier_m == 0.5
+    assert settings.fusion.confidence_min == Settings().fusion.confidence_min
+    assert settings.plan.method == "scaling"
+
+
+def test_settings_of_an_earlier_run_come_back_whole() -> None:
+    settings = load_settings(None, ("occupancy.store_hz=all", "plan.q_p=[0.2, 0.3]"))
+    again = load_settings(None, (), settings.model_dump(mode="json"))
+    assert again == settings
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[fusion]\nrate = 3\n", r"s\.toml: unknown setting 'fusion\.rate'; known here: rate_hz"),
+        ("[fusio]\nrate_hz = 3\n", r"unknown setting 'fusio'; known here: logs, fusion"),
+        ("[fusion]\nrate_hz = -3\n", r"fusion\.rate_hz: found -3; input should be greater than 0"),
+        ("[fusion]\nrate_hz = nan\n", r"fusion\.rate_hz: found nan"),
+        ("fusion = 3\n", r"fusion: found 3"),
+        ("[fusion\n", r"not TOML"),
+        ("[occupancy]\nmethod = 'hopeful'\n", r"occupancy\.method: found 'hopeful'; input should be 'paper'"),
+        (
+            "[[logs.decoders]]\ntopic='/a'\ncamera='a'\npoints='p'\nindex={nose=1}\n",
+            r"unknown body point 'nose'; known are pelvis",
+        ),
+    ],
+)
+def test_a_wrong_file_is_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "s.toml"
+    file.write_text(text)
+    with pytest.raises(SettingsError, match=message) as caught:
+        load_settings(file)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("fusion", "not of the form section.key=value"),
+        ("fusion.a.b=1", "not of the form section.key=value"),
+        ("fusion.rat=1", "unknown setting 'fusion.rat'"),
+        ("limits.tracking=3", "limits.tracking: found 3"),
+    ],
+)
+def test_a_wrong_override_is_one_clear_line(override: str, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        load_settings(None, (override,))
+
+
+def test_a_missing_file_says_so(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"none\.toml: cannot be read"):
+        load_settings(tmp_path / "none.toml")

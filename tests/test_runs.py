@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hrcreplay import runs
+from hrcreplay.errors import SettingsError
+
+
+def _columns(first: int, last: int) -> dict[str, np.ndarray]:
+    t = np.arange(first, last)
+    return {"t_ns": t, "x": np.sin(t / 7.0)}
+
+
+@pytest.mark.parametrize("size", [1, 250, 5000, 10_000])
+def test_table_bytes_do_not_depend_on_the_size_of_the_chunks(tmp_path: Path, size: int) -> None:
+    def write(name: str, step: int) -> bytes:
+        writer = runs.TableWriter(tmp_path / name)
+        for first in range(0, 10_000, step):
+            writer.write(_columns(first, min(first + step, 10_000)))
+        writer.close()
+        return (tmp_path / name).read_bytes()
+
+    assert write("chunked", size) == write("whole", 777)
+
+
+def test_digest_is_that_of_the_system_tool(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"abc" * 100_000)
+    expected = subprocess.run(["sha256sum", str(path)], capture_output=True, text=True, check=True).stdout.split()[0]
+    assert runs.sha256(path) == expected
+
+
+def test_a_run_appears_whole(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "run"
+    with runs.RunWriter(folder) as run:
+        run.table("state", _columns(0, 10))
+        run.text("figures/a.svg", "<svg/>")
+        assert not folder.exists()
+        assert json.loads((run.partial / "run.json").read_text())["complete"] is False
+        run.finish({"command": "fuse"})
+    meta = runs.read_meta(folder)
+    assert meta["complete"] is True
+    assert sorted(meta["outputs"]) == ["figures/a.svg", "state.parquet"]
+    for name, digest in meta["outputs"].items():
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
+    read = runs.read(folder)
+    assert read.state is not None
+    np.testing.assert_array_equal(read.state["x"], _columns(0, 10)["x"])
+    assert read.motion is None
+
+
+def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), runs.RunWriter(tmp_path / "run") as run:
+        run.table("state", _columns(0, 10))
+        _ = 1 / 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_refused_untouched(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "mine").write_text("precious")
+    with pytest.raises(SettingsError, match=r"run: exists already; name another folder with --out"):
+        runs.RunWriter(tmp_path / "run").__enter__()
+    assert (tmp_path / "run" / "mine").read_text() == "precious"
+
+
+def test_a_run_that_is_under_way_is_not_read_and_not_overwritten(tmp_path: Path) -> None:
+    with runs.RunWriter(tmp_path / "run") as run:
+        with pytest.raises(SettingsError, match="did not end"):
+            runs.read_meta(run.partial)
+        with pytest.raises(SettingsError, match="under way or was killed"):
+            runs.RunWriter(tmp_path / "run").__enter__()
+
+
+def test_stopwatch_spreads_a_call_over_its_ticks() -> None:
+    now = iter([0, 10_000_000, 20_000_000, 50_000_000])
+    watch = runs.Stopwatch(lambda: next(now))
+    assert watch.measure("fuse", 10, lambda: "result") == "result"
+    watch.measure("fuse", 1, lambda: None)
+    found = watch.summary(period_s=0.004)["fuse"]
+    assert found["ticks"] == 11
+    assert found["median_us"] == 1000.0  # 10 ticks shared 10 ms
+    assert found["max_us"] == 30_000.0
+    assert found["real_time_factor"] == pytest.approx(11 * 0.004 / 0.040)
