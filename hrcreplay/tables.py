@@ -1,0 +1,111 @@
+"""Records as the columns of a run folder's tables, and back. The names are a contract with whoever reads the files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hrcreplay.records import JOINTS, LENGTHS, STATUSES, Floats, HumanStates, Ints, Measurements, Motion
+
+Columns = dict[str, Any]
+
+
+def measurement_columns(measurements: Measurements) -> Columns:
+    """A row a frame: what the closed-form inverse kinematics made of it."""
+    return {
+        "capture_ns": measurements.capture_ns,
+        "arrival_ns": measurements.arrival_ns,
+        "camera": _names(measurements.camera, measurements.cameras),
+        **_spread(measurements.angles, JOINTS),
+        **_spread(measurements.angles_std, JOINTS, "_std"),
+        **_spread(measurements.lengths_m, LENGTHS),
+    }
+
+
+def truth_columns(t_ns: Ints, angles: Floats, lengths_m: Floats) -> Columns:
+    """A row an instant of the ground truth: (n, 12) JOINTS and (n, 8) LENGTHS [m] of the noise-free skeleton."""
+    return {"t_ns": t_ns, **_spread(angles, JOINTS), **_spread(lengths_m, LENGTHS)}
+
+
+_STATE = (("p", ""), ("v", "_vel"), ("a", "_acc"), ("j", "_jerk"), ("p_std", "_std"), ("v_std", "_vel_std"))
+
+
+def state_columns(states: HumanStates) -> Columns:
+    """A row a tick: joints with derivatives and deviations, lengths, and which cameras entered."""
+    columns: Columns = {"t_ns": states.t_ns}
+    for field, suffix in _STATE:
+        columns |= _spread(getattr(states, field), JOINTS, suffix)
+    columns |= _spread(states.lengths_m, LENGTHS) | _spread(states.lengths_std_m, LENGTHS, "_std")
+    return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
+
+
+def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
+    """state.parquet as records again, bit for bit, ``chunk_ticks`` rows at a time."""
+    with pq.ParquetFile(path) as file:
+        cameras = tuple(n.removeprefix("valid_") for n in file.schema_arrow.names if n.startswith("valid_"))
+        for batch in file.iter_batches(batch_size=chunk_ticks):
+            column = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
+            yield HumanStates(
+                t_ns=column["t_ns"],
+                **{field: _gather(column, JOINTS, suffix) for field, suffix in _STATE},
+                lengths_m=_gather(column, LENGTHS),
+                lengths_std_m=_gather(column, LENGTHS, "_std"),
+                valid=np.column_stack([column[f"valid_{camera}"] for camera in cameras]),
+                cameras=cameras,
+            )
+
+
+def occupancy_columns(
+    t_ns: Ints, limbs: list[str], method: str, radius_m: list[float], volume_m3: list[float], hulls: list[Floats]
+) -> Columns:
+    """A row per stored tick and limb; ``hulls`` are (m, 3) hull vertices in the world [m], before the radius."""
+    return {
+        "t_ns": t_ns,
+        "limb": _text(limbs),
+        "method": _text([method] * len(limbs)),
+        "radius_m": np.array(radius_m, dtype=float),
+        "volume_m3": np.array(volume_m3, dtype=float),
+        "vertices": pa.array([np.ascontiguousarray(hull).ravel() for hull in hulls], type=pa.list_(pa.float64())),
+    }
+
+
+def motion_columns(motion: Motion) -> Columns:
+    """A row a tick: what the robot was told, and how far it was from the person."""
+    numbers = range(1, motion.q.shape[1] + 1)
+    return {
+        "t_ns": motion.t_ns,
+        **_spread(motion.q, [f"q{i}" for i in numbers]),
+        **_spread(motion.dq, [f"dq{i}" for i in numbers]),
+        **_spread(motion.u, [f"u{i}" for i in numbers]),
+        **_spread(motion.ref_m, ["ref_x", "ref_y", "ref_z"]),
+        **_spread(motion.tcp_m, ["tcp_x", "tcp_y", "tcp_z"]),
+        "tcp_speed": motion.tcp_speed,
+        "ref_speed": motion.ref_speed,
+        "distance_m": motion.distance_m,
+        "limb": _names(motion.limb, motion.limbs),
+        "link": _names(motion.link, motion.links),
+        "status": _names(motion.status, STATUSES),
+        "reason": _names(motion.reason, motion.reasons),
+    }
+
+
+def _spread(array: Floats, names: tuple[str, ...] | list[str], suffix: str = "") -> Columns:
+    return {f"{name}{suffix}": np.ascontiguousarray(array[:, i]) for i, name in enumerate(names)}
+
+
+def _gather(column: Columns, names: tuple[str, ...], suffix: str = "") -> Floats:
+    return np.column_stack([column[f"{name}{suffix}"] for name in names])
+
+
+def _text(values: list[str]) -> pa.Array:
+    return pa.array(values, type=pa.string())
+
+
+def _names(index: Ints, names: tuple[str, ...]) -> pa.Array:
+    """Index -> name; -1 -> null."""
+    return pa.array([names[i] if i >= 0 else None for i in index.tolist()], type=pa.string())
