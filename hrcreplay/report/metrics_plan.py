@@ -1,0 +1,274 @@
+"""Metrics of the robot's motion: what safety took, and what it cost the task."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from scipy.spatial import cKDTree
+
+from hrcreplay.records import STATUSES, Bools, Floats
+from hrcreplay.report.metrics_table import MetricTable
+from hrcreplay.report.series import durations_s, times
+
+#: Figures that the paper prints for its own experiments; its logs were never published.
+PAPER = {
+    "paper_stationary_share_qp": (0.3006, "1", "stationary share that the paper prints for its QP, on its own data"),
+    "paper_stationary_share_scaling": (
+        0.8644,
+        "1",
+        "stationary share that the paper prints for kinematic scaling ([24]-[26]), on its own data",
+    ),
+    "paper_deviation_m": (0.221, "m", "deviation from the nominal path that the paper prints for its Fig. 13"),
+    "paper_fusion_rate_hz": (205.0, "Hz", "rate of fusion and swept volumes that the paper prints for its own PC"),
+}
+
+
+def vectors(motion: pd.DataFrame, what: str) -> Floats:
+    """(n, 3) ``ref`` or ``tcp`` positions, world [m]."""
+    return motion[[f"{what}_x", f"{what}_y", f"{what}_z"]].to_numpy(dtype=float)
+
+
+def numbers(motion: pd.DataFrame, name: str) -> Floats:
+    """(n,) one column."""
+    return motion[name].to_numpy(dtype=float)
+
+
+def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -> tuple[Bools, Bools]:
+    """Which ticks are near (separation at most ``near_m``), and at which of all the robot stands though it should move.
+
+    It stands when the TCP is slower than ``stationary_m_per_s`` and the reference is not.
+    """
+    near = numbers(motion, "distance_m") <= near_m
+    stands = numbers(motion, "tcp_speed") < stationary_m_per_s
+    wanted = numbers(motion, "ref_speed") >= stationary_m_per_s
+    return near, stands & wanted
+
+
+def path_feet(points: Floats, path: Floats) -> Floats:
+    """(n, 3) for each of (n, 3) points the nearest one of a (m, 3) polyline, all in one frame [m].
+
+    Searched on the two segments at the nearest vertex, which is exact where vertices are denser than the path bends.
+    """
+    path = path[np.isfinite(path).all(axis=1)]
+    feet = np.full(points.shape, np.nan)
+    known = np.isfinite(points).all(axis=1)
+    if not len(path) or not known.any():
+        return feet
+    at = points[known]
+    _, nearest = cKDTree(path).query(at)
+    best = path[nearest]
+    best_m = np.linalg.norm(at - best, axis=1)
+    for other in (np.maximum(nearest - 1, 0), np.minimum(nearest + 1, len(path) - 1)):
+        along = path[other] - path[nearest]
+        length2 = (along**2).sum(axis=1)
+        share = np.clip(((at - path[nearest]) * along).sum(axis=1) / np.where(length2 > 0, length2, 1.0), 0.0, 1.0)
+        foot = path[nearest] + share[:, None] * along
+        foot_m = np.linalg.norm(at - foot, axis=1)
+        better = foot_m < best_m
+        best, best_m = np.where(better[:, None], foot, best), np.where(better, foot_m, best_m)
+    feet[known] = best
+    return feet
+
+
+def deviation_m(motion: pd.DataFrame) -> Floats:
+    """(n,) distance of the TCP from the programmed path [m]."""
+    tcp = vectors(motion, "tcp")
+    return np.asarray(np.linalg.norm(tcp - path_feet(tcp, vectors(motion, "ref")), axis=1))
+
+
+def time_lost_s(motion: pd.DataFrame, stationary_m_per_s: float) -> Floats:
+    """(n,) how much of each tick the reference waited instead of advancing at the programmed speed [s].
+
+    A tick at which the programme itself stands loses nothing.
+    """
+    duration = durations_s(times(motion))
+    advance = np.append(np.linalg.norm(np.diff(vectors(motion, "ref"), axis=0), axis=1), 0.0)
+    speed = numbers(motion, "ref_speed")
+    speed = 0.5 * (speed + np.append(speed[1:], speed[-1:]))
+    moves = speed >= stationary_m_per_s
+    took = advance / np.where(moves, speed, 1.0)
+    lost = np.where(moves, np.clip(duration - took, 0.0, None), 0.0)
+    lost[-1:] = 0.0  # what the reference does after the last tick is not known
+    return lost
+
+
+def cycles(motion: pd.DataFrame, *, at_m: float = 0.002, away_m: float = 0.05) -> int:
+    """How often the reference came back to its first point (within ``at_m``) after being ``away_m`` from it."""
+    reference = vectors(motion, "ref")
+    gap = np.linalg.norm(reference - reference[0], axis=1)
+    marks = np.where(gap >= away_m, 1, np.where(gap <= at_m, -1, 0))
+    marks = marks[marks != 0]
+    return int(((marks[1:] == -1) & (marks[:-1] == 1)).sum())
+
+
+def add_plan(
+    metrics: MetricTable,
+    motion: pd.DataFrame | None,
+    baselines: dict[str, pd.DataFrame],
+    *,
+    method: str,
+    near_m: float,
+    stationary_m_per_s: float,
+    waits: bool,
+) -> None:
+    """Everything about the motion, the baselines' likewise, and the paper's own figures beside them."""
+    if motion is None:
+        metrics.add("plan_method", None, "name", "method of the plan", reason="not planned")
+    else:
+        metrics.add("plan_method", method, "name", "method of the plan; baselines ran beside it on the same volumes")
+    tables = {} if motion is None else {"plan": motion, **{f"baseline_{name}": baselines[name] for name in baselines}}
+    for prefix, table in tables.items():
+        what = "the plan" if prefix == "plan" else f"the baseline '{prefix.removeprefix('baseline_')}'"
+        _add_status(metrics, prefix, table, what, stationary_m_per_s)
+        _add_separation(metrics, prefix, table, what)
+        _add_stationary(metrics, prefix, table, what, near_m, stationary_m_per_s)
+        _add_path(metrics, prefix, table, what)
+        _add_progress(metrics, prefix, table, what, stationary_m_per_s, waits=waits)
+    for name, (value, unit, meaning) in PAPER.items():
+        metrics.add(name, value, unit, meaning)
+
+
+def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
+    status = motion["status"].astype(str).to_numpy()
+    moving = numbers(motion, "tcp_speed") >= slow
+    braking = status == "braking"
+    metrics.add(f"{prefix}_ticks", len(motion), "1", f"ticks of {what}")
+    for name in STATUSES:
+        share = float((status == name).mean()) if len(status) else None
+        metrics.add(f"{prefix}_{name}_share", share, "1", f"share of all ticks of {what} with status '{name}'")
+    reasons = motion["reason"].astype(str).to_numpy()
+    for reason in sorted(set(reasons[braking])):
+        share = float((reasons[braking] == reason).sum() / len(motion))
+        slug = "_".join("".join(c if c.isalnum() else " " for c in reason.lower()).split()) or "unnamed"
+        metrics.add(
+            f"{prefix}_braking_share_{slug}", share, "1", f"share of all ticks of {what} that braked because: {reason}"
+        )
+    metrics.add(
+        f"{prefix}_moving_ticks", int(moving.sum()), "1", f"ticks of {what} with the TCP at or over {slow:g} m/s"
+    )
+    metrics.add(
+        f"{prefix}_braking_moving_ticks",
+        int((braking & moving).sum()),
+        "1",
+        f"ticks of {what} in braking with the TCP still at or over {slow:g} m/s: inequality (2) may not hold there",
+    )
+    overlap = numbers(motion, "distance_m") <= 0.0
+    metrics.add(
+        f"{prefix}_contact_moving_ticks",
+        int((overlap & moving).sum()),
+        "1",
+        f"ticks of {what} with the TCP at or over {slow:g} m/s while a link touched a swept volume",
+    )
+    closest = numbers(motion, "distance_m")[braking & moving]
+    closest = closest[np.isfinite(closest)]
+    metrics.add(
+        f"{prefix}_braking_moving_separation_min_m",
+        float(closest.min()) if len(closest) else None,
+        "m",
+        f"smallest separation from the swept volumes at such braking ticks of {what}",
+        reason="no braking tick with a moving TCP and a known separation",
+    )
+
+
+def _add_separation(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str) -> None:
+    distance = numbers(motion, "distance_m")
+    known = np.isfinite(distance)
+    reason = "no tick has a separation"
+    k = int(np.argmin(np.where(known, distance, np.inf))) if known.any() else None
+    name = f"{prefix}_separation"
+    metrics.add(
+        f"{name}_min_m",
+        None if k is None else float(distance[k]),
+        "m",
+        f"smallest distance, surface to surface, between robot and swept volumes during {what}",
+        reason=reason,
+    )
+    at_s = None if k is None else float((times(motion)[k] - times(motion)[0]) * 1e-9)
+    metrics.add(f"{name}_min_at_s", at_s, "s", f"its first instant, from the first tick of {what}", reason=reason)
+    for part in ("limb", "link"):
+        found = None if k is None or pd.isna(motion[part].iloc[k]) else str(motion[part].iloc[k])
+        metrics.add(f"{name}_min_{part}", found, "name", f"the {part} of that pair", reason=reason)
+    metrics.add(f"{name}_unknown_ticks", int((~known).sum()), "1", f"ticks of {what} without a separation")
+
+
+def _add_stationary(
+    metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, near_m: float, slow: float
+) -> None:
+    near, stands = stationary(motion, near_m, slow)
+    both = int((near & stands).sum())
+    metrics.add(f"{prefix}_near_ticks", int(near.sum()), "1", f"ticks of {what} with a separation <= {near_m:g} m")
+    metrics.add(
+        f"{prefix}_stationary_ticks",
+        both,
+        "1",
+        f"of those, ticks with the TCP below {slow:g} m/s and a reference at or over it",
+    )
+    metrics.add(
+        f"{prefix}_stationary_share",
+        both / int(near.sum()) if near.any() else None,
+        "1",
+        f"stationary ticks / near ticks of {what}; compare only runs on the same log",
+        reason=f"the separation never was <= {near_m:g} m",
+    )
+
+
+def _add_path(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str) -> None:
+    along = np.linalg.norm(vectors(motion, "tcp") - vectors(motion, "ref"), axis=1)
+    for name, values, meaning in (
+        ("deviation", deviation_m(motion), "distance from the TCP to the nearest point of the programmed path"),
+        ("tracking_error", along, "distance from the TCP to the reference of the same tick"),
+    ):
+        values = values[np.isfinite(values)]
+        for kind, number in (("mean", np.mean), ("p95", _p95), ("max", np.max)):
+            value = float(number(values)) if len(values) else None
+            metrics.add(f"{prefix}_{name}_{kind}_m", value, "m", f"{kind} over all ticks of {what}: {meaning}")
+
+
+def _p95(values: Floats) -> float:
+    return float(np.quantile(values, 0.95))
+
+
+def _add_progress(
+    metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float, *, waits: bool
+) -> None:
+    tcp_speed, ref_speed = numbers(motion, "tcp_speed"), numbers(motion, "ref_speed")
+    for name, speed, meaning in (
+        ("tcp_speed", tcp_speed, "speed of the TCP"),
+        ("ref_speed", ref_speed, "programmed speed of the TCP where the reference is"),
+    ):
+        known = speed[np.isfinite(speed)]
+        mean = float(known.mean()) if len(known) else None
+        metrics.add(f"{prefix}_{name}_mean_m_per_s", mean, "m/s", f"mean over all ticks of {what}: {meaning}")
+    for name, what_moved in (("tcp", "TCP"), ("ref", "reference")):
+        steps = np.linalg.norm(np.diff(vectors(motion, name), axis=0), axis=1)
+        metrics.add(
+            f"{prefix}_{name}_travelled_m",
+            float(np.nansum(steps)),
+            "m",
+            f"path that the {what_moved} travelled, {what}",
+        )
+    count = cycles(motion) if len(motion) else 0
+    metrics.add(
+        f"{prefix}_cycles",
+        count or None,
+        "1",
+        f"times the reference came back to its first point, {what}",
+        reason="the reference never came back to its first point",
+    )
+    lost = float(np.nansum(time_lost_s(motion, slow))) if len(motion) else 0.0
+    total = float(durations_s(times(motion)).sum())
+    reason = "with plan.reference = time the reference never waits: see the tracking error instead"
+    metrics.add(
+        f"{prefix}_time_lost_s",
+        lost if waits else None,
+        "s",
+        f"time that the reference waited for the robot though the programme moves, {what}",
+        reason=reason,
+    )
+    metrics.add(
+        f"{prefix}_progress_share",
+        1.0 - lost / total if waits and total > 0 else None,
+        "1",
+        f"share of the time that {what} did not lose: 1 is the programme at full speed",
+        reason=reason,
+    )

@@ -1,0 +1,116 @@
+"""Time series as the report needs them: interpolation, derivatives, stretches, and fewer points for drawing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from hrcreplay.records import JOINTS, Bools, Floats, Ints
+
+#: The ten angles of Eq. (37); x and y are lengths.
+ANGLES = JOINTS[2:]
+
+#: Which columns of a (n, 12) table of JOINTS are angles.
+IS_ANGLE: Bools = np.array([joint in ANGLES for joint in JOINTS])
+
+
+def wrap(angle_rad: Floats) -> Floats:
+    """Angles brought into [-pi, pi) [rad]."""
+    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def difference(a: Floats, b: Floats) -> Floats:
+    """``a - b`` of rows of JOINTS, (n, 12) [m, m, rad...]; angles the short way round."""
+    return np.where(IS_ANGLE, wrap(a - b), a - b)
+
+
+def columns(table: pd.DataFrame, suffix: str = "") -> Floats:
+    """(n, 12) the columns of JOINTS with a suffix."""
+    return table[[joint + suffix for joint in JOINTS]].to_numpy(dtype=float)
+
+
+def times(table: pd.DataFrame, name: str = "t_ns") -> Ints:
+    """(n,) a column of instants [ns]."""
+    return table[name].to_numpy(dtype=np.int64)
+
+
+def interpolate(t_ns: Ints, values: Floats, at_ns: Ints, *, angles: bool) -> Floats:
+    """Rows of JOINTS, or of their rates, between the two samples around each instant, linear.
+
+    Args:
+        t_ns: (n,) instants of the samples, increasing [ns].
+        values: (n, 12) samples [m, m, rad...].
+        at_ns: (m,) instants asked for [ns].
+        angles: The columns of angles are angles, which go the short way round; else they are rates.
+
+    Returns:
+        (m, 12); NaN outside the samples' span and where one of the two samples is NaN. An instant that meets a
+        sample gets that sample, whatever its neighbours are.
+    """
+    if len(t_ns) < 2 or not len(at_ns):
+        return np.full((len(at_ns), values.shape[1]), np.nan)
+    left = np.clip(np.searchsorted(t_ns, at_ns, side="right") - 1, 0, len(t_ns) - 2)
+    step = t_ns[left + 1] - t_ns[left]
+    fraction = ((at_ns - t_ns[left]) / step)[:, None]
+    change = difference(values[left + 1], values[left]) if angles else values[left + 1] - values[left]
+    found = values[left] + fraction * change
+    found = np.where(fraction == 0.0, values[left], np.where(fraction == 1.0, values[left + 1], found))
+    outside = (at_ns < t_ns[0]) | (at_ns > t_ns[-1])
+    return np.where(outside[:, None], np.nan, found)
+
+
+def central_differences(t_ns: Ints, values: Floats) -> Floats:
+    """(n, 12) rates of rows of JOINTS by central differences [m/s, m/s, rad/s...]; NaN at both ends."""
+    rate = np.full(values.shape, np.nan)
+    if len(t_ns) > 2:
+        rate[1:-1] = difference(values[2:], values[:-2]) / ((t_ns[2:] - t_ns[:-2]) * 1e-9)[:, None]
+    return rate
+
+
+def stretches(mask: Bools) -> Ints:
+    """(k, 2) the runs of true in ``mask``, each as [first, past the last)."""
+    edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
+    return np.column_stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)]).astype(np.int64)
+
+
+def durations_s(t_ns: Ints) -> Floats:
+    """(n,) how long each tick lasts: until the next one; the last as long as the median [s]."""
+    if len(t_ns) < 2:
+        return np.zeros(len(t_ns))
+    steps = np.diff(t_ns) * 1e-9
+    return np.append(steps, np.median(steps))
+
+
+def envelope(x: Floats, y: Floats, bins: int = 700) -> tuple[Floats, Floats]:
+    """Fewer points that draw the same line: of each bin of rows its lowest and its highest point, in order.
+
+    Args:
+        x: (n,) abscissae, increasing.
+        y: (n,) ordinates; NaN breaks the line.
+        bins: How many bins; a table of at most 4 rows a bin is returned as it is.
+
+    Returns:
+        ``x`` and ``y`` of the points kept. A bin without a finite value keeps one NaN.
+    """
+    if len(x) <= 4 * bins:
+        return x, y
+    edges = np.linspace(0, len(x), bins + 1).astype(np.int64)
+    finite = np.isfinite(y)
+    lowest = np.where(finite, y, np.inf)
+    highest = np.where(finite, y, -np.inf)
+    keep = []
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        keep += [first + int(np.argmin(lowest[first:last])), first + int(np.argmax(highest[first:last]))]
+        missing = np.flatnonzero(~finite[first:last])
+        keep += [first + int(m) for m in missing[:1]]
+    kept = np.unique(np.array(keep))
+    return x[kept], y[kept]
+
+
+def thin_path(points: Floats, tolerance: float) -> Floats:
+    """(m, d) a path through fewer of its (n, d) points: one wherever it has moved by ``tolerance``, and the last."""
+    if len(points) < 3:
+        return points
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    _, first = np.unique(np.floor(travelled / tolerance), return_index=True)
+    return points[np.union1d(first, [len(points) - 1])]
