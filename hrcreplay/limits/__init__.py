@@ -50,7 +50,7 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
     if coupled:
         _enclose(bounds)
     p, v, a = (np.ascontiguousarray(bounds[:, k].T) for k in range(len(_QUANTITIES)))
-    return LimitSet(path.stem, *p, *v, *a, coupled)
+    return LimitSet(path.stem, p[0], p[1], v[0], v[1], a[0], a[1], coupled)
 
 
 def _known(table: dict[str, Any], keys: tuple[str, ...], where: str) -> None:
