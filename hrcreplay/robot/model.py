@@ -45,6 +45,8 @@ class RobotModel:
     ddq_max: Floats
     segments: tuple[Segment, ...]
     T_world_base: Floats  #: (4, 4)
+    shoulder_m: Floats  #: (3,) origin of the first axis, world [m]
+    reach_m: float  #: no pose of the TCP is further from there [m]
     _kinematics: _Kinematics = field(repr=False, compare=False)
 
     @property
@@ -170,6 +172,7 @@ def from_urdf(
     model = pin.buildModelFromXML(robot.text)
     _place_base(model, pin.SE3(T_world_base))
     tcp = _add_frame(model, robot.tcp, (0.0, 0.0, tool_m), "robot.tcp_frame")
+    tool = model.frames[tcp].placement
     points = [
         _add_frame(model, s.body, end, f"robot.links: {s.name}") for s in segments for end in (s.start_m, s.end_m)
     ]
@@ -182,6 +185,8 @@ def from_urdf(
         ddq_max=ddq_max,
         segments=segments,
         T_world_base=np.array(T_world_base, dtype=float),
+        shoulder_m=np.array(model.jointPlacements[1].translation),
+        reach_m=sum(float(np.linalg.norm(link.translation)) for link in (*model.jointPlacements[2:], tool)),
         _kinematics=_Kinematics(model, points, tcp),
     )
 

@@ -27,8 +27,8 @@ The same structure is a task file (TOML) and the task that travels inside a log.
     tcp_speed_m_per_s = 0.25          # this move only; at most the task's
     dwell_s = 0.5                     # the robot stands this long before it goes on [s]
 
-The robot stops at every waypoint (and starts with the first one's dwell). ``cycles`` times from the first to the last; between two cycles it goes back to the
-first by the first's own ``move``.
+The robot stops at every waypoint, and stands at the first for its dwell before it starts. ``cycles`` times from the
+first to the last; between two cycles it goes back to the first by the first's own ``move``.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import numpy as np
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
+from hrcreplay.robot.rotation import from_rpy
 from hrcreplay.robot.segments import Segment
 
 _MOVING = ("revolute", "continuous")
@@ -181,7 +182,7 @@ def _capsule(collision: ET.Element, link: str, name: str) -> Segment:
         raise SettingsError(f"robot: the {kind} of link {link!r} has no size; give its measures in metres")
     origin = collision.find("origin")
     centre = _floats(None if origin is None else origin.get("xyz"))
-    axis = _rotation(_floats(None if origin is None else origin.get("rpy"))) @ half
+    axis = from_rpy(_floats(None if origin is None else origin.get("rpy"))) @ half
     start, end = centre - axis, centre + axis
     return Segment(name, link, (start[0], start[1], start[2]), (end[0], end[1], end[2]), radius)
 
@@ -194,15 +195,3 @@ def _floats(text: str | None) -> Floats:
     if values.shape != (3,):
         raise SettingsError(f"robot: {text!r} are {len(values)} numbers; three are needed")
     return values
-
-
-def _rotation(rpy: Floats) -> Floats:
-    """Fixed-axis roll, pitch, yaw of URDF as a matrix: Rz(yaw) Ry(pitch) Rx(roll)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )

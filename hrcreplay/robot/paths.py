@@ -1,0 +1,189 @@
+"""Where references come from: a programmed task, or joint positions that a log recorded."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.inverse import Missed, solve
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.moves import Pace, Track, joint_move, linear_move
+from hrcreplay.robot.reference import STEP_S, Reference
+from hrcreplay.robot.rotation import from_quaternion, from_rpy
+from hrcreplay.robot.task import Task, Waypoint
+
+#: A recorded track is smoothed by cubics over this long [s].
+_SMOOTH_S = 0.1
+
+#: A recorded position may be this far outside the range: encoders are noisy where an axis rests on its stop [rad].
+_NOISE_RAD = 0.01
+
+
+def programmed(task: Task, model: RobotModel, where: str = "task") -> Reference:
+    """The path of a task, time-parametrised within the limits of the axes.
+
+    Args:
+        task: The waypoints.
+        model: The robot; the task's poses are in its base frame.
+        where: What messages begin with.
+
+    Raises:
+        SettingsError: A waypoint is out of reach or range, or a straight line cannot be followed; names the waypoint.
+    """
+    start = _joints(model, task, 0, np.clip(np.zeros(model.nv), model.q_min, model.q_max), where)
+    tracks = [_stand(start, task.waypoints[0].dwell_s)]
+    arrivals_s, end = [0.0], 0
+    for index in range(1, len(task.waypoints)):
+        tracks.append(_move(model, task, index, tracks[-1].q[-1], where))
+        arrivals_s.append(_steps(tracks) * STEP_S)
+        tracks.append(_stand(tracks[-1].q[-1], task.waypoints[index].dwell_s))
+        end = _steps(tracks)
+    if task.repeat or task.cycles > 1:
+        tracks.append(_move(model, task, 0, tracks[-1].q[-1], where, start))
+    if _steps(tracks) == 0:
+        raise SettingsError(f"{where}: every waypoint is where the robot starts; at least one must differ")
+    return Reference(
+        model=model,
+        q=np.concatenate([start[None], *(track.q[1:] for track in tracks)]),
+        dq=np.concatenate([np.zeros((1, model.nv)), *(track.dq[1:] for track in tracks)]),
+        end=end,
+        cycles=math.inf if task.repeat else float(task.cycles),
+        waypoints_s=tuple(arrivals_s),
+    )
+
+
+def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
+    """The path of a recorded joint track, smoothed by cubics over 0.1 s on a regular time grid.
+
+    Programmed time 0 is ``t_ns[0]``. Gaps are bridged on straight lines. Positions and velocities are held against the
+    robot's limits; accelerations are not, since the controller follows only as fast as its own allow.
+
+    Args:
+        t_ns: (n,) instants, in any order; of rows with the same instant the first counts.
+        q: (n, nv) [rad]; rows that are not finite are left out.
+        model: The robot that is to follow.
+
+    Raises:
+        LogError: Another number of axes, too few rows, or a position or speed that the robot does not have.
+    """
+    if q.ndim != 2 or q.shape[1] != model.nv:
+        raise LogError(f"joint track: found {q.shape[-1]} joints; {model.name} has {model.nv} axes")
+    whole = np.isfinite(q).all(axis=1)
+    instants, first = np.unique(t_ns[whole], return_index=True)
+    if len(instants) < 2:
+        raise LogError(f"joint track: found {len(instants)} instants with finite positions; a path needs two")
+    rows = q[whole][first]
+    endless = np.isinf(model.q_max)
+    rows[:, endless] = np.unwrap(rows[:, endless], axis=0)
+    _check(model, instants - t_ns[0], rows, "position", "rad", model.q_min - _NOISE_RAD, model.q_max + _NOISE_RAD)
+    seconds = (instants - instants[0]) * 1e-9
+    grid = np.arange(max(2, math.ceil(seconds[-1] / STEP_S) + 1)) * STEP_S
+    even = np.column_stack([np.interp(grid, seconds, rows[:, axis]) for axis in range(model.nv)])
+    window = min(2 * round(_SMOOTH_S / STEP_S / 2) + 1, 2 * ((len(grid) - 1) // 2) + 1)
+    order = min(3, window - 1)
+    smooth = np.clip(savgol_filter(even, window, order, axis=0), model.q_min, model.q_max)
+    dq = (
+        savgol_filter(even, window, order, deriv=1, delta=STEP_S, axis=0)
+        if order
+        else np.gradient(even, STEP_S, axis=0)
+    )
+    _check(model, grid * 1e9, dq, "speed", "rad/s", -model.dq_max, model.dq_max)
+    return Reference(model, smooth, dq, end=len(grid) - 1, cycles=1.0, waypoints_s=())
+
+
+def _check(
+    model: RobotModel, t_ns: Ints | Floats, rows: Floats, what: str, unit: str, low: Floats, high: Floats
+) -> None:
+    over = np.argwhere((rows < low) | (rows > high))
+    if len(over):
+        row, axis = over[0]
+        raise LogError(
+            f"joint track: {model.joint_names[axis]} has {what} {rows[row, axis]:.3f} {unit} "
+            f"after {t_ns[row] * 1e-9:.3f} s; {model.name} allows {low[axis]:.3f} to {high[axis]:.3f}"
+        )
+
+
+def _steps(tracks: list[Track]) -> int:
+    return sum(len(track.q) - 1 for track in tracks)
+
+
+def _stand(q: Floats, dwell_s: float) -> Track:
+    rows = np.repeat(q[None], round(dwell_s / STEP_S) + 1, axis=0)
+    return Track(rows, np.zeros_like(rows))
+
+
+def _move(model: RobotModel, task: Task, index: int, now: Floats, where: str, goal: Floats | None = None) -> Track:
+    """The move to a waypoint, and for the way back to the first, to the joint positions it started with."""
+    waypoint = task.waypoints[index]
+    at = f"{where}: {task.label(index)}"
+    pace = Pace(
+        dq_max=task.speed * model.dq_max,
+        ddq_max=task.acceleration * model.ddq_max,
+        tcp_speed=min(task.tcp_speed_m_per_s, waypoint.tcp_speed_m_per_s or math.inf),
+        tcp_acceleration=task.tcp_acceleration_m_per_s2,
+        step_s=STEP_S,
+    )
+    given = waypoint.position_m is None or goal is not None
+    if waypoint.move == "joint" or given:
+        goal = _joints(model, task, index, now, where) if goal is None else goal
+    if goal is not None and waypoint.move == "joint":
+        return joint_move(model, now, goal, pace)
+    T_end = _target(model, waypoint) if goal is None else model.pose(goal, np.zeros(model.nv)).T_world_tcp
+    track = linear_move(model, now, T_end, pace, at)
+    if goal is not None and np.abs(track.q[-1] - goal).max() > 1e-6:
+        axis = int(np.argmax(np.abs(track.q[-1] - goal)))
+        raise SettingsError(
+            f"{at}: the straight line to it ends with axis {axis + 1} at {math.degrees(track.q[-1, axis]):.1f} deg "
+            f'and not at {math.degrees(goal[axis]):.1f} deg; use move = "joint"'
+        )
+    return track
+
+
+def _joints(model: RobotModel, task: Task, index: int, near: Floats, where: str) -> Floats:
+    """Joint positions of a waypoint, those nearest to ``near`` where it gives a pose."""
+    waypoint = task.waypoints[index]
+    at = f"{where}: {task.label(index)}"
+    if waypoint.position_m is not None:
+        return _reached(model, _target(model, waypoint), near, at)
+    degrees = waypoint.joints_deg
+    q = np.array(waypoint.joints_rad if degrees is None else np.radians(degrees), dtype=float)
+    if q.shape != model.q_min.shape:
+        raise SettingsError(f"{at}: found {len(q)} joints; {model.name} has {model.nv} axes")
+    for axis in np.flatnonzero((q < model.q_min - 1e-9) | (q > model.q_max + 1e-9)):
+        raise SettingsError(
+            f"{at}: found axis {axis + 1} at {math.degrees(q[axis]):.1f} deg; its range is "
+            f"{math.degrees(model.q_min[axis]):.1f} to {math.degrees(model.q_max[axis]):.1f} deg"
+        )
+    return np.clip(q, model.q_min, model.q_max)
+
+
+def _target(model: RobotModel, waypoint: Waypoint) -> Floats:
+    """(4, 4) pose of the TCP that a waypoint gives, world frame."""
+    T_base_tcp = np.eye(4)
+    T_base_tcp[:3, 3] = waypoint.position_m
+    if waypoint.rpy_deg is not None:
+        T_base_tcp[:3, :3] = from_rpy(np.radians(waypoint.rpy_deg))
+    else:
+        T_base_tcp[:3, :3] = from_quaternion(np.array(waypoint.quaternion_wxyz, dtype=float))
+    return model.T_world_base @ T_base_tcp
+
+
+def _reached(model: RobotModel, T_world_tcp: Floats, near: Floats, at: str) -> Floats:
+    solution = solve(model, T_world_tcp, near)
+    if not isinstance(solution, Missed):
+        return solution
+    distance_m = float(np.linalg.norm(T_world_tcp[:3, 3] - model.shoulder_m))
+    if distance_m > model.reach_m:
+        raise SettingsError(
+            f"{at}: out of reach, {distance_m:.3f} m from the first axis; "
+            f"the TCP of {model.name} reaches {model.reach_m:.3f} m"
+        )
+    raise SettingsError(
+        f"{at}: no joint position within the limits reaches it, {distance_m:.3f} m from the first axis (the TCP of "
+        f"{model.name} reaches {model.reach_m:.3f} m); the nearest misses it by {solution.position_m * 1e3:.0f} mm and "
+        f"{math.degrees(solution.angle_rad):.0f} deg, so move or turn it"
+    )
