@@ -1,0 +1,45 @@
+"""Makes the demo log: ``python -m datasets.make_demo [PATH]``. The same bytes every time."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from datasets.recipe import cameras, scene, worker
+from hrcreplay.logs.writer import LogWriter
+
+SEED = 2024
+START_NS = 1_600_000_000_000_000_000  #: no clock is read
+TRUTH_EVERY = 2  #: rows of the simulation: 100 Hz
+
+
+def make(path: Path) -> None:
+    """Simulates the session and writes it.
+
+    Raises:
+        SettingsError: The file exists, or its folder cannot be written.
+    """
+    t_s, points_m = worker.simulate(SEED)
+    frames = cameras.record(t_s, points_m, START_NS, SEED)
+    t_ns = START_NS + np.round(t_s[::TRUTH_EVERY] * 1e9).astype(np.int64)
+    truth_m = np.round(points_m[::TRUTH_EVERY], 5)
+    with LogWriter(path) as log:
+        for sensor in cameras.SENSORS:
+            log.camera(sensor.name, np.round(sensor.T_world_camera, 9))
+        log.base(scene.T_WORLD_BASE)
+        log.task(scene.TASK)
+        for second in range(int(t_s[-1]) + 1):  # side by side in the file, as in time
+            first, last = START_NS + second * 10**9, START_NS + (second + 1) * 10**9
+            arrived = (frames.arrival_ns >= first) & (frames.arrival_ns < last)
+            if arrived.any():
+                log.frames(frames.rows(arrived))
+            now = (t_ns >= first) & (t_ns < last)
+            log.truth(t_ns[now], truth_m[now])
+
+
+if __name__ == "__main__":
+    target = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("demo.mcap")
+    make(target)
+    print(target)

@@ -1,0 +1,55 @@
+"""The cell: where robot and cameras stand, and what the robot does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from datasets.recipe.curves import unit
+from hrcreplay.records import Floats
+
+PEDESTAL_M = 0.65
+
+#: An IRB 140 on its pedestal, looking along the world's x.
+T_WORLD_BASE = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, PEDESTAL_M], [0.0, 0.0, 0.0, 1.0]])
+
+
+def look_at(eye_m: tuple[float, float, float], target_m: tuple[float, float, float]) -> Floats:
+    """(4, 4) T_world_camera of a level depth camera: x right, y down, z forward."""
+    forward = unit(np.subtract(target_m, eye_m))
+    right = unit(np.cross(forward, (0.0, 0.0, 1.0)))
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    T[:3, 3] = eye_m
+    return T
+
+
+#: Behind the robot on either side, so that their optical axes are far from parallel.
+T_WORLD_KINECT = look_at((-1.00, -1.50, 1.90), (1.60, -0.20, 0.95))
+T_WORLD_XTION = look_at((-0.60, 1.90, 2.10), (1.45, 0.10, 0.95))
+
+_DOWN = [180.0, 0.0, 0.0]
+
+
+def _waypoint(name: str, place_m: tuple[float, float, float], **how: Any) -> dict[str, Any]:
+    return {"name": name, "position_m": list(place_m), "rpy_deg": _DOWN} | how
+
+
+#: Metal pieces from a rack on the robot's right into a box before it on its left, where the worker reaches in.
+TASK: dict[str, Any] = {
+    "name": "pick and place",
+    "repeat": True,
+    "speed": 0.6,
+    "acceleration": 0.5,
+    "tcp_speed_m_per_s": 0.9,
+    "tcp_acceleration_m_per_s2": 3.0,
+    "waypoints": [
+        _waypoint("above the rack", (0.26, -0.46, 0.36)),
+        _waypoint("rack", (0.26, -0.46, 0.22), move="linear", tcp_speed_m_per_s=0.35, dwell_s=0.3),
+        _waypoint("off the rack", (0.26, -0.46, 0.36), move="linear", tcp_speed_m_per_s=0.5),
+        _waypoint("above the box", (0.47, 0.26, 0.38)),
+        _waypoint("box", (0.47, 0.26, 0.26), move="linear", tcp_speed_m_per_s=0.35, dwell_s=0.3),
+        _waypoint("off the box", (0.47, 0.26, 0.38), move="linear", tcp_speed_m_per_s=0.5),
+    ],
+}
