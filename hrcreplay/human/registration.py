@@ -1,0 +1,290 @@
+"""Where two sensors stand to one another, from the skeletons of the one person both saw.
+
+Real skeletons carry gross errors at full confidence (left/right mix-ups, jumps), two clocks that do not agree, and
+frames taken at different instants. So both tracks are smoothed by the same kernel and compared at one camera's
+instants, and pose and clock offset are found together by a robust Gauss-Newton.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.records import POINTS, Bools, Floats, Ints, Table
+
+#: POINTS with left and right exchanged.
+MIRROR = tuple(
+    POINTS.index(name[:-1] + {"l": "r", "r": "l"}[name[-1]]) if name[-2:] in ("_l", "_r") else i
+    for i, name in enumerate(POINTS)
+)
+
+_NS = 1e-9
+_GAP_S = 0.1  # no interpolation across longer silences
+_SPEED_MAX = 4.0  # m/s: faster is a jump of the tracker, not the person
+_STARTS = 40  # frames whose own alignment is tried as the start
+_ITERATIONS = 60
+
+
+@dataclass(frozen=True)
+class Track(Table):
+    """One person as one sensor saw it, a row a frame, in order of capture."""
+
+    t_ns: Ints  #: (n,) capture time on the sensor's own clock
+    points_m: Floats  #: (n, 20, 3) POINTS in the sensor's frame [m]
+    confidence: Floats  #: (n, 20) in [0, 1]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How sensor b stands to sensor a."""
+
+    T_a_b: Floats  #: (4, 4) takes points of b into the frame of a
+    offset_s: float  #: to be added to b's stamps to get a's clock [s]
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """What remains between two registered tracks, over every point that both saw, outliers included."""
+
+    median_m: float
+    p95_m: float
+    points: int  #: point pairs it rests on
+    mirrored: float  #: share of the frames in which the two see left and right exchanged
+
+
+def kabsch(source_m: Floats, target_m: Floats, weight: Floats) -> Floats:
+    """Rigid transform that takes the source points to the target points in weighted least squares.
+
+    Args:
+        source_m: (m, 3) [m].
+        target_m: (m, 3) [m].
+        weight: (m,) not negative.
+
+    Returns:
+        T_target_source (4, 4).
+    """
+    share = weight / weight.sum()
+    middle_s, middle_t = share @ source_m, share @ target_m
+    u, _, vt = np.linalg.svd((share[:, None] * (source_m - middle_s)).T @ (target_m - middle_t))
+    turn = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
+    return rigid(turn, middle_t - turn @ middle_s)
+
+
+def rigid(rotation: Floats, translation_m: Floats) -> Floats:
+    """The (4, 4) transform of a rotation (3, 3) and a translation (3,) [m]."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation, translation_m
+    return T
+
+
+def transform(T: Floats, points_m: Floats) -> Floats:
+    """Points (..., 3) [m] taken through T (4, 4)."""
+    return points_m @ T[:3, :3].T + T[:3, 3]
+
+
+def register(a: Track, b: Track, *, search_s: float = 2.0) -> Registration | None:
+    """Pose of sensor b in the frame of sensor a, and b's clock offset.
+
+    Args:
+        a: The person as sensor a saw it, (n, 20, 3) [m].
+        b: The same person as sensor b saw it, (m, 20, 3) [m].
+        search_s: Clock offsets are searched within plus and minus this [s].
+
+    Returns:
+        The registration, or None where the tracks share too few points to tell.
+    """
+    if min(len(a), len(b)) < 3:
+        return None
+    a, b = _without_jumps(a), _without_jumps(b)
+    width_s = max(float(np.median(np.diff(a.t_ns))), float(np.median(np.diff(b.t_ns)))) * _NS
+    points_a, velocity_a, weight_a = _smoothed(a, a.t_ns, width_s)
+    offset_s = _coarse_offset(a, b, velocity_a, width_s, search_s)
+    points_b, _, weight_b = _smoothed(b, a.t_ns - round(offset_s / _NS), width_s)
+    T = _start(points_a, points_b, np.sqrt(weight_a * weight_b))
+    if T is None:
+        return None
+    step = np.full(7, np.inf)
+    for _ in range(_ITERATIONS):
+        points_b, _, weight_b = _smoothed(b, a.t_ns - round(offset_s / _NS), width_s)
+        weight = np.sqrt(weight_a * weight_b)
+        T, step = _gauss_newton(T, points_a, points_b, velocity_a, weight)
+        offset_s += float(np.clip(step[6], -width_s, width_s))
+        if np.abs(step).max() < 1e-7:
+            break
+    return Registration(T, offset_s)
+
+
+def disagreement(a: Track, b: Track, found: Registration) -> Disagreement | None:
+    """What remains between the raw points of two registered tracks, b interpolated linearly to a's instants.
+
+    Returns:
+        Median and 95th percentile over all point pairs of positive confidence [m]; None where there is no pair.
+    """
+    t_b = a.t_ns - round(found.offset_s / _NS)
+    inside = (t_b >= b.t_ns[0]) & (t_b <= b.t_ns[-1])
+    after = np.clip(np.searchsorted(b.t_ns, t_b), 1, len(b) - 1)
+    gap_ns = b.t_ns[after] - b.t_ns[after - 1]
+    share = ((t_b - b.t_ns[after - 1]) / np.maximum(gap_ns, 1))[:, None]
+    points_b = (1 - share[..., None]) * b.points_m[after - 1] + share[..., None] * b.points_m[after]
+    seen = (a.confidence > 0) & (b.confidence[after - 1] > 0) & (b.confidence[after] > 0)
+    seen &= (inside & (gap_ns <= _GAP_S / _NS))[:, None]
+    there = transform(found.T_a_b, points_b)
+    apart_m = np.linalg.norm(a.points_m - there, axis=2)
+    seen &= np.isfinite(apart_m)
+    if not seen.any():
+        return None
+    scale_m = float(np.median(apart_m[seen]))
+    mirrored = _mirrored(a.points_m, there, seen.astype(np.float64), max(scale_m, 1e-3))
+    median_m, p95_m = np.percentile(apart_m[seen], [50, 95])
+    return Disagreement(float(median_m), float(p95_m), int(seen.sum()), float(mirrored[seen.any(axis=1)].mean()))
+
+
+def _without_jumps(track: Track) -> Track:
+    """Points that leave the median of their five nearest frames by more than a fast arm could: confidence 0.
+
+    Kept out before smoothing, which would smear them over their neighbours.
+    """
+    n = len(track)
+    around = np.clip(np.arange(n)[:, None] + np.arange(-2, 3), 0, n - 1)
+    seen = np.isfinite(track.points_m).all(axis=2) & (track.confidence > 0)
+    points = np.where(seen[..., None], track.points_m, np.nan)
+    filled = np.where(seen[..., None], track.points_m, 0.0)
+    middle = np.median(np.where(np.isnan(points[around]), filled[:, None], points[around]), axis=1)
+    jumps = np.linalg.norm(filled - middle, axis=2) > 0.15
+    return Track(track.t_ns, filled, np.where(seen & ~jumps, track.confidence, 0.0))
+
+
+def _smoothed(track: Track, t_ns: Ints, width_s: float) -> tuple[Floats, Floats, Floats]:
+    """Points (n, 20, 3) [m], velocities [m/s] and weights (n, 20) of a track at other instants."""
+    return _smooth(track.t_ns, track.points_m, track.confidence, t_ns, width_s / _NS)
+
+
+@njit(cache=True)
+def _smooth(
+    t_track: Ints, points: Floats, confidence: Floats, t_ns: Ints, width_ns: float
+) -> tuple[Floats, Floats, Floats]:
+    """Local lines under a Gaussian kernel.
+
+    Linear interpolation between two noisy frames has half the noise midway, which pulls any estimate of the offset
+    towards half a frame. Under a kernel as wide as a frame the noise is the same everywhere.
+    """
+    n, m = len(t_ns), points.shape[1]
+    value, slope, weight = np.zeros((n, m, 3)), np.zeros((n, m, 3)), np.zeros((n, m))
+    reach = 3.0 * width_ns
+    first = 0
+    for i in range(n):
+        while first < len(t_track) and t_track[first] < t_ns[i] - reach:
+            first += 1
+        for k in range(m):
+            s0 = s1 = s2 = mass = 0.0
+            y0, y1 = np.zeros(3), np.zeros(3)
+            j = first
+            while j < len(t_track) and t_track[j] <= t_ns[i] + reach:
+                x = (t_track[j] - t_ns[i]) / width_ns
+                g = np.exp(-0.5 * x * x)
+                w = g * confidence[j, k]
+                s0, s1, s2, mass = s0 + w, s1 + w * x, s2 + w * x * x, mass + g
+                for d in range(3):
+                    y0[d] += w * points[j, k, d]
+                    y1[d] += w * x * points[j, k, d]
+                j += 1
+            det = s0 * s2 - s1 * s1
+            # A line needs frames on both sides of the instant: elsewhere it would extrapolate.
+            if s0 < 1.0 or det < 0.25 * s0 * s0 or abs(s1) > 0.5 * s0:
+                continue
+            weight[i, k] = s0 / mass
+            for d in range(3):
+                value[i, k, d] = (s2 * y0[d] - s1 * y1[d]) / det
+                slope[i, k, d] = (s0 * y1[d] - s1 * y0[d]) / det / (width_ns * 1e-9)
+    return value, slope, weight
+
+
+def _coarse_offset(a: Track, b: Track, velocity_a: Floats, width_s: float, search_s: float) -> float:
+    """Offset [s] at which the points' speeds agree best. Speeds do not depend on where the sensors stand."""
+    speed_a = np.minimum(np.linalg.norm(velocity_a, axis=2), _SPEED_MAX)
+    seen_a = speed_a > 0
+    steps = int(np.ceil(search_s / width_s))
+    best, best_s = -np.inf, 0.0
+    for step in sorted(range(-steps, steps + 1), key=abs):
+        offset_s = step * width_s
+        _, velocity_b, _ = _smoothed(b, a.t_ns - round(offset_s / _NS), width_s)
+        speed_b = np.minimum(np.linalg.norm(velocity_b, axis=2), _SPEED_MAX)
+        both = seen_a & (speed_b > 0)
+        if both.sum() < 20 * len(POINTS):
+            continue
+        x, y = speed_a[both] - speed_a[both].mean(), speed_b[both] - speed_b[both].mean()
+        likeness = float(x @ y / np.sqrt((x @ x) * (y @ y)))
+        if likeness > best:
+            best, best_s = likeness, offset_s
+    return best_s
+
+
+def _start(points_a: Floats, points_b: Floats, weight: Floats) -> Floats | None:
+    """The best of the alignments that single frames give, judged by all: a trimmed start, without chance."""
+    rows = np.flatnonzero((weight > 0).sum(axis=1) >= 4)
+    if not len(rows):
+        return None
+    judges = rows[:: max(1, len(rows) // 400)]
+    seen = weight[judges] > 0
+    best, T_best = np.inf, None
+    for row in rows[np.linspace(0, len(rows) - 1, min(_STARTS, len(rows))).astype(int)]:
+        use = weight[row] > 0
+        T = kabsch(points_b[row, use], points_a[row, use], weight[row, use])
+        apart = np.linalg.norm(points_a[judges] - transform(T, points_b[judges]), axis=2)[seen]
+        cost = float(np.median(apart))
+        if cost < best:
+            best, T_best = cost, T
+    return T_best
+
+
+def _mirrored(points_a: Floats, points_b: Floats, weight: Floats, scale_m: float) -> Bools:
+    """(n,) frames that agree far better with left and right of b exchanged."""
+
+    def cost(other: Floats, w: Floats) -> Floats:
+        squares = np.sum((points_a - other) ** 2, axis=2) / scale_m**2
+        squares = np.where(w > 0, squares, 0.0)
+        return (w * np.log1p(squares)).sum(axis=1) / np.maximum(w.sum(axis=1), 1e-12)
+
+    mirror = list(MIRROR)
+    direct, exchanged = cost(points_b, weight), cost(points_b[:, mirror], weight * weight[:, mirror])
+    return exchanged < 0.5 * direct
+
+
+def _gauss_newton(
+    T: Floats, points_a: Floats, points_b: Floats, velocity_a: Floats, weight: Floats
+) -> tuple[Floats, Floats]:
+    """One step on rotation, translation and offset under Cauchy weights: the new T and the step (7,) [rad, m, s]."""
+    there = transform(T, points_b)
+    scale_m = max(float(np.median(np.linalg.norm(points_a - there, axis=2)[weight > 0])), 1e-6)
+    flip = _mirrored(points_a, there, weight, scale_m)
+    mirror = list(MIRROR)
+    there = np.where(flip[:, None, None], there[:, mirror], there)
+    use = weight > 0
+    p, w = there[use], weight[use]
+    left = points_a[use] - p
+    w = w / (1.0 + np.sum(left**2, axis=1) / (1.5 * scale_m) ** 2)
+    middle = w @ p / w.sum()  # turning about the middle decouples rotation from translation
+    x, y, z = (p - middle).T
+    o = np.zeros_like(x)
+    turn = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)  # columns e_k x p
+    shift = np.broadcast_to(np.eye(3), turn.shape)
+    # b(t - offset) comes later as the offset grows: the point moves back by its velocity.
+    A = np.concatenate([turn, shift, -velocity_a[use][:, :, None]], axis=2)
+    AtW = (A * w[:, None, None]).reshape(-1, 7).T
+    flat = A.reshape(-1, 7)
+    step = np.linalg.lstsq(AtW @ flat, AtW @ left.reshape(-1), rcond=1e-12)[0]
+    R = _rotation(step[:3])
+    moved = rigid(R, middle + step[3:6] - R @ middle)
+    return moved @ T, step
+
+
+def _rotation(vector: Floats) -> Floats:
+    """Rotation matrix of a rotation vector (3,) [rad]."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
