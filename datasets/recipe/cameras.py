@@ -7,17 +7,17 @@ import numpy as np
 from datasets.recipe import scene
 from datasets.recipe.curves import rot_z
 from datasets.recipe.sensors import LEFT_ARM, RIGHT_ARM, Sensor, View, jump, observe, swap_arms
-from hrcreplay.records import CameraFrames, Floats, Ints
+from hrcreplay.records import Bools, CameraFrames, Floats, Ints
 
 KINECT = Sensor(
     name="kinect",
     T_world_camera=scene.T_WORLD_KINECT,
     half_view_rad=(np.radians(35.3), np.radians(30.0)),
     range_m=4.5,
-    white_m=0.011,
-    slow_m=0.006,
+    white_m=0.0075,
+    slow_m=0.004,
     slow_s=0.15,
-    along=1.4,
+    along=1.3,
     rate_hz=30.0,
     first_s=6.0,
     late_s=0.034,
@@ -27,19 +27,19 @@ XTION = Sensor(
     T_world_camera=scene.T_WORLD_XTION,
     half_view_rad=(np.radians(29.0), np.radians(22.5)),
     range_m=4.3,
-    white_m=0.015,
-    slow_m=0.008,
+    white_m=0.010,
+    slow_m=0.005,
     slow_s=0.20,
-    along=1.7,
+    along=1.5,
     rate_hz=25.0,
     first_s=0.3,
     late_s=0.042,
 )
 SENSORS = (KINECT, XTION)
 
-#: When a camera sees no worker at all [s]: a colleague stands before the kinect, a cable before the xtion comes loose.
+#: When a camera sees no worker at all [s]: somebody stands right before the kinect, the xtion's cable is loose.
 BLOCKED_S = {"kinect": ((19.0, 21.4), (45.2, 46.9)), "xtion": ((33.4, 34.1),)}
-#: When the colleague crosses the kinect's view [s].
+#: When a colleague crosses the kinect's view [s], some way behind the worker.
 COLLEAGUE_S = (43.6, 47.6)
 
 
@@ -84,19 +84,19 @@ def between(when_s: Floats, t_s: Floats, points_m: Floats) -> Floats:
 
 
 def _colleague(when_s: Floats, t_s: Floats, points_m: Floats) -> Floats:
-    """Somebody who walks through the cell's back like the worker does when coming, on another way."""
+    """(n, 20, 3) somebody who walks by behind the worker, with the worker's own gait of the first seconds."""
     walk = between(when_s - COLLEAGUE_S[0] + 0.9, t_s, points_m)
     first = walk[0, 0] * np.array([1.0, 1.0, 0.0])
-    turned = (walk - first) @ rot_z(np.array([np.radians(-85.0)]))[0].T
-    return np.asarray(turned + np.array([1.15, -1.35, 0.0]))
+    turned = (walk - first) @ rot_z(np.array([np.radians(-110.0)]))[0].T
+    return np.asarray(turned + np.array([2.70, -1.20, 0.0]))
 
 
 def _spoil(view: View, rng: np.random.Generator) -> None:
     """Gross errors: arms taken for each other and limbs that jump, some of them at full confidence."""
     last = len(view.t_s) - 10
-    for _ in range(5):
+    for _ in range(4):
         first = int(rng.integers(last))
-        swap_arms(view, np.arange(first, first + rng.integers(2, 7)))
+        swap_arms(view, np.arange(first, first + rng.integers(2, 5)))
     for k in range(16):
         first = int(rng.integers(last))
         arm = (RIGHT_ARM, LEFT_ARM)[k % 2]
@@ -106,14 +106,15 @@ def _spoil(view: View, rng: np.random.Generator) -> None:
         jump(view, np.arange(first, first + rng.integers(1, 5)), points, by_m, (1.0, 0.5)[k % 3 == 0])
 
 
-def _blocked(sensor: Sensor, t_s: Floats) -> Floats:
+def _blocked(sensor: Sensor, t_s: Floats) -> Bools:
+    """(n,) whether something stands before the camera."""
     return np.asarray(np.any([(t_s >= first) & (t_s < last) for first, last in BLOCKED_S[sensor.name]], axis=0))
 
 
-def _within(sensor: Sensor, view: View) -> Floats:
-    """(n,) bool: the trunk is in view and near enough; without it there is no skeleton."""
-    trunk = view.points_m[:, :4]
-    far = np.nanmedian(np.where(np.isnan(trunk), np.inf, trunk)[:, :, 2], axis=1)
+def _within(sensor: Sensor, view: View) -> Bools:
+    """(n,) whether the trunk is in view and near enough; without it there is no skeleton."""
+    depth = view.points_m[:, :4, 2]
+    far = np.median(np.where(np.isnan(depth), np.inf, depth), axis=1)
     return np.asarray(far < sensor.range_m)
 
 

@@ -84,7 +84,7 @@ def _rotation(angle: Floats, first: int, second: int) -> Floats:
 def turn(R: Floats, vector: Floats | Sequence[float | Floats]) -> Floats:
     """(n, 3) ``R`` (n, 3, 3) times a vector whose components are numbers or (n,) channels."""
     components = [np.broadcast_to(np.asarray(c, dtype=np.float64), (len(R),)) for c in np.asarray(vector, dtype=object)]
-    return np.einsum("nij,nj->ni", R, np.stack(components, axis=1))
+    return np.asarray(np.einsum("nij,nj->ni", R, np.stack(components, axis=1)))
 
 
 def unit(vectors: Floats) -> Floats:

@@ -41,7 +41,7 @@ TASK: dict[str, Any] = {
     "name": "pick and place",
     "repeat": True,
     "speed": 0.6,
-    "acceleration": 0.5,
+    "acceleration": 0.7,
     "tcp_speed_m_per_s": 0.9,
     "tcp_acceleration_m_per_s2": 3.0,
     "waypoints": [

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from datasets.recipe.curves import smooth
-from hrcreplay.records import POINTS, Floats, Ints
+from hrcreplay.records import POINTS, Bools, Floats, Ints
 
 RIGHT_ARM = tuple(POINTS.index(f"{name}_r") for name in ("shoulder", "elbow", "wrist", "hand"))
 LEFT_ARM = tuple(POINTS.index(f"{name}_l") for name in ("shoulder", "elbow", "wrist", "hand"))
@@ -70,7 +70,7 @@ def observe(sensor: Sensor, t_s: Floats, points_m: Floats, rng: np.random.Genera
     true = (points_m - eye) @ R
     hidden = _hidden(points_m, eye)
     hidden_for_long = smooth(hidden.astype(np.float64), 2.0)
-    loud = _loudness(sensor, t_s, true, hidden_for_long, rng)
+    loud = _loudness(t_s, true, hidden_for_long, rng)
     sigma = np.array([1.0, 1.0, sensor.along])
     white = rng.standard_normal(true.shape) * sensor.white_m
     slow = _correlated(t_s, true.shape[1:], sensor.slow_s, rng) * sensor.slow_m
@@ -82,7 +82,7 @@ def observe(sensor: Sensor, t_s: Floats, points_m: Floats, rng: np.random.Genera
     return View(t_s, seen, confidence)
 
 
-def _loudness(sensor: Sensor, t_s: Floats, true: Floats, hidden: Floats, rng: np.random.Generator) -> Floats:
+def _loudness(t_s: Floats, true: Floats, hidden: Floats, rng: np.random.Generator) -> Floats:
     """(n, 20) what the noise is multiplied with: point, depth, speed, occlusion and the other camera's light."""
     depth = np.maximum(true[:, :, 2], 0.8)
     dt = np.gradient(t_s)[:, None]
@@ -94,8 +94,8 @@ def _loudness(sensor: Sensor, t_s: Floats, true: Floats, hidden: Floats, rng: np
     return np.asarray(loud)
 
 
-def _hidden(points_m: Floats, eye_m: Floats) -> Floats:
-    """(n, 20) bool: the trunk or the head stands between the camera and the point."""
+def _hidden(points_m: Floats, eye_m: Floats) -> Bools:
+    """(n, 20): the trunk or the head stands between the camera and the point."""
     spine = points_m[:, list(SPINE)]
     shares = np.linspace(0.0, 1.0, 5)[:, None]
     low = spine[:, :1] + (spine[:, 1:2] - spine[:, :1]) * shares

@@ -70,7 +70,7 @@ def simulate(seed: int) -> tuple[Floats, Floats]:
 
 def _trunk(t_s: Floats, root_m: Floats, heading: Floats, steps: Feet, rng: np.random.Generator) -> Trunk:
     lean = script.degrees(t_s, 3.0, script.LEAN_DEG) + sway(t_s, rng, 0.018, 0.05, 0.5)
-    bend = script.degrees(t_s, -2.0, script.BEND_DEG) + sway(t_s, rng, 0.020, 0.04, 0.4)
+    bend = script.degrees(t_s, -2.0, script.BEND_DEG) + sway(t_s, rng, 0.028, 0.04, 0.4)
     twist = script.degrees(t_s, 0.0, script.TWIST_DEG) + sway(t_s, rng, 0.030, 0.06, 0.5)
     stride = smooth(_ahead(root_m, heading, steps.ankle_m[:, 0]) - _ahead(root_m, heading, steps.ankle_m[:, 1]), 16.0)
     load = smooth(steps.swing[:, 1] - steps.swing[:, 0], 20.0)  # > 0: the left leg carries
@@ -84,10 +84,10 @@ def _trunk(t_s: Floats, root_m: Floats, heading: Floats, steps: Feet, rng: np.ra
     pelvis = _pelvis(t_s, root_m, heading, lean, load, steps, rng)
     chest = pelvis + turn(R_lumbar, (0.0, 0.0, LUMBAR_M))
     neck = chest + turn(R_chest, (0.0, 0.0, THORAX_M))
-    nod = 0.6 * script.degrees(t_s, 2.0, script.NOD_DEG) + sway(t_s, rng, 0.05, 0.08, 0.6)
+    nod = script.degrees(t_s, 1.0, script.NOD_DEG) + sway(t_s, rng, 0.05, 0.08, 0.6)
     gaze = script.degrees(t_s, 0.0, script.GAZE_DEG) + sway(t_s, rng, 0.06, 0.07, 0.5)
-    R_head = R_chest @ rot_z(gaze) @ rot_y(nod) @ rot_x(-0.5 * bend)
-    head = neck + turn(R_chest, (-0.005, 0.0, 0.07)) + turn(R_head, (0.02, 0.0, 0.135))
+    R_head = R_chest @ rot_z(gaze) @ rot_y(nod) @ rot_x(-1.7 * bend)
+    head = neck + turn(R_chest, (-0.03, 0.0, 0.075)) + turn(R_head, (0.02, 0.0, 0.135))
     return Trunk(pelvis, R_pelvis, chest, neck, R_chest, head)
 
 
