@@ -169,7 +169,10 @@ def from_urdf(
         raise SettingsError(
             f"robot.acceleration: found {len(acceleration)} values; {robot.name} has {len(robot.joints)} axes"
         )
-    model = pin.buildModelFromXML(robot.text)
+    try:
+        model = pin.buildModelFromXML(robot.text)
+    except ValueError as error:
+        raise SettingsError(f"robot: the URDF of {robot.name} cannot be read ({error}); check its numbers") from error
     _place_base(model, pin.SE3(T_world_base))
     tcp = _add_frame(model, robot.tcp, (0.0, 0.0, tool_m), "robot.tcp_frame")
     tool = model.frames[tcp].placement

@@ -21,7 +21,7 @@ RAMP_S = 0.1
 #: On a straight line the TCP turns by at most this for a metre, ABB's 2 pi rad/s for 2.5 m/s [rad/m].
 TURN_RAD_PER_M = 2 * math.pi / 2.5
 
-#: A line slowed more than this for the axes' sake passes a singular posture.
+#: A line that must be slower by more than this for the axes' sake passes a singular posture.
 _SLOWEST = 20.0
 
 
@@ -115,23 +115,30 @@ def _paced(
     acceleration: float,
     where: str,
 ) -> Track:
-    """A path run by a jerk-limited profile, which is stretched in time until no limit is exceeded."""
-    slow = 1.0
+    """A path run by a jerk-limited profile as fast as the axes and the TCP allow.
+
+    The profile's own speed and acceleration are lowered by what its axes exceed. Where that does not help against an
+    acceleration, it stems from the path's curvature, which only less speed can mend.
+    """
+    slowest, softest, before = speed / _SLOWEST, acceleration / _SLOWEST**2, math.inf
     while True:
-        track = along(*_profile(length, speed, acceleration, slow, pace.step_s))
-        excess = _excess(model, track, pace)
-        if excess <= 1.0 + 1e-9:
+        track = along(*_profile(length, speed, acceleration, pace.step_s))
+        faster, harder = _excess(model, track, pace)
+        if max(faster, harder) <= 1.0 + 1e-9:
             return track
-        slow *= excess * 1.0001
-        if slow > _SLOWEST and where:
+        curved = math.sqrt(harder) if harder > max(1.0, 0.9 * before) else 1.0
+        speed /= max(1.0, faster) * curved * 1.0001
+        acceleration /= max(1.0, harder) * 1.0001
+        before = harder
+        if where and (speed < slowest or acceleration < softest):
             raise SettingsError(
-                f"{where}: on the straight line to it the axes would have to be {slow:.0f} times as fast as they are; "
-                'it passes a singular posture: use move = "joint" or start from another posture'
+                f"{where}: on the straight line to it an axis would have to be {_SLOWEST:.0f} times as fast as it is; "
+                'the arm passes a singular posture: use move = "joint" or start from another posture'
             )
 
 
-def _profile(length: float, speed: float, acceleration: float, slow: float, step_s: float) -> tuple[Floats, Floats]:
-    """Position and speed along a path on the time grid, ``slow`` times longer than the fastest."""
+def _profile(length: float, speed: float, acceleration: float, step_s: float) -> tuple[Floats, Floats]:
+    """Position and speed along a path on the time grid, stretched to a whole number of its steps."""
     task = InputParameter(1)
     task.current_position, task.target_position = [0.0], [length]
     task.max_velocity, task.max_acceleration, task.max_jerk = [speed], [acceleration], [acceleration / RAMP_S]
@@ -139,7 +146,7 @@ def _profile(length: float, speed: float, acceleration: float, slow: float, step
     result = Ruckig(1).calculate(task, fastest)
     if result != Result.Working:
         raise RuntimeError(f"ruckig: {result} for {length} m or rad at {speed}, {acceleration}")
-    steps = max(1, math.ceil(fastest.duration * slow / step_s))
+    steps = max(1, math.ceil(fastest.duration / step_s))
     stretch = steps * step_s / fastest.duration
     states = [fastest.at_time(fastest.duration * i / steps) for i in range(steps + 1)]
     s, ds = (np.array([state[order][0] for state in states]) for order in (0, 1))
@@ -147,16 +154,13 @@ def _profile(length: float, speed: float, acceleration: float, slow: float, step
     return np.clip(s, 0.0, length), ds / stretch
 
 
-def _excess(model: RobotModel, track: Track, pace: Pace) -> float:
-    """By which factor the time must be stretched so that every limit holds."""
-    if len(track.q) == 1:
-        return 1.0
+def _excess(model: RobotModel, track: Track, pace: Pace) -> tuple[float, float]:
+    """By which factors the path's speed and its acceleration exceed what axes and TCP allow."""
     way, first, last = np.diff(track.q, axis=0) / pace.step_s, track.dq[:-1], track.dq[1:]
-    speeds = np.concatenate([track.dq, 1.5 * way - 0.25 * (first + last)])  # of the cubics between grid points:
+    speeds = np.concatenate([track.dq, 1.5 * way - 0.25 * (first + last)])  # of the cubics between grid points
     accelerations = np.concatenate([6 * way - 4 * first - 2 * last, 2 * first + 4 * last - 6 * way]) / pace.step_s
     tcp = [np.linalg.norm(model.pose(q, dq).J_tcp[:3] @ dq) for q, dq in zip(track.q, track.dq, strict=True)]
-    return max(
-        float((np.abs(speeds) / pace.dq_max).max()),
-        math.sqrt(float((np.abs(accelerations) / pace.ddq_max).max())),
-        float(max(tcp)) / pace.tcp_speed,
+    return (
+        max(float((np.abs(speeds) / pace.dq_max).max()), float(max(tcp)) / pace.tcp_speed),
+        float((np.abs(accelerations) / pace.ddq_max).max()),
     )

@@ -127,12 +127,11 @@ def _move(model: RobotModel, task: Task, index: int, now: Floats, where: str, go
         tcp_acceleration=task.tcp_acceleration_m_per_s2,
         step_s=STEP_S,
     )
-    given = waypoint.position_m is None or goal is not None
-    if waypoint.move == "joint" or given:
-        goal = _joints(model, task, index, now, where) if goal is None else goal
+    if goal is None and (waypoint.move == "joint" or waypoint.position_m is None):
+        goal = _joints(model, task, index, now, where)
     if goal is not None and waypoint.move == "joint":
         return joint_move(model, now, goal, pace)
-    T_end = _target(model, waypoint) if goal is None else model.pose(goal, np.zeros(model.nv)).T_world_tcp
+    T_end = _target(model, waypoint, at) if goal is None else model.pose(goal, np.zeros(model.nv)).T_world_tcp
     track = linear_move(model, now, T_end, pace, at)
     if goal is not None and np.abs(track.q[-1] - goal).max() > 1e-6:
         axis = int(np.argmax(np.abs(track.q[-1] - goal)))
@@ -148,7 +147,7 @@ def _joints(model: RobotModel, task: Task, index: int, near: Floats, where: str)
     waypoint = task.waypoints[index]
     at = f"{where}: {task.label(index)}"
     if waypoint.position_m is not None:
-        return _reached(model, _target(model, waypoint), near, at)
+        return _reached(model, _target(model, waypoint, at), near, at)
     degrees = waypoint.joints_deg
     q = np.array(waypoint.joints_rad if degrees is None else np.radians(degrees), dtype=float)
     if q.shape != model.q_min.shape:
@@ -161,7 +160,7 @@ def _joints(model: RobotModel, task: Task, index: int, near: Floats, where: str)
     return np.clip(q, model.q_min, model.q_max)
 
 
-def _target(model: RobotModel, waypoint: Waypoint) -> Floats:
+def _target(model: RobotModel, waypoint: Waypoint, at: str) -> Floats:
     """(4, 4) pose of the TCP that a waypoint gives, world frame."""
     T_base_tcp = np.eye(4)
     T_base_tcp[:3, 3] = waypoint.position_m
@@ -169,21 +168,24 @@ def _target(model: RobotModel, waypoint: Waypoint) -> Floats:
         T_base_tcp[:3, :3] = from_rpy(np.radians(waypoint.rpy_deg))
     else:
         T_base_tcp[:3, :3] = from_quaternion(np.array(waypoint.quaternion_wxyz, dtype=float))
-    return model.T_world_base @ T_base_tcp
-
-
-def _reached(model: RobotModel, T_world_tcp: Floats, near: Floats, at: str) -> Floats:
-    solution = solve(model, T_world_tcp, near)
-    if not isinstance(solution, Missed):
-        return solution
+    T_world_tcp = model.T_world_base @ T_base_tcp
     distance_m = float(np.linalg.norm(T_world_tcp[:3, 3] - model.shoulder_m))
     if distance_m > model.reach_m:
         raise SettingsError(
             f"{at}: out of reach, {distance_m:.3f} m from the first axis; "
             f"the TCP of {model.name} reaches {model.reach_m:.3f} m"
         )
-    raise SettingsError(
-        f"{at}: no joint position within the limits reaches it, {distance_m:.3f} m from the first axis (the TCP of "
-        f"{model.name} reaches {model.reach_m:.3f} m); the nearest misses it by {solution.position_m * 1e3:.0f} mm and "
-        f"{math.degrees(solution.angle_rad):.0f} deg, so move or turn it"
-    )
+    return T_world_tcp
+
+
+def _reached(model: RobotModel, T_world_tcp: Floats, near: Floats, at: str) -> Floats:
+    solution = solve(model, T_world_tcp, near)
+    if isinstance(solution, Missed):
+        distance_m = float(np.linalg.norm(T_world_tcp[:3, 3] - model.shoulder_m))
+        raise SettingsError(
+            f"{at}: no joint position within the limits reaches it; the nearest misses it by "
+            f"{solution.position_m * 1e3:.0f} mm and {math.degrees(solution.angle_rad):.0f} deg. "
+            f"It is {distance_m:.3f} m from the first axis and the TCP of {model.name} reaches {model.reach_m:.3f} m; "
+            "move it or turn it"
+        )
+    return solution

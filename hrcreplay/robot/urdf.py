@@ -100,9 +100,20 @@ def _parse(xml: str) -> ET.Element:
         raise SettingsError(f"robot: not a URDF ({error})") from error
     if robot.tag != "robot" or robot.find("link") is None:
         raise SettingsError(f"robot: found <{robot.tag}> without links; a URDF is a <robot> of links and joints")
+    links = [link.get("name") for link in robot.findall("link")]
+    below = []
     for joint in robot.findall("joint"):
-        if joint.find("parent") is None or joint.find("child") is None:
-            raise SettingsError(f"robot: joint {joint.get('name')!r} lacks its parent or child link")
+        ends = [None if end is None else end.get("link") for end in (joint.find("parent"), joint.find("child"))]
+        if not set(ends) <= set(links):
+            raise SettingsError(
+                f"robot: joint {joint.get('name')!r} is between {ends[0]} and {ends[1]}; name two links"
+            )
+        below.append(ends[1])
+    roots = [str(link) for link in links if link not in below]
+    if len(roots) != 1 or len(set(below)) != len(below):
+        raise SettingsError(
+            f"robot: found {len(roots)} links without a parent ({', '.join(roots)}); a URDF is one tree"
+        )
     return robot
 
 
@@ -164,10 +175,10 @@ def _capsule(collision: ET.Element, link: str, name: str) -> Segment:
     kind = "nothing" if shape is None else shape.tag
     half = np.zeros(3)
     if shape is not None and kind in ("cylinder", "capsule"):
-        half[2] = float(shape.get("length", "nan")) / 2
-        radius = float(shape.get("radius", "nan"))
+        half[2] = _measure(shape, "length") / 2
+        radius = _measure(shape, "radius")
     elif shape is not None and kind == "sphere":
-        radius = float(shape.get("radius", "nan"))
+        radius = _measure(shape, "radius")
     elif shape is not None and kind == "box":
         sides = _floats(shape.get("size"))
         longest = int(np.argmax(sides))
@@ -185,6 +196,13 @@ def _capsule(collision: ET.Element, link: str, name: str) -> Segment:
     axis = from_rpy(_floats(None if origin is None else origin.get("rpy"))) @ half
     start, end = centre - axis, centre + axis
     return Segment(name, link, (start[0], start[1], start[2]), (end[0], end[1], end[2]), radius)
+
+
+def _measure(shape: ET.Element, key: str) -> float:
+    try:
+        return float(shape.get(key, "nan"))
+    except ValueError:
+        return math.nan
 
 
 def _floats(text: str | None) -> Floats:
