@@ -82,7 +82,9 @@ def measure(frames: CameraFrames, T_world_camera: Floats, noise: PointNoise) -> 
     points = np.empty((n, len(POINTS), 3))
     rows, variances = np.full((n, ROWS), np.nan), np.full((n, ROWS), np.nan)
     settings = np.array([noise.std_m, noise.depth_std_per_m])
-    _measure_rows(frames.camera, frames.points_m, frames.confidence, T_world_camera, settings, points, rows, variances)
+    _measure_rows(
+        frames.camera, frames.points_m, frames.confidence, np.array(T_world_camera), settings, points, rows, variances
+    )
     std = np.sqrt(variances)
     return Measurements(
         capture_ns=frames.capture_ns,

@@ -1,9 +1,10 @@
 """One posture, two names: which triple (alpha_1, alpha_2, alpha_3) an arm goes by.
 
 The shoulder's three axes are a spherical wrist: (a1, a2, a3) and (a1 + pi, pi - a2, a3 + pi) are the same posture.
-The *canonical* name violates (34a), (34b) least, each angle in the turn around the middle of what (34) allows. Every posture inside (34) has its own angles as canonical name. The names meet where an arm crosses the chest
-low or is raised steeply just outside the shoulder; there the angles jump although the arm does not, and whoever
-follows angles through time takes the name ``nearest`` to where it was.
+The *canonical* name violates (34a), (34b) least, each angle in the turn around the middle of what (34) allows. Every
+posture inside (34) has its own angles as canonical name. The names meet where an arm crosses the chest low or is
+raised steeply just outside the shoulder; there the angles jump although the arm does not, and whoever follows angles
+through time takes the name ``nearest`` to where it was.
 """
 
 from __future__ import annotations

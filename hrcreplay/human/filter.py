@@ -1,0 +1,86 @@
+"""The arrays that the kernels of the fusion share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from numba import njit
+
+from hrcreplay.records import Bools, Floats, Ints
+
+
+class Filter(NamedTuple):
+    """All that one tick hands to the next."""
+
+    tick_ns: Ints  #: (1,) the last tick
+    started: Bools  #: (1,) whether there is a person
+    mean: Floats  #: (12, 4) p, v, a, j
+    cov: Floats  #: (12, 4, 4)
+    lengths: Floats  #: (8,)
+    lengths_var: Floats  #: (8,)
+    row_ns: Ints  #: (20,) tick at which a row (12 angles, 8 lengths) was last valid
+    point_ns: Ints  #: (20,) tick at which a body point last agreed with the filter
+    capture_ns: Ints  #: (c,) of the frame held for each camera
+    uses: Ints  #: (c,) ticks that frame was used in; -1 without one
+    z: Floats  #: (c, 20) its rows
+    z_var: Floats  #: (c, 20) sigma_z^2
+    points: Floats  #: (c, 20, 3)
+    confidence: Floats  #: (c, 20)
+    valid: Bools  #: (c, 20) which of its rows are used
+
+
+class Frames(NamedTuple):
+    """Frames in order of arrival."""
+
+    capture_ns: Ints
+    arrival_ns: Ints
+    camera: Ints
+    z: Floats
+    z_var: Floats
+    points: Floats
+    confidence: Floats
+
+
+class Rules(NamedTuple):
+    """Settings and limits as the kernels need them."""
+
+    sigma: Floats  #: (12, 4) of Eq. (44)
+    reuse: bool
+    compensate: bool
+    delay_max_s: float
+    confidence_min: float
+    outlier_m: float
+    memory_ns: int
+    coast_ns: int
+    rest_s: float
+    p_min: Floats
+    p_max: Floats
+    v_min: Floats
+    v_max: Floats
+    a_min: Floats
+    a_max: Floats
+    coupled: bool
+
+
+class Track(NamedTuple):
+    """What the ticks leave behind; rows before the start stay as they are."""
+
+    mean: Floats  #: (n, 12, 4)
+    std: Floats  #: (n, 12, 2) of p and v
+    lengths: Floats  #: (n, 8)
+    lengths_std: Floats  #: (n, 8)
+    valid: Bools  #: (n, c)
+    cov: Floats  #: (n or 0, 12, 4, 4)
+    damping: Floats  #: (n or 0, 12) of the derivatives, on the way to the tick
+    outliers: Ints  #: (c,)
+    superseded: Ints  #: (c,)
+    reacquired: Ints  #: (1,)
+    saturated: Ints  #: (1,)
+
+
+@njit(cache=True)
+def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
+    """Age of the frame held for a camera [s]; 0 where delays are ignored."""
+    if not rules.compensate:
+        return 0.0
+    return max(0.0, min((now - filter_.capture_ns[c]) * 1e-9, rules.delay_max_s))

@@ -1,0 +1,197 @@
+"""Fusion of several cameras into one moving person, Alg. 3."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hrcreplay.human.filter import Filter, Frames, Rules, Track
+from hrcreplay.human.fusion_kernel import run
+from hrcreplay.human.model import LimitSet
+from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, HumanStates, Ints, Measurements
+
+ROWS = len(JOINTS) + len(LENGTHS)
+_NEVER_NS = -(2**62)
+#: A person nobody has measured: upright, arms hanging; and how wrong that may be [m, m, rad...].
+_NEUTRAL = (0.0, 0.0, 0.0, 0.1, 0.1, 0.3, 0.0, 2.6, 0.1, 0.3, 0.0, 2.6)
+_NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2)
+#: Median man (upper arm 0.36 m, shoulders at 1.44 m), and how wrong that may be [m].
+_LENGTHS_M = (0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
+_LENGTHS_STD_M = 0.1
+
+FusionState = Filter
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """Settings of the filter."""
+
+    stale: Literal["skip", "reuse"] = "skip"  #: use a frame once, or at every tick until the next, R growing (4.1.1)
+    delay: Literal["compensate", "ignore"] = "compensate"  #: relate a frame to its capture time, or to the tick
+    delay_max_s: float = 0.25  #: an older frame counts as this old [s]
+    confidence_min: float = 0.2  #: least product of the confidences of the points an angle is computed from
+    outlier_m: float = 0.30  #: a point further than this from the predicted skeleton is an outlier [m]
+    sigma_position: float = 100.0  #: the four sigmas of x and y in Eq. (44) [m/s^4]
+    sigma_angle: float = 500.0  #: the four sigmas of the angles in Eq. (44) [rad/s^4]
+    coast_s: float = 0.1  #: a joint without a valid row for longer comes to rest [s]
+    memory_s: float = (
+        0.5  #: a joint or point without a valid row for longer is lost: the next one is taken as it is [s]
+    )
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a smoother needs beside the states: P of every tick, and how it was reached."""
+
+    cov: Floats  #: (n, 12, 4, 4) covariance of p, v, a, j
+    damping: Floats  #: (n, 12) of the derivatives on the way to the tick; 1 unless the joint was unseen
+
+
+def start(cameras: tuple[str, ...]) -> FusionState:
+    """The filter before the first frame of any camera."""
+    c = len(cameras)
+    mean, cov = np.zeros((12, 4)), np.zeros((12, 4, 4))
+    mean[:, 0] = _NEUTRAL
+    for j in range(12):
+        cov[j] = np.diag([_NEUTRAL_STD[j], *((1.0, 5.0, 50.0) if j < 2 else (3.0, 30.0, 300.0))]) ** 2
+    return Filter(
+        tick_ns=np.full(1, _NEVER_NS),
+        started=np.zeros(1, dtype=np.bool_),
+        mean=mean,
+        cov=cov,
+        lengths=np.array(_LENGTHS_M),
+        lengths_var=np.full(len(LENGTHS), _LENGTHS_STD_M**2),
+        row_ns=np.full(ROWS, _NEVER_NS),
+        point_ns=np.full(len(POINTS), _NEVER_NS),
+        capture_ns=np.full(c, _NEVER_NS),
+        uses=np.full(c, -1),
+        z=np.full((c, ROWS), np.nan),
+        z_var=np.full((c, ROWS), np.nan),
+        points=np.full((c, len(POINTS), 3), np.nan),
+        confidence=np.zeros((c, len(POINTS))),
+        valid=np.zeros((c, ROWS), dtype=np.bool_),
+    )
+
+
+def fuse(
+    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: FusionSettings, limits: LimitSet
+) -> tuple[FusionState, HumanStates, Counter[str]]:
+    """Alg. 3: one tick after another, each with the frames that arrived in (previous tick, tick].
+
+    The filter is that of (42)-(57) with (44) corrected: per joint p, v, a, j under Eq. (43), per length a constant;
+    rows that are not valid are switched off in H. After each tick the state is saturated by (62)-(65) and fed back;
+    P is not changed by it. Where ``delay`` is compensated, a row measures p - d v + d^2/2 a - d^3/6 j, d the age of
+    the frame at the tick. Each arm is measured by the name nearest to the estimate (see branches), heading by the
+    nearest turn, so neither jumps. A joint unseen for ``coast_s`` has its derivatives damped and its covariance
+    growing; unseen for ``memory_s`` it is lost and starts anew from its next valid row. All is finite from the first
+    valid row on: joints not yet seen stand at a neutral posture with a large standard deviation.
+
+    Args:
+        state: From ``start`` or the previous call. It is not changed.
+        ticks_ns: (n,) instants, after those of the previous call.
+        measurements: Rows in order of arrival, none after ``ticks_ns[-1]`` and none given before.
+        settings: See FusionSettings.
+        limits: Bounds for the saturation.
+
+    Returns:
+        The filter after the last tick, the states (n ticks; NaN before the first valid row), and counts of events:
+        ``outlier_points_<camera>``, ``superseded_frames_<camera>`` (a newer frame had come), ``joints_reacquired``,
+        ``ticks_saturated``. The bits of the states do not depend on how ticks are cut into calls.
+    """
+    after, states, counts, _ = _fuse(state, ticks_ns, measurements, settings, limits, traced=False)
+    return after, states, counts
+
+
+def fuse_traced(
+    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: FusionSettings, limits: LimitSet
+) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
+    """``fuse``, and the covariances that ``smooth`` needs (1.5 kB a tick)."""
+    return _fuse(state, ticks_ns, measurements, settings, limits, traced=True)
+
+
+def _fuse(
+    state: FusionState,
+    ticks_ns: Ints,
+    measurements: Measurements,
+    settings: FusionSettings,
+    limits: LimitSet,
+    *,
+    traced: bool,
+) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
+    after = Filter._make(array.copy() for array in state)
+    track = _track(len(ticks_ns), len(measurements.cameras), traced=traced)
+    run(np.array(ticks_ns), _frames(measurements), after, _rules(settings, limits), track)
+    p, v, a, j = (track.mean[:, :, k].copy() for k in range(4))
+    states = HumanStates(
+        t_ns=ticks_ns,
+        p=p,
+        v=v,
+        a=a,
+        j=j,
+        p_std=track.std[:, :, 0].copy(),
+        v_std=track.std[:, :, 1].copy(),
+        lengths_m=track.lengths,
+        lengths_std_m=track.lengths_std,
+        valid=track.valid,
+        cameras=measurements.cameras,
+    )
+    counts = Counter({"joints_reacquired": int(track.reacquired[0]), "ticks_saturated": int(track.saturated[0])})
+    for c, camera in enumerate(measurements.cameras):
+        counts[f"outlier_points_{camera}"] = int(track.outliers[c])
+        counts[f"superseded_frames_{camera}"] = int(track.superseded[c])
+    return after, states, counts, Trace(cov=track.cov, damping=track.damping)
+
+
+def _frames(measurements: Measurements) -> Frames:
+    return Frames(
+        capture_ns=np.array(measurements.capture_ns),
+        arrival_ns=np.array(measurements.arrival_ns),
+        camera=np.array(measurements.camera),
+        z=np.hstack([measurements.angles, measurements.lengths_m]),
+        z_var=np.hstack([measurements.angles_std, measurements.lengths_std_m]) ** 2,
+        points=np.array(measurements.points_m),
+        confidence=np.array(measurements.confidence),
+    )
+
+
+def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
+    sigma = np.full((12, 4), settings.sigma_angle)
+    sigma[:2] = settings.sigma_position
+    return Rules(
+        sigma=sigma,
+        reuse=settings.stale == "reuse",
+        compensate=settings.delay == "compensate",
+        delay_max_s=settings.delay_max_s,
+        confidence_min=settings.confidence_min,
+        outlier_m=settings.outlier_m,
+        memory_ns=round(settings.memory_s * 1e9),
+        coast_ns=round(settings.coast_s * 1e9),
+        rest_s=0.5 * settings.coast_s,
+        p_min=limits.p_min,
+        p_max=limits.p_max,
+        v_min=limits.v_min,
+        v_max=limits.v_max,
+        a_min=limits.a_min,
+        a_max=limits.a_max,
+        coupled=limits.coupled,
+    )
+
+
+def _track(n: int, cameras: int, *, traced: bool) -> Track:
+    rows = n if traced else 0
+    return Track(
+        mean=np.full((n, 12, 4), np.nan),
+        std=np.full((n, 12, 2), np.nan),
+        lengths=np.full((n, len(LENGTHS)), np.nan),
+        lengths_std=np.full((n, len(LENGTHS)), np.nan),
+        valid=np.zeros((n, cameras), dtype=np.bool_),
+        cov=np.full((rows, 12, 4, 4), np.nan),
+        damping=np.ones((rows, 12)),
+        outliers=np.zeros(cameras, dtype=np.int64),
+        superseded=np.zeros(cameras, dtype=np.int64),
+        reacquired=np.zeros(1, dtype=np.int64),
+        saturated=np.zeros(1, dtype=np.int64),
+    )

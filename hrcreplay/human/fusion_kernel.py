@@ -1,0 +1,169 @@
+"""One tick of Alg. 3 on plain arrays. The filter of (42)-(57) is 12 filters of four states and 8 of one."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.angles import ROWS
+from hrcreplay.human.branches import canonical_arm, nearest_arm, wrap
+from hrcreplay.human.filter import Filter, Frames, Rules, Track, delay
+from hrcreplay.human.kalman import correct, dot, predict
+from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM
+from hrcreplay.human.saturation import saturate
+from hrcreplay.human.validity import judge
+from hrcreplay.records import Floats, Ints
+
+#: A name of an arm is kept until the other is better by this [rad].
+_NAME_MARGIN = np.radians(10.0)
+#: Standard deviations of derivatives before anything is known of them: x and y, angles [../s, ../s^2, ../s^3].
+_PRIOR_STD = np.array([[1.0, 5.0, 50.0], [3.0, 30.0, 300.0]])
+
+
+@njit(cache=True)
+def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Track) -> None:
+    """Runs the ticks, changing the filter in place. Frames must have arrived by the last tick."""
+    damping = np.ones(12)
+    seen = 0
+    for k in range(len(ticks_ns)):
+        now = ticks_ns[k]
+        dt = (now - filter_.tick_ns[0]) * 1e-9 if filter_.started[0] else 0.0
+        if filter_.started[0]:
+            _predict(filter_, now, rules, damping)
+        seen = _collect(frames, seen, now, filter_, track)
+        for c in range(len(filter_.uses)):
+            if filter_.uses[c] == 0:
+                judge(filter_, c, now, rules, track)
+        for c in range(len(filter_.uses)):
+            fresh = filter_.uses[c] == 0
+            again = rules.reuse and filter_.uses[c] > 0 and now - filter_.capture_ns[c] <= rules.memory_ns
+            if fresh or again:
+                track.valid[k, c] = _update(filter_, c, now, rules, track)
+        filter_.tick_ns[0] = now
+        if filter_.started[0]:
+            _rename(filter_)
+            if saturate(filter_.mean, dt, rules):
+                track.saturated[0] += 1
+            _leave(filter_, k, track, damping)
+
+
+@njit(cache=True)
+def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
+    """The a-priori estimate. A joint unseen for longer than ``coast_ns`` comes to rest: no jerk can be followed far."""
+    dt = (now - filter_.tick_ns[0]) * 1e-9
+    for j in range(12):
+        damping[j] = np.exp(-dt / rules.rest_s) if now - filter_.row_ns[j] > rules.coast_ns else 1.0
+        predict(filter_.mean[j], filter_.cov[j], dt, damping[j], rules.sigma[j])
+
+
+@njit(cache=True)
+def _collect(frames: Frames, seen: int, now: int, filter_: Filter, track: Track) -> int:
+    """Holds the newest frame of each camera that has arrived; returns how many frames have been seen."""
+    while seen < len(frames.arrival_ns) and frames.arrival_ns[seen] <= now:
+        c = frames.camera[seen]
+        waiting = filter_.uses[c] == 0
+        late = filter_.uses[c] >= 0 and frames.capture_ns[seen] < filter_.capture_ns[c]
+        if waiting or late:
+            track.superseded[c] += 1
+        if not late:
+            filter_.capture_ns[c] = frames.capture_ns[seen]
+            filter_.uses[c] = 0
+            filter_.z[c] = frames.z[seen]
+            filter_.z_var[c] = frames.z_var[seen]
+            filter_.points[c] = frames.points[seen]
+            filter_.confidence[c] = frames.confidence[seen]
+        seen += 1
+    return seen
+
+
+@njit(cache=True)
+def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bool:
+    """Eq. (52)-(57) with the valid rows of one camera's frame, row after row; whether there was one.
+
+    One scalar row at a time is exact because R is diagonal. R of a frame used for the n-th time is n sigma_z^2.
+    """
+    filter_.uses[c] += 1
+    if not filter_.valid[c].any():
+        return False
+    if not filter_.started[0]:
+        _start(filter_, c)
+    d = delay(filter_, c, now, rules)
+    h = np.array([1.0, -d, d**2 / 2.0, -(d**3) / 6.0])
+    z = _named(filter_, c, h)
+    for row in range(ROWS):
+        if not filter_.valid[c, row]:
+            continue
+        R = filter_.uses[c] * filter_.z_var[c, row]
+        if row >= 12:
+            gain = filter_.lengths_var[row - 12] / (filter_.lengths_var[row - 12] + R)
+            filter_.lengths[row - 12] += gain * (z[row] - filter_.lengths[row - 12])
+            filter_.lengths_var[row - 12] *= 1.0 - gain
+        elif now - filter_.row_ns[row] > rules.memory_ns:
+            _acquire(filter_, row, z[row], R)
+            track.reacquired[0] += 1
+        else:
+            correct(filter_.mean[row], filter_.cov[row], h, z[row], R)
+        if filter_.uses[c] == 1:
+            filter_.row_ns[row] = now
+    return True
+
+
+@njit(cache=True)
+def _named(filter_: Filter, c: int, h: Floats) -> Floats:
+    """The rows (20,) of a camera's frame by the names, and the turn of the heading, nearest to the estimate."""
+    z = filter_.z[c].copy()
+    expected, variance = np.empty(12), np.empty(12)
+    for j in range(12):
+        if not filter_.valid[c, j]:
+            z[j] = np.nan
+        expected[j] = dot(h, filter_.mean[j])
+        variance[j] = filter_.z_var[c, j]
+        for a in range(4):
+            variance[j] += h[a] * dot(filter_.cov[j, a], h)
+    z[2] = expected[2] + wrap(z[2] - expected[2])
+    for first in (RIGHT_ARM, LEFT_ARM):
+        arm = slice(first, first + 4)
+        nearest_arm(z[arm], expected[arm], variance[arm])
+    return z
+
+
+@njit(cache=True)
+def _start(filter_: Filter, c: int) -> None:
+    """The person appears: the base under what is seen, until the pelvis is."""
+    filter_.started[0] = True
+    for axis in range(2):
+        filter_.mean[axis, 0] = np.nanmean(filter_.points[c, :, axis])
+
+
+@njit(cache=True)
+def _acquire(filter_: Filter, j: int, z: float, R: float) -> None:
+    """A joint seen for the first time, or for the first time after it was lost: nothing old is carried over."""
+    filter_.mean[j] = 0.0
+    filter_.mean[j, 0] = z
+    filter_.cov[j] = 0.0
+    filter_.cov[j, 0, 0] = R
+    for k in range(3):
+        filter_.cov[j, k + 1, k + 1] = _PRIOR_STD[0 if j < 2 else 1, k] ** 2
+
+
+@njit(cache=True)
+def _rename(filter_: Filter) -> None:
+    """Keeps each arm near its canonical name. The same posture: alpha_2 is mirrored, P is what it was."""
+    for first in (RIGHT_ARM, LEFT_ARM):
+        arm = filter_.mean[first : first + 4, 0].copy()
+        if canonical_arm(arm, _NAME_MARGIN):
+            filter_.mean[first + 1] *= -1.0
+        filter_.mean[first : first + 4, 0] = arm
+
+
+@njit(cache=True)
+def _leave(filter_: Filter, k: int, track: Track, damping: Floats) -> None:
+    track.mean[k] = filter_.mean
+    for j in range(12):
+        for a in range(2):
+            track.std[k, j, a] = np.sqrt(filter_.cov[j, a, a])
+    track.lengths[k] = filter_.lengths
+    track.lengths_std[k] = np.sqrt(filter_.lengths_var)
+    if len(track.cov) > 0:
+        track.cov[k] = filter_.cov
+        track.damping[k] = damping

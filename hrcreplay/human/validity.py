@@ -1,0 +1,77 @@
+"""Which rows of a camera's frame the filter may use, 4.1.2: by confidence, and by the predicted skeleton."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.angles import DEPENDS, ROWS
+from hrcreplay.human.filter import Filter, Rules, Track, delay
+from hrcreplay.human.kalman import ago
+from hrcreplay.human.model import HEAD, NECK, PELVIS, skeleton_row
+from hrcreplay.records import Bools, Floats
+
+#: An angle known no better than this is not observed: a circle cannot tell [rad].
+_BLIND_STD = 1.0
+#: The points that the model predicts and a camera may get wrong.
+_TESTED = np.flatnonzero(DEPENDS.any(axis=0))
+_STEP = 1e-5
+
+
+@njit(cache=True)
+def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
+    """Which rows of a new frame are valid, 4.1.2: by confidence, and by the predicted skeleton."""
+    trusted = np.ones(len(filter_.point_ns), dtype=np.bool_)
+    if filter_.started[0]:
+        trusted = _agreeing(filter_, c, now, rules)
+        track.outliers[c] += len(trusted) - np.sum(trusted)
+    confidence, points = filter_.confidence[c], filter_.points[c]
+    for row in range(ROWS):
+        product = 1.0
+        agrees = np.isfinite(filter_.z[c, row])
+        for k in range(len(trusted)):
+            if DEPENDS[row, k]:
+                product *= confidence[k] if np.isfinite(points[k, 0]) else confidence[NECK]
+                agrees = agrees and trusted[k]
+        blind = 2 <= row < 12 and filter_.z_var[c, row] > _BLIND_STD**2
+        filter_.valid[c, row] = agrees and not blind and product >= rules.confidence_min
+    for k in _TESTED:
+        if trusted[k] and confidence[k] >= rules.confidence_min and np.isfinite(points[k, 0]):
+            filter_.point_ns[k] = now
+
+
+@njit(cache=True)
+def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
+    """The points of a frame (20,) near enough to the a-priori skeleton; a lost point agrees with anything.
+
+    Near is within ``outlier_m`` widened by three standard deviations of the prediction, each joint's carried through
+    the forward kinematics.
+    """
+    d = delay(filter_, c, now, rules)
+    p, lengths = ago(filter_.mean, d), filter_.lengths
+    expected, moved = np.empty_like(filter_.points[c]), np.empty_like(filter_.points[c])
+    skeleton_row(p, lengths, expected)
+    variance = np.zeros(len(expected))
+    for j in range(12):
+        p[j] += _STEP
+        skeleton_row(p, lengths, moved)
+        p[j] -= _STEP
+        for k in _TESTED:
+            variance[k] += _distance(moved[k], expected[k]) ** 2 / _STEP**2 * filter_.cov[j, 0, 0]
+    for k in _TESTED:
+        variance[k] += filter_.lengths_var[0]
+        if k != PELVIS:
+            variance[k] += filter_.lengths_var[1] + filter_.lengths_var[2 if k == HEAD else 3]
+            variance[k] += 0.0 if k == HEAD else filter_.lengths_var[4:].sum()
+    agreeing = np.ones(len(expected), dtype=np.bool_)
+    for k in _TESTED:
+        lost = now - filter_.point_ns[k] > rules.memory_ns
+        if not lost and np.isfinite(filter_.points[c, k, 0]):
+            gate = rules.outlier_m + 3.0 * np.sqrt(variance[k])
+            agreeing[k] = _distance(filter_.points[c, k], expected[k]) <= gate
+    return agreeing
+
+
+@njit(cache=True)
+def _distance(a: Floats, b: Floats) -> float:
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
