@@ -17,3 +17,8 @@ def skeleton(camera: str) -> str:
 def info(camera: str) -> str:
     """Topic of what is known of a camera."""
     return f"/camera/{camera}/info"
+
+
+def camera(topic: str) -> str:
+    """The camera that a topic of ours is about."""
+    return topic.split("/")[2]

@@ -1,0 +1,250 @@
+"""MCAP files: ours, and those of ROS 1 and ROS 2. Indexed, not indexed, or broken off."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import IO, Any
+
+from google.protobuf.message import DecodeError
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, McapRecord, Schema
+from mcap.records import Header as McapHeader
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import CRCValidationError, StreamReader
+from zstandard import ZstdError
+
+from hrcreplay.errors import LogError
+from hrcreplay.logs import rostypes
+from hrcreplay.logs import skeleton_pb2 as pb
+from hrcreplay.logs.messages import Damage, Message, Part, Topic, Undecodable, in_order
+
+MAGIC = b"\x89MCAP0\r\n"
+_RUN_BYTES = 1 << 20
+_OURS = {
+    kind.DESCRIPTOR.full_name: kind for kind in (pb.Skeleton, pb.Camera, pb.Task, pb.Base, pb.Truth, pb.JointState)
+}
+_BROKEN = (McapError, CRCValidationError, ZstdError, struct.error, RuntimeError, ValueError)  # RuntimeError: lz4's
+
+
+@dataclass(frozen=True)
+class _Block:
+    """A chunk, or a run of messages outside of chunks."""
+
+    start_ns: int
+    end_ns: int
+    offset: int
+    length: int
+    channels: frozenset[int] | None  #: channels with messages in it; None: not known
+
+
+@dataclass
+class _Index:
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)
+    blocks: list[_Block] = field(default_factory=list)
+
+    def add(self, records: list[McapRecord], offset: int, length: int) -> None:
+        """Adds what a block holds."""
+        times, used = [], set()
+        for record in records:
+            if isinstance(record, Schema):
+                self.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self.channels[record.id] = record
+            elif isinstance(record, McapMessage):
+                times.append(record.log_time)
+                used.add(record.channel_id)
+                self.counts[record.channel_id] += 1
+        if times:
+            self.blocks.append(_Block(min(times), max(times), offset, length, frozenset(used)))
+
+
+class McapStream:
+    """One MCAP file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        damage = Damage()
+        with path.open("rb") as file:
+            self.profile = _profile(file, path)
+            index = _summary(file) or _scan(file, path.stat().st_size, damage)
+        self._blocks = index.blocks
+        self.start_ns = min((b.start_ns for b in index.blocks), default=0)
+        self.end_ns = max((b.end_ns for b in index.blocks), default=0)
+        self.defects, self.notes = damage.defects, damage.notes
+        self._damaged: set[int] = set()  # offsets of chunks known to be damaged, each counted once
+        self._topics = {
+            number: Topic(
+                channel.topic,
+                _type(index.schemas.get(channel.schema_id)),
+                index.counts[number],
+                _parser(path, channel, index.schemas.get(channel.schema_id)),
+            )
+            for number, channel in sorted(index.channels.items())
+        }
+        self.topics = tuple(self._topics.values())
+
+    def messages(self, names: Collection[str], start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
+        """Messages on these topics with start <= arrival < end, in order of arrival."""
+        wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
+        with self._path.open("rb") as file:
+            parts = [
+                Part(block.start_ns, partial(self._block, file, block, wanted, start_ns, end_ns))
+                for block in self._blocks
+                if (start_ns is None or block.end_ns >= start_ns)
+                and (end_ns is None or block.start_ns < end_ns)
+                and (block.channels is None or not block.channels.isdisjoint(wanted))
+            ]
+            yield from in_order(parts)
+
+    def _block(
+        self, file: IO[bytes], block: _Block, wanted: dict[int, Topic], start_ns: int | None, end_ns: int | None
+    ) -> Iterator[Message]:
+        try:
+            records = _records(file, block.offset, block.length)
+        except _BROKEN as error:
+            if block.offset not in self._damaged:
+                self._damaged.add(block.offset)
+                self.defects["chunks_unreadable"] += 1
+                self.notes.append(f"the chunk at byte {block.offset} is damaged and left out ({error})")
+            return
+        messages = [
+            Message(record.log_time, wanted[record.channel_id], record.data)
+            for record in records
+            if isinstance(record, McapMessage)
+            and record.channel_id in wanted
+            and (start_ns is None or record.log_time >= start_ns)
+            and (end_ns is None or record.log_time < end_ns)
+        ]
+        messages.sort(key=lambda message: message.arrival_ns)
+        yield from messages
+
+
+def _profile(file: IO[bytes], path: Path) -> str:
+    try:
+        header = next(StreamReader(file).records)
+    except _BROKEN as error:
+        raise LogError(f"{path}: breaks off within the MCAP header; record or copy it again") from error
+    if not isinstance(header, McapHeader):
+        raise LogError(f"{path}: does not begin with an MCAP header; record or copy it again")
+    return header.profile
+
+
+def _summary(file: IO[bytes]) -> _Index | None:
+    """What the file says of itself at its end; None where that is missing or too little."""
+    file.seek(0)
+    try:
+        summary = SeekingReader(file).get_summary()
+    except (*_BROKEN, OSError, StopIteration):
+        return None
+    if summary is None or summary.statistics is None or len(summary.channels) < summary.statistics.channel_count:
+        return None
+    if not summary.chunk_indexes and summary.statistics.message_count:
+        return None
+    blocks = [
+        _Block(
+            chunk.message_start_time,
+            chunk.message_end_time,
+            chunk.chunk_start_offset,
+            chunk.chunk_length,
+            frozenset(chunk.message_index_offsets) or None,
+        )
+        for chunk in summary.chunk_indexes
+    ]
+    counts = Counter(summary.statistics.channel_message_counts)
+    return _Index(dict(summary.schemas), dict(summary.channels), counts, blocks)
+
+
+def _scan(file: IO[bytes], size: int, damage: Damage) -> _Index:
+    """Reads the file once to find what is whole in it."""
+    index = _Index()
+    run: list[tuple[int, int]] = []  # schemas, channels and messages outside of chunks, adjacent
+
+    def close_run() -> None:
+        if run:
+            (offset, _), (_, end) = run[0], run[-1]
+            run.clear()
+            index.add(_records(file, offset, end - offset), offset, end - offset)
+
+    whole = False
+    for opcode, offset, end in _walk(file, size):
+        if opcode == Opcode.CHUNK:
+            close_run()
+            try:
+                index.add(_records(file, offset, end - offset), offset, end - offset)
+            except _BROKEN:
+                damage.defects["chunks_unreadable"] += 1
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            run.append((offset, end))
+            if end - run[0][0] > _RUN_BYTES:
+                close_run()
+        else:
+            close_run()
+        whole = whole or opcode == Opcode.DATA_END
+    close_run()
+    if whole:
+        damage.notes.append("the file has no index: it was read once more to make one")
+    elif index.blocks:
+        damage.ends_at(max(b.end_ns for b in index.blocks), min(b.start_ns for b in index.blocks))
+    return index
+
+
+def _walk(file: IO[bytes], size: int) -> Iterator[tuple[int, int, int]]:
+    """Opcode, start and end of every whole record up to the end of the data."""
+    offset = len(MAGIC)
+    while offset + 9 <= size:
+        file.seek(offset)
+        opcode, length = struct.unpack("<BQ", file.read(9))
+        end = offset + 9 + length
+        if opcode == 0 or end > size:
+            return
+        yield opcode, offset, end
+        if opcode == Opcode.DATA_END:
+            return
+        offset = end
+
+
+def _records(file: IO[bytes], offset: int, length: int) -> list[McapRecord]:
+    file.seek(offset)
+    found: list[McapRecord] = []
+    try:
+        for record in StreamReader(BytesIO(file.read(length)), skip_magic=True, validate_crcs=True).records:
+            found.append(record)  # noqa: PERF402 - what came before the end is kept
+    except EndOfFile:
+        pass  # the only end of a stretch from the middle of a file
+    return found
+
+
+def _type(schema: Schema | None) -> str:
+    return rostypes.plain(schema.name) if schema else "unknown"
+
+
+def _parser(path: Path, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
+    where = f"{path}: {channel.topic}"
+    if schema and channel.message_encoding == "protobuf" and schema.name in _OURS:
+        return partial(_ours, where, _OURS[schema.name])
+    if schema and channel.message_encoding in ("cdr", "ros1"):
+        form = "idl" if schema.encoding == "ros2idl" else "msg"
+        definition = schema.data.decode(errors="replace")
+        return rostypes.parser(where, schema.name, definition, form, cdr=channel.message_encoding == "cdr")
+    return partial(_unknown, where, channel.message_encoding)
+
+
+def _ours(where: str, kind: Any, data: bytes) -> Any:
+    try:
+        return kind.FromString(data)
+    except DecodeError as error:
+        raise Undecodable(f"{where}: a message cannot be decoded: {error}") from error
+
+
+def _unknown(where: str, encoding: str, _data: bytes) -> Any:
+    raise Undecodable(f"{where}: messages in encoding {encoding!r} cannot be decoded; known are cdr, ros1 and our own")

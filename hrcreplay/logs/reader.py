@@ -1,0 +1,157 @@
+"""Opens a log of any supported kind as one lazy, time-ordered stream of records."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from hrcreplay.logs import choose, tracks
+from hrcreplay.logs.clean import Cleaner
+from hrcreplay.logs.decode_generic import GenericDecoder
+from hrcreplay.logs.log import Header, JointTrack, Truth
+from hrcreplay.logs.messages import Topic, Undecodable
+from hrcreplay.logs.skeletons import Decoder
+from hrcreplay.logs.source import Source, open_source
+from hrcreplay.logs.tracks import JointTopic
+from hrcreplay.records import CameraFrames
+
+_LATE_NS = 10**9  # a camera absent for so long at either end of the log is worth a remark
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """How to read a log."""
+
+    topics: tuple[str, ...] = ()  #: skeleton topics; () for all that a decoder knows
+    decoders: tuple[GenericDecoder, ...] = ()  #: for message types the package does not know
+    joints_topic: str | None = None  #: topic of the robot's joint states; None for the first
+    gap_s: float = 0.2  #: a camera silent for longer has a gap [s]
+
+
+class Log:
+    """An open log. ``defects`` (names: clean.DEFECTS) and ``notes`` are about the latest pass over its frames."""
+
+    def __init__(self, source: Source, decoders: list[Decoder], options: LogOptions) -> None:
+        self._source = source
+        self._decoders = decoders
+        self._options = options
+        self._joints = tracks.find_joints(source, options.joints_topic)
+        self._truth = tracks.truth_topic(source)
+        self._reading: Counter[str] = Counter()
+        self._remarks: list[str] = []
+        self._track: Counter[str] = Counter()
+        self.header = _header(
+            source, decoders, self._joints, has_truth=self._truth is not None, chosen=bool(options.topics)
+        )
+
+    @property
+    def defects(self) -> Counter[str]:
+        """What was found wrong so far: in the files, in the latest pass over the frames and over the joints."""
+        found = self._source.damage().defects + self._track
+        found.update(self._reading)  # unlike +, keeps a count of zero
+        return Counter(dict(sorted(found.items())))
+
+    @property
+    def notes(self) -> list[str]:
+        """Remarks for the user."""
+        return [*self._source.damage().notes, *self._remarks]
+
+    @property
+    def topics(self) -> list[Topic]:
+        """All topics of the log."""
+        return self._source.topics()
+
+    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[CameraFrames]:
+        """Frames with start <= arrival < end in order of arrival, in chunks of at most 1 s of arrival time.
+
+        Raises:
+            LogError: The log is broken in a way that cannot be worked around.
+        """
+        self._reading.clear()
+        self._remarks = [note for decoder in self._decoders for note in decoder.notes]
+        decoders = {decoder.topic: decoder.fresh() for decoder in self._decoders}
+        cleaner = Cleaner(self.header.cameras, self._options.gap_s, self._reading)
+        for message in self._source.messages(list(decoders), start_ns, end_ns):
+            decoder = decoders[message.topic.name]
+            try:
+                rows = decoder.rows(message)
+            except Undecodable:
+                self._reading["messages_undecodable"] += 1
+                continue
+            if decoder.always_heard:
+                cleaner.hear(decoder.cameras[0], message.arrival_ns)
+            for row in rows:
+                chunk = cleaner.add(row, message.arrival_ns)
+                if chunk is not None:
+                    yield chunk
+        chunk = cleaner.rest()
+        if chunk is not None:
+            yield chunk
+        self._remark(cleaner, start_ns, end_ns)
+
+    def joints(self) -> Iterator[JointTrack]:
+        """The robot's joint track in order of time, in chunks of at most 1 s; nothing where there is none."""
+        self._track.clear()
+        if self._joints is not None:
+            yield from tracks.joints(self._source, self._joints, self._track)
+
+    def truth(self) -> Iterator[Truth]:
+        """The true person in order of time, in chunks of at most 1 s; nothing where there is none."""
+        if self._truth is not None:
+            yield from tracks.truth(self._source, self._truth)
+
+    def _remark(self, cleaner: Cleaner, start_ns: int | None, end_ns: int | None) -> None:
+        if self._reading["frames_header_stamp_zero"]:
+            self._remarks.append("header stamps are zero: arrival times used")
+        begin = max(self.header.start_ns, start_ns or self.header.start_ns)
+        end = min(self.header.end_ns, end_ns or self.header.end_ns)
+        for camera in self.header.cameras:
+            if camera not in cleaner.heard:
+                self._remarks.append(f"camera {camera} is never heard")
+                continue
+            first, last = cleaner.heard[camera]
+            if first - begin > _LATE_NS:
+                self._remarks.append(f"camera {camera} starts {(first - begin) / 1e9:.2f} s after the log")
+            if end - last > _LATE_NS:
+                self._remarks.append(f"camera {camera} ends {(end - last) / 1e9:.2f} s before the log")
+
+
+def open_log(path: Path, options: LogOptions = LogOptions(), *, skeletons: bool = True) -> Log:
+    """Opens a log.
+
+    Args:
+        path: MCAP file, ROS 1 bag, ROS 2 bag (folder or .db3 file).
+        options: How to read it.
+        skeletons: Whether a log without skeletons is refused.
+
+    Raises:
+        LogError: It cannot be read, holds no messages, lacks a named topic, or has no skeletons.
+    """
+    source = open_source(path)
+    decoders = choose.choose(source, options.topics, options.decoders)
+    if skeletons and not decoders:
+        raise choose.none_found(source)
+    return Log(source, decoders, options)
+
+
+def _header(
+    source: Source, decoders: list[Decoder], joints: JointTopic | None, *, has_truth: bool, chosen: bool
+) -> Header:
+    known = tracks.latched(source)
+    seen = [camera for decoder in decoders for camera in decoder.cameras]
+    declared = [camera for camera in known.cameras if camera in seen or not chosen]  # one may be silent all along
+    cameras = tuple(dict.fromkeys([*declared, *seen]))
+    return Header(
+        path=source.path,
+        kind=source.kind,
+        cameras=cameras,
+        T_world_camera={camera: T for camera, T in known.T_world_camera.items() if camera in cameras},
+        task=known.task,
+        start_ns=source.start_ns,
+        end_ns=source.end_ns,
+        T_world_base=known.T_world_base,
+        has_truth=has_truth,
+        joint_names=joints.names if joints else (),
+    )

@@ -1,0 +1,153 @@
+"""What travels in a log beside the skeletons: cameras' poses, task, base, joints, truth."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hrcreplay.errors import LogError
+from hrcreplay.logs.choose import listed
+from hrcreplay.logs.decode_own import points_of
+from hrcreplay.logs.log import JointTrack, Truth
+from hrcreplay.logs.messages import Message, Topic, Undecodable
+from hrcreplay.logs.skeletons import stamp_ns
+from hrcreplay.logs.source import Source
+from hrcreplay.records import Floats
+
+_ROS_JOINTS, _OWN_JOINTS, _OWN_TRUTH = "sensor_msgs/JointState", "hrcreplay.JointState", "hrcreplay.Truth"
+_OWN_CAMERA, _OWN_TASK, _OWN_BASE = "hrcreplay.Camera", "hrcreplay.Task", "hrcreplay.Base"
+_CHUNK_NS = 10**9
+
+
+@dataclass(frozen=True)
+class Latched:
+    """What holds for the whole log."""
+
+    cameras: tuple[str, ...]  #: declared, in that order
+    T_world_camera: dict[str, Floats]
+    task: dict[str, Any] | None
+    T_world_base: Floats | None
+
+
+def latched(source: Source) -> Latched:
+    """Reads what our own logs say once. Raises LogError where it is broken."""
+    kinds = (_OWN_CAMERA, _OWN_TASK, _OWN_BASE)
+    names = [topic.name for topic in source.topics() if topic.type in kinds]
+    cameras: list[str] = []
+    poses: dict[str, Floats] = {}
+    task = base = None
+    for message in source.messages(names) if names else ():
+        content, kind = message.read(), message.topic.type
+        if kind == _OWN_CAMERA:
+            cameras.append(content.camera)
+            if content.T_world_camera:
+                poses[content.camera] = _pose(content.T_world_camera, message)
+        elif kind == _OWN_TASK:
+            task = _task(content.json, message)
+        else:
+            base = _pose(content.T_world_base, message)
+    return Latched(tuple(cameras), poses, task, base)
+
+
+def _task(text: str, message: Message) -> dict[str, Any]:
+    try:
+        return dict(json.loads(text))
+    except (ValueError, TypeError) as error:
+        raise LogError(
+            f"{message.topic.name}: the task in the log is not JSON ({error}); import the log again"
+        ) from error
+
+
+def _pose(values: Any, message: Message) -> Floats:
+    if len(values) != 16:
+        raise LogError(f"{message.topic.name}: a pose of {len(values)} numbers; 16 are right")
+    pose = np.array(values, dtype=np.float64).reshape(4, 4)
+    pose.flags.writeable = False
+    return pose
+
+
+@dataclass(frozen=True)
+class JointTopic:
+    """The topic of the robot's joints, and the joints of its first message."""
+
+    topic: Topic
+    names: tuple[str, ...]
+
+
+def find_joints(source: Source, name: str | None) -> JointTopic | None:
+    """The joint track: of the topic named, else of the first that carries one.
+
+    Raises:
+        LogError: The topic named is not there or carries none.
+    """
+    found = [topic for topic in source.topics() if topic.type in (_ROS_JOINTS, _OWN_JOINTS)]
+    if name is not None:
+        found = [topic for topic in found if topic.name == name]
+        if not found:
+            raise LogError(f"{source.path}: no joint states on {name}; found {listed(source.topics())}")
+    for topic in found:
+        for message in source.messages([topic.name]):
+            _, q = _joint_state(message)
+            if q:
+                return JointTopic(topic, tuple(q))
+    return None
+
+
+def joints(source: Source, track: JointTopic, defects: Counter[str]) -> Iterator[JointTrack]:
+    """The joint track in chunks of at most a second."""
+    times: list[int] = []
+    rows: list[list[float]] = []
+    last_ns = None
+    for message in source.messages([track.topic.name]):
+        try:
+            t_ns, q = _joint_state(message)
+        except Undecodable:
+            defects["messages_undecodable"] += 1
+            continue
+        if not q.keys() >= set(track.names):
+            defects["joints_incomplete"] += 1
+            continue
+        if last_ns is not None and t_ns <= last_ns:
+            defects["joints_out_of_order"] += 1
+            continue
+        last_ns = t_ns
+        if times and t_ns - times[0] >= _CHUNK_NS:
+            yield JointTrack(np.array(times, dtype=np.int64), np.array(rows, dtype=np.float64), track.names)
+            times, rows = [], []
+        times.append(t_ns)
+        rows.append([q[joint] for joint in track.names])
+    if times:
+        yield JointTrack(np.array(times, dtype=np.int64), np.array(rows, dtype=np.float64), track.names)
+
+
+def _joint_state(message: Message) -> tuple[int, dict[str, float]]:
+    content = message.read()
+    if message.topic.type == _OWN_JOINTS:
+        return content.t_ns, dict(zip(content.names, content.q, strict=False))
+    t_ns = stamp_ns(content.header.stamp, message.topic.name) or message.arrival_ns
+    return t_ns, {str(name): float(q) for name, q in zip(content.name, content.position, strict=False)}
+
+
+def truth_topic(source: Source) -> str | None:
+    """The topic of the ground truth, where the log has one."""
+    return next((topic.name for topic in source.topics() if topic.type == _OWN_TRUTH and topic.count), None)
+
+
+def truth(source: Source, topic: str) -> Iterator[Truth]:
+    """The ground truth in chunks of at most a second."""
+    times: list[int] = []
+    rows: list[Floats] = []
+    for message in source.messages([topic]):
+        content = message.read()
+        if times and content.t_ns - times[0] >= _CHUNK_NS:
+            yield Truth(np.array(times, dtype=np.int64), np.array(rows))
+            times, rows = [], []
+        times.append(content.t_ns)
+        rows.append(points_of(content.points, message.topic.name))
+    if times:
+        yield Truth(np.array(times, dtype=np.int64), np.array(rows))
