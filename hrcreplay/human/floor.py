@@ -27,6 +27,7 @@ class Floor:
 
     up: Floats  #: (3,) unit vector in the sensor's frame
     height_m: float  #: of the sensor's origin above the floor [m]
+    tilt_std_rad: float  #: how well ``up`` is known, standard deviation [rad]
 
 
 def up_direction(track: Track) -> tuple[Floats, float] | None:
@@ -88,7 +89,8 @@ def find_floor(track: Track, up: Floats | None = None) -> Floor | None:
     middle = np.array([np.median(feet_m @ e1), np.median(feet_m @ e2)])
     # Where the person walks, the feet's plane is `level` along the first guess.
     on_plane = middle[0] * e1 + middle[1] * e2 + level[0] * normal
-    return Floor(found, _SOLE_M - float(found @ on_plane))
+    tilt_std = _FOOT_STD_M * float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(H)[:2, :2])[-1]))
+    return Floor(found, _SOLE_M - float(found @ on_plane), tilt_std)
 
 
 def floor_frame(floor: Floor) -> Floats:

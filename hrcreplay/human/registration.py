@@ -41,7 +41,7 @@ class Registration:
     """How sensor b stands to sensor a."""
 
     T_a_b: Floats  #: (4, 4) takes points of b into the frame of a
-    offset_s: float  #: to be added to b's stamps to get a's clock [s]
+    offset_s: float  #: clock of b minus clock of a [s]
 
 
 @dataclass(frozen=True)
@@ -101,13 +101,13 @@ def register(a: Track, b: Track, *, search_s: float = 2.0) -> Registration | Non
     width_s = max(float(np.median(np.diff(a.t_ns))), float(np.median(np.diff(b.t_ns)))) * _NS
     points_a, velocity_a, weight_a = _smoothed(a, a.t_ns, width_s)
     offset_s = _coarse_offset(a, b, velocity_a, width_s, search_s)
-    points_b, _, weight_b = _smoothed(b, a.t_ns - round(offset_s / _NS), width_s)
+    points_b, _, weight_b = _smoothed(b, a.t_ns + round(offset_s / _NS), width_s)
     T = _start(points_a, points_b, np.sqrt(weight_a * weight_b))
     if T is None:
         return None
     step = np.full(7, np.inf)
     for _ in range(_ITERATIONS):
-        points_b, _, weight_b = _smoothed(b, a.t_ns - round(offset_s / _NS), width_s)
+        points_b, _, weight_b = _smoothed(b, a.t_ns + round(offset_s / _NS), width_s)
         weight = np.sqrt(weight_a * weight_b)
         T, step = _gauss_newton(T, points_a, points_b, velocity_a, weight)
         offset_s += float(np.clip(step[6], -width_s, width_s))
@@ -122,7 +122,7 @@ def disagreement(a: Track, b: Track, found: Registration) -> Disagreement | None
     Returns:
         Median and 95th percentile over all point pairs of positive confidence [m]; None where there is no pair.
     """
-    t_b = a.t_ns - round(found.offset_s / _NS)
+    t_b = a.t_ns + round(found.offset_s / _NS)
     inside = (t_b >= b.t_ns[0]) & (t_b <= b.t_ns[-1])
     after = np.clip(np.searchsorted(b.t_ns, t_b), 1, len(b) - 1)
     gap_ns = b.t_ns[after] - b.t_ns[after - 1]
@@ -209,7 +209,7 @@ def _coarse_offset(a: Track, b: Track, velocity_a: Floats, width_s: float, searc
     best, best_s = -np.inf, 0.0
     for step in sorted(range(-steps, steps + 1), key=abs):
         offset_s = step * width_s
-        _, velocity_b, _ = _smoothed(b, a.t_ns - round(offset_s / _NS), width_s)
+        _, velocity_b, _ = _smoothed(b, a.t_ns + round(offset_s / _NS), width_s)
         speed_b = np.minimum(np.linalg.norm(velocity_b, axis=2), _SPEED_MAX)
         both = seen_a & (speed_b > 0)
         if both.sum() < 20 * len(POINTS):
@@ -270,8 +270,8 @@ def _gauss_newton(
     o = np.zeros_like(x)
     turn = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)  # columns e_k x p
     shift = np.broadcast_to(np.eye(3), turn.shape)
-    # b(t - offset) comes later as the offset grows: the point moves back by its velocity.
-    A = np.concatenate([turn, shift, -velocity_a[use][:, :, None]], axis=2)
+    # A larger offset looks at a later b: the point moves on by its velocity.
+    A = np.concatenate([turn, shift, velocity_a[use][:, :, None]], axis=2)
     AtW = (A * w[:, None, None]).reshape(-1, 7).T
     flat = A.reshape(-1, 7)
     step = np.linalg.lstsq(AtW @ flat, AtW @ left.reshape(-1), rcond=1e-12)[0]

@@ -105,13 +105,13 @@ def _by_frame(frames: CameraFrames) -> list[Ints]:
 
 def _places(frames: CameraFrames, T_world_camera: Floats) -> Floats:
     """(n, 3) middle of each body's torso, of all its points where no torso was seen; world where known, else camera."""
-    seen = np.isfinite(frames.points_m).all(axis=2) & (frames.confidence > 0)
-    torso = np.zeros_like(seen)
+    seen: Bools = np.asarray(np.isfinite(frames.points_m).all(axis=2) & (frames.confidence > 0))
+    torso: Bools = np.zeros(seen.shape, dtype=np.bool_)
     torso[:, _TORSO] = seen[:, _TORSO]
-    use: Bools = torso | (seen & ~torso.any(axis=1)[:, None])
-    count = use.sum(axis=1)[:, None].astype(np.float64)
+    use: Bools = torso | (seen & ~torso.any(axis=1, keepdims=True))
+    count = use.sum(axis=1, keepdims=True).astype(np.float64)
     total = np.where(use[..., None], frames.points_m, 0.0).sum(axis=1)
-    middle = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
-    T = np.where(np.isfinite(T_world_camera).all(axis=(1, 2))[:, None, None], T_world_camera, np.eye(4))
+    middle = total / np.where(count > 0, count, np.nan)
+    T = np.where(np.isfinite(T_world_camera).all(axis=(1, 2), keepdims=True), T_world_camera, np.eye(4))
     T = T[frames.camera]
     return np.einsum("nij,nj->ni", T[:, :3, :3], middle) + T[:, :3, 3]

@@ -1,0 +1,214 @@
+"""Poses and clock offsets of a log's cameras, and the world they share, from the skeletons themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hrcreplay.cell import Cell, Residual
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.human.floor import Floor, find_floor, floor_frame, up_direction
+from hrcreplay.human.registration import Registration, Track, disagreement, register, transform
+from hrcreplay.logs.person import PersonMemory, pick
+from hrcreplay.logs.reader import Log
+from hrcreplay.records import CameraFrames, Floats
+
+_WINDOW_S = 10.0  # a long log is looked at in windows, long enough for clock offsets
+_WINDOWS = 60  # evenly spaced: ten minutes in all, so a log of any length fits in memory
+_TOGETHER_S = 0.1  # two cameras saw the person together when their frames are this close
+_FEW = 30  # frames together that are too few to register
+_TILTED_RAD = np.radians(4.0)  # up known less well than this is worth a remark
+_APART_M = 0.25  # more than this (median) and it was not the same person
+
+
+class Pair(NamedTuple):
+    """Two cameras, by index."""
+
+    a: int
+    b: int
+
+
+def calibrate(
+    log: Log,
+    reference: str | None = None,
+    up: Sequence[float] | None = None,
+    height_m: float | None = None,
+    *,
+    jump_m: float = 0.8,
+    memory_s: float = 2.0,
+    search_s: float = 2.0,
+) -> Cell:
+    """Finds where the cameras of a log stand and how their clocks differ.
+
+    The world's origin is the floor under the reference camera, z is up and x the camera's viewing direction along the
+    floor. Each camera is tied to the reference through the pairs that saw the person together most often.
+
+    Args:
+        log: A log whose cameras saw one person.
+        reference: Camera that defines the world; None for the first.
+        up: (3,) up in the reference camera's frame; None to find it from the person.
+        height_m: Reference camera's origin above the floor [m]; None to find it from the feet.
+        jump_m: A body further than this from the person's last place is somebody else [m].
+        memory_s: After this long without the person, the nearest body becomes the person [s].
+        search_s: Clock offsets are searched within plus and minus this [s].
+
+    Returns:
+        Poses of all cameras, clock offsets, and residuals of every pair that saw the person together.
+
+    Raises:
+        SettingsError: No such camera, or ``up`` is no direction.
+        LogError: The cameras did not see one person together, or floor and up cannot be told.
+    """
+    cameras = log.header.cameras
+    root = _root(cameras, reference, log)
+    direction = _direction(up)
+    tracks = collect(log, jump_m, memory_s)
+    ties = _tree(tracks, root)
+    found = {root: Registration(np.eye(4), 0.0)}
+    for pair in ties:
+        found[pair.b] = _tie(tracks, pair, found[pair.a], search_s, log)
+    lost = [name for i, name in enumerate(cameras) if i not in found]
+    if lost:
+        raise LogError(
+            f"{log.header.path}: camera {lost[0]} hardly saw the person together with another one; "
+            f"would be right: {_FEW} frames of both within {_TOGETHER_S:g} s"
+        )
+    floor = _floor(tracks, found, root, direction, height_m, log)
+    T_world_root = floor_frame(floor)
+    return Cell(
+        T_world_camera={name: T_world_root @ found[i].T_a_b for i, name in enumerate(cameras)},
+        clock_offset_s={name: found[i].offset_s for i, name in enumerate(cameras)},
+        residuals=_residuals(cameras, tracks, found),
+        notes=_notes(floor, cameras[root]),
+    )
+
+
+def collect(log: Log, jump_m: float, memory_s: float) -> list[Track]:
+    """The person as each camera saw it; of a long log, evenly spaced windows."""
+    cameras = log.header.cameras
+    alone = np.full((len(cameras), 4, 4), np.nan)  # poses are what is sought: continuity in each camera's own frame
+    memory = PersonMemory()
+    kept: list[CameraFrames] = []
+    for frames in log.frames():
+        memory, mine, _ = pick(frames, memory, alone, jump_m, memory_s)
+        within = _in_window(mine, log.header.start_ns, log.header.end_ns)
+        if len(rows := mine.rows(within)):
+            kept.append(rows)
+    if not kept:
+        raise LogError(f"{log.header.path}: no skeleton; would be right: a log with a person in it")
+    table = CameraFrames.join(kept)
+    return [_track(table, i) for i in range(len(cameras))]
+
+
+def _in_window(frames: CameraFrames, start_ns: int, end_ns: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """(n,) rows that arrived in one of the windows; all rows of a log that is short enough."""
+    window_ns = round(_WINDOW_S * 1e9)
+    every_ns = max(window_ns, (end_ns - start_ns) // _WINDOWS)
+    return np.asarray((frames.arrival_ns - start_ns) % every_ns < window_ns)
+
+
+def _track(table: CameraFrames, camera: int) -> Track:
+    mine = table.rows(table.camera == camera)
+    _, first = np.unique(mine.capture_ns, return_index=True)  # in order of capture, a frame that came twice once
+    mine = mine.rows(first.astype(np.int64))
+    return Track(mine.capture_ns, mine.points_m, mine.confidence)
+
+
+def _root(cameras: tuple[str, ...], reference: str | None, log: Log) -> int:
+    if not cameras:
+        raise LogError(f"{log.header.path}: no camera; would be right: a log with skeletons")
+    if reference is None:
+        return 0
+    if reference not in cameras:
+        raise SettingsError(f"reference camera: found {reference!r}; would be right: {', '.join(cameras)}")
+    return cameras.index(reference)
+
+
+def _direction(up: Sequence[float] | None) -> Floats | None:
+    if up is None:
+        return None
+    vector = np.array(up, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
+        raise SettingsError(f"up: found {list(up)!r}; would be right: x, y, z of a direction, e.g. 0, -1, 0")
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _together(a: Track, b: Track) -> int:
+    """Frames of a that have one of b close by."""
+    if not len(a) or not len(b):
+        return 0
+    after = np.searchsorted(b.t_ns, a.t_ns).clip(1, max(1, len(b) - 1))
+    before = after - 1
+    nearest = np.minimum(abs(b.t_ns[before] - a.t_ns), abs(b.t_ns[np.minimum(after, len(b) - 1)] - a.t_ns))
+    return int((nearest <= _TOGETHER_S * 1e9).sum())
+
+
+def _tree(tracks: list[Track], root: int) -> list[Pair]:
+    """Pairs that tie every camera to the root, those with most frames together first (Prim)."""
+    tied: list[int] = [root]
+    ties: list[Pair] = []
+    while True:
+        open_pairs = [Pair(a, b) for a in tied for b in range(len(tracks)) if b not in tied]
+        best = max(open_pairs, key=lambda pair: _together(tracks[pair.a], tracks[pair.b]), default=None)
+        if best is None or _together(tracks[best.a], tracks[best.b]) < _FEW:
+            return ties
+        ties.append(best)
+        tied.append(best.b)
+
+
+def _tie(tracks: list[Track], pair: Pair, known: Registration, search_s: float, log: Log) -> Registration:
+    """How camera b stands to the root, by way of camera a."""
+    a, b = (tracks[i] for i in pair)
+    names = " and ".join(log.header.cameras[i] for i in pair)
+    found = register(a, b, search_s=search_s)
+    rest = disagreement(a, b, found) if found is not None else None
+    if found is None or rest is None:
+        raise LogError(f"{log.header.path}: cameras {names} share too few points; would be right: 4 in each frame")
+    if rest.median_m > _APART_M:
+        raise LogError(
+            f"{log.header.path}: cameras {names} stay {rest.median_m * 1e3:.0f} mm apart (median); "
+            f"would be right: below {_APART_M * 1e3:.0f} mm, one person and clocks within {search_s:g} s"
+        )
+    return Registration(known.T_a_b @ found.T_a_b, known.offset_s + found.offset_s)
+
+
+def _residuals(cameras: tuple[str, ...], tracks: list[Track], found: dict[int, Registration]) -> tuple[Residual, ...]:
+    rests = []
+    for a in range(len(cameras)):
+        for b in range(a + 1, len(cameras)):
+            if not len(tracks[a]) or len(tracks[b]) < 2:
+                continue
+            T_a_b = np.linalg.inv(found[a].T_a_b) @ found[b].T_a_b
+            rest = disagreement(tracks[a], tracks[b], Registration(T_a_b, found[b].offset_s - found[a].offset_s))
+            if rest is not None:
+                rests.append(Residual(cameras[a], cameras[b], rest.median_m, rest.p95_m, rest.points, rest.mirrored))
+    return tuple(rests)
+
+
+def _floor(
+    tracks: list[Track],
+    found: dict[int, Registration],
+    root: int,
+    up: Floats | None,
+    height_m: float | None,
+    log: Log,
+) -> Floor:
+    """The floor in the root's frame, from the root's own frames or else those of the camera nearest to it in order."""
+    order = [root, *(i for i in found if i != root)]
+    for i in order:
+        T = found[i].T_a_b
+        track = Track(tracks[i].t_ns, transform(T, tracks[i].points_m), tracks[i].confidence)
+        floor = find_floor(track, up)
+        if floor is not None:
+            return floor if height_m is None else replace(floor, height_m=height_m)
+        if height_m is not None:
+            guess = (up, 0.0) if up is not None else up_direction(track)
+            if guess is not None:
+                return Floor(guess[0], height_m, guess[1])
+    raise LogError(
+        f"{log.header.path}: no feet or no trunk seen for long enough to find the floor; "
+        "give the reference camera's height above it (--height) and up in its frame (--up)"
+    )
