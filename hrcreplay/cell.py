@@ -82,7 +82,7 @@ class Cell:
             clock_offset_s=offsets,
             T_world_base=None if base is None else _base(base, f"{where}: T_world_base"),
             residuals=_residuals(table.get("residuals", []), f"{where}: residuals"),
-            notes=tuple(str(note) for note in table.get("notes", [])),
+            notes=_notes(table.get("notes", []), f"{where}: notes"),
         )
 
 
@@ -209,3 +209,9 @@ def _residuals(value: Any, where: str) -> tuple[Residual, ...]:
     except TypeError as error:
         right = ", ".join(Residual.__dataclass_fields__)
         raise SettingsError(f"{where}: found {value!r}; would be right: tables with {right}") from error
+
+
+def _notes(value: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(note, str) for note in value):
+        raise SettingsError(f"{where}: found {value!r}; would be right: a list of texts")
+    return tuple(value)
