@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from hrcreplay.records import LIMBS, Floats
+from hrcreplay.records import LIMBS, Bools, Floats
 from hrcreplay.report.metrics_table import MetricTable
 from hrcreplay.report.series import columns, durations_s, stretches, times
 from hrcreplay.runs import Run
@@ -82,7 +82,7 @@ def _add_validity(metrics: MetricTable, state: pd.DataFrame | None, camera: str,
     )
 
 
-def seconds_since(state: pd.DataFrame, valid: np.ndarray) -> Floats:
+def seconds_since(state: pd.DataFrame, valid: Bools) -> Floats:
     """(n,) time since the last valid tick, 0 at one [s]; infinite before the first."""
     t_ns = times(state)
     last = np.maximum.accumulate(np.where(valid, np.arange(len(valid)), -1))
@@ -91,7 +91,7 @@ def seconds_since(state: pd.DataFrame, valid: np.ndarray) -> Floats:
 
 def _add_coverage(metrics: MetricTable, state: pd.DataFrame) -> None:
     names = [name for name in state.columns if name.startswith("valid_")]
-    any_valid = state[names].to_numpy(dtype=bool).any(axis=1)
+    any_valid: Bools = np.asarray(state[names].to_numpy(dtype=bool).any(axis=1))
     t_ns = times(state)
     runs = stretches(~any_valid)
     ends = (t_ns + np.round(durations_s(t_ns) * 1e9)).astype(np.int64)
@@ -104,7 +104,7 @@ def _add_coverage(metrics: MetricTable, state: pd.DataFrame) -> None:
         "longest stretch of ticks whose updates used no camera at all, the time before the first frame included",
     )
     p = columns(state)
-    finite = np.isfinite(p).all(axis=1)
+    finite: Bools = np.asarray(np.isfinite(p).all(axis=1))
     lost = ~finite
     lost[: int(np.argmax(finite)) if finite.any() else len(lost)] = False
     metrics.add("ticks_before_first_state", int((~finite).sum() - lost.sum()), "1", "ticks before the first full state")

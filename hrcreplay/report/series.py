@@ -34,6 +34,11 @@ def times(table: pd.DataFrame, name: str = "t_ns") -> Ints:
     return table[name].to_numpy(dtype=np.int64)
 
 
+def seconds_from(t_ns: Ints, t0_ns: int) -> Floats:
+    """(n,) time since ``t0_ns`` [s]."""
+    return np.asarray((t_ns - t0_ns) * 1e-9, dtype=np.float64)
+
+
 def interpolate(t_ns: Ints, values: Floats, at_ns: Ints, *, angles: bool) -> Floats:
     """Rows of JOINTS, or of their rates, between the two samples around each instant, linear.
 
@@ -81,6 +86,12 @@ def durations_s(t_ns: Ints) -> Floats:
     return np.append(steps, np.median(steps))
 
 
+def broken(x: Floats, y: Floats, gap: float) -> tuple[Floats, Floats]:
+    """A line with a NaN put in wherever its abscissa leaps by more than ``gap``."""
+    leaps = np.flatnonzero(np.diff(x) > gap) + 1
+    return np.insert(x, leaps, x[leaps - 1]), np.insert(y, leaps, np.nan)
+
+
 def envelope(x: Floats, y: Floats, bins: int = 700) -> tuple[Floats, Floats]:
     """Fewer points that draw the same line: of each bin of rows its lowest and its highest point, in order.
 
@@ -94,16 +105,17 @@ def envelope(x: Floats, y: Floats, bins: int = 700) -> tuple[Floats, Floats]:
     """
     if len(x) <= 4 * bins:
         return x, y
-    edges = np.linspace(0, len(x), bins + 1).astype(np.int64)
-    finite = np.isfinite(y)
-    lowest = np.where(finite, y, np.inf)
-    highest = np.where(finite, y, -np.inf)
-    keep = []
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
-        keep += [first + int(np.argmin(lowest[first:last])), first + int(np.argmax(highest[first:last]))]
-        missing = np.flatnonzero(~finite[first:last])
-        keep += [first + int(m) for m in missing[:1]]
-    kept = np.unique(np.array(keep))
+    size = -(-len(x) // bins)
+    padded = np.full(size * bins, np.nan)
+    padded[: len(y)] = y
+    table = padded.reshape(bins, size)
+    missing = np.isnan(table)
+    first = np.arange(bins) * size
+    lowest = first + np.argmin(np.where(missing, np.inf, table), axis=1)
+    highest = first + np.argmax(np.where(missing, -np.inf, table), axis=1)
+    gaps = (first + np.argmax(missing, axis=1))[missing.any(axis=1)]
+    kept = np.unique(np.concatenate([lowest, highest, gaps]))
+    kept = kept[kept < len(x)]
     return x[kept], y[kept]
 
 

@@ -45,7 +45,7 @@ def state_table(seconds: float, rate_hz: float, rng: np.random.Generator) -> pd.
     v = np.gradient(pose(t_s), 1.0 / rate_hz, axis=0) + 0.05 * np.sin(5.0 * t_s[:, None] + np.arange(12))
     missing = t_s < 0.5
     p[missing], v[missing] = np.nan, np.nan
-    table = {"t_ns": t_ns}
+    table: dict[str, Any] = {"t_ns": t_ns}
     for i, joint in enumerate(JOINTS):
         table |= {joint: p[:, i], f"{joint}_vel": v[:, i], f"{joint}_std": np.where(missing, np.nan, 0.02)}
     for i, length in enumerate(LENGTHS):
@@ -125,7 +125,7 @@ def motion_table(seconds: float, rate_hz: float, *, held: float) -> pd.DataFrame
     for i, axis in enumerate("xyz"):
         columns |= {f"ref_{axis}": ref[:, i], f"tcp_{axis}": tcp[:, i]}
     columns |= {"tcp_speed": speed, "ref_speed": programmed, "distance_m": distance, "status": status, "reason": reason}
-    columns |= {"limb": pd.array(np.where(t_s < 0.5, None, "LRA"), dtype=object), "link": "tool"}
+    columns |= {"limb": [None if t < 0.5 else "LRA" for t in t_s], "link": "tool"}
     return pd.DataFrame(columns)
 
 

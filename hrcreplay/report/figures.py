@@ -1,0 +1,113 @@
+"""Which figures a run can show, and drawing them all into its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from hrcreplay.records import Ints
+from hrcreplay.report import figures_human, figures_quality, figures_robot, style
+from hrcreplay.report.figures_human import Instant
+from hrcreplay.report.metrics_quality import cameras
+from hrcreplay.report.metrics_table import Metric
+from hrcreplay.report.series import columns, times
+from hrcreplay.runs import Run
+
+
+def start_ns(run: Run) -> int:
+    """The instant that the report's clock counts from: the first tick, else the first frame [ns]."""
+    if run.state is not None and len(run.state):
+        return int(times(run.state)[0])
+    if run.motion is not None and len(run.motion):
+        return int(times(run.motion)[0])
+    if run.measurements is not None and len(run.measurements):
+        return int(times(run.measurements, "capture_ns").min())
+    return 0
+
+
+def instants(run: Run, count: int = 4, step_s: float = 1.0) -> Ints:
+    """(count,) ticks for Fig. 17, ``step_s`` apart, that end one step after the nearest or liveliest moment [ns].
+
+    The moment is the smallest separation of the plan or, without a plan, the fastest arm. Empty where the person is
+    not known at that many ticks.
+    """
+    none = np.zeros(0, dtype=np.int64)
+    if run.state is None:
+        return none
+    p = columns(run.state)
+    known_ns = times(run.state)[np.isfinite(p).all(axis=1)]
+    if len(known_ns) < 2:
+        return none
+    if run.motion is not None and run.motion["distance_m"].notna().any():
+        moment_ns = int(times(run.motion)[int(np.nanargmin(run.motion["distance_m"].to_numpy(dtype=float)))])
+    else:
+        speed = np.abs(columns(run.state, "_vel")[:, 4:]).sum(axis=1)
+        moment_ns = int(times(run.state)[int(np.argmax(np.where(np.isfinite(speed), speed, -1.0)))])
+    step_ns = round(step_s * 1e9)
+    first_ns = max(moment_ns - (count - 2) * step_ns, int(known_ns[0]))
+    wanted_ns = first_ns + step_ns * np.arange(count)
+    nearest = np.clip(np.searchsorted(known_ns, wanted_ns), 0, len(known_ns) - 1)
+    found = known_ns[nearest]
+    return found if len(np.unique(found)) == count else none
+
+
+def draw_all(
+    run: Run,
+    folder: Path,
+    metrics: Mapping[str, Metric],
+    *,
+    near_m: float,
+    stationary_m_per_s: float,
+    gap_s: float = 0.2,
+    volumes: Sequence[Instant] = (),
+    radii_m: Mapping[str, float] | None = None,
+) -> tuple[str, ...]:
+    """Draws what the run has data for into ``folder`` as ``<name>.png`` and ``<name>.svg``.
+
+    Args:
+        run: The run's tables.
+        folder: Made if need be.
+        metrics: What :func:`hrcreplay.report.metrics.compute` found.
+        near_m: The stationary share counts ticks with a separation of at most this [m].
+        stationary_m_per_s: A TCP slower than this stands [m/s].
+        gap_s: A camera silent for longer has a gap [s].
+        volumes: The swept volumes of both methods at the ticks that :func:`instants` names.
+        radii_m: Radius per limb, for ``volumes`` [m].
+
+    Returns:
+        The names drawn.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    t0_ns = start_ns(run)
+    motion, state = run.motion, run.state
+    makers: dict[str, Callable[[], Figure]] = {}
+    if motion is not None and len(motion) > 1:
+        plan = motion
+        makers["fig13_path"] = lambda: figures_robot.path(plan, run.occupancy, t0_ns)
+        makers["fig14_speed"] = lambda: figures_robot.speed(plan, t0_ns, near_m)
+        makers["status"] = lambda: figures_robot.status(
+            plan,
+            run.baselines,
+            method=str(metrics["plan_method"]["value"]),
+            t0_ns=t0_ns,
+            near_m=near_m,
+            slow_m_per_s=stationary_m_per_s,
+        )
+        makers["stationary_share"] = lambda: figures_robot.stationary_share(metrics)
+    if state is not None and volumes and radii_m is not None:
+        fused = state
+        makers["fig17_volumes"] = lambda: figures_human.volumes(volumes, radii_m, fused, t0_ns)
+    if run.measurements is not None and len(run.measurements):
+        makers["fig18_coordinate"] = lambda: figures_human.coordinate(run, t0_ns, gap_s)
+        makers["data_quality"] = lambda: figures_quality.data_quality(run, t0_ns, gap_s)
+    if state is not None and len(state) > 1:
+        makers["joint_angles"] = lambda: figures_human.joint_angles(run, t0_ns, gap_s)
+    if metrics["fusion_angle_rmse"]["value"] is not None:
+        makers["fusion_error"] = lambda: figures_human.fusion_error(metrics, cameras(run))
+    for name, make in makers.items():
+        with style.style():
+            style.save(make(), folder, name)
+    return tuple(makers)

@@ -1,0 +1,243 @@
+"""Figures of the person: swept volumes (Fig. 17), one coordinate (Fig. 18), all joints, and errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+
+from hrcreplay.human.model import skeleton
+from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats
+from hrcreplay.report import style
+from hrcreplay.report.metrics_fusion import errors
+from hrcreplay.report.metrics_quality import cameras
+from hrcreplay.report.metrics_table import Metric
+from hrcreplay.report.series import ANGLES, broken, columns, envelope, seconds_from, times
+from hrcreplay.report.solids import Solid, View, bones, outline, picture, view_from
+from hrcreplay.runs import Run
+
+#: One instant of Fig. 17: t_ns, and per method and limb the (m, 3) vertices of the swept volume, world [m].
+Instant = tuple[int, Mapping[str, Mapping[str, Floats]]]
+
+METHODS = {
+    "paper": "paper\npositions and velocities",
+    "positions": "older method [26]\npositions only",
+    "sound": "sound",
+}
+
+LABELS = {
+    "x": "x",
+    "y": "y",
+    "theta": "heading \u03b8",
+    "rho": "torso \u03c1",
+    **{f"a{side}{i}": f"{name} \u03b1{i}" for side, name in (("r", "right"), ("l", "left")) for i in range(1, 5)},
+}
+
+
+def volumes(instants: Sequence[Instant], radii_m: Mapping[str, float], state: pd.DataFrame, t0_ns: int) -> Figure:
+    """Fig. 17: the person's swept volumes, a row a method, a column an instant, all to one scale.
+
+    Args:
+        instants: What to draw, in order of time.
+        radii_m: Radius per limb, Table 2 [m].
+        state: The fused person, for the skeleton and the viewpoint.
+        t0_ns: Start of the run [ns].
+    """
+    methods = list(instants[0][1])
+    people = [_skeleton_at(state, t_ns) for t_ns, _ in instants]
+    heading = float(np.nanmean([heading for _, heading in people]))
+    view = view_from(heading - 0.9, 0.28)
+    figure = style.new_figure(0.55 + 2.35 * len(methods))
+    grid = style.panels(
+        figure, len(methods), len(instants), left_in=0.5, right_in=0.1, top_in=0.34, bottom_in=0.3, gap_in=(0.12, 0.08)
+    )
+    centres = [view.flat(points[[POINTS.index("pelvis")]])[0] for points, _ in people]
+    edges = [
+        outline(vertices, radii_m[limb], view) - centre
+        for (_, found), centre in zip(instants, centres, strict=True)
+        for limbs in found.values()
+        for limb, vertices in limbs.items()
+    ]
+    corners = np.vstack(edges)
+    low, high = corners.min(axis=0) - 0.03, corners.max(axis=0) + 0.03
+    for row, method in enumerate(methods):
+        for column, (t_ns, found) in enumerate(instants):
+            ax = grid[row][column]
+            style.set_window(ax, low.tolist(), high.tolist())
+            _draw_person(ax, found[method], radii_m, people[column][0], view, centres[column], (low, high))
+            if row == 0:
+                later = (t_ns - instants[0][0]) * 1e-9
+                ax.set_title(
+                    f"T = {later:.0f} s  (at {(t_ns - t0_ns) * 1e-9:.1f} s)", fontweight="normal", loc="center"
+                )
+            ax.set(xticks=[], yticks=[])
+            ax.grid(visible=False)
+            ax.spines[:].set_visible(False)
+        grid[row][0].set_ylabel(METHODS.get(method, method), fontweight="bold")
+    _scale_bar(grid[-1][-1], float(high[0]), float(low[1]))
+    handles = [Patch(color=colour, lw=0, label=limb) for limb, colour in style.LIMBS.items()]
+    figure.legend(handles=handles, loc="lower center", ncols=6, bbox_to_anchor=(0.5, 0.005))
+    return figure
+
+
+def _skeleton_at(state: pd.DataFrame, t_ns: int) -> tuple[Floats, float]:
+    row = state.iloc[[int(np.argmin(np.abs(times(state) - t_ns)))]]
+    p = columns(row)
+    return skeleton(p, row[list(LENGTHS)].to_numpy(dtype=float))[0], float(p[0, JOINTS.index("theta")])
+
+
+def _draw_person(
+    ax: Axes,
+    limbs: Mapping[str, Floats],
+    radii_m: Mapping[str, float],
+    points: Floats,
+    view: View,
+    centre: Floats,
+    window: tuple[Floats, Floats],
+) -> None:
+    solids = [Solid(limbs[limb], radii_m[limb], to_rgb(style.LIMBS[limb])) for limb in limbs]
+    low, high = window
+    image = picture(solids, view, low + centre, high + centre, (high[1] - low[1]) / 320.0)
+    image[..., 3] *= 0.78
+    ax.imshow(image, origin="lower", extent=(low[0], high[0], low[1], high[1]), aspect="auto", interpolation="bilinear")
+    style.set_window(ax, low.tolist(), high.tolist())
+    for solid in solids:
+        edge = outline(solid.vertices_m, solid.radius_m, view) - centre
+        if len(edge):
+            ax.add_patch(Polygon(edge, fill=False, edgecolor=solid.colour, lw=0.8, alpha=0.6))
+    ax.add_collection(LineCollection([pair - centre for pair in bones(points, view)], colors=style.INK, lw=1.6))
+
+
+def _scale_bar(ax: Axes, right: float, low: float) -> None:
+    ax.plot([right - 0.5, right], [low, low], color=style.INK, lw=1.4, solid_capstyle="butt")
+    ax.annotate("0.5 m", (right - 0.25, low), xytext=(0, 3), textcoords="offset points", ha="center", fontsize=8)
+
+
+def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
+    """Fig. 18: one coordinate as each camera saw it, as fused and, where the log has it, as it was; and the errors."""
+    found = errors(run, gap_s)
+    unit, factor, error_unit, error_factor = (
+        ("deg", 180 / np.pi, "deg", 180 / np.pi) if joint in ANGLES else ("m", 1.0, "mm", 1e3)
+    )
+    figure = style.new_figure(4.2 if found else 2.6)
+    rows = style.panels(figure, 2 if found else 1, heights=[1.5, 1.0] if found else None, share_x=True, top_in=0.34)
+    ax = rows[0][0]
+    for camera, colour in zip(cameras(run), style.CAMERAS * 3, strict=False):
+        seconds, values = _seen(run, camera, joint, t0_ns, gap_s)
+        ax.plot(*envelope(seconds, factor * values), color=colour, lw=0.9, label=camera)
+    if run.state is not None:
+        seconds = seconds_from(times(run.state), t0_ns)
+        values = factor * run.state[joint].to_numpy(dtype=float)
+        ax.plot(*envelope(seconds, values), color=style.FUSED, lw=1.6, label="fused")
+    if run.truth is not None:
+        seconds = seconds_from(times(run.truth), t0_ns)
+        values = factor * run.truth[joint].to_numpy(dtype=float)
+        ax.plot(*envelope(seconds, values), color=style.TRUTH, lw=0.9, ls=(0, (4, 2)), label="truth")
+    ax.set(title=f"Coordinate {LABELS[joint]} of the person", ylabel=f"{LABELS[joint]} [{unit}]")
+    style.legend_above(ax)
+    if found:
+        below = rows[1][0]
+        for source, colour in zip(
+            [*cameras(run), "fused"], [*(style.CAMERAS * 3)[: len(cameras(run))], style.FUSED], strict=True
+        ):
+            if source in found:
+                seconds = seconds_from(found[source].t_ns, t0_ns)
+                values = error_factor * found[source].position[:, JOINTS.index(joint)]
+                below.plot(
+                    *envelope(*broken(seconds, values, gap_s)), color=colour, lw=1.3 if source == "fused" else 0.7
+                )
+        below.set(title="Error against ground truth", ylabel=f"{error_unit}")
+    rows[-1][0].set_xlabel("time [s]")
+    _span(rows[-1][0], run, t0_ns)
+    return figure
+
+
+def _seen(run: Run, camera: str, joint: str, t0_ns: int, gap_s: float) -> tuple[Floats, Floats]:
+    """A camera's raw values over time [s], broken where it was silent for longer than ``gap_s``."""
+    if run.measurements is None:
+        return np.zeros(0), np.zeros(0)
+    rows = run.measurements[run.measurements["camera"] == camera].sort_values("capture_ns", kind="stable")
+    seconds = seconds_from(times(rows, "capture_ns"), t0_ns)
+    values = rows[joint].to_numpy(dtype=float)
+    return broken(seconds, values, gap_s)
+
+
+def _span(ax: Axes, run: Run, t0_ns: int) -> None:
+    if run.state is not None and len(run.state) > 1:
+        ax.set_xlim(0.0, (int(times(run.state)[-1]) - t0_ns) * 1e-9)
+
+
+def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
+    """All twelve joints: what the cameras saw (dots), the fused state and the truth."""
+    figure = style.new_figure(5.6)
+    grid = style.panels(figure, 4, 3, share_x=True, gap_in=(0.26, 0.55), top_in=0.5, left_in=0.6)
+    seen = cameras(run)
+    for k, joint in enumerate(JOINTS):
+        ax = grid[k % 4][k // 4]
+        factor = 180 / np.pi if joint in ANGLES else 1.0
+        for camera, colour in zip(seen, style.CAMERAS * 3, strict=False):
+            seconds, values = _seen(run, camera, joint, t0_ns, gap_s)
+            some = slice(None, None, max(1, len(seconds) // 900))
+            ax.plot(seconds[some], factor * values[some], ".", ms=1.5, color=colour, alpha=0.5, mew=0, rasterized=True)
+        if run.state is not None:
+            seconds = seconds_from(times(run.state), t0_ns)
+            values = factor * run.state[joint].to_numpy(dtype=float)
+            ax.plot(*envelope(seconds, values, 350), color=style.FUSED, lw=1.0)
+            _limits_of(ax, values)
+        if run.truth is not None:
+            seconds = seconds_from(times(run.truth), t0_ns)
+            values = factor * run.truth[joint].to_numpy(dtype=float)
+            ax.plot(*envelope(seconds, values, 350), color=style.TRUTH, lw=0.7, ls=(0, (4, 2)))
+        ax.set_title(f"{LABELS[joint]} [{'deg' if joint in ANGLES else 'm'}]", fontweight="normal", pad=2.5)
+    for column in grid[-1]:
+        column.set_xlabel("time [s]")
+    _span(grid[-1][0], run, t0_ns)
+    handles = [
+        Line2D([], [], ls="", marker="o", ms=3, color=c, label=n) for n, c in zip(seen, style.CAMERAS * 3, strict=False)
+    ]
+    handles.append(Line2D([], [], color=style.FUSED, label="fused"))
+    if run.truth is not None:
+        handles.append(Line2D([], [], color=style.TRUTH, lw=0.7, ls=(0, (4, 2)), label="truth"))
+    figure.legend(handles=handles, loc="upper right", ncols=6, bbox_to_anchor=(0.985, 0.995))
+    return figure
+
+
+def _limits_of(ax: Axes, values: Floats) -> None:
+    """The fused line with room around it; a camera's outliers may leave the picture."""
+    finite = values[np.isfinite(values)]
+    if len(finite):
+        room = 0.25 * max(float(np.ptp(finite)), 1e-2)
+        ax.set_ylim(float(finite.min()) - room, float(finite.max()) + room)
+
+
+def fusion_error(metrics: Mapping[str, Metric], names: Sequence[str]) -> Figure:
+    """RMSE per angle and pooled, of each camera's raw angles and of the fused state; velocities likewise."""
+    figure = style.new_figure(3.9)
+    rows = style.panels(figure, 2, gap_in=(0.34, 0.0), top_in=0.34, bottom_in=0.3, share_x=True)
+    sources = [*names, "fused"]
+    colours = [*(style.CAMERAS * 3)[: len(names)], style.FUSED]
+    width = 0.8 / len(sources)
+    for (ax,), kind, unit in zip(rows, ("", "velocity_"), ("deg", "deg/s"), strict=True):
+        for s, (source, colour) in enumerate(zip(sources, colours, strict=True)):
+            prefix = "fusion" if source == "fused" else f"camera_{source}"
+            found = [metrics[f"{prefix}_{kind}rmse_{joint}"]["value"] for joint in ANGLES]
+            found.append(metrics[f"{prefix}_{kind or 'angle_'}rmse"]["value"])
+            heights = [np.nan if value is None else np.degrees(value) for value in found]
+            at = np.arange(len(heights)) + (s - 0.5 * (len(sources) - 1)) * width
+            at[-1] += 0.35
+            ax.bar(at, heights, width=0.92 * width, color=colour, label=source)
+        ax.set_ylabel(f"RMSE [{unit}]")
+        ax.grid(visible=False, axis="x")
+        ax.tick_params(axis="x", length=0)
+    rows[0][0].set_title("Angles")
+    rows[1][0].set_title("Angular velocities (cameras: differenced)")
+    rows[1][0].set_xticks([*range(len(ANGLES)), len(ANGLES) + 0.35], [*(LABELS[joint] for joint in ANGLES), "pooled"])
+    style.legend_above(rows[0][0])
+    return figure

@@ -1,0 +1,328 @@
+"""report.html: one self-contained page, the same bytes for the same run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path, PurePath
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from hrcreplay.report import story
+from hrcreplay.report.metrics_quality import cameras
+from hrcreplay.report.metrics_table import Metric
+from hrcreplay.report.tables import PageTable, compare, text_of
+from hrcreplay.runs import Run
+
+
+@dataclass(frozen=True)
+class PageFigure:
+    """A figure on the page."""
+
+    name: str
+    caption: str
+    svg: Markup
+
+
+@dataclass(frozen=True)
+class Part:
+    """A section of the page; ``missing`` says what it would take to fill it."""
+
+    key: str
+    title: str
+    lead: str
+    figures: tuple[PageFigure, ...] = ()
+    tables: tuple[PageTable, ...] = ()
+    missing: str = ""
+
+
+CAPTIONS = {
+    "fig14_speed": (
+        "As the paper's Fig. 14. Programmed speed of the TCP; its actual speed, braking shaded; and the smallest "
+        "distance, surface to surface, between the robot and what the person could reach within the stopping time."
+    ),
+    "status": (
+        "What the robot did over time. Limited: held by a safety constraint or a limit. Above each bar, in grey, when "
+        "it was near the person; dark, when it then stood although its programme moves. Where stretches are narrower "
+        "than a line, the gravest status is drawn."
+    ),
+    "stationary_share": (
+        "Share of the ticks near the person at which the robot stood still although its programme moves. The hatched "
+        "bars are the paper's own numbers, from its own data: they can be compared in kind only."
+    ),
+    "fig13_path": (
+        "As the paper's Fig. 13. Programmed and actual path of the TCP, and the largest deviation between them with "
+        "its length. Shaded: the swept volumes of the person at that tick. The paper's own deviation is 0.221 m."
+    ),
+    "fig17_volumes": (
+        "As the paper's Fig. 17. What the person could reach within the stopping time at four instants, limb radii "
+        "included: from positions and velocities (top), and by the older method, from positions alone (bottom)."
+    ),
+    "fig18_coordinate": (
+        "As the paper's Fig. 18. One coordinate of the person as each camera saw it and as fused, and where the log "
+        "has ground truth, the errors."
+    ),
+    "fusion_error": (
+        "Root mean square error against ground truth, of each camera's raw angles and of the fused state."
+    ),
+    "joint_angles": (
+        "All twelve joints of the human model: the cameras' raw values (dots) and the fused state (line)."
+    ),
+    "data_quality": (
+        "When each camera's frames held the person (pale), when the filter used them (solid), and when it had none."
+    ),
+}
+
+PLAN_SAFETY = (
+    ("ticks", "ticks"),
+    ("tracking freely", "tracking_share"),
+    ("limited", "limited_share"),
+    ("braking", "braking_share"),
+    ("ticks with the robot moving", "moving_ticks"),
+    ("ticks braking with the robot still moving", "braking_moving_ticks"),
+    ("ticks moving while touching a swept volume", "contact_moving_ticks"),
+    ("smallest separation", "separation_min_m"),
+    ("\u2026 at", "separation_min_at_s"),
+    ("\u2026 limb", "separation_min_limb"),
+    ("\u2026 link", "separation_min_link"),
+    ("ticks without a known separation", "separation_unknown_ticks"),
+)
+PLAN_COST = (
+    ("stationary share of the near ticks", "stationary_share"),
+    ("near ticks", "near_ticks"),
+    ("stationary ticks", "stationary_ticks"),
+    ("pace, of the programmed", "progress_share"),
+    ("time lost", "time_lost_s"),
+    ("cycles", "cycles"),
+    ("path that the reference travelled", "ref_travelled_m"),
+    ("deviation from the path, mean", "deviation_mean_m"),
+    ("\u2026 95th percentile", "deviation_p95_m"),
+    ("\u2026 largest", "deviation_max_m"),
+    ("behind the reference, mean", "tracking_error_mean_m"),
+    ("mean TCP speed", "tcp_speed_mean_m_per_s"),
+    ("mean programmed speed", "ref_speed_mean_m_per_s"),
+)
+CAMERA = (
+    ("frames with the person", "frames"),
+    ("rate", "rate_hz"),
+    ("gaps", "gaps"),
+    ("longest gap", "gap_max_s"),
+    ("ticks whose update used it", "valid_share"),
+    ("time available", "available_share"),
+)
+FUSION = (
+    ("angle RMSE, 10 angles pooled", "angle_rmse"),
+    ("angle error, median", "angle_median"),
+    ("angular velocity RMSE, pooled", "velocity_rmse"),
+    ("angular velocity error, median", "velocity_median"),
+    ("RMSE of x", "rmse_x"),
+    ("RMSE of y", "rmse_y"),
+)
+
+NOT_CLAIMED = (
+    "hrcreplay is a research tool. It is not certified, and no page of it makes a robot cell safe or compliant.",
+    (
+        "Only ticks were checked, with the recorded person's actual motion as the log has it. A person who sees a "
+        "robot move differently may move differently too."
+    ),
+    (
+        "The swept volumes follow from a model of twelve joints and assumed bounds. Real people bend sideways, lift "
+        "shoulders and move faster than Table 1: the method 'paper' does not enclose all that a person can do."
+    ),
+    (
+        "The limb's radius is all the room there is for clothes, tools and the cameras' own errors, unless the "
+        "settings add clearance."
+    ),
+    "The robot is assumed to follow its commands exactly and to brake within the stopping time.",
+    "The paper's numbers come from experiments whose logs were never published. They are printed for orientation.",
+)
+
+
+def render(
+    run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: Sequence[PageTable] = (), *, title: str = ""
+) -> str:
+    """The page of a run.
+
+    Args:
+        run: The run's tables.
+        metrics: What :func:`hrcreplay.report.metrics.compute` found.
+        figures_dir: Where :func:`hrcreplay.report.figures.draw_all` drew.
+        tables: Tables 1 and 2 as used, shown with the prediction.
+        title: Name of the session; none: the name of the first input.
+
+    Returns:
+        HTML without scripts, requests, times or paths.
+    """
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(resources.files("hrcreplay.report").joinpath("page.html.j2").read_text("utf-8"))
+    inputs = [{"name": PurePath(str(i["path"])).name, "sha256": i["sha256"]} for i in run.meta.get("inputs", [])]
+    return template.render(
+        title=title or (inputs[0]["name"] if inputs else "a session"),
+        subtitle=_subtitle(run, metrics),
+        answers=story.answers(run, metrics),
+        cards=story.cards(run, metrics),
+        parts=_parts(run, metrics, figures_dir, tables),
+        settings=_settings(run.meta.get("settings", {})),
+        inputs=inputs,
+        versions=sorted(run.meta.get("versions", {}).items()),
+        stages=sorted((run.meta.get("stages") or {}).items()),
+        command=str(run.meta.get("command", "")),
+        not_claimed=NOT_CLAIMED,
+        metrics=[
+            (name, text_of(m) if m["value"] is not None else m["reason"], m["value"] is None, m["meaning"])
+            for name, m in metrics.items()
+        ],
+    )
+
+
+def _subtitle(run: Run, metrics: Mapping[str, Metric]) -> str:
+    parts = [f"{text_of(metrics['span_s'])} of recording, {text_of(metrics['ticks'])} ticks"]
+    names = cameras(run)
+    parts.append(f"{len(names)} camera{'' if len(names) == 1 else 's'}: {', '.join(names)}" if names else "no camera")
+    if run.motion is not None:
+        others = ", ".join(sorted(run.baselines))
+        parts.append(f"plan: {metrics['plan_method']['value']}" + (f", beside it {others}" if others else ""))
+    return " \u00b7 ".join(parts)
+
+
+def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: Sequence[PageTable]) -> tuple[Part, ...]:
+    def figures(*names: str) -> tuple[PageFigure, ...]:
+        found = [name for name in names if (figures_dir / f"{name}.svg").is_file()]
+        return tuple(PageFigure(name, CAPTIONS[name], inline_svg(figures_dir / f"{name}.svg", name)) for name in found)
+
+    plans = {"this plan": "plan", **{name: f"baseline_{name}" for name in sorted(run.baselines)}}
+    planned = run.motion is not None
+    no_plan = "" if planned else "Not in this run: it moved no robot. Run plan or report on the same log."
+    seen = cameras(run)
+    with_truth = metrics["fusion_angle_rmse"]["value"] is not None
+    return (
+        Part(
+            "safety",
+            "Safety",
+            "How fast the robot moved, how near to what the person could reach, and what held it.",
+            figures("fig14_speed", "status"),
+            (compare("Safety, per method on the same volumes", metrics, plans, PLAN_SAFETY), *_reasons(metrics, plans))
+            if planned
+            else (),
+            no_plan,
+        ),
+        Part(
+            "cost",
+            "Cost to the task",
+            "How often it stood, how far it left its path, and how much time that took.",
+            figures("stationary_share", "fig13_path"),
+            (compare("Cost, per method on the same volumes", metrics, plans, PLAN_COST),) if planned else (),
+            no_plan,
+        ),
+        Part(
+            "prediction",
+            "Prediction",
+            "What the person could reach within the robot's stopping time, and the bounds that this rests on.",
+            figures("fig17_volumes"),
+            (*_volumes(metrics), *tables),
+            ""
+            if run.occupancy is not None
+            else "No swept volumes in this run. Run predict, plan or report on the log.",
+        ),
+        Part(
+            "fusion",
+            "Fusion",
+            "The person as each camera saw them, and as the filter has them.",
+            figures("fig18_coordinate", "fusion_error", "joint_angles"),
+            (_fusion_table(metrics, seen),) if with_truth else (),
+            "" if with_truth else "The log has no ground truth, so there is nothing to tell errors by.",
+        ),
+        Part(
+            "data",
+            "Data quality",
+            "What the log held, and what was wrong with it.",
+            figures("data_quality"),
+            (compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA), *_counters(run)),
+        ),
+    )
+
+
+def _reasons(metrics: Mapping[str, Metric], plans: Mapping[str, str]) -> tuple[PageTable, ...]:
+    mark = "_braking_share_"
+    found = sorted({name.split(mark)[1] for name in metrics if mark in name})
+    rows = [(slug.replace("_", " "), f"braking_share_{slug}") for slug in found]
+    body = [
+        (
+            label,
+            *(
+                f"{100 * metrics[f'{p}_{suffix}']['value']:.2f} %" if f"{p}_{suffix}" in metrics else "\u2013"
+                for p in plans.values()
+            ),
+        )
+        for label, suffix in rows
+    ]
+    return (PageTable("Why it braked, share of all ticks", ("", *plans), tuple(body)),) if body else ()
+
+
+def _volumes(metrics: Mapping[str, Metric]) -> tuple[PageTable, ...]:
+    methods = [name.split("_")[1] for name in metrics if name.startswith("occupancy_") and name.endswith("_sum_m3")]
+    columns = {method: f"occupancy_{method}" for method in methods}
+    rows = [(limb, f"{limb}_m3") for limb in ("HD", "THX", "URA", "LRA", "ULA", "LLA")]
+    table = compare("Mean swept volume", metrics, columns, [*rows, ("sum", "sum_m3")], "Limb radius included.")
+    return (table,) if methods else ()
+
+
+def _fusion_table(metrics: Mapping[str, Metric], seen: Sequence[str]) -> PageTable:
+    ratios = [metrics[f"fusion_{kind}_rmse_ratio"]["value"] for kind in ("angle", "velocity")]
+    better = metrics["fusion_angle_better_camera"]["value"]
+    note = "Cameras: raw angles at the capture, velocities by differences between frames. Fused: at every tick."
+    if ratios[0] is not None and ratios[1] is not None:
+        note += (
+            f" Fused / better camera: {ratios[0]:.2f} (angles, {better}), {ratios[1]:.2f} "
+            f"(velocities, {metrics['fusion_velocity_better_camera']['value']})."
+        )
+    columns = {"fused": "fusion", **{name: f"camera_{name}" for name in seen}}
+    return compare("Errors against ground truth", metrics, columns, FUSION, note)
+
+
+def _counters(run: Run) -> tuple[PageTable, ...]:
+    tables = []
+    if run.counts:
+        rows = tuple(
+            (name.replace("_", " "), f"{count:,}".replace(",", "\u202f")) for name, count in sorted(run.counts.items())
+        )
+        tables.append(PageTable("What was counted on the way", ("", "count"), rows))
+    if run.notes:
+        tables.append(PageTable("Remarks", ("",), tuple((note,) for note in run.notes)))
+    return tuple(tables)
+
+
+def _settings(settings: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    def write(value: Any) -> str:
+        if isinstance(value, str):
+            return PurePath(value).name if value.startswith("/") else value
+        if isinstance(value, list):
+            return ", ".join(write(part) for part in value) or "\u2013"
+        if isinstance(value, dict):
+            return ", ".join(f"{name} = {write(part)}" for name, part in sorted(value.items()))
+        return "\u2013" if value is None else str(value)
+
+    return [
+        (section, [(key, write(value)) for key, value in sorted(keys.items())])
+        for section, keys in sorted(settings.items())
+        if isinstance(keys, dict)
+    ]
+
+
+def inline_svg(path: Path, name: str) -> Markup:
+    """An SVG as part of a page: without prologue and size, its ids made the page's own."""
+    svg = path.read_text("utf-8")
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"<style[^>]*>.*?</style>", "", svg, flags=re.DOTALL)
+    head, body = svg.split(">", 1)
+    head = re.sub(r' (width|height|version|xmlns(:xlink)?)="[^"]*"', "", head)
+    body = body.replace("xlink:href", "href")
+    body = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", body)
+    body = re.sub(r">\s*\n\s*<", "><", body)
+    label = Markup.escape(CAPTIONS[name])
+    return Markup(f'{head} role="img" aria-label="{label}">{body.strip()}')  # noqa: S704 (our own figure)

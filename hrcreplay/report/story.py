@@ -1,0 +1,162 @@
+"""The answer in words and headline numbers. Says what the replay shows, and never more than that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from hrcreplay.report.metrics_quality import cameras
+from hrcreplay.report.metrics_table import Metric
+from hrcreplay.report.tables import percent, text_of
+from hrcreplay.runs import Run
+
+
+@dataclass(frozen=True)
+class Card:
+    """A headline number."""
+
+    value: str
+    label: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One of the two questions, the answer in a few words, and what stands behind it."""
+
+    question: str
+    short: str
+    words: str
+
+
+SAFE = "Had this controller been running, would the person have been safe?"
+COST = "What would it have cost the task?"
+
+
+def answers(run: Run, metrics: Mapping[str, Metric]) -> tuple[Answer, ...]:
+    """Both questions of the page."""
+    if run.motion is None:
+        stage = "predicted what the person could reach" if run.occupancy is not None else "fused the cameras"
+        words = f"This run {stage} and moved no robot. Run plan or report on the same log to have it answered."
+        return (Answer(SAFE, "Not asked in this run.", words), Answer(COST, "Not asked in this run.", ""))
+    return (_safety(metrics), _cost(run, metrics))
+
+
+def _safety(metrics: Mapping[str, Metric]) -> Answer:
+    ticks, moving = text_of(metrics["plan_ticks"]), text_of(metrics["plan_moving_ticks"])
+    late = metrics["plan_braking_moving_ticks"]["value"]
+    nearest = metrics["plan_braking_moving_separation_min_m"]["value"]
+    unknown = metrics["plan_separation_unknown_ticks"]["value"]
+    kept = (
+        "the controller kept every link slow enough to stop within the stopping time short of all that the person "
+        "was predicted to reach (inequality 2)"
+    )
+    if late == 0:
+        short = "At every tick of this replay, by the paper's criterion."
+        words = f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}."
+    else:
+        share = 100 * late / metrics["plan_moving_ticks"]["value"]
+        short = (
+            f"Not at every tick: at {text_of(metrics['plan_braking_moving_ticks'])} of {moving}, it was still braking."
+        )
+        words = (
+            f"At {share:.2f} % of the ticks at which the robot moved, no motion satisfied all constraints, or the "
+            "person was not known, and the robot was braking as hard as its joints can. "
+        )
+        if nearest is not None:
+            words += f"The smallest separation from the swept volumes while it did was {nearest:.3f} m. "
+        words += f"At the other ticks, {kept}."
+    if unknown:
+        words += f" At {text_of(metrics['plan_separation_unknown_ticks'])} ticks nobody could say where the person was."
+    return Answer(SAFE, short, words)
+
+
+def _cost(run: Run, metrics: Mapping[str, Metric]) -> Answer:
+    progress, lost = metrics["plan_progress_share"], metrics["plan_time_lost_s"]
+    if progress["value"] is None:
+        short = f"The TCP was {text_of(metrics['plan_tracking_error_mean_m'])} from its reference on average."
+    else:
+        short = f"{text_of(lost)} of {text_of(metrics['span_s'])}: the task ran at {percent(progress)} of its pace."
+    words = (
+        f"The TCP left the programmed path by {text_of(metrics['plan_deviation_mean_m'])} on average and "
+        f"{text_of(metrics['plan_deviation_max_m'])} at most. {_standing(metrics, 'plan', 'it')}"
+    )
+    for name in sorted(run.baselines):
+        prefix = f"baseline_{name}"
+        words += " " + _standing(metrics, prefix, f"the baseline '{name}'")
+        if metrics[f"{prefix}_progress_share"]["value"] is not None:
+            words = words[:-1] + f"; it ran at {percent(metrics[f'{prefix}_progress_share'])} of the pace."
+    return Answer(COST, short, words)
+
+
+def _standing(metrics: Mapping[str, Metric], prefix: str, who: str) -> str:
+    if metrics[f"{prefix}_stationary_share"]["value"] is None:
+        return f"The person never came near {who}."
+    return (
+        f"Of the {text_of(metrics[f'{prefix}_near_ticks'])} ticks near the person, {who} stood still in "
+        f"{percent(metrics[f'{prefix}_stationary_share'], 2)}."
+    )
+
+
+def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
+    """The four headline numbers of a run, whatever stages it has."""
+    if run.motion is None:
+        return _human_cards(run, metrics)
+    late, ticks = metrics["plan_braking_moving_ticks"]["value"], metrics["plan_ticks"]["value"]
+    pair = [metrics[f"plan_separation_min_{part}"]["value"] for part in ("limb", "link")]
+    others = ", ".join(
+        f"{name} {percent(metrics[f'baseline_{name}_progress_share'])}" for name in sorted(run.baselines)
+    )
+    stood = ", ".join(f"{n} {percent(metrics[f'baseline_{n}_stationary_share'], 2)}" for n in sorted(run.baselines))
+    near = text_of(metrics["plan_near_ticks"])
+    return (
+        Card(
+            _floor_percent(1 - late / ticks) if ticks else "\u2013",
+            "ticks with the constraint kept, or the robot standing",
+            f"{text_of(metrics['plan_braking_moving_ticks'])} of {text_of(metrics['plan_ticks'])} ticks still braking",
+        ),
+        Card(
+            text_of(metrics["plan_separation_min_m"]),
+            "smallest separation, robot to swept volumes",
+            f"{pair[0]} \u2013 {pair[1]}, at {text_of(metrics['plan_separation_min_at_s'])}" if pair[0] else "",
+        ),
+        Card(
+            percent(metrics["plan_progress_share"]), "of the programmed pace", f"baseline: {others}" if others else ""
+        ),
+        Card(
+            percent(metrics["plan_stationary_share"], 2),
+            f"standing still, of {near} ticks near the person",
+            (f"{stood}; " if stood else "") + "the paper's own: 30.06 %, scaling 86.44 %",
+        ),
+    )
+
+
+def _floor_percent(share: float) -> str:
+    """Rounded down, so that 100 % means all."""
+    return f"{int(share * 10000) / 100:.2f} %" if share < 1 else "100 %"
+
+
+def _human_cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
+    seen = cameras(run)
+    found = [Card(text_of(metrics["span_s"]), "of recording", f"{text_of(metrics['ticks'])} ticks")]
+    detail = ", ".join(f"{name} {percent(metrics[f'camera_{name}_available_share'])}" for name in seen)
+    found.append(
+        Card(str(len(seen)), "camera" if len(seen) == 1 else "cameras", f"available: {detail}" if seen else "")
+    )
+    if metrics["fusion_angle_rmse_ratio"]["value"] is not None:
+        better = metrics["fusion_angle_better_camera"]["value"]
+        found.append(
+            Card(
+                text_of(metrics["fusion_angle_rmse_ratio"]),
+                "of the better camera's angle error",
+                f"against {better}",
+            )
+        )
+    else:
+        longest = text_of(metrics.get("longest_without_camera_s"))
+        found.append(Card(longest, "longest stretch without a camera", ""))
+    method = next((n.split("_")[1] for n in metrics if n.startswith("occupancy_") and n.endswith("_sum_m3")), None)
+    if method is not None:
+        total = text_of(metrics[f"occupancy_{method}_sum_m3"])
+        found.append(Card(total, "mean sum of the six swept volumes", f"method '{method}'"))
+    return tuple(found)

@@ -1,0 +1,182 @@
+"""The house style of every figure: colours that colour-blind readers can tell apart, few lines, units on every axis."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from PIL import Image
+
+# Okabe and Ito's palette.
+ORANGE, SKY, GREEN, YELLOW = "#E69F00", "#56B4E9", "#009E73", "#F0E442"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+
+#: Text and axes; the page replaces these two by its own ink where it is dark.
+INK, FAINT = "#25313c", "#8b98a5"
+GRID = "#dfe5ea"
+
+NOMINAL, ACTUAL, FUSED, TRUTH = BLUE, VERMILLION, BLUE, INK
+CAMERAS = (ORANGE, GREEN, PURPLE, SKY)
+STATUS = {"tracking": SKY, "limited": ORANGE, "braking": VERMILLION}
+LIMBS = {"HD": PURPLE, "THX": "#9aa5b1", "URA": BLUE, "LRA": SKY, "ULA": GREEN, "LLA": ORANGE}
+
+STYLE: dict[str, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8.5,
+    "axes.titlesize": 9.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlepad": 5.0,
+    "axes.labelsize": 8.5,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": FAINT,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "axes.facecolor": "none",
+    "figure.facecolor": "none",
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "legend.handlelength": 1.6,
+    "legend.columnspacing": 1.4,
+    "legend.borderaxespad": 0.0,
+    "lines.linewidth": 1.1,
+    "lines.solid_capstyle": "round",
+    "lines.solid_joinstyle": "round",
+    "hatch.linewidth": 0.6,
+    "path.simplify_threshold": 0.3,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "hrcreplay",
+    "svg.image_inline": True,
+}
+
+DPI = 150
+WIDTH_IN = 8.4
+
+
+def style() -> Any:
+    """Context in which figures are made and saved."""
+    return mpl.rc_context(cast("Any", STYLE))
+
+
+def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
+    """An empty figure of the page's width."""
+    return Figure(figsize=(width_in, height_in))
+
+
+def panels(
+    figure: Figure,
+    rows: int,
+    columns: int = 1,
+    *,
+    left_in: float = 0.72,
+    right_in: float = 0.14,
+    top_in: float = 0.32,
+    bottom_in: float = 0.46,
+    gap_in: tuple[float, float] = (0.32, 0.5),
+    heights: Sequence[float] | None = None,
+    widths: Sequence[float] | None = None,
+    share_x: bool = False,
+) -> list[list[Axes]]:
+    """A grid of axes with margins in inches, which unlike a layout engine costs no second drawing.
+
+    Args:
+        figure: To draw on.
+        rows: Rows of axes.
+        columns: Columns of axes.
+        left_in: Margin for the labels of the first column [in].
+        right_in: Margin [in].
+        top_in: Margin for titles and legend [in].
+        bottom_in: Margin for the labels of the last row [in].
+        gap_in: Between rows and between columns [in].
+        heights: Ratios of the rows' heights.
+        widths: Ratios of the columns' widths.
+        share_x: One abscissa, labelled in the last row only.
+    """
+    width, height = figure.get_size_inches()
+    inner_w = (width - left_in - right_in - (columns - 1) * gap_in[1]) / columns
+    inner_h = (height - top_in - bottom_in - (rows - 1) * gap_in[0]) / rows
+    axes = figure.subplots(
+        rows,
+        columns,
+        squeeze=False,
+        sharex=share_x,
+        gridspec_kw={
+            "left": left_in / width,
+            "right": 1.0 - right_in / width,
+            "top": 1.0 - top_in / height,
+            "bottom": bottom_in / height,
+            "hspace": gap_in[0] / inner_h if rows > 1 else 0.0,
+            "wspace": gap_in[1] / inner_w if columns > 1 else 0.0,
+            "height_ratios": heights,
+            "width_ratios": widths,
+        },
+    )
+    return [list(row) for row in axes]
+
+
+def set_window(ax: Axes, low: Sequence[float], high: Sequence[float]) -> None:
+    """Limits that show at least the box from ``low`` to ``high`` with one scale for both axes."""
+    figure_in = ax.get_figure(root=True).get_size_inches()  # type: ignore[union-attr]
+    box = ax.get_position()
+    size_in = (box.width * figure_in[0], box.height * figure_in[1])
+    scale = max((high[k] - low[k]) / size_in[k] for k in range(2))
+    middle = [0.5 * (low[k] + high[k]) for k in range(2)]
+    ax.set_xlim(middle[0] - 0.5 * scale * size_in[0], middle[0] + 0.5 * scale * size_in[0])
+    ax.set_ylim(middle[1] - 0.5 * scale * size_in[1], middle[1] + 0.5 * scale * size_in[1])
+
+
+def legend_above(axes: Axes, columns: int = 6, handles: Sequence[Any] | None = None) -> None:
+    """A legend in one row at the upper right, outside the data."""
+    given = {} if handles is None else {"handles": list(handles)}
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.015), ncols=columns, **given)
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """The figure as PNG on white with a palette of 256 colours; the same figure gives the same bytes."""
+    figure.set_dpi(DPI)
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    stream = io.BytesIO()
+    image.quantize(256, dither=Image.Dither.NONE).save(stream, "png", dpi=(DPI, DPI))
+    return stream.getvalue()
+
+
+def svg_bytes(figure: Figure) -> bytes:
+    """The figure as SVG without a background; the same figure gives the same bytes."""
+    stream = io.BytesIO()
+    figure.set_dpi(DPI)  # of what is drawn as pixels inside the SVG
+    canvas: Any = FigureCanvasSVG(figure)
+    canvas.print_svg(stream, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    return stream.getvalue()
+
+
+def save(figure: Figure, folder: Path, name: str) -> None:
+    """Writes ``name.svg`` and ``name.png``."""
+    (folder / f"{name}.svg").write_bytes(svg_bytes(figure))
+    figure.set_facecolor("white")
+    (folder / f"{name}.png").write_bytes(png_bytes(figure))
