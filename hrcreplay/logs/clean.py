@@ -70,9 +70,9 @@ class Cleaner:
         return chunk
 
     def _mended(self, row: Row) -> Row:
-        missing: Bools = np.isnan(row.points_m).any(axis=1) | np.isinf(row.points_m).any(axis=1)
-        told = missing & (row.confidence > 0) | np.isinf(row.points_m).any(axis=1)  # missing, but not said to be
-        self._defects["points_not_finite"] += int(told.sum())
+        missing: Bools = ~np.logical_and.reduce(np.isfinite(row.points_m), axis=1)
+        infinite: Bools = np.logical_or.reduce(np.isinf(row.points_m), axis=1)
+        self._defects["points_not_finite"] += int((infinite | (missing & (row.confidence > 0))).sum())
         confidence = np.where(missing | np.isnan(row.confidence), 0.0, np.clip(row.confidence, 0.0, 1.0))
         return row._replace(points_m=np.where(missing[:, None], np.nan, row.points_m), confidence=confidence)
 

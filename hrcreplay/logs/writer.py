@@ -39,6 +39,7 @@ class LogWriter:
         self._latched: list[tuple[str, Any]] = []
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
+        self._last_ns = 0
 
     def __enter__(self) -> Self:
         """Opens a temporary file beside the target."""
@@ -60,7 +61,7 @@ class LogWriter:
         """Finishes the file and puts it in its place, or removes what there is of it after an error."""
         try:
             if kind is None:
-                self._release(0)
+                self._release(self._last_ns)
                 self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.close()
             if kind is None:
@@ -131,6 +132,7 @@ class LogWriter:
     def _write(self, topic: str, message: Any, log_ns: int, publish_ns: int) -> None:
         if self._latched:
             self._release(log_ns)
+        self._last_ns = log_ns
         self._add(topic, message, log_ns, publish_ns)
 
     def _add(self, topic: str, message: Any, log_ns: int, publish_ns: int) -> None:

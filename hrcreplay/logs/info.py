@@ -1,0 +1,201 @@
+"""What is in a log and what is missing for the next step."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from hrcreplay.logs.reader import Log
+from hrcreplay.records import CameraFrames
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """A topic of the log."""
+
+    name: str
+    type: str
+    messages: int
+
+
+@dataclass(frozen=True)
+class CameraSummary:
+    """What one camera delivered, after duplicates and late frames are dropped."""
+
+    name: str
+    frames: int  #: instants; several bodies in one frame count once
+    rate_hz: float  #: by the median period between captures [Hz]; NaN below two frames
+    first_ns: int | None  #: first arrival
+    last_ns: int | None  #: last arrival
+    longest_gap_s: float  #: between arrivals of frames with a body in them [s]; NaN below two frames
+    delay_s: float  #: median from capture to arrival, with the offset of the two clocks in it [s]
+    bodies: dict[int, int]  #: body id -> rows
+    posed: bool  #: whether its extrinsics are in the log
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Everything that ``hrcreplay info`` tells."""
+
+    path: Path
+    kind: str
+    start_ns: int
+    end_ns: int
+    topics: tuple[TopicSummary, ...]
+    cameras: tuple[CameraSummary, ...]
+    has_task: bool
+    has_base: bool
+    has_truth: bool
+    joint_names: tuple[str, ...]
+    defects: dict[str, int]
+    notes: tuple[str, ...]
+    missing: tuple[str, ...]  #: what the next step needs and the log lacks, each with what to do
+
+    @property
+    def span_s(self) -> float:
+        """First to last arrival [s]."""
+        return (self.end_ns - self.start_ns) / 1e9
+
+
+@dataclass
+class _Tally:
+    frames: int = 0
+    first_ns: int | None = None
+    last_ns: int | None = None
+    last_capture_ns: int | None = None
+    longest_ns: int = 0
+    periods_ns: list[int] = field(default_factory=list)
+    delays_ns: list[int] = field(default_factory=list)
+    bodies: Counter[int] = field(default_factory=Counter)
+
+    def add(self, capture_ns: int, arrival_ns: int, body: int) -> None:
+        self.bodies[body] += 1
+        if capture_ns == self.last_capture_ns:
+            return  # another body of the same frame
+        if self.last_ns is not None and self.last_capture_ns is not None:
+            self.longest_ns = max(self.longest_ns, arrival_ns - self.last_ns)
+            self.periods_ns.append(capture_ns - self.last_capture_ns)
+        self.frames += 1
+        self.first_ns = arrival_ns if self.first_ns is None else self.first_ns
+        self.last_ns, self.last_capture_ns = arrival_ns, capture_ns
+        self.delays_ns.append(arrival_ns - capture_ns)
+
+
+def summarize(log: Log) -> Summary:
+    """Goes through the log once.
+
+    Args:
+        log: An open log; also one without skeletons (``open_log(path, options, skeletons=False)``).
+
+    Raises:
+        LogError: The log is broken in a way that cannot be worked around.
+    """
+    header = log.header
+    tallies = [_Tally() for _ in header.cameras]
+    for frames in log.frames():
+        _count(frames, tallies)
+    for _ in log.joints():
+        pass  # for the defects of the joint track
+    cameras = tuple(
+        _camera(name, tally, posed=name in header.T_world_camera)
+        for name, tally in zip(header.cameras, tallies, strict=True)
+    )
+    return Summary(
+        path=header.path,
+        kind=header.kind,
+        start_ns=header.start_ns,
+        end_ns=header.end_ns,
+        topics=tuple(TopicSummary(topic.name, topic.type, topic.count) for topic in log.topics),
+        cameras=cameras,
+        has_task=header.task is not None,
+        has_base=header.T_world_base is not None,
+        has_truth=header.has_truth,
+        joint_names=header.joint_names,
+        defects=dict(log.defects),
+        notes=tuple(log.notes),
+        missing=tuple(_missing(log, cameras)),
+    )
+
+
+def _count(frames: CameraFrames, tallies: list[_Tally]) -> None:
+    rows = (frames.camera.tolist(), frames.capture_ns.tolist(), frames.arrival_ns.tolist(), frames.body.tolist())
+    for camera, capture_ns, arrival_ns, body in zip(*rows, strict=True):
+        tallies[camera].add(capture_ns, arrival_ns, body)
+
+
+def _camera(name: str, tally: _Tally, *, posed: bool) -> CameraSummary:
+    several = tally.frames > 1
+    return CameraSummary(
+        name=name,
+        frames=tally.frames,
+        rate_hz=1e9 / float(np.median(tally.periods_ns)) if several else float("nan"),
+        first_ns=tally.first_ns,
+        last_ns=tally.last_ns,
+        longest_gap_s=tally.longest_ns / 1e9 if several else float("nan"),
+        delay_s=float(np.median(tally.delays_ns)) / 1e9 if tally.frames else float("nan"),
+        bodies=dict(sorted(tally.bodies.items())),
+        posed=posed,
+    )
+
+
+def _missing(log: Log, cameras: tuple[CameraSummary, ...]) -> Iterator[str]:
+    header = log.header
+    if not cameras:
+        yield "skeletons: name a topic with --topic NAME, or a decoder for it in [logs.decoders] of the settings file"
+    for camera in cameras:
+        if not camera.frames:
+            yield f"frames of camera {camera.name}: it is named but delivers nothing"
+        elif not camera.posed:
+            yield f"extrinsics of camera {camera.name}: run hrcreplay calibrate, or give a cell file with --cell"
+    if header.T_world_base is None:
+        yield "the robot's base pose: give a cell file with --cell"
+    if header.task is None and not header.joint_names:
+        yield "the robot's task: name a task file with --set plan.task=FILE"
+
+
+def lines(summary: Summary) -> list[str]:
+    """The summary as plain text, a line an item."""
+    begin = datetime.fromtimestamp(summary.start_ns / 1e9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S")
+    out = [
+        f"{summary.path}",
+        f"kind     {summary.kind}",
+        f"span     {summary.span_s:.3f} s from {begin} UTC ({summary.start_ns} ns)",
+        "topics",
+    ]
+    width = max((len(topic.name) for topic in summary.topics), default=0)
+    out += [f"  {topic.name:<{width}}  {topic.messages:>8}  {topic.type}" for topic in summary.topics]
+    out += ["cameras", *(_camera_line(camera, summary.start_ns) for camera in summary.cameras)]
+    if not summary.cameras:
+        out.append("  none")
+    out += [
+        f"task     {'in the log' if summary.has_task else 'none'}",
+        f"base     {'in the log' if summary.has_base else 'none'}",
+        f"truth    {'in the log' if summary.has_truth else 'none'}",
+        f"joints   {', '.join(summary.joint_names) or 'none'}",
+    ]
+    delivered = {f"frames_{camera.name}" for camera in summary.cameras}  # counted with the defects, but none
+    found = {name: n for name, n in summary.defects.items() if n and name not in delivered}
+    out += ["defects", *(f"  {name}  {n}" for name, n in found.items())] if found else ["defects  none"]
+    if summary.notes:
+        out += ["notes", *(f"  {note}" for note in summary.notes)]
+    if summary.missing:
+        out += ["missing for the next step", *(f"  {sentence}" for sentence in summary.missing)]
+    return out
+
+
+def _camera_line(camera: CameraSummary, start_ns: int) -> str:
+    if camera.first_ns is None or camera.last_ns is None:
+        return f"  {camera.name}: no frames"
+    ids = list(camera.bodies)
+    bodies = ", ".join(str(body) for body in ids[:8]) + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")
+    return (
+        f"  {camera.name}: {camera.frames} frames at {camera.rate_hz:.2f} Hz, "
+        f"from {(camera.first_ns - start_ns) / 1e9:.3f} to {(camera.last_ns - start_ns) / 1e9:.3f} s, "
+        f"longest gap {camera.longest_gap_s:.3f} s, delay {1e3 * camera.delay_s:.1f} ms, bodies {bodies}, "
+        f"extrinsics {'in the log' if camera.posed else 'none'}"
+    )
