@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel
@@ -74,11 +73,10 @@ def descend(model: RobotModel, T_world_tcp: Floats, seed: Floats) -> tuple[Float
     return q, error
 
 
-@njit(cache=True)
 def _step(q: Floats, J: Floats, T: Floats, T_goal: Floats, q_min: Floats, q_max: Floats) -> tuple[Floats, Floats]:
     error = np.empty(6)
     error[:3] = T_goal[:3, 3] - T[:3, 3]
-    error[3:] = to_vector(np.ascontiguousarray(T_goal[:3, :3]) @ np.ascontiguousarray(T[:3, :3].T))
+    error[3:] = to_vector(T_goal[:3, :3] @ T[:3, :3].T)
     damping = 0.1 * (error @ error) + 1e-12  # vanishes at the solution: Newton's speed there
     dq = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), error)
     return np.minimum(np.maximum(q + dq, q_min), q_max), error

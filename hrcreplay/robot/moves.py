@@ -80,7 +80,7 @@ def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pac
     """
     T_start = model.pose(start, np.zeros(model.nv)).T_world_tcp
     way_m = T_world_end[:3, 3] - T_start[:3, 3]
-    turn_rad = to_vector(np.ascontiguousarray(T_world_end[:3, :3]) @ np.ascontiguousarray(T_start[:3, :3].T))
+    turn_rad = to_vector(T_world_end[:3, :3] @ T_start[:3, :3].T)
     length = max(float(np.linalg.norm(way_m)), float(np.linalg.norm(turn_rad)) / TURN_RAD_PER_M)
     if length < 1e-9:
         return Track(start[None], np.zeros_like(start)[None])

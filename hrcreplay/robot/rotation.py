@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.records import Floats
 
@@ -41,24 +40,18 @@ def from_vector(vector: Floats) -> Floats:
     return from_quaternion(np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis)]))
 
 
-@njit(cache=True)
 def to_vector(R: Floats) -> Floats:
     """(3,) rotation vector of (3, 3), its length in [0, pi] [rad]; exact near both ends."""
-    squares = np.array([R[0, 0] + R[1, 1] + R[2, 2], R[0, 0], R[1, 1], R[2, 2]])
-    largest = int(np.argmax(squares))
-    if largest == 0:
-        q = np.array([1 + squares[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    else:
-        i = largest - 1
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q = np.empty(4)
-        q[0] = R[k, j] - R[j, k]
-        q[1 + i] = 1 + R[i, i] - R[j, j] - R[k, k]
-        q[1 + j] = R[i, j] + R[j, i]
-        q[1 + k] = R[i, k] + R[k, i]
-    if q[0] < 0:
-        q = -q
-    sine = math.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    if sine == 0:
-        return np.zeros(3)
-    return 2 * math.atan2(sine, q[0]) / sine * q[1:]
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
+    # four times the unit quaternion (w, x, y, z) times one of its elements: the row of the largest has no cancellation
+    w, x, y, z = max(
+        (
+            (1 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
+            (zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx),
+            (xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy),
+            (yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz),
+        ),
+        key=lambda row: sum(v * v for v in row),
+    )
+    sine = math.copysign(math.sqrt(x * x + y * y + z * z), w)
+    return np.array([x, y, z]) * (2 * math.atan2(abs(sine), abs(w)) / sine if sine else 0.0)

@@ -207,6 +207,18 @@ def test_a_seven_axis_arm_follows_lines_too() -> None:
 TURNED: dict[str, Any] = {"joints_deg": [0, 0, 0, 180, -90, 180]}  # the TCP of HOME by another posture
 
 
+@pytest.mark.parametrize("sideways_deg", [0.0, 0.01, 1.0])
+def test_a_line_through_a_singular_posture_is_refused(robot: RobotModel, sideways_deg: float) -> None:
+    almost = {"joints_deg": [0, 0, 0, 3, 10, 0]}  # axes 4 and 6 nearly in line; the turn takes axis 5 through zero
+    T = np.linalg.inv(robot.T_world_base) @ robot.pose(np.radians(almost["joints_deg"]), np.zeros(6)).T_world_tcp
+    turned = Rotation.from_euler("zy", [sideways_deg, -20], degrees=True) * Rotation.from_matrix(T[:3, :3])
+    quaternion = turned.as_quat(scalar_first=True).tolist()
+    with pytest.raises(
+        SettingsError, match=r"waypoint 2: on the straight line .* singular posture: use move = \"joint\""
+    ):
+        plan(robot, almost, {"position_m": T[:3, 3].tolist(), "quaternion_wxyz": quaternion, "move": "linear"})
+
+
 @pytest.mark.parametrize(
     ("waypoints", "message"),
     [
@@ -224,7 +236,10 @@ TURNED: dict[str, Any] = {"joints_deg": [0, 0, 0, 180, -90, 180]}  # the TCP of 
             (HOME, {**ABOVE, "position_m": [0.05, 0, 0.30]}),
             "waypoint 2: no joint position within the limits .* misses it by",
         ),
-        ((HOME, {**ABOVE, "position_m": [-0.6, 0.0, 0.5], "move": "linear"}), "waypoint 2: (the|on the) straight line"),
+        (
+            (HOME, {**ABOVE, "position_m": [-0.6, 0.0, 0.5], "move": "linear"}),
+            "waypoint 2: the straight line to it leaves the arm's range",
+        ),
         ((HOME, {**TURNED, "move": "linear"}, ABOVE), "waypoint 2: the straight line to it ends with axis . at"),
         ((HOME, HOME), "task: every waypoint is where the robot starts"),
     ],
