@@ -86,7 +86,8 @@ def draw_all(
     makers: dict[str, Callable[[], Figure]] = {}
     if motion is not None and len(motion) > 1:
         plan = motion
-        makers["fig13_path"] = lambda: figures_robot.path(plan, run.occupancy, t0_ns)
+        if metrics["plan_deviation_max_m"]["value"] is not None:
+            makers["fig13_path"] = lambda: figures_robot.path(plan, run.occupancy, t0_ns)
         makers["fig14_speed"] = lambda: figures_robot.speed(plan, t0_ns, near_m)
         makers["status"] = lambda: figures_robot.status(
             plan,

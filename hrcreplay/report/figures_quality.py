@@ -27,7 +27,7 @@ def data_quality(run: Run, t0_ns: int, gap_s: float) -> Figure:
             seconds = seconds_from(seen, t0_ns)
             end_s = max(end_s, float(seconds[-1]) if len(seconds) else 0.0)
             ax.broken_barh(_frame_bars(seconds, gap_s), (row - 0.32, 0.64), facecolors=colour, alpha=0.3, lw=0)
-        if run.state is not None:
+        if run.state is not None and f"valid_{camera}" in run.state:
             valid = run.state[f"valid_{camera}"].to_numpy(dtype=bool)
             recent = seconds_since(run.state, valid) <= gap_s
             anything = recent if anything is None else anything | recent

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from hrcreplay.report import story
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
-from hrcreplay.report.tables import PageTable, compare, text_of
+from hrcreplay.report.tables import PageTable, compare, percent, text_of
 from hrcreplay.runs import Run
 
 
@@ -47,7 +47,7 @@ CAPTIONS = {
     ),
     "status": (
         "What the robot did over time. Limited: held by a safety constraint or a limit. Above each bar, in grey, when "
-        "it was near the person; dark, when it then stood although its programme moves. Where stretches are narrower "
+        "it was near the person; solid, when it then stood although its programme moves. Where stretches are narrower "
         "than a line, the gravest status is drawn."
     ),
     "stationary_share": (
@@ -215,7 +215,9 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             "Cost to the task",
             "How often it stood, how far it left its path, and how much time that took.",
             figures("stationary_share", "fig13_path"),
-            (compare("Cost, per method on the same volumes", metrics, plans, PLAN_COST),) if planned else (),
+            (compare("Cost, per method on the same volumes", metrics, plans, PLAN_COST, _papers(metrics)),)
+            if planned
+            else (),
             no_plan,
         ),
         Part(
@@ -243,6 +245,14 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             figures("data_quality"),
             (compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA), *_counters(run)),
         ),
+    )
+
+
+def _papers(metrics: Mapping[str, Metric]) -> str:
+    qp, scaling = (percent(metrics[f"paper_stationary_share_{method}"], 2) for method in ("qp", "scaling"))
+    deviation = text_of(metrics["paper_deviation_m"])
+    return (
+        f"The paper's own, on its own data: stationary share {qp} (QP) and {scaling} (scaling), deviation {deviation}."
     )
 
 

@@ -114,7 +114,7 @@ def compare(
         title: Of the table.
         metrics: Name -> metric.
         columns: Heading of each column -> prefix of its metrics' names.
-        rows: Label and suffix of each row's metrics; a suffix that ends in ``_share`` is written in percent.
+        rows: Label and suffix of each row's metrics; shares are written in percent.
         note: Below the table.
     """
     body = []

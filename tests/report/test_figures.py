@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hrcreplay.report import figures
+from hrcreplay.report.metrics import compute
+from hrcreplay.report.solids import Solid, outline, picture, view_from
+from hrcreplay.runs import Run
+from tests.report.synthetic import RADII_M, T0_NS, make_run, volumes_at
+
+ALL = {
+    "fig13_path",
+    "fig14_speed",
+    "fig17_volumes",
+    "fig18_coordinate",
+    "joint_angles",
+    "stationary_share",
+    "fusion_error",
+    "data_quality",
+    "status",
+}
+
+
+def draw(run: Run, folder: Path, *, volumes: bool = True) -> set[str]:
+    metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
+    ticks = figures.instants(run) if volumes else np.zeros(0, dtype=np.int64)
+    found = [
+        (int(k), {m: volumes_at((k - T0_NS) * 1e-9, s) for m, s in (("paper", 0.05), ("positions", 0.15))})
+        for k in ticks
+    ]
+    names = figures.draw_all(run, folder, metrics, near_m=0.5, stationary_m_per_s=0.001, volumes=found, radii_m=RADII_M)
+    return set(names)
+
+
+def test_the_same_run_draws_the_same_bytes(tmp_path: Path) -> None:
+    run = make_run(8.0)
+    for folder in ("a", "b"):
+        assert draw(run, tmp_path / folder) == ALL
+    files = sorted(p.name for p in (tmp_path / "a").iterdir())
+    assert files == sorted(f"{name}.{kind}" for name in ALL for kind in ("png", "svg"))
+    for name in files:
+        first, second = ((tmp_path / folder / name).read_bytes() for folder in ("a", "b"))
+        assert first == second, name
+        assert len(first) < 300_000 or name.endswith(".svg"), name
+        assert b"Matplotlib" not in first or name.endswith(".png"), name
+
+
+def test_what_has_no_data_is_not_drawn(tmp_path: Path) -> None:
+    run = make_run(4.0, human=False, robot=False)
+    assert draw(run, tmp_path, volumes=False) == {"fig18_coordinate", "joint_angles", "data_quality"}
+
+
+def test_a_person_never_seen_and_a_robot_that_never_moved(tmp_path: Path) -> None:
+    run = make_run(4.0)
+    assert run.state is not None
+    assert run.motion is not None
+    keep = {"t_ns", "valid_kinect", "valid_xtion"}
+    state = run.state.assign(**{name: np.nan for name in run.state.columns if name not in keep})
+    state = state.assign(valid_kinect=False, valid_xtion=False)
+    motion = run.motion.assign(distance_m=np.nan, limb=None, tcp_speed=0.0, status="braking", reason="no person yet")
+    run = dataclasses.replace(run, state=state, motion=motion, measurements=None, occupancy=None, baselines={})
+    assert len(figures.instants(run)) == 0
+    assert draw(run, tmp_path) == {"fig13_path", "fig14_speed", "stationary_share", "status", "joint_angles"}
+
+
+def test_instants_are_a_second_apart_and_hold_the_nearest() -> None:
+    run = make_run(12.0)
+    assert run.motion is not None
+    ticks = figures.instants(run)
+    assert np.diff(ticks) * 1e-9 == pytest.approx([1.0, 1.0, 1.0], abs=0.011)
+    nearest = run.motion.sort_values("distance_m")["t_ns"].iloc[0]
+    assert ticks[0] <= nearest <= ticks[-1]
+
+
+def test_outline_of_a_ball_is_its_circle_from_anywhere() -> None:
+    centre = np.array([[0.3, -0.2, 1.0]])
+    for azimuth, elevation in ((0.0, 0.0), (1.0, 0.4), (-2.0, 1.2)):
+        view = view_from(azimuth, elevation)
+        edge = outline(centre, 0.25, view) - view.flat(centre)
+        assert np.linalg.norm(edge, axis=1) == pytest.approx(0.25)
+
+
+def test_outline_of_missing_vertices_is_empty() -> None:
+    assert len(outline(np.full((1, 3), np.nan), 0.1, view_from(0.0, 0.0))) == 0
+
+
+def test_picture_shows_the_nearer_solid_and_the_area_of_a_ball() -> None:
+    view = view_from(0.0, 0.0)  # looks along -x: larger x is nearer
+    near = Solid(np.array([[1.0, 0.0, 0.0]]), 0.2, (1.0, 0.0, 0.0))
+    far = Solid(np.array([[-1.0, 0.0, 0.0]]), 0.4, (0.0, 0.0, 1.0))
+    for order in ((near, far), (far, near)):
+        image = picture(order, view, np.array([-0.5, -0.5]), np.array([0.5, 0.5]), 0.01)
+        assert image.shape == (100, 100, 4)
+        middle, rim = image[50, 50], image[50, 20]
+        assert middle[0] > 0.5
+        assert middle[2] == 0.0
+        assert rim[2] > 0.5
+        assert image[2, 2, 3] == 0.0
+        assert (image[..., 3] > 0).mean() == pytest.approx(np.pi * 0.4**2, rel=0.08)

@@ -1,0 +1,248 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hrcreplay.records import JOINTS
+from hrcreplay.report.metrics import compute
+from hrcreplay.report.metrics_plan import cycles, path_feet, time_lost_s
+from hrcreplay.runs import Run
+from tests.report.synthetic import T0_NS, make_run
+
+ANGLES = JOINTS[2:]
+
+
+def metrics_of(run: Run) -> dict[str, dict[str, Any]]:
+    return compute(run, near_m=0.5, stationary_m_per_s=0.001)
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return make_run()
+
+
+@pytest.fixture(scope="module")
+def found(run: Run) -> dict[str, dict[str, Any]]:
+    return metrics_of(run)
+
+
+def truth_at(run: Run, t_ns: int, joint: str) -> float:
+    """By a loop over the samples, without the report's interpolation."""
+    assert run.truth is not None
+    t, values = run.truth["t_ns"].tolist(), run.truth[joint].tolist()
+    for k in range(len(t) - 1):
+        if t[k] <= t_ns <= t[k + 1]:
+            share = (t_ns - t[k]) / (t[k + 1] - t[k])
+            return float(values[k] + share * (values[k + 1] - values[k])) if 0 < share < 1 else values[k + round(share)]
+    return math.nan
+
+
+def test_every_metric_has_value_unit_and_meaning_and_json_takes_it(found: dict[str, dict[str, Any]]) -> None:
+    text = json.dumps(found, allow_nan=False)
+    assert list(found) == sorted(found)
+    for name, metric in found.items():
+        assert metric["unit"], name
+        assert metric["meaning"], name
+        assert (metric["value"] is None) == ("reason" in metric), name
+        assert type(metric["value"]) in (int, float, str, type(None)), name
+    assert json.loads(text) == found
+
+
+def test_two_computations_agree(run: Run, found: dict[str, dict[str, Any]]) -> None:
+    assert metrics_of(run) == found
+
+
+def test_fused_rmse(run: Run, found: dict[str, dict[str, Any]]) -> None:
+    assert run.state is not None
+    squares: list[float] = []
+    for joint in ANGLES:
+        errors = [
+            value - truth_at(run, int(t), joint) for t, value in zip(run.state["t_ns"], run.state[joint], strict=True)
+        ]  # none is near half a turn
+        kept = [e * e for e in errors if math.isfinite(e)]
+        assert found[f"fusion_rmse_{joint}"]["value"] == pytest.approx(math.sqrt(sum(kept) / len(kept)), rel=1e-9)
+        squares += kept
+    assert found["fusion_angle_rmse"]["value"] == pytest.approx(math.sqrt(sum(squares) / len(squares)), rel=1e-9)
+    assert found["fusion_angle_median"]["value"] == pytest.approx(math.sqrt(np.median(squares)), rel=1e-9)
+
+
+def test_camera_rmse_and_ratio(run: Run, found: dict[str, dict[str, Any]]) -> None:
+    assert run.measurements is not None
+    pooled = {}
+    for camera, rows in run.measurements.groupby("camera"):
+        squares = []
+        for joint in ANGLES:
+            for t, value in zip(rows["capture_ns"], rows[joint], strict=True):
+                error = value - truth_at(run, int(t), joint)
+                if math.isfinite(error):
+                    squares.append(error * error)
+        pooled[str(camera)] = math.sqrt(sum(squares) / len(squares))
+        assert found[f"camera_{camera}_angle_rmse"]["value"] == pytest.approx(pooled[str(camera)], rel=1e-9)
+    better = min(pooled, key=lambda name: pooled[name])
+    assert found["fusion_angle_better_camera"]["value"] == better == "kinect"
+    ratio = found["fusion_angle_rmse"]["value"] / pooled[better]
+    assert found["fusion_angle_rmse_ratio"]["value"] == pytest.approx(ratio, rel=1e-9)
+
+
+def test_differenced_velocity_of_a_camera() -> None:
+    """A camera with a constant angular rate that is off by 0.25 rad/s, and one pair across a gap."""
+    t_s = np.array([0.0, 0.1, 0.2, 0.3, 2.0, 2.1])
+    truth_s = np.arange(0, 3, 0.01)
+    columns = {"t_ns": T0_NS + np.round(truth_s * 1e9).astype(np.int64)}
+    truth = pd.DataFrame(columns | dict.fromkeys(JOINTS, 1.0 * truth_s))
+    capture = T0_NS + np.round(t_s * 1e9).astype(np.int64)
+    raw = pd.DataFrame({"capture_ns": capture, "camera": "one"} | dict.fromkeys(JOINTS, 1.25 * t_s))
+    raw.loc[4, "ar1"] = np.nan
+    run = dataclasses.replace(make_run(2.0), measurements=raw, truth=truth, state=None, motion=None, baselines={})
+    found = metrics_of(run)
+    assert found["camera_one_velocity_rmse"]["value"] == pytest.approx(0.25, abs=1e-6)
+    assert found["camera_one_rmse_x"]["value"] == pytest.approx(0.25 * math.sqrt(np.mean(t_s**2)), rel=1e-6)
+    assert found["fusion_angle_rmse"]["value"] is None
+    assert found["fusion_angle_rmse_ratio"]["value"] is None
+    assert found["camera_one_gaps"]["value"] == 1
+    assert found["camera_one_gap_max_s"]["value"] == pytest.approx(1.7)
+    assert found["camera_one_rate_hz"]["value"] == pytest.approx(10.0)
+
+
+def test_headings_on_either_side_of_half_a_turn_are_near() -> None:
+    run = make_run(4.0)
+    assert run.truth is not None
+    assert run.state is not None
+    truth, state = run.truth.copy(), run.state.copy()
+    truth["theta"], state["theta"] = np.pi - 0.01, -np.pi + 0.01
+    found = metrics_of(dataclasses.replace(run, truth=truth, state=state))
+    assert found["fusion_rmse_theta"]["value"] == pytest.approx(0.02)
+
+
+def test_stationary_share(run: Run, found: dict[str, dict[str, Any]]) -> None:
+    for prefix, motion in (("plan", run.motion), ("baseline_scaling", run.baselines["scaling"])):
+        assert motion is not None
+        near = [row for row in motion.to_dict("records") if row["distance_m"] <= 0.5]
+        stands = [row for row in near if row["tcp_speed"] < 0.001 and row["ref_speed"] >= 0.001]
+        assert found[f"{prefix}_near_ticks"]["value"] == len(near)
+        assert found[f"{prefix}_stationary_ticks"]["value"] == len(stands)
+        assert found[f"{prefix}_stationary_share"]["value"] == pytest.approx(len(stands) / len(near))
+    assert found["baseline_scaling_stationary_share"]["value"] > found["plan_stationary_share"]["value"]
+
+
+def test_a_robot_that_waits_with_its_programme_is_not_stationary(run: Run) -> None:
+    assert run.motion is not None
+    motion = run.motion.assign(tcp_speed=0.0, ref_speed=0.0, distance_m=0.5)
+    found = metrics_of(dataclasses.replace(run, motion=motion))
+    assert found["plan_near_ticks"]["value"] == len(motion)
+    assert found["plan_stationary_share"]["value"] == 0.0
+
+
+def test_never_near_is_null_and_not_zero(run: Run) -> None:
+    assert run.motion is not None
+    found = metrics_of(dataclasses.replace(run, motion=run.motion.assign(distance_m=0.51)))
+    assert found["plan_near_ticks"]["value"] == 0
+    assert found["plan_stationary_share"]["value"] is None
+    assert "0.5 m" in found["plan_stationary_share"]["reason"]
+
+
+def test_status_and_separation(run: Run, found: dict[str, dict[str, Any]]) -> None:
+    motion = run.motion
+    assert motion is not None
+    counts = motion["status"].value_counts()
+    assert found["plan_braking_share"]["value"] == pytest.approx(counts["braking"] / len(motion))
+    assert sum(found[f"plan_{s}_share"]["value"] for s in ("tracking", "limited", "braking")) == pytest.approx(1.0)
+    reasons = [found[n]["value"] for n in found if n.startswith("plan_braking_share_")]
+    assert sum(reasons) == pytest.approx(found["plan_braking_share"]["value"])
+    assert found["plan_braking_share_no_person_yet"]["value"] == pytest.approx(50 / len(motion))
+    nearest = motion.sort_values("distance_m").iloc[0]
+    assert found["plan_separation_min_m"]["value"] == nearest["distance_m"]
+    assert found["plan_separation_min_at_s"]["value"] == pytest.approx((nearest["t_ns"] - T0_NS) * 1e-9)
+    assert found["plan_separation_min_limb"]["value"] == "LRA"
+    assert found["plan_separation_unknown_ticks"]["value"] == 50
+    late = motion[(motion["status"] == "braking") & (motion["tcp_speed"] >= 0.001)]
+    assert found["plan_braking_moving_ticks"]["value"] == len(late) > 0
+    assert found["plan_braking_moving_separation_min_m"]["value"] == late["distance_m"].min()
+
+
+def test_no_separation_at_all_is_null(run: Run) -> None:
+    assert run.motion is not None
+    found = metrics_of(dataclasses.replace(run, motion=run.motion.assign(distance_m=np.nan, limb=None)))
+    for name in ("plan_separation_min_m", "plan_separation_min_limb", "plan_stationary_share"):
+        assert found[name]["value"] is None
+    assert found["plan_separation_unknown_ticks"]["value"] == found["plan_ticks"]["value"]
+
+
+def test_distance_from_a_path_is_to_its_segments() -> None:
+    path = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
+    points = np.array([[0.3, 0.2, 0.0], [1.5, 0.6, 0.0], [2.0, 0.0, 0.0], [np.nan, 0, 0]])
+    feet = path_feet(points, path)
+    assert feet[:3] == pytest.approx(np.array([[0.3, 0, 0], [1, 0.6, 0], [1, 0, 0]]))
+    assert np.isnan(feet[3]).all()
+
+
+def test_time_lost_when_the_reference_waits_half_the_time() -> None:
+    """10 s at 0.2 m/s programmed, of which the reference waits in the seconds 2 to 7; 1 s of programmed rest at 0."""
+    t_s = np.arange(0, 10, 0.01)
+    speed = np.where(t_s < 1, 0.0, 0.2)
+    moves = (t_s >= 1) & ((t_s < 2) | (t_s >= 7))
+    x = np.concatenate([[0.0], np.cumsum(np.where(moves, 0.002, 0.0))[:-1]])
+    motion = pd.DataFrame({"t_ns": (t_s * 1e9).round().astype(np.int64), "ref_x": x, "ref_speed": speed})
+    motion = motion.assign(ref_y=0.0, ref_z=0.5)
+    assert time_lost_s(motion, 0.001).sum() == pytest.approx(5.0, abs=0.02)
+
+
+def test_no_time_is_lost_by_a_reference_that_runs_with_the_clock(run: Run) -> None:
+    settings = {**run.meta["settings"], "plan": {"method": "qp", "reference": "time"}}
+    found = metrics_of(dataclasses.replace(run, meta={**run.meta, "settings": settings}))
+    assert found["plan_time_lost_s"]["value"] is None
+    assert "plan.reference" in found["plan_time_lost_s"]["reason"]
+
+
+def test_cycles_count_returns() -> None:
+    angle = np.linspace(0, 2 * np.pi * 3.2, 3000)
+    motion = pd.DataFrame({"ref_x": 0.3 * np.cos(angle), "ref_y": 0.3 * np.sin(angle), "ref_z": 0.0})
+    assert cycles(motion) == 3
+
+
+def test_validity_of_cameras(run: Run, found: dict[str, dict[str, Any]]) -> None:
+    assert run.state is not None
+    valid = run.state[["valid_kinect", "valid_xtion"]].to_numpy()
+    assert found["camera_kinect_valid_share"]["value"] == pytest.approx(valid[:, 0].mean())
+    assert found["ticks_without_camera"]["value"] == int((~valid.any(axis=1)).sum())
+    longest = current = 0
+    for row in valid:
+        current = 0 if row.any() else current + 1
+        longest = max(longest, current)
+    assert found["longest_without_camera_s"]["value"] == pytest.approx(longest / 100.0)
+    recent = 0
+    last = -10_000
+    for k, row in enumerate(valid):
+        last = k if row[1] else last
+        recent += k - last <= 20
+    assert found["camera_xtion_available_share"]["value"] == pytest.approx(recent / len(valid))
+    assert found["ticks_before_first_state"]["value"] == 50
+    assert found["ticks_state_lost"]["value"] == 0
+    assert found["count_points_not_finite"]["value"] == 17
+
+
+def test_volumes(found: dict[str, dict[str, Any]]) -> None:
+    assert found["occupancy_paper_URA_m3"]["value"] == pytest.approx(0.03)
+    assert found["occupancy_paper_sum_m3"]["value"] == pytest.approx(0.21)
+
+
+def test_a_fused_run_without_truth_and_robot() -> None:
+    found = metrics_of(make_run(human=False, robot=False))
+    for name in ("fusion_angle_rmse", "camera_kinect_velocity_rmse", "plan_method", "occupancy_ticks"):
+        assert found[name]["value"] is None
+        assert found[name]["reason"]
+    assert "ground truth" in found["fusion_angle_rmse"]["reason"]
+    assert not any(name.startswith("plan_near") for name in found)
+
+
+def test_the_papers_numbers_are_labelled_as_the_papers(found: dict[str, dict[str, Any]]) -> None:
+    assert found["paper_stationary_share_qp"]["value"] == 0.3006
+    assert found["paper_stationary_share_scaling"]["value"] == 0.8644
+    assert found["paper_deviation_m"]["value"] == 0.221
+    assert all("the paper prints" in m["meaning"] for n, m in found.items() if n.startswith("paper_"))
