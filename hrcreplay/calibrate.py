@@ -178,10 +178,9 @@ def _tie(tracks: list[Track], pair: Pair, known: Registration, search_s: float, 
 def _notes(floor: Floor, camera: str) -> tuple[str, ...]:
     if floor.tilt_std_rad < _TILTED_RAD:
         return ()
-    return (
-        f"up is known to about {np.degrees(floor.tilt_std_rad):.0f} degrees only: nobody walked or stood straight; "
-        f"give up in the frame of {camera} where it is known (--up)",
-    )
+    degrees = np.degrees(floor.tilt_std_rad)
+    doubt = f"up is known to about {degrees:.0f} degrees only, as nobody walked or stood straight"
+    return (f"{doubt}; give up in the frame of {camera} where it is known (--up)",)
 
 
 def _residuals(cameras: tuple[str, ...], tracks: list[Track], found: dict[int, Registration]) -> tuple[Residual, ...]:

@@ -85,15 +85,17 @@ def _is_number(text: str) -> bool:
 
 
 def instant(where: str, text: str, unit_ns: int, before_ns: int) -> int:
-    """A time stamp [ns] that must not be before ``before_ns``.
+    """A time stamp [ns], not negative, that must not be before ``before_ns``.
 
     Raises:
-        LogError: Not a whole number, or going backwards.
+        LogError: Not a whole number, negative or going backwards.
     """
     try:
         t_ns = int(text) * unit_ns
     except ValueError:
         raise LogError(f"{where}: time: found {text!r}; would be right: a whole number") from None
+    if t_ns < 0:
+        raise LogError(f"{where}: time: found {text!r}; would be right: 0 or later")
     if t_ns < before_ns:
         raise LogError(f"{where}: time goes back by {(before_ns - t_ns) * 1e-9:g} s; would be right: rows in order")
     return t_ns

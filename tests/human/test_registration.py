@@ -1,0 +1,148 @@
+"""Registration against scipy's alignment and known poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hrcreplay.human.registration import (
+    MIRROR,
+    Registration,
+    Track,
+    disagreement,
+    kabsch,
+    register,
+    rigid,
+    transform,
+)
+from hrcreplay.records import POINTS
+from tests.realdata import data_path
+from tests.reobserve import POSE, Truth, angle_deg, read_azure, reobserve, walker
+
+
+def test_mirror_exchanges_left_and_right() -> None:
+    names = [POINTS[i] for i in MIRROR]
+    assert names[POINTS.index("elbow_l")] == "elbow_r"
+    assert names[POINTS.index("foot_r")] == "foot_l"
+    assert names[:4] == list(POINTS[:4])
+
+
+def test_kabsch_is_the_alignment_of_scipy() -> None:
+    rng = np.random.default_rng(1)
+    source, target, weight = rng.normal(size=(30, 3)), rng.normal(size=(30, 3)), rng.random(30)
+    T = kabsch(source, target, weight)
+    middle_s, middle_t = (np.average(points, axis=0, weights=weight) for points in (source, target))
+    best, _ = Rotation.align_vectors(target - middle_t, source - middle_s, weights=weight)
+    np.testing.assert_allclose(T[:3, :3], best.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(T[:3, 3], middle_t - best.as_matrix() @ middle_s, atol=1e-12)
+
+
+def test_kabsch_never_mirrors() -> None:
+    rng = np.random.default_rng(2)
+    source = rng.normal(size=(20, 3))
+    T = kabsch(source, source * [1, 1, -1], np.ones(20))
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("seed", "offset_s"), [(1, 0.0), (2, 0.137), (3, -0.8), (4, 1.7)])
+def test_register_recovers_pose_and_offset(seed: int, offset_s: float) -> None:
+    a = walker()
+    b = reobserve(a, Truth(POSE, offset_s), seed)
+    found = register(a, b)
+    assert found is not None
+    off = np.linalg.inv(POSE) @ found.T_a_b
+    assert angle_deg(off[:3, :3]) < 0.3
+    assert np.linalg.norm(found.T_a_b[:3, 3] - POSE[:3, 3]) < 0.010
+    assert found.offset_s == pytest.approx(offset_s, abs=0.003)
+
+
+def test_register_is_exact_without_noise() -> None:
+    a = walker()
+    b = Track(a.t_ns, (a.points_m - POSE[:3, 3]) @ POSE[:3, :3], a.confidence)
+    found = register(a, b)
+    assert found is not None
+    np.testing.assert_allclose(found.T_a_b, POSE, atol=1e-9)
+    assert abs(found.offset_s) < 1e-9
+
+
+def test_register_is_its_own_inverse() -> None:
+    a = walker()
+    b = reobserve(a, Truth(POSE, 0.05), 5)
+    there, back = register(a, b), register(b, a)
+    assert there is not None
+    assert back is not None
+    np.testing.assert_allclose(there.T_a_b @ back.T_a_b, np.eye(4), atol=4e-3)
+    assert there.offset_s == pytest.approx(-back.offset_s, abs=2e-3)
+
+
+def test_register_works_at_half_the_rate() -> None:
+    a = walker()
+    b = reobserve(a, Truth(POSE, 0.05), 6).rows(slice(None, None, 2))
+    found = register(a, b)
+    assert found is not None
+    assert angle_deg((np.linalg.inv(POSE) @ found.T_a_b)[:3, :3]) < 0.5
+    assert found.offset_s == pytest.approx(0.05, abs=0.005)
+
+
+def test_register_of_nothing_in_common_is_none() -> None:
+    a = walker(5.0)
+    blind = Track(a.t_ns, a.points_m, np.zeros_like(a.confidence))
+    later = Track(a.t_ns + 60_000_000_000, a.points_m, a.confidence)
+    assert register(a, blind) is None
+    assert register(a, later) is None
+    assert register(a, a.rows(slice(0, 2))) is None
+
+
+def test_register_takes_missing_points() -> None:
+    a = walker(8.0)
+    points = a.points_m.copy()
+    points[:, 12:] = np.nan
+    b = Track(a.t_ns, (points - POSE[:3, 3]) @ POSE[:3, :3], a.confidence)
+    found = register(a, b)
+    assert found is not None
+    np.testing.assert_allclose(found.T_a_b, POSE, atol=1e-9)
+
+
+def test_disagreement_is_that_of_the_interpolated_points() -> None:
+    a = walker(4.0)
+    t_ns = a.t_ns[:-1] + 10_000_000
+    rng = np.random.default_rng(7)
+    b = Track(t_ns, walker(4.0).points_m[:-1] + rng.normal(0, 0.02, (len(t_ns), 20, 3)), a.confidence[:-1])
+    found = Registration(rigid(np.eye(3), np.array([0.01, 0.0, 0.0])), 0.005)
+    rest = disagreement(a, b, found)
+    assert rest is not None
+    apart = []
+    for i, t in enumerate(a.t_ns):
+        for k in range(20):
+            at = [np.interp(t + 5_000_000, b.t_ns, b.points_m[:, k, d]) for d in range(3)]
+            if b.t_ns[0] <= t + 5_000_000 <= b.t_ns[-1]:
+                apart.append(np.linalg.norm(a.points_m[i, k] - at - [0.01, 0, 0]))
+    assert rest.points == len(apart)
+    assert rest.median_m == pytest.approx(np.median(apart), rel=1e-6)
+    assert rest.p95_m == pytest.approx(np.percentile(apart, 95), rel=1e-6)
+    assert rest.mirrored == 0.0
+
+
+def test_disagreement_counts_mirrored_frames() -> None:
+    a = walker(4.0)
+    points = a.points_m.copy()
+    points[30:60] = points[30:60][:, list(MIRROR)]
+    rest = disagreement(a, Track(a.t_ns, points, a.confidence), Registration(np.eye(4), 0.0))
+    assert rest is not None
+    assert rest.mirrored == pytest.approx(30 / 120)
+
+
+@pytest.mark.parametrize("name", ["pymocapviewer/azure_positions", "sevivi_azure_single/walking_positions_3d"])
+def test_register_on_real_movement(name: str) -> None:
+    a = read_azure(data_path(f"{name}.csv.gz"))
+    b = reobserve(a, Truth(POSE, 0.137), 1)
+    found = register(a, b)
+    assert found is not None
+    assert angle_deg((np.linalg.inv(POSE) @ found.T_a_b)[:3, :3]) < 0.5
+    assert np.linalg.norm(found.T_a_b[:3, 3] - POSE[:3, 3]) < 0.015
+    assert found.offset_s == pytest.approx(0.137, abs=0.005)
+    rest = disagreement(a, b, found)
+    assert rest is not None
+    assert 0.017 < rest.median_m < 0.036  # as real pairs disagree
+    np.testing.assert_allclose(transform(np.eye(4), b.points_m), b.points_m)
