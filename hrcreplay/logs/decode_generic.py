@@ -42,8 +42,8 @@ class GenericDecoder:
         """The one row of a message; none where the array is empty."""
         content = message.read()
         where = f"{self.topic} ({message.topic.type})"
-        elements = _field(content, self.points, where)
-        trust = None if self.confidence is None else _field(content, self.confidence, where)
+        elements = _array(content, self.points, where)
+        trust = None if self.confidence is None else _array(content, self.confidence, where)
         if not len(elements):
             return []
         points, confidence = blank()
@@ -61,6 +61,13 @@ class GenericDecoder:
             confidence[i] = 1.0 if trust is None else float(trust[element]) if element < len(trust) else 0.0
         stamp = None if self.stamp is None else stamp_ns(_field(content, self.stamp, where), where)
         return [Row(stamp or None, self.camera, 0, points, confidence, stamp_zero=stamp == 0)]
+
+
+def _array(content: Any, path: str, where: str) -> Any:
+    found = _field(content, path, where)
+    if isinstance(found, str) or not hasattr(found, "__len__"):
+        raise LogError(f"{where}: {path!r} is no array but {found!r}; name an array")
+    return found
 
 
 def _field(content: Any, path: str, where: str) -> Any:
