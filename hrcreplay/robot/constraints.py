@@ -1,0 +1,166 @@
+"""Speed limits on the robot's links from the swept volumes, Eq. (12)-(16)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.model import RobotPose
+from hrcreplay.robot.obstacles import Obstacles
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSegment:
+    """The axis of one link at one instant, world frame. Both ends belong to the same body."""
+
+    a_m: Floats  #: (3,) first end [m]
+    b_m: Floats  #: (3,) other end [m]
+    J_a: Floats  #: (3, nv) position Jacobian of the first end [m/rad]
+    J_b: Floats  #: (3, nv) of the other [m/rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Bounds ``A @ dq_next <= b``."""
+
+    A: Floats  #: (m, nv)
+    b: Floats  #: (m,)
+
+
+def link_segment(pose: RobotPose, link: int) -> LinkSegment:
+    """The axis of one link of a pose."""
+    return LinkSegment(*pose.ends_m[link], *pose.J_ends[link])
+
+
+def approach_rows(
+    link: LinkSegment, vertices_m: Floats, distance_m: float, *, clearance_m: float, stop_s: float
+) -> Rows:
+    """Speed rows that keep one link clear of one swept volume, Eq. (12)-(16), corrected.
+
+    Args:
+        link: End points in the world [m] and their position Jacobians (3, nv) [m/rad].
+        vertices_m: (m, 3) vertices of the swept volume, world frame [m].
+        distance_m: Smallest distance between the link's axis and the volume [m].
+        clearance_m: Limb radius + link radius + extra clearance [m].
+        stop_s: Worst-case braking time T_s [s].
+
+    Returns:
+        ``A`` (2m, nv) [m^2 s/rad] and ``b`` (2m,) [m^2] with ``A @ dq_next <= b``.
+    """
+    room_m2 = max(0.0, distance_m - clearance_m) ** 2  # Eq. (10): squared, so m^2
+    from_a = vertices_m - link.a_m
+    rows_a = from_a @ link.J_a  # Eq. (12), first row
+    rows_b = from_a @ link.J_b - (link.b_m - link.a_m) @ link.J_a  # Eq. (12), second row
+    A = stop_s * np.vstack([rows_a, rows_b])  # Eq. (66i), corrected: T_s belongs here
+    return Rows(A=A, b=np.full(len(A), room_m2))
+
+
+def worst_rows(
+    pose: RobotPose, obstacles: Obstacles, dq_next: Floats, room_m2: Floats, stop_s: float, above_m2: float
+) -> tuple[Ints, Floats, Floats]:
+    """The row of Eq. (16) that a velocity breaks most, for every pair and either end of the link.
+
+    The rows are linear in the vertex, so the worst vertex is the one furthest along the end's velocity: one pass
+    over the vertices checks them all, without any row being written down.
+
+    Args:
+        pose: The robot.
+        obstacles: The swept volumes.
+        dq_next: (nv,) [rad/s].
+        room_m2: (s, l) right-hand side for every pair of link and limb [m^2].
+        stop_s: T_s [s].
+        above_m2: Rows that exceed their right-hand side by no more than this hold [m^2].
+
+    Returns:
+        For the n broken ones: ``which`` (n, 4) link, limb, row of Eq. (12), row of ``obstacles.vertices_m``;
+        ``A`` (n, nv) [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2].
+    """
+    return _worst_rows(
+        pose.ends_m,
+        pose.J_ends,
+        obstacles.vertices_m,
+        obstacles.offsets,
+        obstacles.boxes_m,
+        dq_next,
+        room_m2,
+        stop_s,
+        above_m2,
+    )
+
+
+@njit(cache=True)
+def _worst_rows(
+    ends: Floats,
+    J_ends: Floats,
+    vertices: Floats,
+    offsets: Ints,
+    boxes: Floats,
+    dq: Floats,
+    room: Floats,
+    stop_s: float,
+    above: float,
+) -> tuple[Ints, Floats, Floats]:
+    links, limbs = room.shape
+    which = np.empty((2 * links * limbs, 4), dtype=np.int64)
+    A, values = np.empty((len(which), len(dq))), np.empty(len(which))
+    n = 0
+    for s in range(links):
+        for end in range(2):
+            v = _times(J_ends[s, end], dq)
+            rest = -_dot(ends[s, 0], v)
+            if end == 1:
+                rest -= _dot(ends[s, 1] - ends[s, 0], _times(J_ends[s, 0], dq))
+            for k in range(limbs):
+                bound = room[s, k] + above
+                if stop_s * (_box_top(boxes[k], v) + rest) <= bound:
+                    continue
+                best, top = offsets[k], -np.inf
+                for i in range(offsets[k], offsets[k + 1]):
+                    along = _dot(vertices[i], v)
+                    if along > top:
+                        best, top = i, along
+                value = stop_s * (top + rest)
+                if value > bound:
+                    which[n] = s, k, end, best
+                    A[n] = stop_s * _row(ends[s], J_ends[s], vertices[best], end)
+                    values[n] = value
+                    n += 1
+    return which[:n], A[:n], values[:n]
+
+
+@njit(cache=True)
+def _row(ends: Floats, J_ends: Floats, vertex: Floats, end: int) -> Floats:
+    """(nv,) one row of Eq. (12), without T_s."""
+    row = np.zeros(J_ends.shape[2])
+    for j in range(len(row)):
+        for i in range(3):
+            row[j] += (vertex[i] - ends[0, i]) * J_ends[end, i, j]
+            if end == 1:
+                row[j] -= (ends[1, i] - ends[0, i]) * J_ends[0, i, j]
+    return row
+
+
+@njit(cache=True)
+def _box_top(box: Floats, v: Floats) -> float:
+    """How far along v a point of the box can lie."""
+    top = 0.0
+    for i in range(3):
+        top += max(box[0, i] * v[i], box[1, i] * v[i])
+    return top
+
+
+@njit(cache=True)
+def _times(J: Floats, dq: Floats) -> Floats:
+    v = np.zeros(3)
+    for i in range(3):
+        for j in range(len(dq)):
+            v[i] += J[i, j] * dq[j]
+    return v
+
+
+@njit(cache=True)
+def _dot(a: Floats, b: Floats) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,0 +1,140 @@
+"""The trajectory generator: QP (66), or else the stop (67). The only module that imports proxsuite."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import proxsuite
+
+from hrcreplay.records import Floats
+from hrcreplay.robot import stepping
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.obstacles import Obstacles
+from hrcreplay.robot.problem import BoundedRows, Problem, problem
+from hrcreplay.robot.sight import observe
+from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
+from hrcreplay.robot.tracking import minimiser
+
+#: Largest residual with which a row counts as held [m^2; m/s, rad/s].
+HELD = 1e-11
+
+#: Multiplier above which an approach row holds the robot back.
+BINDING = 1e-7
+
+#: Rounds of solving and adding broken rows before the problem counts as unsolved.
+ROUNDS = 40
+
+_dense = proxsuite.proxqp.dense
+_SOLVED = proxsuite.proxqp.QPSolverOutput.PROXQP_SOLVED
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The minimiser of Eq. (66); every row has been checked."""
+
+    dq_next: Floats  #: (nv,) [rad/s]
+    held: bool  #: whether an approach row holds the robot back
+    rounds: int  #: how often rows joined in
+
+
+@dataclass(frozen=True, slots=True)
+class Unsolved:
+    """No minimiser that could be checked: the robot brakes."""
+
+    status: str  #: what went wrong
+
+
+def step(
+    robot: RobotModel,
+    state: RobotState,
+    T_world_ref: Floats,
+    twist_ref: Floats,
+    obstacles: Obstacles,
+    settings: PlanSettings,
+) -> Step:
+    """One tick of Section 5: the acceleration of Eq. (66), or that of Eq. (67) where there is none.
+
+    Never raises for numbers: a robot whose state, reference or people are not known brakes with a reason.
+
+    Args:
+        robot: The manipulator.
+        state: At the tick.
+        T_world_ref: (4, 4) reference of the TCP one tick later.
+        twist_ref: (6,) its velocity, linear first, world frame [m/s, rad/s].
+        obstacles: The swept volumes of the tick.
+        settings: Weights and limits.
+    """
+    with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
+        sight = observe(robot, state, obstacles, settings.clearance_m)
+        reason = sight.reason
+        if sight.pairs is not None:
+            task = problem(robot, state, sight.pose, T_world_ref, twist_ref, obstacles, sight.pairs, settings)
+            solution = solve(task)
+            if isinstance(solution, Solution):
+                status = stepping.LIMITED if solution.held else stepping.TRACKING
+                return sight.step(state, solution.dq_next, settings.dt_s, status)
+            reason = _REASONS.get(solution.status, stepping.NO_SOLUTION)
+        return sight.step(state, stepping.braked(state, robot.ddq_max, settings.dt_s), settings.dt_s, 2, reason)
+
+
+_REASONS = {"not finite": stepping.NOT_FINITE, "separation failed": stepping.NO_DISTANCE}
+
+
+def solve(task: Problem) -> Solution | Unsolved:
+    """The minimiser over all rows, found with few of them.
+
+    Beginning with the minimiser without rows, the rows that the candidate breaks join in and the problem is solved
+    again, until all rows of all links, limbs and vertices hold. A minimiser over some of the rows that breaks none
+    of the others is the minimiser over all of them.
+    """
+    free = minimiser(task.H, task.g)
+    if not math.isfinite(free.sum()):
+        return Unsolved("not finite")
+    w = np.clip(free, task.low, task.high)
+    solved, held = bool((w == free).all()), False
+    rows = BoundedRows((), np.empty((0, len(w))), np.empty(0), np.empty(0))
+    for rounds in range(ROUNDS):
+        broken = task.broken_rows(w, HELD)
+        if task.pairs.failed:
+            return Unsolved("separation failed")
+        if solved and not broken.keys:
+            return Solution(w, held, rounds)
+        before, rows = len(rows.keys), rows.joined(broken)
+        if solved and len(rows.keys) == before:
+            return Unsolved("residual")
+        if _hopeless(rows, task):
+            return Unsolved("infeasible")
+        result = _minimise(task, rows)
+        if isinstance(result, Unsolved):
+            return result
+        w, multipliers = result
+        held = any(key[0] >= 0 and z > BINDING for key, z in zip(rows.keys, multipliers, strict=True))
+        solved = True
+    return Unsolved("rounds")
+
+
+def _hopeless(rows: BoundedRows, task: Problem) -> bool:
+    """Whether no velocity within the axes' limits satisfies some row by itself. Spares the solver a long search."""
+    at_low, at_high = rows.A * task.low, rows.A * task.high
+    least, most = np.minimum(at_low, at_high).sum(axis=1), np.maximum(at_low, at_high).sum(axis=1)
+    return bool(np.any((least > rows.high + HELD) | (most < rows.low - HELD)))
+
+
+def _minimise(task: Problem, rows: BoundedRows) -> tuple[Floats, Floats] | Unsolved:
+    """Minimiser over the axes' limits and some rows, and the rows' multipliers.
+
+    A fresh solver each time: what it returns depends on the problem alone, not on what it solved before.
+    """
+    # of the two backends this one finds solutions where the other claims there are none
+    qp = _dense.QP(len(task.g), 0, len(rows.keys), True, _dense.HessianType.Dense, _dense.DenseBackend.PrimalLDLT)
+    qp.settings.initial_guess = proxsuite.proxqp.InitialGuess.NO_INITIAL_GUESS
+    qp.settings.eps_abs, qp.settings.eps_rel = 1e-12, 0.0
+    qp.settings.eps_primal_inf = 1e-9
+    qp.settings.max_iter = 300
+    qp.init(task.H, task.g, None, None, rows.A, rows.low, rows.high, task.low, task.high)
+    qp.solve()
+    if qp.results.info.status != _SOLVED:
+        return Unsolved(qp.results.info.status.name)
+    return np.clip(qp.results.x, task.low, task.high), qp.results.z[: len(rows.keys)]
