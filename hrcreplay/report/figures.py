@@ -87,7 +87,7 @@ def draw_all(
     if motion is not None and len(motion) > 1:
         plan = motion
         if metrics["plan_deviation_max_m"]["value"] is not None:
-            makers["fig13_path"] = lambda: figures_robot.path(plan, run.occupancy, t0_ns)
+            makers["fig13_path"] = lambda: figures_robot.path(plan, run.occupancy, t0_ns, run.T_world_base)
         makers["fig14_speed"] = lambda: figures_robot.speed(plan, t0_ns, near_m)
         makers["status"] = lambda: figures_robot.status(
             plan,

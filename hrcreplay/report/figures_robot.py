@@ -22,7 +22,9 @@ ABOVE = View(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 1.0, 0.0]), towa
 SIDE = view_from(-0.5 * np.pi, 0.0)
 
 
-def path(motion: pd.DataFrame, occupancy: pd.DataFrame | None, t0_ns: int) -> Figure:
+def path(
+    motion: pd.DataFrame, occupancy: pd.DataFrame | None, t0_ns: int, T_world_base: Floats | None = None
+) -> Figure:
     """Fig. 13: programmed and actual TCP path from above and from the side, and the largest deviation in detail.
 
     The detail looks at the vertical plane that holds the deviation, so its length is seen undistorted. The swept
@@ -37,6 +39,10 @@ def path(motion: pd.DataFrame, occupancy: pd.DataFrame | None, t0_ns: int) -> Fi
     figure = style.new_figure(3.6)
     axes = style.panels(figure, 1, 3, left_in=0.62, top_in=0.62, gap_in=(0.3, 0.62))[0]
     everything = np.vstack([reference, tcp])
+    if T_world_base is not None:
+        everything = np.vstack([everything, T_world_base[:3, 3]])
+        for ax, view in zip(axes[:2], (ABOVE, SIDE), strict=True):
+            ax.plot(*view.flat(T_world_base[None, :3, 3]).T, "s", color=style.INK, ms=6, zorder=3)
     _draw_path(axes[0], ABOVE, reference, tcp, limbs, everything, 0.15)
     axes[0].set(title="From above", xlabel="x [m]", ylabel="y [m]")
     _draw_path(axes[1], SIDE, reference, tcp, limbs, everything, 0.15)
@@ -51,7 +57,7 @@ def path(motion: pd.DataFrame, occupancy: pd.DataFrame | None, t0_ns: int) -> Fi
         ax.plot(*ends[0], "o", color=style.NOMINAL, ms=4.5, zorder=7)
         ax.plot(*ends[1], "o", color=style.ACTUAL, ms=4.5, zorder=7)
     _label_length(axes[2], detail.flat(np.vstack([feet[worst], tcp[worst]])), f"{far[worst]:.3f} m")
-    _path_legend(figure, bool(limbs))
+    _path_legend(figure, with_limbs=bool(limbs), with_base=T_world_base is not None)
     return figure
 
 
@@ -70,15 +76,17 @@ def _label_length(ax: Axes, ends: Floats, text: str) -> None:
     )
 
 
-def _path_legend(figure: Figure, with_limbs: bool) -> None:
+def _path_legend(figure: Figure, *, with_limbs: bool, with_base: bool) -> None:
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=style.NOMINAL, lw=1.4, label="programmed"),
         Line2D([], [], color=style.ACTUAL, lw=1.2, label="actual"),
     ]
+    if with_base:
+        handles.append(Line2D([], [], ls="", marker="s", ms=5, color=style.INK, label="robot base"))
     if with_limbs:
         handles.append(Patch(color=style.FAINT, alpha=0.4, label="swept volumes of the person at that tick"))
     width, height = figure.get_size_inches()
-    figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.62 / width, 1 - 0.06 / height), ncols=3)
+    figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.62 / width, 1 - 0.06 / height), ncols=4)
 
 
 def _plane_of(vector: Floats) -> View:

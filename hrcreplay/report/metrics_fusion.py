@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hrcreplay.records import JOINTS, Floats, Ints
-from hrcreplay.report.metrics_quality import cameras
+from hrcreplay.report.metrics_quality import cameras, seconds_since
 from hrcreplay.report.metrics_table import MetricTable
 from hrcreplay.report.series import (
     ANGLES,
@@ -91,6 +91,7 @@ def add_fusion(metrics: MetricTable, run: Run, gap_s: float) -> None:
         _add_source(metrics, source, found.get(source), "no such rows" if found else NO_TRUTH)
     for kind, unit in (("angle", "rad"), ("velocity", "rad/s")):
         _add_ratio(metrics, found, kind, unit)
+        _add_seen(metrics, run, found, kind, unit, gap_s)
 
 
 def _add_source(metrics: MetricTable, source: str, error: Errors | None, reason: str) -> None:
@@ -148,4 +149,23 @@ def _add_ratio(metrics: MetricTable, found: dict[str, Errors], kind: str, unit: 
         "1",
         f"pooled RMSE [{unit}] of the fused state over all ticks / that of the better camera's {raw} over its frames",
         reason=reason,
+    )
+
+
+def _add_seen(metrics: MetricTable, run: Run, found: dict[str, Errors], kind: str, unit: str, gap_s: float) -> None:
+    """The same where cameras can be compared: they have no errors while they do not see the person, the filter has."""
+    value = None
+    if run.state is not None and "fused" in found:
+        names = [name for name in run.state.columns if name.startswith("valid_")]
+        valid = np.asarray(run.state[names].to_numpy(dtype=bool).any(axis=1))
+        seen = seconds_since(run.state, valid) <= gap_s
+        error = found["fused"].position if kind == "angle" else found["fused"].velocity
+        value = rmse(error[seen][:, IS_ANGLE])
+    what = "angles" if kind == "angle" else "angular velocities"
+    metrics.add(
+        f"fusion_seen_{kind}_rmse",
+        value,
+        unit,
+        f"RMSE of the fused {what}, the 10 angles pooled, at ticks at most {gap_s:g} s after one that used a camera",
+        reason="needs a fused state and ground truth",
     )

@@ -120,7 +120,7 @@ def add_plan(
     for prefix, table in tables.items():
         what = "the plan" if prefix == "plan" else f"the baseline '{prefix.removeprefix('baseline_')}'"
         _add_status(metrics, prefix, table, what, stationary_m_per_s)
-        _add_separation(metrics, prefix, table, what)
+        _add_separation(metrics, prefix, table, what, stationary_m_per_s)
         _add_stationary(metrics, prefix, table, what, near_m, stationary_m_per_s)
         _add_path(metrics, prefix, table, what)
         _add_progress(metrics, prefix, table, what, stationary_m_per_s, waits=waits)
@@ -170,7 +170,7 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
     )
 
 
-def _add_separation(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str) -> None:
+def _add_separation(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
     distance = numbers(motion, "distance_m")
     known = np.isfinite(distance)
     reason = "no tick has a separation"
@@ -188,6 +188,14 @@ def _add_separation(metrics: MetricTable, prefix: str, motion: pd.DataFrame, wha
     for part in ("limb", "link"):
         found = None if k is None or pd.isna(motion[part].iloc[k]) else str(motion[part].iloc[k])
         metrics.add(f"{name}_min_{part}", found, "name", f"the {part} of that pair", reason=reason)
+    moving = distance[known & (numbers(motion, "tcp_speed") >= slow)]
+    metrics.add(
+        f"{name}_min_moving_m",
+        float(moving.min()) if len(moving) else None,
+        "m",
+        f"smallest separation at ticks of {what} with the TCP at or over {slow:g} m/s",
+        reason="the TCP never moved at a known separation",
+    )
     metrics.add(f"{name}_unknown_ticks", int((~known).sum()), "1", f"ticks of {what} without a separation")
 
 

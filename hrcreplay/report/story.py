@@ -116,9 +116,9 @@ def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
             f"{text_of(metrics['plan_braking_moving_ticks'])} of {text_of(metrics['plan_ticks'])} ticks still braking",
         ),
         Card(
-            text_of(metrics["plan_separation_min_m"]),
-            "smallest separation, robot to swept volumes",
-            f"{pair[0]} \u2013 {pair[1]}, at {text_of(metrics['plan_separation_min_at_s'])}" if pair[0] else "",
+            text_of(metrics["plan_separation_min_moving_m"]),
+            "smallest separation from the swept volumes while the robot moved",
+            f"at all: {text_of(metrics['plan_separation_min_m'])}, {pair[0]} \u2013 {pair[1]}" if pair[0] else "",
         ),
         Card(
             percent(metrics["plan_progress_share"]), "of the programmed pace", f"baseline: {others}" if others else ""

@@ -72,6 +72,19 @@ def test_fused_rmse(run: Run, found: dict[str, dict[str, Any]]) -> None:
     assert found["fusion_angle_median"]["value"] == pytest.approx(math.sqrt(np.median(squares)), rel=1e-9)
 
 
+def test_fused_rmse_while_the_person_is_seen(run: Run) -> None:
+    """An error that grows only after the cameras are gone for longer than 0.2 s does not count."""
+    assert run.state is not None
+    state = run.state.copy()
+    t_s = (state["t_ns"].to_numpy() - T0_NS) * 1e-9
+    gone = (t_s > 0.6 * 12 + 0.25) & (t_s < 0.65 * 12)
+    state.loc[gone, list(ANGLES)] += 1.0
+    spoilt = metrics_of(dataclasses.replace(run, state=state))
+    whole = metrics_of(run)
+    assert spoilt["fusion_angle_rmse"]["value"] > 5 * whole["fusion_angle_rmse"]["value"]
+    assert spoilt["fusion_seen_angle_rmse"]["value"] == whole["fusion_seen_angle_rmse"]["value"]
+
+
 def test_camera_rmse_and_ratio(run: Run, found: dict[str, dict[str, Any]]) -> None:
     assert run.measurements is not None
     pooled = {}
@@ -161,6 +174,8 @@ def test_status_and_separation(run: Run, found: dict[str, dict[str, Any]]) -> No
     assert found["plan_separation_min_at_s"]["value"] == pytest.approx((nearest["t_ns"] - T0_NS) * 1e-9)
     assert found["plan_separation_min_limb"]["value"] == "LRA"
     assert found["plan_separation_unknown_ticks"]["value"] == 50
+    moving = motion[motion["tcp_speed"] >= 0.001]
+    assert found["plan_separation_min_moving_m"]["value"] == moving["distance_m"].min()
     late = motion[(motion["status"] == "braking") & (motion["tcp_speed"] >= 0.001)]
     assert found["plan_braking_moving_ticks"]["value"] == len(late) > 0
     assert found["plan_braking_moving_separation_min_m"]["value"] == late["distance_m"].min()
