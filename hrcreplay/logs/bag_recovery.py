@@ -92,11 +92,11 @@ class RecoveredBag:
             while (fields := _fields(file)) is not None:
                 (length,) = struct.unpack("<L", file.read(4))
                 data = file.read(length)
-                if len(data) < length:
-                    return False
                 if fields["op"][0] == _CHUNK:
                     self._add(offset, _DECOMPRESS[fields["compression"]](data), connections, counts)
-                elif fields["op"][0] == _CONNECTION:
+                if len(data) < length:
+                    return False
+                if fields["op"][0] == _CONNECTION:
                     _connect(fields, data, connections)
                 offset = file.tell()
         except _BROKEN:
@@ -147,9 +147,17 @@ def _fields(file: IO[bytes]) -> Fields | None:
 
 
 def _inner(data: bytes) -> Iterator[tuple[Fields, bytes]]:
+    """Whole records of a chunk; the last chunk of a bag that breaks off may itself break off."""
     file = BytesIO(data)
-    while (fields := _fields(file)) is not None:
-        yield fields, file.read(struct.unpack("<L", file.read(4))[0])
+    try:
+        while (fields := _fields(file)) is not None:
+            (length,) = struct.unpack("<L", file.read(4))
+            content = file.read(length)
+            if len(content) < length:
+                return
+            yield fields, content
+    except (struct.error, EOFError):
+        return
 
 
 def _number(fields: Fields) -> int:

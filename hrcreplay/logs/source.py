@@ -144,7 +144,7 @@ def _folder(path: Path) -> Source:
     delivered = sum(topic.count for topic in source.topics())
     if promised and not delivered:
         raise LogError(
-            f"{path}: metadata.yaml promises {promised} messages, but its {len(present)} files give none; "
+            f"{path}: metadata.yaml promises {promised} messages, but its files ({len(present)}) give none; "
             "copy the folder again, or rebuild it with ros2 bag reindex"
         )
     if delivered < promised:
