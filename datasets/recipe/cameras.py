@@ -14,26 +14,26 @@ KINECT = Sensor(
     T_world_camera=scene.T_WORLD_KINECT,
     half_view_rad=(np.radians(35.3), np.radians(30.0)),
     range_m=4.5,
-    white_m=0.0075,
-    slow_m=0.004,
+    white_m=0.0095,
+    slow_m=0.002,
     slow_s=0.15,
     along=1.3,
     rate_hz=30.0,
-    first_s=6.0,
-    late_s=0.034,
+    first_s=5.0,
+    late_s=0.030,
 )
 XTION = Sensor(
     name="xtion",
     T_world_camera=scene.T_WORLD_XTION,
     half_view_rad=(np.radians(29.0), np.radians(22.5)),
-    range_m=4.3,
-    white_m=0.010,
-    slow_m=0.005,
+    range_m=4.0,
+    white_m=0.0105,
+    slow_m=0.003,
     slow_s=0.20,
     along=1.5,
     rate_hz=25.0,
     first_s=0.3,
-    late_s=0.042,
+    late_s=0.036,
 )
 SENSORS = (KINECT, XTION)
 
@@ -85,19 +85,19 @@ def between(when_s: Floats, t_s: Floats, points_m: Floats) -> Floats:
 
 def _colleague(when_s: Floats, t_s: Floats, points_m: Floats) -> Floats:
     """(n, 20, 3) somebody who walks by behind the worker, with the worker's own gait of the first seconds."""
-    walk = between(when_s - COLLEAGUE_S[0] + 0.9, t_s, points_m)
+    walk = between(when_s - COLLEAGUE_S[0] + 0.3, t_s, points_m)
     first = walk[0, 0] * np.array([1.0, 1.0, 0.0])
-    turned = (walk - first) @ rot_z(np.array([np.radians(-110.0)]))[0].T
+    turned = (walk - first) @ rot_z(np.array([np.radians(-72.0)]))[0].T
     return np.asarray(turned + np.array([2.70, -1.20, 0.0]))
 
 
 def _spoil(view: View, rng: np.random.Generator) -> None:
     """Gross errors: arms taken for each other and limbs that jump, some of them at full confidence."""
     last = len(view.t_s) - 10
-    for _ in range(4):
+    for k in range(4):
         first = int(rng.integers(last))
-        swap_arms(view, np.arange(first, first + rng.integers(2, 5)))
-    for k in range(16):
+        swap_arms(view, np.arange(first, first + rng.integers(2, 5)), from_shoulder=k % 2 == 0)
+    for k in range(20):
         first = int(rng.integers(last))
         arm = (RIGHT_ARM, LEFT_ARM)[k % 2]
         by_m = rng.normal(0.0, 1.0, 3)

@@ -26,8 +26,8 @@ def look_at(eye_m: tuple[float, float, float], target_m: tuple[float, float, flo
 
 
 #: Behind the robot on either side, so that their optical axes are far from parallel.
-T_WORLD_KINECT = look_at((-1.00, -1.50, 1.90), (1.60, -0.20, 0.95))
-T_WORLD_XTION = look_at((-0.60, 1.90, 2.10), (1.45, 0.10, 0.95))
+T_WORLD_KINECT = look_at((-0.55, -1.35, 1.95), (1.70, -0.20, 0.95))
+T_WORLD_XTION = look_at((-0.45, 1.35, 2.10), (1.80, 0.10, 1.00))
 
 _DOWN = [180.0, 0.0, 0.0]
 
@@ -48,8 +48,8 @@ TASK: dict[str, Any] = {
         _waypoint("above the rack", (0.26, -0.46, 0.36)),
         _waypoint("rack", (0.26, -0.46, 0.22), move="linear", tcp_speed_m_per_s=0.35, dwell_s=0.3),
         _waypoint("off the rack", (0.26, -0.46, 0.36), move="linear", tcp_speed_m_per_s=0.5),
-        _waypoint("above the box", (0.47, 0.26, 0.38)),
-        _waypoint("box", (0.47, 0.26, 0.26), move="linear", tcp_speed_m_per_s=0.35, dwell_s=0.3),
-        _waypoint("off the box", (0.47, 0.26, 0.38), move="linear", tcp_speed_m_per_s=0.5),
+        _waypoint("above the box", (0.45, 0.26, 0.38)),
+        _waypoint("box", (0.45, 0.26, 0.26), move="linear", tcp_speed_m_per_s=0.35, dwell_s=0.3),
+        _waypoint("off the box", (0.45, 0.26, 0.38), move="linear", tcp_speed_m_per_s=0.5),
     ],
 }

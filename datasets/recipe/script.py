@@ -31,30 +31,30 @@ class Reach:
     frame: Frame = "world"
 
 
-REST = (0.07, 0.07, -0.53)  #: arm hanging, elbow a little bent
+REST = (0.09, 0.05, -0.515)  #: arm hanging, elbow a little bent
 READY = (0.27, -0.02, -0.36)  #: forearms in front of the belly
 LOOK = (0.17, -0.10, -0.42)  #: hands folded low
 
 #: The way of the body: start [s], duration [s], x, y [m].
 _WAY = (
-    (0.9, 3.6, 1.24, 0.04),
+    (0.3, 3.5, 1.24, 0.04),
     (23.6, 1.3, 1.26, 0.26),
     (29.6, 1.2, 1.24, 0.05),
     (36.6, 1.8, 1.40, 0.22),
     (40.6, 1.9, 1.23, 0.10),
-    (51.2, 1.2, 1.42, 0.06),
-    (53.8, 4.6, 2.62, -1.22),
+    (52.4, 1.2, 1.42, 0.06),
+    (54.8, 4.6, 2.60, -0.50),
 )
-_START = (2.95, 0.92)
+_START = (2.65, -0.25)
 
 #: Start [s], duration [s], heading [deg].
-_HEADING = ((3.0, 1.5, 182), (22.4, 1.2, 192), (29.2, 1.4, 174), (36.2, 1.9, 58), (40.3, 2.1, 180), (52.6, 2.2, 315))
+_HEADING = ((2.8, 1.5, 177), (22.4, 1.2, 192), (29.2, 1.4, 174), (36.2, 1.9, 58), (40.3, 2.1, 180), (53.6, 2.4, 335))
 
 
 def floor_way(t_s: Floats) -> tuple[Floats, Floats]:
     """(n, 2) place of the body on the floor [m] and (n,) heading [rad], unwrapped."""
     axes = [follow(t_s, _START[i], [Move(m[0], m[1], m[2 + i]) for m in _WAY]) for i in (0, 1)]
-    heading = follow(t_s, radians(207), [Move(s, d, radians(h)) for s, d, h in _HEADING])
+    heading = follow(t_s, radians(169), [Move(s, d, radians(h)) for s, d, h in _HEADING])
     return np.column_stack(axes), heading
 
 
@@ -102,26 +102,26 @@ RIGHT = (
     Reach(4.6, 1.3, LOOK, "chest"),
     Reach(8.2, 0.85, (0.86, 0.26, 1.00)), Reach(9.4, 0.5, (0.87, 0.20, 1.05)), Reach(10.8, 0.9, READY, "chest"),
     Reach(13.4, 0.9, LOOK, "chest"),
-    Reach(17.0, 1.1, (0.84, 0.20, 0.98)), Reach(18.7, 0.55, (0.86, 0.30, 1.00)), Reach(20.0, 0.55, (0.85, 0.18, 1.06)),
+    Reach(17.0, 1.1, (0.84, 0.20, 0.98)), Reach(18.7, 0.55, (0.86, 0.30, 1.00)), Reach(20.0, 0.55, (0.86, 0.18, 1.06)),
     Reach(21.5, 1.0, READY, "chest"), Reach(23.2, 1.0, REST, "chest"),
     Reach(25.5, 0.8, (0.85, 0.34, 1.02)), Reach(27.0, 0.45, (0.88, 0.28, 1.10)), Reach(28.0, 0.8, LOOK, "chest"),
     Reach(33.1, 0.75, (0.85, 0.24, 1.04)), Reach(34.2, 0.4, (0.84, 0.28, 0.98)), Reach(35.2, 0.8, REST, "chest"),
     Reach(38.2, 0.9, (1.74, 0.62, 0.98)), Reach(39.9, 1.0, READY, "chest"),
     Reach(42.8, 1.0, (0.84, 0.22, 1.00)), Reach(44.3, 0.5, (0.86, 0.30, 1.06)), Reach(45.9, 0.5, (0.85, 0.22, 0.98)),
     Reach(47.3, 0.9, LOOK, "chest"),
-    Reach(48.6, 0.7, (0.85, 0.28, 1.05)), Reach(50.3, 0.8, READY, "chest"), Reach(52.2, 1.2, REST, "chest"),
+    Reach(48.6, 0.7, (0.85, 0.28, 1.05)), Reach(50.3, 0.8, READY, "chest"), Reach(53.4, 1.2, REST, "chest"),
 )  # fmt: skip
 LEFT = (
     Reach(5.0, 1.3, LOOK, "chest"),
     Reach(8.6, 1.0, READY, "chest"), Reach(11.0, 1.0, LOOK, "chest"),
-    Reach(13.1, 0.85, (0.87, -0.20, 1.12)), Reach(14.3, 0.5, (0.86, -0.14, 1.06)), Reach(15.4, 0.85, READY, "chest"),
+    Reach(13.1, 0.85, (0.89, -0.20, 1.12)), Reach(14.3, 0.5, (0.86, -0.14, 1.06)), Reach(15.4, 0.85, READY, "chest"),
     Reach(17.2, 1.1, (0.86, -0.02, 1.00)), Reach(19.3, 0.6, (0.86, 0.04, 1.05)), Reach(20.6, 0.5, (0.87, -0.04, 0.99)),
     Reach(21.8, 1.0, LOOK, "chest"), Reach(23.4, 1.0, REST, "chest"), Reach(25.4, 1.2, READY, "chest"),
     Reach(28.2, 1.0, LOOK, "chest"),
-    Reach(30.8, 0.75, (0.87, -0.16, 1.12)), Reach(32.2, 0.45, (0.86, -0.10, 1.05)), Reach(33.2, 0.8, READY, "chest"),
+    Reach(30.8, 0.75, (0.89, -0.16, 1.12)), Reach(32.2, 0.45, (0.86, -0.10, 1.05)), Reach(33.2, 0.8, READY, "chest"),
     Reach(35.4, 0.9, REST, "chest"), Reach(38.0, 0.9, (1.62, 0.78, 0.98)), Reach(39.8, 1.0, READY, "chest"),
     Reach(42.9, 1.0, (0.86, 0.00, 1.00)), Reach(44.9, 0.55, (0.86, -0.08, 1.06)), Reach(47.4, 0.9, READY, "chest"),
-    Reach(50.4, 0.9, LOOK, "chest"), Reach(52.4, 1.2, REST, "chest"),
+    Reach(50.4, 0.9, LOOK, "chest"), Reach(53.6, 1.2, REST, "chest"),
 )  # fmt: skip
 
 

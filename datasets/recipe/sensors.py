@@ -74,8 +74,8 @@ def observe(sensor: Sensor, t_s: Floats, points_m: Floats, rng: np.random.Genera
     sigma = np.array([1.0, 1.0, sensor.along])
     white = rng.standard_normal(true.shape) * sensor.white_m
     slow = _correlated(t_s, true.shape[1:], sensor.slow_s, rng) * sensor.slow_m
-    pulled = _correlated(t_s, true.shape[1:], 0.7, rng) * 0.03
-    pulled += 0.35 * (true[:, list(SPINE)].mean(axis=1, keepdims=True) - true) * np.array([0.25, 0.1, 0.5])
+    pulled = _correlated(t_s, true.shape[1:], 0.7, rng) * 0.02
+    pulled += 0.20 * (true[:, list(SPINE)].mean(axis=1, keepdims=True) - true) * np.array([0.25, 0.1, 0.5])
     seen = true + (white + slow) * loud[:, :, None] * sigma + pulled * hidden_for_long[:, :, None]
     confidence = np.where(hidden, 0.5, 1.0)
     _lose(sensor, seen, confidence, rng)
@@ -87,7 +87,7 @@ def _loudness(t_s: Floats, true: Floats, hidden: Floats, rng: np.random.Generato
     depth = np.maximum(true[:, :, 2], 0.8)
     dt = np.gradient(t_s)[:, None]
     speed = np.linalg.norm(np.gradient(true, axis=0), axis=2) / dt
-    loud = HARD * (depth / 2.5) ** 2 * (1.0 + 0.35 * np.minimum(speed, 2.0)) * (1.0 + 0.8 * hidden)
+    loud = HARD * (depth / 2.5) ** 2 * (1.0 + 0.2 * np.minimum(speed, 2.0)) * (1.0 + 0.5 * hidden)
     start = t_s[0]
     while (start := start + rng.uniform(2.5, 7.0)) < t_s[-1]:
         loud[(t_s >= start) & (t_s < start + rng.uniform(0.25, 0.7))] *= 3.0  # interference
@@ -131,15 +131,17 @@ def _correlated(t_s: Floats, shape: tuple[int, ...], memory_s: float, rng: np.ra
     return noise
 
 
-def swap_arms(view: View, rows: Ints) -> None:
-    """Takes one arm for the other in these rows, as sure as ever."""
+def swap_arms(view: View, rows: Ints, *, from_shoulder: bool) -> None:
+    """Takes one arm for the other in these rows, from the shoulder or from the elbow on, as sure as ever."""
+    right, left = (np.array(arm if from_shoulder else arm[1:]) for arm in (RIGHT_ARM, LEFT_ARM))
     for values in (view.points_m, view.confidence):
         picked = values[rows].copy()
-        values[np.ix_(rows, np.array(RIGHT_ARM))] = picked[:, list(LEFT_ARM)]
-        values[np.ix_(rows, np.array(LEFT_ARM))] = picked[:, list(RIGHT_ARM)]
+        values[np.ix_(rows, right)] = picked[:, left]
+        values[np.ix_(rows, left)] = picked[:, right]
 
 
 def jump(view: View, rows: Ints, points: tuple[int, ...], by_m: Floats, confidence: float) -> None:
-    """Puts points elsewhere in these rows."""
-    view.points_m[np.ix_(rows, np.array(points))] += by_m
-    view.confidence[np.ix_(rows, np.array(points))] *= confidence
+    """Puts points elsewhere in these rows, at most this sure of them."""
+    where = np.ix_(rows, np.array(points))
+    view.points_m[where] += by_m
+    view.confidence[where] = np.minimum(view.confidence[where], confidence)

@@ -134,7 +134,7 @@ def _arm(
     wrist = shoulder + axis * reach[:, None]
 
     along = (UPPER_ARM_M**2 - FOREARM_M**2 + reach**2) / (2.0 * reach)
-    out = turn(trunk.R_chest, (-0.60, s * (0.40 + sway(t_s, rng, 0.07, 0.05, 0.4)), -0.55))
+    out = turn(trunk.R_chest, (-0.60, s * (0.30 + sway(t_s, rng, 0.07, 0.05, 0.4)), -0.55))
     out = unit(out - np.sum(out * axis, axis=1, keepdims=True) * axis)
     elbow = shoulder + axis * along[:, None] + out * np.sqrt(UPPER_ARM_M**2 - along**2)[:, None]
     flex = turn(trunk.R_chest, (0.05, 0.0, -0.25 + sway(t_s, rng, 0.12, 0.1, 0.7)))
