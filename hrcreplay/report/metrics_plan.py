@@ -44,6 +44,13 @@ def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -
     return near, stands & wanted
 
 
+def is_moving(motion: pd.DataFrame, slow_m_per_s: float) -> Bools:
+    """(n,) ticks at which the robot moves: its TCP, or any joint at 1 mrad/s, for a link can sweep past a still TCP."""
+    joints = [name for name in motion.columns if name.startswith("dq")]
+    turning = (np.abs(motion[joints].to_numpy(dtype=float)) >= 1e-3).any(axis=1)
+    return np.asarray((numbers(motion, "tcp_speed") >= slow_m_per_s) | turning)
+
+
 def path_feet(points: Floats, path: Floats) -> Floats:
     """(n, 3) for each of (n, 3) points the nearest one of a (m, 3) polyline, all in one frame [m].
 
@@ -130,7 +137,7 @@ def add_plan(
 
 def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
     status = motion["status"].astype(str).to_numpy()
-    moving = numbers(motion, "tcp_speed") >= slow
+    moving = is_moving(motion, slow)
     braking = status == "braking"
     metrics.add(f"{prefix}_ticks", len(motion), "1", f"ticks of {what}")
     for name in STATUSES:
@@ -144,20 +151,23 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
             f"{prefix}_braking_share_{slug}", share, "1", f"share of all ticks of {what} that braked because: {reason}"
         )
     metrics.add(
-        f"{prefix}_moving_ticks", int(moving.sum()), "1", f"ticks of {what} with the TCP at or over {slow:g} m/s"
+        f"{prefix}_moving_ticks",
+        int(moving.sum()),
+        "1",
+        f"ticks of {what} with the robot moving: its TCP at {slow:g} m/s or more, or a joint at 0.001 rad/s",
     )
     metrics.add(
         f"{prefix}_braking_moving_ticks",
         int((braking & moving).sum()),
         "1",
-        f"ticks of {what} in braking with the TCP still at or over {slow:g} m/s: inequality (2) may not hold there",
+        f"ticks of {what} in braking with the robot still moving: inequality (2) may not hold there",
     )
     overlap = numbers(motion, "distance_m") <= 0.0
     metrics.add(
         f"{prefix}_contact_moving_ticks",
         int((overlap & moving).sum()),
         "1",
-        f"ticks of {what} with the TCP at or over {slow:g} m/s while a link touched a swept volume",
+        f"ticks of {what} with the robot moving while a link touched a swept volume",
     )
     closest = numbers(motion, "distance_m")[braking & moving]
     closest = closest[np.isfinite(closest)]
@@ -166,7 +176,7 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
         float(closest.min()) if len(closest) else None,
         "m",
         f"smallest separation from the swept volumes at such braking ticks of {what}",
-        reason="no braking tick with a moving TCP and a known separation",
+        reason="no braking tick with a moving robot and a known separation",
     )
 
 
@@ -188,13 +198,13 @@ def _add_separation(metrics: MetricTable, prefix: str, motion: pd.DataFrame, wha
     for part in ("limb", "link"):
         found = None if k is None or pd.isna(motion[part].iloc[k]) else str(motion[part].iloc[k])
         metrics.add(f"{name}_min_{part}", found, "name", f"the {part} of that pair", reason=reason)
-    moving = distance[known & (numbers(motion, "tcp_speed") >= slow)]
+    moving = distance[known & is_moving(motion, slow)]
     metrics.add(
         f"{name}_min_moving_m",
         float(moving.min()) if len(moving) else None,
         "m",
-        f"smallest separation at ticks of {what} with the TCP at or over {slow:g} m/s",
-        reason="the TCP never moved at a known separation",
+        f"smallest separation at ticks of {what} with the robot moving",
+        reason="the robot never moved at a known separation",
     )
     metrics.add(f"{name}_unknown_ticks", int((~known).sum()), "1", f"ticks of {what} without a separation")
 

@@ -37,7 +37,7 @@ def draw(run: Run, folder: Path, *, volumes: bool = True) -> set[str]:
 
 
 def test_the_same_run_draws_the_same_bytes(tmp_path: Path) -> None:
-    run = make_run(8.0)
+    run = make_run(5.0)
     for folder in ("a", "b"):
         assert draw(run, tmp_path / folder) == ALL
     files = sorted(p.name for p in (tmp_path / "a").iterdir())

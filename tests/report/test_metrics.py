@@ -181,6 +181,14 @@ def test_status_and_separation(run: Run, found: dict[str, dict[str, Any]]) -> No
     assert found["plan_braking_moving_separation_min_m"]["value"] == late["distance_m"].min()
 
 
+def test_a_joint_that_turns_about_a_still_tcp_is_a_moving_robot(run: Run) -> None:
+    assert run.motion is not None
+    still = run.motion.assign(tcp_speed=0.0, dq1=0.0, dq2=np.where(np.arange(len(run.motion)) < 7, -0.01, 0.0))
+    found = metrics_of(dataclasses.replace(run, motion=still))
+    assert found["plan_moving_ticks"]["value"] == 7
+    assert found["plan_braking_moving_ticks"]["value"] == 7  # the first half second brakes
+
+
 def test_no_separation_at_all_is_null(run: Run) -> None:
     assert run.motion is not None
     found = metrics_of(dataclasses.replace(run, motion=run.motion.assign(distance_m=np.nan, limb=None)))
