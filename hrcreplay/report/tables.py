@@ -66,7 +66,7 @@ def _bound(value: float, kind: str) -> str:
     if np.isinf(value):
         return "\u221e" if value > 0 else "\u2212\u221e"
     sign = "\u2212" if value < 0 else ""
-    share = Fraction(abs(value) / np.pi).limit_denominator(40)
+    share = Fraction(abs(value) / np.pi).limit_denominator(20)
     if kind == "angle" and share and abs(float(share) * np.pi - abs(value)) < 1e-9:
         top = "\u03c0" if share.numerator == 1 else f"{share.numerator}\u03c0"
         return sign + (top if share.denominator == 1 else f"{top}/{share.denominator}")
