@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from mcap.reader import make_reader
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import CameraFrames
@@ -138,3 +140,16 @@ def test_folder_that_is_not_there(tmp_path: Path) -> None:
 def test_camera_names_that_make_no_topic(tmp_path: Path, name: str) -> None:
     with LogWriter(tmp_path / "a.mcap") as writer, pytest.raises(SettingsError, match="camera"):
         writer.camera(name)
+
+
+def test_generated_messages_are_those_of_the_schema() -> None:
+    text = Path(pb.__file__).with_name("skeleton.proto").read_text()
+    told = {
+        name: re.findall(r"(\w+) = (\d+);", body)
+        for name, body in re.findall(r"message (\w+) {(.*?)\n}", text, re.DOTALL)
+    }
+    made = {
+        name: [(field.name, str(field.number)) for field in message.fields]
+        for name, message in pb.DESCRIPTOR.message_types_by_name.items()
+    }
+    assert made == told
