@@ -53,6 +53,7 @@ class Rules(NamedTuple):
     memory_ns: int
     coast_ns: int
     rest_s: float
+    rest_std: Floats  #: (12, 3) of v, a, j of a joint nobody has seen for long
     p_min: Floats
     p_max: Floats
     v_min: Floats

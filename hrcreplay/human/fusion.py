@@ -10,6 +10,7 @@ import numpy as np
 
 from hrcreplay.human.filter import Filter, Frames, Rules, Track
 from hrcreplay.human.fusion_kernel import run
+from hrcreplay.human.kalman import process_variance
 from hrcreplay.human.model import LimitSet
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, HumanStates, Ints, Measurements
 
@@ -21,8 +22,11 @@ _NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2)
 #: Median man (upper arm 0.36 m, shoulders at 1.44 m), and how wrong that may be [m].
 _LENGTHS_M = (0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
 _LENGTHS_STD_M = 0.1
+#: How fast a joint may be moving that nobody sees: v, a, j of x and y [m/s...], of an angle [rad/s...].
+_REST_STD = np.array([[0.5, 3.0, 30.0]] * 2 + [[1.0, 10.0, 100.0]] * 10)
 
 FusionState = Filter
+Sigmas = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -34,8 +38,8 @@ class FusionSettings:
     delay_max_s: float = 0.25  #: an older frame counts as this old [s]
     confidence_min: float = 0.2  #: least product of the confidences of the points an angle is computed from
     outlier_m: float = 0.30  #: a point further than this from the predicted skeleton is an outlier [m]
-    sigma_position: float = 100.0  #: the four sigmas of x and y in Eq. (44) [m/s^4]
-    sigma_angle: float = 500.0  #: the four sigmas of the angles in Eq. (44) [rad/s^4]
+    sigma_position: Sigmas = (0.0, 100.0, 0.0, 0.0)  #: of x and y in Eq. (44): p, v, a, j [m/s^2, /s^2.5, /s^3, /s^3.5]
+    sigma_angle: Sigmas = (0.0, 200.0, 0.0, 0.0)  #: of the angles in Eq. (44) [rad, likewise]
     coast_s: float = 0.1  #: a joint without a valid row for longer comes to rest [s]
     memory_s: float = (
         0.5  #: a joint or point without a valid row for longer is lost: the next one is taken as it is [s]
@@ -56,7 +60,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
     mean, cov = np.zeros((12, 4)), np.zeros((12, 4, 4))
     mean[:, 0] = _NEUTRAL
     for j in range(12):
-        cov[j] = np.diag([_NEUTRAL_STD[j], *((1.0, 5.0, 50.0) if j < 2 else (3.0, 30.0, 300.0))]) ** 2
+        cov[j] = np.diag([_NEUTRAL_STD[j], *_REST_STD[j]]) ** 2
     return Filter(
         tick_ns=np.full(1, _NEVER_NS),
         started=np.zeros(1, dtype=np.bool_),
@@ -112,6 +116,15 @@ def fuse_traced(
     return _fuse(state, ticks_ns, measurements, settings, limits, traced=True)
 
 
+def process_noise(settings: FusionSettings, j: int, dt: float, damping: float) -> Floats:
+    """Diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds."""
+    return process_variance(dt, damping, _sigma(settings)[j], _REST_STD[j])
+
+
+def _sigma(settings: FusionSettings) -> Floats:
+    return np.array([settings.sigma_position] * 2 + [settings.sigma_angle] * 10)
+
+
 def _fuse(
     state: FusionState,
     ticks_ns: Ints,
@@ -158,10 +171,8 @@ def _frames(measurements: Measurements) -> Frames:
 
 
 def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
-    sigma = np.full((12, 4), settings.sigma_angle)
-    sigma[:2] = settings.sigma_position
     return Rules(
-        sigma=sigma,
+        sigma=_sigma(settings),
         reuse=settings.stale == "reuse",
         compensate=settings.delay == "compensate",
         delay_max_s=settings.delay_max_s,
@@ -170,6 +181,7 @@ def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
         memory_ns=round(settings.memory_s * 1e9),
         coast_ns=round(settings.coast_s * 1e9),
         rest_s=0.5 * settings.coast_s,
+        rest_std=_REST_STD,
         p_min=limits.p_min,
         p_max=limits.p_max,
         v_min=limits.v_min,

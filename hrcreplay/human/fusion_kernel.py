@@ -16,8 +16,6 @@ from hrcreplay.records import Floats, Ints
 
 #: A name of an arm is kept until the other is better by this [rad].
 _NAME_MARGIN = np.radians(10.0)
-#: Standard deviations of derivatives before anything is known of them: x and y, angles [../s, ../s^2, ../s^3].
-_PRIOR_STD = np.array([[1.0, 5.0, 50.0], [3.0, 30.0, 300.0]])
 
 
 @njit(cache=True)
@@ -53,7 +51,7 @@ def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
     dt = (now - filter_.tick_ns[0]) * 1e-9
     for j in range(12):
         damping[j] = np.exp(-dt / rules.rest_s) if now - filter_.row_ns[j] > rules.coast_ns else 1.0
-        predict(filter_.mean[j], filter_.cov[j], dt, damping[j], rules.sigma[j])
+        predict(filter_.mean[j], filter_.cov[j], dt, damping[j], rules.sigma[j], rules.rest_std[j])
 
 
 @njit(cache=True)
@@ -99,7 +97,7 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
             filter_.lengths[row - 12] += gain * (z[row] - filter_.lengths[row - 12])
             filter_.lengths_var[row - 12] *= 1.0 - gain
         elif now - filter_.row_ns[row] > rules.memory_ns:
-            _acquire(filter_, row, z[row], R)
+            _acquire(filter_, row, z[row], R, rules.rest_std[row])
             track.reacquired[0] += 1
         else:
             correct(filter_.mean[row], filter_.cov[row], h, z[row], R)
@@ -136,14 +134,14 @@ def _start(filter_: Filter, c: int) -> None:
 
 
 @njit(cache=True)
-def _acquire(filter_: Filter, j: int, z: float, R: float) -> None:
+def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> None:
     """A joint seen for the first time, or for the first time after it was lost: nothing old is carried over."""
     filter_.mean[j] = 0.0
     filter_.mean[j, 0] = z
     filter_.cov[j] = 0.0
     filter_.cov[j, 0, 0] = R
     for k in range(3):
-        filter_.cov[j, k + 1, k + 1] = _PRIOR_STD[0 if j < 2 else 1, k] ** 2
+        filter_.cov[j, k + 1, k + 1] = rest_std[k] ** 2
 
 
 @njit(cache=True)

@@ -9,16 +9,21 @@ from hrcreplay.records import Floats
 
 
 @njit(cache=True)
-def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats) -> None:
-    """Eq. (48), (49) over dt seconds, mean (4,) and P (4, 4) in place."""
+def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> None:
+    """Eq. (48), (49) over dt seconds, mean (4,) and P (4, 4) in place.
+
+    With a damping below 1 the derivatives also forget: towards rest, give or take ``rest_std`` (3,).
+    """
     F, FP = np.zeros((4, 4)), np.empty((4, 4))
-    _transition(dt, damping, F)
+    transition(dt, damping, F)
     mean[:] = _times(F, mean)
     for b in range(4):
         FP[:, b] = _times(F, P[:, b])
     for a in range(4):
         P[a] = _times(F, FP[a])
-    _add_process_noise(dt, sigma, P)
+    noise = process_variance(dt, damping, sigma, rest_std)
+    for a in range(4):
+        P[a, a] += noise[a]
 
 
 @njit(cache=True)
@@ -36,7 +41,7 @@ def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> None:
 
 
 @njit(cache=True)
-def _transition(dt: float, damping: float, F: Floats) -> None:
+def transition(dt: float, damping: float, F: Floats) -> None:
     """F of Eq. (43) for one joint, its derivatives damped."""
     powers = (1.0, dt, dt**2 / 2.0, dt**3 / 6.0)
     for a in range(4):
@@ -45,12 +50,11 @@ def _transition(dt: float, damping: float, F: Floats) -> None:
 
 
 @njit(cache=True)
-def _add_process_noise(dt: float, sigma: Floats, P: Floats) -> None:
-    """G of Eq. (44), corrected, for one joint."""
-    P[0, 0] += sigma[0] ** 2 * dt**4 / 24.0
-    P[1, 1] += sigma[1] ** 2 * dt**3 / 6.0
-    P[2, 2] += sigma[2] ** 2 * dt**2 / 2.0
-    P[3, 3] += sigma[3] ** 2 * dt
+def process_variance(dt: float, damping: float, sigma: Floats, rest_std: Floats) -> Floats:
+    """Diagonal (4,) of G of Eq. (44), corrected, for one joint; with a damping, also of what is forgotten."""
+    variance = sigma**2 * np.array([dt**4 / 24.0, dt**3 / 6.0, dt**2 / 2.0, dt])
+    variance[1:] += (1.0 - damping**2) * rest_std**2
+    return variance
 
 
 @njit(cache=True)

@@ -35,9 +35,9 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
                 agrees = agrees and trusted[k]
         blind = 2 <= row < 12 and filter_.z_var[c, row] > _BLIND_STD**2
         filter_.valid[c, row] = agrees and not blind and product >= rules.confidence_min
-    for k in _TESTED:
-        if trusted[k] and confidence[k] >= rules.confidence_min and np.isfinite(points[k, 0]):
-            filter_.point_ns[k] = now
+    for point in _TESTED:
+        if trusted[point] and confidence[point] >= rules.confidence_min and np.isfinite(points[point, 0]):
+            filter_.point_ns[point] = now
 
 
 @njit(cache=True)
