@@ -18,8 +18,8 @@ class Header:
     cameras: tuple[str, ...]
     T_world_camera: dict[str, Floats]  #: (4, 4); only of the cameras whose extrinsics are in the log
     task: dict[str, Any] | None  #: programmed task in the log, of the same structure as a task file
-    start_ns: int  #: first arrival
-    end_ns: int  #: last arrival
+    start_ns: int  #: first arrival of a skeleton, joint state or truth; of anything where there are none
+    end_ns: int  #: last arrival of anything
     T_world_base: Floats | None  #: (4, 4) robot base, where the log knows it
     has_truth: bool
     joint_names: tuple[str, ...]  #: of the joint track; () where there is none

@@ -42,9 +42,7 @@ class Log:
         self._reading: Counter[str] = Counter()
         self._remarks: list[str] = []
         self._track: Counter[str] = Counter()
-        self.header = _header(
-            source, decoders, self._joints, has_truth=self._truth is not None, chosen=bool(options.topics)
-        )
+        self.header = _header(source, decoders, self._joints, self._truth, chosen=bool(options.topics))
 
     @property
     def defects(self) -> Counter[str]:
@@ -137,21 +135,26 @@ def open_log(path: Path, options: LogOptions = LogOptions(), *, skeletons: bool 
 
 
 def _header(
-    source: Source, decoders: list[Decoder], joints: JointTopic | None, *, has_truth: bool, chosen: bool
+    source: Source, decoders: list[Decoder], joints: JointTopic | None, truth: str | None, *, chosen: bool
 ) -> Header:
     known = tracks.latched(source)
     seen = [camera for decoder in decoders for camera in decoder.cameras]
     declared = [camera for camera in known.cameras if camera in seen or not chosen]  # one may be silent all along
     cameras = tuple(dict.fromkeys([*declared, *seen]))
+    # Not the first message of all: recorders stamp with zero what came before a simulation's clock.
+    used = (
+        [decoder.topic for decoder in decoders] + ([joints.topic.name] if joints else []) + ([truth] if truth else [])
+    )
+    first = next(source.messages(used), None)
     return Header(
         path=source.path,
         kind=source.kind,
         cameras=cameras,
         T_world_camera={camera: T for camera, T in known.T_world_camera.items() if camera in cameras},
         task=known.task,
-        start_ns=source.start_ns,
+        start_ns=first.arrival_ns if first else source.start_ns,
         end_ns=source.end_ns,
         T_world_base=known.T_world_base,
-        has_truth=has_truth,
+        has_truth=truth is not None,
         joint_names=joints.names if joints else (),
     )

@@ -193,6 +193,15 @@ def test_window_of_a_ros_bag(tmp_path: Path) -> None:
         np.testing.assert_array_equal(part.arrival_ns[2:], whole.arrival_ns[inside][2:])
 
 
+def test_messages_before_the_clock_do_not_stretch_the_span(tmp_path: Path) -> None:
+    with bag(tmp_path / "a.bag", "ros1") as (write, store):
+        write("/chatter", "std_msgs/msg/String", 0, make(store, "std_msgs/msg/String", data="hello"))
+        write_openni(write, store, frames=20, start_ns=BEGIN)
+    header = open_log(tmp_path / "a.bag").header
+    assert header.start_ns == BEGIN + 5_000_000
+    assert header.end_ns == BEGIN + 5_000_000 + 19 * 33_000_000 + 14 * 200_000
+
+
 # --- topics ---
 
 
