@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.records import POINTS, Bools, Floats, Ints, Table
 
@@ -25,6 +26,9 @@ _GAP_S = 0.1  # no interpolation across longer silences
 _SPEED_MAX = 4.0  # m/s: faster is a jump of the tracker, not the person
 _STARTS = 40  # frames whose own alignment is tried as the start
 _ITERATIONS = 60
+_INSTANTS = 5000  # at most, evenly spaced, at which the tracks are compared
+_LIKE = 0.1  # correlation of speeds that is no chance
+_COARSE = 1200  # and of these at most, while offsets are only searched
 
 
 @dataclass(frozen=True)
@@ -99,19 +103,25 @@ def register(a: Track, b: Track, *, search_s: float = 2.0) -> Registration | Non
         return None
     a, b = _without_jumps(a), _without_jumps(b)
     width_s = max(float(np.median(np.diff(a.t_ns))), float(np.median(np.diff(b.t_ns)))) * _NS
-    points_a, velocity_a, weight_a = _smoothed(a, a.t_ns, width_s)
-    offset_s = _coarse_offset(a, b, velocity_a, width_s, search_s)
-    points_b, _, weight_b = _smoothed(b, a.t_ns + round(offset_s / _NS), width_s)
+    t_ns = a.t_ns[:: -(-len(a) // _INSTANTS)]
+    points_a, velocity_a, weight_a = _smoothed(a, t_ns, width_s)
+    few = slice(None, None, -(-len(t_ns) // _COARSE))
+    offset_s, likeness = _coarse_offset(t_ns[few], velocity_a[few], b, width_s, search_s)
+    if likeness < _LIKE:  # nobody moved: the clocks cannot be compared, and a velocity of zero keeps them as they are
+        offset_s, velocity_a = 0.0, np.zeros_like(velocity_a)
+    points_b, _, weight_b = _smoothed(b, t_ns + round(offset_s / _NS), width_s)
     T = _start(points_a, points_b, np.sqrt(weight_a * weight_b))
     if T is None:
         return None
     step = np.full(7, np.inf)
     for _ in range(_ITERATIONS):
-        points_b, _, weight_b = _smoothed(b, a.t_ns + round(offset_s / _NS), width_s)
+        points_b, _, weight_b = _smoothed(b, t_ns + round(offset_s / _NS), width_s)
         weight = np.sqrt(weight_a * weight_b)
+        if not weight.any():
+            return None
         T, step = _gauss_newton(T, points_a, points_b, velocity_a, weight)
         offset_s += float(np.clip(step[6], -width_s, width_s))
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < 1e-6:
             break
     return Registration(T, offset_s)
 
@@ -173,13 +183,14 @@ def _smooth(
     n, m = len(t_ns), points.shape[1]
     value, slope, weight = np.zeros((n, m, 3)), np.zeros((n, m, 3)), np.zeros((n, m))
     reach = 3.0 * width_ns
+    y0, y1 = np.zeros(3), np.zeros(3)
     first = 0
     for i in range(n):
         while first < len(t_track) and t_track[first] < t_ns[i] - reach:
             first += 1
         for k in range(m):
             s0 = s1 = s2 = mass = 0.0
-            y0, y1 = np.zeros(3), np.zeros(3)
+            y0[:], y1[:] = 0.0, 0.0
             j = first
             while j < len(t_track) and t_track[j] <= t_ns[i] + reach:
                 x = (t_track[j] - t_ns[i]) / width_ns
@@ -201,15 +212,15 @@ def _smooth(
     return value, slope, weight
 
 
-def _coarse_offset(a: Track, b: Track, velocity_a: Floats, width_s: float, search_s: float) -> float:
-    """Offset [s] at which the points' speeds agree best. Speeds do not depend on where the sensors stand."""
+def _coarse_offset(t_ns: Ints, velocity_a: Floats, b: Track, width_s: float, search_s: float) -> tuple[float, float]:
+    """Offset [s] at which the points' speeds correlate best, and how well; no pose of a sensor changes them."""
     speed_a = np.minimum(np.linalg.norm(velocity_a, axis=2), _SPEED_MAX)
     seen_a = speed_a > 0
     steps = int(np.ceil(search_s / width_s))
-    best, best_s = -np.inf, 0.0
+    best, best_s = 0.0, 0.0
     for step in sorted(range(-steps, steps + 1), key=abs):
         offset_s = step * width_s
-        _, velocity_b, _ = _smoothed(b, a.t_ns + round(offset_s / _NS), width_s)
+        _, velocity_b, _ = _smoothed(b, t_ns + round(offset_s / _NS), width_s)
         speed_b = np.minimum(np.linalg.norm(velocity_b, axis=2), _SPEED_MAX)
         both = seen_a & (speed_b > 0)
         if both.sum() < 20 * len(POINTS):
@@ -218,7 +229,7 @@ def _coarse_offset(a: Track, b: Track, velocity_a: Floats, width_s: float, searc
         likeness = float(x @ y / np.sqrt((x @ x) * (y @ y)))
         if likeness > best:
             best, best_s = likeness, offset_s
-    return best_s
+    return best_s, best
 
 
 def _start(points_a: Floats, points_b: Floats, weight: Floats) -> Floats | None:
@@ -275,16 +286,6 @@ def _gauss_newton(
     AtW = (A * w[:, None, None]).reshape(-1, 7).T
     flat = A.reshape(-1, 7)
     step = np.linalg.lstsq(AtW @ flat, AtW @ left.reshape(-1), rcond=1e-12)[0]
-    R = _rotation(step[:3])
+    R = Rotation.from_rotvec(step[:3]).as_matrix()
     moved = rigid(R, middle + step[3:6] - R @ middle)
     return moved @ T, step
-
-
-def _rotation(vector: Floats) -> Floats:
-    """Rotation matrix of a rotation vector (3,) [rad]."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)

@@ -94,6 +94,17 @@ def test_register_of_nothing_in_common_is_none() -> None:
     assert register(a, a.rows(slice(0, 2))) is None
 
 
+def test_clocks_are_left_alone_where_nobody_moves() -> None:
+    rng = np.random.default_rng(8)
+    person = walker(10.0)
+    still = np.broadcast_to(person.points_m[0], person.points_m.shape)
+    a, b = (Track(person.t_ns, still + rng.normal(0, 0.01, still.shape), person.confidence) for _ in range(2))
+    found = register(a, b)
+    assert found is not None
+    assert found.offset_s == 0.0
+    np.testing.assert_allclose(found.T_a_b, np.eye(4), atol=5e-3)
+
+
 def test_register_takes_missing_points() -> None:
     a = walker(8.0)
     points = a.points_m.copy()
