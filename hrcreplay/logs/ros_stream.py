@@ -10,7 +10,7 @@ from typing import Any
 
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection, MessageDefinitionFormat
-from zstandard import ZstdDecompressor
+from zstandard import ZstdDecompressor, ZstdError
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs import rostypes
@@ -18,6 +18,7 @@ from hrcreplay.logs.bag_recovery import RecoveredBag
 from hrcreplay.logs.messages import Message, Stream, Topic
 
 _NO_INDEX = (rosbag1.ReaderError, AssertionError, struct.error, ValueError, IndexError)
+_BROKEN = (*_NO_INDEX, rosbag2.ReaderError, ZstdError, RuntimeError, OSError)  # the last two: lz4's, bz2's
 
 
 def open_bag(path: Path) -> Stream:
@@ -77,7 +78,7 @@ class RosStream:
                     return
                 for c, arrival_ns, data in opened.messages(wanted, start_ns, end_ns):
                     yield Message(arrival_ns, self._topics[(c.topic, c.msgtype)], self._unpack(data))
-        except (rosbag1.ReaderError, rosbag2.ReaderError) as error:
+        except _BROKEN as error:
             raise LogError(f"{self._path}: broken in the middle ({error}); copy it again") from error
 
 

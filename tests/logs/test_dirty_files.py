@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
+from rosbags import rosbag1
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs.reader import open_log
@@ -173,3 +174,15 @@ def test_bag_that_breaks_off_at_once(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:4300])
     with pytest.raises(LogError, match="the log holds no messages that are whole"):
         open_log(path)
+
+
+@pytest.mark.parametrize("form", list(rosbag1.Writer.CompressionFormat))
+def test_bag_with_a_damaged_chunk(tmp_path: Path, form: rosbag1.Writer.CompressionFormat) -> None:
+    path = tmp_path / "a.bag"
+    with bag(path, "ros1", compression=(form,)) as (write, store):
+        write_openni(write, store, frames=600, start_ns=BEGIN)
+    data = bytearray(path.read_bytes())
+    data[5000:6000] = b"\xff" * 1000
+    path.write_bytes(data)
+    with pytest.raises(LogError, match=r"a\.bag: (broken in the middle|the log holds no messages that are whole)"):
+        list(open_log(path).frames())
