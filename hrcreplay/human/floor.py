@@ -39,6 +39,7 @@ def up_direction(track: Track) -> tuple[Floats, float] | None:
         where neither was seen long enough.
     """
     neck, pelvis = _point(track, "neck"), _point(track, "pelvis")
+    neck = np.where(np.isfinite(neck), neck, 0.5 * (_point(track, "shoulder_l") + _point(track, "shoulder_r")))
     knee, ankle, foot = (0.5 * (_point(track, f"{name}_l") + _point(track, f"{name}_r")) for name in _LEG)
     bones = _length(neck - pelvis) + _length(pelvis - knee) + _length(knee - ankle)
     upright = _length(neck - ankle) > _UPRIGHT * bones

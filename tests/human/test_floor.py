@@ -47,6 +47,7 @@ def test_sitting_person_gives_up_by_the_trunk() -> None:
     points = person.points_m.copy()
     for name in ("knee_l", "knee_r", "ankle_l", "ankle_r", "foot_l", "foot_r"):
         points[:, POINTS.index(name)] = np.nan
+    points[::2, POINTS.index("neck")] = np.nan  # the middle of the shoulders stands in
     up = up_direction(Track(person.t_ns, points, person.confidence))
     assert up is not None
     np.testing.assert_allclose(up[0], [0, 0, 1], atol=1e-9)
