@@ -14,7 +14,7 @@ KINECT = Sensor(
     T_world_camera=scene.T_WORLD_KINECT,
     half_view_rad=(np.radians(35.3), np.radians(30.0)),
     range_m=4.5,
-    white_m=0.0095,
+    white_m=0.0100,
     slow_m=0.002,
     slow_s=0.15,
     along=1.3,
@@ -27,7 +27,7 @@ XTION = Sensor(
     T_world_camera=scene.T_WORLD_XTION,
     half_view_rad=(np.radians(29.0), np.radians(22.5)),
     range_m=4.0,
-    white_m=0.0105,
+    white_m=0.0085,
     slow_m=0.003,
     slow_s=0.20,
     along=1.5,
@@ -93,12 +93,12 @@ def _colleague(when_s: Floats, t_s: Floats, points_m: Floats) -> Floats:
 
 def _spoil(view: View, rng: np.random.Generator) -> None:
     """Gross errors: arms taken for each other and limbs that jump, some of them at full confidence."""
-    last = len(view.t_s) - 10
+    soonest, last = 60, len(view.t_s) - 60  # nobody can tell when the person has only just appeared
     for k in range(4):
-        first = int(rng.integers(last))
+        first = int(rng.integers(soonest, last))
         swap_arms(view, np.arange(first, first + rng.integers(2, 5)), from_shoulder=k % 2 == 0)
     for k in range(20):
-        first = int(rng.integers(last))
+        first = int(rng.integers(soonest, last))
         arm = (RIGHT_ARM, LEFT_ARM)[k % 2]
         by_m = rng.normal(0.0, 1.0, 3)
         by_m *= rng.uniform(0.25, 0.6) / np.linalg.norm(by_m)
