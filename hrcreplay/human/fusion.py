@@ -23,7 +23,7 @@ _NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2)
 _LENGTHS_M = (0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
 _LENGTHS_STD_M = 0.1
 #: How fast a joint may be moving that nobody sees: v, a, j of x and y [m/s...], of an angle [rad/s...].
-_REST_STD = np.array([[0.5, 3.0, 30.0]] * 2 + [[1.0, 10.0, 100.0]] * 10)
+_REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10)
 
 FusionState = Filter
 Sigmas = tuple[float, float, float, float]
@@ -37,10 +37,15 @@ class FusionSettings:
     delay: Literal["compensate", "ignore"] = "compensate"  #: relate a frame to its capture time, or to the tick
     delay_max_s: float = 0.25  #: an older frame counts as this old [s]
     confidence_min: float = 0.2  #: least product of the confidences of the points an angle is computed from
-    outlier_m: float = 0.30  #: a point further than this from the predicted skeleton is an outlier [m]
-    sigma_position: Sigmas = (0.0, 100.0, 0.0, 0.0)  #: of x and y in Eq. (44): p, v, a, j [m/s^2, /s^2.5, /s^3, /s^3.5]
-    sigma_angle: Sigmas = (0.0, 200.0, 0.0, 0.0)  #: of the angles in Eq. (44) [rad, likewise]
-    coast_s: float = 0.1  #: a joint without a valid row for longer comes to rest [s]
+    outlier_m: float = 0.20  #: a point further than this from the predicted skeleton is an outlier [m]
+    sigma_position: Sigmas = (
+        300.0,
+        100.0,
+        5.0,
+        1.0,
+    )  #: of x and y in Eq. (44): p, v, a, j [m/s^2, /s^2.5, /s^3, /s^3.5]
+    sigma_angle: Sigmas = (1500.0, 600.0, 10.0, 1.0)  #: of the angles in Eq. (44) [rad, likewise]
+    coast_s: float = 0.12  #: a joint without a valid row for longer comes to rest [s]
     memory_s: float = (
         0.5  #: a joint or point without a valid row for longer is lost: the next one is taken as it is [s]
     )
@@ -180,7 +185,7 @@ def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
         outlier_m=settings.outlier_m,
         memory_ns=round(settings.memory_s * 1e9),
         coast_ns=round(settings.coast_s * 1e9),
-        rest_s=0.5 * settings.coast_s,
+        rest_s=0.3 * settings.coast_s,
         rest_std=_REST_STD,
         p_min=limits.p_min,
         p_max=limits.p_max,
