@@ -123,7 +123,8 @@ def fuse_traced(
 
 def process_noise(settings: FusionSettings, j: int, dt: float, damping: float) -> Floats:
     """Diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds."""
-    return process_variance(dt, damping, _sigma(settings)[j], _REST_STD[j])
+    sigma = _sigma(settings)[j]
+    return np.array([process_variance(a, dt, damping, sigma, _REST_STD[j]) for a in range(4)])
 
 
 def _sigma(settings: FusionSettings) -> Floats:

@@ -12,18 +12,30 @@ from hrcreplay.records import Floats
 def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> None:
     """Eq. (48), (49) over dt seconds, mean (4,) and P (4, 4) in place.
 
-    With a damping below 1 the derivatives also forget: towards rest, give or take ``rest_std`` (3,).
+    F is upper triangular, so that each row is done before the rows it needs change. With a damping below 1 the
+    derivatives also forget: towards rest, give or take ``rest_std`` (3,).
     """
-    F, FP = np.zeros((4, 4)), np.empty((4, 4))
-    transition(dt, damping, F)
-    mean[:] = _times(F, mean)
-    for b in range(4):
-        FP[:, b] = _times(F, P[:, b])
+    taylor = (1.0, dt, dt**2 / 2.0, dt**3 / 6.0)  # F of Eq. (43)
     for a in range(4):
-        P[a] = _times(F, FP[a])
-    noise = process_variance(dt, damping, sigma, rest_std)
+        kept = damping if a > 0 else 1.0
+        mean[a] = kept * _ahead(taylor, mean, a)
+        for b in range(4):
+            P[a, b] = kept * _ahead(taylor, P[:, b], a)
     for a in range(4):
-        P[a, a] += noise[a]
+        for b in range(a, 4):
+            P[a, b] = (damping if b > 0 else 1.0) * _ahead(taylor, P[a], b)
+            P[b, a] = P[a, b]
+    for a in range(4):
+        P[a, a] += process_variance(a, dt, damping, sigma, rest_std)
+
+
+@njit(cache=True)
+def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> float:
+    """Row a of F times x (4,)."""
+    total = x[a]
+    for k in range(a + 1, 4):
+        total += taylor[k - a] * x[k]
+    return total
 
 
 @njit(cache=True)
@@ -41,20 +53,11 @@ def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> None:
 
 
 @njit(cache=True)
-def transition(dt: float, damping: float, F: Floats) -> None:
-    """F of Eq. (43) for one joint, its derivatives damped."""
-    powers = (1.0, dt, dt**2 / 2.0, dt**3 / 6.0)
-    for a in range(4):
-        for b in range(a, 4):
-            F[a, b] = powers[b - a] * (damping if a > 0 else 1.0)
-
-
-@njit(cache=True)
-def process_variance(dt: float, damping: float, sigma: Floats, rest_std: Floats) -> Floats:
-    """Diagonal (4,) of G of Eq. (44), corrected, for one joint; with a damping, also of what is forgotten."""
-    variance = sigma**2 * np.array([dt**4 / 24.0, dt**3 / 6.0, dt**2 / 2.0, dt])
-    variance[1:] += (1.0 - damping**2) * rest_std**2
-    return variance
+def process_variance(a: int, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> float:
+    """Entry a of the diagonal of G of Eq. (44), corrected; with a damping, also of what is forgotten."""
+    remainder = (dt**4 / 24.0, dt**3 / 6.0, dt**2 / 2.0, dt)
+    forgotten = (1.0 - damping**2) * rest_std[a - 1] ** 2 if a > 0 else 0.0
+    return sigma[a] ** 2 * remainder[a] + forgotten
 
 
 @njit(cache=True)
@@ -67,15 +70,3 @@ def ago(mean: Floats, d: float) -> Floats:
 def dot(a: Floats, b: Floats) -> float:
     """The scalar product of (4,) and (4,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-
-
-@njit(cache=True)
-def _times(F: Floats, x: Floats) -> Floats:
-    """F @ x for the upper triangular F of Eq. (43)."""
-    y = np.empty(4)
-    for a in range(4):
-        total = 0.0
-        for b in range(a, 4):
-            total += F[a, b] * x[b]
-        y[a] = total
-    return y

@@ -9,7 +9,6 @@ from filterpy.kalman import KalmanFilter
 
 from hrcreplay.human.branches import nearest
 from hrcreplay.human.fusion import FusionSettings, Trace, process_noise
-from hrcreplay.human.kalman import transition
 from hrcreplay.records import Floats, HumanStates
 
 #: Derivatives are smoothed in units of this time, where the four states have about the same size [s].
@@ -60,13 +59,20 @@ def _smooth_joint(
     scale = _UNIT_S ** np.arange(4.0)
     Fs, Qs = np.zeros_like(cov), np.zeros_like(cov)
     for k in range(1, len(dt)):
-        transition(dt[k], damping[k], Fs[k])
+        Fs[k] = _transition(dt[k], damping[k])
         Qs[k] = np.diag(process_noise(settings, j, dt[k], damping[k]))
     both = scale[:, None] * scale
     x, P, _, _ = KalmanFilter(4, 1).rts_smoother(
         mean * scale, cov * both, list(Fs * (scale[:, None] / scale)), list(Qs * both)
     )
     return x / scale, np.sqrt(np.stack([P[:, k, k] for k in range(2)], axis=1)) / scale[:2]
+
+
+def _transition(dt: float, damping: float) -> Floats:
+    """F of Eq. (43) for one joint, (4, 4), its derivatives damped."""
+    F = np.eye(4) + np.eye(4, k=1) * dt + np.eye(4, k=2) * dt**2 / 2.0 + np.eye(4, k=3) * dt**3 / 6.0
+    F[1:] *= damping
+    return F
 
 
 def _one_name(states: HumanStates, first: int) -> Floats:
