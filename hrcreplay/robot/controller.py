@@ -26,6 +26,12 @@ BINDING = 1e-7
 #: Rounds of solving and adding broken rows before the problem counts as unsolved.
 ROUNDS = 40
 
+#: The solver's initial penalties, tried in turn: the second finds some of the solutions that the first misses.
+PENALTIES = (1e-2, 1e-3)
+
+#: Norm below which a row is not scaled up: no link moves along it.
+TINY = 1e-9
+
 _dense = proxsuite.proxqp.dense
 _SOLVED = proxsuite.proxqp.QPSolverOutput.PROXQP_SOLVED
 
@@ -125,16 +131,24 @@ def _hopeless(rows: BoundedRows, task: Problem) -> bool:
 def _minimise(task: Problem, rows: BoundedRows) -> tuple[Floats, Floats] | Unsolved:
     """Minimiser over the axes' limits and some rows, and the rows' multipliers.
 
-    A fresh solver each time: what it returns depends on the problem alone, not on what it solved before.
+    A fresh solver each time: what it returns depends on the problem alone, not on what it solved before. Cost and
+    rows are scaled to 1, so that its tolerances mean the same in every pose.
     """
-    # of the two backends this one finds solutions where the other claims there are none
-    qp = _dense.QP(len(task.g), 0, len(rows.keys), True, _dense.HessianType.Dense, _dense.DenseBackend.PrimalLDLT)
-    qp.settings.initial_guess = proxsuite.proxqp.InitialGuess.NO_INITIAL_GUESS
-    qp.settings.eps_abs, qp.settings.eps_rel = 1e-12, 0.0
-    qp.settings.eps_primal_inf = 1e-9
-    qp.settings.max_iter = 300
-    qp.init(task.H, task.g, None, None, rows.A, rows.low, rows.high, task.low, task.high)
-    qp.solve()
-    if qp.results.info.status != _SOLVED:
-        return Unsolved(qp.results.info.status.name)
-    return np.clip(qp.results.x, task.low, task.high), qp.results.z[: len(rows.keys)]
+    cost, norms = 1.0 / task.H.diagonal().max(), 1.0 / np.maximum(np.linalg.norm(rows.A, axis=1), TINY)
+    H, g = task.H * cost, task.g * cost
+    A, low, high = rows.A * norms[:, None], rows.low * norms, rows.high * norms
+    status = ""
+    for penalty in PENALTIES:
+        qp = _dense.QP(len(g), 0, len(low), True, _dense.HessianType.Dense, _dense.DenseBackend.PrimalDualLDLT)
+        qp.settings.initial_guess = proxsuite.proxqp.InitialGuess.NO_INITIAL_GUESS
+        qp.settings.eps_abs, qp.settings.eps_rel = 1e-13, 0.0
+        qp.settings.eps_primal_inf = 1e-14  # at its default the solver gives up on problems that have a solution
+        qp.settings.max_iter = 200
+        qp.settings.default_rho = 1e-8  # well below the damping of the cost, or flat directions take forever
+        qp.settings.default_mu_in = penalty
+        qp.init(H, g, None, None, A, low, high, task.low, task.high)
+        qp.solve()
+        status = qp.results.info.status.name
+        if qp.results.info.status == _SOLVED:
+            return np.clip(qp.results.x, task.low, task.high), qp.results.z[: len(low)]
+    return Unsolved(status)

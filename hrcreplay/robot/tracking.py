@@ -13,7 +13,7 @@ from hrcreplay.robot.rotation import to_vector
 #: Weight on the squared joint velocities, relative to the mean curvature of the cost. It makes the minimiser unique
 #: where the paper's cost is flat (a stretched wrist: axes 4 and 6 turn against each other) and is too small to be
 #: seen anywhere else.
-DAMPING = 1e-8
+DAMPING = 1e-6
 
 
 def pose_error(T_world_tcp: Floats, T_world_ref: Floats) -> Floats:
