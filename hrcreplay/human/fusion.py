@@ -31,7 +31,13 @@ Sigmas = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class FusionSettings:
-    """Settings of the filter."""
+    """Settings of the filter.
+
+    The sigmas and ``coast_s`` are those with the least error against ground truth over a sweep on a recording with
+    two cameras of 25 and 30 Hz, 1-3 cm of noise and occlusions: the velocity's sigma dominates, since people reach and
+    rest, and a polynomial with a lively jerk overshoots at both ends. Ignoring delays has the smaller error there
+    while people stand, compensating them while they move; what matters for safety is the latter.
+    """
 
     stale: Literal["skip", "reuse"] = "skip"  #: use a frame once, or at every tick until the next, R growing (4.1.1)
     delay: Literal["compensate", "ignore"] = "compensate"  #: relate a frame to its capture time, or to the tick

@@ -98,7 +98,7 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
             filter_.lengths_var[row - 12] *= 1.0 - gain
         elif now - filter_.row_ns[row] > rules.memory_ns:
             _acquire(filter_, row, z[row], R, rules.rest_std[row])
-            track.reacquired[0] += 1
+            track.reacquired[0] += filter_.row_ns[row] >= 0  # the first time is no loss
         else:
             correct(filter_.mean[row], filter_.cov[row], h, z[row], R)
         if filter_.uses[c] == 1:
