@@ -17,7 +17,7 @@ RAD_PER_M = 2 * math.pi / 2.5
 def joint_bounds(
     q: Floats, dq: Floats, q_min: Floats, q_max: Floats, dq_max: Floats, ddq_max: Floats, dt_s: float
 ) -> tuple[Floats, Floats]:
-    """Next joint velocities that an axis can reach and still stop before its position limit, Eq. (66d)-(66f), corrected.
+    """Next velocities from which an axis can still stop before its position limit, Eq. (66d)-(66f), corrected.
 
     An axis at v that brakes by Eq. (67) travels S(v): the braking parabola v^2 / (2 u_max), sampled at whole steps
     v = n u_max dt and linear between them. A state with q + S(dq) <= q_max (and likewise below) is admissible; the

@@ -23,6 +23,9 @@ HELD = 1e-11
 #: Multiplier above which an approach row holds the robot back.
 BINDING = 1e-7
 
+#: Rows that this much of the present velocity breaks are among the first to be tried.
+AHEAD = 1.1
+
 #: Rounds of solving and adding broken rows before the problem counts as unsolved.
 ROUNDS = 40
 
@@ -107,6 +110,8 @@ def solve(task: Problem) -> Solution | Unsolved:
             return Unsolved("separation failed")
         if solved and not broken.keys:
             return Solution(w, held, rounds)
+        if not rounds:  # the rows that held the robot until now are likely to hold it again
+            broken = broken.joined(task.broken_rows(AHEAD * task.dq, HELD))
         before, rows = len(rows.keys), rows.joined(broken)
         if solved and len(rows.keys) == before:
             return Unsolved("residual")

@@ -53,6 +53,7 @@ class Problem:
     obstacles: Obstacles
     pairs: Separation  #: right-hand sides of Eq. (66i)
     stop_s: float  #: T_s [s]
+    dq: Floats  #: (nv,) at the tick [rad/s]
 
     def broken_rows(self, w: Floats, above: float) -> BoundedRows:
         """Limits of the TCP and, per pair and end of the link, the worst approach row that a velocity breaks.
@@ -104,4 +105,4 @@ def problem(
     )
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
     J_low, J_high = cartesian_bounds(J, dJdq, state.dq, settings.tcp_speed_max, settings.tcp_acceleration_max, dt_s)
-    return Problem(H, g, low, high, J_low, J_high, pose, obstacles, pairs, settings.stop_s)
+    return Problem(H, g, low, high, J_low, J_high, pose, obstacles, pairs, settings.stop_s, state.dq)

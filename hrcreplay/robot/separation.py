@@ -53,7 +53,7 @@ class Separation:
         return float(self._low[link, limb])
 
     def room_m2(self) -> Floats:
-        """(s, l) right-hand side of Eq. (14), corrected: max(0, distance - clearance)^2, a lower bound where not exact."""
+        """(s, l) right-hand side of Eq. (14), corrected, [m^2]: exact, or else a lower bound."""
         return np.maximum(0.0, self._low - self.clearance_m) ** 2
 
     def exact_room_m2(self, link: int, limb: int) -> float:
@@ -66,7 +66,7 @@ class Separation:
         return bool(np.isnan(self._low).any())
 
     def nearest(self) -> tuple[float, int, int]:
-        """Smallest distance between surfaces, negative where they overlap [m]; link and limb. NaN as in `distance_m`."""
+        """Smallest distance between surfaces, negative where they overlap, NaN where not found [m]; link and limb."""
         while True:
             surface = self._low - self.clearance_m
             link, limb = divmod(int(np.argmin(surface)), surface.shape[1])

@@ -99,4 +99,3 @@ def minimiser(H: Floats, g: Floats) -> Floats:
             rest -= L[k, i] * w[k]
         w[i] = rest / L[i, i]
     return w
-
