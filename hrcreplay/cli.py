@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 from pathlib import Path
@@ -33,6 +34,10 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting; wins over the file. May be repeated."),
 ]
+Topic = Annotated[
+    list[str] | None,
+    typer.Option("--topic", metavar="NAME", help="Skeleton topic to read; default all that can be. May be repeated."),
+]
 CellFile = Annotated[
     Path | None,
     typer.Option("--cell", metavar="CELL.toml", help="Poses of cameras and robot, as written by calibrate."),
@@ -62,6 +67,10 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
+def _overrides(settings: list[str] | None, topics: list[str] | None) -> tuple[str, ...]:
+    return (*(settings or ()), *([f"logs.topics={json.dumps(topics)}"] if topics else ()))
+
+
 @app.callback()
 def _root(
     _: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
@@ -74,11 +83,12 @@ def info(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A log (MCAP, ROS 1 or ROS 2 bag).")],
     config: Config = None,
     settings: Set = None,
+    topic: Topic = None,
 ) -> None:
     """What a log holds, and what is missing for the next step."""
-    from hrcreplay import replay
+    from hrcreplay import ingest
 
-    sys.stdout.write("\n".join(replay.describe(log, config, tuple(settings or ()))) + "\n")
+    sys.stdout.write("\n".join(ingest.describe(log, config, _overrides(settings, topic))) + "\n")
 
 
 @app.command(name="import")
@@ -94,7 +104,9 @@ def import_(
     """Make our log from Azure Kinect CSV, Kinect v2 CSV or KERAAL text files."""
     from hrcreplay import ingest
 
-    sys.stdout.write(f"{ingest.run(kind, files, out, rate)}\n")
+    for note in ingest.import_files(kind, files, out, rate):
+        sys.stderr.write(f"hrcreplay: {note}\n")
+    sys.stdout.write(f"{out}\n")
 
 
 @app.command()
@@ -103,6 +115,7 @@ def calibrate(
     out: Annotated[Path, typer.Option("--out", metavar="CELL.toml", help="Cell file to write.")],
     config: Config = None,
     settings: Set = None,
+    topic: Topic = None,
     camera: Annotated[
         str | None,
         typer.Option("--reference", metavar="CAMERA", help="Camera that defines the world; default the first."),
@@ -122,12 +135,12 @@ def calibrate(
     ] = None,
 ) -> None:
     """Find the poses and clock offsets of the cameras from the skeletons themselves."""
-    from hrcreplay import replay
+    from hrcreplay import ingest
 
-    for line in replay.calibrate(
-        log, out, config, tuple(settings or ()), reference=camera, up=up, height_m=height, base=base
+    for line in ingest.calibrate(
+        log, out, config, _overrides(settings, topic), reference=camera, up=up, height_m=height, base=base
     ):
-        sys.stderr.write(line + "\n")
+        sys.stderr.write(f"hrcreplay: {line}\n")
     sys.stdout.write(f"{out}\n")
 
 
@@ -139,6 +152,7 @@ def _stage(command: str, text: str) -> None:
         source: Source,
         config: Config = None,
         settings: Set = None,
+        topic: Topic = None,
         cell: CellFile = None,
         out: Out = None,
         start: Start = None,
@@ -155,7 +169,7 @@ def _stage(command: str, text: str) -> None:
             source,
             out=out,
             config=config,
-            overrides=tuple(settings or ()),
+            overrides=_overrides(settings, topic),
             cell_file=cell,
             start_s=start,
             end_s=end,

@@ -17,6 +17,7 @@ from hrcreplay.records import POINTS
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Sigmas = tuple[NotNegative, NotNegative, NotNegative, NotNegative]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -79,14 +80,20 @@ class Fusion(Section):
     """Relate a frame to the state at its capture time, or take it for the state at the tick."""
     confidence_min: Share = 0.2
     """An angle is used when the product of the confidences of its points is at least this."""
-    outlier_m: Positive = 0.30
+    outlier_m: Positive = 0.20
     """A point further than this from the predicted skeleton is an outlier [m]."""
     point_std_m: Positive = 0.02
     """Standard deviation of a skeleton point at full confidence [m]."""
-    sigma_position: Positive = 100.0
-    """Process noise of x, y in Eq. (44), on each derivative's own remainder [m/s^4]."""
-    sigma_angle: Positive = 500.0
-    """Process noise of the angles in Eq. (44), on each derivative's own remainder [rad/s^4]."""
+    point_std_per_m: NotNegative = 0.0
+    """Its growth with the distance from the camera [m/m]."""
+    sigma_position: Sigmas = (300.0, 100.0, 5.0, 1.0)
+    """Sigmas of Eq. (44) for x and y: p, v, a, j [m/s^2, m/s^2.5, m/s^3, m/s^3.5]."""
+    sigma_angle: Sigmas = (1500.0, 600.0, 10.0, 1.0)
+    """The same for the angles [rad]."""
+    coast_s: Positive = 0.12
+    """A joint without a valid row for longer comes to rest [s]."""
+    delay_max_s: Positive = 0.25
+    """An older frame counts as this old [s]."""
     memory_s: Positive = 0.5
     """Without a valid row for longer than this the person counts as lost [s]."""
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -219,12 +220,12 @@ class Stopwatch:
         self._clock_ns = clock_ns
         self._calls: dict[str, list[tuple[int, int]]] = {}
 
-    def measure(self, stage: str, ticks: int, work: Callable[[], Any]) -> Any:
-        """Runs ``work`` and books its time on ``stage``."""
+    @contextmanager
+    def stage(self, name: str, ticks: int) -> Iterator[None]:
+        """Books the time that the block takes on a stage, and on so many of its ticks."""
         start = self._clock_ns()
-        result = work()
-        self._calls.setdefault(stage, []).append((ticks, self._clock_ns() - start))
-        return result
+        yield
+        self._calls.setdefault(name, []).append((ticks, self._clock_ns() - start))
 
     def summary(self, period_s: float) -> dict[str, Any]:
         """Per stage: ticks; median, p99, p99.9 and max time a tick [us]; how much faster than real time."""

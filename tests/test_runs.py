@@ -81,8 +81,9 @@ def test_a_run_that_is_under_way_is_not_read_and_not_overwritten(tmp_path: Path)
 def test_stopwatch_spreads_a_call_over_its_ticks() -> None:
     now = iter([0, 10_000_000, 20_000_000, 50_000_000])
     watch = runs.Stopwatch(lambda: next(now))
-    assert watch.measure("fuse", 10, lambda: "result") == "result"
-    watch.measure("fuse", 1, lambda: None)
+    for ticks in (10, 1):
+        with watch.stage("fuse", ticks):
+            pass
     found = watch.summary(period_s=0.004)["fuse"]
     assert found["ticks"] == 11
     assert found["median_us"] == 1000.0  # 10 ticks shared 10 ms

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from hrcreplay.human.branches import nearest
 from hrcreplay.records import JOINTS, Bools, Floats, Ints
 
 #: The ten angles of Eq. (37); x and y are lengths.
@@ -20,8 +21,9 @@ def wrap(angle_rad: Floats) -> Floats:
 
 
 def difference(a: Floats, b: Floats) -> Floats:
-    """``a - b`` of rows of JOINTS, (n, 12) [m, m, rad...]; angles the short way round."""
-    return np.where(IS_ANGLE, wrap(a - b), a - b)
+    """``a - b`` of rows of JOINTS, (n, 12) [m, m, rad...]; arms by the same name, angles the short way round."""
+    apart = nearest(a, b) - b
+    return np.where(IS_ANGLE, wrap(apart), apart)
 
 
 def columns(table: pd.DataFrame, suffix: str = "") -> Floats:

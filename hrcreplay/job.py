@@ -1,0 +1,183 @@
+"""What a run depends on: log, settings, cell, span; and which stages of an earlier run it can take over."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from hrcreplay import __version__, runs
+from hrcreplay.cell import Cell, load_cell
+from hrcreplay.config import Settings, load_settings
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.human.model import LimitSet
+from hrcreplay.limits import load_limits
+
+STAGES = ("fuse", "predict", "plan")
+
+#: What each stage leaves behind.
+TABLES = {
+    "fuse": ("measurements.parquet", "state.parquet", "truth.parquet"),
+    "predict": ("occupancy.parquet",),
+    "plan": ("motion.parquet", "motion_*.parquet"),
+}
+
+#: Packages whose version can change a result.
+PACKAGES = ("coal", "filterpy", "mcap", "numba", "numpy", "pin", "proxsuite", "rosbags", "ruckig", "scipy")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One command on one log, resolved."""
+
+    command: str
+    log: Path
+    log_sha256: str
+    settings: Settings
+    cell: Cell | None
+    task: dict[str, Any] | None
+    start_s: float | None
+    end_s: float | None
+    tracking: LimitSet
+    prediction: LimitSet
+    earlier: Path | None  #: run folder given instead of a log
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages that the command runs."""
+        return STAGES[: STAGES.index(self.command) + 1] if self.command in STAGES else STAGES
+
+    def digests(self) -> dict[str, str]:
+        """Per stage the digest of all that its result depends on, the stages before it included."""
+        settings = self.settings.model_dump(mode="json")
+        parts: dict[str, Any] = {
+            "fuse": [
+                __version__,
+                self.log_sha256,
+                None if self.cell is None else self.cell.to_dict(),
+                [self.start_s, self.end_s],
+                settings["logs"],
+                settings["fusion"],
+                _plain(self.tracking),
+            ],
+            "predict": [settings["occupancy"], _plain(self.prediction)],
+            "plan": [settings["robot"], settings["plan"], self.task, _urdf_digest(self.settings)],
+        }
+        digests: dict[str, str] = {}
+        before = ""
+        for stage in STAGES:
+            before = hashlib.sha256((before + json.dumps(parts[stage], sort_keys=True)).encode()).hexdigest()
+            digests[stage] = before
+        return digests
+
+    def reusable(self) -> tuple[str, ...]:
+        """The stages whose tables of the earlier run are those that this job would make."""
+        if self.earlier is None:
+            return ()
+        found = runs.read_meta(self.earlier).get("stages", {})
+        mine = self.digests()
+        return tuple(stage for stage in self.stages if found.get(stage) == mine[stage])
+
+    def meta(self) -> dict[str, Any]:
+        """The part of run.json that is known before the first frame is read."""
+        digests = self.digests()
+        return {
+            "command": self.command,
+            "versions": {"hrcreplay": __version__, **{name: metadata.version(name) for name in PACKAGES}},
+            "inputs": [{"path": str(self.log), "sha256": self.log_sha256}],
+            "settings": self.settings.model_dump(mode="json"),
+            "cell": None if self.cell is None else self.cell.to_dict(),
+            "task": self.task,
+            "span_s": [self.start_s, self.end_s],
+            "limits": {"tracking": _plain(self.tracking), "prediction": _plain(self.prediction)},
+            "stages": {stage: digests[stage] for stage in self.stages},
+        }
+
+
+def resolve(
+    command: str,
+    source: Path,
+    *,
+    config: Path | None,
+    overrides: tuple[str, ...],
+    cell_file: Path | None,
+    start_s: float | None,
+    end_s: float | None,
+) -> Job:
+    """The job that a command line asks for.
+
+    Settings of a run folder are those of the run unless a settings file or ``--set`` says otherwise.
+
+    Raises:
+        SettingsError: A setting, the cell, a limit set or the run folder cannot be used.
+        LogError: There is nothing at that path.
+    """
+    if not source.exists():
+        raise LogError(f"{source}: nothing is there; give a log or a run folder")
+    earlier = runs.read_meta(source) if runs.is_run(source) else None
+    base = earlier["settings"] if earlier is not None else {}
+    settings = load_settings(config, overrides, base)
+    cell = load_cell(cell_file) if cell_file is not None else None
+    if earlier is not None:
+        cell = cell or (Cell.from_dict(earlier["cell"]) if earlier["cell"] else None)
+        start_s = earlier["span_s"][0] if start_s is None else start_s
+        end_s = earlier["span_s"][1] if end_s is None else end_s
+    log = Path(earlier["inputs"][0]["path"]) if earlier is not None else source
+    return Job(
+        command=command,
+        log=log,
+        log_sha256=_digest(log, earlier),
+        settings=settings,
+        cell=cell,
+        task=_task(settings, earlier),
+        start_s=start_s,
+        end_s=end_s,
+        tracking=load_limits(settings.limits.tracking),
+        prediction=load_limits(settings.limits.prediction),
+        earlier=source if earlier is not None else None,
+    )
+
+
+def _digest(log: Path, earlier: dict[str, Any] | None) -> str:
+    if log.exists():
+        return runs.sha256(log)
+    if earlier is None:
+        raise LogError(f"{log}: nothing is there; give a log or a run folder")
+    return str(earlier["inputs"][0]["sha256"])
+
+
+def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The task of the task file, else of the earlier run; the log's own is read with the log."""
+    path = settings.plan.task
+    if path is None:
+        return earlier["task"] if earlier is not None else None
+    try:
+        return tomllib.loads(path.read_text())
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror}); plan.task names a TOML file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: not TOML ({error})") from error
+
+
+def _urdf_digest(settings: Settings) -> str | None:
+    path = settings.robot.urdf
+    if path is None:
+        return None
+    if not path.is_file():
+        raise SettingsError(f"robot.urdf: {path} is not a file; name a URDF, or leave it out for the IRB 140")
+    return runs.sha256(path)
+
+
+def _plain(limits: LimitSet) -> dict[str, Any]:
+    """JSON form of a limit set; no bound is null."""
+
+    def plain(value: Any) -> Any:
+        if not hasattr(value, "tolist"):
+            return value
+        return [number if abs(number) != float("inf") else None for number in value.tolist()]
+
+    return {name: plain(value) for name, value in asdict(limits).items()}

@@ -1,0 +1,200 @@
+"""The three stages as generators over batches of ticks: each hands its rows on and writes what it leaves behind."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hrcreplay.human import angles, fusion, hull, occupancy
+from hrcreplay.human import smooth as smoother
+from hrcreplay.human.model import LimitSet
+from hrcreplay.logs.person import PersonMemory, pick
+from hrcreplay.logs.reader import Log
+from hrcreplay.planner import Planner
+from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.runs import RunWriter, Stopwatch
+from hrcreplay.tables import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
+
+NS = 1_000_000_000
+
+
+@dataclass
+class Sink:
+    """Where the stages leave their rows, and what they count on the way."""
+
+    run: RunWriter
+    watch: Stopwatch
+    progress: Callable[[str, int], None]  #: stage, ticks done
+    counts: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True)
+class Eyes:
+    """What the first stage needs to know of cameras and person."""
+
+    T_world_camera: Floats  #: (c, 4, 4)
+    clock_offset_ns: Ints  #: (c,) camera's clock minus the reference camera's
+    noise: angles.PointNoise
+    filter: fusion.FusionSettings
+    limits: LimitSet
+    person_jump_m: float
+    person_memory_s: float
+
+
+@dataclass(frozen=True)
+class Foresight:
+    """What the second stage needs beside the person."""
+
+    limits: LimitSet
+    horizon_s: float
+    radii: occupancy.Radii
+    method: str
+
+    def volumes(self, states: HumanStates, method: str | None = None) -> SweptVolumes:
+        """Swept volumes of every tick, by this or another method."""
+        return occupancy.predict(
+            states, self.limits, horizon_s=self.horizon_s, radii=self.radii, method=method or self.method
+        )
+
+
+def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
+    """(n,) tick times: from the first instant on, at the filter's rate, none after the last [ns]."""
+    count = int((end_ns - start_ns) * rate_hz / NS) + 1
+    ticks: Ints = start_ns + np.round(np.arange(count) * (NS / rate_hz)).astype(np.int64)
+    return ticks[ticks <= end_ns]
+
+
+def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterator[tuple[Ints, CameraFrames | None]]:
+    """Ticks by the batch, each with the frames that arrived up to its last tick and not before."""
+    waiting: list[CameraFrames] = []
+    arrived_ns = -1
+    for first in range(0, len(ticks_ns), size):
+        ticks = ticks_ns[first : first + size]
+        while arrived_ns <= ticks[-1] and (chunk := next(frames, None)) is not None:
+            waiting.append(chunk)
+            arrived_ns = int(chunk.arrival_ns[-1])
+        due = None
+        if waiting:
+            table = CameraFrames.join(waiting)
+            count = int(np.searchsorted(table.arrival_ns, ticks[-1], side="right"))
+            due = table.rows(slice(0, count)) if count else None
+            waiting = [table.rows(slice(count, None))] if count < len(table) else []
+        yield ticks, due
+
+
+def fused(
+    log: Log, ticks_ns: Ints, size: int, eyes: Eyes, sink: Sink, *, smooth: bool = False
+) -> Iterator[HumanStates]:
+    """Stage 1: camera frames to the fused person; leaves measurements and state, and ``smooth`` where asked."""
+    state = fusion.start(log.header.cameras)
+    memory = PersonMemory()
+    frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
+    passed: list[tuple[HumanStates, fusion.Trace]] = []
+    for ticks, seen in batches(frames, ticks_ns, size):
+        measured = _none(log.header.cameras)
+        if seen is not None:
+            memory, mine, found = pick(seen, memory, eyes.T_world_camera, eyes.person_jump_m, eyes.person_memory_s)
+            sink.counts.update(found)
+            mine = replace(mine, capture_ns=mine.capture_ns - eyes.clock_offset_ns[mine.camera])
+            with sink.watch.stage("angles", len(ticks)):
+                measured = angles.measure(mine, eyes.T_world_camera, eyes.noise)
+            sink.run.table("measurements", measurement_columns(measured))
+        with sink.watch.stage("fuse", len(ticks)):
+            if smooth:
+                state, states, events, trace = fusion.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
+                passed.append((states, trace))
+            else:
+                state, states, events = fusion.fuse(state, ticks, measured, eyes.filter, eyes.limits)
+        sink.counts.update(events)
+        sink.run.table("state", state_columns(states))
+        sink.progress("fuse", len(ticks))
+        yield states
+    if smooth:
+        whole = HumanStates.join([states for states, _ in passed])
+        traces = [trace for _, trace in passed]
+        trace = fusion.Trace(
+            cov=np.concatenate([trace.cov for trace in traces]),
+            damping=np.concatenate([trace.damping for trace in traces]),
+        )
+        sink.run.table("smooth", state_columns(smoother.smooth(whole, trace, eyes.filter)))
+
+
+def _none(cameras: tuple[str, ...]) -> Measurements:
+    """No frame of any camera."""
+    return Measurements(
+        capture_ns=np.zeros(0, np.int64),
+        arrival_ns=np.zeros(0, np.int64),
+        camera=np.zeros(0, np.int64),
+        angles=np.zeros((0, 12)),
+        angles_std=np.zeros((0, 12)),
+        lengths_m=np.zeros((0, 8)),
+        lengths_std_m=np.zeros((0, 8)),
+        points_m=np.zeros((0, 20, 3)),
+        confidence=np.zeros((0, 20)),
+        cameras=cameras,
+    )
+
+
+def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
+    """Leaves the closed-form joints of the log's noise-free skeleton, where it has one."""
+    for truth in log.truth():
+        within = truth.rows((truth.t_ns >= start_ns) & (truth.t_ns <= end_ns))
+        if len(within):
+            sink.run.table("truth", truth_columns(within.t_ns, *angles.inverse(within.points_m)))
+
+
+def predicted(
+    states: Iterable[HumanStates], foresight: Foresight, store_every: float, sink: Sink, *, keep: bool
+) -> Iterator[tuple[HumanStates, SweptVolumes]]:
+    """Stage 2: the swept volumes of every tick; where ``keep``, leaves those of one tick in ``store_every``."""
+    done = 0
+    for batch in states:
+        with sink.watch.stage("predict", len(batch)):
+            volumes = foresight.volumes(batch)
+        if keep:
+            number = np.arange(done, done + len(batch))
+            stored = np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
+            with sink.watch.stage("hulls", len(stored)):
+                _store(volumes, stored, sink.run)
+        done += len(batch)
+        sink.progress("predict", len(batch))
+        yield batch, volumes
+
+
+def _store(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
+    """Hull vertices and size of some ticks' volumes; a tick without a person leaves none."""
+    t_ns: list[int] = []
+    limbs: list[str] = []
+    radii: list[float] = []
+    sizes: list[float] = []
+    hulls: list[Floats] = []
+    for tick in ticks.tolist():
+        for i, limb in enumerate(volumes.limbs):
+            vertices = volumes.vertices(tick, i)
+            if np.isnan(vertices).any():
+                continue
+            corners, _ = hull.hull(vertices)
+            radius = float(volumes.radius_m[tick, i])
+            t_ns.append(int(volumes.t_ns[tick]))
+            limbs.append(limb)
+            radii.append(radius)
+            sizes.append(hull.sphere_swept_volume_m3(corners, radius))
+            hulls.append(corners)
+    if t_ns:
+        run.table("occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls))
+
+
+def planned(
+    people: Iterable[tuple[HumanStates, SweptVolumes]], planners: dict[str, Planner], sink: Sink
+) -> Iterator[None]:
+    """Stage 3: what the robot would have done by each method; leaves a motion for each."""
+    for states, volumes in people:
+        for name, planner in planners.items():
+            with sink.watch.stage(f"plan {name}", len(volumes)):
+                motion = planner.follow(states, volumes)
+            sink.run.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
+        sink.progress("plan", len(volumes))
+        yield

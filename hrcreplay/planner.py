@@ -1,0 +1,91 @@
+"""The third stage: one method following its reference tick by tick, beside the people of each tick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from hrcreplay.records import HumanStates, Motion, SweptVolumes
+from hrcreplay.robot import controller, stepping
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.obstacles import Obstacles, obstacles
+from hrcreplay.robot.reference import Reference, ReferencePoint, advance
+from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
+
+
+@dataclass
+class QpFollower:
+    """The trajectory generator of Section 5 along a reference that waits for it or not."""
+
+    robot: RobotModel
+    reference: Reference
+    settings: PlanSettings
+    mode: Literal["time", "path"]
+    leash_m: float
+    s_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.state = RobotState(self.reference.q0, np.zeros(self.robot.nv))
+        self.point = self.reference.sample(self.s_s)
+
+    def step(self, volumes: Obstacles) -> tuple[RobotState, ReferencePoint, Step]:
+        """One tick: the state and the reference that it found, and what it decided."""
+        state, point = self.state, self.point
+        tcp_m = self.robot.pose(state.q, state.dq).T_world_tcp[:3, 3]
+        error_m = float(np.linalg.norm(tcp_m - point.T_world_tcp[:3, 3]))
+        self.s_s, rate = advance(self.s_s, self.settings.dt_s, error_m, self.mode, self.leash_m)
+        self.point = self.reference.sample(self.s_s)
+        step = controller.step(
+            self.robot, state, self.point.T_world_tcp, rate * self.point.twist, volumes, self.settings
+        )
+        self.state = step.next
+        return state, point, step
+
+
+@dataclass
+class Planner:
+    """One method beside the people of each tick; brakes when nobody has seen them for too long."""
+
+    follower: QpFollower
+    chosen: bool  #: the run's method, not a baseline
+    memory_s: float  #: without a camera for longer than this the person counts as lost [s]
+    seen_ns: int | None = None
+
+    def follow(self, states: HumanStates, volumes: SweptVolumes) -> Motion:
+        """The motion of a batch of ticks."""
+        robot = self.follower.robot
+        rows = [self._tick(volumes, i, int(t), bool(states.valid[i].any())) for i, t in enumerate(volumes.t_ns)]
+        found = [state for state, _, _ in rows]
+        points = [point for _, point, _ in rows]
+        steps = [step for _, _, step in rows]
+        poses = [step.pose for step in steps]
+        return Motion(
+            t_ns=volumes.t_ns,
+            q=np.array([state.q for state in found]),
+            dq=np.array([state.dq for state in found]),
+            u=np.array([step.u for step in steps]),
+            ref_m=np.array([point.T_world_tcp[:3, 3] for point in points]),
+            tcp_m=np.array([pose.T_world_tcp[:3, 3] for pose in poses]),
+            tcp_speed=np.array(
+                [np.linalg.norm(pose.J_tcp[:3] @ state.dq) for pose, state in zip(poses, found, strict=True)]
+            ),
+            ref_speed=np.array([np.linalg.norm(point.twist[:3]) for point in points]),
+            distance_m=np.array([step.distance_m for step in steps]),
+            limb=np.array([step.limb for step in steps]),
+            link=np.array([step.link for step in steps]),
+            status=np.array([step.status for step in steps]),
+            reason=np.array([step.reason for step in steps]),
+            limbs=volumes.limbs,
+            links=tuple(segment.name for segment in robot.segments),
+            reasons=stepping.REASONS,
+        )
+
+    def _tick(self, volumes: SweptVolumes, row: int, t_ns: int, seen: bool) -> tuple[RobotState, ReferencePoint, Step]:
+        if seen:
+            self.seen_ns = t_ns
+        around = obstacles(volumes, row)
+        if self.seen_ns is None or t_ns - self.seen_ns > self.memory_s * 1e9:
+            around = replace(around, known=False)
+        return self.follower.step(around)

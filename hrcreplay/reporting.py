@@ -1,0 +1,63 @@
+"""The report of a run: metrics first, then what only reads them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from hrcreplay import runs, wiring
+from hrcreplay.job import Job
+from hrcreplay.records import LIMBS, Floats, HumanStates
+from hrcreplay.report import figures, metrics, page, tables
+from hrcreplay.report.figures_human import Instant
+from hrcreplay.runs import Run, RunWriter
+from hrcreplay.tables import read_states
+
+
+def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
+    """Leaves metrics.json, the figures and report.html beside the tables that have just been written."""
+    settings = job.settings
+    near = {
+        "near_m": settings.report.near_m,
+        "stationary_m_per_s": settings.report.stationary_m_per_s,
+        "gap_s": settings.logs.gap_s,
+    }
+    run = runs.read(writer.partial, meta)
+    found = metrics.compute(run, **near)
+    writer.text("metrics.json", runs.to_json(found))
+    radii = wiring.foresight(job).radii
+    folder = writer.partial / "figures"
+    figures.draw_all(
+        run,
+        folder,
+        found,
+        **near,
+        volumes=_instants(job, run),
+        radii_m=dict(zip(LIMBS, radii.of_limbs().tolist(), strict=True)),
+    )
+    shown = [
+        tables.limit_table(job.prediction, use="prediction"),
+        tables.limit_table(job.tracking, use="tracking"),
+        tables.radius_table({name.replace("_", " "): radius for name, radius in asdict(radii).items()}),
+    ]
+    writer.text("report.html", page.render(run, found, folder, shown))
+
+
+def _instants(job: Job, run: Run) -> list[Instant]:
+    """The swept volumes by both methods at the instants that Fig. 17 shows."""
+    wanted = figures.instants(run)
+    if not len(wanted):
+        return []
+    states = HumanStates.join(
+        [batch.rows(np.isin(batch.t_ns, wanted)) for batch in read_states(run.folder / "state.parquet", 4096)]
+    )
+    foresight = wiring.foresight(job)
+    by_method = {method: foresight.volumes(states, method) for method in ("paper", "positions")}
+
+    def hulls(method: str, row: int) -> dict[str, Floats]:
+        volumes = by_method[method]
+        return {limb: volumes.vertices(row, i) for i, limb in enumerate(volumes.limbs)}
+
+    return [(int(t), {method: hulls(method, row) for method in by_method}) for row, t in enumerate(states.t_ns)]

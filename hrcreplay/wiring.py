@@ -1,0 +1,150 @@
+"""From settings, cell and log to what the stages take. The rooms never see a settings model."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hrcreplay.cell import Cell
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.human.angles import PointNoise
+from hrcreplay.human.fusion import FusionSettings
+from hrcreplay.human.occupancy import Radii
+from hrcreplay.job import Job
+from hrcreplay.logs.log import JointTrack
+from hrcreplay.logs.reader import Log
+from hrcreplay.pipeline import Eyes, Foresight
+from hrcreplay.planner import Planner, QpFollower
+from hrcreplay.records import Floats
+from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
+from hrcreplay.robot.paths import programmed, recorded
+from hrcreplay.robot.reference import Reference
+from hrcreplay.robot.stepping import PlanSettings
+from hrcreplay.robot.task import parse_task
+
+
+def eyes(job: Job, log: Log) -> Eyes:
+    """Stage 1. A pose of the cell file wins over the log's.
+
+    Raises:
+        LogError: A camera's pose is known to neither.
+    """
+    cell = job.cell or Cell()
+    poses = {**log.header.T_world_camera, **cell.T_world_camera}
+    for camera in log.header.cameras:
+        if camera not in poses:
+            raise LogError(
+                f"{log.header.path}: the pose of camera {camera} is not known; "
+                f"find it with: hrcreplay calibrate {log.header.path} --out cell.toml, then give --cell cell.toml"
+            )
+    unknown = sorted(set(cell.T_world_camera) - set(log.header.cameras))
+    if unknown:
+        raise SettingsError(
+            f"cell: camera {unknown[0]} is not in the log; its cameras are {', '.join(log.header.cameras)}"
+        )
+    offsets_s = [cell.clock_offset_s.get(camera, 0.0) for camera in log.header.cameras]
+    fusion, logs = job.settings.fusion, job.settings.logs
+    return Eyes(
+        T_world_camera=np.array([poses[camera] for camera in log.header.cameras]),
+        clock_offset_ns=np.round(np.array(offsets_s) * 1e9).astype(np.int64),
+        noise=PointNoise(std_m=fusion.point_std_m, depth_std_per_m=fusion.point_std_per_m),
+        filter=FusionSettings(**fusion.model_dump(exclude={"rate_hz", "point_std_m", "point_std_per_m"})),
+        limits=job.tracking,
+        person_jump_m=logs.person_jump_m,
+        person_memory_s=logs.person_memory_s,
+    )
+
+
+def foresight(job: Job) -> Foresight:
+    """Stage 2."""
+    occupancy = job.settings.occupancy
+    radii = Radii(
+        head=occupancy.radius_head_m,
+        thorax=occupancy.radius_thorax_m,
+        upper_arm=occupancy.radius_upper_arm_m,
+        lower_arm=occupancy.radius_lower_arm_m,
+    )
+    return Foresight(limits=job.prediction, horizon_s=occupancy.stop_s, radii=radii, method=occupancy.method)
+
+
+def base(job: Job, log: Log) -> Floats | None:
+    """(4, 4) the robot's base in the world: of the cell file, else of the log."""
+    if job.cell is not None and job.cell.T_world_base is not None:
+        return job.cell.T_world_base
+    return log.header.T_world_base
+
+
+def robot(job: Job, T_world_base: Floats) -> RobotModel:
+    """The manipulator on its base.
+
+    Raises:
+        SettingsError: The URDF or a robot setting cannot be used.
+    """
+    settings, stop_s = job.settings.robot, job.settings.occupancy.stop_s
+    if settings.urdf is None:
+        if settings.links or settings.tcp_frame:
+            raise SettingsError("robot.links: found links for the IRB 140; they go with another robot's robot.urdf")
+        return irb140(T_world_base, stop_s=stop_s, tool_m=settings.tool_m, acceleration=settings.acceleration)
+    segments = tuple(
+        Segment(name=link.name, body=link.body, start_m=link.start_m, end_m=link.end_m, radius_m=link.radius_m)
+        for link in settings.links
+    )
+    return from_urdf(
+        settings.urdf.read_text(),
+        T_world_base,
+        stop_s=stop_s,
+        tcp_frame=settings.tcp_frame,
+        tool_m=settings.tool_m,
+        segments=segments,
+        acceleration=settings.acceleration,
+    )
+
+
+def reference(job: Job, log: Log, model: RobotModel) -> tuple[Reference, int | None]:
+    """The programmed path: of the task file, else of the log's task, else the log's joint track.
+
+    Returns:
+        The path, and the instant at which it starts where the log says [ns].
+
+    Raises:
+        SettingsError: The task cannot be used, or there is none.
+        LogError: The joint track does not fit the robot.
+    """
+    own = (log.header.task, f"{log.header.path}: task")
+    table, where = (job.task, str(job.settings.plan.task)) if job.task else own
+    if table is not None:
+        return programmed(parse_task(table, where), model, where), None
+    track = list(log.joints())
+    if not track:
+        raise SettingsError(
+            f"{log.header.path}: no task and no joint track; name a task file with --set plan.task=FILE.toml"
+        )
+    whole = JointTrack.join(track)
+    return recorded(whole.t_ns, whole.q, model), int(whole.t_ns.min())
+
+
+def planners(job: Job, log: Log, start_ns: int) -> dict[str, Planner]:
+    """Stage 3: the chosen method and its baselines, each with a robot of its own."""
+    T_world_base = base(job, log)
+    if T_world_base is None:
+        raise SettingsError(
+            f"{log.header.path}: where the robot stands is not known; give a --cell file with T_world_base"
+        )
+    plan, model = job.settings.plan, robot(job, T_world_base)
+    path, begin_ns = reference(job, log, model)
+    settings = PlanSettings(
+        dt_s=1.0 / job.settings.fusion.rate_hz,
+        stop_s=job.settings.occupancy.stop_s,
+        clearance_m=plan.clearance_m,
+        q_p=plan.q_p,
+        q_v=plan.q_v,
+        path_gain_per_s=plan.path_gain_per_s,
+        tcp_speed_max=plan.tcp_speed_max,
+        tcp_acceleration_max=plan.tcp_acceleration_max,
+    )
+    s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
+
+    def planner(name: str) -> Planner:
+        follower = QpFollower(model, path, settings, plan.reference, plan.leash_m, s_s)
+        return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
+
+    return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
