@@ -29,8 +29,29 @@ AHEAD = 1.1
 #: Rounds of solving and adding broken rows before the problem counts as unsolved.
 ROUNDS = 40
 
-#: The solver's initial penalties, tried in turn: the second finds some of the solutions that the first misses.
-PENALTIES = (1e-2, 1e-3)
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """How the solver goes about a problem."""
+
+    bcl: bool  #: its rule for the penalty
+    penalty: float  #: the penalty it begins with
+    infeasible: float  #: its tolerance for there being no solution; 0: it never claims so
+    rounds: int
+
+
+#: Tried in turn until one finds a solution that can be checked. About one in a thousand of the problems near people
+#: defeats the first and is solved by another; the tolerance for infeasibility is far below the solver's default,
+#: with which it denies many more.
+ATTEMPTS = (
+    _Attempt(bcl=True, penalty=1e-2, infeasible=1e-14, rounds=200),
+    _Attempt(bcl=False, penalty=1e-2, infeasible=0.0, rounds=60),
+    _Attempt(bcl=False, penalty=1e-1, infeasible=0.0, rounds=60),
+    _Attempt(bcl=False, penalty=1e-3, infeasible=0.0, rounds=60),
+)
+
+#: Largest product of a multiplier and what its row lacks to its bound, in the scaled problem.
+GAP = 1e-9
 
 #: Norm below which a row is not scaled up: no link moves along it.
 TINY = 1e-9
@@ -140,20 +161,29 @@ def _minimise(task: Problem, rows: BoundedRows) -> tuple[Floats, Floats] | Unsol
     rows are scaled to 1, so that its tolerances mean the same in every pose.
     """
     cost, norms = 1.0 / task.H.diagonal().max(), 1.0 / np.maximum(np.linalg.norm(rows.A, axis=1), TINY)
-    H, g = task.H * cost, task.g * cost
     A, low, high = rows.A * norms[:, None], rows.low * norms, rows.high * norms
     status = ""
-    for penalty in PENALTIES:
-        qp = _dense.QP(len(g), 0, len(low), True, _dense.HessianType.Dense, _dense.DenseBackend.PrimalDualLDLT)
-        qp.settings.initial_guess = proxsuite.proxqp.InitialGuess.NO_INITIAL_GUESS
-        qp.settings.eps_abs, qp.settings.eps_rel = 1e-13, 0.0
-        qp.settings.eps_primal_inf = 1e-14  # at its default the solver gives up on problems that have a solution
-        qp.settings.max_iter = 200
-        qp.settings.default_rho = 1e-8  # well below the damping of the cost, or flat directions take forever
-        qp.settings.default_mu_in = penalty
-        qp.init(H, g, None, None, A, low, high, task.low, task.high)
+    for attempt in ATTEMPTS:
+        qp = _dense.QP(len(task.g), 0, len(low), True, _dense.HessianType.Dense, _dense.DenseBackend.PrimalDualLDLT)
+        settings = qp.settings
+        settings.initial_guess = proxsuite.proxqp.InitialGuess.NO_INITIAL_GUESS
+        settings.eps_abs, settings.eps_rel = 1e-13, 0.0
+        settings.default_rho = 1e-8  # well below the damping of the cost, or flat directions take forever
+        settings.bcl_update, settings.default_mu_in = attempt.bcl, attempt.penalty
+        settings.eps_primal_inf, settings.max_iter, settings.max_iter_in = attempt.infeasible, attempt.rounds, 100
+        qp.init(task.H * cost, task.g * cost, None, None, A, low, high, task.low, task.high)
         qp.solve()
+        x, z = qp.results.x, qp.results.z
         status = qp.results.info.status.name
-        if qp.results.info.status == _SOLVED:
-            return np.clip(qp.results.x, task.low, task.high), qp.results.z[: len(low)]
+        if qp.results.info.status == _SOLVED and _complementary(
+            z, np.concatenate([A @ x, x]), np.concatenate([low, task.low]), np.concatenate([high, task.high])
+        ):
+            return np.clip(x, task.low, task.high), z[: len(low)]
     return Unsolved(status)
+
+
+def _complementary(z: Floats, values: Floats, low: Floats, high: Floats) -> bool:
+    """Whether only rows at their bound carry a multiplier: the solver claims solutions where this does not hold."""
+    return bool(
+        np.all(np.where(z > 0.0, z * np.minimum(high - values, 1.0), z * np.maximum(low - values, -1.0)) <= GAP)
+    )
