@@ -167,14 +167,16 @@ class Plan(Section):
     """Task file (TOML); none: the one inside the log, else the joint track inside the log."""
     reference: Literal["time", "path"] = "path"
     """time: the reference runs with the clock; path: only as far as the robot has followed."""
-    leash_m: Positive = 0.05
-    """path: the reference waits when the TCP is this far behind [m]."""
+    leash_m: Positive = 0.25
+    """path: the reference waits when the TCP is this far away [m]."""
+    waypoint_m: Positive = 0.02
+    """path: the reference leaves a waypoint when the TCP has come this close [m]."""
     q_p: tuple[NotNegative, NotNegative] = (0.10, 0.10)
     """Eq. (71): weights of the position error, translation and orientation."""
     q_v: tuple[NotNegative, NotNegative] = (1.0, 1.0)
     """Eq. (72): weights of the velocity error, translation and orientation."""
     path_gain_per_s: NotNegative = 5.0
-    """Position error fed into the reference velocity; 0 as printed, where an error never decays [1/s]."""
+    """Position error fed into the reference velocity [1/s]; 0 as printed: no error decays, so use reference "time"."""
     clearance_m: NotNegative = 0.0
     """Clearance beyond limb radius + link radius [m]."""
     tcp_speed_max: Positive = 2.5

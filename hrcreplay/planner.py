@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from hrcreplay.records import HumanStates, Motion, SweptVolumes
-from hrcreplay.robot import controller, stepping
+from hrcreplay.robot import controller, scaling, stepping
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.obstacles import Obstacles, obstacles
-from hrcreplay.robot.reference import Reference, ReferencePoint, advance
+from hrcreplay.robot.reference import Leash, Reference, ReferencePoint, advance
+from hrcreplay.robot.scaling import PathState
 from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
 
 
@@ -22,20 +22,19 @@ class QpFollower:
     robot: RobotModel
     reference: Reference
     settings: PlanSettings
-    mode: Literal["time", "path"]
-    leash_m: float
+    leash: Leash
     s_s: float = 0.0
 
     def __post_init__(self) -> None:
-        self.state = RobotState(self.reference.q0, np.zeros(self.robot.nv))
         self.point = self.reference.sample(self.s_s)
+        self.state = RobotState(self.point.q, np.zeros(self.robot.nv))
 
     def step(self, volumes: Obstacles) -> tuple[RobotState, ReferencePoint, Step]:
         """One tick: the state and the reference that it found, and what it decided."""
         state, point = self.state, self.point
         tcp_m = self.robot.pose(state.q, state.dq).T_world_tcp[:3, 3]
         error_m = float(np.linalg.norm(tcp_m - point.T_world_tcp[:3, 3]))
-        self.s_s, rate = advance(self.s_s, self.settings.dt_s, error_m, self.mode, self.leash_m)
+        self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.leash)
         self.point = self.reference.sample(self.s_s)
         step = controller.step(
             self.robot, state, self.point.T_world_tcp, rate * self.point.twist, volumes, self.settings
@@ -45,10 +44,31 @@ class QpFollower:
 
 
 @dataclass
+class ScalingFollower:
+    """The baseline [24]: the robot stays on the programmed path, and its speed along it is scaled."""
+
+    robot: RobotModel
+    reference: Reference
+    settings: PlanSettings
+    s_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.along = PathState(self.s_s, 0.0)
+        self.state = RobotState(self.reference.sample(self.s_s).q, np.zeros(self.robot.nv))
+
+    def step(self, volumes: Obstacles) -> tuple[RobotState, ReferencePoint, Step]:
+        """One tick: the state and the place on the path that it found, and what it decided."""
+        state, point = self.state, self.reference.sample(self.along.s_s)
+        step, self.along = scaling.step(self.robot, self.reference, self.along, volumes, self.settings)
+        self.state = step.next
+        return state, point, step
+
+
+@dataclass
 class Planner:
     """One method beside the people of each tick; brakes when nobody has seen them for too long."""
 
-    follower: QpFollower
+    follower: QpFollower | ScalingFollower
     chosen: bool  #: the run's method, not a baseline
     memory_s: float  #: without a camera for longer than this the person counts as lost [s]
     seen_ns: int | None = None

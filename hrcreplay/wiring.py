@@ -13,11 +13,11 @@ from hrcreplay.job import Job
 from hrcreplay.logs.log import JointTrack
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline import Eyes, Foresight
-from hrcreplay.planner import Planner, QpFollower
+from hrcreplay.planner import Planner, QpFollower, ScalingFollower
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.paths import programmed, recorded
-from hrcreplay.robot.reference import Reference
+from hrcreplay.robot.reference import Leash, Reference
 from hrcreplay.robot.stepping import PlanSettings
 from hrcreplay.robot.task import parse_task
 
@@ -141,10 +141,15 @@ def planners(job: Job, log: Log, start_ns: int) -> dict[str, Planner]:
         tcp_speed_max=plan.tcp_speed_max,
         tcp_acceleration_max=plan.tcp_acceleration_max,
     )
+    leash = Leash(plan.reference, plan.leash_m, plan.waypoint_m)
     s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
 
     def planner(name: str) -> Planner:
-        follower = QpFollower(model, path, settings, plan.reference, plan.leash_m, s_s)
+        follower = (
+            QpFollower(model, path, settings, leash, s_s)
+            if name == "qp"
+            else ScalingFollower(model, path, settings, s_s)
+        )
         return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -55,6 +56,14 @@ class Reference:
         """From the start to the end of the last cycle; inf when it repeats [s]."""
         return (self.cycles - 1) * self.cycle_s + self.end * STEP_S
 
+    def next_waypoint(self, s_s: float) -> float:
+        """Programmed time of the first arrival at a waypoint that is not before ``s_s``; inf after the last [s]."""
+        if not self.waypoints_s or s_s > self.duration_s:
+            return math.inf
+        cycle = math.floor(s_s / self.cycle_s)
+        arrivals = (n * self.cycle_s + at_s for n in (cycle, cycle + 1) for at_s in self.waypoints_s)
+        return next((arrival for arrival in arrivals if arrival >= s_s), math.inf)
+
     def sample(self, s_s: float) -> ReferencePoint:
         """The reference ``s_s`` seconds of programmed time after its start.
 
@@ -85,30 +94,40 @@ def _cubic(
     return q, dq, (2 * b + share * 6 * a) / step_s**2
 
 
-def advance(
-    s_s: float, dt_s: float, tcp_error_m: float, mode: Literal["time", "path"], leash_m: float
-) -> tuple[float, float]:
+@dataclass(frozen=True, slots=True)
+class Leash:
+    """How far a robot may fall behind its reference before the reference waits (``path``), or never (``time``)."""
+
+    mode: Literal["time", "path"] = "path"
+    length_m: float = 0.25  #: the reference stands when the TCP is this far away [m]
+    waypoint_m: float = 0.02  #: and does not leave a waypoint before the TCP is this close to it [m]
+
+
+def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, leash: Leash) -> tuple[float, float]:
     """Programmed time after one tick, and the rate at which it ran.
 
     ``time`` runs with the clock: a robot that was held back then faces a reference that ran away.
     ``path`` runs with the clock while the TCP is within half the leash of the reference, slows down smoothly beyond
-    and waits when the leash is taut (or the error is not known). So no waypoint is ever skipped: the reference goes
-    past one only while the TCP is less than a leash away from it. Neither ever runs backwards.
+    and stands when the leash is taut (or the error is not known). It stops at every waypoint until the TCP has come
+    as near as ``waypoint_m``: however far the robot evades on the way, it never skips one. Neither runs backwards.
 
     Args:
+        reference: The programmed path.
         s_s: Programmed time [s].
         dt_s: Length of the tick [s].
         tcp_error_m: Distance from the TCP to the reference at ``s_s`` [m].
-        mode: ``plan.reference``.
-        leash_m: ``plan.leash_m`` [m].
+        leash: When to wait.
 
     Returns:
         Programmed time at the next tick [s] and the rate in [0, 1]: the reference's velocity is ``rate * twist``.
     """
-    if mode == "time":
+    if leash.mode == "time":
         return s_s + dt_s, 1.0
-    slack = 2.0 - 2.0 * tcp_error_m / leash_m  # 1 at half the leash, 0 where it is taut
+    slack = 2.0 - 2.0 * tcp_error_m / leash.length_m  # 1 at half the leash, 0 where it is taut
     if not slack > 0.0:
         return s_s, 0.0
     rate = 1.0 if slack >= 1.0 else slack * slack * (3.0 - 2.0 * slack)
-    return s_s + rate * dt_s, rate
+    ahead_s = s_s + rate * dt_s
+    if not tcp_error_m <= leash.waypoint_m:
+        ahead_s = min(ahead_s, reference.next_waypoint(s_s))
+    return ahead_s, (ahead_s - s_s) / dt_s

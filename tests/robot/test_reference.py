@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.inverse import Missed, solve
 from hrcreplay.robot.model import RobotModel, from_urdf, irb140
 from hrcreplay.robot.paths import programmed, recorded
-from hrcreplay.robot.reference import STEP_S, Reference, advance
+from hrcreplay.robot.reference import STEP_S, Leash, Reference, advance
 from hrcreplay.robot.task import parse_task
 from tests.realdata import data_path
 
@@ -308,39 +309,51 @@ def test_a_real_track_moves_as_its_own_log_says(measurement: int) -> None:
     assert np.percentile(np.abs(np.array([p.dq for p in points]) - rows[inner, 6:12]), 95) < 0.05
 
 
-def test_time_runs_with_the_clock() -> None:
-    assert advance(1.0, 0.004, 9.0, "time", 0.05) == (1.004, 1.0)
+def test_time_runs_with_the_clock(pick_and_place: Reference) -> None:
+    assert advance(pick_and_place, 1.0, 0.004, 9.0, Leash("time")) == (1.004, 1.0)
 
 
-def test_path_waits_on_a_taut_leash_and_never_turns_back() -> None:
+def test_path_waits_on_a_taut_leash_and_never_turns_back(pick_and_place: Reference) -> None:
+    leash = Leash("path", length_m=0.05, waypoint_m=0.05)
     errors = np.linspace(0, 0.08, 400)
-    steps = [advance(1.0, 0.004, e, "path", 0.05) for e in errors]
+    steps = [advance(pick_and_place, 1.0, 0.004, e, leash) for e in errors]
     rates = np.array([rate for _, rate in steps])
-    assert (rates[errors <= 0.025] == 1).all()
+    assert_allclose(rates[errors <= 0.025], 1, atol=1e-12)
     assert (rates[errors >= 0.05] == 0).all()
-    assert ((rates >= 0) & (rates <= 1)).all()
-    assert (np.diff(rates) <= 0).all()
+    assert (np.diff(rates) <= 1e-12).all()
     assert np.abs(np.diff(rates)).max() < 0.02  # no jump
     assert_allclose([s for s, _ in steps], 1.0 + 0.004 * rates)
-    assert advance(1.0, 0.004, float("nan"), "path", 0.05) == (1.0, 0.0)
+    assert advance(pick_and_place, 1.0, 0.004, float("nan"), leash) == (1.0, 0.0)
 
 
-def test_a_held_robot_is_waited_for(pick_and_place: Reference) -> None:
-    """The robot stands for two seconds in the middle of a move, and then goes on from there."""
-    tick, leash = 0.004, 0.05
+def test_a_held_robot_is_waited_for_and_skips_no_waypoint(pick_and_place: Reference) -> None:
+    """The robot stands for two seconds in the middle of a move, then evades by 12 cm, and goes on from there."""
+    tick, leash = 0.004, Leash("path", length_m=0.25, waypoint_m=0.01)
     s, tcp = 0.0, pick_and_place.sample(0.0).T_world_tcp[:3, 3]
-    passed = []
-    for k in range(3500):
+    passed, evaded = [], 0.0
+    for k in range(4500):
         target = pick_and_place.sample(s).T_world_tcp[:3, 3]
-        error = float(np.linalg.norm(target - tcp))
-        assert error < leash + 1.0 * tick  # one tick at the top speed beyond the leash at most
+        goal = target + np.array([0, 0, 0.12]) if 900 <= k < 1500 else target
+        way = float(np.linalg.norm(goal - tcp))
         if not 100 <= k < 600:
-            tcp = tcp + min(1.0, 1.2 * tick / max(error, 1e-12)) * (target - tcp)
-        s_next, rate = advance(s, tick, float(np.linalg.norm(target - tcp)), "path", leash)
+            tcp = tcp + min(1.0, 1.2 * tick / max(way, 1e-12)) * (goal - tcp)
+        error = float(np.linalg.norm(target - tcp))
+        assert error < leash.length_m + 2.2 * tick
+        s_next, rate = advance(pick_and_place, s, tick, error, leash)
         assert s <= s_next <= s + tick
-        passed += [error for arrival in pick_and_place.waypoints_s if s < arrival <= s_next]
+        passed += [error for arrival in pick_and_place.waypoints_s if s <= arrival < s_next]
+        evaded = max(evaded, error if s_next > s else 0.0)
         assert rate == pytest.approx((s_next - s) / tick, abs=1e-9)
         s = s_next
-    assert len(passed) == 4
-    assert max(passed) < leash
+    assert len(passed) == 5
+    assert max(passed) <= leash.waypoint_m
+    assert evaded > 0.1  # between waypoints the reference goes on beside a robot that evades
     assert s > pick_and_place.duration_s
+
+
+def test_the_next_waypoint_is_found_in_every_cycle(pick_and_place: Reference) -> None:
+    looping = replace(pick_and_place, cycles=3.0)
+    arrivals = np.add.outer(np.arange(4) * looping.cycle_s, np.array(looping.waypoints_s)).ravel()
+    for s in np.linspace(0, looping.duration_s, 333):
+        assert looping.next_waypoint(s) == pytest.approx(arrivals[arrivals >= s].min(), abs=1e-12)
+    assert looping.next_waypoint(looping.duration_s + 1.0) == np.inf
