@@ -62,10 +62,11 @@ def integrate(state: RobotState, dq_next: Floats, dt_s: float) -> tuple[Floats, 
         dt_s: Length of the tick [s].
 
     Returns:
-        ``u`` (nv,) [rad/s^2] and the next state.
+        ``u`` (nv,) [rad/s^2] and the next state. An axis of unknown velocity counts as standing.
     """
-    u = (dq_next - state.dq) / dt_s
-    q_next = state.q + dt_s * state.dq + 0.5 * dt_s**2 * u
+    dq = np.where(np.isfinite(state.dq), state.dq, 0.0)
+    u = (dq_next - dq) / dt_s
+    q_next = state.q + dt_s * dq + 0.5 * dt_s**2 * u
     return u, RobotState(q_next, dq_next)
 
 

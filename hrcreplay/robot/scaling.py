@@ -1,0 +1,185 @@
+"""The baseline [24]: the robot stays on the programmed path, and only its speed along it is scaled."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.records import Floats
+from hrcreplay.robot import stepping
+from hrcreplay.robot.bounds import cartesian_bounds
+from hrcreplay.robot.constraints import worst_rows
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.obstacles import Obstacles
+from hrcreplay.robot.reference import Reference, ReferencePoint
+from hrcreplay.robot.sight import Sight, observe
+from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
+
+#: Share of a speed below which two speeds are one.
+SAME = 1e-9
+
+#: Largest residual of an approach row that counts as held [m^2].
+HELD = 1e-11
+
+#: Rounds of following the path's direction to where the next rate leads.
+ROUNDS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class PathState:
+    """How far along its programmed path the robot is, and the share of the programmed speed it moves with."""
+
+    s_s: float  #: programmed time [s]
+    rate: float  #: in [0, 1]
+
+
+@dataclass(frozen=True, slots=True)
+class _Try:
+    """A rate and where it leads."""
+
+    rate: float
+    s_s: float
+    point: ReferencePoint
+
+
+def step(
+    robot: RobotModel, reference: Reference, state: PathState, obstacles: Obstacles, settings: PlanSettings
+) -> tuple[Step, PathState]:
+    """One tick of the baseline: the largest rate in [0, 1] that meets the constraints of Section 5.
+
+    The robot is where the path is, to the last bit: position and velocity one tick later are those of the path, and
+    ``u`` leads from this tick's velocity to that one, so the safety rows hold for ``dq + dt u`` as they do for the
+    QP; Eq. (69) then gives the next position but for the third order in dt. Rates change as fast as the axes'
+    acceleration limits allow along the path. Where no such rate meets the constraints, the robot brakes along the
+    path, as fast as it can.
+
+    Args:
+        robot: The manipulator.
+        reference: The programmed path.
+        state: At the tick.
+        obstacles: The swept volumes of the tick.
+        settings: Limits; weights are not used.
+
+    Returns:
+        What was decided, and the state one tick later.
+    """
+    with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
+        now = reference.sample(state.s_s)
+        axes = RobotState(now.q, state.rate * now.dq)
+        sight = observe(robot, axes, obstacles, settings.clearance_m)
+        if sight.reason == stepping.NOT_FINITE:
+            stand = np.zeros(robot.nv)
+            held = sight.step(RobotState(now.q, stand), stand, settings.dt_s, stepping.BRAKING, sight.reason)
+            return held, state
+        slowest = _slowest(robot, reference, state, axes, settings.dt_s)
+        if sight.reason:
+            return _result(sight, axes, slowest, settings.dt_s, stepping.BRAKING, sight.reason)
+        fastest, slowed = _fastest(robot, reference, state, axes, sight, obstacles, settings)
+        if sight.pairs is not None and sight.pairs.failed:
+            return _result(sight, axes, slowest, settings.dt_s, stepping.BRAKING, stepping.NO_DISTANCE)
+        if fastest is None or fastest.rate < slowest.rate * (1.0 - SAME):
+            return _result(sight, axes, slowest, settings.dt_s, stepping.BRAKING, stepping.NO_SOLUTION)
+        status = stepping.LIMITED if slowed else stepping.TRACKING
+        return _result(sight, axes, fastest, settings.dt_s, status, 0)
+
+
+def _result(
+    sight: Sight, axes: RobotState, chosen: _Try, dt_s: float, status: int, reason: int
+) -> tuple[Step, PathState]:
+    made = sight.step(axes, chosen.rate * chosen.point.dq, dt_s, status, reason)
+    on_path = RobotState(chosen.point.q, made.next.dq)
+    result = Step(made.pose, made.u, on_path, made.distance_m, made.limb, made.link, status, reason)
+    return result, PathState(chosen.s_s, chosen.rate)
+
+
+def _attempt(reference: Reference, state: PathState, rate: float, dt_s: float) -> _Try:
+    s_s = state.s_s + 0.5 * dt_s * (state.rate + rate)
+    return _Try(rate, s_s, reference.sample(s_s))
+
+
+def _slowest(robot: RobotModel, reference: Reference, state: PathState, axes: RobotState, dt_s: float) -> _Try:
+    """The smallest rate that the axes' acceleration limits allow, or as near as the path lets them come."""
+    rate = 0.0
+    made = _attempt(reference, state, rate, dt_s)
+    for _ in range(ROUNDS):
+        gain = robot.ddq_max * dt_s
+        low, high = rates(made.point.dq, axes.dq - gain, axes.dq + gain)
+        wanted = min(max(low, 0.0), state.rate) if low <= high else state.rate
+        if wanted <= rate * (1.0 + SAME):
+            break
+        rate = wanted
+        made = _attempt(reference, state, rate, dt_s)
+    return made
+
+
+def _fastest(
+    robot: RobotModel,
+    reference: Reference,
+    state: PathState,
+    axes: RobotState,
+    sight: Sight,
+    obstacles: Obstacles,
+    settings: PlanSettings,
+) -> tuple[_Try | None, bool]:
+    """The largest rate that meets all constraints, and whether an approach row is what bounds it.
+
+    Every bound is linear in the next velocity, which is the path's direction times the rate. The direction is that
+    of the place where the rate leads to, so the rate is lowered until it agrees with the direction it has itself.
+    """
+    dt_s, gain, pose = settings.dt_s, robot.ddq_max * settings.dt_s, sight.pose
+    low, high = np.maximum(-robot.dq_max, axes.dq - gain), np.minimum(robot.dq_max, axes.dq + gain)
+    J_low, J_high = cartesian_bounds(
+        pose.J_tcp, pose.dJdq_tcp, axes.dq, settings.tcp_speed_max, settings.tcp_acceleration_max, dt_s
+    )
+    rate, held = 1.0, False
+    for _ in range(ROUNDS):
+        made = _attempt(reference, state, rate, dt_s)
+        towards = made.point.dq
+        free = min(rates(towards, low, high)[1], rates(pose.J_tcp @ towards, J_low, J_high)[1])
+        safe = _safe_rate(sight, obstacles, towards, min(free, rate), settings.stop_s)
+        if not min(free, safe) >= 0.0:
+            return None, True
+        if rate <= min(free, safe) * (1.0 + SAME):
+            return made, held
+        held = held or safe < min(free, rate)
+        rate = min(free, safe)
+    return None, True
+
+
+def _safe_rate(sight: Sight, obstacles: Obstacles, towards: Floats, rate: float, stop_s: float) -> float:
+    """The largest rate up to a given one with which all approach rows hold, Eq. (16)."""
+    pairs = sight.pairs
+    if pairs is None:
+        return math.nan
+    for _ in range(ROUNDS):
+        which, _, values = worst_rows(sight.pose, obstacles, rate * towards, pairs.room_m2(), stop_s, HELD)
+        slower = rate
+        for (link, limb, *_), value in zip(which.tolist(), values.tolist(), strict=True):
+            room = pairs.exact_room_m2(link, limb)
+            if value > room + HELD:
+                slower = min(slower, rate * room / value)
+        if slower == rate:
+            return rate
+        rate = slower
+    return math.nan
+
+
+@njit(cache=True)
+def rates(towards: Floats, low: Floats, high: Floats) -> tuple[float, float]:
+    """Smallest and largest factor with ``low <= factor * towards <= high``; empty where the first is larger.
+
+    Args:
+        towards: (m,).
+        low: (m,).
+        high: (m,).
+    """
+    least, most = -np.inf, np.inf
+    for i in range(len(towards)):
+        if towards[i] > 0.0:
+            least, most = max(least, low[i] / towards[i]), min(most, high[i] / towards[i])
+        elif towards[i] < 0.0:
+            least, most = max(least, high[i] / towards[i]), min(most, low[i] / towards[i])
+    return least, most
