@@ -51,6 +51,7 @@ def run(
     job = resolve(
         command, source, config=config, overrides=overrides, cell_file=cell_file, start_s=start_s, end_s=end_s
     )
+    known = job.meta()
     with RunWriter(out or _folder(job, began)) as writer:
         log = open_log(job.log, log_options(job.settings))
         ticks_ns = _ticks(job, log)
@@ -59,7 +60,7 @@ def run(
             found = run_stages(job, log, ticks_ns, chunk_ticks, sink, smooth=smooth)
         base = wiring.base(job, log)
         meta = {
-            **job.meta(),
+            **known,
             **found,
             "T_world_base": None if base is None else base.tolist(),
             "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",

@@ -96,13 +96,12 @@ class RunWriter:
     def __enter__(self) -> Self:
         if self.folder.exists():
             raise SettingsError(f"{self.folder}: exists already; name another folder with --out, or remove it")
-        try:
-            self.folder.parent.mkdir(parents=True, exist_ok=True)
-            self.partial.mkdir()
-        except FileExistsError as error:
+        if self.partial.exists():
             raise SettingsError(
                 f"{self.partial}: left by a run that is under way or was killed; remove it or name another --out"
-            ) from error
+            )
+        try:
+            self.partial.mkdir(parents=True)
         except OSError as error:
             raise SettingsError(f"{self.folder}: cannot be made ({error.strerror}); name another --out") from error
         self.text("run.json", to_json({"complete": False}))

@@ -1,0 +1,5 @@
+"""``python -m hrcreplay``."""
+
+from hrcreplay.cli import main
+
+main()

@@ -1,0 +1,160 @@
+"""What a user types and reads: every bad input is one clear line, the right exit code, and nothing half-written."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hrcreplay import __version__, cli, replay
+from tests.logs import own
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+    """Runs the command line in an empty folder; gives exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["hrcreplay", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        out, err = capsys.readouterr()
+        return int(left.value.code or 0), out, err
+
+    return call
+
+
+DEMO = replay.demo_log()
+SHORT = ("--start", 8, "--end", 8.4)
+
+
+def test_help_lists_every_command(run: Run) -> None:
+    code, out, _ = run("--help")
+    assert code == 0
+    for command in ("info", "import", "calibrate", "fuse", "predict", "plan", "report", "demo"):
+        assert f" {command} " in out
+
+
+def test_version(run: Run) -> None:
+    assert run("--version") == (0, f"hrcreplay {__version__}\n", "")
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = "import sys; sys.argv = ['hrcreplay', '--help']\nfrom hrcreplay.cli import main\ntry:\n main()\nfinally:\n"
+    code += " heavy = {'numpy', 'pandas', 'numba', 'matplotlib', 'pydantic', 'pinocchio'} & set(sys.modules)\n"
+    code += " sys.exit(3 if heavy else 0)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def test_stdout_carries_only_the_run_folder(run: Run) -> None:
+    code, out, err = run("fuse", DEMO, "--out", "here", *SHORT)
+    assert (code, out, err) == (0, "here\n", "")
+    assert Path("here/state.parquet").exists()
+
+
+def test_the_default_folder_is_under_reports(run: Run) -> None:
+    code, out, _ = run("fuse", DEMO, *SHORT)
+    assert code == 0
+    assert out.startswith("reports/demo/")
+    assert out.endswith("Z-fuse\n")
+    assert (Path(out.strip()) / "run.json").exists()
+
+
+CELL_WITHOUT_BASE = """
+[cameras.kinect]
+T_world_camera = [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]
+"""
+TASK_OUT_OF_REACH = """
+[[waypoints]]
+joints_deg = [0, 0, 0, 0, 90, 0]
+[[waypoints]]
+name = "the moon"
+position_m = [3.0, 0.0, 0.5]
+rpy_deg = [180, 0, 0]
+"""
+
+BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
+    "no log": (("fuse", "none.mcap"), 3, "none.mcap: nothing is there; give a log or a run folder"),
+    "empty file": (("fuse", "empty.mcap"), 3, "empty.mcap: the log holds no messages (0 bytes)"),
+    "no log at all": (("info", "text.bag"), 3, "text.bag: "),
+    "unknown setting": (
+        ("fuse", DEMO, "--set", "fusion.rate=3"),
+        2,
+        "unknown setting 'fusion.rate'; known here: rate_hz",
+    ),
+    "unknown limit set": (("fuse", DEMO, "--set", "limits.tracking=robot"), 2, "robot: no limit set"),
+    "settings file missing": (("fuse", DEMO, "--config", "none.toml"), 2, "none.toml: cannot be read"),
+    "cell missing": (("fuse", DEMO, "--cell", "none.toml"), 2, "none.toml: cannot be read"),
+    "cell of another log": (("fuse", DEMO, "--cell", "other.toml"), 2, "camera third is not in the log"),
+    "out exists": (("fuse", DEMO, "--out", "taken"), 2, "taken: exists already; name another folder with --out"),
+    "out below a file": (("fuse", DEMO, "--out", "empty.mcap/run"), 2, "empty.mcap/run: cannot be made"),
+    "task out of reach": (
+        ("plan", DEMO, "--set", "plan.task=moon.toml", *SHORT),
+        2,
+        "moon.toml: waypoint 2 (the moon)",
+    ),
+    "task missing": (("plan", DEMO, "--set", "plan.task=none.toml"), 2, "none.toml: cannot be read"),
+    "urdf missing": (("plan", DEMO, "--set", "robot.urdf=none.urdf"), 2, "none.urdf is not a file"),
+    "end before start": (("fuse", DEMO, "--start", 5, "--end", 4), 2, "--end 4: not after --start 5"),
+    "span outside": (("fuse", DEMO, "--start", 90), 2, "nothing of the log is left; it lasts 60.0 s"),
+    "unknown topic": (("fuse", DEMO, "--topic", "/nose"), 3, "/nose"),
+    "unknown kind": (("import", "xbox", "a.csv", "--out", "a.mcap"), 2, "found 'xbox'; would be right: azure"),
+    "camera twice": (
+        ("import", "azure", "a=x.csv", "a=y.csv", "--out", "a.mcap"),
+        2,
+        "camera a is given twice",
+    ),
+    "import out exists": (("import", "azure", "a=text.bag", "--out", "empty.mcap"), 2, "empty.mcap: exists already"),
+    "import not the format": (("import", "azure", "a=text.bag", "--out", "a.mcap"), 3, "text.bag"),
+    "calibrate out exists": (("calibrate", DEMO, "--out", "other.toml"), 2, "other.toml: exists already"),
+    "calibrate up": (("calibrate", DEMO, "--out", "c.toml", "--up", "sky"), 2, "--up sky: would be right: 3 numbers"),
+    "calibrate reference": (("calibrate", DEMO, "--out", "c.toml", "--reference", "eye"), 2, "found 'eye'"),
+    "not a run folder": (("report", "taken"), 3, "taken"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line_and_leaves_nothing(run: Run, tmp_path: Path, case: str) -> None:
+    Path("empty.mcap").touch()
+    Path("text.bag").write_text("not a bag\n" * 20)
+    Path("taken").mkdir()
+    Path("other.toml").write_text(CELL_WITHOUT_BASE.replace("kinect", "third"))
+    Path("moon.toml").write_text(TASK_OUT_OF_REACH)
+    before = sorted(tmp_path.rglob("*"))
+    arguments, code, message = BAD[case]
+    found, out, err = run(*arguments)
+    assert found == code, err
+    assert out == ""
+    assert err.startswith("hrcreplay: ")
+    assert message in err
+    assert len(err.strip().splitlines()) <= 2
+    left = [path for path in sorted(tmp_path.rglob("*")) if path.name != "reports" and path.parent.name != "reports"]
+    assert left == before
+
+
+def test_a_log_without_extrinsics_says_how_to_get_them(run: Run) -> None:
+    own.write(Path("unposed.mcap"), own.frames())
+    code, _, err = run("fuse", "unposed.mcap")
+    assert code == 3
+    assert "find it with: hrcreplay calibrate unposed.mcap --out cell.toml, then give --cell cell.toml" in err
+
+
+def test_a_run_that_did_not_end_is_refused(run: Run) -> None:
+    Path("half").mkdir()
+    Path("half/run.json").write_text('{"complete": false}')
+    code, _, err = run("report", "half")
+    assert code == 2
+    assert "half: the run did not end (complete is false); run it again" in err
+
+
+def test_info_tells_what_the_demo_holds(run: Run) -> None:
+    code, out, _ = run("info", DEMO)
+    assert code == 0
+    assert "kinect: 1563 frames at 29.98 Hz" in out
+    assert "task     in the log" in out

@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hrcreplay import replay, runs
+from hrcreplay.errors import SettingsError
+from hrcreplay.human.model import skeleton
+from hrcreplay.logs.reader import open_log
+from hrcreplay.records import JOINTS, LENGTHS, LIMBS, SweptVolumes
+from hrcreplay.runs import Run
+from tests.robot import checker
+
+SPAN = {"start_s": 8.0, "end_s": 11.0}
+
+
+def _meta(folder: Path) -> dict[str, Any]:
+    return runs.read_meta(folder)
+
+
+def test_a_run_leaves_what_the_contract_says(demo_folder: Path, demo: Run) -> None:
+    assert demo.state is not None
+    assert demo.occupancy is not None
+    assert demo.motion is not None
+    assert demo.state["t_ns"].dtype == np.int64
+    wanted = [f"{joint}{suffix}" for joint in JOINTS for suffix in ("", "_vel", "_acc", "_jerk", "_std")]
+    assert set(wanted) | set(LENGTHS) | {"valid_kinect", "valid_xtion"} <= set(demo.state.columns)
+    assert set(demo.occupancy.columns) == {"t_ns", "limb", "method", "radius_m", "volume_m3", "vertices"}
+    assert set(demo.occupancy["limb"]) == set(LIMBS)
+    axes = [f"{name}{axis}" for name in ("q", "dq", "u") for axis in range(1, 7)]
+    places = [f"{name}_{axis}" for name in ("ref", "tcp") for axis in "xyz"]
+    others = ["tcp_speed", "ref_speed", "distance_m", "limb", "link", "status", "reason"]
+    assert list(demo.motion.columns) == ["t_ns", *axes, *places, *others]
+    assert set(demo.motion["status"]) <= {"tracking", "limited", "braking"}
+    for name in ("run.json", "metrics.json", "timing.json", "report.html"):
+        assert (demo_folder / name).stat().st_size > 0
+    assert {p.suffix for p in (demo_folder / "figures").iterdir()} == {".png", ".svg"}
+    meta = demo.meta
+    assert meta["complete"] is True
+    assert np.array(meta["T_world_base"]).shape == (4, 4)
+    assert meta["inputs"][0]["sha256"] == runs.sha256(replay.demo_log())
+    made = {p.relative_to(demo_folder).as_posix() for p in demo_folder.rglob("*") if p.is_file()}
+    assert set(meta["outputs"]) == made - {"run.json", "timing.json"}
+
+
+def test_ticks_are_the_filters_rate(demo: Run) -> None:
+    assert demo.state is not None
+    assert set(np.diff(demo.state["t_ns"])) == {4_000_000}
+    assert len(demo.state) == 15_001
+
+
+def test_fusion_meets_its_bars_on_the_demo(demo_folder: Path, demo: Run) -> None:
+    metrics = json.loads((demo_folder / "metrics.json").read_text())
+    assert metrics["fusion_angle_rmse_ratio"]["value"] <= 0.6
+    assert metrics["fusion_velocity_rmse_ratio"]["value"] <= 0.4
+    assert demo.state is not None
+    assert demo.measurements is not None
+    numbers = demo.state[[f"{j}{s}" for j in JOINTS for s in ("", "_vel", "_acc", "_jerk", "_std")]].to_numpy()
+    seen = demo.state["t_ns"] >= demo.measurements["arrival_ns"].min()
+    assert np.isfinite(numbers[seen]).all()
+    assert np.isnan(numbers[~seen]).all()  # and nothing is made up before
+
+
+def test_stop_share_of_the_qp_is_below_that_of_scaling(demo_folder: Path) -> None:
+    metrics = json.loads((demo_folder / "metrics.json").read_text())
+    assert metrics["plan_near_ticks"]["value"] > 3000
+    assert metrics["baseline_scaling_near_ticks"]["value"] > 3000
+    assert metrics["plan_stationary_share"]["value"] < metrics["baseline_scaling_stationary_share"]["value"]
+
+
+def _volumes(demo: Run) -> SweptVolumes:
+    """The stored volumes of every tick of the motion; a tick without a person has one NaN vertex a limb."""
+    assert demo.occupancy is not None
+    assert demo.motion is not None
+    by_place = {
+        (t, limb): np.asarray(vertices, dtype=float).reshape(-1, 3)
+        for t, limb, vertices in zip(
+            demo.occupancy["t_ns"], demo.occupancy["limb"], demo.occupancy["vertices"], strict=True
+        )
+    }
+    radius = dict(zip(demo.occupancy["limb"], demo.occupancy["radius_m"], strict=True))
+    t_ns = demo.motion["t_ns"].to_numpy()
+    nothing = np.full((1, 3), np.nan)
+    hulls = [by_place.get((t, limb), nothing) for t in t_ns for limb in LIMBS]
+    offsets = np.concatenate([[0], np.cumsum([len(hull) for hull in hulls])])
+    radius_m = np.tile([radius[limb] for limb in LIMBS], (len(t_ns), 1))
+    return SweptVolumes(t_ns, offsets, np.concatenate(hulls), radius_m, LIMBS, "paper")
+
+
+@pytest.mark.parametrize("name", ["qp", "scaling"])
+def test_every_tick_not_in_braking_keeps_inequality_2(demo: Run, name: str) -> None:
+    """By a checker with its own kinematics, from the tables alone."""
+    table = demo.motion if name == "qp" else demo.baselines[name]
+    assert table is not None
+    assert demo.T_world_base is not None
+    status = table["status"].map({"tracking": 0, "limited": 1, "braking": 2}).to_numpy()
+    q, dq, u = (table[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq", "u"))
+    worst = checker.violation(q, dq, u, status, _volumes(demo), demo.T_world_base, dt_s=0.004, stop_s=0.377)
+    assert worst.metres <= 1e-6
+
+
+@pytest.mark.parametrize("name", ["qp"])
+def test_a_braking_robot_decelerates_every_joint_at_its_limit(demo: Run, name: str) -> None:
+    assert demo.motion is not None
+    braking = demo.motion[demo.motion["status"] == "braking"]
+    assert len(braking) > 50
+    dq, u = (braking[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("dq", "u"))
+    limit = np.radians([200, 200, 260, 360, 360, 450]) / 0.377
+    expected = np.minimum(limit, np.maximum(-dq / 0.004, -limit))  # Eq. (67)
+    np.testing.assert_allclose(u, expected, atol=1e-9)
+    assert (braking["reason"] != "").all()
+
+
+def test_same_bytes_with_other_chunks_and_threads(tmp_path: Path) -> None:
+    first = replay.run("report", replay.demo_log(), out=tmp_path / "a", **SPAN)
+    again = replay.run("report", replay.demo_log(), out=tmp_path / "b", chunk_ticks=61, **SPAN)
+    one = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    arguments = ["--start", "8", "--end", "11", "--chunk-ticks", "1000", "--out", str(tmp_path / "c")]
+    command = [sys.executable, "-m", "hrcreplay", "report", str(replay.demo_log()), *arguments]
+    subprocess.run(command, check=True, capture_output=True, env={**os.environ, **one})
+    digests = _meta(first)["outputs"]
+    assert len(digests) > 15
+    assert _meta(again)["outputs"] == digests
+    assert _meta(tmp_path / "c")["outputs"] == digests
+
+
+def test_a_stage_takes_over_an_earlier_run_or_says_why_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = replay.run("plan", replay.demo_log(), out=tmp_path / "whole", **SPAN)
+    fused = replay.run("fuse", replay.demo_log(), out=tmp_path / "fused", **SPAN)
+    planned = replay.run("plan", fused, out=tmp_path / "planned")
+    assert f"fuse: taken over from {fused}" in capsys.readouterr().err
+    assert _meta(planned)["outputs"] == _meta(whole)["outputs"]
+    assert _meta(planned)["counts"] == _meta(whole)["counts"]
+    other = replay.run("plan", planned, out=tmp_path / "other", overrides=("plan.clearance_m=0.1",))
+    said = capsys.readouterr().err
+    assert "predict: taken over" in said
+    assert f"plan: log, cell or settings are not those of {planned}; computed again" in said
+    mine, theirs = _meta(other)["outputs"], _meta(planned)["outputs"]
+    assert mine["state.parquet"] == theirs["state.parquet"]
+    assert mine["motion.parquet"] != theirs["motion.parquet"]
+
+
+def test_smooth_comes_nearer_to_the_truth_than_the_filter(tmp_path: Path) -> None:
+    folder = replay.run("fuse", replay.demo_log(), out=tmp_path / "s", smooth=True, **SPAN)
+    run = runs.read(folder)
+    assert run.truth is not None
+    assert run.state is not None
+    smooth = runs.pq.read_table(folder / "smooth.parquet").to_pandas()
+    at = np.searchsorted(run.state["t_ns"], run.truth["t_ns"])
+    inside = at < len(run.state)
+    joints = list(JOINTS[4:])
+
+    def error(table: Any) -> float:
+        apart = table[joints].to_numpy()[at[inside]] - run.truth[joints].to_numpy()[inside]  # type: ignore[index]
+        return float(np.median(np.abs((apart + np.pi) % (2 * np.pi) - np.pi)))
+
+    assert error(smooth) < error(run.state)
+
+
+def test_what_the_volumes_hold_is_the_person(demo: Run) -> None:
+    """The fused skeleton's wrist lies in the hull of its own lower arm."""
+    assert demo.state is not None
+    assert demo.occupancy is not None
+    arm = demo.occupancy[demo.occupancy["limb"] == "LRA"].iloc[::500]
+    state = demo.state.set_index("t_ns")
+    for t, vertices in zip(arm["t_ns"], arm["vertices"], strict=True):
+        row = state.loc[t]
+        wrist = skeleton(row[list(JOINTS)].to_numpy()[None], row[list(LENGTHS)].to_numpy()[None])[0, 10]
+        hull = np.asarray(vertices, dtype=float).reshape(-1, 3)
+        directions = np.random.default_rng(0).normal(size=(200, 3))
+        assert (directions @ wrist <= (directions @ hull.T).max(axis=1) + 1e-9).all()
+
+
+def test_nothing_of_a_span_outside_the_log_is_replayed(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"--start 70: nothing of the log is left; it lasts 60\.0 s"):
+        replay.run("fuse", replay.demo_log(), out=tmp_path / "x", start_s=70.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_tick_uses_no_frame_that_was_still_on_the_wire(tmp_path: Path) -> None:
+    """Cutting the log right after a tick changes nothing of what the ticks before knew."""
+    log = open_log(replay.demo_log())
+    assert log.header.end_ns - log.header.start_ns == 60_000_000_000
+    short = runs.read(replay.run("fuse", replay.demo_log(), out=tmp_path / "short", end_s=3.0))
+    longer = runs.read(replay.run("fuse", replay.demo_log(), out=tmp_path / "longer", end_s=4.0))
+    assert short.state is not None
+    assert longer.state is not None
+    assert short.state.equals(longer.state.iloc[: len(short.state)])
