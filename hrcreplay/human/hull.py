@@ -1,0 +1,120 @@
+"""Convex hulls of swept volumes and the size of what a ball makes of them, flat and thin sets included."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from scipy.spatial import ConvexHull
+
+from hrcreplay.records import Floats, Ints
+
+Vector = tuple[float, float, float]
+
+#: A set thinner than this in a direction has no extent in it [m].
+_THIN_M = 1e-9
+
+
+def hull(points_m: Floats) -> tuple[Floats, Ints]:
+    """Corners and triangles of a convex hull.
+
+    Args:
+        points_m: (n, 3), n >= 1, all finite [m].
+
+    Returns:
+        ``vertices`` (m, 3) [m], the corners in the order of the points, and ``faces`` (f, 3), three rows of vertices
+        for each triangle, counterclockwise seen from outside. A flat set's triangles are there for both sides; two
+        points or one have none.
+    """
+    axes = _axes(points_m)
+    if len(axes) == 3:
+        solid = ConvexHull(points_m)
+        corners = np.sort(solid.vertices)
+        faces = np.searchsorted(corners, solid.simplices)
+        vertices = points_m[corners]
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), solid.equations[:, :3]) < 0.0
+        faces[inward] = faces[inward][:, ::-1]
+        return vertices, faces.astype(np.int64)
+    if len(axes) == 2:
+        around = ConvexHull(points_m @ axes.T).vertices  # counterclockwise
+        corners = np.sort(around)
+        loop = np.searchsorted(corners, around)
+        # from different corners, so that no two triangles lie left of one edge
+        return points_m[corners], np.concatenate([_fan(loop), _fan(np.roll(loop, -1))[:, ::-1]])
+    if len(axes) == 1:
+        along = points_m @ axes[0]
+        return points_m[np.sort([along.argmin(), along.argmax()])], np.empty((0, 3), np.int64)
+    return points_m[:1], np.empty((0, 3), np.int64)
+
+
+def _fan(loop: Ints) -> Ints:
+    return np.column_stack([np.full(len(loop) - 2, loop[0]), loop[1:-1], loop[2:]]).astype(np.int64)
+
+
+def sphere_swept_volume_m3(points_m: Floats, radius_m: float, faces: Ints | None = None) -> float:
+    """Volume of a convex hull with a ball around every point, Eq. (41), by Steiner's formula [m^3].
+
+    V + A r + M r^2 + 4/3 pi r^3, where M is half the sum over edges of length times exterior angle. A flat set counts
+    as two-sided (A twice its area, angles of pi), so a segment gives a capsule and a point a ball.
+
+    Args:
+        points_m: (n, 3), n >= 1, all finite [m].
+        radius_m: Radius of the ball [m].
+        faces: What ``hull`` gave with these points; without it the hull is computed here.
+    """
+    if faces is None:
+        points_m, faces = hull(points_m)
+    if len(faces):
+        volume, area, bend = _measures(points_m, faces)
+    else:
+        volume, area, bend = 0.0, 0.0, np.pi * float(np.linalg.norm(points_m[-1] - points_m[0]))
+    return float(volume + area * radius_m + bend * radius_m**2 + 4.0 / 3.0 * np.pi * radius_m**3)
+
+
+@njit(cache=True)
+def _measures(vertices: Floats, faces: Ints) -> tuple[float, float, float]:
+    """V [m^3], A [m^2] and M [m] of Steiner's formula for a closed surface of triangles."""
+    left = np.empty((len(vertices), len(vertices)), np.int32)  # the triangle left of an edge
+    normals = [(0.0, 0.0, 0.0)] * len(faces)
+    volume, area, bend = 0.0, 0.0, 0.0
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        normals[f] = _cross(_edge(vertices, a, b), _edge(vertices, a, c))
+        volume += _dot(_edge(vertices, 0, a), normals[f]) / 6.0
+        area += 0.5 * _norm(normals[f])
+        left[a, b], left[b, c], left[c, a] = f, f, f
+    for f in range(len(faces)):
+        for k in range(3):
+            i, j = faces[f, k], faces[f, (k + 1) % 3]
+            beyond = normals[left[j, i]]
+            angle = np.arctan2(_norm(_cross(normals[f], beyond)), _dot(normals[f], beyond))
+            bend += 0.25 * _norm(_edge(vertices, i, j)) * angle  # half of it, and every edge is there twice
+    return volume, area, bend
+
+
+@njit(cache=True)
+def _edge(vertices: Floats, i: int, j: int) -> Vector:
+    return vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
+
+
+@njit(cache=True)
+def _cross(u: Vector, v: Vector) -> Vector:
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@njit(cache=True)
+def _dot(u: Vector, v: Vector) -> float:
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@njit(cache=True)
+def _norm(u: Vector) -> float:
+    return float(np.sqrt(_dot(u, u)))
+
+
+def _axes(points_m: Floats) -> Floats:
+    """(0 to 3, 3) principal directions in which the set has an extent, the longest first."""
+    _, _, directions = np.linalg.svd(points_m - points_m.mean(axis=0), full_matrices=False)
+    extents = np.ptp(points_m @ directions.T, axis=0)
+    axes: Floats = directions[extents > _THIN_M]
+    return axes

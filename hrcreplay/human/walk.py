@@ -1,0 +1,123 @@
+"""The last three sweeps of Alg. 2, heading, x and y, in one: only copies that can be corners of the result.
+
+All copies of a point are at its height. A copy is no corner of the result when it lies between another copy and a
+point of its own set, that is: when the point can take a small step away from where the other copy is, and stay inside.
+The steps are proven on the surface around the set, so nothing is dropped that is not inside the hull of the rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.corners import Surface, is_inside
+from hrcreplay.human.sweep import MOST_COPIES, turns
+from hrcreplay.records import Floats
+
+#: Directions in the plane: EMPTY, POINTED (within less than half a turn) or ALL_ROUND (they can cancel), and the
+#: clockwise most and counterclockwise most of pointed ones as unit vectors.
+Cone = tuple[int, float, float, float, float]
+EMPTY, POINTED, ALL_ROUND = 0, 1, 2
+
+#: How far a step goes [m], and how far it keeps off the edge of the directions that lead inside [rad].
+_STEP_M, _OFF_EDGE = 1e-6, 1e-3
+#: Directions that differ by less are the same [rad].
+_SAME = 1e-12
+
+
+@njit(cache=True)
+def sweep_walk(points: Floats, count: int, faces: int, work: Surface, low: Floats, high: Floats, swept: Floats) -> int:
+    """Rotational sweep about the z axis, then translational sweeps along x and y.
+
+    Args:
+        points: (m, 3), of which the first ``count`` are what ``keep_corners`` kept, in the human base frame [m].
+        count: Number of points.
+        faces: Number of triangles around them; with none, only copies inside the others of a point are left out.
+        work: The surface, as ``keep_corners`` left it.
+        low: (>= 3,) smallest x, y, heading [m, m, rad].
+        high: (>= 3,) largest.
+        swept: (>= 32 count, 3) receives the points, world [m].
+
+    Returns:
+        Number of points written.
+    """
+    cosines, sines = np.empty(MOST_COPIES), np.empty(MOST_COPIES)
+    copies = turns(low[2], high[2], cosines, sines)
+    wide, deep = low[0] < high[0], low[1] < high[1]
+    steps = _steps_inside(points, count, faces, work)
+    n = 0
+    for i in range(count):
+        x, y = points[i, 0], points[i, 1]
+        for copy in range(1 if x == 0.0 and y == 0.0 else copies):
+            c, s = cosines[copy], sines[copy]
+            away = _away_from_turned(x, y, copy, copies, cosines, sines)
+            for k in (0, 2):
+                away = _widen(away, s * steps[i, k + 1] - c * steps[i, k], -s * steps[i, k] - c * steps[i, k + 1])
+            for right in range(2 if wide else 1):
+                for far in range(2 if deep else 1):
+                    cone = _widen(away, (2.0 * right - 1.0) * wide, 0.0)
+                    cone = _widen(cone, 0.0, (2.0 * far - 1.0) * deep)
+                    if cone[0] == ALL_ROUND:
+                        continue
+                    swept[n, 0] = c * x - s * y + (high[0] if right else low[0])
+                    swept[n, 1] = s * x + c * y + (high[1] if far else low[1])
+                    swept[n, 2] = points[i, 2]
+                    n += 1
+    return n
+
+
+@njit(cache=True)
+def _away_from_turned(x: float, y: float, copy: int, copies: int, cosines: Floats, sines: Floats) -> Cone:
+    """Directions from the other turned copies of a point to this one."""
+    away = (EMPTY, 0.0, 0.0, 0.0, 0.0)
+    if x == 0.0 and y == 0.0:
+        return away
+    for other in range(copies):
+        if other != copy:
+            c, s = cosines[copy] - cosines[other], sines[copy] - sines[other]
+            away = _widen(away, c * x - s * y, s * x + c * y)
+    return away
+
+
+@njit(cache=True)
+def _widen(cone: Cone, x: float, y: float) -> Cone:
+    """The cone with another direction in it; a zero vector is none."""
+    kind, ax, ay, bx, by = cone
+    length = np.sqrt(x * x + y * y)
+    if kind == ALL_ROUND or length == 0.0:
+        return cone
+    x, y = x / length, y / length
+    if kind == EMPTY:
+        return POINTED, x, y, x, y
+    from_a, to_b = ax * y - ay * x, x * by - y * bx
+    if from_a < -_SAME and to_b < -_SAME:
+        return ALL_ROUND, 0.0, 0.0, 0.0, 0.0
+    if from_a < 0.0 <= to_b:
+        return POINTED, x, y, bx, by
+    if to_b < 0.0 <= from_a:
+        return POINTED, ax, ay, x, y
+    return cone
+
+
+@njit(cache=True)
+def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floats:
+    """(count, 4) two level directions (x, y, x, y), from which on and between which a small step leads inside.
+
+    They are next to the edges of what the triangles at a corner allow, and zero where they allow or prove none.
+    """
+    normals = [(EMPTY, 0.0, 0.0, 0.0, 0.0) for _ in range(count)]
+    for f in range(faces):
+        for k in range(3):
+            i = work.slots[work.faces[f, k]]
+            normals[i] = _widen(normals[i], work.planes[0, f], work.planes[1, f])
+    steps = np.zeros((count, 4))
+    for i in range(count):
+        kind, ax, ay, bx, by = normals[i]
+        if kind != POINTED:
+            continue
+        for k, x, y in ((0, -by, bx), (2, ay, -ax)):  # at right angles to the outermost normals
+            x, y = x - _OFF_EDGE * (ax + bx), y - _OFF_EDGE * (ay + by)
+            px, py = points[i, 0] + _STEP_M * x, points[i, 1] + _STEP_M * y
+            if is_inside(px, py, points[i, 2], faces, work):
+                steps[i, k], steps[i, k + 1] = x, y
+    return steps
