@@ -7,9 +7,10 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numba import njit
 
-from hrcreplay.human.corners import Surface, keep_corners, surface
+from hrcreplay.human.corners import keep_corners
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.reach import bounds_of, code_of, reach_row
+from hrcreplay.human.surface import Surface, surface
 from hrcreplay.human.sweep import MOST_COPIES, sweep_rot
 from hrcreplay.human.walk import sweep_walk
 from hrcreplay.records import LIMBS, Floats, HumanStates, Ints, SweptVolumes

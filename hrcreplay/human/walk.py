@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hrcreplay.human.corners import Surface, is_inside
+from hrcreplay.human.surface import Surface, sides
 from hrcreplay.human.sweep import MOST_COPIES, turns
 from hrcreplay.records import Floats
 
@@ -118,6 +118,7 @@ def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floa
         for k, x, y in ((0, -by, bx), (2, ay, -ax)):  # at right angles to the outermost normals
             x, y = x - _OFF_EDGE * (ax + bx), y - _OFF_EDGE * (ay + by)
             px, py = points[i, 0] + _STEP_M * x, points[i, 1] + _STEP_M * y
-            if is_inside(px, py, points[i, 2], faces, work):
+            outside, _ = sides(px, py, points[i, 2], faces, work)
+            if outside == 0:
                 steps[i, k], steps[i, k + 1] = x, y
     return steps
