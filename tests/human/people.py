@@ -1,62 +1,85 @@
-"""Postures, skeletons and measurements for the tests of the person."""
+"""Random people, and Alg. 2 written plainly: matrices, no reduction."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import LimitSet, clamp
-from hrcreplay.records import POINTS, CameraFrames, Floats, Ints, Measurements
+from hrcreplay.records import LIMBS, Floats, HumanStates
 
-NEUTRAL = np.array([0.3, -0.2, 0.4, 0.1, 0.3, 0.6, 0.1, 1.9, 0.2, 0.5, -0.1, 2.1])
-LENGTHS_M = np.array([0.94, 0.5, 0.22, 0.19, 0.31, 0.32, 0.27, 0.26])
-CAMERAS = ("left", "right")
+LENGTHS_M = np.array([1.0, 0.5, 0.21, 0.19, 0.33, 0.34, 0.26, 0.27])
 
 
-def postures(limits: LimitSet, n: int, seed: int) -> Floats:
-    """(n, 12) uniform in the limits' box, then put inside the coupled limits."""
-    rng = np.random.default_rng(seed)
-    low = np.where(np.isfinite(limits.p_min), limits.p_min, -3.0)
-    high = np.where(np.isfinite(limits.p_max), limits.p_max, 3.0)
-    return clamp(rng.uniform(low, high, (n, 12)), limits)
-
-
-def lengths(n: int, seed: int) -> Floats:
-    return np.random.default_rng(seed).uniform(0.15, 1.0, (n, 8))
-
-
-def frames_of(points_m: Floats, camera: Ints, capture_ns: Ints, delay_ns: int = 0) -> CameraFrames:
-    """World points as frames of cameras that stand at the world's origin."""
-    seen = np.isfinite(points_m[:, :, 0])
-    return CameraFrames(
-        capture_ns=capture_ns,
-        arrival_ns=capture_ns + delay_ns,
-        camera=camera,
-        body=np.zeros_like(camera),
-        points_m=points_m,
-        confidence=seen.astype(np.float64),
-        cameras=CAMERAS,
+def states(p: Floats, v: Floats, lengths_m: Floats = LENGTHS_M) -> HumanStates:
+    """States with the given postures and velocities, (n, 12) each."""
+    zeros, lengths = np.zeros_like(p), np.tile(lengths_m, (len(p), 1))
+    valid = np.ones((len(p), 1), dtype=bool)
+    return HumanStates(
+        np.arange(len(p)) * 4_000_000, p, v, zeros, zeros, zeros, zeros, lengths, 0 * lengths, valid, ("camera",)
     )
 
 
-def random_measurements(n: int, seed: int, *, missing: float = 0.3, noise: float = 0.02) -> Measurements:
-    """n frames of a person about NEUTRAL at random instants, angles with noise of their own, confidences random."""
+def random_states(limits: LimitSet, count: int, seed: int) -> HumanStates:
+    """Postures and velocities all over the admissible range."""
     rng = np.random.default_rng(seed)
-    capture = np.sort(rng.integers(0, n * 15_000_000, n))
-    arrival = np.maximum.accumulate(capture + rng.integers(0, 30_000_000, n))
-    std = rng.uniform(0.5, 2.0, (n, 20)) * noise
-    confidence = np.where(rng.random((n, len(POINTS))) < missing / 5.0, 0.1, 1.0)
-    z = np.concatenate([NEUTRAL, LENGTHS_M]) + rng.normal(0.0, noise, (n, 20))
-    z[rng.random((n, 20)) < missing] = np.nan
-    std[np.isnan(z)] = np.nan
-    return Measurements(
-        capture_ns=capture,
-        arrival_ns=arrival,
-        camera=rng.integers(0, 2, n),
-        angles=z[:, :12],
-        angles_std=std[:, :12],
-        lengths_m=z[:, 12:],
-        lengths_std_m=std[:, 12:],
-        points_m=np.zeros((n, len(POINTS), 3)),
-        confidence=confidence,
-        cameras=CAMERAS,
-    )
+    p = rng.uniform(np.maximum(limits.p_min, -4.0), np.minimum(limits.p_max, 4.0), (count, 12))
+    v = rng.uniform(limits.v_min, limits.v_max, (count, 12))
+    c, s = np.cos(p[:, 2]), np.sin(p[:, 2])
+    v[:, 0], v[:, 1] = c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]
+    return states(clamp(p, limits), v)
+
+
+def raw_cloud(limb: str, low: Floats, high: Floats, lengths_m: Floats = LENGTHS_M) -> Floats:
+    """Every point that Alg. 2 makes for a limb, triangles of at most 60 degrees with all their corners."""
+    height, torso, head, half_shoulder, upper_l, upper_r, fore_l, fore_r = lengths_m
+    side, arm = (1.0, slice(8, 12)) if limb in ("ULA", "LLA") else (-1.0, slice(4, 8))
+    upper, fore = (upper_l, fore_l) if side > 0 else (upper_r, fore_r)
+    (l1, l2, l3, l4), (h1, h2, h3, h4) = low[arm], high[arm]
+    if limb == "HD":
+        points = np.array([[0, 0, torso], [0, 0, torso + head]])
+    elif limb == "THX":
+        points = np.array([[0, 0, 0], [0, 0, torso], [0, -half_shoulder, torso], [0, half_shoulder, torso]])
+    else:
+        if limb in ("URA", "ULA"):
+            points = np.array([[0, 0, 0], [0, 0, -upper]])
+        else:
+            points = _turn(np.array([[0, 0, 0], [0, 0, -fore]]), "y", -(np.pi - l4), -(np.pi - h4))
+            points = _turn(points, "z", side * l3, side * h3) + [0, 0, -upper]
+        points = _turn(_turn(points, "y", -l2, -h2), "x", side * l1, side * h1) + [0, side * half_shoulder, torso]
+    points = _turn(points, "y", low[3], high[3]) + [0, 0, height]
+    points = _turn(points, "z", low[2], high[2])
+    return np.concatenate([points + [x, y, 0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+
+
+def _turn(points: Floats, axis: str, start: float, end: float) -> Floats:
+    pieces = max(1, int(np.ceil(abs(end - start) / (np.pi / 3) - 1e-12)))
+    cuts = np.linspace(start, end, pieces + 1)
+    along = np.array([name == axis for name in "xyz"], dtype=float)
+    clouds = [Rotation.from_euler(axis, angle).apply(points) for angle in cuts]
+    for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+        stretched = (points - points * along) / np.cos((b - a) / 2) + points * along
+        clouds.append(Rotation.from_euler(axis, (a + b) / 2).apply(stretched))
+    return np.concatenate(clouds)
+
+
+def directions(count: int, seed: int) -> Floats:
+    """(count + 26, 3) random unit vectors, and the axes and diagonals."""
+    grid = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)])
+    vectors = np.concatenate([np.random.default_rng(seed).normal(size=(count, 3)), grid])
+    unit: Floats = vectors / np.linalg.norm(vectors, axis=1)[:, None]
+    return unit
+
+
+def limb_points(skeleton: Floats, limb: str) -> Floats:
+    """The ends of a limb among POINTS: (k, 3) of (20, 3)."""
+    rows = {
+        "HD": (2, 3),
+        "THX": (0, 2, 4, 8),
+        "URA": (8, 9),
+        "LRA": (9, 10),
+        "ULA": (4, 5),
+        "LLA": (5, 6),
+    }
+    assert set(rows) == set(LIMBS)
+    return skeleton[list(rows[limb])]

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from hrcreplay.human.hull import hull, sphere_swept_volume_m3
+from hrcreplay.records import Floats, Ints
+
+BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], dtype=float)
+TRIANGLE = np.array([[0, 0, 0], [3, 0, 0], [0, 4, 0]], dtype=float)
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+R = 0.3
+BALL = 4 / 3 * np.pi * R**3
+TILTED = Rotation.from_rotvec([0.3, -1.1, 0.7])
+
+
+def tilted(points: Floats) -> Floats:
+    return TILTED.apply(points) + [5.0, -2.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("points", "volume"),
+    [
+        (BOX, 6 + 22 * R + 6 * np.pi * R**2 + BALL),
+        (BOX[[0, 7]], np.pi * np.sqrt(14) * R**2 + BALL),
+        (np.linspace(BOX[0], BOX[7], 5), np.pi * np.sqrt(14) * R**2 + BALL),
+        (TRIANGLE, 12 * R + 0.5 * np.pi * 12 * R**2 + BALL),
+        (SQUARE, 2 * R + 0.5 * np.pi * 4 * R**2 + BALL),
+        (BOX[:1], BALL),
+        (np.tile(BOX[3], (4, 1)), BALL),
+    ],
+    ids=["box", "segment", "collinear", "triangle", "square", "point", "one point many times"],
+)
+def test_closed_forms(points: Floats, volume: float) -> None:
+    for place in (points, tilted(points)):
+        assert sphere_swept_volume_m3(place, R) == pytest.approx(volume, rel=1e-9)
+        assert sphere_swept_volume_m3(*_with_radius(place)) == pytest.approx(volume, rel=1e-9)
+
+
+def _with_radius(points: Floats) -> tuple[Floats, float, Ints]:
+    vertices, faces = hull(points)
+    return vertices, R, faces
+
+
+def test_against_throwing_darts() -> None:
+    rng = np.random.default_rng(0)
+    vertices, _ = hull(rng.normal(size=(30, 3)))
+    low, high = vertices.min(axis=0) - R, vertices.max(axis=0) + R
+    darts = rng.uniform(low, high, (20_000, 3))
+    share = (_distances(darts, vertices) <= R).mean()
+    assert sphere_swept_volume_m3(vertices, R) == pytest.approx(share * np.prod(high - low), rel=0.02)
+
+
+def _distances(points: Floats, vertices: Floats) -> Floats:
+    """Distance to a hull, or -depth, as the largest separation over many directions: at most the true one."""
+    rng = np.random.default_rng(1)
+    normals = rng.normal(size=(4000, 3))
+    normals = np.concatenate(
+        [normals / np.linalg.norm(normals, axis=1)[:, None], ConvexHull(vertices).equations[:, :3]]
+    )
+    support = (normals @ vertices.T).max(axis=1)
+    best = np.full(len(points), -np.inf)
+    for chunk in range(0, len(normals), 500):
+        best = np.maximum(best, (points @ normals[chunk : chunk + 500].T - support[chunk : chunk + 500]).max(axis=1))
+    return best
+
+
+def test_corners_come_in_the_order_of_the_points_and_faces_look_outward() -> None:
+    rng = np.random.default_rng(2)
+    inner = rng.uniform(0.2, 0.8, (20, 3))
+    points = np.concatenate([inner[:10], BOX, inner[10:]])
+    vertices, faces = hull(points)
+    assert vertices.tolist() == BOX.tolist()
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), a - BOX.mean(axis=0)) > 0).all()
+    assert hull(points)[1].tolist() == faces.tolist()
+
+
+def test_a_flat_set_has_both_sides() -> None:
+    vertices, faces = hull(tilted(np.concatenate([SQUARE, [[0.5, 0.5, 0.0]]])))
+    assert vertices == pytest.approx(tilted(SQUARE))
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    areas = np.cross(b - a, c - a) / 2
+    assert np.linalg.norm(areas, axis=1).sum() == pytest.approx(2.0)
+    assert areas.sum(axis=0) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_thin_sets_have_no_faces() -> None:
+    for points, count in ((BOX[[0, 7]], 2), (BOX[:1], 1)):
+        vertices, faces = hull(points)
+        assert (len(vertices), faces.shape) == (count, (0, 3))
