@@ -159,7 +159,7 @@ def test_smooth_comes_nearer_to_the_truth_than_the_filter(tmp_path: Path) -> Non
 
     def error(table: Any) -> float:
         apart = table[joints].to_numpy()[at[inside]] - run.truth[joints].to_numpy()[inside]  # type: ignore[index]
-        return float(np.median(np.abs((apart + np.pi) % (2 * np.pi) - np.pi)))
+        return float(np.nanmedian(np.abs((apart + np.pi) % (2 * np.pi) - np.pi)))
 
     assert error(smooth) < error(run.state)
 
@@ -172,7 +172,9 @@ def test_what_the_volumes_hold_is_the_person(demo: Run) -> None:
     state = demo.state.set_index("t_ns")
     for t, vertices in zip(arm["t_ns"], arm["vertices"], strict=True):
         row = state.loc[t]
-        wrist = skeleton(row[list(JOINTS)].to_numpy()[None], row[list(LENGTHS)].to_numpy()[None])[0, 10]
+        wrist = skeleton(row[list(JOINTS)].to_numpy(dtype=float)[None], row[list(LENGTHS)].to_numpy(dtype=float)[None])[
+            0, 10
+        ]
         hull = np.asarray(vertices, dtype=float).reshape(-1, 3)
         directions = np.random.default_rng(0).normal(size=(200, 3))
         assert (directions @ wrist <= (directions @ hull.T).max(axis=1) + 1e-9).all()
