@@ -176,12 +176,12 @@ def _store(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
             vertices = volumes.vertices(tick, i)
             if np.isnan(vertices).any():
                 continue
-            corners, _ = hull.hull(vertices)
+            corners, faces = hull.hull(vertices)
             radius = float(volumes.radius_m[tick, i])
             t_ns.append(int(volumes.t_ns[tick]))
             limbs.append(limb)
             radii.append(radius)
-            sizes.append(hull.sphere_swept_volume_m3(corners, radius))
+            sizes.append(hull.sphere_swept_volume_m3(corners, radius, faces))
             hulls.append(corners)
     if t_ns:
         run.table("occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls))
