@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -36,20 +38,20 @@ def raw_cloud(limb: str, low: Floats, high: Floats, lengths_m: Floats = LENGTHS_
     side, arm = (1.0, slice(8, 12)) if limb in ("ULA", "LLA") else (-1.0, slice(4, 8))
     upper, fore = (upper_l, fore_l) if side > 0 else (upper_r, fore_r)
     (l1, l2, l3, l4), (h1, h2, h3, h4) = low[arm], high[arm]
+    shoulder, pelvis = np.array([0, side * half_shoulder, torso]), np.array([0, 0, height])
     if limb == "HD":
         points = np.array([[0, 0, torso], [0, 0, torso + head]])
     elif limb == "THX":
         points = np.array([[0, 0, 0], [0, 0, torso], [0, -half_shoulder, torso], [0, half_shoulder, torso]])
     else:
-        if limb in ("URA", "ULA"):
-            points = np.array([[0, 0, 0], [0, 0, -upper]])
-        else:
+        elbow = np.array([0, 0, -upper])
+        points = np.array([[0, 0, 0], elbow])
+        if limb in ("LRA", "LLA"):
             points = _turn(np.array([[0, 0, 0], [0, 0, -fore]]), "y", -(np.pi - l4), -(np.pi - h4))
-            points = _turn(points, "z", side * l3, side * h3) + [0, 0, -upper]
-        points = _turn(_turn(points, "y", -l2, -h2), "x", side * l1, side * h1) + [0, side * half_shoulder, torso]
-    points = _turn(points, "y", low[3], high[3]) + [0, 0, height]
-    points = _turn(points, "z", low[2], high[2])
-    return np.concatenate([points + [x, y, 0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+            points = elbow + _turn(points, "z", side * l3, side * h3)
+        points = shoulder + _turn(_turn(points, "y", -l2, -h2), "x", side * l1, side * h1)
+    points = _turn(pelvis + _turn(points, "y", low[3], high[3]), "z", low[2], high[2])
+    return np.concatenate([points + np.array([x, y, 0]) for x in (low[0], high[0]) for y in (low[1], high[1])])
 
 
 def _turn(points: Floats, axis: str, start: float, end: float) -> Floats:
@@ -57,7 +59,7 @@ def _turn(points: Floats, axis: str, start: float, end: float) -> Floats:
     cuts = np.linspace(start, end, pieces + 1)
     along = np.array([name == axis for name in "xyz"], dtype=float)
     clouds = [Rotation.from_euler(axis, angle).apply(points) for angle in cuts]
-    for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+    for a, b in pairwise(cuts):
         stretched = (points - points * along) / np.cos((b - a) / 2) + points * along
         clouds.append(Rotation.from_euler(axis, (a + b) / 2).apply(stretched))
     return np.concatenate(clouds)

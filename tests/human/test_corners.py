@@ -38,7 +38,7 @@ def clouds() -> dict[str, Floats]:
         "ball": ball,
         "sphere": sphere,
         "crowded sphere": np.concatenate([sphere * (1 + 1e-13 * k) for k in range(3)]),
-        "far away": ball + [1e3, -1e3, 0],
+        "far away": ball + np.array([1e3, -1e3, 0]),
         "grid": grid,
         "grid, one plane": grid[grid[:, 2] == 0],
         "grid, one line": grid[(grid[:, 2] == 0) & (grid[:, 1] == 0)],

@@ -17,7 +17,8 @@ TILTED = Rotation.from_rotvec([0.3, -1.1, 0.7])
 
 
 def tilted(points: Floats) -> Floats:
-    return TILTED.apply(points) + [5.0, -2.0, 1.0]
+    placed: Floats = TILTED.apply(points) + np.array([5.0, -2.0, 1.0])
+    return placed
 
 
 @pytest.mark.parametrize(

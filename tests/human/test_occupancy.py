@@ -18,7 +18,7 @@ from tests.human.people import LENGTHS_M, directions, limb_points, random_states
 
 T = 0.377
 PAPER, HUMAN = load_limits("paper"), load_limits("human")
-ALONG = directions(3000, 1)
+ALONG = directions(1500, 1)
 
 
 def predict(people: HumanStates, limits: LimitSet = PAPER, method: str = "paper", horizon_s: float = T) -> SweptVolumes:
@@ -32,7 +32,7 @@ def support(points: Floats) -> Floats:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_hulls_are_those_of_algorithm_2(method: str) -> None:
-    people = random_states(PAPER, 25, 11)
+    people = random_states(PAPER, 12, 11)
     volumes, reach = predict(people, method=method), reachable(people, PAPER, T, method)
     for i in range(len(people)):
         for k, limb in enumerate(LIMBS):
