@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.human.surface import MOST_SLOTS, Surface, insert, join, set_plane, sides
+from hrcreplay.human.vectors import Vector, cross, dot, edge, norm
 from hrcreplay.records import Bools, Floats, Ints
 
 #: A set whose four most distant points are flatter than this has no surface [m].
@@ -117,18 +118,17 @@ def _seeds_first(points: Floats, count: int) -> Ints:
 @njit(cache=True)
 def _simplex(points: Floats, order: Ints, size: float, work: Surface) -> int:
     """Four points far from each other as the first surface; returns its 4 triangles, or 0 for a flat set."""
-    a = points[order[0]]
-    ib = _farthest(points, order, a, a, a, 1)
-    ic = _farthest(points, order, a, points[ib], a, 2)
-    idd = _farthest(points, order, a, points[ib], points[ic], 3)
-    u, v, w = points[ib] - a, points[ic] - a, points[idd] - a
-    normal = _cross(u, v)
-    area = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-    height = normal[0] * w[0] + normal[1] * w[1] + normal[2] * w[2]
+    a = order[0]
+    b = _farthest(points, a, (0.0, 0.0, 0.0), 1, len(order))
+    along = edge(points, a, b)
+    c = _farthest(points, a, along, 2, len(order))
+    normal = cross(along, edge(points, a, c))
+    d = _farthest(points, a, normal, 3, len(order))
+    area, height = norm(normal), dot(normal, edge(points, a, d))
     if area < _FLAT_M**2 or abs(height) < _FLAT_M * area:
         return 0
-    work.slots[0], work.slots[3] = order[0], idd
-    work.slots[1], work.slots[2] = (ic, ib) if height > 0.0 else (ib, ic)
+    work.slots[0], work.slots[3] = a, d
+    work.slots[1], work.slots[2] = (c, b) if height > 0.0 else (b, c)
     for f, (i, j, k) in enumerate(((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))):
         set_plane(points, f, i, j, k, size, work)
         join(f, work)
@@ -136,24 +136,16 @@ def _simplex(points: Floats, order: Ints, size: float, work: Surface) -> int:
 
 
 @njit(cache=True)
-def _cross(u: Floats, v: Floats) -> tuple[float, float, float]:
-    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-
-
-@njit(cache=True)
-def _farthest(points: Floats, order: Ints, a: Floats, b: Floats, c: Floats, corners: int) -> int:
-    """The point farthest from a point (1), from the line a b (2), or from the plane a b c (3)."""
-    best, index = -1.0, 0
-    across = _cross(b - a, c - a)
-    for i in order:
-        w = points[i] - a
-        if corners == 1:
-            far = w[0] ** 2 + w[1] ** 2 + w[2] ** 2
-        elif corners == 2:
-            n = _cross(b - a, w)
-            far = n[0] ** 2 + n[1] ** 2 + n[2] ** 2
+def _farthest(points: Floats, a: int, v: Vector, rank: int, count: int) -> int:
+    """The point farthest from point a (1), from the line through it along v (2), or from the plane across v (3)."""
+    best, index = -1.0, a
+    for i in range(count):
+        w = edge(points, a, i)
+        if rank == 3:
+            far = abs(dot(v, w))
         else:
-            far = abs(across[0] * w[0] + across[1] * w[1] + across[2] * w[2])
+            n = cross(v, w) if rank == 2 else w
+            far = dot(n, n)
         if far > best:
             best, index = far, i
     return index

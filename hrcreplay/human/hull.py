@@ -6,9 +6,8 @@ import numpy as np
 from numba import njit
 from scipy.spatial import ConvexHull
 
+from hrcreplay.human.vectors import cross, dot, edge, norm
 from hrcreplay.records import Floats, Ints
-
-Vector = tuple[float, float, float]
 
 #: A set thinner than this in a direction has no extent in it [m].
 _THIN_M = 1e-9
@@ -79,37 +78,17 @@ def _measures(vertices: Floats, faces: Ints) -> tuple[float, float, float]:
     volume, area, bend = 0.0, 0.0, 0.0
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        normals[f] = _cross(_edge(vertices, a, b), _edge(vertices, a, c))
-        volume += _dot(_edge(vertices, 0, a), normals[f]) / 6.0
-        area += 0.5 * _norm(normals[f])
+        normals[f] = cross(edge(vertices, a, b), edge(vertices, a, c))
+        volume += dot(edge(vertices, 0, a), normals[f]) / 6.0
+        area += 0.5 * norm(normals[f])
         left[a, b], left[b, c], left[c, a] = f, f, f
     for f in range(len(faces)):
         for k in range(3):
             i, j = faces[f, k], faces[f, (k + 1) % 3]
             beyond = normals[left[j, i]]
-            angle = np.arctan2(_norm(_cross(normals[f], beyond)), _dot(normals[f], beyond))
-            bend += 0.25 * _norm(_edge(vertices, i, j)) * angle  # half of it, and every edge is there twice
+            angle = np.arctan2(norm(cross(normals[f], beyond)), dot(normals[f], beyond))
+            bend += 0.25 * norm(edge(vertices, i, j)) * angle  # half of it, and every edge is there twice
     return volume, area, bend
-
-
-@njit(cache=True)
-def _edge(vertices: Floats, i: int, j: int) -> Vector:
-    return vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
-
-
-@njit(cache=True)
-def _cross(u: Vector, v: Vector) -> Vector:
-    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-
-
-@njit(cache=True)
-def _dot(u: Vector, v: Vector) -> float:
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
-
-
-@njit(cache=True)
-def _norm(u: Vector) -> float:
-    return float(np.sqrt(_dot(u, u)))
 
 
 def _axes(points_m: Floats) -> Floats:

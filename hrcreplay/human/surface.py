@@ -119,12 +119,14 @@ def insert(points: Floats, index: int, inner: Floats, size: float, faces: int, s
 def _look(point: Floats, faces: int, work: Surface) -> int:
     """Lists the triangles that a point sees; returns how many."""
     x, y, z = point[0], point[1], point[2]
+    nx, ny, nz, d = work.planes[0], work.planes[1], work.planes[2], work.planes[3]
+    seen, thin, hidden = work.seen, work.slack[1], work.hidden
+    for f in range(faces):
+        seen[f] = nx[f] * x + ny[f] * y + nz[f] * z - d[f] > thin[f]
     n = 0
     for f in range(faces):
-        height = work.planes[0, f] * x + work.planes[1, f] * y + work.planes[2, f] * z - work.planes[3, f]
-        work.seen[f] = height > work.slack[1, f]
-        if work.seen[f]:
-            work.hidden[n] = f
+        if seen[f]:
+            hidden[n] = f
             n += 1
     return n
 
