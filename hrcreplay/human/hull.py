@@ -28,12 +28,9 @@ def hull(points_m: Floats) -> tuple[Floats, Ints]:
     if len(axes) == 3:
         solid = ConvexHull(points_m)
         corners = np.sort(solid.vertices)
-        faces = np.searchsorted(corners, solid.simplices)
-        vertices = points_m[corners]
-        a, b, c = (vertices[faces[:, k]] for k in range(3))
-        inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), solid.equations[:, :3]) < 0.0
-        faces[inward] = faces[inward][:, ::-1]
-        return vertices, faces.astype(np.int64)
+        faces = np.searchsorted(corners, solid.simplices).astype(np.int64)
+        _turn_outward(points_m[corners], faces, solid.neighbors)
+        return points_m[corners], faces
     if len(axes) == 2:
         around = ConvexHull(points_m @ axes.T).vertices  # counterclockwise
         corners = np.sort(around)
@@ -44,6 +41,39 @@ def hull(points_m: Floats) -> tuple[Floats, Ints]:
         along = points_m @ axes[0]
         return points_m[np.sort([along.argmin(), along.argmax()])], np.empty((0, 3), np.int64)
     return points_m[:1], np.empty((0, 3), np.int64)
+
+
+@njit(cache=True)
+def _turn_outward(vertices: Floats, faces: Ints, neighbors: Ints) -> None:
+    """Makes all triangles counterclockwise from outside, in place; a sliver's own normal could not tell.
+
+    Neighbours run through the edge between them in opposite ways. That leaves one choice for all, and the hull's
+    volume is positive.
+    """
+    known = np.zeros(len(faces), np.bool_)
+    known[0] = True
+    queue = [0]
+    for f in queue:
+        for k in range(3):
+            other = neighbors[f, k]
+            if not known[other]:
+                known[other] = True
+                if _runs_same_way(faces[f], faces[other]):
+                    faces[other, 0], faces[other, 1] = faces[other, 1], faces[other, 0]
+                queue.append(other)
+    if _measures(vertices, faces)[0] < 0.0:
+        for f in range(len(faces)):
+            faces[f, 0], faces[f, 1] = faces[f, 1], faces[f, 0]
+
+
+@njit(cache=True)
+def _runs_same_way(a: Ints, b: Ints) -> bool:
+    """Whether two triangles have an edge in common, in the same direction."""
+    for i in range(3):
+        for k in range(3):
+            if a[i] == b[k] and a[(i + 1) % 3] == b[(k + 1) % 3]:
+                return True
+    return False
 
 
 def _fan(loop: Ints) -> Ints:
@@ -73,7 +103,7 @@ def sphere_swept_volume_m3(points_m: Floats, radius_m: float, faces: Ints | None
 @njit(cache=True)
 def _measures(vertices: Floats, faces: Ints) -> tuple[float, float, float]:
     """V [m^3], A [m^2] and M [m] of Steiner's formula for a closed surface of triangles."""
-    left = np.empty((len(vertices), len(vertices)), np.int32)  # the triangle left of an edge
+    left = np.zeros((len(vertices), len(vertices)), np.int32)  # the triangle left of an edge
     normals = [(0.0, 0.0, 0.0)] * len(faces)
     volume, area, bend = 0.0, 0.0, 0.0
     for f in range(len(faces)):
