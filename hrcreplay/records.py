@@ -134,6 +134,8 @@ class HumanStates(Table):
     lengths_m: Floats  #: (n, 8) LENGTHS [m]
     lengths_std_m: Floats  #: (n, 8) [m]
     valid: Bools  #: (n, c) whether a row of this camera entered the update of this tick
+    residual_m: Floats  #: (n, 6) high quantile of how far LIMBS were from the model lately [m]; NaN until known
+    unseen_s: Floats  #: (n, 6) since a camera last saw the joints of LIMBS [s]; inf before the first time
     cameras: tuple[str, ...]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrcreplay.records import JOINTS, LENGTHS, STATUSES, Floats, HumanStates, Ints, Measurements, Motion
+from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, Floats, HumanStates, Ints, Measurements, Motion
 
 Columns = dict[str, Any]
 
@@ -33,14 +33,17 @@ def truth_columns(t_ns: Ints, angles: Floats, lengths_m: Floats) -> Columns:
 
 
 _STATE = (("p", ""), ("v", "_vel"), ("a", "_acc"), ("j", "_jerk"), ("p_std", "_std"), ("v_std", "_vel_std"))
+_RESIDUAL = tuple(f"residual_{limb}" for limb in LIMBS)
+_UNSEEN = tuple(f"unseen_{limb}" for limb in LIMBS)
 
 
 def state_columns(states: HumanStates) -> Columns:
-    """A row a tick: joints with derivatives and deviations, lengths, and which cameras entered."""
+    """A row a tick: joints with derivatives and deviations, lengths, limbs, and which cameras entered."""
     columns: Columns = {"t_ns": states.t_ns}
     for field, suffix in _STATE:
         columns |= _spread(getattr(states, field), JOINTS, suffix)
     columns |= _spread(states.lengths_m, LENGTHS) | _spread(states.lengths_std_m, LENGTHS, "_std")
+    columns |= _spread(states.residual_m, _RESIDUAL) | _spread(states.unseen_s, _UNSEEN)
     return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
 
 
@@ -56,6 +59,8 @@ def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
                 lengths_m=_gather(column, LENGTHS),
                 lengths_std_m=_gather(column, LENGTHS, "_std"),
                 valid=np.column_stack([column[f"valid_{camera}"] for camera in cameras]),
+                residual_m=_gather(column, _RESIDUAL),
+                unseen_s=_gather(column, _UNSEEN),
                 cameras=cameras,
             )
 

@@ -27,6 +27,11 @@ class Filter(NamedTuple):
     points: Floats  #: (c, 20, 3)
     confidence: Floats  #: (c, 20)
     valid: Bools  #: (c, 20) which of its rows are used
+    shows: Bools  #: (c, 6) which limbs it shows with all that carries them
+    slots: Floats  #: (6, SLOTS) ring of the largest residuals of short stretches, NaN where empty
+    opened: Ints  #: (6,) stretches so far
+    opened_ns: Ints  #: (6,) tick at which the current stretch began
+    residual: Floats  #: (6,) quantile of the ring
 
 
 class Frames(NamedTuple):
@@ -52,6 +57,8 @@ class Rules(NamedTuple):
     outlier_m: float
     memory_ns: int
     coast_ns: int
+    residual_quantile: float
+    slot_ns: int  #: length of a stretch of the ring of residuals
     rest_s: float
     rest_std: Floats  #: (12, 3) of v, a, j of a joint nobody has seen for long
     p_min: Floats
@@ -71,6 +78,8 @@ class Track(NamedTuple):
     lengths: Floats  #: (n, 8)
     lengths_std: Floats  #: (n, 8)
     valid: Bools  #: (n, c)
+    residual: Floats  #: (n, 6)
+    unseen: Floats  #: (n, 6)
     cov: Floats  #: (n or 0, 12, 4, 4)
     damping: Floats  #: (n or 0, 12) of the derivatives, on the way to the tick
     outliers: Ints  #: (c,)

@@ -12,7 +12,8 @@ from hrcreplay.human.filter import Filter, Frames, Rules, Track
 from hrcreplay.human.fusion_kernel import run
 from hrcreplay.human.kalman import process_variance
 from hrcreplay.human.model import LimitSet
-from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, HumanStates, Ints, Measurements
+from hrcreplay.human.residual import SLOTS
+from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
 
 ROWS = len(JOINTS) + len(LENGTHS)
 _NEVER_NS = -(2**62)
@@ -55,6 +56,8 @@ class FusionSettings:
     memory_s: float = (
         0.5  #: a joint or point without a valid row for longer is lost: the next one is taken as it is [s]
     )
+    residual_quantile: float = 0.95  #: of how far each limb's points were from the model's (see residual)
+    residual_memory_s: float = 20.0  #: over that much of the time in which the limb was seen [s]
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,11 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         points=np.full((c, len(POINTS), 3), np.nan),
         confidence=np.zeros((c, len(POINTS))),
         valid=np.zeros((c, ROWS), dtype=np.bool_),
+        shows=np.zeros((c, len(LIMBS)), dtype=np.bool_),
+        slots=np.full((len(LIMBS), SLOTS), np.nan),
+        opened=np.zeros(len(LIMBS), dtype=np.int64),
+        opened_ns=np.full(len(LIMBS), _NEVER_NS),
+        residual=np.full(len(LIMBS), np.nan),
     )
 
 
@@ -102,7 +110,8 @@ def fuse(
     the frame at the tick. Each arm is measured by the name nearest to the estimate (see branches), heading by the
     nearest turn, so neither jumps. A joint unseen for ``coast_s`` has its derivatives damped and its covariance
     growing; unseen for ``memory_s`` it is lost and starts anew from its next valid row. All is finite from the first
-    valid row on: joints not yet seen stand at a neutral posture with a large standard deviation.
+    valid row on: joints not yet seen stand at a neutral posture with a large standard deviation. How far the body is
+    from its model, and for how long a limb has not been seen, is kept beside the filter and changes nothing in it.
 
     Args:
         state: From ``start`` or the previous call. It is not changed.
@@ -161,6 +170,8 @@ def _fuse(
         lengths_m=track.lengths,
         lengths_std_m=track.lengths_std,
         valid=track.valid,
+        residual_m=track.residual,
+        unseen_s=track.unseen,
         cameras=measurements.cameras,
     )
     counts = Counter({"joints_reacquired": int(track.reacquired[0]), "ticks_saturated": int(track.saturated[0])})
@@ -192,6 +203,8 @@ def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
         outlier_m=settings.outlier_m,
         memory_ns=round(settings.memory_s * 1e9),
         coast_ns=round(settings.coast_s * 1e9),
+        residual_quantile=settings.residual_quantile,
+        slot_ns=round(settings.residual_memory_s * 1e9 / SLOTS),
         rest_s=0.3 * settings.coast_s,
         rest_std=_REST_STD,
         p_min=limits.p_min,
@@ -212,6 +225,8 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         lengths=np.full((n, len(LENGTHS)), np.nan),
         lengths_std=np.full((n, len(LENGTHS)), np.nan),
         valid=np.zeros((n, cameras), dtype=np.bool_),
+        residual=np.full((n, len(LIMBS)), np.nan),
+        unseen=np.full((n, len(LIMBS)), np.inf),
         cov=np.full((rows, 12, 4, 4), np.nan),
         damping=np.ones((rows, 12)),
         outliers=np.zeros(cameras, dtype=np.int64),

@@ -10,6 +10,7 @@ from hrcreplay.human.branches import canonical_arm, nearest_arm, wrap
 from hrcreplay.human.filter import Filter, Frames, Rules, Track, delay
 from hrcreplay.human.kalman import correct, dot, predict
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM
+from hrcreplay.human.residual import observe, unseen
 from hrcreplay.human.saturation import saturate
 from hrcreplay.human.validity import judge
 from hrcreplay.records import Floats, Ints
@@ -29,19 +30,20 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
         if filter_.started[0]:
             _predict(filter_, now, rules, damping)
         seen = _collect(frames, seen, now, filter_, track)
-        for c in range(len(filter_.uses)):
-            if filter_.uses[c] == 0:
+        fresh = filter_.uses == 0
+        for c in range(len(fresh)):
+            if fresh[c]:
                 judge(filter_, c, now, rules, track)
-        for c in range(len(filter_.uses)):
-            fresh = filter_.uses[c] == 0
+        for c in range(len(fresh)):
             again = rules.reuse and filter_.uses[c] > 0 and now - filter_.capture_ns[c] <= rules.memory_ns
-            if fresh or again:
+            if fresh[c] or again:
                 track.valid[k, c] = _update(filter_, c, now, rules, track)
         filter_.tick_ns[0] = now
         if filter_.started[0]:
             _rename(filter_)
             if saturate(filter_.mean, dt, rules):
                 track.saturated[0] += 1
+            observe(filter_, fresh, now, rules)
             _leave(filter_, k, track, damping)
 
 
@@ -162,6 +164,8 @@ def _leave(filter_: Filter, k: int, track: Track, damping: Floats) -> None:
             track.std[k, j, a] = np.sqrt(filter_.cov[j, a, a])
     track.lengths[k] = filter_.lengths
     track.lengths_std[k] = np.sqrt(filter_.lengths_var)
+    track.residual[k] = filter_.residual
+    unseen(filter_, track.unseen[k])
     if len(track.cov) > 0:
         track.cov[k] = filter_.cov
         track.damping[k] = damping

@@ -1,4 +1,4 @@
-"""Which rows of a camera's frame the filter may use, 4.1.2: by confidence, and by the predicted skeleton."""
+"""What of a camera's frame the filter may use, 4.1.2: by confidence, and by the predicted skeleton."""
 
 from __future__ import annotations
 
@@ -8,19 +8,22 @@ from numba import njit
 from hrcreplay.human.angles import DEPENDS, ROWS
 from hrcreplay.human.filter import Filter, Rules, Track, delay
 from hrcreplay.human.kalman import ago
-from hrcreplay.human.model import HEAD, NECK, PELVIS, skeleton_row
+from hrcreplay.human.model import HEAD, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.records import Bools, Floats
 
 #: An angle known no better than this is not observed: a circle cannot tell [rad].
 _BLIND_STD = 1.0
 #: The points that the model predicts and a camera may get wrong.
 _TESTED = np.flatnonzero(DEPENDS.any(axis=0))
+#: (6, 20) the body points that place a limb of LIMBS: what its rows are computed from, however it is turned.
+_PLACING = DEPENDS[[3, 3, RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2]]
+_PLACING[0, HEAD] = True
 _STEP = 1e-5
 
 
 @njit(cache=True)
 def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
-    """Which rows of a new frame are valid, 4.1.2: by confidence, and by the predicted skeleton."""
+    """Which rows of a new frame are valid, 4.1.2, and which limbs it shows whole."""
     trusted = np.ones(len(filter_.point_ns), dtype=np.bool_)
     if filter_.started[0]:
         trusted = _agreeing(filter_, c, now, rules)
@@ -38,6 +41,13 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
     for point in _TESTED:
         if trusted[point] and confidence[point] >= rules.confidence_min and np.isfinite(points[point, 0]):
             filter_.point_ns[point] = now
+    for limb in range(len(_PLACING)):
+        product, agrees = 1.0, True
+        for k in range(len(trusted)):
+            if _PLACING[limb, k]:
+                product *= confidence[k]
+                agrees = agrees and trusted[k] and np.isfinite(points[k, 0])
+        filter_.shows[c, limb] = agrees and product >= rules.confidence_min
 
 
 @njit(cache=True)
@@ -57,7 +67,7 @@ def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
         skeleton_row(p, lengths, moved)
         p[j] -= _STEP
         for k in _TESTED:
-            variance[k] += _distance(moved[k], expected[k]) ** 2 / _STEP**2 * filter_.cov[j, 0, 0]
+            variance[k] += distance(moved[k], expected[k]) ** 2 / _STEP**2 * filter_.cov[j, 0, 0]
     for k in _TESTED:
         variance[k] += filter_.lengths_var[0]
         if k != PELVIS:
@@ -68,10 +78,11 @@ def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
         lost = now - filter_.point_ns[k] > rules.memory_ns
         if not lost and np.isfinite(filter_.points[c, k, 0]):
             gate = rules.outlier_m + 3.0 * np.sqrt(variance[k])
-            agreeing[k] = _distance(filter_.points[c, k], expected[k]) <= gate
+            agreeing[k] = distance(filter_.points[c, k], expected[k]) <= gate
     return agreeing
 
 
 @njit(cache=True)
-def _distance(a: Floats, b: Floats) -> float:
+def distance(a: Floats, b: Floats) -> float:
+    """Between two points (3,) [m]."""
     return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)

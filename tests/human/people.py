@@ -16,9 +16,21 @@ LENGTHS_M = np.array([1.0, 0.5, 0.21, 0.19, 0.33, 0.34, 0.26, 0.27])
 def states(p: Floats, v: Floats, lengths_m: Floats = LENGTHS_M) -> HumanStates:
     """States with the given postures and velocities, (n, 12) each."""
     zeros, lengths = np.zeros_like(p), np.tile(lengths_m, (len(p), 1))
-    valid = np.ones((len(p), 1), dtype=bool)
+    valid, limbs = np.ones((len(p), 1), dtype=bool), np.zeros((len(p), len(LIMBS)))
     return HumanStates(
-        np.arange(len(p)) * 4_000_000, p, v, zeros, zeros, zeros, zeros, lengths, 0 * lengths, valid, ("camera",)
+        t_ns=np.arange(len(p)) * 4_000_000,
+        p=p,
+        v=v,
+        a=zeros,
+        j=zeros,
+        p_std=zeros,
+        v_std=zeros,
+        lengths_m=lengths,
+        lengths_std_m=0 * lengths,
+        valid=valid,
+        residual_m=limbs,
+        unseen_s=limbs,
+        cameras=("camera",),
     )
 
 
