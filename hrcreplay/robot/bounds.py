@@ -89,6 +89,6 @@ def cartesian_bounds(
             now += J[i, j] * dq[j]
         drift = dt_s * dJdq[i]
         change = dt_s * unit * acceleration_max
-        low[i] = max(-unit * speed_max, now + drift - change) - drift
-        high[i] = min(unit * speed_max, now + drift + change) - drift
+        low[i] = max(-unit * speed_max, now - change) - drift
+        high[i] = min(unit * speed_max, now + change) - drift
     return low, high

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hrcreplay.records import Floats
+from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.bounds import cartesian_bounds, joint_bounds
 from hrcreplay.robot.constraints import worst_rows
 from hrcreplay.robot.model import RobotModel, RobotPose
@@ -28,14 +28,19 @@ class BoundedRows:
     low: Floats  #: (m,)
     high: Floats  #: (m,)
 
+    def only(self, which: Ints) -> BoundedRows:
+        """Some of these rows."""
+        keys = tuple(self.keys[i] for i in which.tolist())
+        return BoundedRows(keys, self.A[which], self.low[which], self.high[which])
+
     def joined(self, other: BoundedRows) -> BoundedRows:
         """These rows and those of the other that are not among them."""
-        new = [i for i, key in enumerate(other.keys) if key not in self.keys]
+        new = other.only(np.array([i for i, key in enumerate(other.keys) if key not in self.keys], dtype=np.int64))
         return BoundedRows(
-            self.keys + tuple(other.keys[i] for i in new),
-            np.concatenate([self.A, other.A[new]]),
-            np.concatenate([self.low, other.low[new]]),
-            np.concatenate([self.high, other.high[new]]),
+            self.keys + new.keys,
+            np.concatenate([self.A, new.A]),
+            np.concatenate([self.low, new.low]),
+            np.concatenate([self.high, new.high]),
         )
 
 

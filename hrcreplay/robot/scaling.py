@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,14 +19,14 @@ from hrcreplay.robot.reference import Reference, ReferencePoint
 from hrcreplay.robot.sight import Sight, observe
 from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
 
-#: Share of a speed below which two speeds are one.
-SAME = 1e-9
+#: Rates that differ by no more are one.
+SAME = 1e-7
 
 #: Largest residual of an approach row that counts as held [m^2].
 HELD = 1e-11
 
-#: Rounds of following the path's direction to where the next rate leads.
-ROUNDS = 20
+#: Rounds of looking for a rate.
+ROUNDS = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,7 @@ def step(
         fastest, slowed = _fastest(robot, reference, state, axes, sight, obstacles, settings)
         if sight.pairs is not None and sight.pairs.failed:
             return _result(sight, axes, slowest, settings.dt_s, stepping.BRAKING, stepping.NO_DISTANCE)
-        if fastest is None or fastest.rate < slowest.rate * (1.0 - SAME):
+        if fastest is None or fastest.rate < slowest.rate - SAME:
             return _result(sight, axes, slowest, settings.dt_s, stepping.BRAKING, stepping.NO_SOLUTION)
         status = stepping.LIMITED if slowed else stepping.TRACKING
         return _result(sight, axes, fastest, settings.dt_s, status, 0)
@@ -101,18 +102,16 @@ def _attempt(reference: Reference, state: PathState, rate: float, dt_s: float) -
 
 
 def _slowest(robot: RobotModel, reference: Reference, state: PathState, axes: RobotState, dt_s: float) -> _Try:
-    """The smallest rate that the axes' acceleration limits allow, or as near as the path lets them come."""
-    rate = 0.0
-    made = _attempt(reference, state, rate, dt_s)
-    for _ in range(ROUNDS):
-        gain = robot.ddq_max * dt_s
-        low, high = rates(made.point.dq, axes.dq - gain, axes.dq + gain)
-        wanted = min(max(low, 0.0), state.rate) if low <= high else state.rate
-        if wanted <= rate * (1.0 + SAME):
-            break
-        rate = wanted
-        made = _attempt(reference, state, rate, dt_s)
-    return made
+    """The smallest rate that the axes' acceleration limits allow, or the present one where the path allows none."""
+    gain = robot.ddq_max * dt_s
+
+    def most_taken_off(drop: float) -> float:
+        towards = _attempt(reference, state, state.rate - drop, dt_s).point.dq
+        least, most = rates(towards, axes.dq - gain, axes.dq + gain)
+        return state.rate - max(0.0, least) if least <= most else -1.0
+
+    drop = _largest(state.rate, most_taken_off)
+    return _attempt(reference, state, state.rate - (drop or 0.0), dt_s)
 
 
 def _fastest(
@@ -126,27 +125,43 @@ def _fastest(
 ) -> tuple[_Try | None, bool]:
     """The largest rate that meets all constraints, and whether an approach row is what bounds it.
 
-    Every bound is linear in the next velocity, which is the path's direction times the rate. The direction is that
-    of the place where the rate leads to, so the rate is lowered until it agrees with the direction it has itself.
+    Every bound is linear in the next velocity, which is the rate times the path's direction where it leads to.
     """
     dt_s, gain, pose = settings.dt_s, robot.ddq_max * settings.dt_s, sight.pose
     low, high = np.maximum(-robot.dq_max, axes.dq - gain), np.minimum(robot.dq_max, axes.dq + gain)
     J_low, J_high = cartesian_bounds(
         pose.J_tcp, pose.dJdq_tcp, axes.dq, settings.tcp_speed_max, settings.tcp_acceleration_max, dt_s
     )
-    rate, held = 1.0, False
+    slowed = False
+
+    def most(rate: float) -> float:
+        nonlocal slowed
+        towards = _attempt(reference, state, rate, dt_s).point.dq
+        free = min(1.0, rates(towards, low, high)[1], rates(pose.J_tcp @ towards, J_low, J_high)[1])
+        safe = _safe_rate(sight, obstacles, towards, free, settings.stop_s) if free >= 0.0 else free
+        slowed = safe < free
+        return safe
+
+    rate = _largest(1.0, most)
+    return (None, True) if rate is None else (_attempt(reference, state, rate, dt_s), slowed)
+
+
+def _largest(top: float, bound: Callable[[float], float]) -> float | None:
+    """Largest x in [0, top] with ``x <= bound(x)``, for a bound that changes little with x; or none."""
+    found, low, high, x = None, -1.0, top, top
     for _ in range(ROUNDS):
-        made = _attempt(reference, state, rate, dt_s)
-        towards = made.point.dq
-        free = min(rates(towards, low, high)[1], rates(pose.J_tcp @ towards, J_low, J_high)[1])
-        safe = _safe_rate(sight, obstacles, towards, min(free, rate), settings.stop_s)
-        if not min(free, safe) >= 0.0:
-            return None, True
-        if rate <= min(free, safe) * (1.0 + SAME):
-            return made, held
-        held = held or safe < min(free, rate)
-        rate = min(free, safe)
-    return None, True
+        most = bound(x)
+        if x <= most:
+            found = low = x
+            if x == top or most - x <= SAME * top:
+                break
+        else:
+            high = x
+            if not x > 0.0:
+                break
+        guess = max(0.0, most)
+        x = guess if low < guess < high else max(0.0, 0.5 * (low + high))
+    return found
 
 
 def _safe_rate(sight: Sight, obstacles: Obstacles, towards: Floats, rate: float, stop_s: float) -> float:

@@ -108,7 +108,7 @@ def axis_distance(a: Floats, b: Floats, vertices_m: Floats, near: list[int]) -> 
             return 0.0
         below, furthest = plane(a, b, normal, vertices_m)
         if not above - below > EXACT_M:
-            return max(0.0, below)  # NaN passes through
+            return 0.0 if below < 0.0 else below  # NaN passes through
         if furthest in chosen:
             return np.nan
         if len(chosen) == MOST_POINTS:  # those far from the plane do not carry the nearest point

@@ -83,4 +83,4 @@ def braked(state: RobotState, ddq_max: Floats, dt_s: float) -> Floats:
     """
     speed = np.abs(state.dq)
     slower = np.sign(state.dq) * (speed - ddq_max * dt_s)
-    return np.where(speed > ddq_max * dt_s, slower, 0.0)
+    return np.where(np.isfinite(speed) & (speed > ddq_max * dt_s), slower, 0.0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
@@ -75,27 +73,3 @@ def tracking_cost(
     for j in range(nv):
         H[j, j] += DAMPING * max(mean, 1e-6)
     return H, g
-
-
-@njit(cache=True, error_model="numpy")
-def minimiser(H: Floats, g: Floats) -> Floats:
-    """(nv,) with ``H @ w = -g`` for a positive definite H, by Cholesky's decomposition."""
-    n = len(g)
-    L, w = np.zeros((n, n)), np.empty(n)
-    for i in range(n):
-        for j in range(i + 1):
-            rest = H[i, j]
-            for k in range(j):
-                rest -= L[i, k] * L[j, k]
-            L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
-    for i in range(n):
-        rest = -g[i]
-        for k in range(i):
-            rest -= L[i, k] * w[k]
-        w[i] = rest / L[i, i]
-    for i in range(n - 1, -1, -1):
-        rest = w[i]
-        for k in range(i + 1, n):
-            rest -= L[k, i] * w[k]
-        w[i] = rest / L[i, i]
-    return w

@@ -28,7 +28,9 @@ def volumes(limbs: list[Floats], t_ns: int = 0) -> SweptVolumes:
     )
 
 
-def person(ticks: int, dt_s: float, at_m: tuple[float, float], sway_m: float, *, seed: int, points: int = 40) -> SweptVolumes:
+def person(
+    ticks: int, dt_s: float, at_m: tuple[float, float], sway_m: float, *, seed: int, points: int = 40
+) -> SweptVolumes:
     """A person who sways towards the origin and back and waves an arm, a row a tick."""
     rng = np.random.default_rng(seed)
     shapes = [cloud(rng, points, rng.uniform(0.05, 0.25, 3)) for _ in LIMBS]

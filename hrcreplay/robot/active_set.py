@@ -1,0 +1,177 @@
+"""A small, exact solver for quadratic programs of a few variables."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.records import Floats, Ints
+
+#: A row of unit length in the metric of the cost is broken above this.
+BROKEN = 1e-13
+
+#: Squared part of such a row across the held ones below which it depends on them.
+DEPENDENT = 1e-18
+
+#: Rows that may be taken up before the problem counts as unsolved.
+STEPS = 200
+
+
+@njit(cache=True, error_model="numpy")
+def minimiser(H: Floats, g: Floats) -> Floats:
+    """(n,) minimiser of ``w @ H @ w / 2 + g @ w`` for a positive definite H; NaN where H is not."""
+    L = _cholesky(H)
+    return _backward(L, _forward(L, -g))
+
+
+@njit(cache=True, error_model="numpy")
+def active_set(H: Floats, g: Floats, A: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Minimiser of ``w @ H @ w / 2 + g @ w`` where ``A @ w <= high``, and the rows' multipliers; NaN without one.
+
+    The dual method of Goldfarb and Idnani: from the minimiser without rows, one broken row after the other is moved
+    onto, in the metric of H, and rows are let go whose multipliers would turn negative. Exact after finitely many
+    steps, also where rows repeat each other or leave no room.
+
+    Args:
+        H: (n, n) positive definite.
+        g: (n,).
+        A: (m, n).
+        high: (m,); inf where a row has no bound.
+
+    Returns:
+        ``w`` (n,) and ``z`` (m,) with ``H @ w + g + A.T @ z = 0``, ``z >= 0``.
+    """
+    n, m = len(g), len(high)
+    L = _cholesky(H)
+    y = _forward(L, -g)  # y = L' w: there H is the identity
+    E, h, norms = np.zeros((m, n)), high.copy(), np.ones(m)
+    for i in range(m):
+        e = _forward(L, A[i])
+        if _norm(e) > 0.0:
+            norms[i] = _norm(e)
+            E[i], h[i] = e / norms[i], high[i] / norms[i]
+    held, z = np.empty(n, dtype=np.int64), np.zeros(m)
+    count = 0
+    for _ in range(STEPS):
+        p = _worst(E, h, y)
+        if p < 0:
+            return _backward(L, y), z / norms
+        count = _take(E, h, p, y, z, held, count)
+        if count < 0:
+            break
+    return np.full(n, np.nan), np.full(m, np.nan)
+
+
+@njit(cache=True)
+def _worst(E: Floats, h: Floats, y: Floats) -> int:
+    """The row that y breaks most; -1 where all hold."""
+    worst, most = -1, BROKEN
+    for i in range(len(h)):
+        broken = _dot(E[i], y) - h[i]
+        if broken > most:
+            worst, most = i, broken
+    return worst
+
+
+@njit(cache=True, error_model="numpy")
+def _take(E: Floats, h: Floats, p: int, y: Floats, z: Floats, held: Ints, count: int) -> int:
+    """Moves y onto row p and lets go the rows that stand in the way; -1 where they cannot be let go.
+
+    Changes ``y``, ``z`` and ``held``; returns how many rows are held.
+    """
+    while True:
+        r, across = _split(E, held[:count], E[p])
+        squared = _dot(across, across)
+        depends = count == len(y) or squared <= DEPENDENT
+        full = np.inf if depends else (_dot(E[p], y) - h[p]) / squared
+        partial, leaving = np.inf, -1
+        for j in range(count):
+            if r[j] > 0.0 and z[held[j]] / r[j] < partial:
+                partial, leaving = z[held[j]] / r[j], j
+        step = min(full, partial)
+        if step == np.inf:
+            return -1
+        for j in range(count):
+            z[held[j]] -= step * r[j]
+        z[p] += step
+        if not depends:
+            y -= step * across
+        if full <= partial:
+            held[count] = p
+            return count + 1
+        z[held[leaving]] = 0.0
+        held[leaving : count - 1] = held[leaving + 1 : count].copy()
+        count -= 1
+
+
+@njit(cache=True, error_model="numpy")
+def _split(E: Floats, held: Ints, e: Floats) -> tuple[Floats, Floats]:
+    """A row as a combination of the held ones and the rest across them, by Gram and Schmidt."""
+    k, n = len(held), len(e)
+    basis, R = np.zeros((k, n)), np.zeros((k, k + 1))
+    across = e.copy()
+    for i in range(k + 1):
+        v = E[held[i]].copy() if i < k else across
+        for _ in range(2):  # twice is enough
+            for j in range(i):
+                along = _dot(basis[j], v)
+                R[j, i] += along
+                for c in range(n):
+                    v[c] -= along * basis[j, c]
+        if i < k:
+            R[i, i] = _norm(v)
+            for c in range(n):
+                basis[i, c] = v[c] / R[i, i]
+    return _backward(R[:, :k].T, R[:, k]), across
+
+
+@njit(cache=True, error_model="numpy")
+def _cholesky(H: Floats) -> Floats:
+    n = len(H)
+    L = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            rest = H[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
+    return L
+
+
+@njit(cache=True, error_model="numpy")
+def _forward(L: Floats, b: Floats) -> Floats:
+    """(n,) with ``L @ y = b``."""
+    y = np.empty(len(b))
+    for i in range(len(b)):
+        rest = b[i]
+        for k in range(i):
+            rest -= L[i, k] * y[k]
+        y[i] = rest / L[i, i]
+    return y
+
+
+@njit(cache=True, error_model="numpy")
+def _backward(L: Floats, y: Floats) -> Floats:
+    """(n,) with ``L.T @ w = y``."""
+    w = np.empty(len(y))
+    for i in range(len(y) - 1, -1, -1):
+        rest = y[i]
+        for k in range(i + 1, len(y)):
+            rest -= L[k, i] * w[k]
+        w[i] = rest / L[i, i]
+    return w
+
+
+@njit(cache=True)
+def _dot(a: Floats, b: Floats) -> float:
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
+
+
+@njit(cache=True)
+def _norm(v: Floats) -> float:
+    return math.sqrt(_dot(v, v))

@@ -1,0 +1,61 @@
+"""A tick of the controllers beside people, and the QP beside daqp with all rows written down, in the same run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from hrcreplay.robot.controller import solve, step
+from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.robot.obstacles import obstacles
+from hrcreplay.robot.problem import Problem
+from hrcreplay.robot.stepping import RobotState
+from tests.robot.people import person
+from tests.robot.test_controller import DT_S, HOME, SETTINGS, STOP_S, asked, base, dense, run, swing
+
+TICKS = 300
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return irb140(base(), stop_s=STOP_S)
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize(("name", "at_m"), [("far", 4.0), ("near", 1.5), ("in contact", 1.1)])
+def test_a_tick(benchmark: BenchmarkFixture, robot: RobotModel, name: str, at_m: float) -> None:
+    people = person(TICKS, DT_S, (at_m, 0.0), 0.35, seed=1)
+    states = [state for state, _ in run(robot, people)]
+
+    def replay() -> None:
+        for tick, state in enumerate(states):
+            step(robot, state, *swing(robot, (tick + 1) * DT_S), obstacles(people, tick), SETTINGS)
+
+    benchmark.pedantic(replay, rounds=3, warmup_rounds=1)
+    if benchmark.stats is not None:
+        benchmark.extra_info["us_per_tick"] = benchmark.stats.stats.mean / TICKS * 1e6
+
+
+def tasks(robot: RobotModel) -> Iterator[Problem]:
+    people = person(TICKS, DT_S, (1.3, 0.0), 0.35, seed=1)
+    state = RobotState(HOME, np.zeros(6))
+    for tick in range(TICKS):
+        reference, seen = swing(robot, (tick + 1) * DT_S), obstacles(people, tick)
+        yield asked(robot, state, *reference, seen)
+        state = step(robot, state, *reference, seen, SETTINGS).next
+
+
+@pytest.mark.benchmark
+def test_few_rows_beside_all_rows_by_daqp(benchmark: BenchmarkFixture, robot: RobotModel) -> None:
+    problems = list(tasks(robot))
+    benchmark.pedantic(lambda: [solve(task) for task in problems], rounds=3, warmup_rounds=1)
+    if benchmark.stats is None:
+        return
+    started = time.perf_counter()
+    for task in problems:
+        dense(robot, task)
+    benchmark.extra_info["all rows by daqp / few rows"] = (time.perf_counter() - started) / benchmark.stats.stats.mean
