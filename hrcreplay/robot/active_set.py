@@ -12,6 +12,9 @@ from hrcreplay.records import Floats, Ints
 #: A row of unit length in the metric of the cost is broken above this.
 BROKEN = 1e-13
 
+#: A row that cannot be taken up, and is broken by no more than this, counts as kept.
+ROUNDING = 1e-10
+
 #: Squared part of such a row across the held ones below which it depends on them.
 DEPENDENT = 1e-18
 
@@ -58,8 +61,12 @@ def active_set(H: Floats, g: Floats, A: Floats, high: Floats) -> tuple[Floats, F
         p = _worst(E, h, y)
         if p < 0:
             return _backward(L, y), z / norms
-        count = _take(E, h, p, y, z, held, count)
-        if count < 0:
+        count, taken = _take(E, h, p, y, z, held, count)
+        if taken:
+            continue
+        if _dot(E[p], y) - h[p] <= ROUNDING:
+            h[p] = _dot(E[p], y)  # where the held rows leave no room, others are broken by rounding errors
+        else:
             break
     return np.full(n, np.nan), np.full(m, np.nan)
 
@@ -76,10 +83,10 @@ def _worst(E: Floats, h: Floats, y: Floats) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def _take(E: Floats, h: Floats, p: int, y: Floats, z: Floats, held: Ints, count: int) -> int:
-    """Moves y onto row p and lets go the rows that stand in the way; -1 where they cannot be let go.
+def _take(E: Floats, h: Floats, p: int, y: Floats, z: Floats, held: Ints, count: int) -> tuple[int, bool]:
+    """Moves y onto row p and lets go the rows that stand in the way, if they can be let go.
 
-    Changes ``y``, ``z`` and ``held``; returns how many rows are held.
+    Changes ``y``, ``z`` and ``held``; returns how many rows are held, and whether p is the last of them.
     """
     while True:
         r, across = _split(E, held[:count], E[p])
@@ -92,7 +99,7 @@ def _take(E: Floats, h: Floats, p: int, y: Floats, z: Floats, held: Ints, count:
                 partial, leaving = z[held[j]] / r[j], j
         step = min(full, partial)
         if step == np.inf:
-            return -1
+            return count, False
         for j in range(count):
             z[held[j]] -= step * r[j]
         z[p] += step
@@ -100,7 +107,7 @@ def _take(E: Floats, h: Floats, p: int, y: Floats, z: Floats, held: Ints, count:
             y -= step * across
         if full <= partial:
             held[count] = p
-            return count + 1
+            return count + 1, True
         z[held[leaving]] = 0.0
         held[leaving : count - 1] = held[leaving + 1 : count].copy()
         count -= 1

@@ -29,7 +29,7 @@ AHEAD = 1.1
 #: Rounds of solving and adding broken rows before the problem counts as unsolved.
 ROUNDS = 40
 
-#: Largest gradient left, as a share of the one at rest, with which multipliers prove a solution.
+#: Largest gradient left, and product of a multiplier and its row's slack, with which multipliers prove a solution.
 PROVEN = 1e-9
 
 #: How far proxqp's solution may be from the proven one [rad/s].
@@ -125,14 +125,17 @@ def solve(task: Problem) -> Solution | Unsolved:
 def _minimise(task: Problem, rows: BoundedRows) -> tuple[Floats, Floats]:
     """Minimiser over some rows and the axes' limits, and the multipliers of both, negative at a lower bound.
 
-    NaN where there is none, or none whose multipliers prove it: the gradient must vanish.
+    NaN where there is none, or none that the multipliers prove: the gradient must vanish, and only rows at their
+    bound may carry one.
     """
     A = np.concatenate([rows.A, np.eye(len(task.g))])
     high, low = np.concatenate([rows.high, task.high]), np.concatenate([rows.low, task.low])
     w, both = active_set(task.H, task.g, np.concatenate([A, -A]), np.concatenate([high, -low]))
-    z = both[: len(A)] - both[len(A) :]
+    z, values = both[: len(A)] - both[len(A) :], A @ w
     gradient = task.H @ w + task.g + z @ A
-    proven = np.abs(gradient).max() <= PROVEN * max(1.0, np.abs(task.g).max())
+    unused = z * np.where(z > 0.0, np.minimum(high - values, 1.0), np.maximum(low - values, -1.0))
+    most = PROVEN * max(1.0, np.abs(task.g).max())
+    proven = np.abs(gradient).max() <= most and np.abs(unused).max() <= most
     return w if proven else np.full_like(w, np.nan), z
 
 

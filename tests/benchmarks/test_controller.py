@@ -35,7 +35,7 @@ def test_a_tick(benchmark: BenchmarkFixture, robot: RobotModel, name: str, at_m:
         for tick, state in enumerate(states):
             step(robot, state, *swing(robot, (tick + 1) * DT_S), obstacles(people, tick), SETTINGS)
 
-    benchmark.pedantic(replay, rounds=3, warmup_rounds=1)
+    benchmark.pedantic(replay, rounds=3, warmup_rounds=1)  # type: ignore[no-untyped-call]
     if benchmark.stats is not None:
         benchmark.extra_info["us_per_tick"] = benchmark.stats.stats.mean / TICKS * 1e6
 
@@ -52,7 +52,7 @@ def tasks(robot: RobotModel) -> Iterator[Problem]:
 @pytest.mark.benchmark
 def test_few_rows_beside_all_rows_by_daqp(benchmark: BenchmarkFixture, robot: RobotModel) -> None:
     problems = list(tasks(robot))
-    benchmark.pedantic(lambda: [solve(task) for task in problems], rounds=3, warmup_rounds=1)
+    benchmark.pedantic(lambda: [solve(task) for task in problems], rounds=3)  # type: ignore[no-untyped-call]
     if benchmark.stats is None:
         return
     started = time.perf_counter()

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -80,7 +81,7 @@ def test_the_rate_is_the_largest_where_people_hold_it(robot: RobotModel, referen
     people = person(600, DT_S, (1.5, 0.0), 0.35, seed=2)
     rows = list(run(robot, reference, people))
     held = 0
-    for tick, ((state, made), (after, _)) in enumerate(zip(rows[:-1], rows[1:], strict=True)):
+    for tick, ((state, made), (after, _)) in enumerate(pairwise(rows)):
         if made.status != stepping.LIMITED:
             continue
         more = after.rate * 1.001 + 1e-9
