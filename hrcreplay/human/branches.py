@@ -1,10 +1,10 @@
 """One posture, two names: which triple (alpha_1, alpha_2, alpha_3) an arm goes by.
 
 The shoulder's three axes are a spherical wrist: (a1, a2, a3) and (a1 + pi, pi - a2, a3 + pi) are the same posture.
-The *canonical* name violates (34a), (34b) least, each angle in the turn around the middle of what (34) allows. Every
-posture inside (34) has its own angles as canonical name. The names meet where an arm crosses the chest low or is
-raised steeply just outside the shoulder; there the angles jump although the arm does not, and whoever follows angles
-through time takes the name ``nearest`` to where it was.
+The *canonical* name has alpha_1 in the half-turn from -20 to 160 degrees, which holds all of (34a), and the other
+angles in the turn around the middle of what (34) allows. So every posture inside (34) has its own angles as canonical
+name. At the ends of the half-turn, an arm far across the back or steeply raised, the angles jump although the arm
+does not, and whoever follows angles through time takes the name ``nearest`` to where it was.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, alpha_2_bounds
+from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM
 from hrcreplay.records import Floats
 
-_ALPHA_1 = (-np.pi / 20.0, 8.0 * np.pi / 9.0)  # Eq. (34a), Table 1
 #: Middles of the turns of alpha_1, alpha_2, alpha_3 [rad]; (34) spans -9..160, -46..155 and -118..198 degrees.
-_MIDDLES = (75.0 * np.pi / 180.0, 90.0 * np.pi / 180.0, 40.0 * np.pi / 180.0)
+_MIDDLES = (70.0 * np.pi / 180.0, 90.0 * np.pi / 180.0, 40.0 * np.pi / 180.0)
 _ROUNDING = 1e-9
 
 
@@ -46,29 +45,23 @@ def wrap(angle: float) -> float:
 
 
 @njit(cache=True)
-def violation(alpha_1: float, alpha_2: float) -> float:
-    """How far a shoulder is outside (34a), (34b), both excesses added [rad]."""
-    inside = max(_ALPHA_1[0], min(alpha_1, _ALPHA_1[1]))
-    low, high = alpha_2_bounds(inside, inside)
-    return abs(alpha_1 - inside) + max(0.0, low - alpha_2, alpha_2 - high)
-
-
-@njit(cache=True)
 def canonical_arm(arm: Floats, margin: float) -> bool:
     """Renames one arm (4,) in place; True where alpha_2 was mirrored, so that its derivatives change sign.
 
-    A name is kept until another is better by ``margin`` [rad] (or an angle is that far out of its turn), so that an arm
-    resting where the names meet does not flicker.
+    A name is kept until an angle is out of its half-turn (or turn) by ``margin`` [rad], so that an arm resting where
+    the names meet does not flicker.
     """
     mirrored = False
     for j in range(3):
         if abs(arm[j] - _MIDDLES[j]) > np.pi + margin:
             arm[j] = _into_turn(arm[j], j)
-    if np.isfinite(arm[0]) and np.isfinite(arm[1]):
-        other_1, other_2 = _into_turn(arm[0] + np.pi, 0), _into_turn(np.pi - arm[1], 1)
-        if violation(other_1, other_2) + margin + _ROUNDING < violation(arm[0], arm[1]):
-            arm[0], arm[1], arm[2] = other_1, other_2, _into_turn(arm[2] + np.pi, 2)
-            mirrored = True
+    if abs(arm[0] - _MIDDLES[0]) > 0.5 * np.pi + margin + _ROUNDING:
+        arm[0], arm[1], arm[2] = (
+            _into_turn(arm[0] + np.pi, 0),
+            _into_turn(np.pi - arm[1], 1),
+            _into_turn(arm[2] + np.pi, 2),
+        )
+        mirrored = True
     return mirrored
 
 

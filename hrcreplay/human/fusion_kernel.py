@@ -16,7 +16,7 @@ from hrcreplay.human.validity import judge
 from hrcreplay.records import Floats, Ints
 
 #: A name of an arm is kept until the other is better by this [rad].
-_NAME_MARGIN = np.radians(10.0)
+_NAME_MARGIN = np.radians(20.0)
 
 
 @njit(cache=True)

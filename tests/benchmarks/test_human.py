@@ -17,7 +17,7 @@ from hrcreplay.human.fusion import FusionSettings, fuse, start
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import CameraFrames, Ints, Measurements
-from tests.human.people import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
+from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
 
 SECONDS = 4.0
 TICKS = (np.arange(0.1, SECONDS, 0.004) * 1e9).astype(np.int64)

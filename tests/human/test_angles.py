@@ -11,7 +11,7 @@ from hrcreplay.human.branches import canonical, nearest
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, POINTS, Bools, Floats
-from tests.human.people import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, lengths, postures
+from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, lengths, postures
 
 NOISE = PointNoise(0.02)
 AT = {name: k for k, name in enumerate(POINTS)}

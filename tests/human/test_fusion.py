@@ -13,7 +13,7 @@ from hrcreplay.human.fusion import FusionSettings, FusionState, fuse, start
 from hrcreplay.human.model import LimitSet, skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, POINTS, Floats, HumanStates, Ints, Measurements
-from tests.human.people import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, random_measurements
+from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, random_measurements
 
 WIDE = load_limits("human")
 #: No bound but heading's absence of one, no outlier, nothing forgotten: the plain filter of (42)-(57).

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from hrcreplay.human.model import alpha_2_bounds, alpha_3_bounds, clamp, skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats
-from tests.human.people import LENGTHS_M, lengths, postures
+from tests.human.sightings import LENGTHS_M, lengths, postures
 
 
 def chain(p: Floats, pi: Floats) -> dict[str, Floats]:

@@ -12,7 +12,7 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.human.smooth import smooth
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats
-from tests.human.people import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
+from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
 
 LIMITS = load_limits("human")
 T = np.tile(np.eye(4), (2, 1, 1))
