@@ -20,8 +20,10 @@ bench: $(VENV)/made
 # Everything from the lock, by hash and without a compiler; then the project itself.
 $(VENV)/made: requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r requirements.lock
+	$(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	rm -rf $(VENV)/first-run
+	$(BIN)/hrcreplay report datasets/demo.mcap --start 8 --end 10 --out $(VENV)/first-run  # compiles the kernels, once
 	@touch $@
 
 # Needs uv. Writes versions and hashes, never an index's address.
