@@ -52,9 +52,11 @@ def active_set(H: Floats, g: Floats, A: Floats, high: Floats) -> tuple[Floats, F
     E, h, norms = np.zeros((m, n)), high.copy(), np.ones(m)
     for i in range(m):
         e = _forward(L, A[i])
-        if _norm(e) > 0.0:
-            norms[i] = _norm(e)
-            E[i], h[i] = e / norms[i], high[i] / norms[i]
+        length = _norm(e)
+        if length > 0.0:
+            norms[i], h[i] = length, high[i] / length
+            for k in range(n):
+                E[i, k] = e[k] / length
     held, z = np.empty(n, dtype=np.int64), np.zeros(m)
     count = 0
     for _ in range(STEPS):
@@ -89,7 +91,7 @@ def _take(E: Floats, h: Floats, p: int, y: Floats, z: Floats, held: Ints, count:
     Changes ``y``, ``z`` and ``held``; returns how many rows are held, and whether p is the last of them.
     """
     while True:
-        r, across = _split(E, held[:count], E[p])
+        r, across = _split(E, held, count, E[p])
         squared = _dot(across, across)
         depends = count == len(y) or squared <= DEPENDENT
         full = np.inf if depends else (_dot(E[p], y) - h[p]) / squared
@@ -103,35 +105,42 @@ def _take(E: Floats, h: Floats, p: int, y: Floats, z: Floats, held: Ints, count:
         for j in range(count):
             z[held[j]] -= step * r[j]
         z[p] += step
-        if not depends:
-            y -= step * across
+        for k in range(0 if depends else len(y)):
+            y[k] -= step * across[k]
         if full <= partial:
             held[count] = p
             return count + 1, True
         z[held[leaving]] = 0.0
-        held[leaving : count - 1] = held[leaving + 1 : count].copy()
         count -= 1
+        for j in range(leaving, count):
+            held[j] = held[j + 1]
 
 
 @njit(cache=True, error_model="numpy")
-def _split(E: Floats, held: Ints, e: Floats) -> tuple[Floats, Floats]:
+def _split(E: Floats, held: Ints, count: int, e: Floats) -> tuple[Floats, Floats]:
     """A row as a combination of the held ones and the rest across them, by Gram and Schmidt."""
-    k, n = len(held), len(e)
-    basis, R = np.zeros((k, n)), np.zeros((k, k + 1))
-    across = e.copy()
-    for i in range(k + 1):
-        v = E[held[i]].copy() if i < k else across
-        for _ in range(2):  # twice is enough
-            for j in range(i):
-                along = _dot(basis[j], v)
-                R[j, i] += along
-                for c in range(n):
-                    v[c] -= along * basis[j, c]
-        if i < k:
-            R[i, i] = _norm(v)
-            for c in range(n):
-                basis[i, c] = v[c] / R[i, i]
-    return _backward(R[:, :k].T, R[:, k]), across
+    basis, L = np.zeros((count, len(e))), np.zeros((count, count))
+    for i in range(count):
+        for c in range(len(e)):
+            basis[i, c] = E[held[i], c]
+        _remove(basis, i, basis[i], L[i])
+        L[i, i] = _norm(basis[i])
+        for c in range(len(e)):
+            basis[i, c] /= L[i, i]
+    across, along = e.copy(), np.zeros(count)
+    _remove(basis, count, across, along)
+    return _backward(L, along), across
+
+
+@njit(cache=True)
+def _remove(basis: Floats, count: int, v: Floats, along: Floats) -> None:
+    """Takes off v what lies along the first vectors of a basis, and adds up how much."""
+    for _ in range(2):  # twice is enough
+        for j in range(count):
+            part = _dot(basis[j], v)
+            along[j] += part
+            for c in range(len(v)):
+                v[c] -= part * basis[j, c]
 
 
 @njit(cache=True, error_model="numpy")

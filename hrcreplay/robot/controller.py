@@ -85,7 +85,9 @@ def step(
                 status = stepping.LIMITED if solution.held else stepping.TRACKING
                 return sight.step(state, solution.dq_next, settings.dt_s, status)
             reason = _REASONS.get(solution.status, stepping.NO_SOLUTION)
-        return sight.step(state, stepping.braked(state, robot.ddq_max, settings.dt_s), settings.dt_s, 2, reason)
+        return sight.step(
+            state, stepping.braked(state, robot.ddq_max, settings.dt_s), settings.dt_s, stepping.BRAKING, reason
+        )
 
 
 _REASONS = {"not finite": stepping.NOT_FINITE, "separation failed": stepping.NO_DISTANCE}
