@@ -19,7 +19,7 @@ from hrcreplay.robot.rotation import from_vector
 from hrcreplay.robot.separation import Separation, separation
 from hrcreplay.robot.sight import observe
 from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
-from hrcreplay.robot.tracking import pose_error, tracking_cost
+from hrcreplay.robot.tracking import pose_error
 from tests.robot.checker import links, violation
 from tests.robot.people import cloud, person, volumes
 
@@ -200,26 +200,6 @@ def test_as_printed_a_position_error_does_not_decay(robot: RobotModel) -> None:
         left[gain] = T[0, 3] - robot.pose(state.q, state.dq).T_world_tcp[0, 3]
     assert left[0.0] > 0.0099
     assert abs(left[5.0]) < 1e-5
-
-
-def test_the_cost_is_eq_66a(robot: RobotModel) -> None:
-    rng = np.random.default_rng(11)
-    Q_p, Q_v = np.repeat([0.3, 0.2], 3), np.repeat([1.5, 0.7], 3)
-    for _ in range(20):
-        q, dq, error, twist = rng.normal(size=(4, 6)) * 0.5
-        pose = robot.pose(q, dq)
-        J, dJdq = pose.J_tcp, pose.dJdq_tcp
-        H, g = tracking_cost(error, J, dJdq, dq, twist, (0.3, 0.2), (1.5, 0.7), 0.0, DT_S)
-
-        w, w0 = dq + DT_S * rng.normal(size=6), dq
-        costs = []
-        for u in ((w - dq) / DT_S, (w0 - dq) / DT_S):
-            x_next = error + DT_S * J @ dq + DT_S**2 / 2 * (dJdq + J @ u)
-            dx_next = J @ dq + DT_S * (dJdq + J @ u)
-            costs.append((dx_next - twist) ** 2 @ Q_v + x_next**2 @ Q_p)
-        mine = 2 * (0.5 * w @ H @ w + g @ w) - 2 * (0.5 * w0 @ H @ w0 + g @ w0)
-        assert mine == pytest.approx(costs[0] - costs[1], abs=1e-5)
-        np.testing.assert_allclose(minimiser(H, g), np.linalg.solve(H, -g), rtol=1e-6, atol=1e-9)
 
 
 def moving(robot: RobotModel) -> RobotState:
