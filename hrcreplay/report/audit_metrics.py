@@ -1,0 +1,204 @@
+"""What an audit found, as figures with intervals: per method, limb and joint, for one log or several together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hrcreplay.records import JOINTS, LIMBS, Bools, Floats, Ints, Table
+from hrcreplay.report.coverage import Estimate, Resampling
+from hrcreplay.report.metrics_table import Metric, MetricTable
+from hrcreplay.report.series import stretches
+
+#: Rounding of a distance [m].
+_ROUNDING_M = 1e-9
+#: Ticks of one escape may have so many ticks without one between them.
+_BREAK = 2
+
+
+@dataclass(frozen=True)
+class Outcome(Table):
+    """One method's volumes held against what the person did, a row an audited tick."""
+
+    t_ns: Ints  #: (n,)
+    beyond_m: (
+        Floats  #: (n, l) farthest that a recorded point of the limb got from the hull, before the ball; NaN: unseen
+    )
+    radius_m: Floats  #: (n, l) of the ball
+    volume_m3: Floats  #: (n, l) NaN where the limb could not be predicted
+    union_m3: Floats  #: (n,) of the six LIMBS together; NaN where not computed
+    union_std_m3: Floats  #: (n,) standard error of the counting behind it
+    limbs: tuple[str, ...]
+
+    def escape_m(self) -> Floats:
+        """(n, l) how far the limb left its volume within the horizon; 0 inside, NaN where not audited [m]."""
+        depth = self.beyond_m - self.radius_m
+        return np.where(np.isnan(depth), np.nan, np.where(depth > _ROUNDING_M, depth, 0.0))
+
+    def worst_m(self) -> Floats:
+        """(n,) largest escape of the six LIMBS, each from its own volume; NaN where none was audited [m]."""
+        escapes = self.escape_m()[:, : len(LIMBS)]
+        known = np.isfinite(escapes).any(axis=1)
+        return np.where(known, np.where(np.isnan(escapes), -1.0, escapes).max(axis=1), np.nan)
+
+
+def method_figures(
+    outcomes: Sequence[Outcome], resampling: Resampling, body_radius_m: Mapping[str, float]
+) -> dict[str, Any]:
+    """Coverage, escapes and volumes of one method.
+
+    Args:
+        outcomes: One a log, in the order of the resampling.
+        resampling: Of all their ticks.
+        body_radius_m: Radius of each limb itself, Table 2 [m].
+
+    Returns:
+        ``all`` (the six LIMBS, each in its own volume) and each limb -> name -> figure.
+    """
+    whole = Outcome.join(outcomes)
+    escapes = whole.escape_m()
+    found: dict[str, Any] = {"all": _escape_figures(whole.worst_m(), resampling)}
+    found["all"]["union_m3"] = resampling.mean(whole.union_m3).plain()
+    found["all"]["union_counting_error"] = resampling.mean(whole.union_std_m3 / whole.union_m3).plain()["value"]
+    found["all"]["sum_m3"] = resampling.mean(whole.volume_m3[:, : len(LIMBS)].sum(axis=1)).plain()
+    for i, limb in enumerate(whole.limbs):
+        found[limb] = _escape_figures(escapes[:, i], resampling)
+        found[limb]["volume_m3"] = resampling.mean(whole.volume_m3[:, i]).plain()
+        if limb in body_radius_m:
+            room = whole.radius_m[:, i] - body_radius_m[limb] + _ROUNDING_M
+            found[limb]["whole_limb_share"] = resampling.share(_hits(whole.beyond_m[:, i], room)).plain()
+    return found
+
+
+def _escape_figures(escape_m: Floats, resampling: Resampling) -> dict[str, Any]:
+    deep = np.where(escape_m > 0.0, escape_m, np.nan)
+    return {
+        "covered_share": resampling.share(_hits(escape_m, np.zeros(len(escape_m)))).plain(),
+        "escape_p50_m": resampling.quantile(deep, 0.5).plain(),
+        "escape_p95_m": resampling.quantile(deep, 0.95).plain(),
+        "escape_max_m": _number(np.nanmax(deep)) if np.isfinite(deep).any() else None,
+    }
+
+
+def _hits(values: Floats, most: Floats) -> Floats:
+    """1 where a value is at most ``most``, else 0; NaN stays."""
+    return np.where(np.isnan(values), np.nan, (values <= most).astype(float))
+
+
+def joint_figures(inside: Floats, travel: Floats, resampling: Resampling) -> dict[str, Any]:
+    """Per joint: share of ticks whose recorded future stayed inside the reachable interval, and how much it moved.
+
+    Args:
+        inside: (n, 12) 1 or 0; NaN where the joint was not recorded.
+        travel: (12,) how far the joint went in the recording, 5th to 95th percentile [m, m, rad...].
+        resampling: Of the n ticks.
+    """
+    return {
+        joint: {"inside_share": resampling.share(inside[:, j]).plain(), "travel": _number(travel[j])}
+        for j, joint in enumerate(JOINTS)
+    }
+
+
+def curve_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:
+    """Coverage of all limbs and volume of their union, of one method under one limit set."""
+    whole = Outcome.join(outcomes)
+    worst = whole.worst_m()
+    return {
+        "covered_share": resampling.share(_hits(worst, np.zeros(len(worst)))).plain(),
+        "union_m3": resampling.mean(whole.union_m3).plain(),
+    }
+
+
+def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
+    """Every escape: the ticks in a row whose prediction one limb left, when, and how far."""
+    depth = outcome.escape_m()
+    seconds = (outcome.t_ns - start_ns) * 1e-9
+    found = []
+    for i, limb in enumerate(outcome.limbs):
+        for first, last in _joined(depth[:, i] > 0.0):
+            part = depth[first:last, i]
+            found.append(
+                {
+                    "limb": limb,
+                    "from_s": round(float(seconds[first]), 3),
+                    "to_s": round(float(seconds[last - 1]), 3),
+                    "ticks": int((part > 0.0).sum()),
+                    "deepest_m": float(np.nanmax(part)),
+                    "deepest_at_s": round(float(seconds[first + int(np.nanargmax(part))]), 3),
+                }
+            )
+    return sorted(found, key=lambda e: (e["from_s"], e["limb"]))
+
+
+def _joined(escaped: Bools) -> list[tuple[int, int]]:
+    """Runs of true, those joined that lie close together."""
+    runs: list[tuple[int, int]] = []
+    for first, last in stretches(escaped).tolist():
+        if runs and first - runs[-1][1] <= _BREAK:
+            runs[-1] = (runs[-1][0], last)
+        else:
+            runs.append((first, last))
+    return runs
+
+
+def volume_at(curve: Sequence[Mapping[str, Any]], share: float) -> float | None:
+    """Union volume at which a method's curve first has a coverage, between its points; None where it never has [m^3].
+
+    Args:
+        curve: Points of one method, by growing factor.
+        share: The coverage asked for.
+    """
+    before: tuple[float, float] | None = None
+    for point in curve:
+        here = (point["covered_share"]["value"], point["union_m3"]["value"])
+        if None in here:
+            continue
+        if here[0] >= share:
+            if before is None or here[0] == before[0]:
+                return float(here[1])
+            part = (share - before[0]) / (here[0] - before[0])
+            return float(np.exp((1 - part) * np.log(before[1]) + part * np.log(here[1])))
+        before = here
+    return None
+
+
+def flat(found: Mapping[str, Any]) -> dict[str, Metric]:
+    """The headline figures of all logs together, as metrics.json has them.
+
+    Args:
+        found: The content of audit.json.
+    """
+    table = MetricTable()
+    for method, parts in found["total"]["methods"].items():
+        for part, figures in parts.items():
+            share = figures["covered_share"]
+            what = "every limb in its own volume" if part == "all" else f"{part} in its volume"
+            name = f"audit_{method}_{part}"
+            meaning = f"share of ticks with {what} for the whole horizon, by {method}"
+            table.add(f"{name}_covered_share", share["value"], "1", meaning)
+            for end in ("low", "high"):
+                table.add(f"{name}_covered_share_{end}", share[end], "1", f"its 95 % interval: {end} end")
+            table.add(f"{name}_escape_max_m", figures["escape_max_m"], "m", "deepest escape", reason="no escape")
+            key = "union_m3" if part == "all" else "volume_m3"
+            room = "mean volume of the union of the six limbs" if part == "all" else "mean volume"
+            table.add(f"{name}_{key}", figures[key]["value"], "m^3", room)
+    table.add("audit_ticks", found["total"]["ticks"], "1", "audited ticks of all logs")
+    return table.sorted()
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def text(figure: Mapping[str, Any] | Estimate, scale: float = 1.0, decimals: int = 1) -> str:
+    """A figure with its interval, as tables show it; a dash where there is none."""
+    plain = figure.plain() if isinstance(figure, Estimate) else figure
+    if plain["value"] is None:
+        return "\u2013"
+    value = f"{scale * plain['value']:.{decimals}f}"
+    if plain["low"] is None:
+        return value
+    return f"{value} ({scale * plain['low']:.{decimals}f}\u2013{scale * plain['high']:.{decimals}f})"

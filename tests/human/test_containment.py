@@ -1,0 +1,73 @@
+"""Distances against a solver that knows nothing of triangles, volumes against formulas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+from hrcreplay.human.containment import Solid, union_volume_m3
+from hrcreplay.records import Floats
+
+
+def _by_least_squares(point: Floats, vertices: Floats) -> float:
+    """Distance from a convex hull: nearest convex combination, its weights' sum held at 1 by a heavy row."""
+    heavy = 1e4
+    A = np.vstack([(vertices - point).T, np.full(len(vertices), heavy)])
+    weights, _ = nnls(A, np.array([0.0, 0.0, 0.0, heavy]))
+    return float(np.linalg.norm((vertices - point).T @ (weights / weights.sum())))
+
+
+SETS: dict[str, Callable[[np.random.Generator], Floats]] = {
+    "solid": lambda rng: rng.normal(size=(40, 3)),
+    "thin": lambda rng: rng.normal(size=(30, 3)) * [1.0, 0.3, 1e-3],
+    "flat": lambda rng: np.column_stack([rng.normal(size=(12, 2)), np.full(12, 0.3)]),
+    "line": lambda rng: rng.normal(size=(5, 1)) * np.array([[1.0, 2.0, -1.0]]) + 0.2,
+    "point": lambda rng: rng.normal(size=(1, 3)),
+    "few": lambda rng: rng.normal(size=(4, 3)),
+}
+
+
+@pytest.mark.parametrize("kind", SETS)
+def test_distances_are_those_of_the_nearest_convex_combination(kind: str) -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(6):
+        vertices = SETS[kind](rng)
+        points = np.concatenate([1.5 * rng.normal(size=(40, 3)), vertices[:3], vertices.mean(axis=0)[None]])
+        if kind == "flat":
+            points[:10, 2] = 0.3  # in its plane
+        found = Solid.around(vertices, 0.1).distances_m(points)
+        expected = [_by_least_squares(point, vertices) for point in points]
+        np.testing.assert_allclose(found, expected, atol=2e-6)
+        assert (found[40:] < 1e-8).all()
+
+
+def test_a_missing_point_has_no_distance() -> None:
+    found = Solid.around(np.eye(3), 0.1).distances_m(np.array([[np.nan, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    assert np.isnan(found[0])
+    assert found[1] == 0.0
+
+
+def test_the_union_of_solids_apart_is_their_sum() -> None:
+    rng = np.random.default_rng(3)
+    one = Solid.around(rng.normal(size=(20, 3)) * 0.2, 0.1)
+    two = Solid.around(rng.normal(size=(20, 3)) * 0.2 + 1.5, 0.2)
+    exact = one.volume_m3() + two.volume_m3()
+    found, error = union_volume_m3([one, two], 40_000)
+    assert found == pytest.approx(exact, rel=0.01)
+    assert error < 0.01 * exact
+
+
+def test_the_union_of_two_balls_that_meet() -> None:
+    """Lens of two unit balls one apart: 5 pi / 12."""
+    balls = [Solid.around(np.array([[x, 0.0, 0.0]]), 1.0) for x in (0.0, 1.0)]
+    exact = 8.0 / 3.0 * np.pi - 5.0 / 12.0 * np.pi
+    errors = []
+    for k in range(12):
+        found, error = union_volume_m3(balls, 1024, 1024 * k)
+        errors.append(found - exact)
+        assert error < 0.05 * exact
+    assert abs(np.mean(errors)) < 0.004 * exact  # calls that go on in the sequence do not share their error
+    assert union_volume_m3(balls[:1] * 3, 4096)[0] == union_volume_m3(balls[:1], 4096)[0]
