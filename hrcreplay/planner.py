@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,15 @@ from hrcreplay.robot.obstacles import Obstacles, obstacles
 from hrcreplay.robot.reference import Leash, Reference, ReferencePoint, advance
 from hrcreplay.robot.scaling import PathState
 from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
+
+
+class Tick(NamedTuple):
+    """What a method found at a tick, and what it decided."""
+
+    state: RobotState
+    point: ReferencePoint  #: of the reference
+    programme_s: float  #: its programmed time [s]
+    step: Step
 
 
 @dataclass
@@ -29,9 +39,9 @@ class QpFollower:
         self.point = self.reference.sample(self.s_s)
         self.state = RobotState(self.point.q, np.zeros(self.robot.nv))
 
-    def step(self, volumes: Obstacles) -> tuple[RobotState, ReferencePoint, Step]:
-        """One tick: the state and the reference that it found, and what it decided."""
-        state, point = self.state, self.point
+    def step(self, volumes: Obstacles) -> Tick:
+        """One tick of the trajectory generator."""
+        state, point, now_s = self.state, self.point, self.s_s
         tcp_m = self.robot.pose(state.q, state.dq).T_world_tcp[:3, 3]
         error_m = float(np.linalg.norm(tcp_m - point.T_world_tcp[:3, 3]))
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.leash)
@@ -40,7 +50,7 @@ class QpFollower:
             self.robot, state, self.point.T_world_tcp, rate * self.point.twist, volumes, self.settings
         )
         self.state = step.next
-        return state, point, step
+        return Tick(state, point, now_s, step)
 
 
 @dataclass
@@ -56,12 +66,13 @@ class ScalingFollower:
         self.along = PathState(self.s_s, 0.0)
         self.state = RobotState(self.reference.sample(self.s_s).q, np.zeros(self.robot.nv))
 
-    def step(self, volumes: Obstacles) -> tuple[RobotState, ReferencePoint, Step]:
-        """One tick: the state and the place on the path that it found, and what it decided."""
-        state, point = self.state, self.reference.sample(self.along.s_s)
+    def step(self, volumes: Obstacles) -> Tick:
+        """One tick of the baseline."""
+        state, now_s = self.state, self.along.s_s
+        point = self.reference.sample(now_s)
         step, self.along = scaling.step(self.robot, self.reference, self.along, volumes, self.settings)
         self.state = step.next
-        return state, point, step
+        return Tick(state, point, now_s, step)
 
 
 @dataclass
@@ -77,9 +88,7 @@ class Planner:
         """The motion of a batch of ticks."""
         robot = self.follower.robot
         rows = [self._tick(volumes, i, int(t), bool(states.valid[i].any())) for i, t in enumerate(volumes.t_ns)]
-        found = [state for state, _, _ in rows]
-        points = [point for _, point, _ in rows]
-        steps = [step for _, _, step in rows]
+        found, points, steps = ([getattr(row, name) for row in rows] for name in ("state", "point", "step"))
         poses = [step.pose for step in steps]
         return Motion(
             t_ns=volumes.t_ns,
@@ -92,6 +101,7 @@ class Planner:
                 [np.linalg.norm(pose.J_tcp[:3] @ state.dq) for pose, state in zip(poses, found, strict=True)]
             ),
             ref_speed=np.array([np.linalg.norm(point.twist[:3]) for point in points]),
+            programme_s=np.array([row.programme_s for row in rows]),
             distance_m=np.array([step.distance_m for step in steps]),
             limb=np.array([step.limb for step in steps]),
             link=np.array([step.link for step in steps]),
@@ -102,7 +112,7 @@ class Planner:
             reasons=stepping.REASONS,
         )
 
-    def _tick(self, volumes: SweptVolumes, row: int, t_ns: int, seen: bool) -> tuple[RobotState, ReferencePoint, Step]:
+    def _tick(self, volumes: SweptVolumes, row: int, t_ns: int, seen: bool) -> Tick:
         if seen:
             self.seen_ns = t_ns
         around = obstacles(volumes, row)

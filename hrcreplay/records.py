@@ -185,6 +185,7 @@ class Motion(Table):
     tcp_m: Floats  #: (n, 3) TCP position, world [m]
     tcp_speed: Floats  #: (n,) [m/s]
     ref_speed: Floats  #: (n,) [m/s]
+    programme_s: Floats  #: (n,) programmed time of the reference; behind the clock by what it has waited [s]
     distance_m: Floats  #: (n,) surface to surface, smallest over all pairs; 0 in contact [m]
     limb: Ints  #: (n,) index into ``limbs`` of the nearest pair; -1 without one
     link: Ints  #: (n,) index into ``links`` of the nearest pair; -1 without one

@@ -91,6 +91,7 @@ def motion_columns(motion: Motion) -> Columns:
         **_spread(motion.tcp_m, ["tcp_x", "tcp_y", "tcp_z"]),
         "tcp_speed": motion.tcp_speed,
         "ref_speed": motion.ref_speed,
+        "programme_s": motion.programme_s,
         "distance_m": motion.distance_m,
         "limb": _names(motion.limb, motion.limbs),
         "link": _names(motion.link, motion.links),

@@ -83,20 +83,12 @@ def deviation_m(motion: pd.DataFrame) -> Floats:
     return np.asarray(np.linalg.norm(tcp - path_feet(tcp, vectors(motion, "ref")), axis=1))
 
 
-def time_lost_s(motion: pd.DataFrame, stationary_m_per_s: float) -> Floats:
-    """(n,) how much of each tick the reference waited instead of advancing at the programmed speed [s].
-
-    A tick at which the programme itself stands loses nothing.
-    """
-    duration = durations_s(times(motion))
-    advance = np.append(np.linalg.norm(np.diff(vectors(motion, "ref"), axis=0), axis=1), 0.0)
-    speed = numbers(motion, "ref_speed")
-    speed = 0.5 * (speed + np.append(speed[1:], speed[-1:]))
-    moves = speed >= stationary_m_per_s
-    took = advance / np.where(moves, speed, 1.0)
-    lost = np.where(moves, np.clip(duration - took, 0.0, None), 0.0)
+def time_lost_s(motion: pd.DataFrame) -> Floats:
+    """(n,) how much of each tick the reference waited for the robot instead of going on [s]; 0 after the last tick."""
+    lost = durations_s(times(motion))
+    lost[:-1] -= np.diff(numbers(motion, "programme_s"))
     lost[-1:] = 0.0  # what the reference does after the last tick is not known
-    return lost
+    return np.clip(lost, 0.0, None)
 
 
 def cycles(motion: pd.DataFrame, *, at_m: float = 0.002, away_m: float = 0.05) -> int:
@@ -130,7 +122,7 @@ def add_plan(
         _add_separation(metrics, prefix, table, what, stationary_m_per_s)
         _add_stationary(metrics, prefix, table, what, near_m, stationary_m_per_s)
         _add_path(metrics, prefix, table, what)
-        _add_progress(metrics, prefix, table, what, stationary_m_per_s, waits=waits)
+        _add_progress(metrics, prefix, table, what, waits=waits)
     for name, (value, unit, meaning) in PAPER.items():
         metrics.add(name, value, unit, meaning)
 
@@ -246,9 +238,7 @@ def _p95(values: Floats) -> float:
     return float(np.quantile(values, 0.95))
 
 
-def _add_progress(
-    metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float, *, waits: bool
-) -> None:
+def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, *, waits: bool) -> None:
     tcp_speed, ref_speed = numbers(motion, "tcp_speed"), numbers(motion, "ref_speed")
     for name, speed, meaning in (
         ("tcp_speed", tcp_speed, "speed of the TCP"),
@@ -273,14 +263,14 @@ def _add_progress(
         f"times the reference came back to its first point, {what}",
         reason="the reference never came back to its first point",
     )
-    lost = float(np.nansum(time_lost_s(motion, slow))) if len(motion) else 0.0
+    lost = float(np.nansum(time_lost_s(motion))) if len(motion) else 0.0
     total = float(durations_s(times(motion)).sum())
     reason = "with plan.reference = time the reference never waits: see the tracking error instead"
     metrics.add(
         f"{prefix}_time_lost_s",
         lost if waits else None,
         "s",
-        f"time that the reference waited for the robot though the programme moves, {what}",
+        f"time that the reference waited for the robot, {what}",
         reason=reason,
     )
     metrics.add(

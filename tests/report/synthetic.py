@@ -125,6 +125,7 @@ def motion_table(seconds: float, rate_hz: float, *, held: float) -> pd.DataFrame
     for i, axis in enumerate("xyz"):
         columns |= {f"ref_{axis}": ref[:, i], f"tcp_{axis}": tcp[:, i]}
     columns |= {"tcp_speed": speed, "ref_speed": programmed, "distance_m": distance, "status": status, "reason": reason}
+    columns |= {"programme_s": (np.cumsum(pace) - pace[0]) / rate_hz}
     columns |= {"limb": [None if t < 0.5 else "LRA" for t in t_s], "link": "tool"}
     return pd.DataFrame(columns)
 

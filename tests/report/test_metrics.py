@@ -205,15 +205,16 @@ def test_distance_from_a_path_is_to_its_segments() -> None:
     assert np.isnan(feet[3]).all()
 
 
-def test_time_lost_when_the_reference_waits_half_the_time() -> None:
-    """10 s at 0.2 m/s programmed, of which the reference waits in the seconds 2 to 7; 1 s of programmed rest at 0."""
+def test_time_lost_is_what_the_reference_waited() -> None:
+    """10 s, of which the reference waits in the seconds 2 to 7."""
     t_s = np.arange(0, 10, 0.01)
-    speed = np.where(t_s < 1, 0.0, 0.2)
-    moves = (t_s >= 1) & ((t_s < 2) | (t_s >= 7))
-    x = np.concatenate([[0.0], np.cumsum(np.where(moves, 0.002, 0.0))[:-1]])
-    motion = pd.DataFrame({"t_ns": (t_s * 1e9).round().astype(np.int64), "ref_x": x, "ref_speed": speed})
-    motion = motion.assign(ref_y=0.0, ref_z=0.5)
-    assert time_lost_s(motion, 0.001).sum() == pytest.approx(5.0, abs=0.02)
+    goes_on = (t_s < 2) | (t_s >= 7)
+    programme_s = np.concatenate([[0.0], np.cumsum(np.where(goes_on, 0.01, 0.0))[:-1]])
+    motion = pd.DataFrame({"t_ns": (t_s * 1e9).round().astype(np.int64), "programme_s": programme_s})
+    lost = time_lost_s(motion)
+    assert lost.sum() == pytest.approx(5.0, abs=1e-9)
+    assert lost[~goes_on] == pytest.approx(0.01)
+    assert lost[goes_on] == pytest.approx(0.0)
 
 
 def test_no_time_is_lost_by_a_reference_that_runs_with_the_clock(run: Run) -> None:
