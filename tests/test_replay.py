@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay import replay, runs
@@ -18,7 +19,10 @@ from hrcreplay.records import JOINTS, LENGTHS, LIMBS, SweptVolumes
 from hrcreplay.runs import Run
 from tests.robot import checker
 
-SPAN = {"start_s": 8.0, "end_s": 11.0}
+
+def _short(command: str, source: Path, out: Path, **options: Any) -> Path:
+    """Three seconds of the demo log, in which the person reaches in for the first time."""
+    return replay.run(command, source, out=out, start_s=8.0, end_s=11.0, **options)
 
 
 def _meta(folder: Path) -> dict[str, Any]:
@@ -100,7 +104,7 @@ def test_every_tick_not_in_braking_keeps_inequality_2(demo: Run, name: str) -> N
     table = demo.motion if name == "qp" else demo.baselines[name]
     assert table is not None
     assert demo.T_world_base is not None
-    status = table["status"].map({"tracking": 0, "limited": 1, "braking": 2}).to_numpy()
+    status = table["status"].map({"tracking": 0, "limited": 1, "braking": 2}).to_numpy(dtype=np.int64)
     q, dq, u = (table[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq", "u"))
     worst = checker.violation(q, dq, u, status, _volumes(demo), demo.T_world_base, dt_s=0.004, stop_s=0.377)
     assert worst.metres <= 1e-6
@@ -119,8 +123,8 @@ def test_a_braking_robot_decelerates_every_joint_at_its_limit(demo: Run, name: s
 
 
 def test_same_bytes_with_other_chunks_and_threads(tmp_path: Path) -> None:
-    first = replay.run("report", replay.demo_log(), out=tmp_path / "a", **SPAN)
-    again = replay.run("report", replay.demo_log(), out=tmp_path / "b", chunk_ticks=61, **SPAN)
+    first = _short("report", replay.demo_log(), tmp_path / "a")
+    again = _short("report", replay.demo_log(), tmp_path / "b", chunk_ticks=61)
     one = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     arguments = ["--start", "8", "--end", "11", "--chunk-ticks", "1000", "--out", str(tmp_path / "c")]
     command = [sys.executable, "-m", "hrcreplay", "report", str(replay.demo_log()), *arguments]
@@ -132,8 +136,8 @@ def test_same_bytes_with_other_chunks_and_threads(tmp_path: Path) -> None:
 
 
 def test_a_stage_takes_over_an_earlier_run_or_says_why_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = replay.run("plan", replay.demo_log(), out=tmp_path / "whole", **SPAN)
-    fused = replay.run("fuse", replay.demo_log(), out=tmp_path / "fused", **SPAN)
+    whole = _short("plan", replay.demo_log(), tmp_path / "whole")
+    fused = _short("fuse", replay.demo_log(), tmp_path / "fused")
     planned = replay.run("plan", fused, out=tmp_path / "planned")
     assert f"fuse: taken over from {fused}" in capsys.readouterr().err
     assert _meta(planned)["outputs"] == _meta(whole)["outputs"]
@@ -148,11 +152,11 @@ def test_a_stage_takes_over_an_earlier_run_or_says_why_not(tmp_path: Path, capsy
 
 
 def test_smooth_comes_nearer_to_the_truth_than_the_filter(tmp_path: Path) -> None:
-    folder = replay.run("fuse", replay.demo_log(), out=tmp_path / "s", smooth=True, **SPAN)
+    folder = _short("fuse", replay.demo_log(), tmp_path / "s", smooth=True)
     run = runs.read(folder)
     assert run.truth is not None
     assert run.state is not None
-    smooth = runs.pq.read_table(folder / "smooth.parquet").to_pandas()
+    smooth = pq.read_table(folder / "smooth.parquet").to_pandas()
     at = np.searchsorted(run.state["t_ns"], run.truth["t_ns"])
     inside = at < len(run.state)
     joints = list(JOINTS[4:])

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hrcreplay.records import Floats, SweptVolumes
+from hrcreplay.records import Floats, Ints, SweptVolumes
 
 #: d, a [m] and alpha, theta at zero [rad] of each axis.
 DH = (
@@ -73,7 +73,7 @@ def violation(
     q: Floats,
     dq: Floats,
     u: Floats,
-    status: Floats,
+    status: Ints,
     volumes: SweptVolumes,
     T_world_base: Floats,
     *,
@@ -102,15 +102,18 @@ def violation(
     share = np.linspace(0.0, 1.0, POINTS)[:, None]
     for tick in np.flatnonzero(np.asarray(status) != BRAKING):
         ends, speeds = links(q[tick], dq[tick] + dt_s * u[tick], T_world_base, tool_m)
+        limbs = [volumes.vertices(int(tick), limb) for limb in range(len(volumes.limbs))]
+        vertices = np.concatenate(limbs)
+        limb_of = np.repeat(np.arange(len(limbs)), [len(limb) for limb in limbs])
         for link in range(5):
             r_s = ends[link, 0] + share * (ends[link, 1] - ends[link, 0])
             v_s = speeds[link, 0] + share * (speeds[link, 1] - speeds[link, 0])
-            for limb in range(len(volumes.limbs)):
-                delta = RADII[link] + volumes.radius_m[tick, limb] + clearance_m
-                way = volumes.vertices(int(tick), limb)[None] - r_s[:, None]
-                rho = np.linalg.norm(way, axis=2)
-                left = stop_s * np.einsum("pi,pmi->pm", v_s, way) / rho
-                excess = float((left - np.maximum(0.0, rho - delta)).max())
-                if excess > worst.metres:
-                    worst = Violation(excess, int(tick), link, limb)
+            delta = RADII[link] + volumes.radius_m[tick, limb_of] + clearance_m
+            way = vertices[None] - r_s[:, None]
+            rho = np.linalg.norm(way, axis=2)
+            left = stop_s * np.einsum("pi,pmi->pm", v_s, way) / rho
+            excess = left - np.maximum(0.0, rho - delta)
+            if excess.max() > worst.metres:
+                where = int(excess.max(axis=0).argmax())
+                worst = Violation(float(excess.max()), int(tick), link, int(limb_of[where]))
     return worst
