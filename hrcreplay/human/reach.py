@@ -8,12 +8,15 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.human.enclosure import enclose
+from hrcreplay.human.margins import STANDARD, Margins
 from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds
 from hrcreplay.records import Floats, HumanStates, Ints, Table
 
-#: Ways to predict, in the order of their codes in the kernels.
-METHODS = ("paper", "positions")
-PAPER = METHODS.index("paper")
+#: Ways to predict, in the order of their codes in the kernels: the two of the literature, and what encloses.
+PRINTED = ("paper", "positions")
+METHODS = (*PRINTED, "sound")
+PAPER, SOUND = METHODS.index("paper"), METHODS.index("sound")
 
 
 @dataclass(frozen=True)
@@ -25,26 +28,34 @@ class Reach(Table):
     high: Floats  #: (n, 12)
 
 
-def reachable(states: HumanStates, limits: LimitSet, horizon_s: float, method: str) -> Reach:
+def reachable(
+    states: HumanStates, limits: LimitSet, horizon_s: float, method: str, margins: Margins = STANDARD
+) -> Reach:
     """Reachable sets within the horizon, Eq. (36), (38), (39), joint by joint.
 
     ``paper``: Eq. (20)-(30), corrected, for walking and Alg. 1 for the other joints: from positions, velocities and
     bounds on velocity and acceleration. ``positions``: the older way of [26], from positions and velocity bounds.
     Both hold the angles within their limits, with (34b), (34c) taken over the reachable interval of what they depend
-    on; a posture that is itself outside stays included.
+    on; a posture that is itself outside stays included. ``sound``: every motion under the limits from every likely
+    state, at all times until the horizon and the latency are over; x and y are those of a polygon, see ``stroll``.
 
     Args:
         states: The fused person.
         limits: Bounds.
         horizon_s: Braking time T_s of the robot [s].
         method: One of METHODS.
+        margins: What ``sound`` adds; the printed methods add nothing.
 
     Raises:
         SettingsError: There is no such method.
     """
+    code = code_of(method)
+    if code == SOUND:
+        low, high = enclose(states, bounds_of(limits), limits.coupled, horizon_s, margins)
+        return Reach(states.t_ns, low, high)
     low, high = np.empty_like(states.p), np.empty_like(states.p)
     p, v = np.ascontiguousarray(states.p), np.ascontiguousarray(states.v)
-    _reach_rows(p, v, bounds_of(limits), limits.coupled, horizon_s, code_of(method), low, high)
+    _reach_rows(p, v, bounds_of(limits), limits.coupled, horizon_s, code, low, high)
     return Reach(states.t_ns, low, high)
 
 

@@ -1,4 +1,4 @@
-"""The last three sweeps of Alg. 2, heading, x and y, in one: only copies that can be corners of the result.
+"""The last sweeps of Alg. 2, heading and place, in one: only copies that can be corners of the result.
 
 All copies of a point are at its height. A copy is no corner of the result when it lies between another copy and a
 point of its own set, that is: when the point can take a small step away from where the other copy is, and stay inside.
@@ -26,24 +26,26 @@ _SAME = 1e-12
 
 
 @njit(cache=True)
-def sweep_walk(points: Floats, count: int, faces: int, work: Surface, low: Floats, high: Floats, swept: Floats) -> int:
-    """Rotational sweep about the z axis, then translational sweeps along x and y.
+def sweep_walk(
+    points: Floats, count: int, faces: int, work: Surface, heading: tuple[float, float], floor: Floats, swept: Floats
+) -> int:
+    """Rotational sweep about the z axis, then a translational one over a polygon.
 
     Args:
         points: (m, 3), of which the first ``count`` are what ``keep_corners`` kept, in the human base frame [m].
         count: Number of points.
         faces: Number of triangles around them; with none, only copies inside the others of a point are left out.
         work: The surface, as ``keep_corners`` left it.
-        low: (>= 3,) smallest x, y, heading [m, m, rad].
-        high: (>= 3,) largest.
-        swept: (>= 32 count, 3) receives the points, world [m].
+        heading: Smallest and largest heading [rad].
+        floor: (k, 6) places of the human base: x, y, and the vectors there from the two neighbouring corners of the
+            polygon, zero where there is none [m].
+        swept: (>= 8 k count, 3) receives the points, world [m].
 
     Returns:
         Number of points written.
     """
     cosines, sines = np.empty(MOST_COPIES), np.empty(MOST_COPIES)
-    copies = turns(low[2], high[2], cosines, sines)
-    wide, deep = low[0] < high[0], low[1] < high[1]
+    copies = turns(heading[0], heading[1], cosines, sines)
     steps = _steps_inside(points, count, faces, work)
     n = 0
     for i in range(count):
@@ -53,17 +55,41 @@ def sweep_walk(points: Floats, count: int, faces: int, work: Surface, low: Float
             away = _away_from_turned(x, y, copy, copies, cosines, sines)
             for k in (0, 2):
                 away = _widen(away, s * steps[i, k + 1] - c * steps[i, k], -s * steps[i, k] - c * steps[i, k + 1])
-            for right in range(2 if wide else 1):
-                for far in range(2 if deep else 1):
-                    cone = _widen(away, (2.0 * right - 1.0) * wide, 0.0)
-                    cone = _widen(cone, 0.0, (2.0 * far - 1.0) * deep)
-                    if cone[0] == ALL_ROUND:
-                        continue
-                    swept[n, 0] = c * x - s * y + (high[0] if right else low[0])
-                    swept[n, 1] = s * x + c * y + (high[1] if far else low[1])
-                    swept[n, 2] = points[i, 2]
-                    n += 1
+            for place in floor:
+                cone = _widen(_widen(away, place[2], place[3]), place[4], place[5])
+                if cone[0] == ALL_ROUND:
+                    continue
+                swept[n, 0] = c * x - s * y + place[0]
+                swept[n, 1] = s * x + c * y + place[1]
+                swept[n, 2] = points[i, 2]
+                n += 1
     return n
+
+
+@njit(cache=True)
+def box(low: Floats, high: Floats) -> Floats:
+    """The floor of ``sweep_walk`` for x and y in intervals of their own; an empty interval has one end."""
+    wide, deep = 1 + (low[0] < high[0]), 1 + (low[1] < high[1])
+    floor = np.zeros((wide * deep, 6))
+    for right in range(wide):
+        for far in range(deep):
+            place = floor[deep * right + far]
+            place[0], place[1] = high[0] if right else low[0], high[1] if far else low[1]
+            place[2] = (2 * right - 1) * (high[0] - low[0])
+            place[5] = (2 * far - 1) * (high[1] - low[1])
+    return floor
+
+
+@njit(cache=True)
+def polygon(corners: Floats) -> Floats:
+    """The floor of ``sweep_walk`` for the hull of corners (k, 2) in order around it [m]."""
+    floor = np.empty((len(corners), 6))
+    for i in range(len(corners)):
+        before, after = corners[i - 1], corners[(i + 1) % len(corners)]
+        floor[i, 0], floor[i, 1] = corners[i, 0], corners[i, 1]
+        floor[i, 2], floor[i, 3] = corners[i, 0] - before[0], corners[i, 1] - before[1]
+        floor[i, 4], floor[i, 5] = corners[i, 0] - after[0], corners[i, 1] - after[1]
+    return floor
 
 
 @njit(cache=True)

@@ -11,7 +11,7 @@ from hrcreplay.human import occupancy
 from hrcreplay.human.hull import sphere_swept_volume_m3
 from hrcreplay.human.model import LimitSet, skeleton
 from hrcreplay.human.occupancy import Radii
-from hrcreplay.human.reach import METHODS, reachable
+from hrcreplay.human.reach import PRINTED, reachable
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from tests.human.people import LENGTHS_M, directions, limb_points, random_states, raw_cloud, states
@@ -30,7 +30,7 @@ def support(points: Floats) -> Floats:
     return largest
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", PRINTED)
 def test_the_hulls_are_those_of_algorithm_2(method: str) -> None:
     people = random_states(PAPER, 12, 11)
     volumes, reach = predict(people, method=method), reachable(people, PAPER, T, method)
@@ -66,7 +66,7 @@ def test_wide_limits_turn_joints_all_the_way_around() -> None:
             assert (support(reached) <= support(volumes.vertices(i, k)) + 1e-12).all()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", PRINTED)
 def test_every_posture_in_the_reachable_sets_is_inside(method: str) -> None:
     """Random postures, postures with every joint at an end, and the way of one joint between its ends."""
     people = random_states(PAPER, 30, 14)
@@ -96,7 +96,7 @@ def test_the_older_method_needs_more_room() -> None:
                 for i in range(len(people))
             ]
         )
-        for volumes in (predict(people, method=method) for method in METHODS)
+        for volumes in (predict(people, method=method) for method in PRINTED)
     )
     assert (positions >= paper * (1 - 1e-9)).all()
     assert positions.sum() > 1.3 * paper.sum()

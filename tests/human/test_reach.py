@@ -7,7 +7,7 @@ import pytest
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.reach import METHODS, reachable
+from hrcreplay.human.reach import PRINTED, reachable
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, Floats
 from tests.human.people import random_states, states
@@ -135,7 +135,7 @@ def test_positions_is_the_velocity_bounds_alone() -> None:
 @pytest.mark.parametrize("limits", [PAPER, load_limits("human")], ids=lambda limits: limits.name)
 def test_positions_holds_paper_and_both_hold_the_posture(limits: LimitSet) -> None:
     people = random_states(limits, 500, 5)
-    paper, positions = (reachable(people, limits, T, method) for method in METHODS)
+    paper, positions = (reachable(people, limits, T, method) for method in PRINTED)
     assert (positions.low <= paper.low + 1e-12).all()
     assert (positions.high >= paper.high - 1e-12).all()
     assert (paper.low <= people.p).all()

@@ -1,0 +1,118 @@
+"""How far one joint gets: bang-bang motions between bounds, with what stops do to them.
+
+A joint obeys v_min <= v <= v_max and a_min <= a <= a_max. A state beyond a velocity bound comes back as fast as the
+acceleration bounds allow. So with v_hi the largest initial velocity, no velocity is ever above the profile that starts
+there and goes to v_max at a_max (from above: at a_min), and no displacement above that profile's integral.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.model import alpha_2_bounds, alpha_3_bounds
+from hrcreplay.records import Floats
+
+#: Largest and smallest value of a joint's stops over a reachable box: (least, inner least, inner most, most).
+Stops = tuple[float, float, float, float]
+
+
+@njit(cache=True)
+def saturation_s(v: float, top: float, gain: float, brake: float) -> float:
+    """When the fastest velocity profile reaches its bound [s]; inf where it never does."""
+    a = gain if v <= top else brake
+    return np.inf if a == 0.0 else (top - v) / a
+
+
+@njit(cache=True)
+def fastest(v: float, top: float, gain: float, brake: float, t: float) -> float:
+    """The largest velocity at time t of motions that start with at most v."""
+    if v <= top:
+        return min(v + gain * t, top)
+    return max(v + brake * t, top)
+
+
+@njit(cache=True)
+def rise(v: float, top: float, gain: float, brake: float, horizon: float) -> float:
+    """The largest displacement at any time in [0, horizon] of motions that start with at most v.
+
+    The fastest profile's integral. Rising, the profile makes a convex integral: its largest value is at an end.
+    Falling, the integral may peak before: where the profile passes zero, if it does.
+
+    Args:
+        v: Largest initial velocity.
+        top: Velocity bound.
+        gain: Largest acceleration, >= 0.
+        brake: Smallest acceleration, <= 0.
+        horizon: [s].
+    """
+    a = gain if v <= top else brake
+    end = min(horizon, saturation_s(v, top, gain, brake))
+    at_end = v * end + 0.5 * a * end**2
+    largest = max(0.0, at_end, at_end + top * (horizon - end))
+    if v > 0.0 and a < 0.0:
+        peak = min(end, -v / a)
+        largest = max(largest, v * peak + 0.5 * a * peak**2)
+    return largest
+
+
+@njit(cache=True)
+def braking(v: float, brake: float, horizon: float) -> float:
+    """How far a joint still gets that brakes as hard as it can."""
+    return rise(v, 0.0, 0.0, brake, horizon) if v > 0.0 else 0.0
+
+
+@njit(cache=True)
+def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> Stops:
+    """Where the stops of joint j can be while the joints that they depend on are in [low, high].
+
+    A stop outside of all of them holds always; one inside of all may be where the joint is stopped. The coupled ones,
+    (34b) and (34c), are monotonic or bilinear: their extremes are at the corners.
+    """
+    if not coupled or j not in (5, 6, 9, 10):
+        return bounds[0, j], bounds[0, j], bounds[1, j], bounds[1, j]
+    least, inner_least, inner_most, most = np.inf, -np.inf, np.inf, -np.inf
+    first = 4 if j < 8 else 8
+    for k in range(4):
+        a1 = high[first] if k % 2 else low[first]
+        if j == first + 1:
+            start, end = alpha_2_bounds(a1, a1)
+        else:
+            a2 = high[first + 1] if k // 2 else low[first + 1]
+            start, end = alpha_3_bounds(a1, a1, a2, a2)
+        least, inner_least = min(least, start), max(inner_least, start)
+        inner_most, most = min(inner_most, end), max(most, end)
+    return least, inner_least, inner_most, most
+
+
+@njit(cache=True)
+def interval(
+    p: tuple[float, float], v: tuple[float, float], speed: Floats, limit: Stops, horizon: float
+) -> tuple[float, float]:
+    """What a joint between stops can reach at any time in [0, horizon].
+
+    A stop takes the velocity into it away at once: from there the joint starts again from rest. A state that may be
+    beyond a stop brakes outward and then stays; a stop takes nothing away from what the state itself encloses.
+
+    Args:
+        p: Smallest and largest initial position.
+        v: Smallest and largest initial velocity.
+        speed: (4,) v_min, v_max, a_min, a_max.
+        limit: Where its stops can be.
+        horizon: [s].
+    """
+    least, inner_least, inner_most, most = limit
+    v_min, v_max, a_min, a_max = speed[0], speed[1], speed[2], speed[3]
+    up = p[1] + rise(v[1], v_max, a_max, a_min, horizon)
+    down = p[0] - rise(-v[0], -v_min, -a_min, -a_max, horizon)
+    for _ in range(2):  # what leaves one stop may meet the other
+        if down < inner_least:
+            up = max(up, inner_least + rise(0.0, v_max, a_max, a_min, horizon))
+        if up > inner_most:
+            down = min(down, inner_most - rise(0.0, -v_min, -a_min, -a_max, horizon))
+    low, high = max(down, least), min(up, most)
+    if p[1] > inner_most:
+        high = max(high, p[1] + braking(v[1], a_min, horizon))
+    if p[0] < inner_least:
+        low = min(low, p[0] - braking(-v[0], -a_max, horizon))
+    return min(low, p[0]), max(high, p[1])

@@ -1,0 +1,236 @@
+"""Swept volumes that enclose: every motion of model (25) with the stops (34), over all times, from all likely states.
+
+Why no motion leaves them, step by step:
+
+1. States. Each joint's position and velocity are within ``sigmas`` deviations of the estimate, whatever their
+   correlation: a box around it. World velocities are turned into the body's frame over all headings of the box.
+2. Joints. Heading, torso and arm joints stay in the intervals of ``excursion`` at all times; stops that depend on
+   other joints are taken over the intervals of those.
+3. Walking. The pelvis stays in the convex polygon of ``stroll`` at all times.
+4. Limbs. A limb at any instant is a chain of rotations, each with an angle of its interval, then a displacement of the
+   polygon. Sweeping a convex set by all angles of a joint and by all displacements, each regardless of the others,
+   holds all combinations, among them those that occur. A swept set is kept as points whose hull holds it: rotations
+   are linear, so a hull of swept points holds the swept hull. Arcs are in triangles of at most 60 degrees with their
+   apexes outside, and points are only dropped where they are proven to be inside the rest (``sweep``, ``corners``);
+   where that leaves too many, the polytope of ``outer`` takes their place, which holds them all.
+5. Lengths. A limb is drawn as long as it may be: its far end goes out along a line through the near one. An unknown
+   length further up the chain displaces the limb by no more than its error, which is added to the radius.
+6. Rounding. The steps are exact in real numbers; in floating point they are off by less than 1e-12 m for people within
+   a kilometre of the origin. Radii are larger by ``ROUNDING_M``. That is no tolerance for motions outside.
+
+The lower body is the line from the floor to the pelvis with its own radius, walking along: hips, and feet in a stride
+that stays within the radius.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.chain import kinematic_chain
+from hrcreplay.human.corners import keep_corners
+from hrcreplay.human.enclosure import Likely, enclose_row, likely
+from hrcreplay.human.margins import Margins
+from hrcreplay.human.outer import CORNERS, DIRECTIONS, around, reach_turning
+from hrcreplay.human.stroll import SIDES
+from hrcreplay.human.surface import Surface, surface
+from hrcreplay.human.sweep import MOST_COPIES, TRIANGLE_RAD, sweep_rot
+from hrcreplay.human.walk import polygon, sweep_walk
+from hrcreplay.records import LIMBS, Floats, HumanStates, Ints
+
+#: Added to every radius: more than all rounding on the way [m].
+ROUNDING_M = 1e-9
+#: More points than this that a rotation or walking would make are never made: the polytope around them is.
+MOST_POINTS, MOST_AT_END = 128, 2048
+#: More corners than this at the end are replaced by the polytope around them.
+MOST_CORNERS = 256
+#: A larger set is reduced before the next rotation.
+_WORTH_REDUCING = 40
+_HEAD, _THORAX, _LEGS = LIMBS.index("HD"), LIMBS.index("THX"), len(LIMBS)
+
+
+def sweep(
+    states: HumanStates, bounds: Floats, coupled: bool, horizon_s: float, margins: Margins
+) -> tuple[Floats, Ints]:
+    """Vertices (m, 3) of all ticks and limbs [m], and the offsets of ``SweptVolumes``.
+
+    Args:
+        states: The fused person.
+        bounds: (6, 12) of ``reach.bounds_of``.
+        coupled: Whether (34b), (34c) hold.
+        horizon_s: Braking time T_s of the robot [s].
+        margins: What is added to the model.
+    """
+    return _sweep_rows(
+        likely(states, margins),
+        np.ascontiguousarray(states.lengths_m),
+        np.ascontiguousarray(margins.sigmas * states.lengths_std_m),
+        bounds,
+        coupled,
+        horizon_s + margins.latency_s,
+        margins.memory_s,
+        margins.hand_m,
+        len(LIMBS) + margins.legs,
+        surface(),
+    )
+
+
+def radii(states: HumanStates, limbs_m: Floats, margins: Margins) -> Floats:
+    """(n, limbs) radii: of the limb (6,) [m], of what an unknown length up the chain displaces, and the residual.
+
+    A residual that is not known yet (NaN) adds nothing.
+    """
+    off = margins.sigmas * states.lengths_std_m
+    pelvis = off[:, 0]
+    shoulder = pelvis + np.hypot(off[:, 1], off[:, 3])
+    displaced = np.column_stack([pelvis, pelvis, shoulder, shoulder + off[:, 5], shoulder, shoulder + off[:, 4]])
+    radius = limbs_m + displaced + ROUNDING_M
+    if margins.residual:
+        radius = radius + np.where(np.isnan(states.residual_m), 0.0, states.residual_m)
+    if margins.legs:
+        radius = np.column_stack([radius, np.full(len(states), margins.legs_radius_m + ROUNDING_M)])
+    return radius
+
+
+@njit(cache=True)
+def _sweep_rows(
+    at: Likely,
+    lengths: Floats,
+    lengths_off: Floats,
+    bounds: Floats,
+    coupled: bool,
+    horizon: float,
+    memory: float,
+    hand: float,
+    limbs: int,
+    work: Surface,
+) -> tuple[Floats, Ints]:
+    offsets = np.zeros(len(at.p) * limbs + 1, np.int64)
+    vertices = np.empty((len(at.p) * limbs * 80 + 80, 3))
+    low, high, corners = np.empty(12), np.empty(12), np.empty((SIDES, 2))
+    n = 0
+    for i in range(len(at.p)):
+        enclose_row(i, at, bounds, coupled, horizon, memory, low, high, corners)
+        for limb in range(limbs):
+            if limb == _LEGS:
+                swept, count = _legs(corners, lengths[i, 0] + lengths_off[i, 0])
+            else:
+                swept, count = _limb(limb, low, high, corners, lengths[i], lengths_off[i], hand, work)
+            if n + count > len(vertices):
+                roomier = np.empty((2 * (n + count), 3))
+                roomier[:n] = vertices[:n]
+                vertices = roomier
+            vertices[n : n + count] = swept[:count]
+            n += count
+            offsets[i * limbs + limb + 1] = n
+    return vertices[:n].copy(), offsets
+
+
+@njit(cache=True)
+def _legs(corners: Floats, height: float) -> tuple[Floats, int]:
+    """From the floor to the highest pelvis, wherever it walks."""
+    if not np.isfinite(corners.sum() + height):
+        return np.full((1, 3), np.nan), 1
+    swept = np.zeros((2 * SIDES, 3))
+    swept[:SIDES, :2], swept[SIDES:, :2], swept[SIDES:, 2] = corners, corners, height
+    return swept, len(swept)
+
+
+@njit(cache=True)
+def _limb(
+    limb: int, low: Floats, high: Floats, corners: Floats, lengths: Floats, off: Floats, hand: float, work: Surface
+) -> tuple[Floats, int]:
+    """Points around all that a limb reaches; a NaN vertex where the state or the lengths are NaN."""
+    ends, chain = kinematic_chain(limb, low, high, lengths)
+    ends = _longest(limb, ends, off, hand)
+    if not np.isfinite(ends.sum() + chain.sum() + corners.sum() + low[2] + high[2]):
+        return np.full((1, 3), np.nan), 1
+    points, count, faces, exact = _turn_all(ends, chain, work)
+    if exact and count * _copies(low[2], high[2]) * SIDES <= MOST_AT_END:
+        swept = np.empty((MOST_COPIES * SIDES * count, 3))
+        many = sweep_walk(points, count, faces, work, (low[2], high[2]), polygon(corners), swept)
+        if many > MOST_CORNERS:
+            many, _ = keep_corners(swept, many, work)
+        if many <= MOST_CORNERS:
+            return swept, many
+    return _walk(points, count, low[2], high[2], corners)
+
+
+@njit(cache=True)
+def _turn_all(ends: Floats, chain: Floats, work: Surface) -> tuple[Floats, int, int, bool]:
+    """Points around what the rotations of a chain make of a limb's ends; how many; triangles around them; corners?
+
+    The last is whether the points are the corners of Alg. 2, rather than those of a polytope around them.
+    """
+    points, count, faces, exact = ends, len(ends), 0, True
+    radius = 0.0  # of the ball around the frame's origin that holds the limb
+    for end in ends:
+        radius = max(radius, np.sqrt(end[0] ** 2 + end[1] ** 2 + end[2] ** 2))
+    for k, step in enumerate(chain):
+        axis, low, high = int(step[0]), step[1], step[2]
+        exact = exact and count * _copies(low, high) <= MOST_POINTS
+        if exact:
+            swept = np.empty((MOST_COPIES * count, 3))
+            count = sweep_rot(points, count, axis, low, high, swept)
+        else:
+            swept = np.empty((CORNERS, 3))
+            count = _turn(points, count, axis, low, high, radius, swept)
+        points = swept
+        for i in range(count):
+            for j in range(3):
+                points[i, j] += step[3 + j]
+        if exact and (count > _WORTH_REDUCING or k == len(chain) - 1):
+            count, faces = keep_corners(points, count, work)
+        radius += np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+    return points, count, faces, exact
+
+
+@njit(cache=True)
+def _longest(limb: int, ends: Floats, off: Floats, hand: float) -> Floats:
+    """The limb's end points, drawn out to where lengths up to ``off`` (8,) longer or shorter may put them [m]."""
+    if limb == _HEAD:
+        ends[0, 2] -= off[1]
+        ends[1, 2] += off[1] + off[2]
+        return ends
+    if limb == _THORAX:
+        if off[1] == 0.0 and off[3] == 0.0:
+            return ends
+        wide = np.concatenate((ends, ends[1:]))
+        for i in range(1, 5):
+            wide[i, 1] += off[3] if wide[i, 1] > 0.0 else -off[3]
+            wide[i, 2] += off[1] if i > 2 else -off[1]
+        return wide
+    left = limb >= 4
+    if limb in (2, 4):
+        ends[1, 2] -= off[4] if left else off[5]
+    else:
+        ends[1, 2] -= hand + (off[6] if left else off[7])
+    return ends
+
+
+@njit(cache=True)
+def _copies(low: float, high: float) -> int:
+    """Most points that a rotation makes of one."""
+    return 1 if low == high else 2 + min(6, int(np.ceil((high - low) / TRIANGLE_RAD)))
+
+
+@njit(cache=True)
+def _turn(points: Floats, count: int, axis: int, low: float, high: float, radius: float, swept: Floats) -> int:
+    far = np.full(len(DIRECTIONS), -np.inf)
+    reach_turning(points, count, axis, low, high, far)
+    for d in range(len(far)):
+        far[d] = min(far[d], radius)
+    return around(far, swept)
+
+
+@njit(cache=True)
+def _walk(points: Floats, count: int, low: float, high: float, corners: Floats) -> tuple[Floats, int]:
+    far = np.full(len(DIRECTIONS), -np.inf)
+    reach_turning(points, count, 2, low, high, far)
+    for d in range(len(far)):
+        there = -np.inf
+        for k in range(SIDES):
+            there = max(there, DIRECTIONS[d, 0] * corners[k, 0] + DIRECTIONS[d, 1] * corners[k, 1])
+        far[d] += there
+    swept = np.empty((CORNERS, 3))
+    return swept, around(far, swept)
