@@ -28,10 +28,11 @@ class Filter(NamedTuple):
     confidence: Floats  #: (c, 20)
     valid: Bools  #: (c, 20) which of its rows are used
     shows: Bools  #: (c, 6) which limbs it shows with all that carries them
-    slots: Floats  #: (6, SLOTS) ring of the largest residuals of short stretches, NaN where empty
-    opened: Ints  #: (6,) stretches so far
-    opened_ns: Ints  #: (6,) tick at which the current stretch began
-    residual: Floats  #: (6,) quantile of the ring
+    residuals: Floats  #: (6, BINS) weights of the residuals of each limb by their size
+    weight: Floats  #: (6,) of all of them
+    samples: Ints  #: (6,) residuals so far
+    sampled_ns: Ints  #: (6,) tick of the last
+    residual: Floats  #: (6,) their quantile [m]
 
 
 class Frames(NamedTuple):
@@ -58,7 +59,7 @@ class Rules(NamedTuple):
     memory_ns: int
     coast_ns: int
     residual_quantile: float
-    slot_ns: int  #: length of a stretch of the ring of residuals
+    residual_memory_s: float
     rest_s: float
     rest_std: Floats  #: (12, 3) of v, a, j of a joint nobody has seen for long
     p_min: Floats

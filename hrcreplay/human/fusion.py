@@ -12,7 +12,7 @@ from hrcreplay.human.filter import Filter, Frames, Rules, Track
 from hrcreplay.human.fusion_kernel import run
 from hrcreplay.human.kalman import process_variance
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.residual import SLOTS
+from hrcreplay.human.residual import BINS
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
 
 ROWS = len(JOINTS) + len(LENGTHS)
@@ -57,7 +57,7 @@ class FusionSettings:
         0.5  #: a joint or point without a valid row for longer is lost: the next one is taken as it is [s]
     )
     residual_quantile: float = 0.95  #: of how far each limb's points were from the model's (see residual)
-    residual_memory_s: float = 20.0  #: over that much of the time in which the limb was seen [s]
+    residual_memory_s: float = 20.0  #: that were seen this long ago count 1/e of new ones [s]
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,10 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         confidence=np.zeros((c, len(POINTS))),
         valid=np.zeros((c, ROWS), dtype=np.bool_),
         shows=np.zeros((c, len(LIMBS)), dtype=np.bool_),
-        slots=np.full((len(LIMBS), SLOTS), np.nan),
-        opened=np.zeros(len(LIMBS), dtype=np.int64),
-        opened_ns=np.full(len(LIMBS), _NEVER_NS),
+        residuals=np.zeros((len(LIMBS), BINS)),
+        weight=np.zeros(len(LIMBS)),
+        samples=np.zeros(len(LIMBS), dtype=np.int64),
+        sampled_ns=np.full(len(LIMBS), _NEVER_NS),
         residual=np.full(len(LIMBS), np.nan),
     )
 
@@ -204,7 +205,7 @@ def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
         memory_ns=round(settings.memory_s * 1e9),
         coast_ns=round(settings.coast_s * 1e9),
         residual_quantile=settings.residual_quantile,
-        slot_ns=round(settings.residual_memory_s * 1e9 / SLOTS),
+        residual_memory_s=settings.residual_memory_s,
         rest_s=0.3 * settings.coast_s,
         rest_std=_REST_STD,
         p_min=limits.p_min,

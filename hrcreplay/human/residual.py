@@ -5,9 +5,9 @@ limb's residual is the largest distance of its measured points from those of the
 time, where the delay is compensated. It is taken after the tick's update and saturation, so it is about the state that
 is handed on, from frames that show the limb and all that carries it with enough confidence and without an outlier.
 
-The samples of a short stretch of time count once, by the largest: a quantile over stretches depends neither on how many
-cameras there are nor on which of them comes first. The ring holds the last ``SLOTS`` stretches in which the limb was
-seen; a limb out of sight forgets nothing.
+The running quantile is that of all samples so far, each with the weight exp(-age / memory); a limb out of sight does
+not age for longer than it takes to be lost, so that what is known of a person outlives an occlusion. Samples are kept
+by the millimetre and rounded up.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from hrcreplay.human.model import ARM_POINTS, HEAD, LEFT_ARM, PELVIS, RIGHT_ARM,
 from hrcreplay.human.validity import distance
 from hrcreplay.records import Bools, Floats
 
-#: Stretches in the ring of a limb.
-SLOTS = 256
-#: Fewer stretches say nothing of a quantile.
+#: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person.
+BINS = 512
+_BIN_M = 0.001
+#: Fewer samples say nothing of a quantile.
 LEAST = 20
 
 (_SHOULDER_R, _ELBOW_R, _WRIST_R), (_SHOULDER_L, _ELBOW_L, _WRIST_L) = ARM_POINTS
@@ -45,8 +46,7 @@ _FIRST = np.array([RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2])
 
 @njit(cache=True)
 def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
-    """Takes the samples of the new frames into the rings, and the quantiles anew where a ring changed."""
-    changed = np.zeros(len(_ENDS), dtype=np.bool_)
+    """Takes the samples of the cameras' new frames in, and the quantiles of those limbs anew."""
     model = np.empty_like(filter_.points[0])
     for c in np.flatnonzero(fresh):
         skeleton_row(ago(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths, model)
@@ -54,11 +54,11 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
             sample = 0.0
             for k in _ENDS[limb]:
                 sample = max(sample, distance(filter_.points[c, k], model[k]))
-            changed[limb] |= _enter(filter_, limb, now, sample, rules)
-    for limb in np.flatnonzero(changed):
-        if filter_.opened[limb] >= LEAST:
-            known = filter_.slots[limb, : min(filter_.opened[limb], SLOTS)]
-            filter_.residual[limb] = _quantile(known, rules.residual_quantile)
+            _enter(filter_, limb, now, sample, rules)
+    for limb in np.flatnonzero(filter_.sampled_ns == now):
+        if filter_.samples[limb] >= LEAST:
+            larger = (1.0 - rules.residual_quantile) * filter_.weight[limb]
+            filter_.residual[limb] = _exceeded_by(filter_.residuals[limb], larger)
 
 
 @njit(cache=True)
@@ -80,23 +80,23 @@ def _since(now: int, then: int) -> float:
 
 
 @njit(cache=True)
-def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) -> bool:
-    """Puts a sample into the current stretch, or a new one where that is over; whether the ring changed."""
-    ring = filter_.slots[limb]
-    if now - filter_.opened_ns[limb] >= rules.slot_ns:
-        ring[filter_.opened[limb] % SLOTS] = sample
-        filter_.opened[limb] += 1
-        filter_.opened_ns[limb] = now
-        return True
-    current = (filter_.opened[limb] - 1) % SLOTS
-    if sample <= ring[current]:
-        return False
-    ring[current] = sample
-    return True
+def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) -> None:
+    """Lets the earlier samples of a limb age, and adds one of weight 1."""
+    age = min(now - filter_.sampled_ns[limb], rules.memory_ns) * 1e-9
+    kept = np.exp(-age / rules.residual_memory_s)
+    filter_.residuals[limb] *= kept
+    filter_.residuals[limb, min(int(sample / _BIN_M), BINS - 1)] += 1.0
+    filter_.weight[limb] = kept * filter_.weight[limb] + 1.0
+    filter_.samples[limb] += 1
+    filter_.sampled_ns[limb] = now
 
 
 @njit(cache=True)
-def _quantile(samples: Floats, share: float) -> float:
-    """The least sample that at least this share of the samples does not exceed."""
-    rank = max(1, int(np.ceil(share * len(samples))))
-    return np.partition(samples, rank - 1)[rank - 1]
+def _exceeded_by(weights: Floats, larger: float) -> float:
+    """The least upper end of a bin with samples of at most this weight above it [m]."""
+    above = 0.0
+    bin_ = BINS
+    while bin_ > 1 and above + weights[bin_ - 1] <= larger:
+        bin_ -= 1
+        above += weights[bin_]
+    return bin_ * _BIN_M

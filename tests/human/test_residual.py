@@ -1,0 +1,285 @@
+"""The residual against a plain implementation over the demo: lists of samples, exact weighted quantiles."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from hrcreplay.human.angles import PointNoise, inverse, measure
+from hrcreplay.human.fusion import FusionSettings, fuse, start
+from hrcreplay.human.model import skeleton
+from hrcreplay.human.residual import LEAST
+from hrcreplay.limits import load_limits
+from hrcreplay.logs.person import PersonMemory, pick
+from hrcreplay.logs.reader import open_log
+from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats, HumanStates, Ints, Measurements
+from hrcreplay.tables import read_states, state_columns
+
+DEMO = Path(__file__).parents[2] / "datasets" / "demo.mcap"
+WIDE = load_limits("human")
+CAMERAS = ("left", "right")
+RATE_HZ = 250
+#: A person unlike the model: bent sideways, one shoulder up, head forward. World, facing x.
+BENT_M = {
+    "pelvis": (0.0, 0.0, 0.95),
+    "head": (0.06, 0.14, 1.62),
+    "shoulder_r": (0.0, -0.12, 1.47),
+    "elbow_r": (0.10, -0.30, 1.22),
+    "wrist_r": (0.33, -0.28, 1.25),
+    "shoulder_l": (0.0, 0.26, 1.41),
+    "elbow_l": (0.05, 0.33, 1.10),
+    "wrist_l": (0.27, 0.25, 1.18),
+}
+POINTS_OF = {
+    "HD": ("head",),
+    "THX": ("pelvis", "shoulder_l", "shoulder_r"),
+    "URA": ("shoulder_r", "elbow_r"),
+    "LRA": ("elbow_r", "wrist_r"),
+    "ULA": ("shoulder_l", "elbow_l"),
+    "LLA": ("elbow_l", "wrist_l"),
+}
+TORSO = ("pelvis", "shoulder_l", "shoulder_r")
+
+
+def index(names: tuple[str, ...]) -> list[int]:
+    return [POINTS.index(name) for name in names]
+
+
+def ticks(seconds: float) -> Ints:
+    return np.arange(1, round(seconds * RATE_HZ) + 1) * (1_000_000_000 // RATE_HZ)
+
+
+def bent(seconds: float) -> CameraFrames:
+    """Frames of the bent person, who stands still; each camera at 25 Hz, noise-free, at the world's origin."""
+    capture = np.arange(0, round(seconds * 1e9), 20_000_000)
+    points = np.full((len(capture), len(POINTS), 3), np.nan)
+    for name, point in BENT_M.items():
+        points[:, POINTS.index(name)] = point
+    return CameraFrames(
+        capture_ns=capture,
+        arrival_ns=capture + 1_000_000,
+        camera=np.arange(len(capture)) % 2,
+        body=np.zeros(len(capture), np.int64),
+        points_m=points,
+        confidence=np.isfinite(points[:, :, 0]).astype(np.float64),
+        cameras=CAMERAS,
+    )
+
+
+def measured(frames: CameraFrames) -> Measurements:
+    return measure(frames, np.tile(np.eye(4), (2, 1, 1)), PointNoise(0.01))
+
+
+def fused(m: Measurements, t_ns: Ints, settings: FusionSettings | None = None) -> HumanStates:
+    return fuse(start(m.cameras), t_ns, m.rows(m.arrival_ns <= t_ns[-1]), settings or FusionSettings(), WIDE)[1]
+
+
+@pytest.fixture(scope="module")
+def demo() -> tuple[Measurements, Ints]:
+    log = open_log(DEMO)
+    poses, memory, parts = np.array([log.header.T_world_camera[c] for c in log.header.cameras]), PersonMemory(), []
+    for chunk in log.frames():
+        memory, mine, _ = pick(chunk, memory, poses, 0.8, 2.0)
+        parts.append(measure(mine, poses, PointNoise()))
+    m = Measurements.join(parts)
+    first = int(m.arrival_ns[0]) - 100_000_000
+    return m, first + ticks((m.arrival_ns[-1] - first) * 1e-9)
+
+
+def used_frames(m: Measurements, t_ns: Ints) -> list[tuple[int, int]]:
+    """(tick, frame) of the newest frame of a camera in each tick; one captured before an earlier arrival is not."""
+    newest: dict[tuple[int, int], int] = {}
+    captured = dict.fromkeys(range(len(m.cameras)), -1)
+    for i, k in enumerate(np.searchsorted(t_ns, m.arrival_ns).tolist()):
+        c = int(m.camera[i])
+        if k < len(t_ns) and m.capture_ns[i] >= captured[c]:
+            captured[c] = int(m.capture_ns[i])
+            newest[k, c] = i
+    return sorted((k, i) for (k, _), i in newest.items())
+
+
+def plain_residual(m: Measurements, states: HumanStates, settings: FusionSettings) -> Floats:
+    """(n, 6) without a gate for outliers: every sample kept, the quantile exact."""
+    found = np.full((len(states), 6), np.nan)
+    frames = used_frames(m, states.t_ns)
+    for limb, name in enumerate(LIMBS):
+        ends, carrying = index(POINTS_OF[name]), [*TORSO, *POINTS_OF[name]]
+        samples, ages, last = np.zeros(0), np.zeros(0), 0
+        for k, i in frames:
+            confident = m.confidence[i, index(tuple(dict.fromkeys(carrying)))].prod() >= settings.confidence_min
+            if not confident or np.isnan(m.points_m[i, index(tuple(carrying))]).any():
+                continue
+            d = min(max((states.t_ns[k] - m.capture_ns[i]) * 1e-9, 0.0), settings.delay_max_s)
+            p = states.p[k] - d * states.v[k] + d**2 / 2 * states.a[k] - d**3 / 6 * states.j[k]
+            model = skeleton(p[None], states.lengths_m[k : k + 1])[0]
+            sample = np.linalg.norm(model[ends] - m.points_m[i, ends], axis=1).max()
+            ages = np.append(ages + min((states.t_ns[k] - last) * 1e-9, settings.memory_s), 0.0)
+            samples, last = np.append(samples, sample), states.t_ns[k]
+            if len(samples) >= LEAST:
+                weights = np.exp(-ages / settings.residual_memory_s)
+                order = np.argsort(samples)
+                share = np.cumsum(weights[order]) / weights.sum()
+                found[k:, limb] = samples[order][np.searchsorted(share, settings.residual_quantile)]
+    return found
+
+
+@pytest.mark.parametrize(("quantile", "memory_s"), [(0.95, 20.0), (0.6, 1.0)])
+def test_it_is_the_weighted_quantile_of_all_samples(
+    demo: tuple[Measurements, Ints], quantile: float, memory_s: float
+) -> None:
+    m, t = demo[0], demo[1][: 25 * RATE_HZ]
+    m = m.rows(m.arrival_ns <= t[-1])
+    settings = FusionSettings(outlier_m=1e6, residual_quantile=quantile, residual_memory_s=memory_s)
+    states = fused(m, t, settings)
+    expected = plain_residual(m, states, settings)
+    np.testing.assert_array_equal(np.isnan(states.residual_m), np.isnan(expected))
+    known = np.isfinite(expected)
+    assert known.mean() > 0.8
+    above_mm = (states.residual_m[known] - expected[known]) * 1e3  # by the millimetre, rounded up
+    assert above_mm.min() > -1e-6
+    assert above_mm.max() <= 1.0 + 1e-6
+
+
+def test_chunks_of_any_size_give_the_same_bits(demo: tuple[Measurements, Ints]) -> None:
+    m, t = demo[0], demo[1][: 10 * RATE_HZ]
+    whole = fused(m, t)
+    for size in (1, 97):
+        state, parts, last = start(m.cameras), [], -1
+        for chunk in (t[i : i + size] for i in range(0, len(t), size)):
+            mine = m.rows((m.arrival_ns > last) & (m.arrival_ns <= chunk[-1]))
+            state, part, _ = fuse(state, chunk, mine, FusionSettings(), WIDE)
+            parts.append(part)
+            last = int(chunk[-1])
+        joined = HumanStates.join(parts)
+        np.testing.assert_array_equal(joined.residual_m, whole.residual_m)
+        np.testing.assert_array_equal(joined.unseen_s, whole.unseen_s)
+
+
+def test_nine_of_ten_true_postures_are_within_it(demo: tuple[Measurements, Ints]) -> None:
+    """The demo's worker is up to 89-113 mm (p95) from twelve joints; noise and estimation come on top."""
+    m, t = demo
+    states = fused(m, t)
+    truth = list(open_log(DEMO).truth())
+    points = np.concatenate([part.points_m for part in truth])
+    k = np.searchsorted(t, np.concatenate([part.t_ns for part in truth]))
+    within = (k > 0) & (k < len(t))
+    k = k[within]
+    off = np.linalg.norm(skeleton(states.p[k], states.lengths_m[k]) - points[within], axis=2)
+    for limb, name in enumerate(LIMBS):
+        residual = states.residual_m[k, limb]
+        known = np.isfinite(residual)
+        assert 0.08 < np.median(residual[known]) < 0.14
+        assert 0.92 < np.mean(off[:, index(POINTS_OF[name])].max(axis=1)[known] <= residual[known]) < 0.98
+
+
+def test_a_body_unlike_the_model_has_the_residual_of_the_closed_form_fit() -> None:
+    frames = bent(4.0)
+    states = fused(measured(frames), ticks(4.0))
+    off = np.linalg.norm(skeleton(*inverse(frames.points_m[:1]))[0] - frames.points_m[0], axis=1)
+    expected = [off[index(POINTS_OF[limb])].max() for limb in LIMBS]
+    assert max(expected) > 0.05
+    np.testing.assert_allclose(states.residual_m[-1], expected, atol=2e-3)
+
+
+def test_it_is_not_known_before_enough_samples() -> None:
+    frames = bent(2.0)
+    states = fused(measured(frames), ticks(2.0))
+    first = np.searchsorted(states.t_ns, frames.arrival_ns[LEAST - 1])
+    assert np.isnan(states.residual_m[:first]).all()
+    assert np.isfinite(states.residual_m[first:]).all()
+
+
+def test_what_no_camera_shows_has_no_residual_and_was_never_seen() -> None:
+    frames = bent(2.0)
+    points = frames.points_m.copy()
+    points[:, POINTS.index("wrist_l")] = np.nan
+    states = fused(measured(replace(frames, points_m=points)), ticks(2.0))
+    hidden = np.array(LIMBS) == "LLA"
+    assert np.isnan(states.residual_m[:, hidden]).all()
+    assert np.isinf(states.unseen_s[:, hidden]).all()
+    assert np.isfinite(states.residual_m[-1, ~hidden]).all()
+    assert (states.unseen_s[-1, ~hidden] < 0.03).all()
+
+
+@pytest.mark.parametrize(
+    ("point", "hidden"),
+    [
+        ("elbow_r", {"URA", "LRA"}),
+        ("wrist_l", {"LLA"}),
+        ("pelvis", {"HD", "THX", "URA", "ULA"}),
+        ("shoulder_l", {"HD", "THX", "URA", "ULA", "LLA"}),
+    ],
+)
+def test_time_runs_from_the_last_frame_that_measured_the_limbs_own_joints(point: str, hidden: set[str]) -> None:
+    frames = bent(3.0)
+    confidence = frames.confidence.copy()
+    confidence[frames.capture_ns >= 2_000_000_000, POINTS.index(point)] = 0.0
+    states = fused(measured(replace(frames, confidence=confidence)), ticks(3.0))
+    before, after = states.t_ns < 2_000_000_000, states.t_ns > 2_020_000_000
+    assert (states.unseen_s[states.t_ns < frames.arrival_ns[0]] == np.inf).all()
+    assert (states.unseen_s[before & (states.t_ns > frames.arrival_ns[0])] < 0.021).all()
+    for limb, name in enumerate(LIMBS):
+        if name in hidden:
+            last = states.t_ns[np.searchsorted(states.t_ns, 1_981_000_000)]
+            np.testing.assert_allclose(states.unseen_s[after, limb], (states.t_ns[after] - last) * 1e-9)
+            assert len(np.unique(states.residual_m[after, limb])) == 1
+        else:
+            assert (states.unseen_s[after, limb] < 0.021).all()
+
+
+def test_a_straight_arm_is_seen_although_its_rotation_is_not() -> None:
+    frames = bent(2.0)
+    points = frames.points_m.copy()
+    shoulder, elbow, wrist = index(("shoulder_l", "elbow_l", "wrist_l"))
+    points[:, wrist] = points[:, elbow] + 0.8 * (points[:, elbow] - points[:, shoulder])
+    states = fused(measured(replace(frames, points_m=points)), ticks(2.0))
+    assert (states.unseen_s[states.t_ns > frames.arrival_ns[0]][:, LIMBS.index("LLA")] < 0.021).all()
+    assert np.isfinite(states.residual_m[-1, LIMBS.index("LLA")])
+
+
+def test_an_outlier_is_no_sample() -> None:
+    frames = bent(3.0)
+    points, wrist = frames.points_m.copy(), POINTS.index("wrist_l")
+    points[50::9, wrist] += [0.5, 0.0, 0.4]
+    gross = measured(replace(frames, points_m=points))
+    clean = fused(measured(frames), ticks(3.0)).residual_m[-1]
+    np.testing.assert_allclose(fused(gross, ticks(3.0)).residual_m[-1], clean, atol=1.1e-3)
+    no_gate = fused(gross, ticks(3.0), FusionSettings(outlier_m=1e6)).residual_m[-1]
+    assert no_gate[LIMBS.index("LLA")] > 0.3
+
+
+def test_what_was_learnt_outlives_an_occlusion_and_fades_while_the_limb_is_seen() -> None:
+    """Bent for 2 s, out of sight for 20 s, then like the model: the old samples lose weight only from then on."""
+    settings = FusionSettings(residual_memory_s=2.0)
+    first, later = bent(2.0), bent(10.0)
+    straight = skeleton(*inverse(first.points_m[:1]))
+    later = replace(
+        later,
+        capture_ns=later.capture_ns + 22_000_000_000,
+        arrival_ns=later.arrival_ns + 22_000_000_000,
+        points_m=np.where(np.isfinite(later.points_m), straight, np.nan),
+    )
+    states = fused(measured(CameraFrames.join([first, later])), ticks(32.0), settings)
+    limb = LIMBS.index("URA")
+    learnt = states.residual_m[2 * RATE_HZ, limb]
+    assert learnt > 0.05
+    assert (states.residual_m[2 * RATE_HZ : 23 * RATE_HZ, limb] == learnt).all()
+    assert states.residual_m[-1, limb] < 0.01
+
+
+def test_the_table_gives_both_back_bit_for_bit(tmp_path: Path) -> None:
+    frames = bent(1.0)
+    points = frames.points_m.copy()
+    points[:, POINTS.index("wrist_l")] = np.nan
+    states = fused(measured(replace(frames, points_m=points)), ticks(1.0))
+    pq.write_table(pa.table(state_columns(states)), tmp_path / "state.parquet")
+    again = HumanStates.join(list(read_states(tmp_path / "state.parquet", 100)))
+    for name in ("residual_m", "unseen_s"):
+        assert getattr(again, name).tobytes() == np.ascontiguousarray(getattr(states, name)).tobytes()
+    assert np.isnan(states.residual_m).any()
+    assert np.isinf(states.unseen_s).any()
