@@ -57,7 +57,7 @@ class FusionSettings:
         0.5  #: a joint or point without a valid row for longer is lost: the next one is taken as it is [s]
     )
     residual_quantile: float = 0.95  #: of how far each limb's points were from the model's (see residual)
-    residual_memory_s: float = 20.0  #: that were seen this long ago count 1/e of new ones [s]
+    residual_memory_s: float = 20.0  #: one seen this long ago counts 1/e of a new one [s]
 
 
 @dataclass(frozen=True)
