@@ -55,8 +55,8 @@ class TableWriter:
         self._waiting: list[pa.Table] = []
 
     def write(self, columns: Mapping[str, Any]) -> None:
-        """Appends rows given as columns: numpy arrays, lists of strings or arrow arrays."""
-        self._waiting.append(pa.table(dict(columns)))
+        """Appends rows given as columns: numpy arrays or arrow arrays."""
+        self._waiting.append(pa.table({name: _one_nan(column) for name, column in columns.items()}))
         while sum(len(table) for table in self._waiting) >= self.ROWS:
             table = pa.concat_tables(self._waiting).combine_chunks()
             self._flush(table.slice(0, self.ROWS))
@@ -74,6 +74,13 @@ class TableWriter:
             self._flush(pa.concat_tables(rest or self._waiting[:1]))
         if self._writer is not None:
             self._writer.close()
+
+
+def _one_nan(column: Any) -> Any:
+    """The column with one NaN for all: which of the many bit patterns arises depends on the machine."""
+    if isinstance(column, np.ndarray) and column.dtype == np.float64:
+        return np.where(np.isnan(column), np.nan, column)
+    return column
 
 
 @dataclass

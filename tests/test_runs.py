@@ -29,6 +29,14 @@ def test_table_bytes_do_not_depend_on_the_size_of_the_chunks(tmp_path: Path, siz
     assert write("chunked", size) == write("whole", 777)
 
 
+def test_every_nan_is_written_alike(tmp_path: Path) -> None:
+    for name, nan in (("a", np.nan), ("b", -np.nan)):
+        writer = runs.TableWriter(tmp_path / name)
+        writer.write({"x": np.array([1.0, nan, 2.0])})
+        writer.close()
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
 def test_digest_is_that_of_the_system_tool(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"abc" * 100_000)
