@@ -1,0 +1,179 @@
+"""The audit's driver: did the people of some logs stay in the volumes that were predicted for them?"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from hrcreplay import runs, wiring
+from hrcreplay.audited import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, methods
+from hrcreplay.follow import travel
+from hrcreplay.human import reach
+from hrcreplay.job import Job, resolve
+from hrcreplay.records import LIMBS
+from hrcreplay.report import audit_page, figures_audit
+from hrcreplay.report.audit_metrics import curve_point, escapes, flat, joint_figures, method_figures
+from hrcreplay.report.coverage import DRAWS, LEVEL, Resampling, block_ticks, resample
+from hrcreplay.runs import RunWriter, Stopwatch
+
+#: Of the bootstrap: any number, but always the same.
+SEED = 3
+
+
+def run(
+    sources: Sequence[Path],
+    *,
+    out: Path | None = None,
+    config: Path | None = None,
+    overrides: tuple[str, ...] = (),
+    cell_file: Path | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+) -> Path:
+    """Audits logs, or the logs of earlier runs with the settings and cells of those runs.
+
+    Returns:
+        The run folder: audit.json, audit.parquet (a row per tick, method and limb), figures, report.html.
+
+    Raises:
+        SettingsError: A setting, a cell or the output folder cannot be used.
+        LogError: A log cannot be read, is shorter than the horizon, or shows nobody.
+    """
+    began = datetime.now(UTC)
+    jobs = [
+        resolve("audit", source, config=config, overrides=overrides, cell_file=cell_file, start_s=start_s, end_s=end_s)
+        for source in sources
+    ]
+    with RunWriter(out or Path("reports") / jobs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-audit") as writer:
+        watch = Stopwatch(time.perf_counter_ns)
+        audits = [audit_log(job, name, watch) for job, name in zip(jobs, _names(jobs), strict=True)]
+        for audit in audits:
+            _write_rows(audit, writer)
+        writer.close_tables()
+        found = figures(audits)
+        writer.text("audit.json", runs.to_json(found))
+        meta = _meta(jobs, began)
+        folder = writer.partial / "figures"
+        figures_audit.draw_all(found, folder)
+        metrics = flat(found)
+        writer.text("metrics.json", runs.to_json(metrics))
+        writer.text("report.html", audit_page.render(found, metrics, meta, folder))
+        writer.timing.update(watch.summary(1.0 / AUDIT_HZ))
+        writer.finish(meta)
+        return writer.folder
+
+
+def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
+    """All that audit.json holds."""
+    horizon_s = wiring.foresight(audits[0].job).horizon_s
+    lengths = [len(audit.outcomes[methods()[0]]) for audit in audits]
+    block = block_ticks(horizon_s, AUDIT_HZ, max(lengths))
+    drawn = resample(lengths, block, horizon_s * AUDIT_HZ, SEED)
+    edges = np.concatenate([[0], np.cumsum(lengths)])
+    logs = []
+    for k, audit in enumerate(audits):
+        mine = drawn.of(slice(edges[k], edges[k + 1]))
+        start_ns = int(audit.recording.states.t_ns[0])
+        logs.append(
+            {
+                "log": audit.name,
+                "sha256": audit.job.log_sha256,
+                "recorded_future": audit.recording.source,
+                "limits": audit.job.prediction.name,
+                "ticks": lengths[k],
+                "counts": audit.recording.counts,
+                "notes": list(audit.notes),
+                "methods": _methods([audit], mine),
+                "joints": _joints([audit], mine),
+                "curve": _curves([audit]),
+                "escapes": {method: escapes(outcome, start_ns) for method, outcome in audit.outcomes.items()},
+            }
+        )
+    return {
+        "horizon_s": horizon_s,
+        "audit_hz": AUDIT_HZ,
+        "interval": {"level": LEVEL, "block_ticks": block, "draws": DRAWS, "seed": SEED},
+        "method": audits[0].job.settings.occupancy.method,
+        "own_methods": list(reach.METHODS),
+        "logs": logs,
+        "total": {
+            "ticks": sum(lengths),
+            "methods": _methods(audits, drawn),
+            "joints": _joints(audits, drawn),
+            "curve": _curves(audits),
+        },
+    }
+
+
+def _methods(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
+    radii = wiring.foresight(audits[0].job).radii
+    body = dict(zip(LIMBS, radii.of_limbs().tolist(), strict=True))
+    return {method: method_figures([audit.outcomes[method] for audit in audits], drawn, body) for method in methods()}
+
+
+def _joints(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
+    went = np.max([travel(audit.recording.joints) for audit in audits], axis=0)
+    return {
+        method: joint_figures(np.concatenate([audit.joints[method] for audit in audits]), went, drawn)
+        for method in reach.METHODS
+    }
+
+
+def _curves(audits: Sequence[LogAudit]) -> dict[str, Any]:
+    horizon_s = wiring.foresight(audits[0].job).horizon_s
+
+    def point(method: str, factor: float) -> dict[str, Any]:
+        outcomes = [audit.curve[method][factor] for audit in audits]
+        rate_hz = AUDIT_HZ if factor == 1.0 else AUDIT_HZ / EVERY
+        lengths = [len(outcome) for outcome in outcomes]
+        block = block_ticks(horizon_s, rate_hz, max(lengths))
+        return {"factor": factor, **curve_point(outcomes, resample(lengths, block, horizon_s * rate_hz, SEED))}
+
+    return {method: [point(method, factor) for factor in factors(method)] for method in reach.METHODS}
+
+
+def _write_rows(audit: LogAudit, writer: RunWriter) -> None:
+    """A row per tick, limb and method."""
+    for method, outcome in audit.outcomes.items():
+        ticks, limbs = len(outcome), len(outcome.limbs)
+        escape = outcome.escape_m().ravel()
+        seen = np.isfinite(escape)
+        writer.table(
+            "audit",
+            {
+                "t_ns": np.repeat(outcome.t_ns, limbs),
+                "log": pa.array([audit.name] * (ticks * limbs), type=pa.string()),
+                "method": pa.array([method] * (ticks * limbs), type=pa.string()),
+                "limb": pa.array(list(outcome.limbs) * ticks, type=pa.string()),
+                "covered": pa.array(escape == 0.0, mask=~seen),
+                "escape_m": escape,
+                "beyond_hull_m": outcome.beyond_m.ravel(),
+                "radius_m": outcome.radius_m.ravel(),
+                "volume_m3": outcome.volume_m3.ravel(),
+            },
+        )
+
+
+def _names(jobs: Sequence[Job]) -> list[str]:
+    """A short name for each log; the same name twice gets numbers."""
+    stems = [job.log.stem for job in jobs]
+    return [s if stems.count(s) == 1 else f"{s} ({stems[:i].count(s) + 1})" for i, s in enumerate(stems)]
+
+
+def _meta(jobs: Sequence[Job], began: datetime) -> dict[str, Any]:
+    meta = jobs[0].meta()
+    del meta["stages"]
+    others = [job.meta() for job in jobs]
+    return {
+        **meta,
+        "inputs": [part["inputs"][0] for part in others],
+        "cells": [part["cell"] for part in others],
+        "settings_by_log": [part["settings"] for part in others],
+        "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
+    }

@@ -1,0 +1,141 @@
+"""Holds what was predicted at a tick against what the person did within the horizon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hrcreplay.human.containment import Solid, union_volume_m3
+from hrcreplay.human.reach import Reach
+from hrcreplay.recorded import Recording
+from hrcreplay.records import LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.report.audit_metrics import Outcome
+from hrcreplay.report.series import difference
+
+#: Recorded points of a limb. The first two must have been seen near the end of the horizon, or the limb is not audited.
+LIMB_POINTS = {
+    "HD": ("neck", "head"),
+    "THX": ("pelvis", "shoulder_r", "shoulder_l"),
+    "URA": ("shoulder_r", "elbow_r"),
+    "LRA": ("elbow_r", "wrist_r", "hand_r"),
+    "ULA": ("shoulder_l", "elbow_l"),
+    "LLA": ("elbow_l", "wrist_l", "hand_l"),
+    "LEGS": tuple(f"{part}_{side}" for part in ("hip", "knee", "ankle", "foot") for side in "rl"),
+}
+#: The end of the horizon: its last quarter. A limb that was last seen before could have left later.
+_END = 0.75
+#: Points with which the union of a tick's volumes is counted out.
+_COUNT = 1024
+_SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
+
+
+@dataclass(frozen=True)
+class Window:
+    """The recorded future of some ticks."""
+
+    states: HumanStates  #: (n,) the fused person at the ticks
+    limbs: dict[str, Floats]  #: limb -> (m, k, 3) its recorded points, world [m]
+    first: Ints  #: (n,) row of the first recorded instant after the tick
+    last: Ints  #: (n,) row past the last one within the horizon
+    end: Ints  #: (n,) row of the first one in the last quarter of the horizon
+
+    def rows(self, which: slice | Ints) -> Window:
+        """The same for some of the ticks."""
+        return Window(self.states.rows(which), self.limbs, self.first[which], self.last[which], self.end[which])
+
+
+def window(recording: Recording, ticks: Ints, horizon_s: float) -> Window:
+    """The recorded future (t, t + T_s] of some ticks.
+
+    Args:
+        recording: The log.
+        ticks: (n,) rows of ``recording.states``.
+        horizon_s: T_s [s].
+    """
+    points = recording.points_m.copy()
+    # the model's neck is the middle of the shoulders, not the bone that cameras call so
+    points[:, POINTS.index("neck")] = 0.5 * (points[:, _SHOULDERS[0]] + points[:, _SHOULDERS[1]])
+    limbs = {
+        limb: np.ascontiguousarray(points[:, [POINTS.index(n) for n in names]]) for limb, names in LIMB_POINTS.items()
+    }
+    states = recording.states.rows(ticks)
+    horizon_ns = round(horizon_s * 1e9)
+    first = np.searchsorted(recording.t_ns, states.t_ns, side="right")
+    last = np.searchsorted(recording.t_ns, states.t_ns + horizon_ns, side="right")
+    end = np.searchsorted(recording.t_ns, states.t_ns + round(_END * horizon_ns), side="right")
+    return Window(states, limbs, first, last, end)
+
+
+def hold(volumes: SweptVolumes, future: Window, counted: Bools, first_sample: int = 0) -> Outcome:
+    """One method's volumes against the recorded future.
+
+    Args:
+        volumes: Of the n ticks.
+        future: Of the same ticks.
+        counted: (n,) the ticks whose union is counted out.
+        first_sample: Number of ticks counted before, see ``union_volume_m3``.
+    """
+    n, limbs = len(volumes), volumes.limbs
+    beyond, size = np.full((n, len(limbs)), np.nan), np.full((n, len(limbs)), np.nan)
+    union, union_std = np.full(n, np.nan), np.full(n, np.nan)
+    for i in range(n):
+        solids = []
+        for k, limb in enumerate(limbs):
+            vertices = volumes.vertices(i, k)
+            if np.isnan(vertices).any():
+                continue
+            solid = Solid.around(vertices, float(volumes.radius_m[i, k]))
+            size[i, k] = solid.volume_m3()
+            if limb in LIMBS:
+                solids.append(solid)
+            beyond[i, k] = _farthest(solid, future, i, limb)
+        if counted[i] and len(solids) == len(LIMBS):
+            union[i], union_std[i] = union_volume_m3(solids, _COUNT, _COUNT * (first_sample + i))
+    return Outcome(volumes.t_ns, beyond, np.array(volumes.radius_m), size, union, union_std, limbs)
+
+
+def _farthest(solid: Solid, future: Window, tick: int, limb: str) -> float:
+    """How far the limb's recorded points get from a hull [m]; NaN where it was not seen near the horizon's end."""
+    recorded = future.limbs[limb]
+    late = recorded[future.end[tick] : future.last[tick], :2, 0]
+    if not np.isfinite(late).any(axis=0).all():
+        return np.nan
+    points = recorded[future.first[tick] : future.last[tick]].reshape(-1, 3)
+    return float(np.nanmax(solid.distances_m(points)))
+
+
+def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horizon_s: float) -> Floats:
+    """(n, 12) whether each joint's recorded future stayed in its reachable interval: 1, 0, or NaN where not recorded.
+
+    Args:
+        recording: The log.
+        states: (n,) the fused person at the ticks.
+        reach: Of the same ticks.
+        horizon_s: T_s [s].
+    """
+    t_ns = recording.joints_t_ns
+    first = np.searchsorted(t_ns, states.t_ns, side="right")
+    last = np.searchsorted(t_ns, states.t_ns + round(horizon_s * 1e9), side="right")
+    count = last - first
+    tick = np.repeat(np.arange(len(states)), count)
+    row = np.arange(len(tick)) - np.repeat(np.cumsum(count) - count, count) + first[tick]
+    moved = difference(recording.joints[row], states.p[tick])
+    low, high = reach.low - states.p, reach.high - states.p
+    out = ((moved < low[tick] - 1e-9) | (moved > high[tick] + 1e-9)).astype(float)
+    known = np.isfinite(moved) & np.isfinite(low[tick])
+    left, seen = np.zeros((len(states), 12)), np.zeros((len(states), 12))
+    np.add.at(left, tick, np.where(known, out, 0.0))
+    np.add.at(seen, tick, known.astype(float))
+    return np.where(seen > 0.0, (left == 0.0).astype(float), np.nan)
+
+
+def travel(joints: Floats) -> Floats:
+    """(12,) how far each joint went, between the 5th and the 95th percentile of its values [m, m, rad...]."""
+    known = joints[np.isfinite(joints).all(axis=1)]
+    if len(known) < 2:
+        return np.full(joints.shape[1], np.nan)
+    from_first = difference(known, np.repeat(known[:1], len(known), axis=0))
+    low, high = np.quantile(from_first, [0.05, 0.95], axis=0)
+    found: Floats = high - low
+    return found

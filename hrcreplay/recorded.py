@@ -1,0 +1,174 @@
+"""What a log says the person did: the future that an audit holds a prediction against."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hrcreplay.errors import LogError
+from hrcreplay.human import angles, fusion, smooth
+from hrcreplay.human.model import skeleton
+from hrcreplay.logs.person import PersonMemory, pick
+from hrcreplay.logs.reader import Log
+from hrcreplay.pipeline import Eyes, batches
+from hrcreplay.records import LENGTHS, POINTS, Bools, Floats, HumanStates, Ints, Measurements
+
+TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
+
+#: Points that the model has no say about -> the point they hang from and the longest a body makes that bone [m].
+_HANGING = {
+    "hand": ("wrist", 0.30),
+    "hip": ("pelvis", 0.30),
+    "knee": ("hip", 0.65),
+    "ankle": ("knee", 0.65),
+    "foot": ("ankle", 0.40),
+}
+#: Points of the model from the root on, where their bone starts, and its length: so many times one of LENGTHS.
+_BONES: tuple[tuple[str, str, str, float], ...] = (
+    ("shoulder_r", "shoulder_l", "pi_half_shoulder", 2.0),
+    ("shoulder_l", "shoulder_r", "pi_half_shoulder", 2.0),
+    ("pelvis", "neck", "pi_torso", 1.0),
+    ("head", "neck", "pi_head", 1.0),
+    *((f"elbow_{side}", f"shoulder_{side}", f"pi_upper_arm_{side}", 1.0) for side in "rl"),
+    *((f"wrist_{side}", f"elbow_{side}", f"pi_forearm_{side}", 1.0) for side in "rl"),
+)
+#: A bone that is so near to the person's own length is that person's: people are not the model [m].
+_BONE_M = 0.08
+#: Ticks fused and smoothed at a time, since the trace takes 1.5 kB a tick; and how many of the next stretch a smoothed
+#: stretch knows of: what comes later tells no more.
+_STRETCH, _LATER = 15_000, 500
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A log as an audit needs it."""
+
+    states: HumanStates  #: the fused person at every tick, knowing only what had arrived
+    t_ns: Ints  #: (m,) instants of the recorded points, increasing
+    points_m: Floats  #: (m, 20, 3) POINTS, world [m]; NaN where not recorded or not believed
+    joints_t_ns: Ints  #: (k,) instants of the recorded joints, increasing
+    joints: Floats  #: (k, 12) JOINTS [m, m, rad...]
+    source: str  #: TRUTH, CAMERAS or SMOOTHED
+    counts: dict[str, int]
+
+
+def record(log: Log, ticks_ns: Ints, eyes: Eyes, progress: Callable[[int], None]) -> Recording:
+    """Reads the span of ``ticks_ns``.
+
+    The recorded future is the ground truth where the log has it. Else the points of the cameras, at their capture
+    times, that the cameras trust and that are either within the filter's outlier distance of the smoothed person, who
+    knows what came later, or at the end of a bone of the person's own length: who squats or bends sideways leaves the
+    model, not the room, and must not be thrown out for it; a marker that jumps away takes no bone along. Else the
+    smoothed person. Recorded joints are those of the truth, else of the smoothed person.
+
+    Raises:
+        LogError: No camera saw anybody.
+    """
+    counts: Counter[str] = Counter()
+    stretches = _fuse(log, ticks_ns, eyes, counts, progress)
+    truth = [part.rows((part.t_ns >= ticks_ns[0]) & (part.t_ns <= ticks_ns[-1])) for part in log.truth()]
+    truth = [part for part in truth if len(part)]
+    if truth:
+        states = HumanStates.join([states for _, states, _ in stretches])
+        t_ns = np.concatenate([part.t_ns for part in truth])
+        points = np.concatenate([part.points_m for part in truth])
+        joints, _ = angles.inverse(points)
+        return Recording(states, t_ns, points, t_ns, joints, TRUTH, _plain(log, counts))
+    states, seen, best = _smoothed(stretches, eyes)
+    points, rejected = _believed(seen, best, eyes)
+    counts.update(rejected)
+    order = np.argsort(seen.capture_ns, kind="stable")
+    t_ns, points, source = seen.capture_ns[order], points[order], CAMERAS
+    if not np.isfinite(points).any():
+        t_ns, points, source = best.t_ns, skeleton(best.p, best.lengths_m), SMOOTHED
+    return Recording(states, t_ns, points, best.t_ns, best.p, source, _plain(log, counts))
+
+
+Stretch = tuple[Measurements, HumanStates, fusion.Trace]
+
+
+def _fuse(
+    log: Log, ticks_ns: Ints, eyes: Eyes, counts: Counter[str], progress: Callable[[int], None]
+) -> Iterator[Stretch]:
+    """Stage 1 from the first stretch on in which a camera saw somebody."""
+    state, memory = fusion.start(log.header.cameras), PersonMemory()
+    measured: Measurements | None = None
+    for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _STRETCH):
+        progress(len(ticks))
+        if due is not None:
+            memory, mine, found = pick(due, memory, eyes.T_world_camera, eyes.person_jump_m, eyes.person_memory_s)
+            counts.update(found)
+            mine = replace(mine, capture_ns=mine.capture_ns - eyes.clock_offset_ns[mine.camera])
+            measured = angles.measure(mine, eyes.T_world_camera, eyes.noise)
+        elif measured is not None:
+            measured = measured.rows(slice(0, 0))
+        else:
+            continue
+        state, states, events, trace = fusion.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
+        counts.update(events)
+        yield measured, states, trace
+    if measured is None:
+        raise LogError(f"{log.header.path}: no camera saw anybody; an audit needs a person")
+
+
+def _smoothed(stretches: Iterator[Stretch], eyes: Eyes) -> tuple[HumanStates, Measurements, HumanStates]:
+    """The states, the measurements and the smoothed states of all stretches."""
+    seen, passed, best = [], [], []
+    held: tuple[HumanStates, fusion.Trace] | None = None
+
+    def finish(held: tuple[HumanStates, fusion.Trace], after: tuple[HumanStates, fusion.Trace] | None) -> None:
+        states, trace = held
+        if after is not None:
+            states = HumanStates.join([states, after[0].rows(slice(0, _LATER))])
+            trace = fusion.Trace(
+                cov=np.concatenate([trace.cov, after[1].cov[:_LATER]]),
+                damping=np.concatenate([trace.damping, after[1].damping[:_LATER]]),
+            )
+        best.append(smooth.smooth(states, trace, eyes.filter).rows(slice(0, len(held[0]))))
+
+    for measured, states, trace in stretches:
+        seen.append(measured)
+        passed.append(states)
+        if held is not None:
+            finish(held, (states, trace))
+        held = states, trace
+    if held is not None:
+        finish(held, None)
+    return HumanStates.join(passed), Measurements.join(seen), HumanStates.join(best)
+
+
+def _believed(seen: Measurements, best: HumanStates, eyes: Eyes) -> tuple[Floats, Counter[str]]:
+    """The measured points (m, 20, 3) without those that fail a gate, and how many failed per camera."""
+    tick = np.clip(np.searchsorted(best.t_ns, seen.capture_ns), 0, len(best) - 1)
+    expected = skeleton(best.p[tick], best.lengths_m[tick])
+    measured: Bools = np.asarray(np.isfinite(seen.points_m).all(axis=2))
+    good = measured & (seen.confidence >= eyes.filter.confidence_min)
+    points = seen.points_m.copy()
+    neck = POINTS.index("neck")  # the model's: the middle of the shoulders
+    points[:, neck] = 0.5 * (points[:, POINTS.index("shoulder_l")] + points[:, POINTS.index("shoulder_r")])
+    near = np.linalg.norm(points - expected, axis=2) <= eyes.filter.outlier_m
+    good[:, neck] = measured[:, neck]
+    for name, start, length, part in _BONES:
+        k, j = POINTS.index(name), POINTS.index(start)
+        own = part * best.lengths_m[tick, LENGTHS.index(length)]
+        right = np.abs(np.linalg.norm(points[:, k] - points[:, j], axis=1) - own) <= _BONE_M
+        good[:, k] &= near[:, k] | (right & good[:, j])
+    for name, (parent, longest_m) in _HANGING.items():
+        for side in "lr":
+            k = POINTS.index(f"{name}_{side}")
+            j = POINTS.index(parent if parent in POINTS else f"{parent}_{side}")
+            apart = np.linalg.norm(seen.points_m[:, k] - seen.points_m[:, j], axis=1)
+            good[:, k] &= good[:, j] & (apart <= longest_m)
+    rejected = measured & ~good
+    counts: Counter[str] = Counter()
+    for c, camera in enumerate(seen.cameras):
+        counts[f"audit_rejected_points_{camera}"] = int(rejected[seen.camera == c].sum())
+        counts[f"audit_rejected_frames_{camera}"] = int(rejected[seen.camera == c].any(axis=1).sum())
+    return np.where(good[..., None], seen.points_m, np.nan), counts
+
+
+def _plain(log: Log, found: Counter[str]) -> dict[str, int]:
+    return {name: int(count) for name, count in sorted((log.defects + found).items())}
