@@ -94,6 +94,10 @@ class Fusion(Section):
     """A joint without a valid row for longer comes to rest [s]."""
     delay_max_s: Positive = 0.25
     """An older frame counts as this old [s]."""
+    residual_quantile: Share = 0.95
+    """Of how far each limb's measured points were from the model's: the quantile that is tracked."""
+    residual_memory_s: Positive = 20.0
+    """A distance seen this long ago counts 1/e of a new one [s]."""
     memory_s: Positive = 0.5
     """Without a valid row for longer than this the person counts as lost [s]."""
 
@@ -110,8 +114,9 @@ class Limits(Section):
 class Occupancy(Section):
     """Section 3: what the person can reach."""
 
-    method: Literal["paper", "positions"] = "paper"
-    """paper: Eq. (20)-(30) and Alg. 1, 2; positions: reachable sets from positions and velocity bounds alone [26]."""
+    method: Literal["paper", "positions", "sound"] = "paper"
+    """paper: Eq. (20)-(30) and Alg. 1, 2; positions: from positions and velocity bounds alone [26]; sound: encloses
+    every motion of the model under the limits."""
     stop_s: Positive = 0.377
     """Worst-case braking time T_s of the robot, Eq. (70) [s]."""
     store_hz: Positive | Literal["all"] = 25.0
@@ -124,6 +129,19 @@ class Occupancy(Section):
     """Table 2 [m]."""
     radius_lower_arm_m: NotNegative = 0.07
     """Table 2 [m]."""
+
+    sigmas: NotNegative = 3.0
+    """sound: states within so many standard deviations of the estimate are enclosed."""
+    latency_s: NotNegative = 0.0
+    """sound: from the newest capture to the robot's reaction; the horizon is longer by it [s]."""
+    hand_m: NotNegative = 0.19
+    """sound: length of the hand beyond the wrist [m]."""
+    legs_radius_m: Positive = 0.20
+    """sound: radius of the lower body around the line from the floor to the pelvis [m]."""
+    legs: bool = True
+    """sound: whether there is a lower body."""
+    residual: bool = True
+    """sound: whether the measured body's distance from the model is added to the radii."""
 
 
 class LinkSettings(Section):

@@ -10,6 +10,7 @@ import numpy as np
 
 from hrcreplay.human import angles, fusion, hull, occupancy
 from hrcreplay.human import smooth as smoother
+from hrcreplay.human.margins import Margins
 from hrcreplay.human.model import LimitSet
 from hrcreplay.logs.person import PersonMemory, pick
 from hrcreplay.logs.reader import Log
@@ -51,12 +52,18 @@ class Foresight:
     limits: LimitSet
     horizon_s: float
     radii: occupancy.Radii
+    margins: Margins
     method: str
 
     def volumes(self, states: HumanStates, method: str | None = None) -> SweptVolumes:
         """Swept volumes of every tick, by this or another method."""
         return occupancy.predict(
-            states, self.limits, horizon_s=self.horizon_s, radii=self.radii, method=method or self.method
+            states,
+            self.limits,
+            horizon_s=self.horizon_s,
+            radii=self.radii,
+            method=method or self.method,
+            margins=self.margins,
         )
 
 

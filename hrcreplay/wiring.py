@@ -8,6 +8,7 @@ from hrcreplay.cell import Cell
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.angles import PointNoise
 from hrcreplay.human.fusion import FusionSettings
+from hrcreplay.human.margins import Margins
 from hrcreplay.human.occupancy import Radii
 from hrcreplay.job import Job
 from hrcreplay.logs.log import JointTrack
@@ -63,7 +64,16 @@ def foresight(job: Job) -> Foresight:
         upper_arm=occupancy.radius_upper_arm_m,
         lower_arm=occupancy.radius_lower_arm_m,
     )
-    return Foresight(limits=job.prediction, horizon_s=occupancy.stop_s, radii=radii, method=occupancy.method)
+    margins = Margins(
+        sigmas=occupancy.sigmas,
+        latency_s=occupancy.latency_s,
+        hand_m=occupancy.hand_m,
+        legs_radius_m=occupancy.legs_radius_m,
+        residual=occupancy.residual,
+        memory_s=job.settings.fusion.memory_s,
+        legs=occupancy.legs,
+    )
+    return Foresight(job.prediction, occupancy.stop_s, radii, margins, occupancy.method)
 
 
 def base(job: Job, log: Log) -> Floats | None:
