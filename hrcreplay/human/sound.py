@@ -7,12 +7,13 @@ Why no motion leaves them, step by step:
 2. Joints. Heading, torso and arm joints stay in the intervals of ``excursion`` at all times; stops that depend on
    other joints are taken over the intervals of those.
 3. Walking. The pelvis stays in the convex polygon of ``stroll`` at all times.
-4. Limbs. A limb at any instant is a chain of rotations, each with an angle of its interval, then a displacement of the
+4. Limbs. A limb at any instant is a chain of rotations, each by an angle of its interval, then a displacement of the
    polygon. Sweeping a convex set by all angles of a joint and by all displacements, each regardless of the others,
    holds all combinations, among them those that occur. A swept set is kept as points whose hull holds it: rotations
-   are linear, so a hull of swept points holds the swept hull. Arcs are in triangles of at most 60 degrees with their
-   apexes outside, and points are only dropped where they are proven to be inside the rest (``sweep``, ``corners``);
-   where that leaves too many, the polytope of ``outer`` takes their place, which holds them all.
+   are linear, so the hull of the swept points holds the swept hull. Arcs are in triangles with their apexes outside,
+   and points are only dropped where they are proven to be inside the rest (``sweep``, ``walk``, ``corners``). Where
+   that leaves too many, the polytope of ``outer`` takes their place, which holds them all. It may be cut back to the
+   ball that no point of the limb can leave, because a direction's number may be any that is not below the truth.
 5. Lengths. A limb is drawn as long as it may be: its far end goes out along a line through the near one. An unknown
    length further up the chain displaces the limb by no more than its error, which is added to the radius.
 6. Rounding. The steps are exact in real numbers; in floating point they are off by less than 1e-12 m for people within
@@ -34,14 +35,18 @@ from hrcreplay.human.margins import Margins
 from hrcreplay.human.outer import CORNERS, DIRECTIONS, around, reach_turning
 from hrcreplay.human.stroll import SIDES
 from hrcreplay.human.surface import Surface, surface
-from hrcreplay.human.sweep import MOST_COPIES, TRIANGLE_RAD, sweep_rot
+from hrcreplay.human.sweep import copies, sweep_rot
 from hrcreplay.human.walk import polygon, sweep_walk
 from hrcreplay.records import LIMBS, Floats, HumanStates, Ints
 
 #: Added to every radius: more than all rounding on the way [m].
 ROUNDING_M = 1e-9
-#: More points than this that a rotation or walking would make are never made: the polytope around them is.
-MOST_POINTS, MOST_AT_END = 128, 2048
+#: More points than a rotation or walking may make: the polytope around them is made instead.
+MOST_COPIED = 2000
+#: Only smaller sets are reduced to their corners: the time goes with the square.
+MOST_REDUCED = 256
+#: Largest angle of a triangle around an arc: its apex is then at most 3.6 % of the radius off [rad].
+FINE_RAD = np.pi / 6.0
 #: More corners than this at the end are replaced by the polytope around them.
 MOST_CORNERS = 256
 #: A larger set is reduced before the next rotation.
@@ -145,10 +150,11 @@ def _limb(
     ends = _longest(limb, ends, off, hand)
     if not np.isfinite(ends.sum() + chain.sum() + corners.sum() + low[2] + high[2]):
         return np.full((1, 3), np.nan), 1
-    points, count, faces, exact = _turn_all(ends, chain, work)
-    if exact and count * _copies(low[2], high[2]) * SIDES <= MOST_AT_END:
-        swept = np.empty((MOST_COPIES * SIDES * count, 3))
-        many = sweep_walk(points, count, faces, work, (low[2], high[2]), polygon(corners), swept)
+    points, count, faces = _turn_all(ends, chain, work)
+    room = count * copies(low[2], high[2], FINE_RAD) * SIDES
+    if count <= MOST_REDUCED and room <= MOST_COPIED:
+        swept = np.empty((room, 3))
+        many = sweep_walk(points, count, faces, work, (low[2], high[2]), polygon(corners), swept, FINE_RAD)
         if many > MOST_CORNERS:
             many, _ = keep_corners(swept, many, work)
         if many <= MOST_CORNERS:
@@ -157,21 +163,18 @@ def _limb(
 
 
 @njit(cache=True)
-def _turn_all(ends: Floats, chain: Floats, work: Surface) -> tuple[Floats, int, int, bool]:
-    """Points around what the rotations of a chain make of a limb's ends; how many; triangles around them; corners?
-
-    The last is whether the points are the corners of Alg. 2, rather than those of a polytope around them.
-    """
-    points, count, faces, exact = ends, len(ends), 0, True
+def _turn_all(ends: Floats, chain: Floats, work: Surface) -> tuple[Floats, int, int]:
+    """Points around what the rotations of a chain make of a limb's ends, how many, and triangles around them."""
+    points, count, faces = ends, len(ends), 0
     radius = 0.0  # of the ball around the frame's origin that holds the limb
     for end in ends:
         radius = max(radius, np.sqrt(end[0] ** 2 + end[1] ** 2 + end[2] ** 2))
     for k, step in enumerate(chain):
         axis, low, high = int(step[0]), step[1], step[2]
-        exact = exact and count * _copies(low, high) <= MOST_POINTS
-        if exact:
-            swept = np.empty((MOST_COPIES * count, 3))
-            count = sweep_rot(points, count, axis, low, high, swept)
+        room = count * copies(low, high, FINE_RAD)
+        if room <= MOST_COPIED:
+            swept = np.empty((room, 3))
+            count = sweep_rot(points, count, axis, low, high, swept, FINE_RAD)
         else:
             swept = np.empty((CORNERS, 3))
             count = _turn(points, count, axis, low, high, radius, swept)
@@ -179,10 +182,11 @@ def _turn_all(ends: Floats, chain: Floats, work: Surface) -> tuple[Floats, int, 
         for i in range(count):
             for j in range(3):
                 points[i, j] += step[3 + j]
-        if exact and (count > _WORTH_REDUCING or k == len(chain) - 1):
+        faces = 0
+        if room <= MOST_REDUCED and (count > _WORTH_REDUCING or k == len(chain) - 1):
             count, faces = keep_corners(points, count, work)
         radius += np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
-    return points, count, faces, exact
+    return points, count, faces
 
 
 @njit(cache=True)
@@ -206,12 +210,6 @@ def _longest(limb: int, ends: Floats, off: Floats, hand: float) -> Floats:
     else:
         ends[1, 2] -= hand + (off[6] if left else off[7])
     return ends
-
-
-@njit(cache=True)
-def _copies(low: float, high: float) -> int:
-    """Most points that a rotation makes of one."""
-    return 1 if low == high else 2 + min(6, int(np.ceil((high - low) / TRIANGLE_RAD)))
 
 
 @njit(cache=True)

@@ -42,12 +42,14 @@ def sweep_lin(points: Floats, count: int, axis: int, low: float, high: float, sw
 
 
 @njit(cache=True)
-def sweep_rot(points: Floats, count: int, axis: int, low: float, high: float, swept: Floats) -> int:
+def sweep_rot(
+    points: Floats, count: int, axis: int, low: float, high: float, swept: Floats, widest: float = TRIANGLE_RAD
+) -> int:
     """Rotational sweep about a coordinate axis through the origin, Fig. 8: arcs inside triangles.
 
-    An arc is cut into equal pieces of at most 60 degrees; each lies in the triangle of its ends and the point where
+    An arc is cut into equal pieces of at most ``widest``; each lies in the triangle of its ends and the point where
     their tangents meet. A cut lies on the tangent that its two triangles share, between their apexes, so only the
-    arc's ends and the apexes are corners. A whole turn is the hexagon around the circle.
+    arc's ends and the apexes are corners. A whole turn is the polygon around the circle.
 
     Args:
         points: (m, 3), of which the first ``count`` are swept [m].
@@ -55,18 +57,20 @@ def sweep_rot(points: Floats, count: int, axis: int, low: float, high: float, sw
         axis: 0, 1, 2 for x, y, z.
         low: Smallest angle [rad].
         high: Largest angle [rad]; equal to ``low`` it turns the points and adds none.
-        swept: (>= 8 count, 3) receives the points, whose hull contains every arc [m].
+        swept: (>= copies(low, high, widest) count, 3) receives the points, whose hull contains every arc [m].
+        widest: Largest angle of a triangle [rad].
 
     Returns:
         Number of points written.
     """
-    cosines, sines = np.empty(MOST_COPIES), np.empty(MOST_COPIES)
-    copies = turns(low, high, cosines, sines)
+    most = copies(low, high, widest)
+    cosines, sines = np.empty(most), np.empty(most)
+    made = turns(low, high, cosines, sines, widest)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     n = 0
     for row in range(count):
         u, v = points[row, i], points[row, j]
-        for copy in range(1 if u == 0.0 and v == 0.0 else copies):
+        for copy in range(1 if u == 0.0 and v == 0.0 else made):
             swept[n, axis] = points[row, axis]
             swept[n, i] = cosines[copy] * u - sines[copy] * v
             swept[n, j] = sines[copy] * u + cosines[copy] * v
@@ -75,7 +79,13 @@ def sweep_rot(points: Floats, count: int, axis: int, low: float, high: float, sw
 
 
 @njit(cache=True)
-def turns(low: float, high: float, cosines: Floats, sines: Floats) -> int:
+def copies(low: float, high: float, widest: float = TRIANGLE_RAD) -> int:
+    """Most points that a rotation makes of one."""
+    return 1 if low == high else 2 + int(np.ceil(min(high - low, 2.0 * np.pi) / widest))
+
+
+@njit(cache=True)
+def turns(low: float, high: float, cosines: Floats, sines: Floats, widest: float = TRIANGLE_RAD) -> int:
     """The maps of a rotational sweep: rotations, for an apex stretched by 1 / cos(half the piece).
 
     Writes the first columns (cos, sin) of their matrices, and returns how many there are.
@@ -84,7 +94,7 @@ def turns(low: float, high: float, cosines: Floats, sines: Floats) -> int:
         cosines[0], sines[0] = np.cos(low), np.sin(low)
         return 1
     width = min(high - low, 2.0 * np.pi)
-    pieces = int(np.ceil(width / TRIANGLE_RAD))
+    pieces = int(np.ceil(width / widest))
     half = 0.5 * width / pieces
     for piece in range(pieces):
         middle = low + (2 * piece + 1) * half

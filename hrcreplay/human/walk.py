@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.human.surface import Surface, sides
-from hrcreplay.human.sweep import MOST_COPIES, turns
+from hrcreplay.human.sweep import TRIANGLE_RAD, copies, turns
 from hrcreplay.records import Floats
 
 #: Directions in the plane: EMPTY, POINTED (within less than half a turn) or ALL_ROUND (they can cancel), and the
@@ -27,7 +27,14 @@ _SAME = 1e-12
 
 @njit(cache=True)
 def sweep_walk(
-    points: Floats, count: int, faces: int, work: Surface, heading: tuple[float, float], floor: Floats, swept: Floats
+    points: Floats,
+    count: int,
+    faces: int,
+    work: Surface,
+    heading: tuple[float, float],
+    floor: Floats,
+    swept: Floats,
+    widest: float = TRIANGLE_RAD,
 ) -> int:
     """Rotational sweep about the z axis, then a translational one over a polygon.
 
@@ -39,20 +46,22 @@ def sweep_walk(
         heading: Smallest and largest heading [rad].
         floor: (k, 6) places of the human base: x, y, and the vectors there from the two neighbouring corners of the
             polygon, zero where there is none [m].
-        swept: (>= 8 k count, 3) receives the points, world [m].
+        swept: (>= copies(*heading, widest) k count, 3) receives the points, world [m].
+        widest: Largest angle of a triangle [rad].
 
     Returns:
         Number of points written.
     """
-    cosines, sines = np.empty(MOST_COPIES), np.empty(MOST_COPIES)
-    copies = turns(heading[0], heading[1], cosines, sines)
+    most = copies(heading[0], heading[1], widest)
+    cosines, sines = np.empty(most), np.empty(most)
+    made = turns(heading[0], heading[1], cosines, sines, widest)
     steps = _steps_inside(points, count, faces, work)
     n = 0
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
-        for copy in range(1 if x == 0.0 and y == 0.0 else copies):
+        for copy in range(1 if x == 0.0 and y == 0.0 else made):
             c, s = cosines[copy], sines[copy]
-            away = _away_from_turned(x, y, copy, copies, cosines, sines)
+            away = _away_from_turned(x, y, copy, made, cosines, sines)
             for k in (0, 2):
                 away = _widen(away, s * steps[i, k + 1] - c * steps[i, k], -s * steps[i, k] - c * steps[i, k + 1])
             for place in floor:
@@ -93,12 +102,12 @@ def polygon(corners: Floats) -> Floats:
 
 
 @njit(cache=True)
-def _away_from_turned(x: float, y: float, copy: int, copies: int, cosines: Floats, sines: Floats) -> Cone:
+def _away_from_turned(x: float, y: float, copy: int, made: int, cosines: Floats, sines: Floats) -> Cone:
     """Directions from the other turned copies of a point to this one."""
     away = (EMPTY, 0.0, 0.0, 0.0, 0.0)
     if x == 0.0 and y == 0.0:
         return away
-    for other in range(copies):
+    for other in range(made):
         if other != copy:
             c, s = cosines[copy] - cosines[other], sines[copy] - sines[other]
             away = _widen(away, c * x - s * y, s * x + c * y)

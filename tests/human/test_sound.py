@@ -7,13 +7,18 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
+from hrcreplay.human.excursion import rise
+from hrcreplay.human.hull import sphere_swept_volume_m3
 from hrcreplay.human.margins import Margins
 from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds, skeleton
 from hrcreplay.human.occupancy import Radii, predict
+from hrcreplay.human.outer import CORNERS, DIRECTIONS, around, reach_turning
+from hrcreplay.human.reach import reachable
 from hrcreplay.limits import load_limits
-from hrcreplay.records import LIMBS, Floats, HumanStates, SweptVolumes
-from tests.human.people import limb_points, random_states
+from hrcreplay.records import JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
+from tests.human.people import limb_points, random_states, states
 
 T = 0.377
 PAPER, HUMAN = load_limits("paper"), load_limits("human")
@@ -110,3 +115,164 @@ def test_no_motion_leaves(limits: LimitSet, std: float) -> None:
     margins = BARE if std == 0.0 else Margins(sigmas=2.0, legs=False)
     out, where = worst(people, limits, margins, 1)
     assert out <= 0.0, where
+
+
+def test_paper_lets_motions_out_that_sound_holds() -> None:
+    """The motions drawn here have teeth: the same ones leave the volumes of ``paper``."""
+    people, rng = random_states(PAPER, 40, 3), np.random.default_rng(1)
+    printed = predict(people, PAPER, horizon_s=T, radii=Radii(), method="paper")
+    out = np.full(len(LIMBS), -np.inf)
+    for i in range(len(people)):
+        c, s = np.cos(people.p[i, 2]), np.sin(people.p[i, 2])
+        v = people.v[i].copy()
+        v[0], v[1] = c * v[0] + s * v[1], c * v[1] - s * v[0]
+        q, _ = motions(rng, people.p[i], v, PAPER, 60, True)[-1]
+        points = skeleton(q, np.tile(people.lengths_m[i], (60, 1)))
+        for limb, name in enumerate(LIMBS):
+            solid = ConvexHull(printed.vertices(i, limb)).equations
+            reached = np.concatenate([limb_points(body, name) for body in points])
+            out[limb] = max(out[limb], (reached @ solid[:, :3].T + solid[:, 3]).max())
+    assert (out > 0.003).all()
+
+
+def test_it_is_hardly_larger_than_paper() -> None:
+    people = random_states(PAPER, 60, 15)
+    totals = []
+    for method in ("paper", "sound"):
+        swept = predict(people, PAPER, horizon_s=T, radii=Radii(), method=method, margins=BARE)
+        totals.append(
+            [
+                sum(sphere_swept_volume_m3(swept.vertices(i, k), swept.radius_m[i, k]) for k in range(len(LIMBS)))
+                for i in range(len(people))
+            ]
+        )
+    assert np.mean(np.array(totals[1]) / totals[0]) < 1.3
+
+
+def test_an_excursion_peaks_where_a_simulated_joint_does() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(300):
+        v, top = rng.uniform(-3, 3), rng.uniform(-1, 2)
+        gain, brake = rng.uniform(0, 8), -rng.uniform(0, 8)
+        t = np.linspace(0, T, 20_001)
+        profile = np.minimum(v + gain * t, top) if v <= top else np.maximum(v + brake * t, top)
+        travelled = np.concatenate([[0.0], np.cumsum(0.5 * (profile[1:] + profile[:-1])) * (t[1] - t[0])])
+        assert rise(v, top, gain, brake, T) == pytest.approx(travelled.max(), abs=1e-6)
+
+
+def test_a_joint_faster_than_its_bound_comes_back_at_its_bound() -> None:
+    j, p, v = JOINTS.index("rho"), np.zeros((1, 12)), np.zeros((1, 12))
+    v[0, j] = PAPER.v_max[j] + 0.1
+    reach = reachable(states(p, v), PAPER, T, "sound", BARE)
+    assert reach.high[0, j] == pytest.approx((PAPER.v_max[j] + 0.1) * T + 0.5 * PAPER.a_min[j] * T**2)
+
+
+def test_stops_hold_and_a_posture_beyond_one_stays_inside() -> None:
+    j, p, v = JOINTS.index("ar1"), np.zeros((2, 12)), np.zeros((2, 12))
+    p[:, j], v[:, j] = (PAPER.p_max[j] - 0.01, PAPER.p_max[j] + 0.2), (1.0, 0.0)
+    reach = reachable(states(p, v), PAPER, T, "sound", BARE)
+    assert reach.high[:, j].tolist() == [PAPER.p_max[j], p[1, j]]
+
+
+def test_a_walker_who_turns_stays_in_the_polygon() -> None:
+    """By fine integration: heading, speed and sidestep each at their own bounds, in world axes."""
+    rng = np.random.default_rng(6)
+    people = random_states(PAPER, 40, 6)
+    reach = reachable(people, PAPER, T, "sound", BARE)
+    dt = T / 4000
+    for i in range(len(people)):
+        c, s = np.cos(people.p[i, 2]), np.sin(people.p[i, 2])
+        v = np.array([[c, s], [-s, c]]) @ people.v[i, :2]
+        body = np.tile([v[0], v[1], people.v[i, 2]], (16, 1))
+        a = np.where(rng.random((16, 3)) < 0.5, PAPER.a_min[:3], PAPER.a_max[:3])
+        q = np.tile(people.p[i, :3], (16, 1))
+        for _ in range(4000):
+            after = np.clip(body + a * dt, PAPER.v_min[:3], PAPER.v_max[:3])
+            mean, body = 0.5 * (body + after), after
+            turn = q[:, 2] + 0.5 * dt * mean[:, 2]
+            q[:, 0] += dt * (np.cos(turn) * mean[:, 0] - np.sin(turn) * mean[:, 1])
+            q[:, 1] += dt * (np.sin(turn) * mean[:, 0] + np.cos(turn) * mean[:, 1])
+            q[:, 2] += dt * mean[:, 2]
+        assert (q >= reach.low[i, :3] - 1e-9).all()
+        assert (q <= reach.high[i, :3] + 1e-9).all()
+
+
+def test_a_polytope_holds_every_turned_point() -> None:
+    rng = np.random.default_rng(7)
+    for axis in range(3):
+        for low, high in ((0.0, 0.0), (-0.3, 0.4), (-1.0, 2.6), (0.0, 7.0)):
+            points, far = rng.normal(size=(12, 3)), np.full(len(DIRECTIONS), -np.inf)
+            reach_turning(points, len(points), axis, low, high, far)
+            corners = np.empty((CORNERS, 3))
+            solid = ConvexHull(corners[: around(far, corners)]).equations
+            turning = Rotation.from_euler("xyz"[axis], np.linspace(low, high, 500)[:, None])
+            reached = np.concatenate([turning.apply(point) for point in points])
+            assert (reached @ solid[:, :3].T + solid[:, 3]).max() <= 1e-12
+            assert (reached @ DIRECTIONS.T).max(axis=0) == pytest.approx(far, abs=1e-4)
+
+
+def test_unknown_lengths_are_in_the_volumes() -> None:
+    people = uncertain(random_states(PAPER, 30, 9), 0.0, 0.0, 0.01)
+    margins = Margins(sigmas=3.0, legs=False)
+    out, where = worst(people, PAPER, margins, 5)
+    assert out <= 0.0, where
+    assert volumes(people, PAPER, margins).radius_m[0, LIMBS.index("HD")] == pytest.approx(0.12 + 0.03)
+
+
+def test_a_limb_out_of_sight_grows_to_all_that_it_can_reach() -> None:
+    people = random_states(PAPER, 5, 10)
+    unseen = np.zeros((5, len(LIMBS)))
+    unseen[:, LIMBS.index("LLA")] = (0.0, 0.5, 0.6, 3.0, np.inf)
+    same = people.rows(np.zeros(5, dtype=np.int64))
+    reach = reachable(dataclasses.replace(same, unseen_s=unseen), PAPER, T, "sound", BARE)
+    elbow = JOINTS.index("al4")
+    width = reach.high[:, elbow] - reach.low[:, elbow]
+    assert width[0] == width[1] < width[2] < width[4] == pytest.approx(PAPER.p_max[elbow] - PAPER.p_min[elbow])
+    assert width[3] == pytest.approx(width[4])
+    others = [j for j in range(12) if JOINTS[j] not in ("al3", "al4")]
+    assert (reach.low[:, others] == reach.low[0, others]).all()
+    swept = volumes(dataclasses.replace(same, unseen_s=unseen))
+    sizes = [sphere_swept_volume_m3(swept.vertices(i, LIMBS.index("LLA")), 0.07) for i in range(5)]
+    assert sizes[0] == sizes[1] < sizes[2] < sizes[3]
+
+
+def test_an_arm_never_seen_needs_no_state_but_its_lengths() -> None:
+    people = random_states(PAPER, 1, 11)
+    p, unseen = people.p.copy(), np.zeros((1, len(LIMBS)))
+    p[0, 8:] = np.nan
+    blind = dataclasses.replace(people, p=p)
+    assert np.isnan(volumes(blind).vertices(0, LIMBS.index("LLA"))).all()
+    unseen[0, [LIMBS.index("ULA"), LIMBS.index("LLA")]] = np.inf
+    assert np.isfinite(volumes(dataclasses.replace(blind, unseen_s=unseen)).vertices_m).all()
+
+
+def test_a_person_out_of_sight_may_have_walked_anywhere() -> None:
+    people = random_states(PAPER, 1, 12)
+    away = dataclasses.replace(people, unseen_s=np.full((1, len(LIMBS)), 2.0))
+    near, far = (reachable(someone, PAPER, T, "sound", BARE) for someone in (people, away))
+    assert (far.high[0, :2] - far.low[0, :2] > near.high[0, :2] - near.low[0, :2] + 0.8 * 2.0).all()
+
+
+def test_residual_hand_and_legs() -> None:
+    people = random_states(PAPER, 2, 13)
+    residual = np.array([[np.nan] * 6, [0.05] * 6])
+    people = dataclasses.replace(people, residual_m=residual)
+    swept = volumes(people, PAPER, Margins(sigmas=0.0))
+    assert swept.limbs == (*LIMBS, "LEGS")
+    assert swept.radius_m[:, -1] == pytest.approx(0.20)
+    assert swept.radius_m[1, :-1] - swept.radius_m[0, :-1] == pytest.approx(0.05)
+    assert volumes(people, PAPER, dataclasses.replace(BARE, residual=False)).radius_m[1] == pytest.approx(
+        Radii().of_limbs()
+    )
+    legs = swept.vertices(0, len(LIMBS))
+    assert (legs[:, 2].min(), legs[:, 2].max()) == (0.0, people.lengths_m[0, 0])
+    assert (legs[:, :2].min(axis=0) <= people.p[0, :2]).all()
+    assert (legs[:, :2].max(axis=0) >= people.p[0, :2]).all()
+
+
+def test_one_tick_has_the_bits_of_many() -> None:
+    people = uncertain(random_states(HUMAN, 20, 16), 0.05, 0.3, 0.004)
+    whole = volumes(people, HUMAN, Margins())
+    alone = [volumes(people.rows(slice(i, i + 1)), HUMAN, Margins()) for i in range(len(people))]
+    assert np.concatenate([tick.vertices_m for tick in alone]).tobytes() == whole.vertices_m.tobytes()
+    assert len(volumes(people.rows(slice(0, 0)))) == 0
