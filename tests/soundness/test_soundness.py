@@ -1,0 +1,93 @@
+"""A million sampled motions, of which none may leave a sound volume, and some must leave the printed ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hrcreplay.records import LIMBS, HumanStates, SweptVolumes
+from tests.soundness import run as sampling
+from tests.soundness.__main__ import main
+from tests.soundness.run import Plan, Result, escaped, run, sample_states
+
+SEED = 2020
+#: A million in all.
+SHARES = {
+    "exact": (Plan("sound", "paper", SEED), 400_000),
+    "people": (Plan("sound", "human", SEED), 200_000),
+    "likely": (Plan("sound", "paper", SEED, sigmas=3.0, latency_s=0.05, hand_m=0.19), 200_000),
+    "beyond": (Plan("sound", "paper", SEED, beyond=True), 100_000),
+    "people, likely and beyond": (Plan("sound", "human", SEED, sigmas=3.0, hand_m=0.19, beyond=True), 100_000),
+}
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_no_motion_leaves_a_sound_volume(share: str) -> None:
+    plan, motions = SHARES[share]
+    result = run(plan, motions, processes=1)
+    assert result.motions == motions
+    assert result.limbs == (*LIMBS, "LEGS")
+    assert not escaped(result), dict(zip(result.limbs, result.margin_m, strict=True))
+    assert result.escapes.sum() == 0
+    assert result.margin_m.max() > -1e-5  # the sampler comes as far as anyone can
+
+
+def test_a_million_in_all() -> None:
+    assert sum(motions for _, motions in SHARES.values()) == 1_000_000
+
+
+@pytest.mark.parametrize("method", ["paper", "positions"])
+def test_motions_leave_the_printed_volumes(method: str) -> None:
+    result = run(Plan(method, "paper", SEED), 60_000, processes=1)
+    share = dict(zip((*LIMBS, "any"), result.states_with_escapes / result.states, strict=True))
+    worst_m = dict(zip(LIMBS, result.margin_m, strict=True))
+    assert share["any"] > (0.4 if method == "paper" else 0.1)
+    assert worst_m["THX"] > 0.01
+    if method == "paper":
+        assert share["LRA"] + share["LLA"] > 0.1
+        assert min(worst_m.values()) > 0.005
+
+
+def shortened(
+    predict: Callable[[HumanStates, Plan], SweptVolumes],
+) -> Callable[[HumanStates, Plan], SweptVolumes]:
+    return lambda states, plan: predict(states, replace(plan, horizon_s=0.995 * plan.horizon_s))
+
+
+def test_a_horizon_half_a_percent_short_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "predict", shortened(sampling.predict))
+    result = run(Plan("sound", "paper", SEED), 40_000, processes=1)
+    assert (result.escapes > 0).all()
+    assert (result.states_with_escapes > 0.5 * result.states).sum() >= 3
+    assert 1e-5 < result.margin_m.max() < 5e-3
+
+
+def same(a: Result, b: Result) -> bool:
+    return all(np.array_equal(value, getattr(b, name)) for name, value in vars(a).items())
+
+
+def test_any_split_over_any_processes_gives_the_same() -> None:
+    plan = Plan("paper", "paper", SEED, motions_a_state=200)
+    whole = run(plan, 12 * 200, processes=1)
+    assert same(run(plan, 12 * 200, processes=2), whole)
+    parts = sample_states(plan, 0, 5)
+    parts.add(sample_states(plan, 5, 7))
+    assert same(parts, whole)
+    assert not same(run(replace(plan, seed=SEED + 1), 12 * 200, processes=1), whole)
+
+
+def test_the_command_tells_of_escapes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--samples", "3000", "--method", "paper", "--processes", "1"]) == 1
+    out = capsys.readouterr().out
+    assert "3,000 motions from 3 states" in out
+    assert "motions escaped; worst margin outside" in out
+    assert main(["--samples", "1000", "--method", "sound", "--processes", "1"]) == 0
+    assert "no motion escaped; worst margin inside by 0.00" in capsys.readouterr().out
+
+
+def test_the_command_tells_of_wrong_limits(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--samples", "10", "--limits", "nobody", "--processes", "1"]) == 2
+    assert "nobody" in capsys.readouterr().err
