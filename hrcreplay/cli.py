@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -38,6 +38,10 @@ Topic = Annotated[
     list[str] | None,
     typer.Option("--topic", metavar="NAME", help="Skeleton topic to read; default all that can be. May be repeated."),
 ]
+LimitSet = Annotated[
+    str | None,
+    typer.Option("--limits", metavar="SET", help="Limit set of the prediction: paper, human, or a TOML file."),
+]
 CellFile = Annotated[
     Path | None,
     typer.Option("--cell", metavar="CELL.toml", help="Poses of cameras and robot, as written by calibrate."),
@@ -67,8 +71,19 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
-def _overrides(settings: list[str] | None, topics: list[str] | None) -> tuple[str, ...]:
-    return (*(settings or ()), *([f"logs.topics={json.dumps(topics)}"] if topics else ()))
+def _overrides(
+    settings: list[str] | None, topics: list[str] | None = None, limits: str | None = None
+) -> tuple[str, ...]:
+    """Options that stand for a setting, as settings."""
+    short = [f"logs.topics={json.dumps(topics)}"] if topics else []
+    short += [f"limits.prediction={json.dumps(limits)}"] if limits else []
+    return (*(settings or ()), *short)
+
+
+def _span(start: float | None, end: float | None) -> dict[str, Any]:
+    if start is not None and end is not None and end <= start:
+        raise SettingsError(f"--end {end:g}: not after --start {start:g}; give a later second")
+    return {"start_s": start, "end_s": end}
 
 
 @app.callback()
@@ -153,6 +168,7 @@ def _stage(command: str, text: str) -> None:
         config: Config = None,
         settings: Set = None,
         topic: Topic = None,
+        limits: LimitSet = None,
         cell: CellFile = None,
         out: Out = None,
         start: Start = None,
@@ -162,17 +178,14 @@ def _stage(command: str, text: str) -> None:
     ) -> None:
         from hrcreplay import replay
 
-        if start is not None and end is not None and end <= start:
-            raise SettingsError(f"--end {end:g}: not after --start {start:g}; give a later second")
         folder = replay.run(
             command,
             source,
             out=out,
             config=config,
-            overrides=_overrides(settings, topic),
+            overrides=_overrides(settings, topic, limits),
             cell_file=cell,
-            start_s=start,
-            end_s=end,
+            **_span(start, end),
             smooth=smooth,
             chunk_ticks=chunk_ticks,
         )
@@ -186,6 +199,28 @@ _stage("report", "All stages, then metrics.json, figures and report.html.")
 
 
 @app.command()
+def audit(
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="LOG_OR_RUN...", help="Logs, or run folders of earlier stages.")
+    ],
+    config: Config = None,
+    settings: Set = None,
+    topic: Topic = None,
+    limits: LimitSet = None,
+    cell: CellFile = None,
+    out: Out = None,
+    start: Start = None,
+    end: End = None,
+) -> None:
+    """How often people left the volumes that were predicted for them, by method and limb."""
+    from hrcreplay import audit as driver
+
+    overrides = _overrides(settings, topic, limits)
+    folder = driver.run(sources, out=out, config=config, overrides=overrides, cell_file=cell, **_span(start, end))
+    sys.stdout.write(f"{folder}\n")
+
+
+@app.command()
 def demo(
     out: Out = None,
     config: Config = None,
@@ -195,7 +230,7 @@ def demo(
     """Report on the log that ships with hrcreplay: a worker beside a pick-and-place robot, two cameras, 60 s."""
     from hrcreplay import replay
 
-    overrides = tuple(settings or ())
+    overrides = _overrides(settings)
     folder = replay.run(
         "report", replay.demo_log(), out=out, config=config, overrides=overrides, chunk_ticks=chunk_ticks
     )
