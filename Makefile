@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test bench lock clean
+.PHONY: demo test bench soundness lock clean
 
 demo: $(VENV)/made
 	@$(BIN)/hrcreplay demo
@@ -16,6 +16,13 @@ test: $(VENV)/made
 
 bench: $(VENV)/made
 	$(BIN)/pytest tests/benchmarks --benchmark-only
+
+# Looks for a motion of the person that leaves the volumes of a method, on all cores.
+SAMPLES ?= 1000000
+METHOD ?= sound
+LIMITS ?= paper
+soundness: $(VENV)/made
+	$(BIN)/python -m tests.soundness --samples $(SAMPLES) --method $(METHOD) --limits $(LIMITS) --processes $(shell nproc)
 
 # Everything from the lock, by hash and without a compiler; then the project itself.
 $(VENV)/made: requirements.lock pyproject.toml
