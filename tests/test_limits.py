@@ -76,7 +76,12 @@ def test_a_file_of_the_users_own(tmp_path: Path) -> None:
     ("base", "found", "wrong", "message"),
     [
         ("human", "coupled = false", "coupled = 1", r"coupled: found 1; write true or false"),
-        ("human", "coupled = false", "coupled = false\nspeed = 1", r"unknown key 'speed'; known here: coupled, joints"),
+        (
+            "human",
+            "coupled = false",
+            "coupled = false\nspeed = 1",
+            r"unknown key 'speed'; known here: coupled, joints, provenance",
+        ),
         ("human", "\nar4 ", "\nar5 ", r"joints: unknown key 'ar5'; known here: x, y, theta"),
         ("human", "\nar4 ", "\n#ar4 ", r"joints.ar4: found None; write a row"),
         ("human", "{ position = [-inf, inf], velocity = [-1.3, 2.5]", "{ speed = 1", r"joints.x: unknown key 'speed'"),

@@ -1,7 +1,10 @@
-"""Named limit sets: ``paper`` (Table 1) and ``human`` (what people do); any other is read from its own file."""
+"""Named limit sets: ``paper`` (Table 1) and ``human`` (what people do); any other is a file of its own."""
 
 from __future__ import annotations
 
+import json
+import os
+import tempfile
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -25,6 +28,7 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
         name_or_path: ``paper``, ``human`` or a file like theirs: ``coupled`` and a table ``joints`` with a row
             ``{ position = [low, high], velocity = [...], acceleration = [...] }`` for each of JOINTS
             [m, m, rad...; per second; per second squared]. Where coupled, alpha_2 and alpha_3 have no position.
+            A table ``provenance`` may say where the bounds come from; it changes nothing.
 
     Raises:
         SettingsError: The file cannot be read, or a key or a bound is not what it should be.
@@ -39,7 +43,9 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path}: not TOML ({error})") from error
-    _known(table, ("coupled", "joints"), str(path))
+    _known(table, ("coupled", "joints", "provenance"), str(path))
+    if not isinstance(table.get("provenance", {}), dict):
+        raise SettingsError(f"{path}: provenance: found {table['provenance']!r}; write a table, or leave it out")
     coupled, joints = table.get("coupled"), table.get("joints")
     if not isinstance(coupled, bool):
         raise SettingsError(f"{path}: coupled: found {coupled!r}; write true or false")
@@ -51,6 +57,66 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
         _enclose(bounds)
     p, v, a = (np.ascontiguousarray(bounds[:, k].T) for k in range(len(_QUANTITIES)))
     return LimitSet(path.stem, p[0], p[1], v[0], v[1], a[0], a[1], coupled)
+
+
+def write_limits(limits: LimitSet, provenance: dict[str, Any], path: Path) -> None:
+    """Writes a limit set that ``load_limits`` reads, whole or not at all.
+
+    Args:
+        limits: Bounds; its name is that of the file.
+        provenance: Where they come from: texts, numbers, lists and tables.
+        path: File to make.
+
+    Raises:
+        SettingsError: The file exists, or its folder cannot be written.
+    """
+    if path.exists():
+        raise SettingsError(f"{path}: exists already; name another file, or remove it")
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be written ({error.strerror}); name a folder that can") from error
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(_toml(limits, provenance))
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.rename(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _toml(limits: LimitSet, provenance: dict[str, Any]) -> str:
+    pairs = ((limits.p_min, limits.p_max), (limits.v_min, limits.v_max), (limits.a_min, limits.a_max))
+    lines = [
+        "# [m, m, rad...; per second; per second squared]; x forward, y to the left",
+        f"coupled = {_value(limits.coupled)}",
+        "",
+        "[joints]",
+    ]
+    for j, joint in enumerate(JOINTS):
+        row = {name: [float(low[j]), float(high[j])] for name, (low, high) in zip(_QUANTITIES, pairs, strict=True)}
+        if limits.coupled and joint in _COUPLED:
+            del row["position"]
+        lines.append(f"{joint} = {_value(row)}")
+    lines += ["", "[provenance]", *(f"{key} = {_value(value)}" for key, value in provenance.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: Any) -> str:
+    """TOML of a value; a table on one line."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_value(part)}" for key, part in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        several = any(isinstance(part, dict) for part in value)
+        return (
+            ("[\n  " + ",\n  ".join(map(_value, value)) + ",\n]") if several else f"[{', '.join(map(_value, value))}]"
+        )
+    if isinstance(value, float):
+        return repr(value)
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _known(table: dict[str, Any], keys: tuple[str, ...], where: str) -> None:

@@ -1,0 +1,181 @@
+"""Limits from logs, from the log to the file that every stage takes."""
+
+from __future__ import annotations
+
+import shutil
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hrcreplay import fit, replay, runs
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.limits import load_limits
+from hrcreplay.logs.writer import LogWriter
+from hrcreplay.records import JOINTS, POINTS, CameraFrames
+from tests.realdata import data_path
+from tests.test_recordings import SARA, SARA_CELL
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+    out = tmp_path_factory.mktemp("fit") / "worker.toml"
+    return out, fit.run([replay.demo_log()], out=out, coverage=0.99)
+
+
+@pytest.fixture(scope="module")
+def provenance(fitted: tuple[Path, list[str]]) -> dict[str, Any]:
+    found: dict[str, Any] = tomllib.loads(fitted[0].read_text())["provenance"]
+    return found
+
+
+def test_the_file_is_a_limit_set(fitted: tuple[Path, list[str]]) -> None:
+    limits, human = load_limits(fitted[0]), load_limits("human")
+    assert limits.name == "worker"
+    assert not limits.coupled  # the worker's arms leave what (34) allows
+    np.testing.assert_array_equal(limits.p_min, human.p_min)
+    assert (limits.v_min < 0).all()
+    assert (limits.v_max > 0).all()
+    assert limits.v_max[0] < 2.0
+
+
+def test_provenance_tells_the_log_and_what_was_reached(provenance: dict[str, Any]) -> None:
+    (log,) = provenance["logs"]
+    assert log["sha256"] == runs.sha256(replay.demo_log())
+    assert log["recorded_future"] == "ground truth"
+    assert provenance["coverage_requested"] == 0.99
+    assert provenance["total"]["training"]["share"] >= 0.99
+    held_back = provenance["total"]["held_back"]
+    assert held_back["share"] > 0.9
+    assert held_back["low"] <= held_back["share"] <= held_back["high"]
+    # 60 s at 25 Hz, seven tenths of them to fit on, a horizon before the end of each part without its whole future
+    assert provenance["total"]["training"]["ticks"] == pytest.approx(0.7 * 1500 - 9, abs=15)
+    assert held_back["ticks"] == pytest.approx(0.3 * 1500 - 9, abs=3)
+
+
+def test_the_user_is_told(fitted: tuple[Path, list[str]], provenance: dict[str, Any]) -> None:
+    text = "\n".join(fitted[1])
+    for joint in JOINTS:
+        assert f"{joint}: velocity" in text or joint in provenance["kept"]
+    assert "demo.mcap: training 99." in text
+    assert "recorded postures leave the positions of paper" in text
+
+
+def test_a_stage_takes_the_file(tmp_path: Path, fitted: tuple[Path, list[str]]) -> None:
+    folder = replay.run(
+        "predict",
+        replay.demo_log(),
+        out=tmp_path / "run",
+        overrides=(f"limits.prediction={fitted[0]}",),
+        start_s=10.0,
+        end_s=11.0,
+    )
+    assert runs.read(folder).meta["limits"]["prediction"]["name"] == "worker"
+
+
+def test_the_same_logs_give_the_same_bytes(tmp_path: Path, fitted: tuple[Path, list[str]]) -> None:
+    fit.run([replay.demo_log()], out=tmp_path / "again.toml")
+    assert (tmp_path / "again.toml").read_bytes() == fitted[0].read_bytes()
+
+
+def test_the_part_held_back_changes_no_bound(tmp_path: Path, fitted: tuple[Path, list[str]]) -> None:
+    """Cut at 42 s, where the held-back part of 60 s begins, with no more than a horizon held back."""
+    fit.run([replay.demo_log()], out=tmp_path / "cut.toml", end_s=43.0, held_back=0.9999 / 43.0)
+    cut, whole = load_limits(tmp_path / "cut.toml"), load_limits(fitted[0])
+    for name in ("v_min", "v_max", "a_min", "a_max"):
+        np.testing.assert_array_equal(getattr(cut, name), getattr(whole, name))
+
+
+def test_several_logs_are_each_left_out_once(tmp_path: Path) -> None:
+    shutil.copy(replay.demo_log(), tmp_path / "copy.mcap")
+    out = tmp_path / "two.toml"
+    lines = fit.run([replay.demo_log(), tmp_path / "copy.mcap"], out=out, end_s=20.0, coverage=0.95)
+    logs = tomllib.loads(out.read_text())["provenance"]["logs"]
+    assert [log["name"] for log in logs] == ["demo.mcap", "copy.mcap"]
+    for log in logs:
+        # the copy fits the original as well as itself: its own training part, then the part that neither saw
+        assert log["left_out"]["ticks"] == log["training"]["ticks"] + log["held_back"]["ticks"]
+        assert log["left_out"]["share"] > 0.8
+        assert log["end_s"] == 20.0
+    assert sum("fitted to the other logs" in line for line in lines) == 2
+
+
+@pytest.mark.parametrize("coverage", [0.0, 1.0, 1.5, -0.1, float("nan")])
+def test_a_coverage_that_nothing_reaches_is_refused(tmp_path: Path, coverage: float) -> None:
+    with pytest.raises(SettingsError, match=r"--coverage .*: .*give a share between 0 and 1"):
+        fit.run([replay.demo_log()], out=tmp_path / "x.toml", coverage=coverage)
+
+
+def test_a_share_held_back_of_everything_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"--held-back 1: "):
+        fit.run([replay.demo_log()], out=tmp_path / "x.toml", held_back=1.0)
+
+
+def test_an_existing_file_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "x.toml").write_text("mine")
+    with pytest.raises(SettingsError, match="exists already"):
+        fit.run([replay.demo_log()], out=tmp_path / "x.toml")
+    assert (tmp_path / "x.toml").read_text() == "mine"
+
+
+@pytest.mark.parametrize("end_s", [0.2, 1.0])
+def test_a_log_shorter_than_its_parts_need_is_refused(tmp_path: Path, end_s: float) -> None:
+    with pytest.raises(LogError, match=r"found .* s; .* both need more than the horizon of 0.377 s"):
+        fit.run([replay.demo_log()], out=tmp_path / "x.toml", end_s=end_s)
+    assert not list(tmp_path.iterdir())
+
+
+def standing(path: Path) -> Path:
+    """A log of somebody who does not stir."""
+    n = 300
+    heights = {"pelvis": 1.0, "neck": 1.5, "head": 1.7, "shoulder": 1.5, "elbow": 1.2, "wrist": 0.95}
+    points = np.full((n, len(POINTS), 3), np.nan)
+    for k, point in enumerate(POINTS):
+        name, _, side = point.partition("_")
+        if name in heights:
+            points[:, k] = [0.02 * (name == "wrist"), {"l": 0.2, "r": -0.2}.get(side, 0.0), heights[name]]
+    t_ns = 1_700_000_000_000_000_000 + np.arange(n, dtype=np.int64) * 33_333_333
+    with LogWriter(path) as writer:
+        writer.camera("still", np.eye(4))
+        writer.frames(
+            CameraFrames(
+                capture_ns=t_ns,
+                arrival_ns=t_ns + 5_000_000,
+                camera=np.zeros(n, dtype=np.int64),
+                body=np.ones(n, dtype=np.int64),
+                points_m=points,
+                confidence=np.isfinite(points[:, :, 0]).astype(float),
+                cameras=("still",),
+            )
+        )
+    return path
+
+
+def test_no_arm_motion_is_refused_in_one_line(tmp_path: Path) -> None:
+    log = standing(tmp_path / "still.mcap")
+    with pytest.raises(LogError, match=r"still.mcap: found no arm motion") as caught:
+        fit.run([log], out=tmp_path / "x.toml")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "x.toml").exists()
+
+
+@pytest.mark.parametrize("name", ["exp_appraoching", "exp_box"])
+def test_a_real_recording(tmp_path: Path, name: str) -> None:
+    bag = data_path(f"sara_human_robot_bags/{name}.bag")
+    settings, cell, out = tmp_path / "s.toml", tmp_path / "cell.toml", tmp_path / "person.toml"
+    settings.write_text(SARA)
+    cell.write_text(SARA_CELL)
+    lines = fit.run([bag], out=out, config=settings, cell_file=cell)
+    limits, paper = load_limits(out), load_limits("paper")
+    found = tomllib.loads(out.read_text())["provenance"]
+    assert found["logs"][0]["recorded_future"] == "smoothed estimate"
+    assert found["total"]["training"]["share"] >= 0.99
+    assert found["total"]["held_back"]["share"] > 0.6  # 20 s are few: the interval says so
+    assert found["total"]["held_back"]["low"] < 0.7
+    assert "rho" in found["kept"]  # the person walks upright
+    assert any("too little motion to say" in line and "rho" in line for line in lines)
+    for joint in found["kept"]:
+        j = JOINTS.index(joint)
+        assert (limits.v_max[j], limits.a_max[j]) == (paper.v_max[j], paper.a_max[j])
