@@ -35,7 +35,7 @@ from hrcreplay.human.margins import Margins
 from hrcreplay.human.outer import CORNERS, DIRECTIONS, around, reach_turning
 from hrcreplay.human.stroll import SIDES
 from hrcreplay.human.surface import Surface, surface
-from hrcreplay.human.sweep import copies, sweep_rot
+from hrcreplay.human.sweep import TRIANGLE_RAD, copies, sweep_rot
 from hrcreplay.human.walk import polygon, sweep_walk
 from hrcreplay.records import LIMBS, Floats, HumanStates, Ints
 
@@ -43,6 +43,8 @@ from hrcreplay.records import LIMBS, Floats, HumanStates, Ints
 ROUNDING_M = 1e-9
 #: More points than a rotation or walking may make: the polytope around them is made instead.
 MOST_COPIED = 2000
+#: Beyond this many, walking makes triangles of 60 degrees.
+MOST_FINE = 700
 #: Only smaller sets are reduced to their corners: the time goes with the square.
 MOST_REDUCED = 256
 #: Largest angle of a triangle around an arc: its apex is then at most 3.6 % of the radius off [rad].
@@ -151,10 +153,12 @@ def _limb(
     if not np.isfinite(ends.sum() + chain.sum() + corners.sum() + low[2] + high[2]):
         return np.full((1, 3), np.nan), 1
     points, count, faces = _turn_all(ends, chain, work)
-    room = count * copies(low[2], high[2], FINE_RAD) * SIDES
+    fine = count * copies(low[2], high[2], FINE_RAD) * SIDES <= MOST_FINE
+    widest = FINE_RAD if fine else TRIANGLE_RAD
+    room = count * copies(low[2], high[2], widest) * SIDES
     if count <= MOST_REDUCED and room <= MOST_COPIED:
         swept = np.empty((room, 3))
-        many = sweep_walk(points, count, faces, work, (low[2], high[2]), polygon(corners), swept, FINE_RAD)
+        many = sweep_walk(points, count, faces, work, (low[2], high[2]), polygon(corners), swept, widest)
         if many > MOST_CORNERS:
             many, _ = keep_corners(swept, many, work)
         if many <= MOST_CORNERS:
