@@ -1,3 +1,26 @@
 """Replays recorded human-robot sessions through a safety-aware trajectory generator."""
 
+import hashlib
+import os
+from pathlib import Path
+
 __version__ = "0.1.0"
+
+
+def _keep_kernels_apart() -> None:
+    """Gives the compiled kernels of each state of the sources a folder of their own.
+
+    numba compares a cached kernel with the file that it stands in, not with those of the functions it calls: after an
+    update it would go on with old code inside new. So the folder's name is a digest of all of them.
+    """
+    here = Path(__file__).parent
+    digest = hashlib.sha256()
+    for source in sorted([*here.glob("human/*.py"), *here.glob("robot/*.py")]):
+        digest.update(source.read_bytes())
+    cache = here / "__pycache__"
+    if not os.access(cache if cache.exists() else here, os.W_OK):
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hrcreplay"
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(cache / f"kernels-{digest.hexdigest()[:16]}"))
+
+
+_keep_kernels_apart()

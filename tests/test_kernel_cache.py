@@ -1,0 +1,41 @@
+"""Compiled kernels of other sources are never used: numba itself looks only at a kernel's own file."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import hrcreplay
+
+ASK = "import os, hrcreplay; print(os.environ['NUMBA_CACHE_DIR'])"
+
+
+def _cache(package: Path, **environment: str) -> str:
+    clean = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-c", ASK],
+        cwd=package.parent,
+        env={**clean, **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+def test_a_changed_source_gets_a_cache_of_its_own(tmp_path: Path) -> None:
+    package = tmp_path / "hrcreplay"
+    shutil.copytree(Path(hrcreplay.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    before = _cache(package)
+    assert Path(before).is_relative_to(tmp_path)
+    assert _cache(package) == before
+    vectors = package / "human" / "vectors.py"
+    vectors.write_text(vectors.read_text() + "\n# changed\n")
+    assert _cache(package) != before
+
+
+def test_the_users_own_choice_stands(tmp_path: Path) -> None:
+    assert _cache(Path(hrcreplay.__file__).parent, NUMBA_CACHE_DIR=str(tmp_path)) == str(tmp_path)
