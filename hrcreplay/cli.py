@@ -220,6 +220,30 @@ def audit(
     sys.stdout.write(f"{folder}\n")
 
 
+@app.command(name="fit-limits")
+def fit_limits(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG_OR_RUN...", help="Logs of people, or runs on them.")],
+    out: Annotated[Path, typer.Option("--out", metavar="LIMITS.toml", help="Limit set to write.")],
+    coverage: Annotated[
+        float, typer.Option("--coverage", metavar="SHARE", help="Share of the ticks to cover, between 0 and 1.")
+    ] = 0.99,
+    config: Config = None,
+    settings: Set = None,
+    topic: Topic = None,
+    cell: CellFile = None,
+    start: Start = None,
+    end: End = None,
+) -> None:
+    """The tightest velocity and acceleration bounds that cover what people did; for --limits."""
+    from hrcreplay import fit
+
+    overrides = _overrides(settings, topic)
+    options = {"config": config, "overrides": overrides, "cell_file": cell, **_span(start, end)}
+    for line in fit.run(logs, out=out, coverage=coverage, **options):
+        sys.stderr.write(f"hrcreplay: {line}\n")
+    sys.stdout.write(f"{out}\n")
+
+
 @app.command()
 def demo(
     out: Out = None,

@@ -37,7 +37,7 @@ SHORT = ("--start", 8, "--end", 8.4)
 def test_help_lists_every_command(run: Run) -> None:
     code, out, _ = run("--help")
     assert code == 0
-    for command in ("info", "import", "calibrate", "fuse", "predict", "plan", "report", "audit", "demo"):
+    for command in ("info", "import", "calibrate", "fuse", "predict", "plan", "report", "audit", "fit-limits", "demo"):
         assert f" {command} " in out
 
 
