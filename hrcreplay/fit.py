@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from hrcreplay import __version__, wiring
+from hrcreplay import __version__, tighten, wiring
 from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.follow import window
 from hrcreplay.human import fitting
 from hrcreplay.human.fitting import Fit, Futures
 from hrcreplay.human.model import LimitSet
@@ -20,7 +21,7 @@ from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import NS, tick_times
 from hrcreplay.progress import Bar
-from hrcreplay.recorded import SMOOTHED, TRUTH, record
+from hrcreplay.recorded import SMOOTHED, TRUTH, Recording, record
 from hrcreplay.records import JOINTS, Floats
 from hrcreplay.report.coverage import Estimate, block_ticks, resample
 
@@ -28,6 +29,8 @@ from hrcreplay.report.coverage import Estimate, block_ticks, resample
 FIT_HZ, SEEN_S, SEED = 25.0, 0.25, 3
 #: The limit sets that joints keep which cannot be fitted, and whose positions hold more than those.
 STANDARD, WIDE = "paper", "human"
+#: What the coverage is of: joints in their intervals, or limbs in their volumes.
+COVERS = ("joints", "limbs")
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Sample:
     training: Futures
     held_back: Futures
     outside: bool  #: whether a training posture is outside the standard positions
+    limbs: tighten.Held
 
 
 def run(
@@ -53,6 +57,7 @@ def run(
     start_s: float | None = None,
     end_s: float | None = None,
     held_back: float = 0.3,
+    cover: str = "joints",
 ) -> list[str]:
     """Fits velocity and acceleration bounds to logs and writes them as a limit set.
 
@@ -69,6 +74,9 @@ def run(
         start_s: First second of every log.
         end_s: Last one.
         held_back: Share of every log's time, its end.
+        cover: ``joints``: the share is of ticks with all fitted joints in their intervals of Alg. 1. ``limbs``: of
+            ticks with all limbs in the volumes of ``occupancy.method``, margins and all; the bounds that hold the
+            joints are scaled down to what holds the limbs.
 
     Returns:
         What the user should know, line by line.
@@ -81,6 +89,8 @@ def run(
         raise SettingsError(f"--coverage {coverage:g}: no bound holds always or never; give a share between 0 and 1")
     if not 0.0 < held_back < 1.0:
         raise SettingsError(f"--held-back {held_back:g}: would be right: a share between 0 and 1")
+    if cover not in COVERS:
+        raise SettingsError(f"--cover {cover}: would be right: {', '.join(COVERS)}")
     if not logs:
         raise SettingsError("fit-limits: found no log; give at least one")
     if out.exists():
@@ -94,7 +104,11 @@ def run(
     samples = [_sample(job, horizon_s, held_back) for job in jobs]
     found = _fit(samples, coverage, horizon_s)
     limits = _limits(found, samples, out.stem)
-    facts = _facts(samples, found, limits, coverage, horizon_s, held_back)
+    limbs: dict[str, Any] = {}
+    if cover == "limbs":
+        found, limbs = _tightened([sample.limbs for sample in samples], found, limits, coverage, horizon_s)
+        limits = found.onto(limits, out.stem)
+    facts = _facts(samples, found, limits, coverage, horizon_s, held_back) | {"covers": cover} | limbs
     write_limits(limits, facts, out)
     return _lines(found, limits, facts)
 
@@ -138,7 +152,31 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
         some.rows(some.t_ns + round(horizon_s * NS) <= cut_ns),
         some.rows(some.t_ns > cut_ns),
         bool(fitting.leave(training.p, load_limits(STANDARD)).any()),
+        _limbs(job, recording, cut_ns, horizon_s),
     )
+
+
+def _limbs(job: Job, recording: Recording, cut_ns: int, horizon_s: float) -> tighten.Held:
+    states, horizon_ns = recording.states, round(horizon_s * NS)
+    ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / tighten.TIGHTEN_HZ)))
+    ticks = ticks[np.isfinite(states.p[ticks]).all(axis=1)]
+    end_ns = states.t_ns[ticks] + horizon_ns
+    parts = ticks[end_ns <= cut_ns], ticks[(states.t_ns[ticks] > cut_ns) & (end_ns <= recording.t_ns[-1])]
+    return tighten.Held(wiring.foresight(job), *(window(recording, part, horizon_s) for part in parts))
+
+
+def _tightened(
+    people: Sequence[tighten.Held], found: Fit, limits: LimitSet, coverage: float, horizon_s: float
+) -> tuple[Fit, dict[str, Any]]:
+    """The fit scaled down to what holds the limbs, and what it holds."""
+    factor = tighten.factor(people, found, limits, coverage)
+    found = tighten.scaled(found, factor)
+    limits = found.onto(limits, limits.name)
+    shares = {}
+    for name in ("training", "held_back"):
+        parts = [tighten.stayed(one.foresight, getattr(one, name), limits)[:, None] for one in people]
+        shares[name] = _plain(_share(parts, horizon_s, tighten.TIGHTEN_HZ))
+    return found, {"factor": round(factor, 4), "method": people[0].foresight.method, "limbs": shares}
 
 
 def _fit(samples: Sequence[Sample], coverage: float, horizon_s: float) -> Fit:
@@ -158,12 +196,11 @@ def _limits(found: Fit, samples: Sequence[Sample], name: str) -> LimitSet:
     return found.onto(standard, name)
 
 
-def _share(within: Sequence[Floats], horizon_s: float) -> Estimate:
+def _share(within: Sequence[Floats], horizon_s: float, rate_hz: float = FIT_HZ) -> Estimate:
     """Share of the ticks of some logs in which all joints stayed inside, with its interval."""
     hits = [fitting.together(part) for part in within]
     lengths = [len(part) for part in hits]
-    look = horizon_s * FIT_HZ
-    drawn = resample(lengths, block_ticks(horizon_s, FIT_HZ, max(lengths)), look, SEED)
+    drawn = resample(lengths, block_ticks(horizon_s, rate_hz, max(lengths)), horizon_s * rate_hz, SEED)
     return drawn.share(np.concatenate(hits))
 
 
@@ -243,7 +280,13 @@ def _lines(found: Fit, limits: LimitSet, facts: dict[str, Any]) -> list[str]:
         left_out = f"; fitted to the other logs {_text(log['left_out'])}" if "left_out" in log else ""
         lines.append(f"{log['name']}: training {_text(log['training'])}; held back {_text(log['held_back'])}{left_out}")
     total = facts["total"]
-    return [*lines, f"all: training {_text(total['training'])}; held back {_text(total['held_back'])}"]
+    if "limbs" in facts:
+        limbs = facts["limbs"]
+        lines.append(
+            f"limbs in the volumes of {facts['method']}, with {facts['factor']:g} of what holds the joints: "
+            f"training {_text(limbs['training'])}; held back {_text(limbs['held_back'])}"
+        )
+    return [*lines, f"all joints: training {_text(total['training'])}; held back {_text(total['held_back'])}"]
 
 
 def _text(share: dict[str, Any]) -> str:

@@ -102,6 +102,25 @@ def test_several_logs_are_each_left_out_once(tmp_path: Path) -> None:
     assert sum("fitted to the other logs" in line for line in lines) == 2
 
 
+def test_covering_the_limbs_needs_less_than_covering_the_joints(tmp_path: Path, fitted: tuple[Path, list[str]]) -> None:
+    out = tmp_path / "limbs.toml"
+    lines = fit.run([replay.demo_log()], out=out, cover="limbs", overrides=("occupancy.method=sound",))
+    limits, joints = load_limits(out), load_limits(fitted[0])
+    found = tomllib.loads(out.read_text())["provenance"]
+    assert found["covers"] == "limbs"
+    assert found["method"] == "sound"
+    assert found["factor"] < 1.0
+    assert limits.v_max[0] < joints.v_max[0]
+    assert found["limbs"]["training"]["share"] >= 0.99
+    assert found["limbs"]["held_back"]["share"] >= 0.99
+    assert any("limbs in the volumes of sound" in line for line in lines)
+
+
+def test_another_kind_of_coverage_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="--cover toes: would be right: joints, limbs"):
+        fit.run([replay.demo_log()], out=tmp_path / "x.toml", cover="toes")
+
+
 @pytest.mark.parametrize("coverage", [0.0, 1.0, 1.5, -0.1, float("nan")])
 def test_a_coverage_that_nothing_reaches_is_refused(tmp_path: Path, coverage: float) -> None:
     with pytest.raises(SettingsError, match=r"--coverage .*: .*give a share between 0 and 1"):
