@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
 .PHONY: demo test bench soundness lock clean
 
@@ -24,13 +25,14 @@ LIMITS ?= paper
 soundness: $(VENV)/made
 	$(BIN)/python -m tests.soundness --samples $(SAMPLES) --method $(METHOD) --limits $(LIMITS) --processes $(shell nproc)
 
-# Everything from the lock, by hash and without a compiler; then the project itself.
+# Everything from the lock, by hash and without a compiler; then the project itself, its kernels compiled once.
 $(VENV)/made: requirements.lock pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
-	rm -rf $(VENV)/first-run
-	$(BIN)/hrcreplay report datasets/demo.mcap --start 8 --end 10 --out $(VENV)/first-run  # compiles the kernels, once
+	@echo "Building $(VENV): a minute and a half, once."
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) --require-hashes --only-binary :all: -r requirements.lock
+	@$(PIP) --no-deps --no-build-isolation --editable .
+	@rm -rf $(VENV)/first-run
+	@$(BIN)/hrcreplay report datasets/demo.mcap --start 8 --end 10 --out $(VENV)/first-run >$(VENV)/first-run.log
 	@touch $@
 
 # Needs uv. Writes versions and hashes, never an index's address.
