@@ -73,7 +73,7 @@ def violation(
     q: Floats,
     dq: Floats,
     u: Floats,
-    status: Ints,
+    status: Ints | Floats,
     volumes: SweptVolumes,
     T_world_base: Floats,
     *,
