@@ -132,7 +132,6 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
     states, joints = recording.states, recording.joints
     if recording.source != TRUTH:
         joints = fitting.believed(joints, states.unseen_s, SEEN_S)
-    margins = wiring.foresight(job).margins
     every = max(1, round(rate_hz / FIT_HZ))
     ticks = np.arange(0, len(states), every)
     some = fitting.futures(
@@ -141,7 +140,6 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
         recording.joints_t_ns,
         joints,
         horizon_s=horizon_s,
-        sigmas=margins.sigmas if job.settings.occupancy.method == "sound" else 0.0,
         memory_s=SEEN_S,
     )
     training = states.rows(states.t_ns <= cut_ns)

@@ -1,9 +1,9 @@
 """The tightest bounds under which Alg. 1 holds what people went on to do.
 
-A joint's recorded future lies in its interval where the highest and the lowest of it do, so a tick is four numbers: the
-velocity either way, and how far the joint then got up and down within the horizon. For a given velocity bound each tick
-needs an acceleration bound of at least so much, in closed form; how many ticks may be missed picks one of these. Of all
-pairs that miss no more, the fit takes the one whose intervals are shortest on average.
+A joint's recorded future lies in its interval where the highest and the lowest of it do, so a tick is three numbers:
+the velocity, and how far the joint then got up and down within the horizon. For a given velocity bound each tick needs
+an acceleration bound of at least so much, in closed form; how many ticks may be missed picks one of these. Of all pairs
+that miss no more, the fit takes the one whose intervals are shortest on average.
 """
 
 from __future__ import annotations
@@ -41,17 +41,20 @@ _SHOWN_BY = np.array(
 
 @dataclass(frozen=True)
 class Futures(Table):
-    """What each joint did within the horizon of a tick, seen from the likely states furthest from it. (n, 12) each.
+    """What each joint did within the horizon of a tick, seen from the fused state. (n, 12) each.
 
     x and y are those of the body frame at the tick: forward, to the left. NaN where not recorded to the end.
     """
 
     t_ns: Ints  #: (n,)
-    v_low: Floats  #: smallest velocity of the likely states [m/s, m/s, rad/s...]
-    v_high: Floats  #: largest one
-    down: Floats  #: lowest recorded position, from the lowest likely one [m, m, rad...]
-    up: Floats  #: highest recorded position, from the highest likely one
-    moved: Floats  #: highest minus lowest recorded position
+    v: Floats  #: estimated velocity [m/s, m/s, rad/s...]
+    down: Floats  #: lowest recorded position, from the estimated one [m, m, rad...]
+    up: Floats  #: highest one
+
+    @property
+    def moved(self) -> Floats:
+        """Highest minus lowest recorded position."""
+        return self.up - self.down
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class Fit:
 
 
 def futures(
-    states: HumanStates, ticks: Ints, t_ns: Ints, joints: Floats, *, horizon_s: float, sigmas: float, memory_s: float
+    states: HumanStates, ticks: Ints, t_ns: Ints, joints: Floats, *, horizon_s: float, memory_s: float
 ) -> Futures:
     """The recorded futures (t, t + T_s] of some ticks.
 
@@ -81,7 +84,6 @@ def futures(
         t_ns: (m,) instants of the recorded joints, increasing.
         joints: (m, 12) recorded JOINTS [m, m, rad...].
         horizon_s: T_s [s].
-        sigmas: States within so many standard deviations of the estimate are likely.
         memory_s: What no camera had seen for longer at the tick says nothing [s].
     """
     at = states.rows(ticks)
@@ -95,9 +97,7 @@ def futures(
         apart = _turned(nearest(future, now) - now, c[i], s[i])
         low[i], high[i] = apart.min(axis=0), apart.max(axis=0)
     low, high = believed(low, at.unseen_s, memory_s), believed(high, at.unseen_s, memory_s)
-    v = _turned(at.v, c, s)
-    p_off, v_off = (sigmas * _turned(std, np.abs(c), np.abs(s), mirror=1.0) for std in (at.p_std, at.v_std))
-    return Futures(at.t_ns, v - v_off, v + v_off, low + p_off, high - p_off, high - low)
+    return Futures(at.t_ns, _turned(at.v, c, s), low, high)
 
 
 def believed(joints: Floats, unseen_s: Floats, memory_s: float) -> Floats:
@@ -151,8 +151,8 @@ def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -
 
 def inside(some: Futures, bounds: Fit | LimitSet, horizon_s: float) -> Floats:
     """(n, 12) whether each joint stayed in its interval, stops aside: 1, 0, or NaN where not recorded."""
-    high = farthest(some.v_high, bounds.v_max, bounds.a_max, horizon_s)
-    low = -farthest(-some.v_low, -bounds.v_min, -bounds.a_min, horizon_s)
+    high = farthest(some.v, bounds.v_max, bounds.a_max, horizon_s)
+    low = -farthest(-some.v, -bounds.v_min, -bounds.a_min, horizon_s)
     within = (some.up <= high) & (some.down >= low)
     return np.where(np.isfinite(some.moved), within.astype(float), np.nan)
 
@@ -183,7 +183,7 @@ class _Side:
 
     def __init__(self, some: Futures, joint: int, upward: bool, horizon_s: float) -> None:
         self.joint, self.upward = joint, upward
-        v, gone = (some.v_high, some.up) if upward else (-some.v_low, -some.down)
+        v, gone = (some.v, some.up) if upward else (-some.v, -some.down)
         self._v, self._gone, self._horizon_s = v[:, joint], gone[:, joint], horizon_s
         self._known: dict[int, _Pair] = {}
         self.misses = 0
@@ -273,8 +273,8 @@ def _excursions(t_ns: Ints, moving: Bools, horizon_s: float) -> int:
     return count
 
 
-def _turned(rows: Floats, c: Floats, s: Floats, mirror: float = -1.0) -> Floats:
-    """Rows (n, 12) of JOINTS or their rates with x and y along the body's axes, Eq. (33); with 1, of deviations."""
+def _turned(rows: Floats, c: Floats, s: Floats) -> Floats:
+    """Rows (n, 12) of JOINTS or their rates with x and y along the body's axes, Eq. (33)."""
     turned = rows.copy()
-    turned[:, 0], turned[:, 1] = c * rows[:, 0] + s * rows[:, 1], c * rows[:, 1] + mirror * s * rows[:, 0]
+    turned[:, 0], turned[:, 1] = c * rows[:, 0] + s * rows[:, 1], c * rows[:, 1] - s * rows[:, 0]
     return turned
