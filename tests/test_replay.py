@@ -15,7 +15,7 @@ from hrcreplay import replay, runs
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import JOINTS, LENGTHS, LIMBS, SweptVolumes
+from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, SweptVolumes
 from hrcreplay.runs import Run
 from tests.robot import checker
 
@@ -104,7 +104,7 @@ def test_every_tick_not_in_braking_keeps_inequality_2(demo: Run, name: str) -> N
     table = demo.motion if name == "qp" else demo.baselines[name]
     assert table is not None
     assert demo.T_world_base is not None
-    status = table["status"].map({"tracking": 0, "limited": 1, "braking": 2}).to_numpy(dtype=np.int64)
+    status = np.array([STATUSES.index(name) for name in table["status"]])
     q, dq, u = (table[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq", "u"))
     worst = checker.violation(q, dq, u, status, _volumes(demo), demo.T_world_base, dt_s=0.004, stop_s=0.377)
     assert worst.metres <= 1e-6
