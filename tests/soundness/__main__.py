@@ -30,6 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
         latency_s=options.latency,
         sigmas=options.sigmas,
         hand_m=options.hand,
+        unseen_s=options.unseen,
         beyond=options.beyond,
     )
     console = Console(stderr=True)
@@ -42,9 +43,9 @@ def main(arguments: list[str] | None = None) -> int:
     except HrcReplayError as error:
         console.print(str(error), highlight=False)
         return 2
-    _tell(Console(), plan, result)
     rate = result.motions / (time.perf_counter() - start)
     console.print(f"{rate:,.0f} motions/s with {options.processes} processes", highlight=False)
+    _tell(Console(), plan, result)
     return int(escaped(result))
 
 
@@ -59,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--latency", type=float, default=0.0, help="added to the horizon [s]")
     parser.add_argument("--sigmas", type=float, default=0.0, help="draw the truth within so many sigma of the estimate")
     parser.add_argument("--hand", type=float, default=0.0, help="length of the hand beyond the wrist [m]")
+    parser.add_argument("--unseen", type=float, default=0.0, help="for how long nobody has seen the person [s]")
     beyond = "also velocities above their bounds that come back, and limits that bring joints to rest at once"
     parser.add_argument("--beyond", action="store_true", help=beyond)
     return parser

@@ -1,4 +1,4 @@
-"""Motions that obey the model: joints exactly, piece by piece; walking by Gauss's rule on smooth pieces.
+"""Motions that obey the model.
 
 A joint wishes for an acceleration. It gets it until its velocity is at a bound, and then keeps that velocity.
 
@@ -17,36 +17,24 @@ import math
 import numpy as np
 from numba import njit
 
-from hrcreplay.human.model import LimitSet
 from hrcreplay.records import Floats, Ints
+from tests.soundness.joint import P_MAX, P_MIN, V_MAX, V_MIN, Rates, accelerate, along, rates_of, stops_at
+from tests.soundness.walking import walk
 
 #: Joints whose limits are checked together: the torso, the right arm, the left arm. First joint and one past the last.
 GROUPS = ((3, 4), (4, 8), (8, 12))
-#: Rows of bounds, (6, 12). The first two are NaN where (34b), (34c) tell instead.
-P_MIN, P_MAX, V_MIN, V_MAX, A_MIN, A_MAX = range(6)
 _DEGREE = math.pi / 180.0
 #: Halvings in search of the last instant to brake, and the finest steps towards a limit: to end there, to rest there.
 _HALVINGS = 10
 _FINEST, _EXACT = 2.0**-7, 2.0**-40
 #: More steps are not spent on one limit: what lasted so far is what lasts.
 _TRIALS = 200
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 Range = tuple[float, float]
 #: Careful or not, and whether limits bring joints to rest.
 Style = tuple[bool, bool]
 #: For how long [s], and whether a limit was met.
 Moved = tuple[float, bool]
-#: Smallest and largest velocity, smallest and largest acceleration of one joint.
-Rates = tuple[float, float, float, float]
-
-
-def bounds_of(limits: LimitSet) -> Floats:
-    """(6, 12) bounds of all joints; x and y bound the forward and lateral motion of the body."""
-    bounds = np.stack([limits.p_min, limits.p_max, limits.v_min, limits.v_max, limits.a_min, limits.a_max])
-    if limits.coupled:
-        bounds[:2, [5, 6, 9, 10]] = np.nan
-    return bounds
 
 
 @njit(cache=True)
@@ -91,7 +79,7 @@ def step(
                 ended[g] = not (stops and _rest(q, v, wish, until, h * _EXACT, g, bounds))
                 if ended[g]:
                     v[GROUPS[g][0] : GROUPS[g][1]] = 0.0
-    _walk(q, v, wish, moved, bounds)
+    walk(q, v, wish, moved, bounds)
     for j in range(12):  # not to come back for ever
         for bound in (bounds[V_MIN, j], bounds[V_MAX, j]):
             if abs(v[j] - bound) < 1e-12:
@@ -128,54 +116,6 @@ def _rest(q: Floats, v: Floats, wish: Floats, until: Floats, dt: float, group: i
 
 
 @njit(cache=True)
-def rates_of(bounds: Floats, j: int) -> Rates:
-    return bounds[V_MIN, j], bounds[V_MAX, j], bounds[A_MIN, j], bounds[A_MAX, j]
-
-
-@njit(cache=True)
-def along(q: float, v: float, wish: float, until: float, h: float, rates: Rates) -> tuple[float, float, float, float]:
-    """A joint that accelerates as it wishes for ``until`` and then brakes: position, velocity, and the range passed."""
-    q, v, low, high = _accelerate(q, v, wish, min(until, h), rates)
-    if h > until and v != 0.0:
-        a = rates[2] if v > 0.0 else rates[3]
-        rest = -v / a
-        t = min(h - until, rest)
-        q += v * t + 0.5 * a * t * t
-        v = 0.0 if t == rest else v + a * t
-    return q, v, min(low, q), max(high, q)
-
-
-@njit(cache=True)
-def _accelerate(q: float, v: float, a: float, h: float, rates: Rates) -> tuple[float, float, float, float]:
-    t = _saturates(v, a, h, rates)
-    v_end = v + a * t
-    if t < h:
-        v_end = rates[1] if a > 0.0 else rates[0]
-    q_end = q + v * t + 0.5 * a * t * t + v_end * (h - t)
-    low, high = min(q, q_end), max(q, q_end)
-    if a != 0.0 and 0.0 < -v / a < t:
-        turning = q - 0.5 * v * v / a
-        low, high = min(low, turning), max(high, turning)
-    return q_end, v_end, low, high
-
-
-@njit(cache=True)
-def _saturates(v: float, a: float, h: float, rates: Rates) -> float:
-    """When the velocity comes to a bound, at the latest h [s]."""
-    if a > 0.0 and v + a * h > rates[1]:
-        return max(0.0, (rates[1] - v) / a)
-    if a < 0.0 and v + a * h < rates[0]:
-        return max(0.0, (rates[0] - v) / a)
-    return h
-
-
-@njit(cache=True)
-def stops_at(q: float, v: float, rates: Rates) -> float:
-    """Where a joint comes to rest that brakes from now on."""
-    return q - 0.5 * v * v / (rates[2] if v > 0.0 else rates[3])
-
-
-@njit(cache=True)
 def _brake_in_time(
     q: Floats, v: Floats, wish: Floats, h: float, bounds: Floats, until: Floats, low: Floats, high: Floats
 ) -> None:
@@ -206,7 +146,7 @@ def _last_moment(q: float, v: float, wish: float, h: float, least: float, most: 
 @njit(cache=True)
 def _can_stop(q: float, v: float, wish: float, t: float, least: float, most: float, rates: Rates) -> bool:
     """Whether a joint that does as it wishes for t stays within its limits, and still can after that."""
-    q, v, low, high = _accelerate(q, v, wish, t, rates)
+    q, v, low, high = accelerate(q, v, wish, t, rates)
     return least <= low and high <= most and least <= stops_at(q, v, rates) <= most
 
 
@@ -266,34 +206,3 @@ def allowed(j: int, low: Floats, high: Floats, bounds: Floats) -> Range:
             least = max(least, -90.0 + 7.0 / 9.0 * a - b / 9.0 + 2.0 / 810.0 * a * b)
             most = min(most, 60.0 + 4.0 / 9.0 * a - 5.0 / 9.0 * b + 5.0 / 810.0 * a * b)
     return least * _DEGREE, most * _DEGREE
-
-
-@njit(cache=True)
-def _walk(q: Floats, v: Floats, wish: Floats, h: float, bounds: Floats) -> None:
-    """Eq. (25) for h [s]. Between the instants at which a velocity comes to its bound, all is smooth."""
-    when = (
-        _saturates(v[0], wish[0], h, rates_of(bounds, 0)),
-        _saturates(v[1], wish[1], h, rates_of(bounds, 1)),
-        _saturates(v[2], wish[2], h, rates_of(bounds, 2)),
-    )
-    first, last = min(when), max(when)
-    cuts = (0.0, first, when[0] + when[1] + when[2] - first - last, last, h)
-    dx, dy = 0.0, 0.0
-    for i in range(4):
-        half = 0.5 * (cuts[i + 1] - cuts[i])
-        if half > 0.0:
-            for node, weight in zip(_NODES, _WEIGHTS):  # noqa: B905 (numba knows no strict)
-                t = cuts[i] + half * (1.0 + node)
-                forward = v[0] + wish[0] * min(t, when[0])
-                left = v[1] + wish[1] * min(t, when[1])
-                turning = min(t, when[2])
-                theta = q[2] + v[2] * t + wish[2] * turning * (t - 0.5 * turning)
-                c, s = math.cos(theta), math.sin(theta)
-                dx += half * weight * (forward * c - left * s)
-                dy += half * weight * (forward * s + left * c)
-    q[0] += dx
-    q[1] += dy
-    for k in range(3):
-        q_end, v[k], _, _ = _accelerate(q[k], v[k], wish[k], h, rates_of(bounds, k))
-        if k == 2:
-            q[k] = q_end

@@ -15,8 +15,9 @@ from hrcreplay.human.occupancy import Radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
 from tests.soundness.facets import distance_m, facets_of
+from tests.soundness.joint import bounds_of
 from tests.soundness.kinematics import CORNERS, POINTS
-from tests.soundness.motion import GROUPS, bounds_of
+from tests.soundness.motion import GROUPS
 from tests.soundness.sampler import BLOCK, ROUNDING_M, Corners, sample
 from tests.soundness.states import draw_estimate, states_of
 
@@ -36,11 +37,21 @@ class Plan:
     latency_s: float = 0.0
     sigmas: float = 0.0
     hand_m: float = 0.0
+    unseen_s: float = 0.0  #: for how long nobody has seen the person [s]
     beyond: bool = False  #: also velocities above their bounds, and limits that bring joints to rest
 
     def __post_init__(self) -> None:
         if self.motions_a_state % BLOCK:
             raise ValueError(f"motions_a_state: found {self.motions_a_state}; take a multiple of {BLOCK}")
+
+    @property
+    def margins(self) -> Margins:
+        return Margins(sigmas=self.sigmas, latency_s=self.latency_s, hand_m=self.hand_m, legs_radius_m=0.0)
+
+    @property
+    def coasted_s(self) -> float:
+        """For how long the filter went on without measurements: at most for its memory."""
+        return self.margins.memory_s if self.unseen_s > self.margins.memory_s else 0.0
 
 
 @dataclass
@@ -87,7 +98,7 @@ def predict(states: HumanStates, plan: Plan) -> SweptVolumes:
         horizon_s=plan.horizon_s,
         radii=Radii(0.0, 0.0, 0.0, 0.0),
         method=plan.method,
-        margins=Margins(sigmas=plan.sigmas, latency_s=plan.latency_s, hand_m=plan.hand_m, legs_radius_m=0.0),
+        margins=plan.margins,
     )
 
 
@@ -95,8 +106,8 @@ def sample_states(plan: Plan, first: int, count: int) -> Result:
     """Samples the states of these numbers. Each has its own stream of chance, so any split gives the same."""
     limits = load_limits(plan.limits)
     generators = [np.random.default_rng([plan.seed, number]) for number in range(first, first + count)]
-    estimates = [draw_estimate(rng, limits, plan.sigmas, plan.beyond) for rng in generators]
-    volumes = predict(states_of(estimates, plan.sigmas), plan)
+    estimates = [draw_estimate(rng, limits, plan.sigmas, plan.beyond, plan.coasted_s) for rng in generators]
+    volumes = predict(states_of(estimates, plan.unseen_s), plan)
     corners, total = corners_of(volumes.limbs), Result(volumes.limbs)
     for i, (rng, estimate) in enumerate(zip(generators, estimates, strict=True)):
         clouds = [volumes.vertices(i, k) for k in range(len(volumes.limbs))]
@@ -105,7 +116,7 @@ def sample_states(plan: Plan, first: int, count: int) -> Result:
             rng,
             estimate,
             bounds_of(limits),
-            plan.horizon_s + plan.latency_s,
+            plan.unseen_s + plan.horizon_s + plan.latency_s,
             plan.hand_m,
             plan.beyond,
             corners,

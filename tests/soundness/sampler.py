@@ -14,7 +14,7 @@ from tests.soundness.motion import GROUPS, step
 from tests.soundness.truth import Estimate, draw_truth, vary_truth
 from tests.soundness.wishes import MUTATE, ORDER, PUSH, draw, mutate, push
 
-#: Points and sides are good to about 1e-13 m. What is farther outside than this has escaped [m].
+#: Points and sides are good to about 1e-12 m. What is farther outside than this has escaped [m].
 ROUNDING_M = 1e-10
 #: Pieces of constant wish of a motion; it is measured at the start and after every piece.
 PIECES = 8

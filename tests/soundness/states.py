@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
-
 import numpy as np
 
 from hrcreplay.human.model import LimitSet
 from hrcreplay.records import LENGTHS, LIMBS, Floats, HumanStates
-from tests.soundness.motion import allowed, bounds_of, rates_of, stops_at
+from tests.soundness.joint import bounds_of, rates_of, stops_at
+from tests.soundness.motion import allowed
 from tests.soundness.truth import Estimate
 
 #: Lengths of a grown person [m]; people are drawn within a quarter of them.
@@ -26,7 +24,9 @@ _BEYOND = 2.5
 _STD = np.array([0.03, 0.1, 0.3, 0.02])
 
 
-def draw_estimate(rng: np.random.Generator, limits: LimitSet, sigmas: float, beyond: bool) -> Estimate:
+def draw_estimate(
+    rng: np.random.Generator, limits: LimitSet, sigmas: float = 0.0, beyond: bool = False, coasted_s: float = 0.0
+) -> Estimate:
     """A person, and an estimate of them that is within so many standard deviations of the truth, entry by entry.
 
     Args:
@@ -34,6 +34,7 @@ def draw_estimate(rng: np.random.Generator, limits: LimitSet, sigmas: float, bey
         limits: What the person keeps to.
         sigmas: How many standard deviations; 0 for an exact estimate.
         beyond: Whether velocities may be above their bounds.
+        coasted_s: For how long the estimate has gone on without being measured, whatever the person did [s].
     """
     fastest = _BEYOND if beyond and rng.random() < 0.5 else 1.0
     q, v = _draw(rng, limits, fastest)
@@ -42,12 +43,18 @@ def draw_estimate(rng: np.random.Generator, limits: LimitSet, sigmas: float, bey
     c, s = np.cos(q[2]), np.sin(q[2])
     world[0], world[1] = c * v[0] - s * v[1], s * v[0] + c * v[1]
     std = np.concatenate([[_STD[0]] * 2, [_STD[1]] * 10, [_STD[2]] * 12, [_STD[3]] * 8])
-    off = sigmas * std * rng.random() * rng.random(len(std))
+    std = (std * rng.random() * rng.random(len(std))) if sigmas > 0.0 else 0.0 * std
+    off = sigmas * std
+    if coasted_s > 0.0:
+        fast = np.maximum(limits.v_max, -limits.v_min)
+        off[12:24] = 10.0 * fast.max()  # nothing is known
+        fast[:2] = fast[:2].max() / np.sqrt(2.0)  # whatever the heading
+        off[:12] += coasted_s * fast
     true = np.concatenate([q, world, lengths])
     estimated = true + off * rng.uniform(-1.0, 1.0, len(off))
     (p, v_world, pi), (p_off, v_off, pi_off) = (np.split(parts.copy(), [12, 24]) for parts in (estimated, off))
     v_low, v_high = fastest * limits.v_min, fastest * limits.v_max
-    return Estimate(p, v_world, pi, p_off, v_off, pi_off, v_low, v_high, q, v, lengths)
+    return Estimate(p, v_world, pi, p_off, v_off, pi_off, v_low, v_high, q, v, lengths, std)
 
 
 def _draw(rng: np.random.Generator, limits: LimitSet, fastest: float) -> tuple[Floats, Floats]:
@@ -72,24 +79,23 @@ def _draw(rng: np.random.Generator, limits: LimitSet, fastest: float) -> tuple[F
     return q, v
 
 
-def states_of(estimates: list[Estimate], sigmas: float) -> HumanStates:
-    """The estimates as fused states, a row each."""
+def states_of(estimates: list[Estimate], unseen_s: float = 0.0) -> HumanStates:
+    """The estimates as fused states, a row each, of people that nobody has seen for so long."""
     n = len(estimates)
     zeros = np.zeros((n, 12))
-    share = 1.0 / sigmas if sigmas > 0.0 else 0.0
-    columns: dict[str, Any] = {
-        "t_ns": np.arange(n, dtype=np.int64) * 4_000_000,
-        "p": np.array([e.q for e in estimates]),
-        "v": np.array([e.v_world for e in estimates]),
-        "a": zeros,
-        "j": zeros,
-        "p_std": share * np.array([e.q_off for e in estimates]),
-        "v_std": share * np.array([e.v_off for e in estimates]),
-        "lengths_m": np.array([e.lengths for e in estimates]),
-        "lengths_std_m": share * np.array([e.lengths_off for e in estimates]),
-        "valid": np.ones((n, 1), dtype=bool),
-        "cameras": ("camera",),
-        "residual_m": np.zeros((n, len(LIMBS))),
-        "unseen_s": np.zeros((n, len(LIMBS))),
-    }
-    return HumanStates(**{f.name: columns[f.name] for f in dataclasses.fields(HumanStates)})
+    p_std, v_std, lengths_std = np.split(np.array([e.std for e in estimates]), [12, 24], axis=1)
+    return HumanStates(
+        t_ns=np.arange(n, dtype=np.int64) * 4_000_000,
+        p=np.array([e.q for e in estimates]),
+        v=np.array([e.v_world for e in estimates]),
+        a=zeros,
+        j=zeros,
+        p_std=p_std,
+        v_std=v_std,
+        lengths_m=np.array([e.lengths for e in estimates]),
+        lengths_std_m=lengths_std,
+        valid=np.ones((n, 1), dtype=bool),
+        residual_m=np.zeros((n, len(LIMBS))),
+        unseen_s=np.full((n, len(LIMBS)), unseen_s),
+        cameras=("camera",),
+    )

@@ -17,8 +17,9 @@ SEED = 2020
 #: A million in all.
 SHARES = {
     "exact": (Plan("sound", "paper", SEED), 400_000),
-    "people": (Plan("sound", "human", SEED), 200_000),
+    "people": (Plan("sound", "human", SEED), 150_000),
     "likely": (Plan("sound", "paper", SEED, sigmas=3.0, latency_s=0.05, hand_m=0.19), 200_000),
+    "unseen": (Plan("sound", "paper", SEED, sigmas=3.0, unseen_s=0.8), 50_000),
     "beyond": (Plan("sound", "paper", SEED, beyond=True), 100_000),
     "people, likely and beyond": (Plan("sound", "human", SEED, sigmas=3.0, hand_m=0.19, beyond=True), 100_000),
 }

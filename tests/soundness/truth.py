@@ -26,6 +26,7 @@ class Estimate(NamedTuple):
     true_q: Floats  #: (12,) an admissible state within these distances
     true_v: Floats  #: (12,) the first two forward and to the left
     true_lengths: Floats  #: (8,)
+    std: Floats  #: (32,) standard deviations of all of these, as the filter tells them
 
 
 @njit(cache=True)

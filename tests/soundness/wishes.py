@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.records import Floats
-from tests.soundness.motion import A_MAX, A_MIN
+from tests.soundness.joint import A_MAX, A_MIN
 
 #: ``push`` drives a corner of a limb through a side of its volume, ``mutate`` varies the worst motion so far.
 FAMILIES = (
