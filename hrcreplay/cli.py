@@ -227,6 +227,13 @@ def fit_limits(
     coverage: Annotated[
         float, typer.Option("--coverage", metavar="SHARE", help="Share of the ticks to cover, between 0 and 1.")
     ] = 0.99,
+    held_back: Annotated[
+        float,
+        typer.Option("--held-back", metavar="SHARE", help="Share of each log's time, its end, that is not fitted to."),
+    ] = 0.3,
+    cover: Annotated[
+        str, typer.Option("--cover", metavar="WHAT", help="joints in their intervals, or limbs in their volumes.")
+    ] = "joints",
     config: Config = None,
     settings: Set = None,
     topic: Topic = None,
@@ -239,7 +246,7 @@ def fit_limits(
 
     overrides = _overrides(settings, topic)
     options = {"config": config, "overrides": overrides, "cell_file": cell, **_span(start, end)}
-    for line in fit.run(logs, out=out, coverage=coverage, **options):
+    for line in fit.run(logs, out=out, coverage=coverage, held_back=held_back, cover=cover, **options):
         sys.stderr.write(f"hrcreplay: {line}\n")
     sys.stdout.write(f"{out}\n")
 
