@@ -14,12 +14,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats
+from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, Ints
 from hrcreplay.report import style
 from hrcreplay.report.metrics_fusion import errors
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
-from hrcreplay.report.series import ANGLES, broken, columns, envelope, seconds_from, times
+from hrcreplay.report.series import ANGLES, broken, columns, envelope, seconds_from, times, wrap
 from hrcreplay.report.solids import Solid, View, bones, outline, picture, view_from
 from hrcreplay.runs import Run
 
@@ -165,7 +165,7 @@ def _seen(run: Run, camera: str, joint: str, t0_ns: int, gap_s: float) -> tuple[
         return np.zeros(0), np.zeros(0)
     rows = run.measurements[run.measurements["camera"] == camera].sort_values("capture_ns", kind="stable")
     seconds = seconds_from(times(rows, "capture_ns"), t0_ns)
-    values = rows[joint].to_numpy(dtype=float)
+    values = _beside_fused(run, joint, times(rows, "capture_ns"), rows[joint].to_numpy(dtype=float))
     return broken(seconds, values, gap_s)
 
 
@@ -193,8 +193,8 @@ def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
             _limits_of(ax, values)
         if run.truth is not None:
             seconds = seconds_from(times(run.truth), t0_ns)
-            values = factor * run.truth[joint].to_numpy(dtype=float)
-            ax.plot(*envelope(seconds, values, 350), color=style.TRUTH, lw=0.7, ls=(0, (4, 2)))
+            values = _beside_fused(run, joint, times(run.truth), run.truth[joint].to_numpy(dtype=float))
+            ax.plot(*envelope(seconds, factor * values, 350), color=style.TRUTH, lw=0.7, ls=(0, (4, 2)))
         ax.set_title(f"{LABELS[joint]} [{'deg' if joint in ANGLES else 'm'}]", fontweight="normal", pad=2.5)
     for column in grid[-1]:
         column.set_xlabel("time [s]")
@@ -207,6 +207,17 @@ def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
         handles.append(Line2D([], [], color=style.TRUTH, lw=0.7, ls=(0, (4, 2)), label="truth"))
     figure.legend(handles=handles, loc="upper right", ncols=6, bbox_to_anchor=(0.985, 0.995))
     return figure
+
+
+def _beside_fused(run: Run, joint: str, t_ns: Ints, values: Floats) -> Floats:
+    """An angle in the turn of the fused one, which is unwrapped; a length as it is."""
+    if run.state is None or joint not in ANGLES:
+        return values
+    known = run.state[["t_ns", joint]].dropna()
+    if not len(known):
+        return values
+    fused = np.interp(t_ns, known["t_ns"].to_numpy(dtype=float), known[joint].to_numpy(dtype=float))
+    return np.asarray(fused + wrap(values - fused))
 
 
 def _limits_of(ax: Axes, values: Floats) -> None:
