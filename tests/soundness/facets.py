@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.optimize import nnls
 from scipy.spatial import ConvexHull
 
 from hrcreplay.records import Floats, Ints
+from tests.soundness.compiled import kernel
 
 #: A set thinner than this in a direction has no extent in it [m].
 _FLAT_M = 1e-10
@@ -72,7 +72,7 @@ def _planes(cloud: Floats) -> Floats:
     return np.unique(planes, axis=0)
 
 
-@njit(cache=True)
+@kernel
 def outside(facets: Facets, k: int, points: Floats, enough: float, margins: Floats) -> None:
     """Raises ``margins`` (b,) to how far outside the k-th polytope the points (3, b) are [m].
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.human.model import LimitSet
 from hrcreplay.records import Floats
+from tests.soundness.compiled import kernel
 
 #: Rows of bounds, (6, 12). The first two are NaN where (34b), (34c) tell instead.
 P_MIN, P_MAX, V_MIN, V_MAX, A_MIN, A_MAX = range(6)
@@ -23,12 +23,12 @@ def bounds_of(limits: LimitSet) -> Floats:
     return bounds
 
 
-@njit(cache=True)
+@kernel
 def rates_of(bounds: Floats, j: int) -> Rates:
     return bounds[V_MIN, j], bounds[V_MAX, j], bounds[A_MIN, j], bounds[A_MAX, j]
 
 
-@njit(cache=True)
+@kernel
 def along(q: float, v: float, wish: float, until: float, h: float, rates: Rates) -> tuple[float, float, float, float]:
     """A joint that accelerates as it wishes for ``until`` and then brakes: position, velocity, and the range passed."""
     q, v, low, high = accelerate(q, v, wish, min(until, h), rates)
@@ -41,7 +41,7 @@ def along(q: float, v: float, wish: float, until: float, h: float, rates: Rates)
     return q, v, min(low, q), max(high, q)
 
 
-@njit(cache=True)
+@kernel
 def accelerate(q: float, v: float, a: float, h: float, rates: Rates) -> tuple[float, float, float, float]:
     """A joint that accelerates until its velocity is at a bound: position, velocity, and the range passed."""
     t = saturates(v, a, h, rates)
@@ -56,7 +56,7 @@ def accelerate(q: float, v: float, a: float, h: float, rates: Rates) -> tuple[fl
     return q_end, v_end, low, high
 
 
-@njit(cache=True)
+@kernel
 def saturates(v: float, a: float, h: float, rates: Rates) -> float:
     """When the velocity comes to a bound, at the latest h [s]."""
     if a > 0.0 and v + a * h > rates[1]:
@@ -66,7 +66,7 @@ def saturates(v: float, a: float, h: float, rates: Rates) -> float:
     return h
 
 
-@njit(cache=True)
+@kernel
 def stops_at(q: float, v: float, rates: Rates) -> float:
     """Where a joint comes to rest that brakes from now on."""
     return q - 0.5 * v * v / (rates[2] if v > 0.0 else rates[3])

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from hrcreplay.records import Floats
+from tests.soundness.compiled import kernel
 
 #: Points of the body; a tip is the wrist, or beyond it the hand's end; ``floor`` is below the pelvis.
 POINTS = ("neck", "head", "pelvis", "shoulder_r", "elbow_r", "tip_r", "shoulder_l", "elbow_l", "tip_l", "floor")
@@ -25,7 +24,7 @@ CORNERS = {
 Point = tuple[float, float, float]
 
 
-@njit(cache=True)
+@kernel
 def body(q: Floats, lengths: Floats, hand: float, points: Floats) -> None:
     """Writes POINTS (10, 3), world [m].
 
@@ -56,37 +55,37 @@ def body(q: Floats, lengths: Floats, hand: float, points: Floats) -> None:
         _put(points, 5 + 3 * arm, to_world(tip, rho, theta, q, lengths))
 
 
-@njit(cache=True)
+@kernel
 def turn(angle: float) -> tuple[float, float]:
     return math.cos(angle), math.sin(angle)
 
 
-@njit(cache=True)
+@kernel
 def about_x(p: Point, by: tuple[float, float]) -> Point:
     return p[0], by[0] * p[1] - by[1] * p[2], by[1] * p[1] + by[0] * p[2]
 
 
-@njit(cache=True)
+@kernel
 def about_y(p: Point, by: tuple[float, float]) -> Point:
     return by[0] * p[0] + by[1] * p[2], p[1], by[0] * p[2] - by[1] * p[0]
 
 
-@njit(cache=True)
+@kernel
 def about_z(p: Point, by: tuple[float, float]) -> Point:
     return by[0] * p[0] - by[1] * p[1], by[1] * p[0] + by[0] * p[1], p[2]
 
 
-@njit(cache=True)
+@kernel
 def add(a: Point, b: Point) -> Point:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@njit(cache=True)
+@kernel
 def to_world(p: Point, rho: tuple[float, float], theta: tuple[float, float], q: Floats, lengths: Floats) -> Point:
     """From the torso's frame, whose origin is the pelvis."""
     return add((q[0], q[1], lengths[0]), about_z(about_y(p, rho), theta))
 
 
-@njit(cache=True)
+@kernel
 def _put(points: Floats, row: int, p: Point) -> None:
     points[row, 0], points[row, 1], points[row, 2] = p

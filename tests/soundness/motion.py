@@ -15,9 +15,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.records import Floats, Ints
+from tests.soundness.compiled import kernel
 from tests.soundness.joint import P_MAX, P_MIN, V_MAX, V_MIN, Rates, accelerate, along, rates_of, stops_at
 from tests.soundness.walking import walk
 
@@ -37,7 +37,7 @@ Style = tuple[bool, bool]
 Moved = tuple[float, bool]
 
 
-@njit(cache=True)
+@kernel
 def step(
     q: Floats, v: Floats, wish: Floats, h: float, style: Style, ended: Ints, bounds: Floats, work: Floats
 ) -> Moved:
@@ -87,7 +87,7 @@ def step(
     return moved, met
 
 
-@njit(cache=True)
+@kernel
 def _come_back(v: Floats, wish: Floats, h: float, bounds: Floats, effective: Floats) -> float:
     """Writes the wishes (12,), those of joints above a velocity bound replaced; how long they hold, at most h [s]."""
     for j in range(12):
@@ -100,7 +100,7 @@ def _come_back(v: Floats, wish: Floats, h: float, bounds: Floats, effective: Flo
     return h
 
 
-@njit(cache=True)
+@kernel
 def _rest(q: Floats, v: Floats, wish: Floats, until: Floats, dt: float, group: int, bounds: Floats) -> bool:
     """Takes their velocity from the joints that meet a limit within dt; False where that does not help."""
     first, end = GROUPS[group]
@@ -115,7 +115,7 @@ def _rest(q: Floats, v: Floats, wish: Floats, until: Floats, dt: float, group: i
     return helped
 
 
-@njit(cache=True)
+@kernel
 def _brake_in_time(
     q: Floats, v: Floats, wish: Floats, h: float, bounds: Floats, until: Floats, low: Floats, high: Floats
 ) -> None:
@@ -127,7 +127,7 @@ def _brake_in_time(
         _, _, low[j], high[j] = along(q[j], v[j], wish[j], until[j], h, rates)
 
 
-@njit(cache=True)
+@kernel
 def _last_moment(q: float, v: float, wish: float, h: float, least: float, most: float, rates: Rates) -> float:
     if _can_stop(q, v, wish, h, least, most, rates):
         return h
@@ -143,14 +143,14 @@ def _last_moment(q: float, v: float, wish: float, h: float, least: float, most: 
     return good
 
 
-@njit(cache=True)
+@kernel
 def _can_stop(q: float, v: float, wish: float, t: float, least: float, most: float, rates: Rates) -> bool:
     """Whether a joint that does as it wishes for t stays within its limits, and still can after that."""
     q, v, low, high = accelerate(q, v, wish, t, rates)
     return least <= low and high <= most and least <= stops_at(q, v, rates) <= most
 
 
-@njit(cache=True)
+@kernel
 def _lasts(
     q: Floats, v: Floats, wish: Floats, h: float, group: int, finest: float, bounds: Floats, work: Floats
 ) -> float:
@@ -183,7 +183,7 @@ def _lasts(
     return t
 
 
-@njit(cache=True)
+@kernel
 def within(low: Floats, high: Floats, first: int, end: int, bounds: Floats) -> bool:
     """Whether all postures of a box, (12,) each, are within the limits of one group of joints."""
     for j in range(first, end):
@@ -193,7 +193,7 @@ def within(low: Floats, high: Floats, first: int, end: int, bounds: Floats) -> b
     return True
 
 
-@njit(cache=True)
+@kernel
 def allowed(j: int, low: Floats, high: Floats, bounds: Floats) -> Range:
     """Position limits of a joint that hold whatever the joints before it do in their ranges (12,) [m, m, rad...]."""
     if not np.isnan(bounds[P_MIN, j]):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.records import Floats, Ints
+from tests.soundness.compiled import kernel
 from tests.soundness.facets import Facets, outside
 from tests.soundness.kinematics import POINTS, body
 from tests.soundness.motion import GROUPS, step
@@ -56,7 +56,7 @@ class Block(NamedTuple):
     alive: Ints  #: (groups, b) instants up to which a group was followed
 
 
-@njit(cache=True)
+@kernel
 def block_of(count: int) -> Block:
     return Block(
         np.empty((count, 12)),
@@ -71,7 +71,7 @@ def block_of(count: int) -> Block:
     )
 
 
-@njit(cache=True)
+@kernel
 def sample(
     rng: np.random.Generator,
     estimate: Estimate,
@@ -115,7 +115,7 @@ def sample(
     return worst
 
 
-@njit(cache=True)
+@kernel
 def _draw_motion(
     rng: np.random.Generator,
     number: int,
@@ -153,7 +153,7 @@ def _draw_motion(
         draw(rng, family, bounds, block.wish[i])
 
 
-@njit(cache=True)
+@kernel
 def _jacobians(estimate: Estimate, hand: float) -> Floats:
     """(POINTS, 3, 12) d point / d q by differences; x and y are forward and left."""
     q, span = estimate.q.copy(), 1e-5
@@ -171,7 +171,7 @@ def _jacobians(estimate: Estimate, hand: float) -> Floats:
     return jacobians
 
 
-@njit(cache=True)
+@kernel
 def _follow(block: Block, i: int, hand: float, stops: bool, bounds: Floats) -> None:
     """Writes the points of the i-th motion at all its instants; what is not followed any more stays as at the start."""
     q, v, points = block.q[i].copy(), block.v[i].copy(), np.empty((len(POINTS), 3))
@@ -202,7 +202,7 @@ def _follow(block: Block, i: int, hand: float, stops: bool, bounds: Floats) -> N
             break
 
 
-@njit(cache=True)
+@kernel
 def _measure(start: int, block: Block, best: Block, worst: Worst, corners: Corners, facets: Facets) -> None:
     """Compares the points of a block with the volumes."""
     count = len(block.q)
@@ -228,7 +228,7 @@ def _measure(start: int, block: Block, best: Block, worst: Worst, corners: Corne
         worst.escapes[-1] += largest[:, i].max() > ROUNDING_M
 
 
-@njit(cache=True)
+@kernel
 def _select(block: Block, corners: Corners, point: int, limb: int, instant: int, points: Floats) -> None:
     """A point of all motions at one instant, (3, b); at the start where what moves its limb was not followed so far."""
     for i in range(len(block.q)):

@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.records import Floats
+from tests.soundness.compiled import kernel
 from tests.soundness.motion import GROUPS, allowed, within
 
 
@@ -29,7 +29,7 @@ class Estimate(NamedTuple):
     std: Floats  #: (32,) standard deviations of all of these, as the filter tells them
 
 
-@njit(cache=True)
+@kernel
 def draw_truth(
     rng: np.random.Generator, estimate: Estimate, bounds: Floats, q: Floats, v: Floats, lengths: Floats
 ) -> None:
@@ -38,7 +38,7 @@ def draw_truth(
     _vary(rng, estimate, bounds, q, v, lengths, 1.0)
 
 
-@njit(cache=True)
+@kernel
 def vary_truth(
     rng: np.random.Generator, estimate: Estimate, bounds: Floats, q: Floats, v: Floats, lengths: Floats
 ) -> None:
@@ -47,7 +47,7 @@ def vary_truth(
         _vary(rng, estimate, bounds, q, v, lengths, 0.15)
 
 
-@njit(cache=True)
+@kernel
 def _vary(
     rng: np.random.Generator, estimate: Estimate, bounds: Floats, q: Floats, v: Floats, lengths: Floats, share: float
 ) -> None:
@@ -76,7 +76,7 @@ def _vary(
         q[:3], v[:3] = new_q[:3], new_v[:3]
 
 
-@njit(cache=True)
+@kernel
 def _redraw(rng: np.random.Generator, middle: Floats, off: Floats, share: float, edge: bool, values: Floats) -> None:
     for j in range(len(values)):
         if rng.random() < share:
@@ -84,7 +84,7 @@ def _redraw(rng: np.random.Generator, middle: Floats, off: Floats, share: float,
             values[j] = middle[j] + off[j] * ((1.0 if unit > 0.0 else -1.0) if edge else unit)
 
 
-@njit(cache=True)
+@kernel
 def _clip(q: Floats, v: Floats, estimate: Estimate, bounds: Floats, first: int, end: int) -> None:
     for j in range(first, end):
         least, most = allowed(j, q, q, bounds)
@@ -92,7 +92,7 @@ def _clip(q: Floats, v: Floats, estimate: Estimate, bounds: Floats, first: int, 
         v[j] = max(estimate.v_low[j], min(v[j], estimate.v_high[j]))
 
 
-@njit(cache=True)
+@kernel
 def _near(values: Floats, middle: Floats, off: Floats, first: int, end: int) -> bool:
     gaps = np.abs(values[first:end] - middle[first:end])
     return bool((gaps <= off[first:end] * (1.0 + 1e-9)).all())

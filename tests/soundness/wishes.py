@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.records import Floats
+from tests.soundness.compiled import kernel
 from tests.soundness.joint import A_MAX, A_MIN
 
 #: ``push`` drives a corner of a limb through a side of its volume, ``mutate`` varies the worst motion so far.
@@ -30,12 +30,12 @@ PUSH, MUTATE, CORNER, BANG_BANG, SWITCHING, PIECES, SIDEWAYS, SINGLE = (
 )
 
 
-@njit(cache=True)
+@kernel
 def extreme(rng: np.random.Generator, j: int, bounds: Floats) -> float:
     return bounds[A_MAX, j] if rng.random() < 0.5 else bounds[A_MIN, j]
 
 
-@njit(cache=True)
+@kernel
 def toward(sign: float, j: int, bounds: Floats) -> float:
     """The bound in the direction of a sign; 0 for none."""
     if sign == 0.0:
@@ -43,7 +43,7 @@ def toward(sign: float, j: int, bounds: Floats) -> float:
     return bounds[A_MAX, j] if sign > 0.0 else bounds[A_MIN, j]
 
 
-@njit(cache=True)
+@kernel
 def draw(rng: np.random.Generator, family: int, bounds: Floats, wish: Floats) -> None:
     """Writes the accelerations (k, 12) of a family, one row a piece of time; not of ``push`` and ``mutate``."""
     for j in range(12):
@@ -58,7 +58,7 @@ def draw(rng: np.random.Generator, family: int, bounds: Floats, wish: Floats) ->
                 wish[:, j] = 0.0
 
 
-@njit(cache=True)
+@kernel
 def _draw_joint(rng: np.random.Generator, family: int, j: int, bounds: Floats, wish: Floats) -> None:
     a = extreme(rng, j, bounds)
     switch = rng.integers(0, len(wish) + 1) if family in (BANG_BANG, SINGLE) else len(wish)
@@ -72,7 +72,7 @@ def _draw_joint(rng: np.random.Generator, family: int, j: int, bounds: Floats, w
         wish[k] = a
 
 
-@njit(cache=True)
+@kernel
 def push(normal: Floats, jacobian: Floats, bounds: Floats, wish: Floats) -> None:
     """Every joint as hard as it can in the sense that moves a point along a normal (3,); jacobian (3, 12)."""
     for j in range(12):
@@ -80,11 +80,11 @@ def push(normal: Floats, jacobian: Floats, bounds: Floats, wish: Floats) -> None
         wish[:, j] = toward(along if abs(along) > 1e-9 else 0.0, j, bounds)
 
 
-@njit(cache=True)
+@kernel
 def mutate(rng: np.random.Generator, bounds: Floats, wish: Floats) -> None:
     """Changes a few joints from some piece of time on."""
     for _ in range(rng.integers(1, 4)):
-        j, first = rng.integers(0, 12), rng.integers(0, len(wish))
+        j, first = int(rng.integers(0, 12)), int(rng.integers(0, len(wish)))
         kind = rng.random()
         a = 0.0 if kind < 0.15 else extreme(rng, j, bounds)
         if kind > 0.85:

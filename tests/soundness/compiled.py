@@ -1,0 +1,27 @@
+"""Compiled functions, kept for as long as no file of this folder changes: a kernel holds those that it calls."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_HERE = Path(__file__).parent
+_SOURCES = sorted(path for path in _HERE.glob("*.py") if not path.name.startswith("test_"))
+_DIGEST = hashlib.sha256(b"".join(path.read_bytes() for path in _SOURCES)).hexdigest()[:16]
+
+
+def kernel(function: F) -> F:
+    """Compiles a function when it is first called."""
+    others = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(Path(others or _HERE / "__pycache__") / f"soundness-{_DIGEST}")
+    try:
+        compiled: F = numba.njit(cache=True)(function)
+    finally:
+        numba.config.CACHE_DIR = others
+    return compiled
