@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs import topics
-from hrcreplay.records import CameraFrames, Floats, Ints
+from hrcreplay.records import POINTS, CameraFrames, Floats, Ints
 
 _CHUNK_BYTES = 256 * 1024  # some ten seconds of two cameras: small enough to seek by, large enough to compress
 
@@ -97,7 +97,7 @@ class LogWriter:
         for name in frames.cameras:
             if name not in self._cameras:
                 self.camera(name)
-        points = frames.points_m.reshape(len(frames), -1)
+        points = frames.points_m.reshape(len(frames), 3 * len(POINTS))
         for i in range(len(frames)):
             name = frames.cameras[frames.camera[i]]
             capture_ns = int(frames.capture_ns[i])
@@ -112,7 +112,7 @@ class LogWriter:
 
     def truth(self, t_ns: Ints, points_m: Floats) -> None:
         """Adds the true person: (n,) instants and (n, 20, 3) POINTS in the world [m]."""
-        for t, points in zip(t_ns.tolist(), points_m.reshape(len(t_ns), -1).tolist(), strict=True):
+        for t, points in zip(t_ns.tolist(), points_m.reshape(len(t_ns), 3 * len(POINTS)).tolist(), strict=True):
             self._write(topics.TRUTH, pb.Truth(t_ns=t, points=points), t, t)
 
     def joints(self, names: Sequence[str], t_ns: Ints, q: Floats) -> None:

@@ -153,3 +153,10 @@ def test_generated_messages_are_those_of_the_schema() -> None:
         for name, message in pb.DESCRIPTOR.message_types_by_name.items()
     }
     assert made == told
+
+
+def test_an_empty_table_adds_nothing(tmp_path: Path) -> None:
+    full, table = tmp_path / "full.mcap", own.frames(12)
+    own.write(full, table)
+    own.write(tmp_path / "also.mcap", table, table.rows(slice(0, 0)))
+    assert (tmp_path / "also.mcap").read_bytes() == full.read_bytes()
