@@ -16,8 +16,14 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, SweptVolumes
+from hrcreplay.robot.model import irb140
+from hrcreplay.robot.obstacles import obstacles
+from hrcreplay.robot.paths import programmed
+from hrcreplay.robot.stepping import RobotState
+from hrcreplay.robot.task import parse_task
 from hrcreplay.runs import Run
 from tests.robot import checker
+from tests.robot.test_controller import asked, dense
 
 
 def _short(command: str, source: Path, out: Path, **options: Any) -> Path:
@@ -199,3 +205,29 @@ def test_a_tick_uses_no_frame_that_was_still_on_the_wire(tmp_path: Path) -> None
     assert short.state is not None
     assert longer.state is not None
     assert short.state.equals(longer.state.iloc[: len(short.state)])
+
+
+def test_a_thousand_ticks_of_the_demo_are_those_of_another_solver(demo: Run) -> None:
+    """With all rows, by daqp: every stop with a person in sight, the nearest ticks, and others evenly."""
+    assert demo.motion is not None
+    assert demo.T_world_base is not None
+    task = open_log(replay.demo_log()).header.task
+    assert task is not None
+    robot = irb140(demo.T_world_base, stop_s=0.377)
+    path, volumes = programmed(parse_task(task), robot), _volumes(demo)
+    q, dq, u = (demo.motion[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq", "u"))
+    s, status = demo.motion["programme_s"].to_numpy(), demo.motion["status"].to_numpy()
+    known = np.flatnonzero(demo.motion["distance_m"].notna().to_numpy()[:-1])
+    stops = known[status[known] == "braking"]
+    nearest = known[np.argsort(demo.motion["distance_m"].to_numpy()[known], kind="stable")[:350]]
+    ticks = np.unique(np.concatenate([stops[:300], nearest, known[:: len(known) // 500]]))
+    assert len(ticks) >= 1000
+    assert (status[ticks] == "braking").sum() >= 200
+    for k in ticks.tolist():
+        ahead = path.sample(s[k + 1])
+        rate = (s[k + 1] - s[k]) / 0.004
+        made = asked(robot, RobotState(q[k], dq[k]), ahead.T_world_tcp, rate * ahead.twist, obstacles(volumes, k))
+        expected, feasible = dense(robot, made)
+        assert (status[k] != "braking") == feasible
+        if feasible:
+            np.testing.assert_allclose(dq[k] + 0.004 * u[k], expected, atol=1e-6)
