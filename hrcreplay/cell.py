@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -14,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.files import write_whole
 from hrcreplay.records import Floats
 
 _TOLERANCE = 1e-6
@@ -107,22 +106,7 @@ def write_cell(cell: Cell, path: Path) -> None:
     Raises:
         SettingsError: The file exists, or its folder cannot be written.
     """
-    if path.exists():
-        raise SettingsError(f"{path}: exists already; name another file, or remove it")
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be written ({error.strerror}); name a folder that can") from error
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(_toml(cell))
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.rename(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, _toml(cell))
 
 
 def pose_from_position(position_m: Floats, yaw_rad: float) -> Floats:

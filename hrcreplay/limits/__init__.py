@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.files import write_whole
 from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds
 from hrcreplay.records import JOINTS, Floats
 
@@ -70,22 +69,7 @@ def write_limits(limits: LimitSet, provenance: dict[str, Any], path: Path) -> No
     Raises:
         SettingsError: The file exists, or its folder cannot be written.
     """
-    if path.exists():
-        raise SettingsError(f"{path}: exists already; name another file, or remove it")
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be written ({error.strerror}); name a folder that can") from error
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(_toml(limits, provenance))
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.rename(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, _toml(limits, provenance))
 
 
 def _toml(limits: LimitSet, provenance: dict[str, Any]) -> str:
