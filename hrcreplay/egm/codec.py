@@ -1,0 +1,271 @@
+"""Datagrams to records and back. Degrees and millimetres stay in here.
+
+Every call makes its message anew: one that is used again never gives memory back (0.5 kB a packet).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from math import isfinite, nan, pi
+from typing import Any, Final, Literal
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from hrcreplay.egm import motion_link_pb2 as messages
+from hrcreplay.records import Floats
+
+#: Axes of the arm.
+AXES: Final = 6
+#: Counters of the link, ``seqno`` and ``tm``, go round here.
+WRAP: Final = 2**32
+
+_RAD_PER_DEG: Final = pi / 180.0
+_DEG_PER_RAD: Final = 180.0 / pi
+_MM_PER_M: Final = 1000.0
+_NS_PER_S: Final = 1_000_000_000
+_LATEST_NS: Final = 2**63  # what a record of int64 holds
+
+
+class BadPacket(ValueError):
+    """A datagram that is no message of the link; the text says why."""
+
+
+class Motors(IntEnum):
+    """State of the motors."""
+
+    UNDEFINED = 0
+    ON = 1
+    OFF = 2
+
+
+class Mci(IntEnum):
+    """State of the motion correction interface, the part of the controller that executes EGM."""
+
+    UNDEFINED = 0
+    ERROR = 1
+    STOPPED = 2
+    RUNNING = 3
+
+
+class Rapid(IntEnum):
+    """State of the program on the controller."""
+
+    UNDEFINED = 0
+    STOPPED = 1
+    RUNNING = 2
+
+
+@dataclass(frozen=True, slots=True)
+class RobotPacket:
+    """What the robot says each cycle.
+
+    Attributes:
+        seqno: The robot's counter, None where it sent none.
+        tm_ms: The robot's own stamp [ms], goes round at 2**32.
+        clock_ns: Instant of the feedback by the robot's clock; None below RobotWare 6.07, which sends radians.
+        q: (6,) measured joints, followed by external ones if there are any [rad].
+        q_planned: (6,) where the controller itself wants to be [rad].
+        motors: One of ``Motors``.
+        mci: One of ``Mci``.
+        rapid: One of ``Rapid``.
+        converged: The controller holds the target for reached, which is how a session ends.
+        utilization: Share of what the robot can follow [%]; NaN where it does not say.
+    """
+
+    seqno: int | None
+    tm_ms: int | None
+    clock_ns: int | None
+    q: Floats
+    q_planned: Floats | None
+    motors: int
+    mci: int
+    rapid: int
+    converged: bool
+    utilization: float
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What we tell the robot: ``q`` (6,) [rad] and the speed reference ``dq`` (6,) [rad/s]."""
+
+    seqno: int
+    tm_ms: int
+    q: Floats
+    dq: Floats
+
+
+def decode_robot(data: bytes) -> RobotPacket:
+    """Read one datagram of the robot, of any edition.
+
+    Without ``feedBack.time`` the joints are taken for radians, because RobotWare below 6.07 sends those.
+
+    Raises:
+        BadPacket: Empty, garbage, another kind of message, not six joints, or a joint that is no finite number.
+    """
+    if not data:
+        raise BadPacket("empty datagram")
+    try:
+        message = messages.RobotMessage.FromString(data)
+    except DecodeError:
+        raise BadPacket(f"garbage: {len(data)} bytes that are no message") from None
+    header, feedback, planned = message.header, message.feed_back, message.planned
+    if header.mtype not in (messages.TYPE_DATA, messages.TYPE_UNDEFINED):
+        raise BadPacket(f"message type {header.mtype}: a robot sends {messages.TYPE_DATA}")
+    clock_ns = _clock(feedback.time) if feedback.HasField("time") else None
+    scale = 1.0 if clock_ns is None else _RAD_PER_DEG
+    joints = _joints(feedback.joints, "feedBack") + list(feedback.external_joints.joints)
+    return RobotPacket(
+        seqno=header.seqno if header.HasField("seqno") else None,
+        tm_ms=header.tm if header.HasField("tm") else None,
+        clock_ns=clock_ns,
+        q=_scaled(joints, scale, "feedBack"),
+        q_planned=_scaled(_joints(planned.joints, "planned"), scale, "planned") if planned.HasField("joints") else None,
+        motors=message.motor_state.state,
+        mci=message.mci_state.state,
+        rapid=message.rapid_state.state,
+        converged=message.mci_convergence_met,
+        utilization=message.utilization_rate if message.HasField("utilization_rate") else nan,
+    )
+
+
+def encode_correction(correction: Correction) -> bytes:
+    """The datagram that answers the robot: joints [deg] and speed reference [deg/s].
+
+    Raises:
+        ValueError: Not six joints, or one that is no finite number: nothing of the kind may leave.
+    """
+    q, dq = (correction.q * _DEG_PER_RAD).tolist(), (correction.dq * _DEG_PER_RAD).tolist()
+    if len(q) != AXES or len(dq) != AXES or not all(map(isfinite, q + dq)):
+        raise ValueError(f"correction {correction.q} rad, {correction.dq} rad/s: {AXES} finite joints each are right")
+    message = messages.SensorMessage()
+    header = message.header
+    header.seqno = correction.seqno
+    header.tm = correction.tm_ms
+    header.mtype = messages.TYPE_CORRECTION
+    message.planned.joints.joints.extend(q)
+    message.speed_reference.joints.joints.extend(dq)
+    return message.SerializeToString()
+
+
+def decode_correction(data: bytes) -> Correction:
+    """Read what a guide told the robot; without a speed reference the speed is 0.
+
+    Raises:
+        BadPacket: Empty, garbage, a robot's own message, not six joints, or a joint that is no finite number.
+    """
+    if not data:
+        raise BadPacket("empty datagram")
+    try:
+        message = messages.SensorMessage.FromString(data)
+    except DecodeError:
+        raise BadPacket(f"garbage: {len(data)} bytes that are no message") from None
+    header, speed = message.header, message.speed_reference
+    if header.mtype == messages.TYPE_DATA:
+        raise BadPacket(f"message type {header.mtype}: a guide sends {messages.TYPE_CORRECTION}")
+    dq = _joints(speed.joints, "speedRef") if speed.HasField("joints") else [0.0] * AXES
+    return Correction(
+        seqno=header.seqno,
+        tm_ms=header.tm,
+        q=_scaled(_joints(message.planned.joints, "planned"), _RAD_PER_DEG, "planned"),
+        dq=_scaled(dq, _RAD_PER_DEG, "speedRef"),
+    )
+
+
+def encode_robot(
+    packet: RobotPacket,
+    *,
+    version: Literal["A", "B", "C"] = "B",
+    radians: bool = False,
+    q_cartesian: Floats | None = None,
+) -> bytes:
+    """The datagram of a robot, as editions A, B and C fill it. Checks nothing: a double also has to send nonsense.
+
+    Args:
+        packet: What to say. None is left out.
+        version: A says no utilisation, collision or RAPID data; C adds the second stamp and the torques.
+        radians: As RobotWare below 6.07: joints in radians, no clock.
+        q_cartesian: (7,) pose of the tool: position [m], then quaternion w, x, y, z.
+    """
+    message = messages.RobotMessage()
+    message.header.mtype = messages.TYPE_DATA
+    if packet.seqno is not None:
+        message.header.seqno = packet.seqno
+    if packet.tm_ms is not None:
+        message.header.tm = packet.tm_ms
+    message.motor_state.state = packet.motors
+    message.mci_state.state = packet.mci
+    message.rapid_state.state = packet.rapid
+    message.mci_convergence_met = packet.converged
+    scale = 1.0 if radians else _DEG_PER_RAD
+    _fill_place(message.feed_back, packet.q, scale, q_cartesian)
+    if packet.q_planned is not None:
+        _fill_place(message.planned, packet.q_planned, scale, q_cartesian)
+    if packet.clock_ns is not None and not radians:
+        for place in (message.feed_back, message.planned) if packet.q_planned is not None else (message.feed_back,):
+            _fill_clock(place, packet.clock_ns, stamp=version == "C")
+    _fill_edition(message, packet, version)
+    return message.SerializeToString()
+
+
+def _joints(joints: Any, what: str) -> list[float]:
+    """The arm's joints of one part of a message."""
+    values = list(joints.joints)
+    if len(values) != AXES:
+        raise BadPacket(f"{what}: {len(values)} joints; {AXES} are right")
+    return values
+
+
+def _scaled(values: list[float], scale: float, what: str) -> Floats:
+    """Joints in SI, read-only."""
+    if not all(map(isfinite, values)):
+        raise BadPacket(f"{what}: joints {values}; finite numbers are right")
+    scaled = np.array(values) * scale
+    scaled.flags.writeable = False
+    return scaled
+
+
+def _clock(clock: Any) -> int:
+    """Nanoseconds of the robot's clock."""
+    clock_ns: int = clock.sec * _NS_PER_S + clock.usec * 1000
+    if clock_ns >= _LATEST_NS:
+        raise BadPacket(f"feedBack: time {clock.sec} s + {clock.usec} us; seconds since 1970 are right")
+    return clock_ns
+
+
+def _fill_place(place: Any, q: Floats, scale: float, cartesian: Floats | None) -> None:
+    """Joints and pose of the measured or of the planned place."""
+    degrees = (q * scale).tolist()
+    place.joints.joints.extend(degrees[:AXES])
+    if degrees[AXES:]:
+        place.external_joints.joints.extend(degrees[AXES:])
+    if cartesian is not None:
+        pos, orient = place.cartesian.pos, place.cartesian.orient
+        pos.x, pos.y, pos.z = (cartesian[:3] * _MM_PER_M).tolist()
+        orient.u0, orient.u1, orient.u2, orient.u3 = cartesian[3:].tolist()
+
+
+def _fill_clock(place: Any, clock_ns: int, *, stamp: bool) -> None:
+    """The clock, and the second stamp of edition C."""
+    place.time.sec, remainder_ns = divmod(clock_ns, _NS_PER_S)
+    place.time.usec = remainder_ns // 1000
+    if stamp:
+        place.time_stamp.sec, place.time_stamp.nsec = divmod(clock_ns, _NS_PER_S)
+
+
+def _fill_edition(message: Any, packet: RobotPacket, version: str) -> None:
+    """What the editions have beyond each other, at rest where this robot has nothing to say."""
+    still = [0.0] * AXES
+    if version == "A":
+        message.measured_force = messages.MeasuredForceA(force=still).SerializeToString()
+        return
+    message.measured_force = messages.MeasuredForceB(fc_active=False, force=still).SerializeToString()
+    if packet.utilization == packet.utilization:  # NaN is silence
+        message.utilization_rate = packet.utilization
+    message.move_index = 1
+    message.collision.triggered = False
+    message.collision.quota.extend(still)
+    message.rapid_from_robot.digital = False
+    if version == "C":
+        message.torque_reference.joints.extend(still)

@@ -1,0 +1,214 @@
+"""What the controller makes of the references it is told: a state machine stepped once a cycle.
+
+The robot's side of a session, without clock and socket. Settings bear the controller's names and units (degrees);
+all that moves is in radians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from hrcreplay.egm.codec import Correction
+from hrcreplay.errors import SettingsError
+from hrcreplay.records import Floats
+
+#: Time between two packets of a real controller [ns].
+PERIOD_NS = 4_032_000
+_PERIOD_S = PERIOD_NS * 1e-9
+#: A reference may be this far out of range by the rounding of degrees [rad].
+_ROUNDING_RAD = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Axes:
+    """What the axes can do."""
+
+    low_deg: tuple[float, ...]
+    """Lower end of the range [deg]."""
+    high_deg: tuple[float, ...]
+    """Upper end of the range [deg]."""
+    speed_deg_per_s: tuple[float, ...]
+    """Top speed [deg/s]."""
+    acceleration_deg_per_s2: tuple[float, ...]
+    """Top acceleration, either way [deg/s^2]."""
+
+
+_TOP_DEG_PER_S = (200.0, 200.0, 260.0, 360.0, 360.0, 450.0)
+
+#: Range and speed of the product specification. No acceleration is published: full speed to rest in 0.15 s is ours.
+IRB140 = Axes(
+    low_deg=(-180.0, -90.0, -230.0, -200.0, -115.0, -400.0),
+    high_deg=(180.0, 110.0, 50.0, 200.0, 115.0, 400.0),
+    speed_deg_per_s=_TOP_DEG_PER_S,
+    acceleration_deg_per_s2=tuple(speed / 0.15 for speed in _TOP_DEG_PER_S),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ServoSettings:
+    """The session as RAPID sets it up. As delivered: ``max_speed_deviation_deg_per_s`` 1 and ``cond_time_s`` 1."""
+
+    gain: float = 5.0
+    """Proportional gain of the position loop, 0 to 20 [1/s]."""
+    pos_corr_gain: float = 1.0
+    """PosCorrGain, 0 to 1: 0 follows the speed reference alone."""
+    filter_hz: float = 20.0
+    """Low-pass filter of the speed; 0 is off [Hz]."""
+    max_speed_deviation_deg_per_s: float = 450.0
+    """MaxSpeedDeviation: above it all axes are slowed together [deg/s]."""
+    convergence_deg: float = 0.5
+    """An axis this close to its reference has converged [deg]."""
+    cond_time_s: float = 0.0
+    """CondTime: converged for this long, the session ends; 0 is never [s]."""
+    comm_timeout_s: float = 1.0
+    """CommTimeout: without a message for longer, once there was one, the session ends in an error [s]."""
+    ramp_s: float = 0.5
+    """A program stop or the end of the session takes the robot to rest in this time [s]."""
+    lag_cycles: int = 3
+    """Cycles by which the measured joints trail the planned ones."""
+    axes: Axes = IRB140
+    """Range, speed and acceleration of each axis."""
+
+    def __post_init__(self) -> None:
+        top = {"gain": 20.0, "pos_corr_gain": 1.0}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Axes):
+                continue
+            if not 0 <= value <= top.get(field.name, math.inf) or math.isinf(value):
+                limit = f"0 to {top[field.name]:g}" if field.name in top else "a finite number from 0"
+                raise SettingsError(f"robot double: {field.name} is {value}; {limit} would be right")
+        for name in ("max_speed_deviation_deg_per_s", "comm_timeout_s", "ramp_s"):
+            if getattr(self, name) == 0:
+                raise SettingsError(f"robot double: {name} is 0; a positive number would be right")
+
+
+class Servo:
+    """The controller in a session: told one reference a cycle, or none, it moves the robot by one cycle.
+
+    Attributes:
+        motors_on: Set from outside. Off, the brakes stop the robot; back on, the last reference is live again.
+        program_running: Set from outside. Stopped, the robot ramps to rest; running, the last reference is live again.
+        error: Why the session ended in an error; empty without one.
+        converged: The session ended by convergence.
+        ended_ns: When it ended; None while it lasts.
+        q: Planned joints (nv,) [rad].
+        dq: Planned speed (nv,) [rad/s].
+        utilization: Speed or acceleration asked for, of what is allowed; above 100 the robot cannot follow [%].
+        reference: The reference that is followed; None before the first of the session.
+    """
+
+    def __init__(self, settings: ServoSettings, q: Floats) -> None:
+        self.settings = settings
+        axes = settings.axes
+        self.low, self.high = np.radians(axes.low_deg), np.radians(axes.high_deg)
+        self.speed_max, self.acceleration_max = (
+            np.radians(axes.speed_deg_per_s),
+            np.radians(axes.acceleration_deg_per_s2),
+        )
+        self._speed_allowed = np.minimum(self.speed_max, math.radians(settings.max_speed_deviation_deg_per_s))
+        self._gain_per_s = settings.gain * settings.pos_corr_gain
+        self._passed = -math.expm1(-2 * math.pi * settings.filter_hz * _PERIOD_S) if settings.filter_hz else 1.0
+        self.motors_on = True
+        self.program_running = True
+        self.q = np.array(q, dtype=np.float64)
+        self.dq = np.zeros_like(self.q)
+        self._trail = deque([self.q] * (settings.lag_cycles + 1), maxlen=settings.lag_cycles + 1)
+        self.begin()
+
+    def begin(self) -> None:
+        """Starts a session: nothing of the one before counts."""
+        self.error = ""
+        self.converged = False
+        self.ended_ns: int | None = None
+        self.utilization = 0.0
+        self.reference: Correction | None = None
+        self._heard_ns: int | None = None
+        self._near_since_ns: int | None = None
+        self._halted: tuple[int, Floats] | None = None
+        self._filtered = self.dq.copy()
+
+    @property
+    def measured(self) -> Floats:
+        """Measured joints (nv,) [rad]: the planned ones some cycles ago."""
+        return self._trail[0]
+
+    @property
+    def moves(self) -> bool:
+        """Whether references are followed: the session lasts, motors are on and the program runs."""
+        return self.ended_ns is None and self.motors_on and self.program_running
+
+    def step(self, t_ns: int, told: Correction | None) -> None:
+        """One cycle: take the message, if any, then move until the next cycle.
+
+        Args:
+            t_ns: Start of the cycle [ns].
+            told: The one message read in this cycle; without one the last is used again.
+        """
+        if told is not None and self.ended_ns is None:
+            self._heard_ns = t_ns
+            self.reference = told
+        self._watch(t_ns)
+        self.dq = self._keep_range(self._follow() if self.moves else self._halt(t_ns))
+        self.q = np.clip(self.q + self.dq * _PERIOD_S, self.low, self.high)
+        self._trail.append(self.q)
+
+    def fail(self, t_ns: int, why: str) -> None:
+        """Ends the session in an error."""
+        if self.ended_ns is None:
+            self.error, self.ended_ns = why, t_ns
+
+    def _watch(self, t_ns: int) -> None:
+        """Ends the session by time-out, by a reference out of range, or by convergence."""
+        if self.reference is None or self._heard_ns is None or self.ended_ns is not None:
+            return
+        target = self.reference.q
+        if t_ns - self._heard_ns > self.settings.comm_timeout_s * 1e9:
+            self.fail(t_ns, "CommTimeout")
+        elif np.any(target < self.low - _ROUNDING_RAD) or np.any(target > self.high + _ROUNDING_RAD):
+            self.fail(t_ns, "reference out of range")
+        elif not self.moves or np.any(np.abs(target - self.q) > math.radians(self.settings.convergence_deg)):
+            self._near_since_ns = None
+        elif self._near_since_ns is None:
+            self._near_since_ns = t_ns
+        elif self.settings.cond_time_s and t_ns - self._near_since_ns >= self.settings.cond_time_s * 1e9:
+            self.converged, self.ended_ns = True, t_ns
+
+    def _follow(self) -> Floats:
+        """Speed (nv,) [rad/s] of the control law: k (pos_ref - pos) + speed_ref, filtered, then limited."""
+        self._halted = None
+        raw = np.zeros_like(self.q)
+        if self.reference is not None:
+            raw = self._gain_per_s * (self.reference.q - self.q) + self.reference.dq
+        self._filtered = self._filtered + self._passed * (raw - self._filtered)
+        share = float(np.max(np.abs(self._filtered) / self._speed_allowed))
+        change = self._filtered / max(1.0, share) - self.dq
+        step = self.acceleration_max * _PERIOD_S
+        self.utilization = 100.0 * max(share, float(np.max(np.abs(change) / step)))
+        return self.dq + np.clip(change, -step, step)
+
+    def _halt(self, t_ns: int) -> Floats:
+        """Speed (nv,) [rad/s] on the way to rest: by brakes without motors, by the ramp otherwise."""
+        if self._halted is None:
+            self._halted = (t_ns, self.dq)
+        self.utilization = 0.0
+        since_ns, dq = self._halted
+        left = max(0.0, 1.0 - ((t_ns - since_ns) * 1e-9 + _PERIOD_S) / self.settings.ramp_s)
+        step = self.acceleration_max * _PERIOD_S
+        ramped = dq * left if self.motors_on else np.zeros_like(dq)
+        self._filtered = self.dq + np.clip(ramped - self.dq, -step, step)
+        return self._filtered
+
+    def _keep_range(self, dq: Floats) -> Floats:
+        """The speed from which full braking still ends within the range of each axis (nv,) [rad/s]."""
+        return np.clip(dq, -self._fastest(self.q - self.low), self._fastest(self.high - self.q))
+
+    def _fastest(self, room: Floats) -> Floats:
+        """Largest speed that can be braked within some room, cycle by cycle (nv,) [rad/s]."""
+        step = self.acceleration_max * _PERIOD_S  # v T + (v - step) T + ... over n cycles is the room
+        n = np.maximum(1.0, np.ceil(np.sqrt(0.25 + 2 * np.maximum(room, 0.0) / (step * _PERIOD_S)) - 0.5))
+        return np.maximum(room, 0.0) / (n * _PERIOD_S) + step * (n - 1) / 2

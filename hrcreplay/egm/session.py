@@ -1,0 +1,213 @@
+"""Our side of the conversation with the robot: packets and instants in, decisions out. No clock, no socket.
+
+The robot counts its packets. What a packet is to the conversation follows from its counter, ``ahead`` of the last:
+
+- older by the robot's clock, and not 0: overtaken on the way, however long ago. Not answered.
+- 1 to ``LEAP`` ahead, round 2**32 too: the next one; those between are lost.
+- the same counter, clock and stamp: a duplicate. Not answered, for a second answer queues up in the robot as lag.
+- anything else, as 0, and any packet after a silence: a new session.
+
+A session begins with an echo: the first answer is what the robot measured, at speed 0, whatever is asked for. So is
+every answer while the robot may not move, since the last target is live again as soon as it may.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from hrcreplay.egm.codec import WRAP, Correction, Mci, Motors, Rapid, RobotPacket
+from hrcreplay.records import Floats
+
+#: Lost packets that a session survives: 4 s of them, far more than a silence allows.
+LEAP: Final = 1000
+
+#: Why a datagram is not answered. The first two refuse the robot, the others the datagram.
+REFUSALS: Final = ("radians", "axes", "no packet", "stale", "duplicate")
+#: Why an answered robot must not be moved.
+STOPS: Final = ("motors off", "EGM error", "converged", "program stopped", "not answered yet", "utilization")
+#: Every reason that ``hear`` gives.
+REASONS: Final = (*REFUSALS, *STOPS)
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What a packet means.
+
+    Attributes:
+        answer: It is to be answered, at once.
+        fresh: The answer will be an echo of the measured joints; blend from there. True from the first packet of a
+            session, or from the first on which the robot may move again, until that echo is given.
+        allowed: Motors on, EGM running, program not stopped. Of a datagram that is refused: what held before.
+        reason: Empty, or one of ``REASONS``.
+        ended: The robot has converged or left EGM: the session is over or about to be. To report, no failure.
+        lost: Packets missing before this one.
+    """
+
+    answer: bool
+    fresh: bool
+    allowed: bool
+    reason: str
+    ended: bool
+    lost: int
+
+
+class Session:
+    """Conversations with one robot, one after the other.
+
+    ``counts`` has the packets and sessions heard, those lost, and each refusal by its reason.
+    """
+
+    def __init__(
+        self,
+        q_min: Floats,
+        q_max: Floats,
+        dq_max: Floats,
+        *,
+        utilization_max: float = 100.0,
+        utilization_packets: int = 5,
+        silence_s: float = 0.1,
+    ) -> None:
+        """Begin before the first packet.
+
+        Args:
+            q_min: (6,) smallest joints that are ever commanded [rad].
+            q_max: (6,) largest ones [rad].
+            dq_max: (6,) largest speed reference [rad/s].
+            utilization_max: The robot cannot follow above this [%].
+            utilization_packets: It must say so this often in a row, because a lost packet lets it flare up.
+            silence_s: After a longer pause of the robot the session is a new one [s].
+        """
+        self.counts: Counter[str] = Counter()
+        self._q_min, self._q_max, self._dq_max = q_min, q_max, dq_max
+        self._utilization = (utilization_max, utilization_packets)
+        self._silence_ns = round(silence_s * 1e9)
+        self._last: RobotPacket | None = None
+        self._last_ns = 0
+        self._seqno = -1
+        self._low, self._high = q_min, q_max
+        self._due = self._fresh = self._allowed = self._answered = self._ran = False
+        self._strained = 0
+
+    def hear(self, packet: RobotPacket | None, t_ns: int) -> Heard:
+        """Take one datagram in order of arrival; None stands for one that is no packet."""
+        if packet is None:
+            return self._refuse("no packet")
+        if packet.clock_ns is None:
+            self._allowed = False
+            return self._refuse("radians")
+        if packet.q.shape != self._q_min.shape:
+            self._allowed = False
+            return self._refuse("axes")
+        kind, lost = self._place(packet, t_ns)
+        if kind in REFUSALS:
+            return self._refuse(kind)
+        if kind == "new":
+            self._begin()
+        self._last, self._last_ns, self._due = packet, t_ns, True
+        self.counts["packets"] += 1
+        self.counts["lost"] += lost
+        return self._judge(packet, lost)
+
+    def hear_all(self, packets: Iterable[RobotPacket | None], t_ns: int) -> tuple[Heard, RobotPacket | None]:
+        """Take a queue that built up, in order of arrival: one decision, and the packet to answer if there is one.
+
+        The last datagram need not be that packet: it may be garbage, or overtaken by one before it.
+        """
+        newest, answered, lost, ended = None, None, 0, False
+        heard = Heard(answer=False, fresh=False, allowed=self._allowed, reason="no packet", ended=False, lost=0)
+        for packet in packets:
+            heard = self.hear(packet, t_ns)
+            lost, ended = lost + heard.lost, ended or heard.ended
+            if heard.answer:
+                newest, answered = packet, heard
+        return replace(answered or heard, lost=lost, ended=ended), newest
+
+    def reply(self, q: Floats, dq: Floats, t_ns: int) -> Correction:
+        """Answer the packet just heard. What it says is what the robot was told, also where more was asked for.
+
+        Args:
+            q: (6,) joints to be at [rad]. Held inside the limits, and a speed that leads out of them with it; where
+                the echo itself was outside, the limits reach as far as it.
+            dq: (6,) derivative of q [rad/s]. Held inside dq_max.
+            t_ns: Now.
+
+        Raises:
+            ValueError: Nothing is due, or a joint is no finite number.
+        """
+        if not self._due or self._last is None:
+            raise ValueError("reply: no packet is waiting for one; one answer each is right")
+        if q.shape != self._q_min.shape or dq.shape != q.shape or not (np.isfinite(q).all() and np.isfinite(dq).all()):
+            raise ValueError(f"reply: {q} rad, {dq} rad/s; {len(self._q_min)} finite joints each are right")
+        if self._fresh or not self._allowed:
+            q, dq = self._last.q, np.zeros_like(q)
+            self._low, self._high = np.minimum(self._q_min, q), np.maximum(self._q_max, q)
+        else:
+            dq = np.minimum(
+                np.maximum(dq, np.where(q > self._low, -self._dq_max, 0.0)), np.where(q < self._high, self._dq_max, 0.0)
+            )
+            q = np.minimum(np.maximum(q, self._low), self._high)
+        self._seqno = (self._seqno + 1) % WRAP
+        self._due = self._fresh = False
+        self._answered = True
+        return Correction(seqno=self._seqno, tm_ms=t_ns // 1_000_000 % WRAP, q=q, dq=dq)
+
+    def _place(self, packet: RobotPacket, t_ns: int) -> tuple[str, int]:
+        """What the packet is to the conversation, "new", "next" or a refusal, and how many are missing before it."""
+        last = self._last
+        if last is None or t_ns - self._last_ns > self._silence_ns:
+            return "new", 0
+        if packet.seqno is None or last.seqno is None:
+            return "next", 0
+        older = (packet.clock_ns or 0) < (last.clock_ns or 0)
+        if older and packet.seqno != 0:
+            return "stale", 0
+        ahead = (packet.seqno - last.seqno) % WRAP
+        if 1 <= ahead <= LEAP:
+            return "next", ahead - 1
+        same = packet.clock_ns == last.clock_ns
+        if ahead == 0 and same and packet.tm_ms == last.tm_ms:
+            return "duplicate", 0
+        return ("stale" if same and packet.seqno != 0 else "new"), 0
+
+    def _begin(self) -> None:
+        """Forget the last session. Our own counter goes on: the robot sees no gap that is none."""
+        self.counts["sessions"] += 1
+        self._fresh = True
+        self._answered = self._ran = False
+        self._strained = 0
+
+    def _refuse(self, reason: str) -> Heard:
+        """Count a datagram that is not answered."""
+        self.counts[reason] += 1
+        return Heard(answer=False, fresh=False, allowed=self._allowed, reason=reason, ended=False, lost=0)
+
+    def _judge(self, packet: RobotPacket, lost: int) -> Heard:
+        """Whether the robot may be moved."""
+        allowed = packet.motors == Motors.ON and packet.mci == Mci.RUNNING and packet.rapid != Rapid.STOPPED
+        self._fresh = self._fresh or (allowed and not self._allowed)
+        self._allowed = allowed
+        self._ran = self._ran or packet.mci == Mci.RUNNING
+        most, often = self._utilization
+        self._strained = self._strained + 1 if packet.utilization > most else 0
+        reason = "" if allowed else self._standing(packet)
+        if allowed and self._strained >= often:
+            reason = "utilization"
+        ended = packet.converged or (self._ran and packet.mci != Mci.RUNNING)
+        return Heard(answer=True, fresh=self._fresh, allowed=allowed, reason=reason, ended=ended, lost=lost)
+
+    def _standing(self, packet: RobotPacket) -> str:
+        """Why the robot may not move. EGM does not run before the first answer: that is no stop."""
+        if packet.motors != Motors.ON:
+            return "motors off"
+        if packet.mci == Mci.ERROR:
+            return "EGM error"
+        if packet.converged:
+            return "converged"
+        if packet.rapid == Rapid.STOPPED or self._answered or self._ran:
+            return "program stopped"
+        return "not answered yet"
