@@ -210,7 +210,7 @@ def _floor(
         T = found[i].T_a_b
         track = Track(tracks[i].t_ns, transform(T, tracks[i].points_m), tracks[i].confidence)
         floor = find_floor(track, up)
-        if floor is not None:
+        if floor is not None and np.isfinite([*floor.up, floor.height_m]).all():
             return floor if height_m is None else replace(floor, height_m=height_m)
         if height_m is not None:
             guess = (up, 0.0) if up is not None else up_direction(track)

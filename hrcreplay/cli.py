@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from hrcreplay import __version__
-from hrcreplay.errors import HrcReplayError, SettingsError
+from hrcreplay.errors import HrcReplayError
+from hrcreplay.options import (
+    CellFile,
+    Chunk,
+    Config,
+    End,
+    LimitSet,
+    Out,
+    Set,
+    Smooth,
+    Source,
+    Start,
+    Topic,
+    as_overrides,
+    span,
+)
 
 app = typer.Typer(
     name="hrcreplay",
@@ -28,62 +42,11 @@ A research and engineering tool, not a certified safety function.""",
     epilog="Try it: hrcreplay demo",
 )
 
-Source = Annotated[Path, typer.Argument(metavar="LOG_OR_RUN", help="A log, or the run folder of an earlier stage.")]
-Config = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings file.")]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting; wins over the file. May be repeated."),
-]
-Topic = Annotated[
-    list[str] | None,
-    typer.Option("--topic", metavar="NAME", help="Skeleton topic to read; default all that can be. May be repeated."),
-]
-LimitSet = Annotated[
-    str | None,
-    typer.Option("--limits", metavar="SET", help="Limit set of the prediction: paper, human, or a TOML file."),
-]
-CellFile = Annotated[
-    Path | None,
-    typer.Option("--cell", metavar="CELL.toml", help="Poses of cameras and robot, as written by calibrate."),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option("--out", metavar="DIR", help="Run folder to make; default reports/<log>/<UTC>-<command>."),
-]
-Start = Annotated[
-    float | None,
-    typer.Option("--start", metavar="S", help="First second of the log to use, in seconds from its start."),
-]
-End = Annotated[
-    float | None, typer.Option("--end", metavar="S", help="Last second of the log to use, in seconds from its start.")
-]
-Smooth = Annotated[
-    bool, typer.Option("--smooth", help="Also write smooth.parquet: Rauch-Tung-Striebel pass, for reference.")
-]
-Chunk = Annotated[
-    int, typer.Option("--chunk-ticks", min=1, metavar="N", help="Number of ticks worked on at once; changes no result.")
-]
-
 
 def _version(asked: bool) -> None:
     if asked:
         sys.stdout.write(f"hrcreplay {__version__}\n")
         raise typer.Exit
-
-
-def _overrides(
-    settings: list[str] | None, topics: list[str] | None = None, limits: str | None = None
-) -> tuple[str, ...]:
-    """Options that stand for a setting, as settings."""
-    short = [f"logs.topics={json.dumps(topics)}"] if topics else []
-    short += [f"limits.prediction={json.dumps(limits)}"] if limits else []
-    return (*(settings or ()), *short)
-
-
-def _span(start: float | None, end: float | None) -> dict[str, Any]:
-    if start is not None and end is not None and end <= start:
-        raise SettingsError(f"--end {end:g}: not after --start {start:g}; give a later second")
-    return {"start_s": start, "end_s": end}
 
 
 @app.callback()
@@ -103,7 +66,7 @@ def info(
     """What a log holds, and what is missing for the next step."""
     from hrcreplay import ingest
 
-    sys.stdout.write("\n".join(ingest.describe(log, config, _overrides(settings, topic))) + "\n")
+    sys.stdout.write("\n".join(ingest.describe(log, config, as_overrides(settings, topic))) + "\n")
 
 
 @app.command(name="import")
@@ -153,7 +116,7 @@ def calibrate(
     from hrcreplay import ingest
 
     for line in ingest.calibrate(
-        log, out, config, _overrides(settings, topic), reference=camera, up=up, height_m=height, base=base
+        log, out, config, as_overrides(settings, topic), reference=camera, up=up, height_m=height, base=base
     ):
         sys.stderr.write(f"hrcreplay: {line}\n")
     sys.stdout.write(f"{out}\n")
@@ -183,9 +146,9 @@ def _stage(command: str, text: str) -> None:
             source,
             out=out,
             config=config,
-            overrides=_overrides(settings, topic, limits),
+            overrides=as_overrides(settings, topic, limits),
             cell_file=cell,
-            **_span(start, end),
+            **span(start, end),
             smooth=smooth,
             chunk_ticks=chunk_ticks,
         )
@@ -213,10 +176,10 @@ def audit(
     end: End = None,
 ) -> None:
     """How often people left the volumes that were predicted for them, by method and limb."""
-    from hrcreplay import audit as driver
+    from hrcreplay.audit import driver
 
-    overrides = _overrides(settings, topic, limits)
-    folder = driver.run(sources, out=out, config=config, overrides=overrides, cell_file=cell, **_span(start, end))
+    overrides = as_overrides(settings, topic, limits)
+    folder = driver.run(sources, out=out, config=config, overrides=overrides, cell_file=cell, **span(start, end))
     sys.stdout.write(f"{folder}\n")
 
 
@@ -233,7 +196,7 @@ def fit_limits(
     ] = 0.3,
     cover: Annotated[
         str, typer.Option("--cover", metavar="WHAT", help="joints in their intervals, or limbs in their volumes.")
-    ] = "joints",
+    ] = "limbs",
     config: Config = None,
     settings: Set = None,
     topic: Topic = None,
@@ -242,10 +205,10 @@ def fit_limits(
     end: End = None,
 ) -> None:
     """The tightest velocity and acceleration bounds that cover what people did; for --limits."""
-    from hrcreplay import fit
+    from hrcreplay.audit import fit
 
-    overrides = _overrides(settings, topic)
-    options = {"config": config, "overrides": overrides, "cell_file": cell, **_span(start, end)}
+    overrides = as_overrides(settings, topic)
+    options = {"config": config, "overrides": overrides, "cell_file": cell, **span(start, end)}
     for line in fit.run(logs, out=out, coverage=coverage, held_back=held_back, cover=cover, **options):
         sys.stderr.write(f"hrcreplay: {line}\n")
     sys.stdout.write(f"{out}\n")
@@ -261,11 +224,13 @@ def demo(
     """Report on the log that ships with hrcreplay: a worker beside a pick-and-place robot, two cameras, 60 s."""
     from hrcreplay import replay
 
-    overrides = _overrides(settings)
+    overrides = as_overrides(settings)
     folder = replay.run(
         "report", replay.demo_log(), out=out, config=config, overrides=overrides, chunk_ticks=chunk_ticks
     )
     sys.stdout.write(f"{folder / 'report.html'}\n")
+
+
 
 
 def main() -> None:

@@ -82,6 +82,10 @@ class Fusion(Section):
     """An angle is used when the product of the confidences of its points is at least this."""
     outlier_m: Positive = 0.20
     """A point further than this from the predicted skeleton is an outlier [m]."""
+    bone_m: Positive = 0.10
+    """So is one at the end of a bone that is longer or shorter than the person's by more [m]."""
+    bone_memory_s: Positive = 5.0
+    """Unless no camera has seen that bone right for so long [s]."""
     point_std_m: Positive = 0.02
     """Standard deviation of a skeleton point at full confidence [m]."""
     point_std_per_m: NotNegative = 0.0
@@ -98,25 +102,27 @@ class Fusion(Section):
     """Of how far each limb's measured points were from the model's: the quantile that is tracked."""
     residual_memory_s: Positive = 20.0
     """A distance seen this long ago counts 1/e of a new one [s]."""
+    spread_memory_s: Positive = 1.0
+    """The reported deviations follow the surprises of measurements; a surprise falls to 1/e in this time [s]."""
     memory_s: Positive = 0.5
     """Without a valid row for longer than this the person counts as lost [s]."""
 
 
 class Limits(Section):
-    """Named limit sets (paper, human) or paths of TOML files."""
+    """Named limit sets (paper, human, people) or paths of TOML files."""
 
     tracking: str = "human"
     """Bounds the filter's state, Eq. (62)-(65)."""
-    prediction: str = "paper"
-    """Bounds the reachable sets, Alg. 1."""
+    prediction: str = "people"
+    """Bounds the reachable sets, Alg. 1. people: fitted on recordings; the README says why it is the default."""
 
 
 class Occupancy(Section):
     """Section 3: what the person can reach."""
 
-    method: Literal["paper", "positions", "sound"] = "paper"
-    """paper: Eq. (20)-(30) and Alg. 1, 2; positions: from positions and velocity bounds alone [26]; sound: encloses
-    every motion of the model under the limits."""
+    method: Literal["paper", "positions", "sound"] = "sound"
+    """sound: encloses every motion of the model under the limits; paper: Eq. (20)-(30) and Alg. 1, 2 as printed;
+    positions: from positions and velocity bounds alone [26]."""
     stop_s: Positive = 0.377
     """Worst-case braking time T_s of the robot, Eq. (70) [s]."""
     store_hz: Positive | Literal["all"] = 25.0
@@ -130,8 +136,8 @@ class Occupancy(Section):
     radius_lower_arm_m: NotNegative = 0.07
     """Table 2 [m]."""
 
-    sigmas: NotNegative = 3.0
-    """sound: states within so many standard deviations of the estimate are enclosed."""
+    sigmas: NotNegative = 1.0
+    """sound: states within so many standard deviations of the estimate are enclosed, all joints off at once."""
     latency_s: NotNegative = 0.0
     """sound: from the newest capture to the robot's reaction; the horizon is longer by it [s]."""
     hand_m: NotNegative = 0.19
@@ -142,6 +148,8 @@ class Occupancy(Section):
     """sound: whether there is a lower body."""
     residual: bool = True
     """sound: whether the measured body's distance from the model is added to the radii."""
+    residual_unknown_m: NotNegative = 0.10
+    """sound: that distance until enough of it has been seen [m]."""
 
 
 class LinkSettings(Section):
@@ -212,6 +220,82 @@ class Report(Section):
     """A TCP slower than this stands [m/s]."""
 
 
+class ZenohKey(Section):
+    """The Zenoh keys of one camera."""
+
+    key: str
+    """Key expression: 0/kinect/skeleton/** of rmw_zenoh, kinect/skeleton of the DDS bridge."""
+    payload: Literal["hrcreplay", "cdr"] = "hrcreplay"
+    """Our own message, or the CDR of a ROS 2 system."""
+    type: str | None = None
+    """cdr: message type; none: as the keys of rmw_zenoh tell."""
+    definition: str = ""
+    """cdr: text of the type's .msg, where no release of ROS 2 has it."""
+    points: str | None = None
+    """cdr: path to the points in a type without a decoder of its own, as in logs.decoders."""
+    index: dict[str, int] = {}
+    """cdr: which element is which body point."""
+    unit: Literal["m", "mm"] = "m"
+    """cdr: unit of the points."""
+    stamp: str | None = "header.stamp"
+    """cdr: path to the capture time."""
+    confidence: str | None = None
+    """cdr: path to an array of confidences."""
+
+
+class Zenoh(Section):
+    """Live skeletons over Zenoh."""
+
+    mode: Literal["peer", "client"] = "peer"
+    """How we take part."""
+    connect: tuple[str, ...] = ()
+    """Endpoints to connect to, as tcp/192.168.0.1:7447."""
+    listen: tuple[str, ...] = ()
+    """Endpoints to listen on."""
+    scouting: bool = False
+    """Whether to look for others by multicast."""
+    keys: dict[str, ZenohKey] = {}
+    """Camera -> where its skeletons are."""
+
+
+class Live(Section):
+    """The live session: EGM link, watchdog, person."""
+
+    port: Annotated[int, Field(ge=0, le=65535)] = 6510
+    """UDP port at which the robot's packets arrive."""
+    cycle_s: Positive = 0.004032
+    """The robot's cycle: every answer moves the reference by this much time [s]."""
+    reaction_s: NotNegative = 0.05
+    """From a look at the person to the robot's obedience: an answer's delay, a cycle and the robot's own lag. The swept
+    volumes of method sound reach this much further than T_s [s]."""
+    approach_speed: Annotated[float, Field(gt=0, le=1)] = 0.1
+    """Share of the axes' top speeds on the way from where the robot stands to its programme."""
+    resume: bool = False
+    """Whether motion goes on by itself once the reason of a stop is gone."""
+    resume_s: Positive = 1.0
+    """How long it must be gone before that [s]."""
+    fresh_s: Positive = 0.3
+    """No frame of the person for longer stops the robot [s]."""
+    uncertain_m: Positive = 0.2
+    """A larger standard deviation of the person's position stops the robot [m]."""
+    uncertain_rad: Positive = 0.8
+    """The same for heading and bend of the trunk [rad]."""
+    person_late_s: Positive = 0.2
+    """The human side's process without a sign of life for longer stops the robot [s]."""
+    overrun_s: Positive = 0.02
+    """An answer later than this stops the robot [s]."""
+    silent_s: Positive = 0.1
+    """A robot that sends nothing for longer counts as gone [s]."""
+    tracking_rad: Positive = 0.2
+    """A robot further than this from its reference stops [rad]."""
+    utilization_max: Positive = 100.0
+    """A robot above this cannot follow, and stops [%]."""
+    keep_recorder: bool = True
+    """Whether the robot stops when nobody records any more."""
+    zenoh: Zenoh = Zenoh()
+    """Where live skeletons come from when no recording is played."""
+
+
 class Settings(Section):
     """Everything a run depends on beside the log and the cell."""
 
@@ -222,6 +306,7 @@ class Settings(Section):
     robot: Robot = Robot()
     plan: Plan = Plan()
     report: Report = Report()
+    live: Live = Live()
 
 
 def load_settings(

@@ -6,6 +6,7 @@ import hashlib
 import json
 import tomllib
 from dataclasses import asdict, dataclass
+from fnmatch import fnmatch
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from hrcreplay.config import Settings, load_settings
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.limits import load_limits
+from hrcreplay.tables import lacks
 
 STAGES = ("fuse", "predict", "plan")
 
@@ -25,6 +27,9 @@ TABLES = {
     "predict": ("occupancy.parquet",),
     "plan": ("motion.parquet", "motion_*.parquet"),
 }
+
+#: What a run must tell of itself, so that its log can be replayed as it was.
+_NEEDED = ("inputs", "settings", "cell", "task", "span_s")
 
 #: Packages whose version can change a result.
 PACKAGES = ("coal", "filterpy", "mcap", "numba", "numpy", "pin", "proxsuite", "rosbags", "ruckig", "scipy")
@@ -74,13 +79,20 @@ class Job:
             digests[stage] = before
         return digests
 
-    def reusable(self) -> tuple[str, ...]:
-        """The stages whose tables of the earlier run are those that this job would make."""
+    def stale(self) -> dict[str, str]:
+        """Stage -> why the earlier run's tables are not those that this job would make; nor are those of later ones."""
         if self.earlier is None:
-            return ()
-        found = runs.read_meta(self.earlier).get("stages", {})
-        mine = self.digests()
-        return tuple(stage for stage in self.stages if found.get(stage) == mine[stage])
+            return {}
+        meta, mine = runs.read_meta(self.earlier), self.digests()
+        found: dict[str, str] = {}
+        reason = None
+        for stage in self.stages:
+            if reason is None and meta.get("stages", {}).get(stage) != mine[stage]:
+                reason = f"log, cell or settings are not those of {self.earlier}"
+            reason = reason or _damage(self.earlier, stage, meta["outputs"])
+            if reason is not None:
+                found[stage] = reason
+        return found
 
     def meta(self) -> dict[str, Any]:
         """The part of run.json that is known before the first frame is read."""
@@ -119,6 +131,8 @@ def resolve(
     if not source.exists():
         raise LogError(f"{source}: nothing is there; give a log or a run folder")
     earlier = runs.read_meta(source) if runs.is_run(source) else None
+    if earlier is not None and (missing := [key for key in _NEEDED if key not in earlier]):
+        raise LogError(f"{source}: its run.json lacks {missing[0]}, so another version made it; give the log itself")
     base = earlier["settings"] if earlier is not None else {}
     settings = load_settings(config, overrides, base)
     cell = load_cell(cell_file) if cell_file is not None else None
@@ -126,7 +140,10 @@ def resolve(
         cell = cell or (Cell.from_dict(earlier["cell"]) if earlier["cell"] else None)
         start_s = earlier["span_s"][0] if start_s is None else start_s
         end_s = earlier["span_s"][1] if end_s is None else end_s
-    log = Path(earlier["inputs"][0]["path"]) if earlier is not None else source
+    log = source
+    if earlier is not None:  # a live session's log lies in its folder, wherever that is by now
+        named = Path(earlier["inputs"][0]["path"])
+        log = source / named if (source / named).exists() else named
     return Job(
         command=command,
         log=log,
@@ -140,6 +157,38 @@ def resolve(
         prediction=load_limits(settings.limits.prediction),
         earlier=source if earlier is not None else None,
     )
+
+
+def unlogged(command: str, where: Path, settings: Settings, cell_file: Path | None) -> Job:
+    """The job of a command that has no log yet; ``where`` is what messages call it.
+
+    Raises:
+        SettingsError: The cell, the task or a limit set cannot be used.
+    """
+    return Job(
+        command=command,
+        log=where,
+        log_sha256="",
+        settings=settings,
+        cell=load_cell(cell_file) if cell_file is not None else None,
+        task=_task(settings, None),
+        start_s=None,
+        end_s=None,
+        tracking=load_limits(settings.limits.tracking),
+        prediction=load_limits(settings.limits.prediction),
+        earlier=None,
+    )
+
+
+def _damage(folder: Path, stage: str, outputs: dict[str, str]) -> str | None:
+    """What keeps an earlier run's tables of a stage from being taken for ours."""
+    for name in sorted(name for name in outputs if any(fnmatch(name, pattern) for pattern in TABLES[stage])):
+        path = folder / name
+        if not path.exists() or runs.sha256(path) != outputs[name]:
+            return f"{path} is not as its run left it"
+        if missing := lacks(path):
+            return f"{path} is of an earlier version, without {missing[0]}"
+    return None
 
 
 def _digest(log: Path, earlier: dict[str, Any] | None) -> str:

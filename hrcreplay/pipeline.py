@@ -44,6 +44,12 @@ class Eyes:
     person_jump_m: float
     person_memory_s: float
 
+    def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
+        """What the frames say of the person, by the clock of the reference camera; see ``person.pick``."""
+        memory, mine, found = pick(frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s)
+        mine = replace(mine, capture_ns=mine.capture_ns - self.clock_offset_ns[mine.camera])
+        return memory, angles.measure(mine, self.T_world_camera, self.noise), found
+
 
 @dataclass(frozen=True)
 class Foresight:
@@ -101,13 +107,11 @@ def fused(
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
     passed: list[tuple[HumanStates, fusion.Trace]] = []
     for ticks, seen in batches(frames, ticks_ns, size):
-        measured = _none(log.header.cameras)
+        measured = nothing(log.header.cameras)
         if seen is not None:
-            memory, mine, found = pick(seen, memory, eyes.T_world_camera, eyes.person_jump_m, eyes.person_memory_s)
-            sink.counts.update(found)
-            mine = replace(mine, capture_ns=mine.capture_ns - eyes.clock_offset_ns[mine.camera])
             with sink.watch.stage("angles", len(ticks)):
-                measured = angles.measure(mine, eyes.T_world_camera, eyes.noise)
+                memory, measured, found = eyes.measure(seen, memory)
+            sink.counts.update(found)
             sink.run.table("measurements", measurement_columns(measured))
         with sink.watch.stage("fuse", len(ticks)):
             if smooth:
@@ -129,7 +133,7 @@ def fused(
         sink.run.table("smooth", state_columns(smoother.smooth(whole, trace, eyes.filter)))
 
 
-def _none(cameras: tuple[str, ...]) -> Measurements:
+def nothing(cameras: tuple[str, ...]) -> Measurements:
     """No frame of any camera."""
     return Measurements(
         capture_ns=np.zeros(0, np.int64),
@@ -165,13 +169,13 @@ def predicted(
             number = np.arange(done, done + len(batch))
             stored = np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
             with sink.watch.stage("hulls", len(stored)):
-                _store(volumes, stored, sink.run)
+                store(volumes, stored, sink.run)
         done += len(batch)
         sink.progress("predict", len(batch))
         yield batch, volumes
 
 
-def _store(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
+def store(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
     """Hull vertices and size of some ticks' volumes; a tick without a person leaves none."""
     t_ns: list[int] = []
     limbs: list[str] = []

@@ -107,8 +107,10 @@ def _take_over(job: Job, writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
     """Copies the tables of the earlier run's stages that would come out the same, and says which those are."""
     if job.earlier is None:
         return ()
-    # the smoother needs the filter's covariances, which no table holds
-    reused = tuple(stage for stage in job.reusable() if not (smooth and stage == "fuse"))
+    stale = job.stale()
+    if smooth:
+        stale.setdefault("fuse", f"{job.earlier} holds no covariances to smooth with")
+    reused = tuple(stage for stage in job.stages if stage not in stale)
     for stage in job.stages:
         names = [name for pattern in TABLES[stage] for name in sorted(p.name for p in job.earlier.glob(pattern))]
         if stage in reused:
@@ -116,7 +118,7 @@ def _take_over(job: Job, writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
                 writer.copy(name, job.earlier)
             say(f"{stage}: taken over from {job.earlier}")
         elif names:
-            say(f"{stage}: log, cell or settings are not those of {job.earlier}; computed again")
+            say(f"{stage}: {stale[stage]}; computed again")
     return reused
 
 

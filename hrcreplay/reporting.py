@@ -9,7 +9,8 @@ import numpy as np
 
 from hrcreplay import runs, wiring
 from hrcreplay.job import Job
-from hrcreplay.records import LIMBS, Floats, HumanStates
+from hrcreplay.pipeline import Foresight
+from hrcreplay.records import Floats, HumanStates
 from hrcreplay.report import figures, metrics, page, tables
 from hrcreplay.report.figures_human import Instant
 from hrcreplay.runs import Run, RunWriter
@@ -27,37 +28,35 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
     run = runs.read(writer.partial, meta)
     found = metrics.compute(run, **near)
     writer.text("metrics.json", runs.to_json(found))
-    radii = wiring.foresight(job).radii
+    foresight = wiring.foresight(job)
+    radii = {name.replace("_", " "): radius for name, radius in asdict(foresight.radii).items()}
+    if foresight.method == "sound" and foresight.margins.legs:
+        radii["legs, of sound"] = foresight.margins.legs_radius_m
     folder = writer.partial / "figures"
-    figures.draw_all(
-        run,
-        folder,
-        found,
-        **near,
-        volumes=_instants(job, run),
-        radii_m=dict(zip(LIMBS, radii.of_limbs().tolist(), strict=True)),
-    )
+    figures.draw_all(run, folder, found, **near, volumes=_instants(foresight, run))
     shown = [
         tables.limit_table(job.prediction, use="prediction"),
         tables.limit_table(job.tracking, use="tracking"),
-        tables.radius_table({name.replace("_", " "): radius for name, radius in asdict(radii).items()}),
+        tables.radius_table(radii),
     ]
     writer.text("report.html", page.render(run, found, folder, shown))
 
 
-def _instants(job: Job, run: Run) -> list[Instant]:
-    """The swept volumes by both methods at the instants that Fig. 17 shows."""
+def _instants(foresight: Foresight, run: Run) -> list[Instant]:
+    """The swept volumes by the paper's two methods and the run's own at the instants that Fig. 17 shows."""
     wanted = figures.instants(run)
     if not len(wanted):
         return []
     states = HumanStates.join(
         [batch.rows(np.isin(batch.t_ns, wanted)) for batch in read_states(run.folder / "state.parquet", 4096)]
     )
-    foresight = wiring.foresight(job)
-    by_method = {method: foresight.volumes(states, method) for method in ("paper", "positions")}
+    methods = dict.fromkeys(("paper", "positions", foresight.method))
+    by_method = {method: foresight.volumes(states, method) for method in methods}
 
-    def hulls(method: str, row: int) -> dict[str, Floats]:
+    def hulls(method: str, row: int) -> dict[str, tuple[Floats, float]]:
         volumes = by_method[method]
-        return {limb: volumes.vertices(row, i) for i, limb in enumerate(volumes.limbs)}
+        return {
+            limb: (volumes.vertices(row, i), float(volumes.radius_m[row, i])) for i, limb in enumerate(volumes.limbs)
+        }
 
     return [(int(t), {method: hulls(method, row) for method in by_method}) for row, t in enumerate(states.t_ns)]

@@ -47,6 +47,32 @@ def state_columns(states: HumanStates) -> Columns:
     return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
 
 
+#: Columns that a table of a run folder has whatever the cameras and the robot; who reads one counts on them.
+COLUMNS = {
+    "measurements": ("capture_ns", "arrival_ns", "camera", *JOINTS, *(f"{joint}_std" for joint in JOINTS), *LENGTHS),
+    "truth": ("t_ns", *JOINTS, *LENGTHS),
+    "state": (
+        "t_ns",
+        *(f"{joint}{suffix}" for _, suffix in _STATE for joint in JOINTS),
+        *(f"{length}{suffix}" for suffix in ("", "_std") for length in LENGTHS),
+        *_RESIDUAL,
+        *_UNSEEN,
+    ),
+    "occupancy": ("t_ns", "limb", "method", "radius_m", "volume_m3", "vertices"),
+    "motion": (
+        "t_ns",
+        *(f"{point}_{axis}" for point in ("ref", "tcp") for axis in "xyz"),
+        *("tcp_speed", "ref_speed", "programme_s", "distance_m", "limb", "link", "status", "reason"),
+    ),
+}
+
+
+def lacks(path: Path) -> tuple[str, ...]:
+    """The COLUMNS that a table lacks, as one of an earlier version may; ``motion_<baseline>`` has those of motion."""
+    names = set(pq.read_schema(path).names)
+    return tuple(name for name in COLUMNS[path.stem.split("_")[0]] if name not in names)
+
+
 def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
     """state.parquet as records again, bit for bit, ``chunk_ticks`` rows at a time."""
     with pq.ParquetFile(path) as file:

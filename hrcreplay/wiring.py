@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Protocol
+
 import numpy as np
 
 from hrcreplay.cell import Cell
@@ -11,8 +14,7 @@ from hrcreplay.human.fusion import FusionSettings
 from hrcreplay.human.margins import Margins
 from hrcreplay.human.occupancy import Radii
 from hrcreplay.job import Job
-from hrcreplay.logs.log import JointTrack
-from hrcreplay.logs.reader import Log
+from hrcreplay.logs.log import Header, JointTrack
 from hrcreplay.pipeline import Eyes, Foresight
 from hrcreplay.planner import Planner, QpFollower, ScalingFollower
 from hrcreplay.records import Floats
@@ -23,7 +25,18 @@ from hrcreplay.robot.stepping import PlanSettings
 from hrcreplay.robot.task import parse_task
 
 
-def eyes(job: Job, log: Log) -> Eyes:
+class Source(Protocol):
+    """A log, or what stands for one in a live session."""
+
+    @property
+    def header(self) -> Header:
+        """Cameras, task and robot base as far as they are known."""
+
+    def joints(self) -> Iterator[JointTrack]:
+        """The recorded joints, where there are any."""
+
+
+def eyes(job: Job, log: Source) -> Eyes:
     """Stage 1. A pose of the cell file wins over the log's.
 
     Raises:
@@ -56,7 +69,7 @@ def eyes(job: Job, log: Log) -> Eyes:
 
 
 def foresight(job: Job) -> Foresight:
-    """Stage 2."""
+    """Stage 2. Beside a real robot the volumes reach further, by the time until it obeys."""
     occupancy = job.settings.occupancy
     radii = Radii(
         head=occupancy.radius_head_m,
@@ -64,19 +77,21 @@ def foresight(job: Job) -> Foresight:
         upper_arm=occupancy.radius_upper_arm_m,
         lower_arm=occupancy.radius_lower_arm_m,
     )
+    reaction_s = job.settings.live.reaction_s if job.command == "live" else 0.0
     margins = Margins(
         sigmas=occupancy.sigmas,
-        latency_s=occupancy.latency_s,
+        latency_s=occupancy.latency_s + reaction_s,
         hand_m=occupancy.hand_m,
         legs_radius_m=occupancy.legs_radius_m,
         residual=occupancy.residual,
+        residual_m=occupancy.residual_unknown_m,
         memory_s=job.settings.fusion.memory_s,
         legs=occupancy.legs,
     )
     return Foresight(job.prediction, occupancy.stop_s, radii, margins, occupancy.method)
 
 
-def base(job: Job, log: Log) -> Floats | None:
+def base(job: Job, log: Source) -> Floats | None:
     """(4, 4) the robot's base in the world: of the cell file, else of the log."""
     if job.cell is not None and job.cell.T_world_base is not None:
         return job.cell.T_world_base
@@ -109,7 +124,7 @@ def robot(job: Job, T_world_base: Floats) -> RobotModel:
     )
 
 
-def reference(job: Job, log: Log, model: RobotModel) -> tuple[Reference, int | None]:
+def reference(job: Job, log: Source, model: RobotModel) -> tuple[Reference, int | None]:
     """The programmed path: of the task file, else of the log's task, else the log's joint track.
 
     Returns:
@@ -132,17 +147,39 @@ def reference(job: Job, log: Log, model: RobotModel) -> tuple[Reference, int | N
     return recorded(whole.t_ns, whole.q, model), int(whole.t_ns.min())
 
 
-def planners(job: Job, log: Log, start_ns: int) -> dict[str, Planner]:
+def planners(job: Job, log: Source, start_ns: int) -> dict[str, Planner]:
     """Stage 3: the chosen method and its baselines, each with a robot of its own."""
+    plan, model = job.settings.plan, robot(job, standing(job, log))
+    path, begin_ns = reference(job, log, model)
+    settings = plan_settings(job, 1.0 / job.settings.fusion.rate_hz)
+    s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
+
+    def planner(name: str) -> Planner:
+        follower = follow(job, name, model, path, settings, s_s)
+        return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
+
+    return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
+
+
+def standing(job: Job, log: Source) -> Floats:
+    """(4, 4) where the robot stands.
+
+    Raises:
+        SettingsError: Neither the cell nor the log knows.
+    """
     T_world_base = base(job, log)
     if T_world_base is None:
         raise SettingsError(
             f"{log.header.path}: where the robot stands is not known; give a --cell file with T_world_base"
         )
-    plan, model = job.settings.plan, robot(job, T_world_base)
-    path, begin_ns = reference(job, log, model)
-    settings = PlanSettings(
-        dt_s=1.0 / job.settings.fusion.rate_hz,
+    return T_world_base
+
+
+def plan_settings(job: Job, dt_s: float) -> PlanSettings:
+    """Section 5 for ticks of ``dt_s`` [s]."""
+    plan = job.settings.plan
+    return PlanSettings(
+        dt_s=dt_s,
         stop_s=job.settings.occupancy.stop_s,
         clearance_m=plan.clearance_m,
         q_p=plan.q_p,
@@ -151,15 +188,13 @@ def planners(job: Job, log: Log, start_ns: int) -> dict[str, Planner]:
         tcp_speed_max=plan.tcp_speed_max,
         tcp_acceleration_max=plan.tcp_acceleration_max,
     )
-    leash = Leash(plan.reference, plan.leash_m, plan.waypoint_m)
-    s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
 
-    def planner(name: str) -> Planner:
-        follower = (
-            QpFollower(model, path, settings, leash, s_s)
-            if name == "qp"
-            else ScalingFollower(model, path, settings, s_s)
-        )
-        return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
 
-    return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
+def follow(
+    job: Job, method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float
+) -> QpFollower | ScalingFollower:
+    """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on."""
+    if method == "scaling":
+        return ScalingFollower(model, path, settings, s_s)
+    plan = job.settings.plan
+    return QpFollower(model, path, settings, Leash(plan.reference, plan.leash_m, plan.waypoint_m), s_s)

@@ -16,5 +16,14 @@ def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def printed(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The plan on the shipped log by the paper's own prediction, with which the robot meets the person at speed."""
+    overrides = ("occupancy.store_hz=all", "occupancy.method=paper", "limits.prediction=paper")
+    return runs.read(
+        replay.run("plan", replay.demo_log(), out=tmp_path_factory.mktemp("printed") / "run", overrides=overrides)
+    )
+
+
+@pytest.fixture(scope="session")
 def demo(demo_folder: Path) -> Run:
     return runs.read(demo_folder)

@@ -200,3 +200,9 @@ def test_what_cannot_be_calibrated_is_told(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"no feet .*--height"):
         calibrate(_log(tmp_path / "blind.mcap", {"a": blind}))
     assert calibrate(_log(tmp_path / "told.mcap", {"a": blind}), height_m=1.6).T_world_camera["a"][2, 3] == 1.6
+
+
+def test_a_log_that_does_not_show_where_up_is_says_so() -> None:
+    demo = open_log(Path(__file__).parents[1] / "datasets" / "demo.mcap")
+    with pytest.raises(LogError, match=r"give the reference camera's height above it \(--height\) and up"):
+        calibrate(demo, jump_m=0.8, memory_s=2.0)

@@ -109,5 +109,5 @@ def test_a_wrong_file_is_refused_in_one_clear_line(
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(SettingsError, match=r"humans: no limit set .*name one of paper, human or a file"):
+    with pytest.raises(SettingsError, match=r"humans: no limit set .*name one of paper, human, people or a file"):
         load_limits("humans")

@@ -23,7 +23,7 @@ from hrcreplay.robot.stepping import RobotState
 from hrcreplay.robot.task import parse_task
 from hrcreplay.runs import Run
 from tests.robot import checker
-from tests.robot.test_controller import asked, dense
+from tests.robot.swinging import asked, dense
 
 
 def _short(command: str, source: Path, out: Path, **options: Any) -> Path:
@@ -43,7 +43,7 @@ def test_a_run_leaves_what_the_contract_says(demo_folder: Path, demo: Run) -> No
     wanted = [f"{joint}{suffix}" for joint in JOINTS for suffix in ("", "_vel", "_acc", "_jerk", "_std")]
     assert set(wanted) | set(LENGTHS) | {"valid_kinect", "valid_xtion"} <= set(demo.state.columns)
     assert set(demo.occupancy.columns) == {"t_ns", "limb", "method", "radius_m", "volume_m3", "vertices"}
-    assert set(demo.occupancy["limb"]) == set(LIMBS)
+    assert set(demo.occupancy["limb"]) == {*LIMBS, "LEGS"}
     axes = [f"{name}{axis}" for name in ("q", "dq", "u") for axis in range(1, 7)]
     places = [f"{name}_{axis}" for name in ("ref", "tcp") for axis in "xyz"]
     others = ["tcp_speed", "ref_speed", "programme_s", "distance_m", "limb", "link", "status", "reason"]
@@ -95,18 +95,23 @@ def _volumes(demo: Run) -> SweptVolumes:
             demo.occupancy["t_ns"], demo.occupancy["limb"], demo.occupancy["vertices"], strict=True
         )
     }
-    radius = dict(zip(demo.occupancy["limb"], demo.occupancy["radius_m"], strict=True))
+    radii = demo.occupancy.pivot_table(index="t_ns", columns="limb", values="radius_m")
+    limbs = tuple(limb for limb in (*LIMBS, "LEGS") if limb in radii)
     t_ns = demo.motion["t_ns"].to_numpy()
     nothing = np.full((1, 3), np.nan)
-    hulls = [by_place.get((t, limb), nothing) for t in t_ns for limb in LIMBS]
+    hulls = [by_place.get((t, limb), nothing) for t in t_ns for limb in limbs]
     offsets = np.concatenate([[0], np.cumsum([len(hull) for hull in hulls])])
-    radius_m = np.tile([radius[limb] for limb in LIMBS], (len(t_ns), 1))
-    return SweptVolumes(t_ns, offsets, np.concatenate(hulls), radius_m, LIMBS, "paper")
+    radius_m = radii[list(limbs)].reindex(t_ns).to_numpy()
+    return SweptVolumes(t_ns, offsets, np.concatenate(hulls), radius_m, limbs, str(demo.occupancy["method"].iloc[0]))
 
 
+@pytest.mark.parametrize("prediction", ["demo", "printed"])
 @pytest.mark.parametrize("name", ["qp", "scaling"])
-def test_every_tick_not_in_braking_keeps_inequality_2(demo: Run, name: str) -> None:
+def test_every_tick_not_in_braking_keeps_inequality_2(
+    request: pytest.FixtureRequest, prediction: str, name: str
+) -> None:
     """By a checker with its own kinematics, from the tables alone."""
+    demo: Run = request.getfixturevalue(prediction)
     table = demo.motion if name == "qp" else demo.baselines[name]
     assert table is not None
     assert demo.T_world_base is not None
@@ -117,9 +122,9 @@ def test_every_tick_not_in_braking_keeps_inequality_2(demo: Run, name: str) -> N
 
 
 @pytest.mark.parametrize("name", ["qp"])
-def test_a_braking_robot_decelerates_every_joint_at_its_limit(demo: Run, name: str) -> None:
-    assert demo.motion is not None
-    braking = demo.motion[demo.motion["status"] == "braking"]
+def test_a_braking_robot_decelerates_every_joint_at_its_limit(printed: Run, name: str) -> None:
+    assert printed.motion is not None
+    braking = printed.motion[printed.motion["status"] == "braking"]
     assert len(braking) > 50
     dq, u = (braking[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("dq", "u"))
     limit = np.radians([200, 200, 260, 360, 360, 450]) / 0.377
@@ -207,19 +212,19 @@ def test_a_tick_uses_no_frame_that_was_still_on_the_wire(tmp_path: Path) -> None
     assert short.state.equals(longer.state.iloc[: len(short.state)])
 
 
-def test_a_thousand_ticks_of_the_demo_are_those_of_another_solver(demo: Run) -> None:
+def test_a_thousand_ticks_of_the_demo_are_those_of_another_solver(printed: Run) -> None:
     """With all rows, by daqp: every stop with a person in sight, the nearest ticks, and others evenly."""
-    assert demo.motion is not None
-    assert demo.T_world_base is not None
+    assert printed.motion is not None
+    assert printed.T_world_base is not None
     task = open_log(replay.demo_log()).header.task
     assert task is not None
-    robot = irb140(demo.T_world_base, stop_s=0.377)
-    path, volumes = programmed(parse_task(task), robot), _volumes(demo)
-    q, dq, u = (demo.motion[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq", "u"))
-    s, status = demo.motion["programme_s"].to_numpy(), demo.motion["status"].to_numpy()
-    known = np.flatnonzero(demo.motion["distance_m"].notna().to_numpy()[:-1])
+    robot = irb140(printed.T_world_base, stop_s=0.377)
+    path, volumes = programmed(parse_task(task), robot), _volumes(printed)
+    q, dq, u = (printed.motion[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq", "u"))
+    s, status = printed.motion["programme_s"].to_numpy(), printed.motion["status"].to_numpy()
+    known = np.flatnonzero(printed.motion["distance_m"].notna().to_numpy()[:-1])
     stops = known[status[known] == "braking"]
-    nearest = known[np.argsort(demo.motion["distance_m"].to_numpy()[known], kind="stable")[:350]]
+    nearest = known[np.argsort(printed.motion["distance_m"].to_numpy()[known], kind="stable")[:350]]
     ticks = np.unique(np.concatenate([stops[:300], nearest, known[:: len(known) // 500]]))
     assert len(ticks) >= 1000
     assert (status[ticks] == "braking").sum() >= 200

@@ -19,7 +19,9 @@ class Filter(NamedTuple):
     lengths: Floats  #: (8,)
     lengths_var: Floats  #: (8,)
     row_ns: Ints  #: (20,) tick at which a row (12 angles, 8 lengths) was last valid
+    acquired_ns: Ints  #: (20,) tick at which a row started anew
     point_ns: Ints  #: (20,) tick at which a body point last agreed with the filter
+    bone_ns: Ints  #: (8,) tick at which a camera last saw a length that agreed with the filter
     capture_ns: Ints  #: (c,) of the frame held for each camera
     uses: Ints  #: (c,) ticks that frame was used in; -1 without one
     z: Floats  #: (c, 20) its rows
@@ -33,6 +35,8 @@ class Filter(NamedTuple):
     samples: Ints  #: (6,) residuals so far
     sampled_ns: Ints  #: (6,) tick of the last
     residual: Floats  #: (6,) their quantile [m]
+    surprise: Floats  #: (12,) running mean of each joint's innovations squared over their variance
+    spread: Floats  #: (12,) highest of it lately: the factor on the variances that are told
 
 
 class Frames(NamedTuple):
@@ -56,10 +60,15 @@ class Rules(NamedTuple):
     delay_max_s: float
     confidence_min: float
     outlier_m: float
+    bone_m: float
     memory_ns: int
+    bone_memory_ns: int
     coast_ns: int
     residual_quantile: float
     residual_memory_s: float
+    spread_memory_s: float
+    spread_least: float
+    spread_most: float
     rest_s: float
     rest_std: Floats  #: (12, 3) of v, a, j of a joint nobody has seen for long
     p_min: Floats
@@ -75,7 +84,7 @@ class Track(NamedTuple):
     """What the ticks leave behind; rows before the start stay as they are."""
 
     mean: Floats  #: (n, 12, 4)
-    std: Floats  #: (n, 12, 2) of p and v
+    std: Floats  #: (n, 12, 2) of p and v, with the factor of ``spread``
     lengths: Floats  #: (n, 8)
     lengths_std: Floats  #: (n, 8)
     valid: Bools  #: (n, c)

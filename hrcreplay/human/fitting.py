@@ -22,7 +22,7 @@ STIR = np.array([0.03] * 2 + [np.radians(5.0)] * 10)
 #: A joint needs so many horizons with motion, none overlapping; with fewer its bounds cannot be told.
 EXCURSIONS = 10
 #: Bounds are at least this [per second; per second squared], and are rounded up to so many digits.
-_LEAST, _DIGITS = 0.01, 3
+LEAST, _DIGITS = 0.01, 3
 #: Velocity bounds tried; and how much longer than the shortest mean reach one with less acceleration may be.
 _TRIED, _HARDLY = 48, 1.05
 #: The ticks that may be missed are given up in about so many steps, or in steps doubled up to so many times.
@@ -131,7 +131,9 @@ def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -
     Raises:
         LogError: No arm moved.
     """
-    excursions = np.array([_excursions(training.t_ns, training.moved[:, j] > STIR[j], horizon_s) for j in range(12)])
+    excursions = np.array(
+        [count_excursions(training.t_ns, training.moved[:, j] > STIR[j], horizon_s) for j in range(12)]
+    )
     if not arms_move(training).any():
         raise LogError(
             f"found no arm motion: within no horizon of {horizon_s:g} s does a joint of an arm move by "
@@ -204,11 +206,11 @@ class _Side:
         known = np.isfinite(self._gone)
         v, gone, horizon_s = self._v[known], self._gone[known], self._horizon_s
         rank = max(0, len(v) - 1 - misses)
-        slowest = max(float(np.partition(gone, rank)[rank]) / horizon_s, _LEAST)
-        free = float(np.partition(_needed(v, gone, np.inf, horizon_s), rank)[rank])
-        tried = _rounded_up(np.geomspace(slowest, max(float(v.max()) + free * horizon_s, slowest), _TRIED))
-        needed = np.array([np.partition(_needed(v, gone, bound, horizon_s), rank)[rank] for bound in tried])
-        tried, a = tried[np.isfinite(needed)], _rounded_up(np.maximum(needed[np.isfinite(needed)], _LEAST))
+        slowest = max(float(np.partition(gone, rank)[rank]) / horizon_s, LEAST)
+        free = float(np.partition(least_needed(v, gone, np.inf, horizon_s), rank)[rank])
+        tried = rounded_up(np.geomspace(slowest, max(float(v.max()) + free * horizon_s, slowest), _TRIED))
+        needed = np.array([np.partition(least_needed(v, gone, bound, horizon_s), rank)[rank] for bound in tried])
+        tried, a = tried[np.isfinite(needed)], rounded_up(np.maximum(needed[np.isfinite(needed)], LEAST))
         lengths = farthest(v[:, None], tried, a, horizon_s).mean(axis=0)
         k = np.argmin(np.where(lengths <= _HARDLY * lengths.min(), a, np.inf))
         reached = farthest(self._v[:, None], tried[k : k + 1], a[k : k + 1], horizon_s)[:, 0]
@@ -241,7 +243,7 @@ def _give_up(sides: list[_Side], budget: int) -> None:
         missed = missed + side.now.missed
 
 
-def _needed(v: Floats, gone: Floats, bound: float, horizon_s: float) -> Floats:
+def least_needed(v: Floats, gone: Floats, bound: float, horizon_s: float) -> Floats:
     """(n,) the least acceleration bound under which Alg. 1 reaches ``gone``; inf where none does.
 
     Either the whole horizon is spent speeding up, gone = v T + a T^2 / 2, or the velocity bound V is reached, and
@@ -256,7 +258,7 @@ def _needed(v: Floats, gone: Floats, bound: float, horizon_s: float) -> Floats:
     return np.where(gone <= 0.0, 0.0, np.where(v < bound, rising, np.where(lacks >= 0.0, 0.0, np.inf)))
 
 
-def _rounded_up(values: Floats) -> Floats:
+def rounded_up(values: Floats) -> Floats:
     """Positive values rounded up to few digits, as the shortest decimals that say so."""
     digits = _DIGITS - 1 - np.floor(np.log10(values)).astype(int)
     return np.array(
@@ -264,7 +266,7 @@ def _rounded_up(values: Floats) -> Floats:
     )
 
 
-def _excursions(t_ns: Ints, moving: Bools, horizon_s: float) -> int:
+def count_excursions(t_ns: Ints, moving: Bools, horizon_s: float) -> int:
     """How many of the moving ticks fit behind each other without a common future."""
     count, free_ns = 0, -1
     for t in t_ns[moving].tolist():

@@ -45,6 +45,8 @@ class FusionSettings:
     delay_max_s: float = 0.25  #: an older frame counts as this old [s]
     confidence_min: float = 0.2  #: least product of the confidences of the points an angle is computed from
     outlier_m: float = 0.20  #: a point further than this from the predicted skeleton is an outlier [m]
+    bone_m: float = 0.10  #: and one at the end of a bone that is longer or shorter than the person's by more [m]
+    bone_memory_s: float = 5.0  #: unless no camera has seen that bone right for so long [s]
     sigma_position: Sigmas = (
         300.0,
         100.0,
@@ -58,6 +60,9 @@ class FusionSettings:
     )
     residual_quantile: float = 0.95  #: of how far each limb's points were from the model's (see residual)
     residual_memory_s: float = 20.0  #: one seen this long ago counts 1/e of a new one [s]
+    spread_memory_s: float = 1.0  #: the factor on the variances falls to 1/e in this time (see surprise) [s]
+    spread_least: float = 0.01  #: smallest factor on the variances
+    spread_most: float = 4.0  #: largest one
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,9 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         lengths=np.array(_LENGTHS_M),
         lengths_var=np.full(len(LENGTHS), _LENGTHS_STD_M**2),
         row_ns=np.full(ROWS, _NEVER_NS),
+        acquired_ns=np.full(ROWS, _NEVER_NS),
         point_ns=np.full(len(POINTS), _NEVER_NS),
+        bone_ns=np.full(len(LENGTHS), _NEVER_NS),
         capture_ns=np.full(c, _NEVER_NS),
         uses=np.full(c, -1),
         z=np.full((c, ROWS), np.nan),
@@ -97,6 +104,8 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         samples=np.zeros(len(LIMBS), dtype=np.int64),
         sampled_ns=np.full(len(LIMBS), _NEVER_NS),
         residual=np.full(len(LIMBS), np.nan),
+        surprise=np.ones(12),
+        spread=np.ones(12),
     )
 
 
@@ -202,10 +211,15 @@ def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
         delay_max_s=settings.delay_max_s,
         confidence_min=settings.confidence_min,
         outlier_m=settings.outlier_m,
+        bone_m=settings.bone_m,
         memory_ns=round(settings.memory_s * 1e9),
+        bone_memory_ns=round(settings.bone_memory_s * 1e9),
         coast_ns=round(settings.coast_s * 1e9),
         residual_quantile=settings.residual_quantile,
         residual_memory_s=settings.residual_memory_s,
+        spread_memory_s=settings.spread_memory_s,
+        spread_least=settings.spread_least,
+        spread_most=settings.spread_most,
         rest_s=0.3 * settings.coast_s,
         rest_std=_REST_STD,
         p_min=limits.p_min,

@@ -12,6 +12,7 @@ from hrcreplay.human.kalman import correct, dot, predict
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM
 from hrcreplay.human.residual import observe, unseen
 from hrcreplay.human.saturation import saturate
+from hrcreplay.human.surprise import enter, factor
 from hrcreplay.human.validity import judge
 from hrcreplay.records import Floats, Ints
 
@@ -44,7 +45,7 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
             if saturate(filter_.mean, dt, rules):
                 track.saturated[0] += 1
             observe(filter_, fresh, now, rules)
-            _leave(filter_, k, track, damping)
+            _leave(filter_, k, rules, track, damping)
 
 
 @njit(cache=True)
@@ -100,9 +101,11 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
             filter_.lengths_var[row - 12] *= 1.0 - gain
         elif now - filter_.row_ns[row] > rules.memory_ns:
             _acquire(filter_, row, z[row], R, rules.rest_std[row])
+            filter_.acquired_ns[row] = now
             track.reacquired[0] += filter_.row_ns[row] >= 0  # the first time is no loss
         else:
-            correct(filter_.mean[row], filter_.cov[row], h, z[row], R)
+            squared = correct(filter_.mean[row], filter_.cov[row], h, z[row], R)
+            enter(filter_, row, squared, now, rules)
         if filter_.uses[c] == 1:
             filter_.row_ns[row] = now
     return True
@@ -140,6 +143,7 @@ def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> N
     """A joint seen for the first time, or for the first time after it was lost: nothing old is carried over."""
     filter_.mean[j] = 0.0
     filter_.mean[j, 0] = z
+    filter_.surprise[j], filter_.spread[j] = 1.0, 1.0
     filter_.cov[j] = 0.0
     filter_.cov[j, 0, 0] = R
     for k in range(3):
@@ -157,11 +161,11 @@ def _rename(filter_: Filter) -> None:
 
 
 @njit(cache=True)
-def _leave(filter_: Filter, k: int, track: Track, damping: Floats) -> None:
+def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats) -> None:
     track.mean[k] = filter_.mean
     for j in range(12):
         for a in range(2):
-            track.std[k, j, a] = np.sqrt(filter_.cov[j, a, a])
+            track.std[k, j, a] = np.sqrt(factor(filter_, j, rules) * filter_.cov[j, a, a])
     track.lengths[k] = filter_.lengths
     track.lengths_std[k] = np.sqrt(filter_.lengths_var)
     track.residual[k] = filter_.residual

@@ -39,8 +39,8 @@ def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> floa
 
 
 @njit(cache=True)
-def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> None:
-    """The Kalman update of one joint by one scalar row."""
+def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
+    """The Kalman update of one joint by one scalar row; returns the innovation squared over its variance."""
     Ph = np.empty(4)
     for a in range(4):
         Ph[a] = dot(P[a], h)
@@ -50,6 +50,7 @@ def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> None:
         mean[a] += Ph[a] / S * innovation
         for b in range(4):
             P[a, b] -= Ph[a] * Ph[b] / S
+    return innovation**2 / S
 
 
 @njit(cache=True)

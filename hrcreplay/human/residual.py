@@ -51,14 +51,25 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
     for c in np.flatnonzero(fresh):
         skeleton_row(ago(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths, model)
         for limb in np.flatnonzero(filter_.shows[c]):
-            sample = 0.0
-            for k in _ENDS[limb]:
-                sample = max(sample, distance(filter_.points[c, k], model[k]))
-            _enter(filter_, limb, now, sample, rules)
+            if _settled(filter_, limb, now, rules):
+                sample = 0.0
+                for k in _ENDS[limb]:
+                    sample = max(sample, distance(filter_.points[c, k], model[k]))
+                _enter(filter_, limb, now, sample, rules)
     for limb in np.flatnonzero(filter_.sampled_ns == now):
         if filter_.samples[limb] >= LEAST:
             larger = (1.0 - rules.residual_quantile) * filter_.weight[limb]
             filter_.residual[limb] = _exceeded_by(filter_.residuals[limb], larger)
+
+
+@njit(cache=True)
+def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
+    """Whether no joint that carries the limb has started anew within the memory: the filter must find it first."""
+    newest = filter_.acquired_ns[:4].max()
+    if limb >= 2:
+        first = _FIRST[limb - 2]
+        newest = max(newest, filter_.acquired_ns[first - first % 4 : first + 2].max())
+    return now - newest > rules.memory_ns
 
 
 @njit(cache=True)

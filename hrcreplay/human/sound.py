@@ -85,18 +85,19 @@ def sweep(
 def radii(states: HumanStates, limbs_m: Floats, margins: Margins) -> Floats:
     """(n, limbs) radii: of the limb (6,) [m], of what an unknown length up the chain displaces, and the residual.
 
-    A residual that is not known yet (NaN) adds nothing.
+    A residual that is not known yet (NaN) is taken to be ``margins.residual_m``. That of the thorax tells how far the
+    pelvis is from where it stands upright, so the lower body has it too: who squats has the knees where the hips were.
     """
     off = margins.sigmas * states.lengths_std_m
     pelvis = off[:, 0]
     shoulder = pelvis + np.hypot(off[:, 1], off[:, 3])
     displaced = np.column_stack([pelvis, pelvis, shoulder, shoulder + off[:, 5], shoulder, shoulder + off[:, 4]])
     radius = limbs_m + displaced + ROUNDING_M
+    legs = np.full(len(states), margins.legs_radius_m + ROUNDING_M)
     if margins.residual:
-        radius = radius + np.where(np.isnan(states.residual_m), 0.0, states.residual_m)
-    if margins.legs:
-        radius = np.column_stack([radius, np.full(len(states), margins.legs_radius_m + ROUNDING_M)])
-    return radius
+        residual = np.where(np.isnan(states.residual_m), margins.residual_m, states.residual_m)
+        radius, legs = radius + residual, legs + residual[:, _THORAX]
+    return np.column_stack([radius, legs]) if margins.legs else radius
 
 
 @njit(cache=True)

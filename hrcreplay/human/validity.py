@@ -8,17 +8,34 @@ from numba import njit
 from hrcreplay.human.angles import DEPENDS, ROWS
 from hrcreplay.human.filter import Filter, Rules, Track, delay
 from hrcreplay.human.kalman import ago
-from hrcreplay.human.model import HEAD, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
-from hrcreplay.records import Bools, Floats
+from hrcreplay.human.model import ARM_POINTS, HEAD, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
+from hrcreplay.records import LENGTHS, POINTS, Bools, Floats
 
 #: An angle known no better than this is not observed: a circle cannot tell [rad].
 _BLIND_STD = 1.0
 #: The points that the model predicts and a camera may get wrong.
 _TESTED = np.flatnonzero(DEPENDS.any(axis=0))
+_FAR_ENDS = (
+    (),
+    (PELVIS,),
+    (HEAD,),
+    (ARM_POINTS[0][0], ARM_POINTS[1][0]),
+    (ARM_POINTS[1][1],),
+    (ARM_POINTS[0][1],),
+    (ARM_POINTS[1][2],),
+    (ARM_POINTS[0][2],),
+)
 #: (6, 20) the body points that place a limb of LIMBS: what its rows are computed from, however it is turned.
 _PLACING = DEPENDS[[3, 3, RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2]]
 _PLACING[0, HEAD] = True
+#: (8, 20) the points that may be wrong where a length is: the far end of its bone, both shoulders of their line. How
+#: high the pelvis is may change.
+_ENDS = np.zeros((len(LENGTHS), len(POINTS)), dtype=np.bool_)
+for _length, _point in enumerate(_FAR_ENDS):
+    _ENDS[_length, list(_point)] = True
 _STEP = 1e-5
+#: How wrong a length is that starts anew, standard deviation [m].
+_UNKNOWN_M = 0.1
 
 
 @njit(cache=True)
@@ -26,7 +43,7 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
     """Which rows of a new frame are valid, 4.1.2, and which limbs it shows whole."""
     trusted = np.ones(len(filter_.point_ns), dtype=np.bool_)
     if filter_.started[0]:
-        trusted = _agreeing(filter_, c, now, rules)
+        trusted = _agreeing(filter_, c, now, rules) & _whole(filter_, c, now, rules)
         track.outliers[c] += len(trusted) - np.sum(trusted)
     confidence, points = filter_.confidence[c], filter_.points[c]
     for row in range(ROWS):
@@ -80,6 +97,27 @@ def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
             gate = rules.outlier_m + 3.0 * np.sqrt(variance[k])
             agreeing[k] = distance(filter_.points[c, k], expected[k]) <= gate
     return agreeing
+
+
+@njit(cache=True)
+def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
+    """The points of a frame (20,) that are not at the far end of a bone of another length than the person's.
+
+    Bones do not change, so a marker that jumps is told from a limb that moves. A length that no camera has seen right
+    for long was learnt wrong: it starts anew.
+    """
+    whole = np.ones(len(filter_.point_ns), dtype=np.bool_)
+    for k in range(1, len(filter_.lengths)):
+        apart = abs(filter_.z[c, 12 + k] - filter_.lengths[k])
+        if not np.isfinite(apart):
+            continue
+        if filter_.bone_ns[k] >= 0 and now - filter_.bone_ns[k] > rules.bone_memory_ns:
+            filter_.lengths_var[k] = _UNKNOWN_M**2
+        if apart <= rules.bone_m + 3.0 * np.sqrt(filter_.lengths_var[k]):
+            filter_.bone_ns[k] = now
+        else:
+            whole &= ~_ENDS[k]
+    return whole
 
 
 @njit(cache=True)

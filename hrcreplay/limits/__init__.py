@@ -1,4 +1,4 @@
-"""Named limit sets: ``paper`` (Table 1) and ``human`` (what people do); any other is a file of its own."""
+"""Named limit sets: ``paper`` (Table 1), ``human`` (the literature) and ``people`` (fitted); others are files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds
 from hrcreplay.records import JOINTS, Floats
 
 _HERE = Path(__file__).parent
-NAMES = ("paper", "human")
+NAMES = ("paper", "human", "people")
 _QUANTITIES = ("position", "velocity", "acceleration")
 _COUPLED = ("ar2", "ar3", "al2", "al3")
 
@@ -24,8 +24,8 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
     """A limit set that ships with the package, by its name, or one of the user's, by the path of its TOML file.
 
     Args:
-        name_or_path: ``paper``, ``human`` or a file like theirs: ``coupled`` and a table ``joints`` with a row
-            ``{ position = [low, high], velocity = [...], acceleration = [...] }`` for each of JOINTS
+        name_or_path: ``paper``, ``human``, ``people`` or a file like theirs: ``coupled`` and a table ``joints`` with
+            a row ``{ position = [low, high], velocity = [...], acceleration = [...] }`` for each of JOINTS
             [m, m, rad...; per second; per second squared]. Where coupled, alpha_2 and alpha_3 have no position.
             A table ``provenance`` may say where the bounds come from; it changes nothing.
 

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.rows import ARRIVAL_NOTE, Row, instant, lines, numbers, overlap_notes, row, write_log
+from hrcreplay.logs.rows import Row, import_cameras, instant, lines, numbers, row
 
 #: K4ABT's joint confidence: none, low, medium, high. 'High' is reserved by the SDK; medium is the most it gives.
 CONFIDENCE = {0.0: 0.0, 1.0: 0.5, 2.0: 1.0, 3.0: 1.0}
@@ -35,24 +35,12 @@ _JOINTS = {
 
 
 def import_azure(paths: Mapping[str, Path], out: Path) -> list[str]:
-    """Makes our log from Azure Kinect CSV files.
+    """Makes our log from Azure Kinect CSV files (.csv or .csv.gz): ``import_cameras``, with its remarks and errors.
 
     Points stay in each camera's own depth frame (x right, y down, z forward) [m]. Confidence 0, 1, 2, 3 becomes
     0, 0.5, 1, 1. The device's time is the capture time.
-
-    Args:
-        paths: Camera -> file (.csv or .csv.gz).
-        out: Log to write.
-
-    Returns:
-        Remarks for the user.
-
-    Raises:
-        LogError: A file that cannot be read as this format.
-        SettingsError: ``out`` exists or cannot be written.
     """
-    spans = write_log({name: _rows(path) for name, path in paths.items()}, out)
-    return [ARRIVAL_NOTE, *overlap_notes(spans)]
+    return import_cameras(paths, out, _rows)
 
 
 def _rows(path: Path) -> Iterator[Row]:

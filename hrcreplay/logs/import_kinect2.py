@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.rows import ARRIVAL_NOTE, Row, instant, lines, numbers, overlap_notes, row, write_log
+from hrcreplay.logs.rows import Row, import_cameras, instant, lines, numbers, row
 
 #: Confidence of the tracking states 'not tracked', 'inferred' and 'tracked'.
 CONFIDENCE = np.array([0.0, 0.5, 1.0])
@@ -31,24 +31,12 @@ _COUNT = 25
 
 
 def import_kinect2(paths: Mapping[str, Path], out: Path) -> list[str]:
-    """Makes our log from Kinect v2 CSV files.
+    """Makes our log from Kinect v2 CSV files (.csv or .csv.gz): ``import_cameras``, with its remarks and errors.
 
     Points stay in each camera's own frame (x to the sensor's left, y up, z forward) [m]. Tracking states 0, 1, 2
     become confidence 0, 0.5, 1. The sensor's time is the capture time.
-
-    Args:
-        paths: Camera -> file (.csv or .csv.gz).
-        out: Log to write.
-
-    Returns:
-        Remarks for the user.
-
-    Raises:
-        LogError: A file that cannot be read as this format.
-        SettingsError: ``out`` exists or cannot be written.
     """
-    spans = write_log({name: _rows(path) for name, path in paths.items()}, out)
-    return [ARRIVAL_NOTE, *overlap_notes(spans)]
+    return import_cameras(paths, out, _rows)
 
 
 def _rows(path: Path) -> Iterator[Row]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any
 
 from rosbags.serde import SerdeError
@@ -68,9 +69,15 @@ def _stores(name: str, definition: str, form: str, releases: tuple[Stores, ...])
         except _FAILURES:
             pass  # some recorders stored definitions without their parts; a release may know the type
     for release in releases:
-        store = get_typestore(release)
+        store = _release(release)
         if name in store.fielddefs:
             yield store
+
+
+@cache
+def _release(release: Stores) -> Typestore:
+    """The types of a release, which take a while to build."""
+    return get_typestore(release)
 
 
 def _types(name: str, definition: str, form: str) -> Any:

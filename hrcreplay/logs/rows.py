@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gzip
 import heapq
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -136,6 +136,25 @@ def write_log(sources: Mapping[str, Iterator[Row]], out: Path) -> dict[str, tupl
         if empty:
             raise LogError(f"camera {empty[0]}: no row with a body; would be right: one row a body a frame")
     return spans
+
+
+def import_cameras(paths: Mapping[str, Path], out: Path, read: Callable[[Path], Iterator[Row]]) -> list[str]:
+    """Makes our log from one file a camera, whose times are those of the captures.
+
+    Args:
+        paths: Camera -> file.
+        out: Log to write.
+        read: The rows of a file.
+
+    Returns:
+        Remarks for the user.
+
+    Raises:
+        LogError: A file that cannot be read as its format.
+        SettingsError: ``out`` exists or cannot be written.
+    """
+    spans = write_log({name: read(path) for name, path in paths.items()}, out)
+    return [ARRIVAL_NOTE, *overlap_notes(spans)]
 
 
 def overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:

@@ -113,13 +113,17 @@ def curve_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str
 
 
 def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
-    """Every escape: the ticks in a row whose prediction one limb left, when, and how far."""
+    """Every escape: the ticks in a row whose prediction one limb left, when, and how far.
+
+    Times are those of the predictions; seconds count from ``start_ns``.
+    """
     depth = outcome.escape_m()
     seconds = (outcome.t_ns - start_ns) * 1e-9
     found = []
     for i, limb in enumerate(outcome.limbs):
         for first, last in _joined(depth[:, i] > 0.0):
             part = depth[first:last, i]
+            deepest = first + int(np.nanargmax(part))
             found.append(
                 {
                     "limb": limb,
@@ -127,7 +131,8 @@ def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
                     "to_s": round(float(seconds[last - 1]), 3),
                     "ticks": int((part > 0.0).sum()),
                     "deepest_m": float(np.nanmax(part)),
-                    "deepest_at_s": round(float(seconds[first + int(np.nanargmax(part))]), 3),
+                    "deepest_at_s": round(float(seconds[deepest]), 3),
+                    "deepest_t_ns": int(outcome.t_ns[deepest]),
                 }
             )
     return sorted(found, key=lambda e: (e["from_s"], e["limb"]))

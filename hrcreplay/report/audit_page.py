@@ -134,6 +134,8 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> Part:
         f"({blocks['block_ticks'] / found['audit_hz']:.2f} s), {blocks['draws']} draws; of shares, "
         f"wide enough for a binomial with one look a horizon too. {_equal(found)}"
     )
+    if len(found["logs"]) > 1:
+        way += " The total counts every tick once: a long log weighs more than a short one."
     error = max(found["total"]["methods"][m]["all"]["union_counting_error"] or 0.0 for m in methods)
     return Part(
         "coverage",
@@ -224,6 +226,7 @@ def _data(found: Mapping[str, Any]) -> Part:
     for log in found["logs"]:
         rows = [(f"limits of the prediction: {log['limits']}",), *((note,) for note in log["notes"])]
         tables.append(PageTable(f"{log['log']}: {log['ticks']} ticks", ("",), tuple(rows)))
+        tables.append(_cameras(log))
         counts = tuple((name.replace("_", " "), str(count)) for name, count in log["counts"].items())
         tables.append(PageTable(f"{log['log']}: what was counted on the way", ("", "count"), counts))
         tables += [_escapes(log, method) for method in found["own_methods"]]
@@ -236,16 +239,42 @@ def _data(found: Mapping[str, Any]) -> Part:
     )
 
 
+def _cameras(log: Mapping[str, Any]) -> PageTable:
+    """What of each camera's points was not believed."""
+    rows = tuple(
+        (camera, *("\u2013" if count is None else str(count) for count in counts.values()))
+        for camera, counts in log["cameras"].items()
+    )
+    return PageTable(
+        f"{log['log']}: thrown out",
+        ("camera", "frames", "frames with a point rejected", "points rejected", "outliers in the fusion"),
+        rows,
+        "Points that jump off the person are rejected: they are no part of the recorded future. A dash: the recorded "
+        "future is not from cameras. The fusion's own gate is per tick and knows only what came before.",
+    )
+
+
 def _escapes(log: Mapping[str, Any], method: str) -> PageTable:
     every = log["escapes"][method]
     deepest = sorted(every, key=lambda e: -e["deepest_m"])[:_MOST_ESCAPES]
     rows = tuple(
-        (f"{e['from_s']:.2f} s", f"{e['to_s']:.2f} s", e["limb"], str(e["ticks"]), f"{1e3 * e['deepest_m']:.0f}")
+        (
+            f"{e['from_s']:.2f} s",
+            f"{e['to_s']:.2f} s",
+            e["limb"],
+            str(e["ticks"]),
+            f"{1e3 * e['deepest_m']:.0f}",
+            f"{e['deepest_at_s']:.2f} s",
+        )
         for e in sorted(deepest, key=lambda e: (e["from_s"], e["limb"]))
     )
-    note = "" if len(every) <= _MOST_ESCAPES else f"The deepest {_MOST_ESCAPES} of {len(every)}; all are in audit.json."
+    note = (
+        ""
+        if len(every) <= _MOST_ESCAPES
+        else f"The deepest {_MOST_ESCAPES} of {len(every)}; all are in escapes.parquet."
+    )
     title = f"{log['log']}: escapes from {METHODS.get(method, method)}"
-    return PageTable(title, ("predicted from", "to", "limb", "ticks", "deepest [mm]"), rows, note)
+    return PageTable(title, ("predicted from", "to", "limb", "ticks", "deepest [mm]", "at"), rows, note)
 
 
 def _settings(settings: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

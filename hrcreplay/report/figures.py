@@ -63,7 +63,6 @@ def draw_all(
     stationary_m_per_s: float,
     gap_s: float = 0.2,
     volumes: Sequence[Instant] = (),
-    radii_m: Mapping[str, float] | None = None,
 ) -> tuple[str, ...]:
     """Draws what the run has data for into ``folder`` as ``<name>.png`` and ``<name>.svg``.
 
@@ -74,8 +73,7 @@ def draw_all(
         near_m: The stationary share counts ticks with a separation of at most this [m].
         stationary_m_per_s: A TCP slower than this stands [m/s].
         gap_s: A camera silent for longer has a gap [s].
-        volumes: The swept volumes of both methods at the ticks that :func:`instants` names.
-        radii_m: Radius per limb, for ``volumes`` [m].
+        volumes: The swept volumes by several methods at the ticks that :func:`instants` names.
 
     Returns:
         The names drawn.
@@ -98,9 +96,9 @@ def draw_all(
             slow_m_per_s=stationary_m_per_s,
         )
         makers["stationary_share"] = lambda: figures_robot.stationary_share(metrics)
-    if state is not None and volumes and radii_m is not None:
+    if state is not None and volumes:
         fused = state
-        makers["fig17_volumes"] = lambda: figures_human.volumes(volumes, radii_m, fused, t0_ns)
+        makers["fig17_volumes"] = lambda: figures_human.volumes(volumes, fused, t0_ns)
     if run.measurements is not None and len(run.measurements):
         makers["fig18_coordinate"] = lambda: figures_human.coordinate(run, t0_ns, gap_s)
         makers["data_quality"] = lambda: figures_quality.data_quality(run, t0_ns, gap_s)

@@ -182,6 +182,7 @@ def limbs(found: Mapping[str, Any]) -> Figure:
     below.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
     below.set_title("Volume, mean [m\u00b3]")
     below.set_xticks(range(len(names)), names)
+    below.set_xlim(-0.6, len(names) - 0.4)
     for ax in (above, below):
         ax.grid(visible=False, axis="x")
         ax.tick_params(axis="x", length=0)

@@ -23,13 +23,13 @@ from hrcreplay.report.series import ANGLES, broken, columns, envelope, seconds_f
 from hrcreplay.report.solids import Solid, View, bones, outline, picture, view_from
 from hrcreplay.runs import Run
 
-#: One instant of Fig. 17: t_ns, and per method and limb the (m, 3) vertices of the swept volume, world [m].
-Instant = tuple[int, Mapping[str, Mapping[str, Floats]]]
+#: One instant of Fig. 17: t_ns, and per method and limb the swept volume: (m, 3) vertices, world [m], and radius [m].
+Instant = tuple[int, Mapping[str, Mapping[str, tuple[Floats, float]]]]
 
 METHODS = {
     "paper": "paper\npositions and velocities",
     "positions": "older method [26]\npositions only",
-    "sound": "sound",
+    "sound": "sound\nall motions of the model",
 }
 
 LABELS = {
@@ -41,12 +41,11 @@ LABELS = {
 }
 
 
-def volumes(instants: Sequence[Instant], radii_m: Mapping[str, float], state: pd.DataFrame, t0_ns: int) -> Figure:
+def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Figure:
     """Fig. 17: the person's swept volumes, a row a method, a column an instant, all to one scale.
 
     Args:
         instants: What to draw, in order of time.
-        radii_m: Radius per limb, Table 2 [m].
         state: The fused person, for the skeleton and the viewpoint.
         t0_ns: Start of the run [ns].
     """
@@ -60,10 +59,10 @@ def volumes(instants: Sequence[Instant], radii_m: Mapping[str, float], state: pd
     )
     centres = [view.flat(points[[POINTS.index("pelvis")]])[0] for points, _ in people]
     edges = [
-        outline(vertices, radii_m[limb], view) - centre
+        outline(vertices, radius, view) - centre
         for (_, found), centre in zip(instants, centres, strict=True)
         for limbs in found.values()
-        for limb, vertices in limbs.items()
+        for vertices, radius in limbs.values()
     ]
     corners = np.vstack(edges)
     low, high = corners.min(axis=0) - 0.03, corners.max(axis=0) + 0.03
@@ -71,7 +70,7 @@ def volumes(instants: Sequence[Instant], radii_m: Mapping[str, float], state: pd
         for column, (t_ns, found) in enumerate(instants):
             ax = grid[row][column]
             style.set_window(ax, low.tolist(), high.tolist())
-            _draw_person(ax, found[method], radii_m, people[column][0], view, centres[column], (low, high))
+            _draw_person(ax, found[method], people[column][0], view, centres[column], (low, high))
             if row == 0:
                 later = (t_ns - instants[0][0]) * 1e-9
                 ax.set_title(
@@ -82,8 +81,9 @@ def volumes(instants: Sequence[Instant], radii_m: Mapping[str, float], state: pd
             ax.spines[:].set_visible(False)
         grid[row][0].set_ylabel(METHODS.get(method, method), fontweight="bold")
     _scale_bar(grid[-1][-1], float(high[0]), float(low[1]))
-    handles = [Patch(color=colour, lw=0, label=limb) for limb, colour in style.LIMBS.items()]
-    figure.legend(handles=handles, loc="lower center", ncols=6, bbox_to_anchor=(0.5, 0.005))
+    drawn = {limb for limbs in instants[0][1].values() for limb in limbs}
+    handles = [Patch(color=colour, lw=0, label=limb) for limb, colour in style.LIMBS.items() if limb in drawn]
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), bbox_to_anchor=(0.5, 0.005))
     return figure
 
 
@@ -95,14 +95,13 @@ def _skeleton_at(state: pd.DataFrame, t_ns: int) -> tuple[Floats, float]:
 
 def _draw_person(
     ax: Axes,
-    limbs: Mapping[str, Floats],
-    radii_m: Mapping[str, float],
+    limbs: Mapping[str, tuple[Floats, float]],
     points: Floats,
     view: View,
     centre: Floats,
     window: tuple[Floats, Floats],
 ) -> None:
-    solids = [Solid(limbs[limb], radii_m[limb], to_rgb(style.LIMBS[limb])) for limb in limbs]
+    solids = [Solid(vertices, radius, to_rgb(style.LIMBS[limb])) for limb, (vertices, radius) in limbs.items()]
     low, high = window
     image = picture(solids, view, low + centre, high + centre, (high[1] - low[1]) / 320.0)
     image[..., 3] *= 0.78

@@ -20,6 +20,8 @@ from hrcreplay.report.solids import View, outline, view_from
 
 ABOVE = View(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 1.0, 0.0]), toward=np.array([0.0, 0.0, 1.0]))
 SIDE = view_from(-0.5 * np.pi, 0.0)
+#: A deviation below this is none [m].
+_SHORTEST_M = 0.5e-3
 
 
 def path(
@@ -49,14 +51,16 @@ def path(
     axes[1].set(title="From the side", xlabel="x [m]", ylabel="z [m]")
     detail = _plane_of(tcp[worst] - feet[worst])
     _draw_path(axes[2], detail, reference, tcp, limbs, np.vstack([tcp[worst], feet[worst]]), 0.75 * far[worst] + 0.12)
-    title = f"Largest deviation, at {(t_ns[worst] - t0_ns) * 1e-9:.1f} s"
+    left = far[worst] >= _SHORTEST_M
+    title = f"Largest deviation, at {(t_ns[worst] - t0_ns) * 1e-9:.1f} s" if left else "No deviation"
     axes[2].set(title=title, xlabel="in its vertical plane [m]", ylabel="z [m]")
     for ax, view in zip(axes, (ABOVE, SIDE, detail), strict=True):
         ends = view.flat(np.vstack([feet[worst], tcp[worst]]))
         ax.plot(*ends.T, color=style.INK, lw=1.0, zorder=6)
         ax.plot(*ends[0], "o", color=style.NOMINAL, ms=4.5, zorder=7)
         ax.plot(*ends[1], "o", color=style.ACTUAL, ms=4.5, zorder=7)
-    _label_length(axes[2], detail.flat(np.vstack([feet[worst], tcp[worst]])), f"{far[worst]:.3f} m")
+    if left:
+        _label_length(axes[2], detail.flat(np.vstack([feet[worst], tcp[worst]])), f"{far[worst]:.3f} m")
     _path_legend(figure, with_limbs=bool(limbs), with_base=T_world_base is not None)
     return figure
 

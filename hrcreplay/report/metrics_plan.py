@@ -36,12 +36,14 @@ def numbers(motion: pd.DataFrame, name: str) -> Floats:
 def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -> tuple[Bools, Bools]:
     """Which ticks are near (separation at most ``near_m``), and at which of all the robot stands though it should move.
 
-    It stands when the TCP is slower than ``stationary_m_per_s`` and the reference is not.
+    It stands when the TCP is slower than ``stationary_m_per_s``. It should move when the reference is not, and when the
+    reference waits for the robot: at a waypoint it stands itself.
     """
     near = numbers(motion, "distance_m") <= near_m
     stands = numbers(motion, "tcp_speed") < stationary_m_per_s
     wanted = numbers(motion, "ref_speed") >= stationary_m_per_s
-    return near, stands & wanted
+    waits = time_lost_s(motion) > 0.5 * durations_s(times(motion))
+    return near, stands & (wanted | waits)
 
 
 def is_moving(motion: pd.DataFrame, slow_m_per_s: float) -> Bools:
@@ -211,7 +213,7 @@ def _add_stationary(
         f"{prefix}_stationary_ticks",
         both,
         "1",
-        f"of those, ticks with the TCP below {slow:g} m/s and a reference at or over it",
+        f"of those, ticks with the TCP below {slow:g} m/s, and a reference at or over it or waiting",
     )
     metrics.add(
         f"{prefix}_stationary_share",

@@ -118,7 +118,7 @@ def add_occupancy(metrics: MetricTable, occupancy: pd.DataFrame | None) -> None:
         return
     metrics.add("occupancy_ticks", int(occupancy["t_ns"].nunique()), "1", "ticks with stored swept volumes")
     for method, rows in occupancy.groupby("method", sort=True):
-        for limb in LIMBS:
+        for limb in (*LIMBS, *sorted(set(rows["limb"]) - set(LIMBS))):
             volume = rows.loc[rows["limb"] == limb, "volume_m3"].to_numpy(dtype=float)
             volume = volume[np.isfinite(volume)]
             metrics.add(
@@ -127,7 +127,9 @@ def add_occupancy(metrics: MetricTable, occupancy: pd.DataFrame | None) -> None:
                 "m^3",
                 f"mean swept volume of {limb} over the stored ticks, method '{method}', limb radius included",
             )
-        total = rows.groupby("t_ns", sort=True)["volume_m3"].sum(min_count=len(LIMBS)).dropna()
+        total = (
+            rows[rows["limb"].isin(LIMBS)].groupby("t_ns", sort=True)["volume_m3"].sum(min_count=len(LIMBS)).dropna()
+        )
         metrics.add(
             f"occupancy_{method}_sum_m3",
             float(total.mean()) if len(total) else None,

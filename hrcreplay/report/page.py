@@ -12,6 +12,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from hrcreplay.records import LIMBS
 from hrcreplay.report import story
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
@@ -175,8 +176,9 @@ def _reasons(metrics: Mapping[str, Metric], plans: Mapping[str, str]) -> tuple[P
 def _volumes(metrics: Mapping[str, Metric]) -> tuple[PageTable, ...]:
     methods = [name.split("_")[1] for name in metrics if name.startswith("occupancy_") and name.endswith("_sum_m3")]
     columns = {method: f"occupancy_{method}" for method in methods}
-    rows = [(limb, f"{limb}_m3") for limb in ("HD", "THX", "URA", "LRA", "ULA", "LLA")]
-    table = compare("Mean swept volume", metrics, columns, [*rows, ("sum", "sum_m3")], "Limb radius included.")
+    rows = [(limb, f"{limb}_m3") for limb in LIMBS]
+    rows += [("sum of the six", "sum_m3"), ("LEGS", "LEGS_m3")]
+    table = compare("Mean swept volume", metrics, columns, rows, "Limb radius included.")
     return (table,) if methods else ()
 
 

@@ -51,7 +51,10 @@ def _safety(metrics: Mapping[str, Metric]) -> Answer:
         "the controller kept every link slow enough to stop within the stopping time short of all that the person "
         "was predicted to reach (inequality 2)"
     )
-    if late == 0:
+    if not metrics["plan_moving_ticks"]["value"]:
+        short = "The robot never moved."
+        words = f"It stood at all {ticks} ticks."
+    elif late == 0:
         short = "At every tick of this replay, by the paper's criterion."
         words = f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}."
     else:

@@ -26,7 +26,7 @@ GRID = "#dfe5ea"
 NOMINAL, ACTUAL, FUSED, TRUTH = BLUE, VERMILLION, BLUE, INK
 CAMERAS = (ORANGE, GREEN, PURPLE, SKY)
 STATUS = {"tracking": SKY, "limited": ORANGE, "braking": VERMILLION}
-LIMBS = {"HD": PURPLE, "THX": "#9aa5b1", "URA": BLUE, "LRA": SKY, "ULA": GREEN, "LLA": ORANGE}
+LIMBS = {"HD": PURPLE, "THX": "#9aa5b1", "URA": BLUE, "LRA": SKY, "ULA": GREEN, "LLA": ORANGE, "LEGS": YELLOW}
 
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",

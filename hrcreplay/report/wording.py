@@ -23,7 +23,8 @@ CAPTIONS = {
     ),
     "fig17_volumes": (
         "As the paper's Fig. 17. What the person could reach within the stopping time at four instants, limb radii "
-        "included: from positions and velocities (top), and by the older method, from positions alone (bottom)."
+        "included: from positions and velocities; by the older method, from positions alone; and as this run did it, "
+        "where that is neither."
     ),
     "fig18_coordinate": (
         "As the paper's Fig. 18. One coordinate of the person as each camera saw it and as fused, and where the log "

@@ -15,7 +15,7 @@ from hrcreplay.robot.obstacles import obstacles
 from hrcreplay.robot.problem import Problem
 from hrcreplay.robot.stepping import RobotState
 from tests.robot.people import person
-from tests.robot.test_controller import DT_S, HOME, SETTINGS, STOP_S, asked, base, dense, run, swing
+from tests.robot.swinging import DT_S, HOME, SETTINGS, STOP_S, asked, base, dense, run, swing
 
 TICKS = 300
 

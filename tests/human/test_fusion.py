@@ -19,7 +19,7 @@ WIDE = load_limits("human")
 #: No bound but heading's absence of one, no outlier, nothing forgotten: the plain filter of (42)-(57).
 _LOW, _HIGH = np.full(12, -1e9), np.full(12, 1e9)
 FREE = LimitSet("free", _LOW, _HIGH, _LOW, _HIGH, _LOW, _HIGH, coupled=False)
-PLAIN = FusionSettings(outlier_m=1e6, coast_s=1e3, memory_s=1e3)
+PLAIN = FusionSettings(outlier_m=1e6, bone_m=1e6, coast_s=1e3, memory_s=1e3, spread_least=1.0, spread_most=1.0)
 
 
 def ticks(stop_s: float, start_s: float = 0.0, rate_hz: float = 250.0) -> Ints:

@@ -103,6 +103,19 @@ def used_frames(m: Measurements, t_ns: Ints) -> list[tuple[int, int]]:
     return sorted((k, i) for (k, _), i in newest.items())
 
 
+def found_s(states: HumanStates, limb: int) -> float:
+    """When the filter had first found all joints that carry a limb: when their errors fell for the first time."""
+    arm = {2: [4, 5], 3: [4, 5, 6, 7], 4: [8, 9], 5: [8, 9, 10, 11]}.get(limb, [])
+    known = np.isfinite(states.p_std[:, 0])
+    first = states.p_std[known][0]
+    unknown = np.array([0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2])
+    fell = [
+        np.flatnonzero(known)[0] if first[j] < unknown[j] else np.flatnonzero(states.p_std[:, j] < unknown[j])[0]
+        for j in [*range(4), *arm]
+    ]
+    return float(states.t_ns[max(fell)] * 1e-9)
+
+
 def plain_residual(m: Measurements, states: HumanStates, settings: FusionSettings) -> Floats:
     """(n, 6) without a gate for outliers: every sample kept, the quantile exact."""
     found = np.full((len(states), 6), np.nan)
@@ -110,7 +123,10 @@ def plain_residual(m: Measurements, states: HumanStates, settings: FusionSetting
     for limb, name in enumerate(LIMBS):
         ends, carrying = index(POINTS_OF[name]), [*TORSO, *POINTS_OF[name]]
         samples, ages, last = np.zeros(0), np.zeros(0), 0
+        settled_s = found_s(states, limb) + settings.memory_s
         for k, i in frames:
+            if states.t_ns[k] * 1e-9 <= settled_s + 1e-9:
+                continue
             confident = m.confidence[i, index(tuple(dict.fromkeys(carrying)))].prod() >= settings.confidence_min
             if not confident or np.isnan(m.points_m[i, index(tuple(carrying))]).any():
                 continue
@@ -134,7 +150,7 @@ def test_it_is_the_weighted_quantile_of_all_samples(
 ) -> None:
     m, t = demo[0], demo[1][: 25 * RATE_HZ]
     m = m.rows(m.arrival_ns <= t[-1])
-    settings = FusionSettings(outlier_m=1e6, residual_quantile=quantile, residual_memory_s=memory_s)
+    settings = FusionSettings(outlier_m=1e6, bone_m=1e6, residual_quantile=quantile, residual_memory_s=memory_s)
     states = fused(m, t, settings)
     expected = plain_residual(m, states, settings)
     np.testing.assert_array_equal(np.isnan(states.residual_m), np.isnan(expected))
@@ -189,7 +205,9 @@ def test_a_body_unlike_the_model_has_the_residual_of_the_closed_form_fit() -> No
 def test_it_is_not_known_before_enough_samples() -> None:
     frames = bent(2.0)
     states = fused(measured(frames), ticks(2.0))
-    first = np.searchsorted(states.t_ns, frames.arrival_ns[LEAST - 1])
+    begin_ns = states.t_ns[np.searchsorted(states.t_ns, frames.arrival_ns[0])] + 500_000_000  # found, not lost again
+    settled = np.searchsorted(states.t_ns[np.searchsorted(states.t_ns, frames.arrival_ns)], begin_ns, side="right")
+    first = np.searchsorted(states.t_ns, frames.arrival_ns[settled + LEAST - 1])
     assert np.isnan(states.residual_m[:first]).all()
     assert np.isfinite(states.residual_m[first:]).all()
 
@@ -249,7 +267,7 @@ def test_an_outlier_is_no_sample() -> None:
     gross = measured(replace(frames, points_m=points))
     clean = fused(measured(frames), ticks(3.0)).residual_m[-1]
     np.testing.assert_allclose(fused(gross, ticks(3.0)).residual_m[-1], clean, atol=1.1e-3)
-    no_gate = fused(gross, ticks(3.0), FusionSettings(outlier_m=1e6)).residual_m[-1]
+    no_gate = fused(gross, ticks(3.0), FusionSettings(outlier_m=1e6, bone_m=1e6)).residual_m[-1]
     assert no_gate[LIMBS.index("LLA")] > 0.3
 
 

@@ -30,6 +30,7 @@ def test_it_is_the_least_squares_estimate_given_all_measurements() -> None:
     settings = FusionSettings(
         delay="ignore",
         outlier_m=1e6,
+        bone_m=1e6,
         coast_s=1e3,
         memory_s=1e3,
         sigma_position=(1e3, 300.0, 100.0, 30.0),
@@ -72,7 +73,7 @@ def test_it_is_nearer_to_the_truth_than_the_filter_and_surer() -> None:
     points = skeleton(moving(capture * 1e-9), np.tile(LENGTHS_M, (len(capture), 1)))
     frames = frames_of(points + rng.normal(0, 0.015, points.shape), capture * 0, capture, 30_000_000)
     t = np.arange(0, 4_000_000_000, 10_000_000)
-    settings = FusionSettings()
+    settings = FusionSettings(spread_least=1.0, spread_most=1.0)
     m = measure(frames, T, PointNoise(0.015))
     _, states, _, trace = fuse_traced(start(CAMERAS), t, m.rows(m.arrival_ns <= t[-1]), settings, LIMITS)
     smoothed = smooth(states, trace, settings)

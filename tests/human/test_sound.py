@@ -259,8 +259,8 @@ def test_residual_hand_and_legs() -> None:
     people = dataclasses.replace(people, residual_m=residual)
     swept = volumes(people, PAPER, Margins(sigmas=0.0))
     assert swept.limbs == (*LIMBS, "LEGS")
-    assert swept.radius_m[:, -1] == pytest.approx(0.20)
-    assert swept.radius_m[1, :-1] - swept.radius_m[0, :-1] == pytest.approx(0.05)
+    assert swept.radius_m[:, -1] == pytest.approx([0.20 + 0.10, 0.20 + 0.05])  # not known yet: that of most people
+    assert swept.radius_m[0, :-1] - swept.radius_m[1, :-1] == pytest.approx(0.05)
     assert volumes(people, PAPER, dataclasses.replace(BARE, residual=False)).radius_m[1] == pytest.approx(
         Radii().of_limbs()
     )

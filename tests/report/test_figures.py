@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.report import figures
+from hrcreplay.report import figures, figures_human, figures_robot
 from hrcreplay.report.metrics import compute
 from hrcreplay.report.solids import Solid, outline, picture, view_from
 from hrcreplay.runs import Run
@@ -29,10 +29,16 @@ def draw(run: Run, folder: Path, *, volumes: bool = True) -> set[str]:
     metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
     ticks = figures.instants(run) if volumes else np.zeros(0, dtype=np.int64)
     found = [
-        (int(k), {m: volumes_at((k - T0_NS) * 1e-9, s) for m, s in (("paper", 0.05), ("positions", 0.15))})
+        (
+            int(k),
+            {
+                m: {limb: (vertices, RADII_M[limb]) for limb, vertices in volumes_at((k - T0_NS) * 1e-9, s).items()}
+                for m, s in (("paper", 0.05), ("positions", 0.15))
+            },
+        )
         for k in ticks
     ]
-    names = figures.draw_all(run, folder, metrics, near_m=0.5, stationary_m_per_s=0.001, volumes=found, radii_m=RADII_M)
+    names = figures.draw_all(run, folder, metrics, near_m=0.5, stationary_m_per_s=0.001, volumes=found)
     return set(names)
 
 
@@ -65,6 +71,31 @@ def test_a_person_never_seen_and_a_robot_that_never_moved(tmp_path: Path) -> Non
     run = dataclasses.replace(run, state=state, motion=motion, measurements=None, occupancy=None, baselines={})
     assert len(figures.instants(run)) == 0
     assert draw(run, tmp_path) == {"fig13_path", "fig14_speed", "stationary_share", "status", "joint_angles"}
+
+
+def test_volumes_show_every_method_and_limb_in_its_own_size() -> None:
+    run = make_run(5.0)
+    assert run.state is not None
+    limbs = {limb: (vertices, 0.1) for limb, vertices in volumes_at(2.0, 0.05).items()}
+    tall = limbs | {"LEGS": (np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), 0.5)}
+    k = T0_NS + 2_000_000_000
+    plain = figures_human.volumes([(k, {"paper": limbs})], run.state, T0_NS)
+    assert "LEGS" not in {text.get_text() for text in plain.legends[0].get_texts()}
+    found = figures_human.volumes([(k, {"paper": limbs, "sound": tall})], run.state, T0_NS)
+    assert {text.get_text() for text in found.legends[0].get_texts()} == {*limbs, "LEGS"}
+    assert [ax.get_ylabel().split("\n")[0] for ax in found.axes] == ["paper", "sound"]
+    low, high = found.axes[0].get_ylim()  # one scale for both
+    assert high - low > 9.0 * np.cos(0.28)
+
+
+def test_a_robot_that_kept_to_its_path_left_it_nowhere() -> None:
+    run = make_run(5.0)
+    assert run.motion is not None
+    kept = run.motion.assign(tcp_x=run.motion["ref_x"], tcp_y=run.motion["ref_y"], tcp_z=run.motion["ref_z"])
+    for motion, title in ((run.motion, "Largest deviation, at"), (kept, "No deviation")):
+        last = figures_robot.path(motion, None, T0_NS).axes[2]
+        assert last.get_title().startswith(title)
+        assert bool(last.texts) == (motion is run.motion)
 
 
 def test_instants_are_a_second_apart_and_hold_the_nearest() -> None:

@@ -137,19 +137,44 @@ def test_stationary_share(run: Run, found: dict[str, dict[str, Any]]) -> None:
     for prefix, motion in (("plan", run.motion), ("baseline_scaling", run.baselines["scaling"])):
         assert motion is not None
         near = [row for row in motion.to_dict("records") if row["distance_m"] <= 0.5]
-        stands = [row for row in near if row["tcp_speed"] < 0.001 and row["ref_speed"] >= 0.001]
+        programme_s = dict(zip(motion["t_ns"], motion["programme_s"].diff().shift(-1), strict=True))
+        stands = [
+            row
+            for row in near
+            if row["tcp_speed"] < 0.001 and (row["ref_speed"] >= 0.001 or programme_s[row["t_ns"]] < 0.005)
+        ]
         assert found[f"{prefix}_near_ticks"]["value"] == len(near)
         assert found[f"{prefix}_stationary_ticks"]["value"] == len(stands)
         assert found[f"{prefix}_stationary_share"]["value"] == pytest.approx(len(stands) / len(near))
     assert found["baseline_scaling_stationary_share"]["value"] > found["plan_stationary_share"]["value"]
 
 
-def test_a_robot_that_waits_with_its_programme_is_not_stationary(run: Run) -> None:
+def test_the_lower_body_has_its_own_volume_and_no_part_in_the_six(run: Run, found: dict[str, dict[str, Any]]) -> None:
+    occupancy = run.occupancy
+    assert occupancy is not None
+    legs = occupancy[occupancy["limb"] == "HD"].assign(limb="LEGS", volume_m3=0.7)
+    sound = metrics_of(dataclasses.replace(run, occupancy=pd.concat([occupancy, legs]).assign(method="sound")))
+    assert sound["occupancy_sound_LEGS_m3"]["value"] == pytest.approx(0.7)
+    assert sound["occupancy_sound_sum_m3"]["value"] == pytest.approx(found["occupancy_paper_sum_m3"]["value"])
+    assert "occupancy_paper_LEGS_m3" not in found
+
+
+def test_a_robot_that_dwells_as_programmed_is_not_stationary(run: Run) -> None:
     assert run.motion is not None
-    motion = run.motion.assign(tcp_speed=0.0, ref_speed=0.0, distance_m=0.5)
+    n = len(run.motion)
+    motion = run.motion.assign(tcp_speed=0.0, ref_speed=0.0, distance_m=0.5, programme_s=0.01 * np.arange(n))
     found = metrics_of(dataclasses.replace(run, motion=motion))
-    assert found["plan_near_ticks"]["value"] == len(motion)
+    assert found["plan_near_ticks"]["value"] == n
     assert found["plan_stationary_share"]["value"] == 0.0
+
+
+def test_a_robot_whose_programme_waits_for_it_at_a_waypoint_is_stationary(run: Run) -> None:
+    assert run.motion is not None
+    n = len(run.motion)
+    programme_s = 0.01 * np.minimum(np.arange(n), 100)  # held from the second on
+    motion = run.motion.assign(tcp_speed=0.0, ref_speed=0.0, distance_m=0.5, programme_s=programme_s)
+    found = metrics_of(dataclasses.replace(run, motion=motion))
+    assert found["plan_stationary_ticks"]["value"] == n - 101  # of the last tick nobody knows
 
 
 def test_never_near_is_null_and_not_zero(run: Run) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.human.model import LimitSet
-from hrcreplay.report import figures, page, tables
+from hrcreplay.report import figures, page, story, tables
 from hrcreplay.report.metrics import compute
 from hrcreplay.runs import Run
 from tests.report.synthetic import make_run
@@ -180,3 +180,12 @@ def test_bounds_that_are_no_fraction_of_pi_stay_numbers() -> None:
 
 def test_table_2() -> None:
     assert tables.radius_table(RADII).rows[1] == ("thorax", "0.15")
+
+
+def test_a_robot_that_was_never_let_go_is_said_to_have_stood() -> None:
+    run = make_run(4.0)
+    assert run.motion is not None
+    still = dataclasses.replace(run, motion=run.motion.assign(tcp_speed=0.0))
+    safe, _ = story.answers(still, compute(still, near_m=0.5, stationary_m_per_s=0.001))
+    assert safe.short == "The robot never moved."
+    assert safe.words.startswith("It stood at all 400 ticks.")

@@ -1,110 +1,36 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
-import daqp
 import numpy as np
 import pytest
 
-from hrcreplay.records import Floats, SweptVolumes
-from hrcreplay.robot import controller, stepping
-from hrcreplay.robot.active_set import minimiser
-from hrcreplay.robot.constraints import approach_rows, link_segment
+from hrcreplay.records import SweptVolumes
+from hrcreplay.robot import stepping
 from hrcreplay.robot.controller import Solution, Unsolved, solve, step
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.obstacles import Obstacles, obstacles
-from hrcreplay.robot.problem import Problem, problem
-from hrcreplay.robot.rotation import from_vector
-from hrcreplay.robot.separation import Separation, separation
-from hrcreplay.robot.sight import observe
-from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
+from hrcreplay.robot.obstacles import obstacles
+from hrcreplay.robot.separation import separation
+from hrcreplay.robot.stepping import RobotState
 from hrcreplay.robot.tracking import pose_error
 from tests.robot.checker import links, violation
-from tests.robot.people import cloud, person, volumes
+from tests.robot.people import person, volumes
+from tests.robot.swinging import (
+    DT_S,
+    HOME,
+    SETTINGS,
+    STOP_S,
+    asked,
+    base,
+    dense,
+    moving,
+    random_tick,
+    robot,
+    run,
+    swing,
+)
 
-STOP_S, DT_S = 0.377, 0.004
-SETTINGS = PlanSettings(dt_s=DT_S, stop_s=STOP_S)
-HOME = np.deg2rad([10.0, 20.0, -20.0, 0.0, 60.0, 0.0])
-
-
-def base() -> Floats:
-    T_world_base = np.eye(4)
-    T_world_base[2, 3] = 0.65
-    return T_world_base
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return irb140(base(), stop_s=STOP_S)
-
-
-def swing(robot: RobotModel, t_s: float) -> tuple[Floats, Floats]:
-    """A reference that swings sideways, and its twist."""
-    T = robot.pose(HOME, np.zeros(6)).T_world_tcp.copy()
-    T[1, 3] += 0.3 * np.sin(1.5 * t_s)
-    return T, np.array([0.0, 0.45 * np.cos(1.5 * t_s), 0.0, 0.0, 0.0, 0.0])
-
-
-def run(
-    robot: RobotModel, people: SweptVolumes, settings: PlanSettings = SETTINGS
-) -> Iterator[tuple[RobotState, Step]]:
-    state = RobotState(HOME, np.zeros(6))
-    for tick in range(len(people)):
-        made = step(robot, state, *swing(robot, (tick + 1) * DT_S), obstacles(people, tick), settings)
-        yield state, made
-        state = made.next
-
-
-def all_rows(robot: RobotModel, task: Problem) -> tuple[Floats, Floats, Floats]:
-    """Every row of Eq. (66g)-(66i), written down."""
-    A, low, high = [task.pose.J_tcp], [task.J_low], [task.J_high]
-    distance, offsets = separation(task.pose, task.obstacles), task.obstacles.offsets
-    for link, segment in enumerate(robot.segments):
-        for limb, radius in enumerate(task.obstacles.radius_m):
-            vertices = task.obstacles.vertices_m[offsets[limb] : offsets[limb + 1]]
-            rows = approach_rows(
-                link_segment(task.pose, link),
-                vertices,
-                distance[link, limb],
-                clearance_m=segment.radius_m + radius,
-                stop_s=STOP_S,
-            )
-            A.append(rows.A)
-            high.append(rows.b)
-            low.append(np.full(len(rows.b), -1e30))
-    every: Floats = np.concatenate(A)
-    every[np.abs(every) < 1e-13] = 0.0  # rounding errors of axes that do not move the link: daqp scales them up to rows
-    return np.ascontiguousarray(every), np.concatenate(low), np.concatenate(high)
-
-
-def dense(robot: RobotModel, task: Problem) -> tuple[Floats, bool]:
-    """The same problem with all rows, by another solver."""
-    A, low, high = all_rows(robot, task)
-    upper, lower = np.concatenate([task.high, high]), np.concatenate([task.low, low])
-    found = daqp.solve(task.H, task.g, A, upper, lower, primal_tol=1e-11, dual_tol=1e-12)
-    return found[0], found[2] == 1
-
-
-def asked(robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles) -> Problem:
-    pairs = observe(robot, state, seen, 0.0).pairs
-    assert isinstance(pairs, Separation)
-    return problem(robot, state, robot.pose(state.q, state.dq), T, twist, seen, pairs, SETTINGS)
-
-
-def random_tick(robot: RobotModel, rng: np.random.Generator) -> Problem:
-    """Anything: singular wrists, robots at rest, people far and in contact."""
-    q = rng.uniform(robot.q_min, robot.q_max) * 0.6
-    q[4] *= rng.choice([0.0, 1e-4, 1.0, 1.0, 1.0])
-    state = RobotState(q, rng.normal(size=6) * rng.choice([0.0, 0.1, 0.5]))
-    pose = robot.pose(q, state.dq)
-    T = pose.T_world_tcp.copy()
-    T[:3, 3] += rng.normal(size=3) * 0.02
-    T[:3, :3] = from_vector(rng.normal(size=3) * 0.05) @ T[:3, :3]
-    centre = pose.T_world_tcp[:3, 3] + rng.normal(size=3) * 0.6
-    limbs = [cloud(rng, 40, rng.uniform(0.02, 0.3, 3)) + centre + rng.normal(size=3) * 0.25 for _ in range(6)]
-    twist = pose.J_tcp @ (state.dq + rng.normal(size=6) * 0.1)
-    return asked(robot, state, T, twist, obstacles(volumes(limbs), 0))
+__all__ = ["robot"]  # the fixture
 
 
 def test_the_solution_is_that_of_another_solver_with_all_rows(robot: RobotModel) -> None:
@@ -202,40 +128,6 @@ def test_as_printed_a_position_error_does_not_decay(robot: RobotModel) -> None:
     assert abs(left[5.0]) < 1e-5
 
 
-def moving(robot: RobotModel) -> RobotState:
-    return RobotState(HOME, np.array([0.5, -0.3, 0.2, -1.0, 0.8, 0.001]))
-
-
-def test_a_stop_is_as_fast_as_each_axis_can_and_exact(robot: RobotModel) -> None:
-    unknown = obstacles(volumes([np.full((1, 3), np.nan)]), 0)
-    state = moving(robot)
-    T, twist = swing(robot, 0.0)
-    for tick in range(200):
-        made = step(robot, state, T, twist, unknown, SETTINGS)
-        assert (made.status, made.reason) == (stepping.BRAKING, stepping.NO_HUMAN)
-        expected = np.minimum(robot.ddq_max, np.maximum(-state.dq / DT_S, -robot.ddq_max))  # Eq. (67)
-        np.testing.assert_allclose(made.u, expected, atol=1e-9)
-        started = moving(robot).dq
-        speed = np.maximum(0.0, np.abs(started) - (tick + 1) * DT_S * robot.ddq_max)
-        np.testing.assert_allclose(np.abs(made.next.dq), speed, atol=1e-12)
-        state = made.next
-    assert np.all(state.dq == 0.0)
-    assert np.all(made.u == 0.0)
-    np.testing.assert_array_equal(made.next.q, state.q)
-
-
-def test_it_goes_on_when_the_person_is_known_again(robot: RobotModel) -> None:
-    unknown = obstacles(volumes([np.full((1, 3), np.nan)]), 0)
-    nobody = obstacles(volumes([np.full((1, 3), 50.0)]), 0)
-    T, twist = swing(robot, 0.0)
-    stopped = step(robot, RobotState(HOME, np.zeros(6)), T, twist, unknown, SETTINGS)
-    assert np.isnan(stopped.distance_m)
-    assert (stopped.link, stopped.limb) == (-1, -1)
-    again = step(robot, stopped.next, T, twist, nobody, SETTINGS)
-    assert again.status == stepping.TRACKING
-    assert np.any(again.next.dq != 0.0)
-
-
 def test_distance_and_pair_are_those_of_all_pairs(robot: RobotModel) -> None:
     people = person(40, DT_S * 20, (1.3, 0.0), 0.4, seed=5)
     for tick, (state, made) in enumerate(run(robot, people)):
@@ -244,43 +136,6 @@ def test_distance_and_pair_are_those_of_all_pairs(robot: RobotModel) -> None:
         surface = separation(robot.pose(state.q, state.dq), seen) - (radius[:, None] + seen.radius_m)
         assert made.distance_m == max(0.0, surface.min())
         assert surface[made.link, made.limb] == surface.min()
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
-@pytest.mark.parametrize("where", ["q", "dq", "reference", "rotation", "twist", "vertices"])
-def test_bad_numbers_brake_with_a_reason(robot: RobotModel, where: str, bad: float) -> None:
-    state, (T, twist), limb = moving(robot), swing(robot, 0.0), np.full((4, 3), 5.0)
-    q, dq, T = state.q.copy(), state.dq.copy(), T.copy()
-    changed = {"q": q[2:3], "dq": dq[1:2], "reference": T[:1, 3], "rotation": T[0, :1], "twist": twist[4:5]}
-    changed.get(where, limb[0, :1])[:] = bad
-    made = step(robot, RobotState(q, dq), T, twist, obstacles(volumes([limb]), 0), SETTINGS)
-    assert np.all(np.isfinite(made.u))
-    if bad != 1e300:
-        assert made.status == stepping.BRAKING
-        assert made.reason == (stepping.NO_HUMAN if where == "vertices" else stepping.NOT_FINITE)
-        others = np.arange(6) != 1
-        np.testing.assert_array_equal(made.next.dq[others], stepping.braked(state, robot.ddq_max, DT_S)[others])
-
-
-def test_an_unsolved_qp_is_a_stop(robot: RobotModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = obstacles(volumes([np.full((1, 3), 50.0)]), 0)
-    state = moving(robot)
-    monkeypatch.setattr(controller, "solve", lambda _: Unsolved("PROXQP_MAX_ITER_REACHED"))
-    made = step(robot, state, *swing(robot, 0.0), seen, SETTINGS)
-    assert (made.status, made.reason) == (stepping.BRAKING, stepping.NO_SOLUTION)
-    np.testing.assert_array_equal(made.next.dq, stepping.braked(state, robot.ddq_max, DT_S))
-
-
-def test_a_solver_that_says_solved_is_not_believed(robot: RobotModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A candidate that breaks a row although the row is in the problem is no solution."""
-
-    def careless(H: Floats, g: Floats, A: Floats, _: Floats) -> tuple[Floats, Floats]:
-        return minimiser(H, g), np.zeros(len(A))
-
-    monkeypatch.setattr(controller, "active_set", careless)
-    rng = np.random.default_rng(12)
-    found = [solve(random_tick(robot, rng)) for _ in range(60)]
-    assert Unsolved("residual") in found
 
 
 def test_without_limbs_there_is_no_distance(robot: RobotModel) -> None:

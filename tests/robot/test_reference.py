@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,43 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation, Slerp
 
-from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
 from hrcreplay.robot.inverse import Missed, solve
-from hrcreplay.robot.model import RobotModel, from_urdf, irb140
-from hrcreplay.robot.paths import programmed, recorded
-from hrcreplay.robot.reference import STEP_S, Leash, Reference, advance
-from hrcreplay.robot.task import parse_task
-from tests.realdata import data_path
+from hrcreplay.robot.model import RobotModel, from_urdf
+from hrcreplay.robot.reference import STEP_S, Reference
+from tests.robot.tasks import ABOVE, BOX, HOME, RACK, pick_and_place, plan, robot
 
-HOME: dict[str, Any] = {"name": "home", "joints_deg": [0, 0, 0, 0, 90, 0]}
-ABOVE: dict[str, Any] = {"position_m": [0.45, 0.30, 0.25], "rpy_deg": [180, 0, 30]}
-RACK: dict[str, Any] = {
-    "name": "rack",
-    "position_m": [0.45, 0.30, 0.10],
-    "rpy_deg": [180, 0, -20],
-    "move": "linear",
-    "tcp_speed_m_per_s": 0.25,
-    "dwell_s": 0.3,
-}
-BOX: dict[str, Any] = {"position_m": [0.40, -0.35, 0.15], "quaternion_wxyz": [0, 1, 0, 0], "dwell_s": 0.2}
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", 0.5).as_matrix()
-    T[:3, 3] = 1.0, 0.5, 0.65
-    return irb140(T, stop_s=0.377)
-
-
-def plan(robot: RobotModel, *waypoints: dict[str, Any], **task: Any) -> Reference:
-    return programmed(parse_task({"waypoints": list(waypoints), **task}), robot)
-
-
-@pytest.fixture(scope="module")
-def pick_and_place(robot: RobotModel) -> Reference:
-    return plan(robot, HOME, ABOVE, RACK, {**ABOVE, "move": "linear"}, BOX, cycles=2, speed=1.0, acceleration=1.0)
+__all__ = ["pick_and_place", "robot"]  # fixtures
 
 
 def columns(reference: Reference, step_s: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -248,112 +218,3 @@ def test_a_line_through_a_singular_posture_is_refused(robot: RobotModel, sideway
 def test_what_cannot_be_driven_is_named(robot: RobotModel, waypoints: tuple[dict[str, Any], ...], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         plan(robot, *waypoints)
-
-
-def test_a_recorded_track_is_followed(robot: RobotModel) -> None:
-    rng = np.random.default_rng(4)
-    t = np.sort(rng.uniform(0, 6, 1200))
-    amplitude, rate = np.array([0.8, 0.4, 0.5, 1.0, 0.9, 1.5]), np.array([1.0, 1.3, 0.7, 1.1, 0.9, 1.2])
-    q = amplitude * np.sin(np.outer(t, rate)) + rng.normal(0, 1e-4, (1200, 6))
-    order = rng.permutation(1200)
-    t_ns = (t * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
-    reference = recorded(t_ns[order], q[order], robot)
-    for s in np.linspace(0.2, 5.7, 40):
-        point = reference.sample(s)
-        at = s + t[0]
-        assert_allclose(point.q, amplitude * np.sin(rate * at), atol=2e-3)
-        assert_allclose(point.dq, amplitude * rate * np.cos(rate * at), atol=3e-2)
-    assert reference.duration_s == pytest.approx(t[-1] - t[0], abs=STEP_S)
-    assert not reference.sample(1e9).dq.any()
-
-
-def test_recorded_rows_without_values_are_left_out(robot: RobotModel) -> None:
-    t_ns = np.arange(0, 1_000_000_000, 10_000_000)
-    q = np.outer(t_ns * 1e-9, np.ones(6)) * 0.3
-    q[40:45, 2] = np.nan
-    assert_allclose(recorded(t_ns, q, robot).sample(0.42).q, 0.42 * 0.3, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("q", "message"),
-    [
-        (np.zeros((50, 7)), "joint track: found 7 joints; irb140 has 6 axes"),
-        (np.full((50, 6), np.nan), "joint track: found 0 instants"),
-        (np.full((50, 6), 1.0), "joint_3 has position 1.000 rad after 0.000 s; irb140 allows -4.024 to 0.883"),
-        (np.outer(np.linspace(0, 2, 50), [1, 0, 0, 0, 0, 0]), "joint_1 has speed 4.* rad/s .* allows -3.491 to 3.491"),
-    ],
-)
-def test_a_track_of_another_robot_is_refused(robot: RobotModel, q: Floats, message: str) -> None:
-    with pytest.raises(LogError, match=message):
-        recorded(np.arange(50) * 10_000_000, q, robot)
-
-
-@pytest.mark.parametrize("measurement", [1, 33])
-def test_a_real_track_moves_as_its_own_log_says(measurement: int) -> None:
-    folder = data_path(f"robot_schunk_6dof/measurement_{measurement}")
-    t_ns = np.round(np.loadtxt(folder / "time.csv") * 1e9).astype(np.int64)
-    rows = np.loadtxt(folder / "trajectory.csv", delimiter=",")
-    parts = ["<robot name='arm'><link name='l0'/>"]
-    for i, axis in enumerate("zyyzyz", start=1):
-        parts.append(
-            f"<link name='l{i}'><collision><geometry><sphere radius='0.1'/></geometry></collision></link>"
-            f"<joint name='j{i}' type='continuous'><parent link='l{i - 1}'/><child link='l{i}'/>"
-            f"<origin xyz='0 0 0.2'/><axis xyz='0 {int(axis == 'y')} {int(axis == 'z')}'/>"
-            "<limit velocity='4' effort='0'/></joint>"
-        )
-    arm = from_urdf("".join(parts) + "</robot>", np.eye(4), stop_s=0.377)
-    reference = recorded(t_ns, rows[:, :6], arm)
-    inner = slice(30, -30)
-    points = [reference.sample(t) for t in (t_ns[inner] - t_ns[0]) * 1e-9]
-    assert np.abs(np.array([p.q for p in points]) - rows[inner, :6]).max() < 5e-3
-    assert np.percentile(np.abs(np.array([p.dq for p in points]) - rows[inner, 6:12]), 95) < 0.05
-
-
-def test_time_runs_with_the_clock(pick_and_place: Reference) -> None:
-    assert advance(pick_and_place, 1.0, 0.004, 9.0, Leash("time")) == (1.004, 1.0)
-
-
-def test_path_waits_on_a_taut_leash_and_never_turns_back(pick_and_place: Reference) -> None:
-    leash = Leash("path", length_m=0.05, waypoint_m=0.05)
-    errors = np.linspace(0, 0.08, 400)
-    steps = [advance(pick_and_place, 1.0, 0.004, e, leash) for e in errors]
-    rates = np.array([rate for _, rate in steps])
-    assert_allclose(rates[errors <= 0.025], 1, atol=1e-12)
-    assert (rates[errors >= 0.05] == 0).all()
-    assert (np.diff(rates) <= 1e-12).all()
-    assert np.abs(np.diff(rates)).max() < 0.02  # no jump
-    assert_allclose([s for s, _ in steps], 1.0 + 0.004 * rates)
-    assert advance(pick_and_place, 1.0, 0.004, float("nan"), leash) == (1.0, 0.0)
-
-
-def test_a_held_robot_is_waited_for_and_skips_no_waypoint(pick_and_place: Reference) -> None:
-    """The robot stands for two seconds in the middle of a move, then evades by 12 cm, and goes on from there."""
-    tick, leash = 0.004, Leash("path", length_m=0.25, waypoint_m=0.01)
-    s, tcp = 0.0, pick_and_place.sample(0.0).T_world_tcp[:3, 3]
-    passed, evaded = [], 0.0
-    for k in range(4500):
-        target = pick_and_place.sample(s).T_world_tcp[:3, 3]
-        goal = target + np.array([0, 0, 0.12]) if 900 <= k < 1500 else target
-        way = float(np.linalg.norm(goal - tcp))
-        if not 100 <= k < 600:
-            tcp = tcp + min(1.0, 1.2 * tick / max(way, 1e-12)) * (goal - tcp)
-        error = float(np.linalg.norm(target - tcp))
-        assert error < leash.length_m + 2.2 * tick
-        s_next, rate = advance(pick_and_place, s, tick, error, leash)
-        assert s <= s_next <= s + tick
-        passed += [error for arrival in pick_and_place.waypoints_s if s <= arrival < s_next]
-        evaded = max(evaded, error if s_next > s else 0.0)
-        assert rate == pytest.approx((s_next - s) / tick, abs=1e-9)
-        s = s_next
-    assert len(passed) == 5
-    assert max(passed) <= leash.waypoint_m
-    assert evaded > 0.1  # between waypoints the reference goes on beside a robot that evades
-    assert s > pick_and_place.duration_s
-
-
-def test_the_next_waypoint_is_found_in_every_cycle(pick_and_place: Reference) -> None:
-    looping = replace(pick_and_place, cycles=3.0)
-    arrivals = np.add.outer(np.arange(4) * looping.cycle_s, np.array(looping.waypoints_s)).ravel()
-    for s in np.linspace(0, looping.duration_s, 333):
-        assert looping.next_waypoint(s) == pytest.approx(arrivals[arrivals >= s].min(), abs=1e-12)
-    assert looping.next_waypoint(looping.duration_s + 1.0) == np.inf

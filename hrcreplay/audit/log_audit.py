@@ -9,8 +9,9 @@ from functools import partial
 import numpy as np
 
 from hrcreplay import wiring
+from hrcreplay.audit.recording import Recording, record
+from hrcreplay.audit.window import Window, hold, joints_inside, standstill_s, travel, window
 from hrcreplay.errors import LogError
-from hrcreplay.follow import Window, hold, joints_inside, travel, window
 from hrcreplay.human import peers, reach
 from hrcreplay.human.model import LimitSet
 from hrcreplay.ingest import log_options
@@ -18,7 +19,6 @@ from hrcreplay.job import Job
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import NS, Foresight, tick_times
 from hrcreplay.progress import Bar
-from hrcreplay.recorded import Recording, record
 from hrcreplay.records import JOINTS, LIMBS, Floats, Ints, SweptVolumes
 from hrcreplay.report.audit_metrics import Outcome
 from hrcreplay.runs import Stopwatch
@@ -30,7 +30,6 @@ _FACTORS = {"positions": (0.25, 0.5, 1.0, 2.0)}
 _STANDARD_FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
 #: A joint that went less than this says little about its bounds [m, m, rad...].
 LITTLE = np.array([0.05] * 2 + [np.radians(10.0)] * 10)
-_HAND_M = 0.19
 _BATCH = 100
 
 
@@ -60,9 +59,12 @@ def factors(method: str) -> tuple[float, ...]:
 def volumes(foresight: Foresight, window: Window, method: str) -> SweptVolumes:
     """Swept volumes by any method, ours or a peer's."""
     if method in peers.PEERS:
-        hand_m = float(getattr(getattr(foresight, "margins", None), "hand_m", _HAND_M))
         return peers.predict(
-            window.states, horizon_s=foresight.horizon_s, radii=foresight.radii, hand_m=hand_m, method=method
+            window.states,
+            horizon_s=standstill_s(foresight),
+            radii=foresight.radii,
+            hand_m=foresight.margins.hand_m,
+            method=method,
         )
     return foresight.volumes(window.states, method)
 
@@ -82,21 +84,22 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
     """
     log = open_log(job.log, log_options(job.settings))
     foresight = wiring.foresight(job)
+    horizon_s = standstill_s(foresight)
     first_ns, last_ns = log.header.start_ns, log.header.end_ns
     begin_ns = first_ns + round((job.start_s or 0.0) * NS)
     end_ns = last_ns if job.end_s is None else min(last_ns, first_ns + round(job.end_s * NS))
-    if (end_ns - begin_ns) / NS <= foresight.horizon_s:
+    if (end_ns - begin_ns) / NS <= horizon_s:
         raise LogError(
             f"{job.log}: found {max(0.0, (end_ns - begin_ns) / NS):.2f} s; an audit needs more than the horizon of "
-            f"{foresight.horizon_s:g} s"
+            f"{horizon_s:g} s"
         )
     ticks_ns = tick_times(begin_ns, end_ns, job.settings.fusion.rate_hz)
     with Bar(f"reading {name}", len(ticks_ns)) as bar, watch.stage("record", len(ticks_ns)):
         recording = record(log, ticks_ns, wiring.eyes(job, log), lambda n: bar.advance(f"reading {name}", n))
-    rows = _audited(recording, job.settings.fusion.rate_hz, foresight.horizon_s)
+    rows = _audited(recording, job.settings.fusion.rate_hz, horizon_s)
     if not len(rows):
-        raise LogError(f"{job.log}: nobody was seen for longer than the horizon of {foresight.horizon_s:g} s")
-    future = window(recording, rows, foresight.horizon_s)
+        raise LogError(f"{job.log}: nobody was seen for longer than the horizon of {horizon_s:g} s")
+    future = window(recording, rows, horizon_s)
     outcomes, curve = {}, {}
     stage = f"auditing {name}"
     more = sum(len(factors(method)) - 1 for method in reach.METHODS)
@@ -109,11 +112,12 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         for method in reach.METHODS:
             with watch.stage(f"curve {method}", len(rows)):
                 curve[method] = _curve(foresight, future, method, outcomes[method], progress)
-    intervals = {m: reach.reachable(future.states, foresight.limits, foresight.horizon_s, m) for m in reach.METHODS}
-    joints = {m: joints_inside(recording, future.states, r, foresight.horizon_s) for m, r in intervals.items()}
-    return LogAudit(
-        job, name, recording, outcomes, joints, curve, (*log.notes, *_remarks(recording, outcomes, foresight.horizon_s))
-    )
+    joints = {}
+    for method in reach.METHODS:
+        interval = reach.reachable(future.states, foresight.limits, foresight.horizon_s, method, foresight.margins)
+        joints[method] = joints_inside(recording, future.states, interval, horizon_s)
+    notes = (*log.notes, *_remarks(recording, outcomes, horizon_s))
+    return LogAudit(job, name, recording, outcomes, joints, curve, notes)
 
 
 def _audited(recording: Recording, rate_hz: float, horizon_s: float) -> Ints:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from hrcreplay.errors import LogError
 from hrcreplay.human import angles, fusion, smooth
 from hrcreplay.human.model import skeleton
-from hrcreplay.logs.person import PersonMemory, pick
+from hrcreplay.logs.person import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline import Eyes, batches
 from hrcreplay.records import LENGTHS, POINTS, Bools, Floats, HumanStates, Ints, Measurements
@@ -99,10 +99,8 @@ def _fuse(
     for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _STRETCH):
         progress(len(ticks))
         if due is not None:
-            memory, mine, found = pick(due, memory, eyes.T_world_camera, eyes.person_jump_m, eyes.person_memory_s)
+            memory, measured, found = eyes.measure(due, memory)
             counts.update(found)
-            mine = replace(mine, capture_ns=mine.capture_ns - eyes.clock_offset_ns[mine.camera])
-            measured = angles.measure(mine, eyes.T_world_camera, eyes.noise)
         elif measured is not None:
             measured = measured.rows(slice(0, 0))
         else:

@@ -12,16 +12,26 @@ import numpy as np
 import pyarrow as pa
 
 from hrcreplay import runs, wiring
-from hrcreplay.audited import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, methods
-from hrcreplay.follow import travel
+from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, methods
+from hrcreplay.audit.window import standstill_s, travel
+from hrcreplay.errors import SettingsError
 from hrcreplay.human import reach
 from hrcreplay.job import Job, resolve
+from hrcreplay.progress import say
 from hrcreplay.records import LIMBS
 from hrcreplay.report import audit_page, figures_audit
 from hrcreplay.report.audit_metrics import curve_point, escapes, flat, joint_figures, method_figures
 from hrcreplay.report.coverage import DRAWS, LEVEL, Resampling, block_ticks, resample
 from hrcreplay.runs import RunWriter, Stopwatch
 
+#: Columns of escapes.parquet.
+_ESCAPES = pa.schema(
+    [
+        *((name, pa.string()) for name in ("log", "method", "limb")),
+        *((name, pa.float64()) for name in ("from_s", "to_s", "deepest_at_s", "deepest_m")),
+        *((name, pa.int64()) for name in ("ticks", "deepest_t_ns")),
+    ]
+)
 #: Of the bootstrap: any number, but always the same.
 SEED = 3
 
@@ -38,8 +48,13 @@ def run(
 ) -> Path:
     """Audits logs, or the logs of earlier runs with the settings and cells of those runs.
 
+    The total counts every audited tick of every log once, so a long log weighs more than a short one: it is the share
+    of all the recorded time. Its intervals draw each log anew by itself, keeping its length: they say how well these
+    logs tell of more of the same people at the same work, and nothing of others.
+
     Returns:
-        The run folder: audit.json, audit.parquet (a row per tick, method and limb), figures, report.html.
+        The run folder: audit.json, audit.parquet (a row per tick, method and limb), escapes.parquet (a row per
+        escape), figures, report.html.
 
     Raises:
         SettingsError: A setting, a cell or the output folder cannot be used.
@@ -50,13 +65,17 @@ def run(
         resolve("audit", source, config=config, overrides=overrides, cell_file=cell_file, start_s=start_s, end_s=end_s)
         for source in sources
     ]
+    _alike(jobs)
     with RunWriter(out or Path("reports") / jobs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-audit") as writer:
         watch = Stopwatch(time.perf_counter_ns)
         audits = [audit_log(job, name, watch) for job, name in zip(jobs, _names(jobs), strict=True)]
         for audit in audits:
             _write_rows(audit, writer)
-        writer.close_tables()
+            for note in audit.notes:
+                say(f"{audit.name}: {note}")
         found = figures(audits)
+        _write_escapes(found, writer)
+        writer.close_tables()
         writer.text("audit.json", runs.to_json(found))
         meta = _meta(jobs, began)
         folder = writer.partial / "figures"
@@ -69,9 +88,26 @@ def run(
         return writer.folder
 
 
+def _alike(jobs: Sequence[Job]) -> None:
+    """Refuses logs whose ticks cannot be counted together."""
+    foresights = [wiring.foresight(job) for job in jobs]
+    for what, values in (
+        ("occupancy.stop_s and latency_s", [standstill_s(one) for one in foresights]),
+        ("occupancy.method", [one.method for one in foresights]),
+        ("occupancy.radius_*", [one.radii.of_limbs().tolist() for one in foresights]),
+        ("the margins of occupancy", [one.margins for one in foresights]),
+    ):
+        for job, value in zip(jobs, values, strict=True):
+            if value != values[0]:
+                raise SettingsError(
+                    f"{what}: {job.log.name} and {jobs[0].log.name} differ, and one audit has one horizon, method and "
+                    "body; audit them apart, or give one with --set"
+                )
+
+
 def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
     """All that audit.json holds."""
-    horizon_s = wiring.foresight(audits[0].job).horizon_s
+    horizon_s = standstill_s(wiring.foresight(audits[0].job))
     lengths = [len(audit.outcomes[methods()[0]]) for audit in audits]
     block = block_ticks(horizon_s, AUDIT_HZ, max(lengths))
     drawn = resample(lengths, block, horizon_s * AUDIT_HZ, SEED)
@@ -88,6 +124,7 @@ def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
                 "limits": audit.job.prediction.name,
                 "ticks": lengths[k],
                 "counts": audit.recording.counts,
+                "cameras": _cameras(audit),
                 "notes": list(audit.notes),
                 "methods": _methods([audit], mine),
                 "joints": _joints([audit], mine),
@@ -126,7 +163,7 @@ def _joints(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
 
 
 def _curves(audits: Sequence[LogAudit]) -> dict[str, Any]:
-    horizon_s = wiring.foresight(audits[0].job).horizon_s
+    horizon_s = standstill_s(wiring.foresight(audits[0].job))
 
     def point(method: str, factor: float) -> dict[str, Any]:
         outcomes = [audit.curve[method][factor] for audit in audits]
@@ -158,6 +195,33 @@ def _write_rows(audit: LogAudit, writer: RunWriter) -> None:
                 "volume_m3": outcome.volume_m3.ravel(),
             },
         )
+
+
+def _write_escapes(found: dict[str, Any], writer: RunWriter) -> None:
+    """A row per escape: log, method, limb, when, for how many ticks, how far."""
+    rows = [
+        {"log": log["log"], "method": method, **escape}
+        for log in found["logs"]
+        for method, every in log["escapes"].items()
+        for escape in every
+    ]
+    table = pa.Table.from_pylist(rows, _ESCAPES)
+    writer.table("escapes", {name: table[name] for name in table.column_names})
+
+
+def _cameras(audit: LogAudit) -> dict[str, dict[str, int | None]]:
+    """Per camera what it saw and what of it was not believed; None where nothing was held against it."""
+    counts = audit.recording.counts
+    names = {
+        "frames": "frames",
+        "rejected_frames": "audit_rejected_frames",
+        "rejected_points": "audit_rejected_points",
+        "outlier_points": "outlier_points",
+    }
+    return {
+        camera: {key: counts.get(f"{name}_{camera}") for key, name in names.items()}
+        for camera in audit.recording.states.cameras
+    }
 
 
 def _names(jobs: Sequence[Job]) -> list[str]:

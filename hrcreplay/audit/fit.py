@@ -9,10 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from hrcreplay import __version__, tighten, wiring
+from hrcreplay import __version__, wiring
+from hrcreplay.audit import tightening
+from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, record
+from hrcreplay.audit.window import standstill_s, window
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.follow import window
 from hrcreplay.human import fitting
+from hrcreplay.human.ballistic import ballistic
 from hrcreplay.human.fitting import Fit, Futures
 from hrcreplay.human.model import LimitSet
 from hrcreplay.ingest import log_options
@@ -21,14 +24,13 @@ from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import NS, tick_times
 from hrcreplay.progress import Bar
-from hrcreplay.recorded import SMOOTHED, TRUTH, Recording, record
 from hrcreplay.records import JOINTS, Floats
 from hrcreplay.report.coverage import Estimate, block_ticks, resample
 
 #: Ticks a second that are fitted to [Hz]; what no camera has seen for longer is no evidence [s]; of the bootstrap.
 FIT_HZ, SEEN_S, SEED = 25.0, 0.25, 3
 #: The limit sets that joints keep which cannot be fitted, and whose positions hold more than those.
-STANDARD, WIDE = "paper", "human"
+STANDARD, WIDE, KEPT = "paper", "human", "people"
 #: What the coverage is of: joints in their intervals, or limbs in their volumes.
 COVERS = ("joints", "limbs")
 
@@ -43,7 +45,7 @@ class Sample:
     training: Futures
     held_back: Futures
     outside: bool  #: whether a training posture is outside the standard positions
-    limbs: tighten.Held
+    limbs: tightening.Held
 
 
 def run(
@@ -74,9 +76,8 @@ def run(
         start_s: First second of every log.
         end_s: Last one.
         held_back: Share of every log's time, its end.
-        cover: ``joints``: the share is of ticks with all fitted joints in their intervals of Alg. 1. ``limbs``: of
-            ticks with all limbs in the volumes of ``occupancy.method``, margins and all; the bounds that hold the
-            joints are scaled down to what holds the limbs.
+        cover: ``joints``: of ticks with all fitted joints in their intervals of Alg. 1. ``limbs``: of ticks with
+            all limbs in the volumes of ``occupancy.method``, margins and all.
 
     Returns:
         What the user should know, line by line.
@@ -106,6 +107,8 @@ def run(
     limits = _limits(found, samples, out.stem)
     limbs: dict[str, Any] = {}
     if cover == "limbs":
+        training = Futures.join([sample.training for sample in samples])
+        found = ballistic(training, load_limits(KEPT), tightening.BEFORE, horizon_s)
         found, limbs = _tightened([sample.limbs for sample in samples], found, limits, coverage, horizon_s)
         limits = found.onto(limits, out.stem)
     facts = _facts(samples, found, limits, coverage, horizon_s, held_back) | {"covers": cover} | limbs
@@ -150,37 +153,40 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
         some.rows(some.t_ns + round(horizon_s * NS) <= cut_ns),
         some.rows(some.t_ns > cut_ns),
         bool(fitting.leave(training.p, load_limits(STANDARD)).any()),
-        _limbs(job, recording, cut_ns, horizon_s),
+        _limbs(job, recording, cut_ns),
     )
 
 
-def _limbs(job: Job, recording: Recording, cut_ns: int, horizon_s: float) -> tighten.Held:
-    states, horizon_ns = recording.states, round(horizon_s * NS)
-    ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / tighten.TIGHTEN_HZ)))
-    ticks = ticks[np.isfinite(states.p[ticks]).all(axis=1)]
+def _limbs(job: Job, recording: Recording, cut_ns: int) -> tightening.Held:
+    foresight, states = wiring.foresight(job), recording.states
+    horizon_s = standstill_s(foresight)
+    horizon_ns = round(horizon_s * NS)
+    ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / tightening.TIGHTEN_HZ)))
+    ticks = ticks[np.isfinite(states.residual_m[ticks]).all(axis=1)]  # the filter has found the person
     end_ns = states.t_ns[ticks] + horizon_ns
     parts = ticks[end_ns <= cut_ns], ticks[(states.t_ns[ticks] > cut_ns) & (end_ns <= recording.t_ns[-1])]
-    return tighten.Held(wiring.foresight(job), *(window(recording, part, horizon_s) for part in parts))
+    return tightening.Held(foresight, *(window(recording, part, horizon_s) for part in parts))
 
 
 def _tightened(
-    people: Sequence[tighten.Held], found: Fit, limits: LimitSet, coverage: float, horizon_s: float
+    people: Sequence[tightening.Held], found: Fit, limits: LimitSet, coverage: float, horizon_s: float
 ) -> tuple[Fit, dict[str, Any]]:
-    """The fit scaled down to what holds the limbs, and what it holds."""
-    factor = tighten.factor(people, found, limits, coverage)
-    found = tighten.scaled(found, factor)
+    """The fit with the accelerations that hold the limbs, and what it holds of all logs together and of each."""
+    factor = tightening.factor(people, found, limits, coverage)
+    found = tightening.scaled(found, factor)
     limits = found.onto(limits, limits.name)
-    shares = {}
+    shares: dict[str, Any] = {}
     for name in ("training", "held_back"):
-        parts = [tighten.stayed(one.foresight, getattr(one, name), limits)[:, None] for one in people]
-        shares[name] = _plain(_share(parts, horizon_s, tighten.TIGHTEN_HZ))
+        parts = [tightening.stayed(one.foresight, getattr(one, name), limits)[:, None] for one in people]
+        shares[name] = _plain(_share(parts, horizon_s, tightening.TIGHTEN_HZ))
+        shares[f"{name}_by_log"] = [_plain(_share([part], horizon_s, tightening.TIGHTEN_HZ)) for part in parts]
     return found, {"factor": round(factor, 4), "method": people[0].foresight.method, "limbs": shares}
 
 
 def _fit(samples: Sequence[Sample], coverage: float, horizon_s: float) -> Fit:
     training = Futures.join([sample.training for sample in samples])
     try:
-        return fitting.fit(training, load_limits(STANDARD), coverage, horizon_s)
+        return fitting.fit(training, load_limits(KEPT), coverage, horizon_s)
     except LogError as error:
         raise LogError(f"{', '.join(sample.name for sample in samples)}: {error}") from error
 
@@ -244,7 +250,7 @@ def _facts(
         "held_back_share": held_back,
         "ticks_hz": FIT_HZ,
         "kept": [joint for j, joint in enumerate(JOINTS) if found.kept[j]],
-        "kept_from": STANDARD,
+        "kept_from": KEPT,
         "positions": STANDARD if limits.coupled else f"{STANDARD} and {WIDE}, the outer of both",
         "total": shares(trained, held),
         "joints": each,
@@ -268,10 +274,10 @@ def _lines(found: Fit, limits: LimitSet, facts: dict[str, Any]) -> list[str]:
     if facts["kept"]:
         lines.append(
             f"too little motion to say (fewer than {fitting.EXCURSIONS} horizons with motion), so the bounds of "
-            f"{STANDARD} stay: {', '.join(facts['kept'])}"
+            f"{KEPT} stay: {', '.join(facts['kept'])}"
         )
     if len(facts["kept"]) == len(JOINTS):
-        lines.append(f"no joint was fitted: this is {STANDARD} under another name")
+        lines.append(f"no joint was fitted: these are the rates of {KEPT} under another name")
     if "and" in facts["positions"]:
         lines.append(f"recorded postures leave the positions of {STANDARD}: written are {facts['positions']}")
     for log in facts["logs"]:
@@ -279,11 +285,8 @@ def _lines(found: Fit, limits: LimitSet, facts: dict[str, Any]) -> list[str]:
         lines.append(f"{log['name']}: training {_text(log['training'])}; held back {_text(log['held_back'])}{left_out}")
     total = facts["total"]
     if "limbs" in facts:
-        limbs = facts["limbs"]
-        lines.append(
-            f"limbs in the volumes of {facts['method']}, with {facts['factor']:g} of what holds the joints: "
-            f"training {_text(limbs['training'])}; held back {_text(limbs['held_back'])}"
-        )
+        training, held_back = (_text(facts["limbs"][part]) for part in ("training", "held_back"))
+        lines.append(f"limbs in the volumes of {facts['method']}: training {training}; held back {held_back}")
     return [*lines, f"all joints: training {_text(total['training'])}; held back {_text(total['held_back'])}"]
 
 

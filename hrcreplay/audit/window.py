@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hrcreplay.audit.recording import Recording
 from hrcreplay.human.containment import Solid, union_volume_m3
 from hrcreplay.human.reach import Reach
-from hrcreplay.recorded import Recording
+from hrcreplay.pipeline import Foresight
 from hrcreplay.records import LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report.audit_metrics import Outcome
 from hrcreplay.report.series import difference
@@ -30,6 +31,11 @@ _COUNT = 1024
 _SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
 
 
+def standstill_s(foresight: Foresight) -> float:
+    """How long the person must stay in what was predicted: until the robot has reacted and braked [s]."""
+    return foresight.horizon_s + foresight.margins.latency_s
+
+
 @dataclass(frozen=True)
 class Window:
     """The recorded future of some ticks."""
@@ -46,12 +52,12 @@ class Window:
 
 
 def window(recording: Recording, ticks: Ints, horizon_s: float) -> Window:
-    """The recorded future (t, t + T_s] of some ticks.
+    """The recorded future (t, t + T] of some ticks.
 
     Args:
         recording: The log.
         ticks: (n,) rows of ``recording.states``.
-        horizon_s: T_s [s].
+        horizon_s: T, T_s and the latency [s].
     """
     points = recording.points_m.copy()
     # the model's neck is the middle of the shoulders, not the bone that cameras call so
@@ -112,7 +118,7 @@ def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horiz
         recording: The log.
         states: (n,) the fused person at the ticks.
         reach: Of the same ticks.
-        horizon_s: T_s [s].
+        horizon_s: T, T_s and the latency [s].
     """
     t_ns = recording.joints_t_ns
     first = np.searchsorted(t_ns, states.t_ns, side="right")

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay import fit, replay, runs
+from hrcreplay import replay, runs
+from hrcreplay.audit import fit
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.limits import load_limits
-from hrcreplay.logs.writer import LogWriter
-from hrcreplay.records import JOINTS, POINTS, CameraFrames
+from hrcreplay.records import JOINTS
+from tests.audit.standing import log_of_one_who_does_not_stir
 from tests.realdata import data_path
 from tests.test_recordings import SARA, SARA_CELL
 
@@ -110,7 +111,7 @@ def test_covering_the_limbs_needs_less_than_covering_the_joints(tmp_path: Path, 
     assert found["covers"] == "limbs"
     assert found["method"] == "sound"
     assert found["factor"] < 1.0
-    assert limits.v_max[0] < joints.v_max[0]
+    assert (limits.a_max <= joints.a_max).all()  # velocities are people's own, accelerations what is left
     assert found["limbs"]["training"]["share"] >= 0.99
     assert found["limbs"]["held_back"]["share"] >= 0.99
     assert any("limbs in the volumes of sound" in line for line in lines)
@@ -146,34 +147,8 @@ def test_a_log_shorter_than_its_parts_need_is_refused(tmp_path: Path, end_s: flo
     assert not list(tmp_path.iterdir())
 
 
-def standing(path: Path) -> Path:
-    """A log of somebody who does not stir."""
-    n = 300
-    heights = {"pelvis": 1.0, "neck": 1.5, "head": 1.7, "shoulder": 1.5, "elbow": 1.2, "wrist": 0.95}
-    points = np.full((n, len(POINTS), 3), np.nan)
-    for k, point in enumerate(POINTS):
-        name, _, side = point.partition("_")
-        if name in heights:
-            points[:, k] = [0.02 * (name == "wrist"), {"l": 0.2, "r": -0.2}.get(side, 0.0), heights[name]]
-    t_ns = 1_700_000_000_000_000_000 + np.arange(n, dtype=np.int64) * 33_333_333
-    with LogWriter(path) as writer:
-        writer.camera("still", np.eye(4))
-        writer.frames(
-            CameraFrames(
-                capture_ns=t_ns,
-                arrival_ns=t_ns + 5_000_000,
-                camera=np.zeros(n, dtype=np.int64),
-                body=np.ones(n, dtype=np.int64),
-                points_m=points,
-                confidence=np.isfinite(points[:, :, 0]).astype(float),
-                cameras=("still",),
-            )
-        )
-    return path
-
-
 def test_no_arm_motion_is_refused_in_one_line(tmp_path: Path) -> None:
-    log = standing(tmp_path / "still.mcap")
+    log = log_of_one_who_does_not_stir(tmp_path / "still.mcap")
     with pytest.raises(LogError, match=r"still.mcap: found no arm motion") as caught:
         fit.run([log], out=tmp_path / "x.toml")
     assert "\n" not in str(caught.value)
@@ -187,7 +162,7 @@ def test_a_real_recording(tmp_path: Path, name: str) -> None:
     settings.write_text(SARA)
     cell.write_text(SARA_CELL)
     lines = fit.run([bag], out=out, config=settings, cell_file=cell)
-    limits, paper = load_limits(out), load_limits("paper")
+    limits, people = load_limits(out), load_limits("people")
     found = tomllib.loads(out.read_text())["provenance"]
     assert found["logs"][0]["recorded_future"] == "smoothed estimate"
     assert found["total"]["training"]["share"] >= 0.99
@@ -197,4 +172,4 @@ def test_a_real_recording(tmp_path: Path, name: str) -> None:
     assert any("too little motion to say" in line and "rho" in line for line in lines)
     for joint in found["kept"]:
         j = JOINTS.index(joint)
-        assert (limits.v_max[j], limits.a_max[j]) == (paper.v_max[j], paper.a_max[j])
+        assert (limits.v_max[j], limits.a_max[j]) == (people.v_max[j], people.a_max[j])

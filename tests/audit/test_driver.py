@@ -1,0 +1,220 @@
+"""The audit from log to page, and its parts where a whole log would hide a mistake."""
+
+from __future__ import annotations
+
+import json
+import re
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hrcreplay import replay, runs
+from hrcreplay.audit import driver
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.human import peers, reach
+from hrcreplay.logs.writer import LogWriter
+from hrcreplay.records import LIMBS
+from tests.audit.standing import frames, standing
+from tests.realdata import data_path
+from tests.test_recordings import SARA, SARA_CELL
+
+START_S, END_S = 8.0, 14.0
+
+#: What the paper bounds its people by, which real ones leave.
+TABLE_1 = ("limits.prediction=paper",)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return driver.run(
+        [replay.demo_log()],
+        out=tmp_path_factory.mktemp("audit") / "run",
+        start_s=START_S,
+        end_s=END_S,
+        overrides=TABLE_1,
+    )
+
+
+@pytest.fixture(scope="module")
+def found(folder: Path) -> dict[str, Any]:
+    result: dict[str, Any] = json.loads((folder / "audit.json").read_text())
+    return result
+
+
+def test_an_audit_leaves_what_it_promises(folder: Path, found: dict[str, Any]) -> None:
+    for name in ("run.json", "audit.json", "metrics.json", "timing.json", "report.html"):
+        assert (folder / name).stat().st_size > 0
+    for name in ("audit_coverage", "audit_limbs", "audit_joints"):
+        assert (folder / "figures" / f"{name}.png").stat().st_size > 5_000
+    table = pd.read_parquet(folder / "audit.parquet")
+    assert {"t_ns", "log", "method", "limb", "covered", "escape_m", "volume_m3"} <= set(table.columns)
+    assert set(table["method"]) == {*reach.METHODS, *peers.PEERS}
+    assert set(table["limb"]) >= set(LIMBS)
+    assert found["logs"][0]["recorded_future"] == "ground truth"
+    assert found["total"]["ticks"] == 140  # (6 s - 0.377 s) at 25 Hz; the first tick is before the first frame
+    page = (folder / "report.html").read_text()
+    assert not re.search(r"\b(nan|inf|None)\b", re.sub(r"base64,[^\"]*", "", page))
+    assert "every limb" in page
+
+
+def test_the_figures_are_those_of_the_table(folder: Path, found: dict[str, Any]) -> None:
+    """Recomputed from the rows with pandas."""
+    table = pd.read_parquet(folder / "audit.parquet")
+    for (method, limb), rows in table.groupby(["method", "limb"]):
+        figures = found["total"]["methods"][method][limb]
+        seen = rows[rows["escape_m"].notna()]
+        assert figures["covered_share"]["value"] == pytest.approx(seen["covered"].astype(float).mean())
+        assert figures["volume_m3"]["value"] == pytest.approx(rows["volume_m3"].mean())
+        deep = np.sort(seen.loc[seen["escape_m"] > 0, "escape_m"].to_numpy())
+        if len(deep):
+            assert figures["escape_max_m"] == pytest.approx(deep[-1])
+            assert figures["escape_p50_m"]["value"] == pytest.approx(deep[int(np.ceil(0.5 * len(deep))) - 1])
+    six = table[table["limb"].isin(LIMBS)]
+    whole = six.groupby(["method", "t_ns"])["escape_m"].max().groupby("method").agg(lambda worst: (worst == 0).mean())
+    for method, share in whole.items():
+        figures = found["total"]["methods"][method]["all"]
+        assert figures["covered_share"]["value"] == pytest.approx(share)
+        assert figures["covered_share"]["low"] <= share <= figures["covered_share"]["high"]
+        assert figures["union_m3"]["value"] < figures["sum_m3"]["value"]
+
+
+def test_what_must_hold_between_methods(found: dict[str, Any]) -> None:
+    methods = found["total"]["methods"]
+    share = {name: parts["all"]["covered_share"]["value"] for name, parts in methods.items()}
+    room = {name: parts["all"]["union_m3"]["value"] for name, parts in methods.items()}
+    assert share["paper"] < 0.7  # Table 1 is far below what people do
+    assert share["v2_a50"] == share["iso_13855"] == 1.0
+    assert share["constant_velocity"] < share["positions"]
+    assert room["constant_velocity"] < room["paper"] < room["positions"] < room["v2_a50"]
+    for method, curve in found["total"]["curve"].items():
+        shares = [point["covered_share"]["value"] for point in curve]
+        assert all(b >= a - 0.1 for a, b in pairwise(shares)), method
+    standard = next(point for point in found["total"]["curve"]["paper"] if point["factor"] == 1.0)
+    assert standard["covered_share"]["value"] == pytest.approx(share["paper"])
+
+
+def test_escapes_name_their_time_and_limb(folder: Path, found: dict[str, Any]) -> None:
+    table = pd.read_parquet(folder / "audit.parquet")
+    rows = table[(table["method"] == "paper") & (table["escape_m"] > 0)]
+    listed = found["logs"][0]["escapes"]["paper"]
+    assert sum(e["ticks"] for e in listed) == len(rows)
+    deepest = max(listed, key=lambda e: e["deepest_m"])
+    worst = rows.sort_values("escape_m").iloc[-1]
+    assert deepest["limb"] == worst["limb"]
+    start_ns = table["t_ns"].min()
+    assert deepest["deepest_t_ns"] == worst["t_ns"]
+    assert deepest["deepest_at_s"] == pytest.approx((worst["t_ns"] - start_ns) * 1e-9, abs=0.05)
+
+
+def test_every_escape_is_a_row_by_every_method(folder: Path) -> None:
+    table, rows = pd.read_parquet(folder / "escapes.parquet"), pd.read_parquet(folder / "audit.parquet")
+    deep = rows[rows["escape_m"] > 0.0]
+    assert set(table["method"]) == set(deep["method"])
+    for (method, limb), mine in table.groupby(["method", "limb"]):
+        theirs = deep[(deep["method"] == method) & (deep["limb"] == limb)]
+        assert mine["ticks"].sum() == len(theirs)
+        at = theirs.set_index("t_ns")["escape_m"]
+        np.testing.assert_array_equal(mine["deepest_m"], at.loc[mine["deepest_t_ns"]])
+        assert mine["deepest_m"].max() == theirs["escape_m"].max()
+    page = (folder / "report.html").read_text()
+    assert "demo: escapes from paper" in page
+    shown = table[table["method"] == "paper"].sort_values("deepest_m").iloc[-1]
+    assert f"{shown['deepest_at_s']:.2f} s" in page
+
+
+def test_same_bytes_again(folder: Path, tmp_path: Path) -> None:
+    again = driver.run([replay.demo_log()], out=tmp_path / "again", start_s=START_S, end_s=END_S, overrides=TABLE_1)
+    assert runs.read_meta(again)["outputs"] == runs.read_meta(folder)["outputs"]
+
+
+@pytest.fixture(scope="module")
+def both(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same log with another second of it, each with the span of its own run."""
+    out = tmp_path_factory.mktemp("both")
+    fused = replay.run("fuse", replay.demo_log(), out=out / "fused", start_s=20.0, end_s=21.0)
+    return driver.run([folder, fused], out=out / "run")
+
+
+def test_a_log_among_others_has_the_figures_it_has_alone(both: Path, found: dict[str, Any]) -> None:
+    together = json.loads((both / "audit.json").read_text())
+    assert [log["ticks"] for log in together["logs"]] == [140, 15]
+    assert [log["log"] for log in together["logs"]] == ["demo (1)", "demo (2)"]
+    first = together["logs"][0]["methods"]["paper"]["LRA"]["covered_share"]["value"]
+    assert first == found["total"]["methods"]["paper"]["LRA"]["covered_share"]["value"]
+
+
+def test_the_total_counts_every_tick_once(both: Path) -> None:
+    """Recomputed from the rows of both logs."""
+    found = json.loads((both / "audit.json").read_text())
+    rows = pd.read_parquet(both / "audit.parquet")
+    for method in ("paper", "positions"):
+        mine = rows[(rows["method"] == method) & rows["limb"].isin(LIMBS)]
+        worst = mine.groupby(["log", "t_ns"])["escape_m"].max()
+        total = found["total"]["methods"][method]["all"]
+        assert total["covered_share"]["samples"] == found["total"]["ticks"] == len(worst) == 155
+        assert total["covered_share"]["value"] == pytest.approx((worst == 0.0).mean())
+        each = [log["methods"][method]["all"] for log in found["logs"]]
+        deepest = [part["escape_max_m"] for part in each if part["escape_max_m"] is not None]
+        assert total["escape_max_m"] == max(deepest, default=None)
+        assert total["union_m3"]["value"] == pytest.approx(
+            np.average([p["union_m3"]["value"] for p in each], weights=[p["union_m3"]["samples"] for p in each])
+        )
+        # 15 ticks are little more than a look: the total knows more than the short log, not more than it should
+        width = [part["covered_share"]["high"] - part["covered_share"]["low"] for part in (*each, total)]
+        assert width[2] < width[1]
+    assert "The total counts every tick once" in (both / "report.html").read_text()
+
+
+def test_logs_of_two_horizons_have_no_total(tmp_path: Path) -> None:
+    short = replay.run(
+        "fuse", replay.demo_log(), out=tmp_path / "a", start_s=8.0, end_s=9.0, overrides=("occupancy.stop_s=0.2",)
+    )
+    with pytest.raises(SettingsError, match=r"occupancy\.stop_s and latency_s: demo\.mcap and demo\.mcap differ"):
+        driver.run([short, replay.demo_log()], out=tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_log_shorter_than_the_horizon_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"demo\.mcap: found 0\.30 s; an audit needs more than the horizon of 0\.377 s"):
+        driver.run([replay.demo_log()], out=tmp_path / "x", start_s=8.0, end_s=8.3)
+    with pytest.raises(SettingsError, match="exists already"):
+        driver.run([replay.demo_log()], out=tmp_path, start_s=8.0, end_s=8.3)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_person_who_stands_still_is_said_to(tmp_path: Path) -> None:
+    path = tmp_path / "still.mcap"
+    with LogWriter(path) as writer:
+        writer.camera("cam", np.eye(4))
+        writer.frames(frames(standing(60)))
+    found = json.loads((driver.run([path], out=tmp_path / "run") / "audit.json").read_text())
+    notes = found["logs"][0]["notes"]
+    assert "no arm motion: the shares of the arms say nothing of a person at work" in notes
+    assert any(note.startswith("hardly moved") and "ar1 (0 deg)" in note for note in notes)
+    assert any("the intervals are wide" in note for note in notes)
+    assert found["logs"][0]["recorded_future"] == "camera points"
+    share = found["total"]["methods"]["paper"]["all"]["covered_share"]
+    assert share["value"] == 1.0
+    assert share["low"] < 0.7  # 1.6 s are no proof
+
+
+@pytest.mark.parametrize("name", ["exp_appraoching", "exp_box"])
+def test_teleports_of_a_real_bag_do_not_count_as_motion(tmp_path: Path, name: str) -> None:
+    settings, cell = tmp_path / "s.toml", tmp_path / "cell.toml"
+    settings.write_text(SARA)
+    cell.write_text(SARA_CELL)
+    bag = data_path(f"sara_human_robot_bags/{name}.bag")
+    folder = driver.run([bag], out=tmp_path / "run", config=settings, cell_file=cell, end_s=6.0)
+    found = json.loads((folder / "audit.json").read_text())
+    log = found["logs"][0]
+    assert log["recorded_future"] == "camera points"
+    assert log["counts"]["audit_rejected_frames_mocap"] >= 0
+    assert found["total"]["methods"]["v2_a50"]["all"]["covered_share"]["value"] > 0.9
+    for method in reach.METHODS:
+        assert all(e["deepest_m"] < 1.0 for e in log["escapes"][method])
+    deepest = found["total"]["methods"]["paper"]["all"]["escape_max_m"]
+    assert deepest is None or deepest < 1.0

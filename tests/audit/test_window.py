@@ -1,0 +1,67 @@
+"""The recorded future of a tick, and what is held against it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hrcreplay.audit import recording
+from hrcreplay.audit.recording import Recording
+from hrcreplay.audit.window import hold, joints_inside, travel, window
+from hrcreplay.human import reach
+from hrcreplay.records import JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
+from tests.human.people import states
+
+
+def _recording(points: Floats, joints: Floats, people: HumanStates) -> Recording:
+    t_ns = people.t_ns[0] + np.arange(len(points)) * 100_000_000
+    return Recording(people, t_ns, points, t_ns, joints, recording.TRUTH, {})
+
+
+def _balls(people: HumanStates, radius_m: float) -> SweptVolumes:
+    """A ball at the world's origin for every limb."""
+    n = len(people) * len(LIMBS)
+    radius = np.full((len(people), len(LIMBS)), radius_m)
+    return SweptVolumes(people.t_ns, np.arange(n + 1), np.zeros((n, 3)), radius, LIMBS, "balls")
+
+
+def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
+    """A point that moves 1 m a sample along x, sampled every 0.1 s."""
+    people = states(np.zeros((1, 12)), np.zeros((1, 12)))
+    points = np.zeros((10, len(POINTS), 3))
+    points[:, :, 0] = np.arange(10)[:, None]
+    future = window(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4)
+    outcome = hold(_balls(people, 1.5), future, np.array([True]))
+    np.testing.assert_allclose(outcome.beyond_m, 4.0)  # the sample at the horizon counts, the next does not
+    np.testing.assert_allclose(outcome.escape_m(), 2.5)
+    assert outcome.union_m3[0] == pytest.approx(4.0 / 3.0 * np.pi * 1.5**3, rel=0.05)
+    points[4, POINTS.index("wrist_l")] = np.nan  # not seen near the end: the lower arm cannot be audited
+    future = window(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4)
+    outcome = hold(_balls(people, 1.5), future, np.array([False]))
+    assert np.isnan(outcome.beyond_m[0]).tolist() == [limb == "LLA" for limb in LIMBS]
+    assert outcome.worst_m()[0] == pytest.approx(2.5)
+    assert np.isnan(outcome.union_m3[0])
+
+
+def test_a_joint_stays_inside_whatever_its_name_and_turn() -> None:
+    people = states(np.zeros((2, 12)), np.zeros((2, 12)))
+    people = replace(people, t_ns=np.array([0, 300_000_000]))
+    joints = np.zeros((8, 12))
+    joints[:, 2] = 2.0 * np.pi + 0.01 * np.arange(8)  # heading, a turn later
+    joints[:, 4] = 0.02 * np.arange(8)
+    joints[6:, 5] = np.nan
+    low, high = np.full((2, 12), -0.05), np.full((2, 12), 0.05)
+    recording = _recording(np.zeros((8, len(POINTS), 3)), joints, people)
+    inside = joints_inside(recording, people, reach.Reach(people.t_ns, low, high), 0.2)
+    assert inside[0, JOINTS.index("theta")] == 1.0  # 0.01, 0.02
+    assert inside[1, JOINTS.index("theta")] == 1.0  # 0.04, 0.05
+    assert inside[0, 4] == 1.0  # 0.02, 0.04
+    assert inside[1, 4] == 0.0  # 0.08, 0.10
+    late = joints_inside(
+        recording, replace(people, t_ns=people.t_ns + 600_000_000), reach.Reach(people.t_ns, low, high), 0.2
+    )
+    assert late[0, 4] == 0.0
+    assert np.isnan(late[1]).all()  # the recording is over
+    assert travel(joints[:6])[4] == pytest.approx(0.09)

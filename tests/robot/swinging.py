@@ -1,0 +1,108 @@
+"""A robot that swings beside people, and its problem written down in full for another solver."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import daqp
+import numpy as np
+import pytest
+
+from hrcreplay.records import Floats, SweptVolumes
+from hrcreplay.robot.constraints import approach_rows, link_segment
+from hrcreplay.robot.controller import step
+from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.robot.obstacles import Obstacles, obstacles
+from hrcreplay.robot.problem import Problem, problem
+from hrcreplay.robot.rotation import from_vector
+from hrcreplay.robot.separation import Separation, separation
+from hrcreplay.robot.sight import observe
+from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
+from tests.robot.people import cloud, volumes
+
+STOP_S, DT_S = 0.377, 0.004
+SETTINGS = PlanSettings(dt_s=DT_S, stop_s=STOP_S)
+HOME = np.deg2rad([10.0, 20.0, -20.0, 0.0, 60.0, 0.0])
+
+
+def base() -> Floats:
+    T_world_base = np.eye(4)
+    T_world_base[2, 3] = 0.65
+    return T_world_base
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return irb140(base(), stop_s=STOP_S)
+
+
+def swing(robot: RobotModel, t_s: float) -> tuple[Floats, Floats]:
+    """A reference that swings sideways, and its twist."""
+    T = robot.pose(HOME, np.zeros(6)).T_world_tcp.copy()
+    T[1, 3] += 0.3 * np.sin(1.5 * t_s)
+    return T, np.array([0.0, 0.45 * np.cos(1.5 * t_s), 0.0, 0.0, 0.0, 0.0])
+
+
+def run(
+    robot: RobotModel, people: SweptVolumes, settings: PlanSettings = SETTINGS
+) -> Iterator[tuple[RobotState, Step]]:
+    state = RobotState(HOME, np.zeros(6))
+    for tick in range(len(people)):
+        made = step(robot, state, *swing(robot, (tick + 1) * DT_S), obstacles(people, tick), settings)
+        yield state, made
+        state = made.next
+
+
+def all_rows(robot: RobotModel, task: Problem) -> tuple[Floats, Floats, Floats]:
+    """Every row of Eq. (66g)-(66i), written down."""
+    A, low, high = [task.pose.J_tcp], [task.J_low], [task.J_high]
+    distance, offsets = separation(task.pose, task.obstacles), task.obstacles.offsets
+    for link, segment in enumerate(robot.segments):
+        for limb, radius in enumerate(task.obstacles.radius_m):
+            vertices = task.obstacles.vertices_m[offsets[limb] : offsets[limb + 1]]
+            rows = approach_rows(
+                link_segment(task.pose, link),
+                vertices,
+                distance[link, limb],
+                clearance_m=segment.radius_m + radius,
+                stop_s=STOP_S,
+            )
+            A.append(rows.A)
+            high.append(rows.b)
+            low.append(np.full(len(rows.b), -1e30))
+    every: Floats = np.concatenate(A)
+    every[np.abs(every) < 1e-13] = 0.0  # rounding errors of axes that do not move the link: daqp scales them up to rows
+    return np.ascontiguousarray(every), np.concatenate(low), np.concatenate(high)
+
+
+def dense(robot: RobotModel, task: Problem) -> tuple[Floats, bool]:
+    """The same problem with all rows, by another solver."""
+    A, low, high = all_rows(robot, task)
+    upper, lower = np.concatenate([task.high, high]), np.concatenate([task.low, low])
+    found = daqp.solve(task.H, task.g, A, upper, lower, primal_tol=1e-11, dual_tol=1e-12)
+    return found[0], found[2] == 1
+
+
+def asked(robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles) -> Problem:
+    pairs = observe(robot, state, seen, 0.0).pairs
+    assert isinstance(pairs, Separation)
+    return problem(robot, state, robot.pose(state.q, state.dq), T, twist, seen, pairs, SETTINGS)
+
+
+def random_tick(robot: RobotModel, rng: np.random.Generator) -> Problem:
+    """Anything: singular wrists, robots at rest, people far and in contact."""
+    q = rng.uniform(robot.q_min, robot.q_max) * 0.6
+    q[4] *= rng.choice([0.0, 1e-4, 1.0, 1.0, 1.0])
+    state = RobotState(q, rng.normal(size=6) * rng.choice([0.0, 0.1, 0.5]))
+    pose = robot.pose(q, state.dq)
+    T = pose.T_world_tcp.copy()
+    T[:3, 3] += rng.normal(size=3) * 0.02
+    T[:3, :3] = from_vector(rng.normal(size=3) * 0.05) @ T[:3, :3]
+    centre = pose.T_world_tcp[:3, 3] + rng.normal(size=3) * 0.6
+    limbs = [cloud(rng, 40, rng.uniform(0.02, 0.3, 3)) + centre + rng.normal(size=3) * 0.25 for _ in range(6)]
+    twist = pose.J_tcp @ (state.dq + rng.normal(size=6) * 0.1)
+    return asked(robot, state, T, twist, obstacles(volumes(limbs), 0))
+
+
+def moving(robot: RobotModel) -> RobotState:
+    return RobotState(HOME, np.array([0.5, -0.3, 0.2, -1.0, 0.8, 0.001]))

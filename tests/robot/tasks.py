@@ -1,0 +1,43 @@
+"""A robot at an angle, and a pick and place for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.robot.paths import programmed
+from hrcreplay.robot.reference import Reference
+from hrcreplay.robot.task import parse_task
+
+HOME: dict[str, Any] = {"name": "home", "joints_deg": [0, 0, 0, 0, 90, 0]}
+ABOVE: dict[str, Any] = {"position_m": [0.45, 0.30, 0.25], "rpy_deg": [180, 0, 30]}
+RACK: dict[str, Any] = {
+    "name": "rack",
+    "position_m": [0.45, 0.30, 0.10],
+    "rpy_deg": [180, 0, -20],
+    "move": "linear",
+    "tcp_speed_m_per_s": 0.25,
+    "dwell_s": 0.3,
+}
+BOX: dict[str, Any] = {"position_m": [0.40, -0.35, 0.15], "quaternion_wxyz": [0, 1, 0, 0], "dwell_s": 0.2}
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", 0.5).as_matrix()
+    T[:3, 3] = 1.0, 0.5, 0.65
+    return irb140(T, stop_s=0.377)
+
+
+def plan(robot: RobotModel, *waypoints: dict[str, Any], **task: Any) -> Reference:
+    return programmed(parse_task({"waypoints": list(waypoints), **task}), robot)
+
+
+@pytest.fixture(scope="module")
+def pick_and_place(robot: RobotModel) -> Reference:
+    return plan(robot, HOME, ABOVE, RACK, {**ABOVE, "move": "linear"}, BOX, cycles=2, speed=1.0, acceleration=1.0)

@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.robot.paths import approach
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return irb140(np.eye(4), stop_s=0.377)
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.3, 1.0])
+def test_an_approach_begins_and_ends_at_rest_and_keeps_its_share_of_the_limits(robot: RobotModel, speed: float) -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        start, goal = rng.uniform(robot.q_min, robot.q_max, (2, robot.nv))
+        path = approach(robot, start, goal, speed)
+        assert_allclose(path.sample(0.0).q, start, atol=1e-12)
+        assert_allclose(path.sample(path.duration_s).q, goal, atol=1e-12)
+        t = np.arange(0.0, path.duration_s, 0.001)
+        q = np.array([path.sample(s).q for s in t])
+        dq, ddq = np.gradient(q, t, axis=0), np.array([path.sample(s).ddq for s in t])
+        assert np.all(np.abs(dq) <= speed * robot.dq_max * 1.001)
+        assert np.all(np.abs(ddq) <= speed * robot.ddq_max * 1.01)
+        assert_allclose([dq[1], dq[-1]], 0.0, atol=0.05 * speed)
+        fastest = max((np.abs(dq) / robot.dq_max).max(), (np.abs(ddq) / robot.ddq_max).max())
+        assert fastest > 0.97 * speed  # and no slower than that
+
+
+def test_an_approach_from_where_the_robot_is_has_a_reference_at_every_time(robot: RobotModel) -> None:
+    path = approach(robot, np.zeros(6), np.zeros(6), 0.1)
+    assert path.next_waypoint(0.0) == 0.0 or path.next_waypoint(0.0) == path.duration_s
+    assert_allclose([path.sample(s).q for s in (0.0, 0.002, 1.0)], 0.0)

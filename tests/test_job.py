@@ -1,0 +1,99 @@
+"""Run folders as input that were not left as ours are: made by an earlier version, or changed since."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from hrcreplay import replay, runs
+from hrcreplay.audit import driver
+from hrcreplay.errors import LogError
+from hrcreplay.tables import COLUMNS, lacks
+
+#: What tables of the version before had not.
+NEW = {
+    "state.parquet": [name for name in COLUMNS["state"] if name.startswith(("residual_", "unseen_"))],
+    "motion.parquet": ["programme_s", "reason"],
+    "motion_scaling.parquet": ["programme_s", "reason"],
+}
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return replay.run("plan", replay.demo_log(), out=tmp_path_factory.mktemp("job") / "run", start_s=9.0, end_s=10.0)
+
+
+def _aged(folder: Path, to: Path, *names: str) -> Path:
+    """The same run as if a version had made it that knew no NEW columns in those tables."""
+    shutil.copytree(folder, to)
+    meta = runs.read_meta(to)
+    for name in names:
+        pq.write_table(pq.read_table(to / name).drop_columns(NEW[name]), to / name)
+        meta["outputs"][name] = runs.sha256(to / name)
+    (to / "run.json").write_text(json.dumps(meta))
+    return to
+
+
+def test_our_tables_lack_nothing(planned: Path) -> None:
+    tables = sorted(planned.glob("*.parquet"))
+    assert {path.stem for path in tables} >= set(COLUMNS)
+    for path in tables:
+        assert lacks(path) == ()
+        of_the_cell = re.compile(r"valid_.*|(q|dq|u)\d")
+        own = {name for name in pq.read_schema(path).names if not of_the_cell.fullmatch(name)}
+        assert own == set(COLUMNS[path.stem.split("_")[0]]), path
+
+
+@pytest.mark.parametrize(
+    ("table", "again"), [("state.parquet", ("fuse", "predict", "plan")), ("motion_scaling.parquet", ("plan",))]
+)
+def test_tables_of_an_earlier_version_are_computed_again(
+    planned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, again: tuple[str, ...]
+) -> None:
+    old = _aged(planned, tmp_path / "old", table)
+    new = replay.run("report", old, out=tmp_path / "new")
+    said = capsys.readouterr().err
+    for stage in ("fuse", "predict", "plan"):
+        outcome = f"{old / table} is of an earlier version, without {NEW[table][0]}; computed again"
+        assert f"{stage}: {outcome if stage in again else f'taken over from {old}'}" in said
+    mine, theirs = runs.read_meta(new)["outputs"], runs.read_meta(planned)["outputs"]
+    assert {name: mine[name] for name in theirs} == theirs
+
+
+def _changed(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+@pytest.mark.parametrize("harm", [Path.unlink, _changed])
+def test_tables_that_were_changed_since_are_computed_again(
+    planned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], harm: Callable[[Path], None]
+) -> None:
+    shutil.copytree(planned, tmp_path / "old")
+    harm(tmp_path / "old" / "state.parquet")
+    new = replay.run("plan", tmp_path / "old", out=tmp_path / "new")
+    assert "fuse: " in (said := capsys.readouterr().err)
+    assert "state.parquet is not as its run left it; computed again" in said
+    assert runs.read_meta(new)["outputs"] == runs.read_meta(planned)["outputs"]
+
+
+def test_an_audit_takes_an_old_run(planned: Path, tmp_path: Path) -> None:
+    old = _aged(planned, tmp_path / "old", "state.parquet")
+    found = json.loads((driver.run([old], out=tmp_path / "audit") / "audit.json").read_text())
+    assert found["logs"][0]["log"] == "demo"
+
+
+@pytest.mark.parametrize("key", ["inputs", "settings", "cell", "task", "span_s"])
+def test_a_run_that_does_not_tell_how_it_was_made_is_refused(planned: Path, tmp_path: Path, key: str) -> None:
+    shutil.copytree(planned, tmp_path / "old")
+    meta = runs.read_meta(planned)
+    del meta[key]
+    (tmp_path / "old" / "run.json").write_text(json.dumps(meta))
+    with pytest.raises(LogError, match=rf"old: its run\.json lacks {key}, .*; give the log itself"):
+        replay.run("plan", tmp_path / "old", out=tmp_path / "new")
+    assert not (tmp_path / "new").exists()

@@ -1,0 +1,41 @@
+"""What a report shows of the run's own method."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from hrcreplay import replay, reporting, runs
+from hrcreplay.human.margins import Margins
+from hrcreplay.human.occupancy import Radii
+from hrcreplay.limits import load_limits
+from hrcreplay.pipeline import Foresight
+from hrcreplay.records import LIMBS
+from hrcreplay.runs import Run
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    out = tmp_path_factory.mktemp("sound") / "run"
+    overrides = ("occupancy.method=sound", "occupancy.store_hz=5")
+    return runs.read(replay.run("report", replay.demo_log(), out=out, overrides=overrides, start_s=8.0, end_s=12.0))
+
+
+def test_the_figure_of_volumes_holds_the_runs_own_method(sound: Run) -> None:
+    radii = Radii(head=0.12, thorax=0.15, upper_arm=0.07, lower_arm=0.07)
+    foresight = Foresight(load_limits("paper"), 0.377, radii, Margins(), "sound")
+    (_, methods), *others = reporting._instants(foresight, sound)
+    assert len(others) == 3
+    assert list(methods) == ["paper", "positions", "sound"]
+    assert list(methods["paper"]) == list(LIMBS)
+    assert list(methods["sound"]) == [*LIMBS, "LEGS"]
+    assert methods["paper"]["HD"][1] == 0.12
+    assert methods["sound"]["HD"][1] > 0.12  # the residual
+
+
+def test_the_page_has_the_lower_body(sound: Run) -> None:
+    page = re.sub(r"base64,[^\"]*", "", (sound.folder / "report.html").read_text())
+    assert re.search(r"<t[hd][^>]*>\s*LEGS\s*</t[hd]>", page)
+    assert "legs, of sound" in page
+    assert not re.search(r"\b(nan|inf|None)\b", page)
