@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from hrcreplay import __version__
+from hrcreplay import __version__, cli_live
 from hrcreplay.errors import HrcReplayError
 from hrcreplay.options import (
     CellFile,
@@ -231,6 +231,7 @@ def demo(
     sys.stdout.write(f"{folder / 'report.html'}\n")
 
 
+cli_live.register(app)
 
 
 def main() -> None:

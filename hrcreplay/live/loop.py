@@ -1,0 +1,155 @@
+"""The control loop: a packet, an answer, a look; everything else is told to others and waited for by nobody."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from hrcreplay.egm.link import Link, Received
+from hrcreplay.live import wire
+from hrcreplay.live.durations import Durations
+from hrcreplay.live.helpers import Helper
+from hrcreplay.live.pilot import Pilot
+from hrcreplay.live.records import Answer, Signal, TickEvent
+from hrcreplay.live.watch import REFUSED
+
+#: Signals after which the session ends as soon as the robot stands.
+ENDING = Signal.INTERRUPT | Signal.TERMINATE | Signal.DURATION | Signal.PERSON_ENDED
+
+#: Answers at speed 0 before we leave: a robot keeps obeying the last one.
+FAREWELLS = 5
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """What the loop itself watches; see config.Live."""
+
+    duration_s: float  #: inf: until it is stopped
+    sending: bool
+    person_late_s: float
+    overrun_s: float
+    keep_recorder: bool
+    store_every_s: float  #: between two looks whose volumes are recorded whole
+
+
+@dataclass
+class Loop:
+    """One session's loop. ``now_ns`` is the session's clock."""
+
+    pilot: Pilot
+    link: Link
+    person: Helper
+    recorder: Helper
+    settings: LoopSettings
+    anchor_ns: int
+    start_ns: int
+    caught: Signal = Signal.NONE  #: by the handlers of the operating system's signals
+    notes: list[str] = field(default_factory=list)
+    took: Durations = field(default_factory=Durations)
+    answers: int = 0
+    robot: str | None = None
+    last: Answer | None = None
+    stored: bytes | None = None  #: the latest swept volumes that were recorded whole
+    _bodies: list[bytes] = field(default_factory=list)
+    _beat_ns: int = 0
+    _late: bool = False
+    _ended: bool = False
+    _stored_ns: int = 0
+
+    def now_ns(self) -> int:
+        """The session's clock: monotonic, beginning at the time of day."""
+        return time.monotonic_ns() + self.anchor_ns
+
+    def begin(self) -> None:
+        """Tells the human side to start."""
+        self.link.clear()
+        self._beat_ns = self.now_ns()
+        self.person.send(b"G" + self.start_ns.to_bytes(8, "little"))
+
+    def turn(self) -> bool:
+        """One turn; False when the session is over."""
+        received = self.link.newest()
+        signals = self._signals()
+        if received is None:
+            t_ns = self.now_ns()
+            self.pilot.silence(t_ns, signals)
+            self.recorder.send(wire.silence(t_ns, signals))
+        else:
+            self._answer(received, signals)
+        self._look()
+        return not self._over(signals)
+
+    def _answer(self, received: Received, signals: Signal) -> None:
+        event = TickEvent(received.t_ns + self.anchor_ns, (*received.older, received.data), signals)
+        answer = self.pilot.answer(event)
+        if answer.datagram is not None and self.settings.sending:
+            self.link.answer(answer.datagram, received.sender)
+        took_ns = self.now_ns() - event.t_ns
+        self._late = took_ns > self.settings.overrun_s * 1e9
+        self.robot = "{}:{}".format(*received.sender)
+        for datagram in event.datagrams:
+            self.recorder.send(wire.robot(event.t_ns, datagram))
+        self.recorder.send(wire.answer(answer, signals, len(event.datagrams), took_ns // 1000))
+        if answer.datagram is not None:
+            self.answers += 1
+            self.took.add(took_ns)
+            self.recorder.send(wire.reply(event.t_ns, answer.datagram, sent=self.settings.sending))
+        self.last = answer
+
+    def _look(self) -> None:
+        skeletons = self._hear_person()
+        t_ns = self.now_ns()
+        sight = self.pilot.look(t_ns, skeletons)
+        for skeleton in skeletons:
+            self.recorder.send(wire.frame(t_ns, skeleton))
+        if sight is None:
+            self.recorder.send(wire.event(t_ns, {"what": "blind"}))
+            return
+        self.recorder.send(wire.look(sight.states, sight.volumes, len(skeletons)))
+        if t_ns - self._stored_ns >= self.settings.store_every_s * 1e9:
+            self._stored_ns = t_ns
+            self.stored = wire.whole(sight.volumes)
+            self.recorder.send(self.stored)
+
+    def _hear_person(self) -> list[bytes]:
+        skeletons = []
+        for message in self.person.messages():
+            self._beat_ns = self.now_ns()
+            kind = message[:1]
+            if kind in (b"f", b"F"):
+                self._bodies.append(message[1:])
+                if kind == b"F":  # the last body of its frame: half a frame could be somebody else's
+                    skeletons += self._bodies
+                    self._bodies = []
+            elif kind == b"N":
+                self.note(message[1:].decode(errors="replace"))
+            elif kind == b"Z":
+                self._ended = True
+        return skeletons
+
+    def note(self, text: str) -> None:
+        """Something worth telling and recording."""
+        self.notes.append(text)
+        self.recorder.send(wire.event(self.now_ns(), {"what": "note", "text": text}))
+
+    def _signals(self) -> Signal:
+        now_ns, found = self.now_ns(), self.caught
+        if now_ns - self.start_ns >= self.settings.duration_s * 1e9:
+            found |= Signal.DURATION
+        if self._ended:
+            found |= Signal.PERSON_ENDED
+        elif not self.person.alive:
+            found |= Signal.PERSON_DEAD
+        elif now_ns - self._beat_ns > self.settings.person_late_s * 1e9:
+            found |= Signal.PERSON_LATE
+        if self.settings.keep_recorder and not self.recorder.notice():
+            found |= Signal.RECORDER_DEAD
+        if self._late:
+            found |= Signal.OVERRUN
+        return found
+
+    def _over(self, signals: Signal) -> bool:
+        if self.pilot.stop in REFUSED:
+            return True
+        ending = bool(signals & ENDING) or self.pilot.fault is not None
+        return ending and (self.pilot.standing >= FAREWELLS or not self.pilot.connected)

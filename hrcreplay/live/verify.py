@@ -1,0 +1,276 @@
+"""`hrcreplay verify`: what a session's record says came out, against what comes out of it again, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from hrcreplay import runs
+from hrcreplay.egm.codec import AXES
+from hrcreplay.errors import SettingsError
+from hrcreplay.live import records, setup, verify_replay, wire
+from hrcreplay.live.records import Answer, Sight, Signal, TickEvent
+from hrcreplay.live.tape import Tape
+from hrcreplay.records import STATUSES, Floats, SweptVolumes
+from hrcreplay.tables import state_columns
+
+LOG = "log.mcap"
+_ROW = (
+    *(f"{name}{axis}" for name in ("q_measured", "q", "dq", "u") for axis in range(1, AXES + 1)),
+    *("ref_x", "ref_y", "ref_z", "tcp_x", "tcp_y", "tcp_z", "tcp_speed", "ref_speed", "programme_s", "distance_m"),
+)  #: the numbers of a MotionRow, named as in motion.parquet
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether a run came out the same again, and what there is to say of it."""
+
+    identical: bool
+    lines: tuple[str, ...]
+
+
+class Pilot(Protocol):
+    """What makes a session's decisions; see pilot.py."""
+
+    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Sight | None:
+        """What is known of the person."""
+
+    def answer(self, event: TickEvent) -> Answer:
+        """What the robot is told."""
+
+    def silence(self, t_ns: int, signals: Signal) -> None:
+        """The robot said nothing."""
+
+
+Build = Callable[[dict[str, Any]], Pilot]
+
+
+def verify(run: Path, build: Build = setup.build) -> Verdict:
+    """Runs a live session or a replay again from what its folder holds, and compares.
+
+    Args:
+        run: Run folder; also that of a session under way or killed.
+        build: Makes a session's pilot from its start event.
+
+    Raises:
+        SettingsError: No run folder, or one of a command that cannot be run again.
+        LogError: The log of the run cannot be read.
+    """
+    if not (run / LOG).exists():
+        lines = [*verify_replay.again(run), *_changed(run)]
+        return Verdict(identical=False, lines=tuple(lines)) if lines else Verdict(identical=True, lines=("identical",))
+    return _session(run, build)
+
+
+def _session(run: Path, build: Build) -> Verdict:
+    tape = Tape(run / LOG)
+    again = Again(build(tape.start()))
+    difference = None
+    for message in tape.messages():
+        if tape.flaws:
+            break
+        difference = again.differs(message)
+        if difference is not None:
+            break
+    else:
+        difference = again.owed()
+    lines = [f"{tape.path}: {flaw}" for flaw in tape.flaws]
+    if difference is not None:
+        lines.append(difference)
+    lines += _changed(run)
+    if lines:
+        return Verdict(identical=False, lines=(*lines, f"identical until then: {again.ticks} ticks"))
+    end = "" if again.ended and tape.finished else "; the record breaks off: the session or its recorder was killed"
+    return Verdict(identical=True, lines=(f"identical: {again.ticks} ticks, {again.looks} looks{end}",))
+
+
+def _changed(run: Path) -> Iterator[str]:
+    """The files of a complete run that are not those it left."""
+    try:
+        meta = runs.read_meta(run)
+    except SettingsError as error:
+        if run.suffix != ".partial":  # of which only the log counts
+            yield str(error)
+        return
+    for name, digest in sorted(meta["outputs"].items()):
+        path = run / name
+        if not path.exists():
+            yield f"{path}: is gone"
+        elif runs.sha256(path) != digest:
+            yield f"{path}: is not as the run left it"
+
+
+class Again:
+    """A session once more: a fresh pilot is told what the record says, and must say what the record says."""
+
+    def __init__(self, pilot: Pilot) -> None:
+        self.ticks = 0  #: answers so far
+        self.looks = 0
+        self.ended = False
+        self._pilot = pilot
+        self._start_ns: int | None = None
+        self._last_ns = 0
+        self._frames: list[bytes] = []
+        self._datagrams: list[bytes] = []
+        self._reply: bytes | None = None  # due as the next message
+        self._sight: Sight | None = None
+        self._suspect = ""  # a limb whose volume is not that of the record; perhaps it is there whole
+        self._take = {
+            wire.ROBOT: self._robot,
+            wire.REPLY: self._replied,
+            wire.FRAME: self._frame,
+            wire.LOOK: self._look,
+            wire.VOLUMES: self._volumes,
+            wire.ANSWER: self._answer,
+            wire.SILENCE: self._silence,
+            wire.EVENT: self._event,
+        }
+
+    def differs(self, message: bytes) -> str | None:
+        """The first thing about a message, or due before it, that is not the same again."""
+        kind, t_ns = wire.kind(message), wire.clock_ns(message)
+        if self._start_ns is None:
+            self._start_ns = t_ns
+        self._last_ns = t_ns
+        found = None
+        if self._reply is not None and kind != wire.REPLY:
+            found = _both("reply", "none", f"{len(self._reply)} bytes")
+        elif self._suspect and kind != wire.VOLUMES:
+            found = self._suspect
+        else:
+            found = self._take[kind](message)
+        return None if found is None else self._at(t_ns, found)
+
+    def owed(self) -> str | None:
+        """What differs that the message after the last one would have shown."""
+        return self._at(self._last_ns, self._suspect) if self._suspect else None
+
+    def _at(self, t_ns: int, found: str) -> str:
+        return f"tick {max(0, self.ticks - 1)} at {(t_ns - (self._start_ns or 0)) / 1e9:.3f} s: {found}"
+
+    def _robot(self, message: bytes) -> None:
+        self._datagrams.append(wire.body(message))
+
+    def _frame(self, message: bytes) -> None:
+        self._frames.append(wire.body(message))
+
+    def _silence(self, message: bytes) -> None:
+        self._pilot.silence(wire.clock_ns(message), wire.read_silence(message))
+
+    def _event(self, message: bytes) -> str | None:
+        what = wire.read_event(message).get("what")
+        self.ended = what == "end"
+        if what != "blind":
+            return None
+        frames, self._frames = self._frames, []
+        self._sight = self._pilot.look(wire.clock_ns(message), frames)
+        return None if self._sight is None else _both("look", "failed", "none of it")
+
+    def _look(self, message: bytes) -> str | None:
+        frames, self._frames = self._frames, []
+        recorded = wire.read_look(message)
+        if len(frames) != recorded.skeletons:
+            return f"the record has {len(frames)} of the {recorded.skeletons} skeletons of this look"
+        sight = self._sight = self._pilot.look(recorded.t_ns, frames)
+        self.looks += 1
+        if sight is None:
+            return _both("look", "done", "failed")
+        if wire.look(sight.states, sight.volumes, len(frames)) == message:
+            return None
+        columns = state_columns(sight.states)
+        cameras = [f"valid_{camera}" for camera in sight.states.cameras]
+        names = [name for name in columns if name != "t_ns" and name not in cameras]
+        found = _first(names, recorded.state, wire.flat(sight.states))
+        found = found or _first(cameras, list(recorded.valid), list(sight.states.valid[0].tobytes()))
+        if found is None:
+            digests = [wire.digest(sight.volumes, limb) for limb in range(len(sight.volumes.limbs))]
+            whole = [f"volume of {limb} (digest)" for limb in sight.volumes.limbs]
+            self._suspect = _first(whole, [d.hex() for d in recorded.digests], [d.hex() for d in digests]) or ""
+        return found
+
+    def _volumes(self, message: bytes) -> str | None:
+        suspect, self._suspect = self._suspect, ""
+        if self._sight is None:
+            return _both("volumes", "some", "none")
+        volumes = self._sight.volumes
+        if wire.whole(volumes) == message:
+            return suspect or None
+        return _volume(wire.read_whole(message, volumes.limbs, volumes.method), volumes) or suspect or None
+
+    def _answer(self, message: bytes) -> str | None:
+        datagrams, self._datagrams = tuple(self._datagrams), []
+        recorded = wire.read_answer(message)
+        self.ticks += 1
+        if len(datagrams) != recorded.datagrams:
+            return f"the record has {len(datagrams)} of the {recorded.datagrams} packets of this tick"
+        again = self._pilot.answer(TickEvent(recorded.t_ns, datagrams, recorded.signals))
+        self._reply = again.datagram
+        said = wire.read_answer(wire.answer(again, recorded.signals, len(datagrams), recorded.took_us))
+        return _first(
+            ("phase", "status", "reason", "look_ns", "limb", "link"), _decision(recorded), _decision(said)
+        ) or (_first(_ROW, _numbers(recorded), _numbers(said)))
+
+    def _replied(self, message: bytes) -> str | None:
+        _, recorded = wire.read_reply(message)
+        again, self._reply = self._reply, None
+        if again is None:
+            return _both("reply", f"{len(recorded)} bytes", "none")
+        if again == recorded:
+            return None
+        if len(again) != len(recorded):
+            return _both("length of the reply", len(recorded), len(again))
+        return _first([f"byte {i} of the reply" for i in range(len(again))], list(recorded), list(again))
+
+
+def _decision(found: wire.Answered) -> list[Any]:
+    return [
+        records.PHASES[found.phase],
+        STATUSES[found.status],
+        found.reason,
+        found.look_ns,
+        found.limb,
+        found.link,
+    ]
+
+
+def _numbers(found: wire.Answered) -> Floats:
+    return np.empty(0) if found.row is None else found.row
+
+
+def _volume(recorded: SweptVolumes, again: SweptVolumes) -> str | None:
+    """The first number that differs in a look's volumes."""
+    for limb, name in enumerate(again.limbs):
+        mine, yours = recorded.vertices(0, limb), again.vertices(0, limb)
+        if len(mine) != len(yours):
+            return _both(f"vertices of {name}", len(mine), len(yours))
+        names = [f"vertex {i} of {name}, {axis}" for i in range(len(mine)) for axis in "xyz"]
+        found = _first(names, mine.ravel(), yours.ravel())
+        found = found or _first(
+            [f"radius of {name}"], recorded.radius_m[0, limb : limb + 1], again.radius_m[0, limb : limb + 1]
+        )
+        if found is not None:
+            return found
+    return None
+
+
+def _first(names: Sequence[str], recorded: Sequence[Any] | Floats, again: Sequence[Any] | Floats) -> str | None:
+    """The first of some quantities that differs by a bit; any NaN is like any other."""
+    if len(recorded) != len(again):
+        return _both(f"how many of {names[0]} ... there are" if names else "numbers", len(recorded), len(again))
+    for name, mine, yours in zip(names, recorded, again, strict=False):
+        if isinstance(mine, float) and isinstance(yours, float):
+            same = np.float64(mine).tobytes() == np.float64(yours).tobytes() or (mine != mine and yours != yours)
+            mine, yours = float(mine), float(yours)
+        else:
+            same = mine == yours
+        if not same:
+            return _both(name, mine, yours)
+    return None
+
+
+def _both(name: str, recorded: Any, again: Any) -> str:
+    return f"{name}: recorded {recorded!r}, again {again!r}"

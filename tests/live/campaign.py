@@ -1,0 +1,115 @@
+"""Random faults against the pilot, session by session: ``python -m tests.live.campaign --sessions 200``.
+
+In counted time, so a session is the same on every machine. What must never happen is looked for in every answer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from itertools import pairwise
+
+import numpy as np
+
+from hrcreplay.egm.codec import BadPacket, decode_robot
+from hrcreplay.egm.faults import KINDS, Fault, random_faults
+from hrcreplay.live.records import PHASES
+from tests.live.flights import CYCLE_S, Flight, steps_keep_the_limits
+
+SECONDS = 6.0
+
+
+def walk(s: float) -> tuple[float, float]:
+    """Somebody who comes near and goes away."""
+    return 1.3 + 0.7 * float(np.cos(1.1 * s)), 0.3 * float(np.sin(0.7 * s))
+
+
+def session(seed: int, faults: tuple[Fault, ...] | None = None, seconds: float = SECONDS) -> Flight:
+    """A session with faults of its own, every second one with motion that resumes."""
+    found = random_faults(seed, duration_s=seconds - 0.5, count=4) if faults is None else faults
+    overrides = ("live.resume=true", "live.resume_s=0.5") if seed % 2 else ()
+    return Flight(overrides=("live.approach_speed=1.0", *overrides), walk=walk, faults=found, seed=seed).fly(seconds)
+
+
+def violations(flight: Flight) -> list[str]:
+    """What a session did that none may do."""
+    found = []
+    if flight.pilot.fault is not None:
+        found.append(f"crash: {flight.pilot.fault!r}")
+    try:
+        steps_keep_the_limits(flight)
+    except AssertionError:
+        found.append("a step beyond the limits")
+    return [*found, *_motion_after_stops(flight), *_unanswered(flight)]
+
+
+def _motion_after_stops(flight: Flight) -> list[str]:
+    """Whether each stop is Eq. (67) to standstill, within T_s and two cycles."""
+    found = []
+    stop_s = flight.start["settings"]["occupancy"]["stop_s"]
+    ddq_max, dt_s = flight.robot.ddq_max, flight.pilot.setup.plan.dt_s
+    for at_ns, reason in flight.pilot.stops:
+        rows = [answer for answer in flight.answers if answer.t_ns >= at_ns and answer.row is not None]
+        speeds: list[np.ndarray] = []
+        for answer in rows:
+            if answer.row is None or PHASES[answer.phase] in ("echo", "approach", "following"):
+                break
+            speeds.append(answer.row.dq)
+        moving = [speed for speed in speeds if np.any(speed)]
+        if len(moving) * CYCLE_S > stop_s + 2 * CYCLE_S:
+            found.append(f"{reason}: moves for {len(moving) * CYCLE_S:.3f} s")
+        for now, then in pairwise(speeds):
+            braked = np.sign(now) * np.maximum(np.abs(now) - ddq_max * dt_s, 0.0)
+            if np.any(then) and not np.allclose(then, braked, atol=1e-12):
+                found.append(f"{reason}: moves after the stop")
+                break
+    return found
+
+
+def _unanswered(flight: Flight) -> list[str]:
+    """Packets that nobody answered although the robot had sent none later."""
+    missed, newest_ns = 0, 0
+    for answer, datagrams in flight.heard:
+        fresh = False
+        for data in datagrams:
+            try:
+                clock_ns = decode_robot(data).clock_ns or 0
+            except BadPacket:
+                continue
+            if clock_ns > newest_ns:
+                fresh, newest_ns = True, clock_ns
+        missed += fresh and answer.datagram is None
+    return [f"{missed} packets unanswered"] if missed else []
+
+
+def _judge(seed: int) -> tuple[int, list[str], Counter[str], Counter[str]]:
+    flight = session(seed)
+    faults = Counter(fault.kind for fault in flight.faults)
+    return seed, violations(flight), faults, Counter(reason for _, reason in flight.pilot.stops)
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="python -m tests.live.campaign", description=__doc__)
+    parser.add_argument("--sessions", type=int, default=200)
+    parser.add_argument("--processes", type=int, default=1)
+    given = parser.parse_args()
+    faults: Counter[str] = Counter()
+    stops: Counter[str] = Counter()
+    bad = 0
+    with ProcessPoolExecutor(given.processes) as pool:
+        for seed, wrong, kinds, reasons in pool.map(_judge, range(given.sessions)):
+            faults, stops, bad = faults + kinds, stops + reasons, bad + bool(wrong)
+            for line in wrong:
+                sys.stdout.write(f"session {seed}: {line}\n")
+    missing = sorted(set(KINDS) - set(faults))
+    sys.stdout.write(f"{given.sessions} sessions, {sum(faults.values())} faults: {dict(sorted(faults.items()))}\n")
+    sys.stdout.write(f"kinds that did not come up: {', '.join(missing) or 'none'}\n")
+    sys.stdout.write(f"stops: {dict(sorted(stops.items()))}\n{bad} sessions with a violation\n")
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

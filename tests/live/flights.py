@@ -1,0 +1,157 @@
+"""Sessions in counted time: the pilot that `hrcreplay live` runs, the robot double, and a person who is made up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hrcreplay.egm.codec import Correction, decode_correction
+from hrcreplay.egm.faults import Fault
+from hrcreplay.egm.rehearsal import rehearse
+from hrcreplay.egm.servo import PERIOD_NS
+from hrcreplay.egm.twin import TwinCore, TwinSettings
+from hrcreplay.human.model import skeleton
+from hrcreplay.live import wire
+from hrcreplay.live.pilot import Pilot
+from hrcreplay.live.records import PHASES, Answer, MotionRow, Signal, TickEvent
+from hrcreplay.live.setup import build, live_job, start_table
+from hrcreplay.logs import skeleton_pb2
+from hrcreplay.records import Floats, HumanStates
+from hrcreplay.robot.model import RobotModel
+
+DEMO = Path(__file__).parents[2] / "datasets" / "demo.mcap"
+BEGIN_NS = 1_800_000_000_000_000_000
+RESPONSE_NS = 300_000
+CYCLE_S = PERIOD_NS * 1e-9
+FRAME_NS = 33_000_000
+LENGTHS_M = np.array([[0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
+
+#: Where somebody stands over time, from the robot's base [m]; None: no camera sees them.
+Walk = Callable[[float], tuple[float, float] | None]
+
+
+def far_away(_s: float) -> tuple[float, float]:
+    """Nobody is near."""
+    return 3.0, 0.0
+
+
+@cache
+def start(*overrides: str) -> dict[str, Any]:
+    """The table of a session in the demo's cell."""
+    job, header = live_job(DEMO, None, overrides, None)
+    return start_table(job, header, sending=True)
+
+
+@dataclass
+class Flight:
+    """A pilot beside a robot double, cycle by cycle."""
+
+    overrides: tuple[str, ...] = ()
+    walk: Walk = far_away
+    faults: tuple[Fault, ...] = ()
+    seed: int = 0
+    twin: TwinSettings = field(default_factory=TwinSettings)
+    signals: Callable[[float], Signal] = lambda _s: Signal.NONE
+    messages: list[bytes] = field(default_factory=list)  #: what the recorder would get
+    answers: list[Answer] = field(default_factory=list)
+    heard: list[tuple[Answer, tuple[bytes, ...]]] = field(default_factory=list)  #: with what they answer
+    states: list[HumanStates] = field(default_factory=list)
+    frames: list[tuple[int, bytes]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.start = start(*self.overrides)
+        self.pilot: Pilot = build(self.start)
+        self.core = TwinCore(self.twin, self.faults, self.seed)
+        self._framed_ns = BEGIN_NS
+        self._cycles = 0
+
+    @property
+    def robot(self) -> RobotModel:
+        return self.pilot.setup.robot
+
+    def fly(self, seconds: float) -> Flight:
+        """Goes on for so long."""
+        cycles = round(seconds * 1e9 / PERIOD_NS)
+        begin_ns = BEGIN_NS + self._cycles * PERIOD_NS
+        rehearse(self.core, self._guide, cycles=cycles, begin_ns=begin_ns, response_ns=RESPONSE_NS)
+        self._cycles += cycles
+        return self
+
+    def _guide(self, t_ns: int, datagrams: list[bytes]) -> Iterator[bytes]:
+        signals = self.signals((t_ns - BEGIN_NS) * 1e-9)
+        if datagrams:
+            event = TickEvent(t_ns, tuple(datagrams), signals)
+            answer = self.pilot.answer(event)
+            self.answers.append(answer)
+            self.heard.append((answer, event.datagrams))
+            self.messages += [wire.robot(t_ns, datagram) for datagram in datagrams]
+            self.messages.append(wire.answer(answer, signals, len(datagrams), 0))
+            if answer.datagram is not None:
+                self.messages.append(wire.reply(t_ns, answer.datagram, sent=True))
+                yield answer.datagram
+        else:
+            self.pilot.silence(t_ns, signals)
+            self.messages.append(wire.silence(t_ns, signals))
+        self._look(t_ns + 1)
+
+    def _look(self, t_ns: int) -> None:
+        seen = []
+        while self._framed_ns <= t_ns:
+            place = self.walk((self._framed_ns - BEGIN_NS) * 1e-9)
+            if place is not None:
+                seen += [self._skeleton(camera, place, self._framed_ns) for camera in self.start["cameras"]]
+            self._framed_ns += FRAME_NS
+        sight = self.pilot.look(t_ns, seen)
+        self.frames += [(t_ns, data) for data in seen]
+        self.messages += [wire.frame(t_ns, data) for data in seen]
+        if sight is not None:
+            self.states.append(sight.states)
+            self.messages.append(wire.look(sight.states, sight.volumes, len(seen)))
+
+    def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
+        base = np.array(self.start["T_world_base"])[:3, 3]
+        joints = np.array([[base[0] + place_m[0], base[1] + place_m[1], np.pi, 0.1, *(0.1, 0.5, 0.0, 1.8) * 2]])
+        to_camera = np.linalg.inv(np.array(self.start["cameras"][camera]))
+        points = skeleton(joints, LENGTHS_M)[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
+        message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=1)
+        message.points.extend(points.ravel().tolist())
+        message.confidence.extend(np.isfinite(points[:, 0]).astype(float).tolist())
+        data: bytes = message.SerializeToString()
+        return data
+
+    def said(self) -> list[Correction]:
+        """Every reply."""
+        return [decode_correction(answer.datagram) for answer in self.answers if answer.datagram is not None]
+
+    def phases(self) -> list[str]:
+        """The phases passed through, each once in a row."""
+        names = [PHASES[answer.phase] for answer in self.answers]
+        return [name for i, name in enumerate(names) if i == 0 or names[i - 1] != name]
+
+    def commanded(self) -> tuple[Floats, Floats]:
+        """(n, 6) positions [rad] and speed references [rad/s] of all replies."""
+        said = self.said()
+        return np.array([reply.q for reply in said]), np.array([reply.dq for reply in said])
+
+
+def echoed(one: MotionRow, two: MotionRow) -> bool:
+    """Whether the second of two answers takes a robot that may not move, or begins a session, for where it is."""
+    return bool(np.array_equal(two.q, one.q_measured) and not np.any(two.dq))
+
+
+def steps_keep_the_limits(flight: Flight) -> None:
+    """What was told while the robot may move: each step within speed and acceleration limits of every axis."""
+    robot = flight.robot
+    rows = [(answer.row, PHASES[answer.phase]) for answer in flight.answers if answer.row is not None]
+    for (one, _), (two, phase) in pairwise(rows):
+        if phase == "echo" or echoed(one, two):
+            continue
+        assert np.all(np.abs(two.q - one.q) <= robot.dq_max * CYCLE_S * (1 + 1e-9))
+        assert np.all(np.abs(two.dq - one.dq) <= robot.ddq_max * CYCLE_S * (1 + 1e-9))
+        assert np.all((two.q >= robot.q_min - 1e-9) & (two.q <= robot.q_max + 1e-9))

@@ -1,0 +1,188 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from hrcreplay.egm.faults import Fault
+from hrcreplay.human import fusion
+from hrcreplay.live import records, watch
+from hrcreplay.live.observer import Observer
+from hrcreplay.live.records import PHASES, Signal
+from hrcreplay.live.setup import build
+from hrcreplay.logs.person import PersonMemory
+from hrcreplay.planner import QpFollower
+from hrcreplay.records import STATUSES, CameraFrames, HumanStates
+from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, far_away, start, steps_keep_the_limits
+
+
+def moved(flight: Flight, after: int = 0) -> bool:
+    return bool(np.any([reply.dq for reply in flight.said()[after:]]))
+
+
+def test_it_echoes_then_approaches_then_follows_without_a_jump() -> None:
+    flight = Flight().fly(12.0)
+    first = flight.said()[0]
+    measured = flight.answers[0].row
+    assert measured is not None
+    assert_allclose(first.q, measured.q_measured, atol=1e-12)
+    assert_array_equal(first.dq, 0.0)
+    assert flight.phases()[0] == "echo"
+    assert flight.phases()[-2:] == ["approach", "following"]
+    steps_keep_the_limits(flight)
+    q, _ = flight.commanded()
+    assert np.abs(q - flight.pilot.setup.programme.q0).max(axis=1).min() < 0.05  # it came past where the path begins
+    assert moved(flight, after=-200)
+
+
+def test_it_does_not_start_before_it_has_seen_the_person() -> None:
+    flight = Flight(walk=lambda s: None if s < 1.0 else (3.0, 0.0)).fly(2.0)
+    early = [answer for answer in flight.answers if answer.t_ns < BEGIN_NS + 1e9]
+    assert {PHASES[answer.phase] for answer in early} == {"echo", "waiting"}
+    assert not any(answer.row is not None and np.any(answer.row.dq) for answer in early)
+    assert flight.phases()[-1] == "approach"
+    assert not flight.pilot.stops
+
+
+def after_start(signal: Signal, at_s: float, for_s: float = np.inf) -> dict[str, Any]:
+    return {"signals": lambda s: signal if at_s <= s < at_s + for_s else Signal.NONE}
+
+
+STOPS: dict[str, dict[str, Any]] = {
+    watch.INTERRUPTED: after_start(Signal.INTERRUPT, 2.0),
+    watch.TERMINATED: after_start(Signal.TERMINATE, 2.0),
+    watch.SESSION_OVER: after_start(Signal.DURATION, 2.0),
+    watch.RECORDING_OVER: after_start(Signal.PERSON_ENDED, 2.0),
+    watch.PERSON_DEAD: after_start(Signal.PERSON_DEAD, 2.0, 0.5),
+    watch.PERSON_LATE: after_start(Signal.PERSON_LATE, 2.0, 0.5),
+    watch.RECORDER_DEAD: after_start(Signal.RECORDER_DEAD, 2.0, 0.5),
+    watch.OVERRUN: after_start(Signal.OVERRUN, 2.0, 0.004),
+    watch.NO_FRAME: {"walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0)},
+    watch.UNCERTAIN: {
+        "overrides": ("live.uncertain_m=0.012", "live.fresh_s=9"),
+        "walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0),
+    },
+    watch.TRACKING: {"faults": (Fault("teleport", 2.0, 0.5, angle_deg=20.0),)},
+    "motors off": {"faults": (Fault("motors_off", 2.0, 0.5),)},
+    "program stopped": {"faults": (Fault("program_stop", 2.0, 0.5),)},
+    "EGM error": {"faults": (Fault("egm_error", 2.0),)},
+}
+
+
+@pytest.mark.parametrize("reason", STOPS)
+def test_every_reason_of_the_watchdog_brakes_by_67_and_holds(reason: str) -> None:
+    flight = Flight(**STOPS[reason]).fly(5.0)
+    assert [why for _, why in flight.pilot.stops] == [reason]
+    stopped_ns = flight.pilot.stops[0][0]
+    robot, dt_s = flight.robot, flight.pilot.setup.plan.dt_s
+    later = [answer for answer in flight.answers if answer.t_ns >= stopped_ns and answer.row is not None]
+    assert any(np.any(answer.row.dq) for answer in flight.answers if answer.row is not None)  # it was moving
+    speeds = np.array([answer.row.dq for answer in later if answer.row is not None])
+    for now, then in pairwise(speeds):
+        braked = np.sign(now) * np.maximum(np.abs(now) - robot.ddq_max * dt_s, 0.0)  # Eq. (67), written again
+        echoed = not np.any(then)  # of a robot that may not move at all, the reply is where it is
+        assert echoed or np.allclose(then, braked, atol=1e-12)
+    still = np.flatnonzero(~np.any(speeds, axis=1))
+    assert still[0] * CYCLE_S <= flight.start["settings"]["occupancy"]["stop_s"] + 2 * CYCLE_S
+    assert not np.any(speeds[still[0] :])  # and does not move again
+    assert later[-1].reason == reason
+    assert PHASES[later[-1].phase] in ("holding", "stopping", "echo")
+    assert len(flight.said()) >= 0.99 * len(flight.answers)  # it goes on answering
+
+
+@pytest.mark.parametrize("reason", [watch.NO_FRAME, watch.OVERRUN, "motors off", "program stopped", watch.TRACKING])
+def test_it_goes_on_by_a_setting_only_and_from_where_it_stands(reason: str) -> None:
+    kept = STOPS[reason]
+    flight = Flight(**{**kept, "overrides": (*kept.get("overrides", ()), "live.resume=true")}).fly(9.0)
+    assert [why for _, why in flight.pilot.stops] == [reason]
+    names = flight.phases()
+    assert "approach" in names[names.index("holding") :]
+    assert flight.pilot.stop == ""
+    steps_keep_the_limits(flight)
+    assert moved(flight, after=-100)
+
+
+def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
+    flight = Flight(faults=(Fault("silence", 2.0, 0.5),), overrides=("live.resume=true",)).fly(6.0)
+    assert [why for _, why in flight.pilot.stops] == [watch.SILENT]
+    assert flight.phases().count("echo") == 2
+    replies = [answer for answer in flight.answers if answer.phase == records.ECHO]
+    assert_array_equal([answer.row.dq for answer in replies if answer.row is not None], 0.0)
+    steps_keep_the_limits(flight)
+
+
+def test_a_person_in_the_way_stops_the_motion_but_not_the_session() -> None:
+    """They walk up to the base and away again; the robot waits for them and goes on by itself."""
+    flight = Flight(walk=lambda s: (max(0.3, abs(3.0 - 1.0 * max(0.0, s - 6.0)) if s < 9.0 else s - 9.0), 0.0)).fly(
+        13.0
+    )
+    assert not flight.pilot.stops
+    held = [answer for answer in flight.answers if STATUSES[answer.status] != "tracking" and answer.row is not None]
+    assert len(held) > 100
+    assert np.nanmin([answer.row.rest[3] for answer in held if answer.row is not None]) < 0.05
+    tracked = [answer for answer in flight.answers[-100:] if STATUSES[answer.status] == "tracking"]
+    assert len(tracked) == 100
+    assert moved(flight, after=-100)
+
+
+def test_a_robot_that_sends_radians_is_refused() -> None:
+    flight = Flight()
+    flight = Flight(twin=replace(flight.twin, radians=True)).fly(0.5)
+    assert not flight.said()
+    assert flight.pilot.stop == "radians"
+
+
+def test_the_same_events_give_the_same_bytes() -> None:
+    faults = (Fault("loss", 1.0, 3.0, probability=0.2, direction="both"), Fault("garbage", 2.0, 0.5))
+    walk = lambda s: (1.2 + 0.5 * np.cos(s), 0.2)  # noqa: E731
+    one, two = (Flight(faults=faults, walk=walk).fly(5.0) for _ in range(2))
+    assert one.messages == two.messages
+    assert len(one.messages) > 4000
+
+
+def test_looks_are_the_replay_tick_by_tick() -> None:
+    """One fuse and one predict over all ticks give the bits that thousands of looks gave."""
+    flight = Flight(walk=lambda s: (2.0 + 0.5 * np.sin(s), 0.3 * s)).fly(4.0)
+    pilot = build(start())
+    observer: Observer = pilot.observer
+    eyes, foresight = observer._eyes, observer._foresight
+    ticks = np.array([int(states.t_ns[0]) for states in flight.states])
+    frames = [observer._frames(t_ns, [data]) for t_ns, data in flight.frames]
+    _, measured, _ = eyes.measure(CameraFrames.join([frame for frame in frames if frame is not None]), PersonMemory())
+    _, states, _ = fusion.fuse(fusion.start(observer._cameras), ticks, measured, eyes.filter, eyes.limits)
+    live = HumanStates.join(flight.states)
+    for name in ("p", "v", "a", "j", "p_std", "v_std", "lengths_m", "residual_m", "unseen_s", "valid"):
+        assert_array_equal(getattr(live, name), getattr(states, name), err_msg=name)
+    assert pilot.sight is None
+    volumes = foresight.volumes(states)
+    last = flight.pilot.sight
+    assert last is not None
+    for limb in range(len(volumes.limbs)):
+        assert_array_equal(last.volumes.vertices(0, limb), volumes.vertices(len(ticks) - 1, limb))
+
+
+def test_a_bug_in_the_stages_brakes_the_robot_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight().fly(3.0)
+    assert moved(flight, after=-10)
+
+    def broken(*_args: object) -> None:
+        raise ZeroDivisionError("of the test")
+
+    monkeypatch.setattr(QpFollower, "step", broken)
+    before = len(flight.said())
+    flight.fly(1.0)
+    assert isinstance(flight.pilot.fault, ZeroDivisionError)
+    assert [why for _, why in flight.pilot.stops] == [watch.FAULT]
+    assert not moved(flight, after=before + 100)
+    assert len(flight.said()) > before + 200
+
+
+def test_scaling_drives_live_too() -> None:
+    flight = Flight(overrides=("plan.method=scaling",), walk=far_away).fly(12.0)
+    assert flight.phases()[-1] == "following"
+    steps_keep_the_limits(flight)
+    assert moved(flight, after=-200)

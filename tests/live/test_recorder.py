@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import os
+import resource
+import select
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from hrcreplay.live import recorder, topics, wire
+from hrcreplay.live.tape import Tape
+from hrcreplay.logs.reader import open_log
+from tests.live import made
+
+
+@pytest.fixture(scope="module")
+def messages() -> list[bytes]:
+    return list(made.session(60))
+
+
+def _by_hand(path: Path) -> list[tuple[str, int, int, bytes]]:
+    """Topic, log time, publish time and content in file order, by the library's own reader."""
+    with path.open("rb") as file:
+        found = make_reader(file, validate_crcs=True).iter_messages(log_time_order=False)
+        return [(channel.topic, m.log_time, m.publish_time, m.data) for _, channel, m in found]
+
+
+def test_the_record_is_a_log_of_ours(tmp_path: Path, messages: list[bytes]) -> None:
+    log = open_log(made.record(tmp_path / "log.mcap", messages))
+    assert log.header.kind == "hrcreplay"
+    assert log.header.cameras == ("left", "right")
+    assert set(log.header.T_world_camera) == {"left"}
+    assert log.header.task == made.START["task"]
+    np.testing.assert_array_equal(log.header.T_world_base, np.eye(4))
+    frames = next(iter(log.frames()))
+    assert len(frames) == 12  # that of nobody's camera is none of the log's
+    assert frames.arrival_ns.tolist() == [made.START_NS + (k + 1) * made.TICK_NS + 500_000 for k in range(0, 60, 5)]
+    assert frames.capture_ns.tolist() == [made.START_NS + k * made.TICK_NS - 20_000_000 for k in range(0, 60, 5)]
+    assert [frames.cameras[i] for i in frames.camera] == ["left", "right"] * 6
+
+
+def test_datagrams_lie_raw_on_their_topics_even_garbage(tmp_path: Path, messages: list[bytes]) -> None:
+    rows = _by_hand(made.record(tmp_path / "log.mcap", messages))
+    robot = [data for topic, _, _, data in rows if topic == "/egm/robot"]
+    assert robot == [wire.body(m) for m in messages if wire.kind(m) == wire.ROBOT]
+    assert b"\xff garbage" in robot
+    assert b"" in robot
+    replies = [m for m in messages if wire.kind(m) == wire.REPLY]
+    assert [d for t, _, _, d in rows if t == "/egm/correction"] == [wire.read_reply(m)[1] for m in replies[3:]]
+    assert [d for t, _, _, d in rows if t == "/egm/correction/unsent"] == [wire.read_reply(m)[1] for m in replies[:3]]
+    assert {t for t, _, _, _ in rows if t.startswith("/live/")} == {
+        f"/live/{name}" for name in ("answer", "event", "frame", "look", "silence", "volumes")
+    }
+
+
+def test_skeletons_that_cannot_be_read_are_on_record(tmp_path: Path) -> None:
+    messages = [wire.event(5, made.START), wire.frame(7, b"\xff\xff"), wire.frame(8, b"")]
+    path = made.record(tmp_path / "log.mcap", messages)
+    assert [row for row in _by_hand(path) if row[0] == topics.STRAY] == [
+        (topics.STRAY, 7, 7, b"\xff\xff"),
+        (topics.STRAY, 8, 8, b""),
+    ]
+    assert list(Tape(path).messages()) == messages
+
+
+class Process:
+    """The recorder as control sees it."""
+
+    def __init__(self, path: Path, before: Callable[[], None] | None = None) -> None:
+        self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        command = [sys.executable, "-m", "hrcreplay.live.recorder", "--fd", str(theirs.fileno()), "--path", str(path)]
+        self.popen = subprocess.Popen(
+            command,
+            pass_fds=(theirs.fileno(),),
+            start_new_session=True,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=before,
+        )
+        theirs.close()
+
+    def end(self) -> tuple[int, str]:
+        """Exit code and what was said, after it has ended by itself."""
+        said = self.popen.communicate(timeout=20)[1]
+        return self.popen.returncode, said
+
+
+@contextmanager
+def recording(path: Path, before: Callable[[], None] | None = None) -> Iterator[Process]:
+    process = Process(path, before)
+    try:
+        yield process
+    finally:
+        process.control.close()
+        process.popen.kill()
+        process.popen.communicate()
+
+
+def _on_disk(path: Path, number: int) -> list[bytes]:
+    """The messages in a file that is being written, once there are so many."""
+    while True:
+        found = list(Tape(path).messages()) if path.exists() and path.stat().st_size else []
+        if len(found) >= number:
+            return found
+        select.select([], [], [], 0.02)
+
+
+def test_the_file_is_finished_when_control_is_gone(tmp_path: Path, messages: list[bytes]) -> None:
+    path = tmp_path / "log.mcap"
+    with recording(path) as process:
+        assert process.control.recv(10) == recorder.READY
+        for message in messages:
+            process.control.send(message)
+        os.kill(process.popen.pid, signal.SIGTERM)  # it is not the terminal's, nor the system's, to end a record
+        os.kill(process.popen.pid, signal.SIGINT)
+        process.control.close()
+        assert process.end() == (0, "")
+    tape = Tape(path)
+    assert list(tape.messages()) == messages
+    assert tape.finished
+    assert not tape.flaws
+
+
+def test_a_killed_recorder_leaves_a_file_that_opens(tmp_path: Path, messages: list[bytes]) -> None:
+    path = tmp_path / "log.mcap"
+    with recording(path) as process:
+        for message in messages[:200]:
+            process.control.send(message)
+        assert _on_disk(path, 200) == messages[:200]  # without an end of the session: it is there within a moment
+        process.popen.kill()
+        process.popen.wait()
+        with pytest.raises(OSError):  # noqa: PT011 - a pipe or a connection
+            process.control.send(messages[0])
+    tape = Tape(path)
+    assert list(tape.messages()) == messages[:200]
+    assert not tape.finished
+    assert not tape.flaws
+    assert len(next(iter(open_log(path).frames()))) > 1
+
+
+def test_a_full_disk_ends_the_recorder_with_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    limit = 20_000
+    noise = np.random.default_rng(0)
+    with recording(path, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))) as process:
+        process.control.recv(10)
+        for k in range(20):
+            process.control.send(wire.robot(1000 + k, noise.bytes(5000)))
+        code, said = process.end()
+        assert process.control.recv(10) == b""  # this is how control knows
+    assert code == 1
+    assert said == f"hrcreplay: {path}: the record cannot be written (File too large)\n"
+
+
+def test_an_existing_file_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_text("precious")
+    with recording(path) as process:
+        code, said = process.end()
+    assert code == 1
+    assert "File exists" in said
+    assert path.read_text() == "precious"

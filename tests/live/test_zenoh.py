@@ -1,0 +1,253 @@
+"""Skeletons over Zenoh, from a process of their own: our messages and those of ROS 2."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.live import zenoh_source
+from hrcreplay.live.zenoh_source import KeySettings, Stream
+from hrcreplay.logs import skeleton_pb2 as pb
+from hrcreplay.logs.joints import AZURE_INDEX, OPENNI_JOINTS
+from hrcreplay.records import POINTS
+from tests.live import zenoh_publisher
+from tests.live.human import Human
+from tests.logs.bags import make, marker_array, store_of, transform
+
+NOW_NS = 1_800_000_000_000_000_000
+MARKER_KEY = "0/cell/kinect/visualization_msgs::msg::dds_::MarkerArray_/RIHS01_0"
+
+
+def skeletons(messages: list[tuple[bytes, bytes]]) -> list[Any]:
+    return [pb.Skeleton.FromString(payload) for kind, payload in messages if kind in (b"f", b"F")]
+
+
+def notes(messages: list[tuple[bytes, bytes]]) -> list[str]:
+    return [payload.decode() for kind, payload in messages if kind == b"N"]
+
+
+def markers(stamp_ns: int, bodies: dict[int, Any] | None = None) -> bytes:
+    store = store_of("ros2")
+    message = marker_array(store, stamp_ns, bodies or {1: np.ones((32, 3))})
+    return bytes(store.serialize_cdr(message, "visualization_msgs/msg/MarkerArray"))
+
+
+def own(capture_ns: int, **change: Any) -> bytes:
+    values = {"capture_ns": capture_ns, "camera": "x", "body": 2, "points": [1.0] * 60, "confidence": [1.0] * 20}
+    return pb.Skeleton(**(values | change)).SerializeToString()
+
+
+# --- payloads ---
+
+
+def test_the_type_comes_from_the_key_of_rmw_zenoh_and_all_bodies_are_read() -> None:
+    stream = Stream("kinect", KeySettings(MARKER_KEY, "cdr"))
+    bodies = {3: np.full((32, 3), 0.25), 1: np.full((32, 3), 2.0)}
+    sent = skeletons(list(stream.take(MARKER_KEY, markers(NOW_NS - 40_000_000, bodies), NOW_NS)))
+    assert [(s.body, s.points[0], s.camera, s.capture_ns) for s in sent] == [
+        (1, 2.0, "kinect", NOW_NS - 40_000_000),
+        (3, 0.25, "kinect", NOW_NS - 40_000_000),
+    ]
+
+
+def test_the_key_of_the_bridge_needs_a_type() -> None:
+    stream = Stream("kinect", KeySettings("cell/kinect", "cdr"))
+    (told,) = notes(list(stream.take("cell/kinect", markers(NOW_NS), NOW_NS)))
+    assert told.startswith("live.zenoh.keys.kinect: 1 undecodable: key cell/kinect does not tell its type; name it")
+    stream = Stream("kinect", KeySettings("cell/kinect", "cdr", type="visualization_msgs/msg/MarkerArray"))
+    assert len(skeletons(list(stream.take("cell/kinect", markers(NOW_NS), NOW_NS)))) == 1
+
+
+def test_transforms_of_a_tracker() -> None:
+    store = store_of("ros2")
+    sent = [
+        transform(store, NOW_NS - 10**7, "/cam", f"{joint}_1", (k, 0.0, 2.0))
+        for k, joint in enumerate(sorted(OPENNI_JOINTS))
+    ]
+    data = bytes(store.serialize_cdr(make(store, "tf2_msgs/msg/TFMessage", transforms=sent), "tf2_msgs/msg/TFMessage"))
+    stream = Stream("cam", KeySettings("0/tf/**", "cdr"))
+    (found,) = skeletons(list(stream.take("0/tf/tf2_msgs::msg::dds_::TFMessage_/RIHS01_0", data, NOW_NS)))
+    assert found.capture_ns == NOW_NS - 10**7
+    assert found.points[3 * POINTS.index("head")] == sorted(OPENNI_JOINTS).index("head")
+
+
+def test_a_stamp_of_zero_is_the_receipt_and_told_once() -> None:
+    stream = Stream("kinect", KeySettings(MARKER_KEY, "cdr"))
+    first, second = (list(stream.take(MARKER_KEY, markers(0), NOW_NS + i)) for i in range(2))
+    assert [s.capture_ns for s in skeletons(first + second)] == [NOW_NS, NOW_NS + 1]
+    assert notes(first) == [
+        "live.zenoh.keys.kinect: frames_header_stamp_zero: rows with a capture time of zero; their arrival is used"
+    ]
+    assert notes(second) == []
+    stream = Stream("ours", KeySettings("hrc/x"))
+    assert skeletons(list(stream.take("hrc/x", own(0), NOW_NS)))[0].capture_ns == NOW_NS
+
+
+def test_frames_that_come_twice_or_late_are_dropped() -> None:
+    stream = Stream("ours", KeySettings("hrc/x"))
+    captures = (10, 10, 9, 11)
+    taken = [list(stream.take("hrc/x", own(NOW_NS + c), NOW_NS + 100)) for c in captures]
+    assert [len(skeletons(messages)) for messages in taken] == [1, 0, 0, 1]
+    assert "frames_duplicate" in notes(taken[1])[0]
+    assert "frames_out_of_order" in notes(taken[2])[0]
+
+
+def test_a_capture_in_the_future_does_not_shut_out_those_that_follow() -> None:
+    stream = Stream("ours", KeySettings("hrc/x"))
+    ahead = list(stream.take("hrc/x", own(NOW_NS + 3_600 * 10**9), NOW_NS))
+    assert skeletons(ahead) == []
+    assert notes(ahead) == [
+        "live.zenoh.keys.ours: captured 3600.000 s after; left out. Set the clocks of both computers"
+    ]
+    assert len(skeletons(list(stream.take("hrc/x", own(NOW_NS + 10), NOW_NS + 20)))) == 1
+
+
+def test_points_that_are_no_numbers_are_missing() -> None:
+    stream = Stream("ours", KeySettings("hrc/x"))
+    points = [np.inf, 0.0, 0.0, *[1.0] * 57]
+    (sent,) = skeletons(list(stream.take("hrc/x", own(NOW_NS, points=points), NOW_NS)))
+    assert np.isnan(sent.points[:3]).all()
+    assert sent.confidence[0] == 0.0
+    assert sent.confidence[1] == 1.0
+
+
+def test_what_cannot_be_decoded_is_counted_and_told_at_powers_of_ten() -> None:
+    rng = np.random.default_rng(5)
+    stream = Stream("kinect", KeySettings(MARKER_KEY, "cdr"))
+    whole = markers(NOW_NS)
+    told = notes(list(stream.take(MARKER_KEY, whole, NOW_NS - 1)))
+    for i in range(300):
+        data = bytearray(whole[: rng.integers(0, len(whole))])
+        for at in rng.integers(0, max(len(data), 1), size=8 if data else 0):
+            data[at] = rng.integers(0, 256)
+        told += notes(list(stream.take(MARKER_KEY, bytes(data), NOW_NS + i)))
+    undecodable = [text.split(":")[1].split()[0] for text in told if "undecodable" in text]
+    assert undecodable == ["1", "10", "100"]
+    stream = Stream("ours", KeySettings("hrc/x"))
+    for wrong in (b"", b"\xff", own(NOW_NS, points=[1.0]), own(NOW_NS, confidence=[])):
+        assert skeletons(list(stream.take("hrc/x", wrong, NOW_NS))) == []
+
+
+def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    with pytest.raises(SettingsError, match=r"eclipse-zenoh is not installed; would be right: pip install 'hrcreplay"):
+        zenoh_source.open_session({"keys": {}})
+
+
+# --- sessions ---
+
+
+def free_endpoint() -> str:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+
+
+@contextmanager
+def publisher(endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen([sys.executable, "-m", "tests.live.zenoh_publisher", endpoint])
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def section(endpoint: str, **keys: Any) -> str:
+    return json.dumps({"mode": "peer", "listen": [endpoint], "connect": [], "keys": keys})
+
+
+def test_a_publisher_is_heard_killed_and_heard_again() -> None:
+    pytest.importorskip("zenoh")
+    endpoint = free_endpoint()
+    keys = {
+        "kinect": {"key": "0/cell/kinect/**", "payload": "cdr"},
+        "xtion": {"key": zenoh_publisher.OWN},
+        "lab": {
+            "key": zenoh_publisher.PERSON,
+            "payload": "cdr",
+            "type": "lab/msg/Person",
+            "definition": zenoh_publisher.PERSON_DEFINITION,
+            "points": "joints",
+            "index": {"head": 0, "pelvis": 1},
+            "unit": "mm",
+        },
+    }
+    with Human("--zenoh", section(endpoint, **keys)) as human:
+        (told,) = human.until(b"N", text=b"ready")
+        assert json.loads(told.removeprefix(b"ready ")) == {"cameras": ["kinect", "xtion", "lab"]}
+        human.go(human.now_ns())
+        before_ns = human.now_ns()
+        with publisher(endpoint):
+            human.until(b"F", 30)
+        check(human.skeletons())
+        assert any("frames_header_stamp_zero" in note and "keys.lab" in note for note in human.notes())
+        drain(human)
+        seen = len(human.skeletons())
+        human.until(b"H", 10)
+        assert len(human.skeletons()) == seen  # heartbeats, but no frames
+        with publisher(endpoint):
+            human.until(b"F", 12)
+        sent = human.skeletons()
+        check(sent)
+        for camera in keys:
+            captures = [s.capture_ns for s in sent if s.camera == camera]
+            assert captures == sorted(set(captures))
+            assert captures[0] > before_ns - 10**9
+        assert sum("keys.xtion: 1 undecodable" in note for note in human.notes()) == 1
+
+
+def drain(human: Human) -> None:
+    """Takes what is on its way from a publisher that is gone: until several heartbeats bring no frame."""
+    while True:
+        before = len(human.skeletons())
+        human.until(b"H", 5)
+        if len(human.skeletons()) == before:
+            return
+
+
+def check(sent: list[Any]) -> None:
+    """Every skeleton is one that the publisher made."""
+    by_camera = {camera: [s for s in sent if s.camera == camera] for camera in ("kinect", "xtion", "lab")}
+    assert all(by_camera.values())
+    where = [POINTS.index(POINTS[i]) for i in sorted(AZURE_INDEX.values())]
+    joints = {point: joint for joint, point in AZURE_INDEX.items()}
+    for skeleton in by_camera["kinect"]:
+        found = np.reshape(skeleton.points, (20, 3))
+        i = round(found[0, 0] - zenoh_publisher.markers_m(0)[joints[0]][0])
+        np.testing.assert_array_equal(found[where], zenoh_publisher.markers_m(i)[[joints[k] for k in where]])
+    for skeleton in by_camera["xtion"]:
+        i = round(-skeleton.points[0])
+        assert list(skeleton.points) == zenoh_publisher.own_points(i)
+        assert skeleton.body == 4
+    for skeleton in by_camera["lab"]:
+        head = skeleton.points[3 * POINTS.index("head") : 3 * POINTS.index("head") + 3]
+        assert head[2] == 1.5
+        assert skeleton.confidence[POINTS.index("head")] == 1.0
+        assert np.isnan(skeleton.points[3 * POINTS.index("neck")])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"keys": {"left": {"key": "no//key"}}}, b"failed live.zenoh.keys.left: 'no//key' is no key expression"),
+        ({"listen": ["tcp/somewhere"]}, b"failed live.zenoh: no session"),
+        ({"mode": "pear"}, b"failed live.zenoh: no session"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_told(change: dict[str, Any], told: bytes) -> None:
+    pytest.importorskip("zenoh")
+    settings = {"listen": [free_endpoint()], "keys": {"left": {"key": "a"}}} | change
+    with Human("--zenoh", json.dumps(settings)) as human:
+        (text,) = human.until(b"N", text=b"failed")
+        assert text.startswith(told)
+        assert human.process.wait(60.0) == SettingsError.exit_code
