@@ -123,4 +123,6 @@ def _source(given: argparse.Namespace, channel: Channel) -> Source:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    sys.stderr.flush()
+    os._exit(code)  # Zenoh's threads may be about to call back; an interpreter that unwinds meanwhile aborts

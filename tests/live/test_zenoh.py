@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -251,3 +252,28 @@ def test_settings_that_cannot_be_used_are_told(change: dict[str, Any], told: byt
         (text,) = human.until(b"N", text=b"failed")
         assert text.startswith(told)
         assert human.process.wait(60.0) == SettingsError.exit_code
+
+
+def test_it_ends_in_order_while_frames_pour_in() -> None:
+    """Threads of Zenoh's that call into an interpreter that is ending would abort the process."""
+    pytest.importorskip("zenoh")
+    endpoint = free_endpoint()
+    with Human("--zenoh", section(endpoint, xtion={"key": "hrc/xtion"})) as human:
+        human.until(b"N", text=b"ready")
+        human.go(human.now_ns())
+        with zenoh_source.open_session({"connect": [endpoint]}) as cameras:
+            over = Event()
+
+            def pour() -> None:
+                while not over.is_set():
+                    cameras.put("hrc/xtion", own(human.now_ns()))
+
+            pouring = Thread(target=pour)
+            pouring.start()
+            try:
+                human.until(b"F", 50)
+                human.socket.close()
+                assert human.process.wait(60.0) == 0
+            finally:
+                over.set()
+                pouring.join()
