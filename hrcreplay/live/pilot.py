@@ -155,6 +155,8 @@ class Pilot:
             self._clear_ns = None if why else (self._clear_ns or event.t_ns)
             if self._clear_ns is not None and event.t_ns - self._clear_ns >= self.setup.bounds.resume_s * 1e9:
                 self.stop, self.phase = "", records.WAITING
+            elif why and why not in watch.ENDINGS:
+                self.stop = why  # what holds it now
         self.waiting = why if self.phase == records.WAITING else ""
         if self.phase == records.WAITING and not why and self._course is not None:
             self._course, self.phase = set_out(self.setup, self._course), records.APPROACH

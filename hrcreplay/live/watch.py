@@ -20,6 +20,9 @@ RECORDER_DEAD, OVERRUN, SILENT = "recorder dead", "tick overrun", "robot silent"
 NO_FRAME, UNCERTAIN, NOT_FINITE, TRACKING = "no fresh frame", "state uncertain", "not finite", "tracking error"
 FAULT = "internal error"
 
+#: What ends a session whose robot may have been stopped for another reason.
+ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
+
 #: Robots that are not answered at all.
 REFUSED = ("radians", "axes")
 

@@ -106,6 +106,19 @@ def test_it_goes_on_by_a_setting_only_and_from_where_it_stands(reason: str) -> N
     assert moved(flight, after=-100)
 
 
+def test_it_tells_what_holds_it_once_another_reason_has_taken_over() -> None:
+    def signals(s: float) -> Signal:
+        return (Signal.RECORDER_DEAD if s >= 2.5 else Signal.NONE) | (Signal.INTERRUPT if s >= 4.0 else Signal.NONE)
+
+    flight = Flight(
+        walk=lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0), signals=signals, overrides=("live.resume=true",)
+    ).fly(5.0)
+    assert [why for _, why in flight.pilot.stops] == [watch.NO_FRAME]
+    told = {answer.t_ns: answer.reason for answer in flight.answers if answer.row is not None}
+    assert [reason for t_ns, reason in told.items() if t_ns < BEGIN_NS + 2.45e9][-1] == watch.NO_FRAME
+    assert {reason for t_ns, reason in told.items() if t_ns > BEGIN_NS + 2.7e9} == {watch.RECORDER_DEAD}
+
+
 def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
     flight = Flight(faults=(Fault("silence", 2.0, 0.5),), overrides=("live.resume=true",)).fly(6.0)
     assert [why for _, why in flight.pilot.stops] == [watch.SILENT]
