@@ -22,7 +22,13 @@ PATIENCE_S = 120.0  # only a process that hangs takes so long
 HELPERS = ("person", "recorder", "screen")
 
 #: A machine that also does other work may be late; what a session then does is another test's matter.
-PATIENT = ("live.overrun_s=5.0", "live.person_late_s=10.0", "live.fresh_s=10.0")
+PATIENT = (
+    "live.overrun_s=5.0",
+    "live.person_late_s=10.0",
+    "live.fresh_s=10.0",
+    "live.uncertain_m=1e3",
+    "live.uncertain_rad=1e3",
+)
 
 
 def free_port() -> int:
