@@ -13,12 +13,13 @@ import typer
 from hrcreplay import errors
 from hrcreplay.cell import Cell
 from hrcreplay.cli import app
-from hrcreplay.config import Live, Settings, load_settings
+from hrcreplay.config import Settings, load_settings
 from hrcreplay.egm import motion_link_pb2, session
 from hrcreplay.egm.faults import KINDS, load_faults
 from hrcreplay.live import topics, watch
 from hrcreplay.robot import stepping
 from hrcreplay.robot.task import parse_task
+from hrcreplay.sections_live import Live
 
 ROOT = Path(__file__).parent.parent
 LIVE = ROOT / "docs" / "live.md"

@@ -16,7 +16,9 @@ FOUNDATION = {"errors", "records"}
 MAY_IMPORT = {
     "errors": set(),
     "records": set(),
-    "config": FOUNDATION,
+    "sections": FOUNDATION,
+    "sections_live": FOUNDATION | {"sections"},
+    "config": FOUNDATION | {"sections", "sections_live"},
     "human": FOUNDATION,
     "robot": FOUNDATION,
     "logs": FOUNDATION,
