@@ -22,7 +22,7 @@ FAREWELLS = 5
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What the loop itself watches; see config.Live."""
+    """What the loop itself watches; see sections_live.Live."""
 
     duration_s: float  #: inf: until it is stopped
     sending: bool

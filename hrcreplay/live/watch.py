@@ -43,7 +43,7 @@ _BASE = 4  #: x, y, heading and bend: the joints that carry the whole person
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Settings of the watchdog; see config.Live."""
+    """Settings of the watchdog; see sections_live.Live."""
 
     fresh_s: float
     uncertain_m: float

@@ -20,7 +20,7 @@ from tests.live.sessions import PATIENT, Session, Twin, alive, children, free_po
 QUICK = (*PATIENT, "live.approach_speed=1.0", "live.resume=true", "live.resume_s=0.1")
 FILES = {"run.json", "log.mcap", "state.parquet", "motion.parquet", "occupancy.parquet", "report.html", "metrics.json"}
 CYCLE_S = PERIOD_NS * 1e-9
-STALL_S = 0.5  # no machine makes such a pause of its own; a loop that waits for a dead process makes a longer one
+STALL_S = 1.0  # beyond the pauses that the machine makes of its own; a loop that waits for a dead process makes longer
 MOVING = ("approach", "following")
 
 
@@ -83,7 +83,7 @@ def brakes_for(reason: str, folder: Path) -> None:
     assert moving[~after].any()
     assert np.count_nonzero(moving[after]) * CYCLE_S <= start()["settings"]["occupancy"]["stop_s"] + 2 * CYCLE_S
     assert not moving[-1]
-    assert set(motion["phase"][after]) <= {"stopping", "holding"}
+    assert set(motion["phase"][after]) <= {"stopping", "holding", "echo"}  # a robot that timed out begins anew
 
 
 def verified(folder: Path) -> str:
@@ -94,9 +94,12 @@ def verified(folder: Path) -> str:
 
 
 def never_stalls(flown: Flown) -> None:
-    """Answers came without a long pause, one a packet, in steps that the robot can take."""
-    arrived_ns = np.genfromtxt(flown.twin.folder / "twin_arrivals.csv", delimiter=",", names=True)["t_ns"]
-    assert np.diff(arrived_ns).max() * 1e-9 < STALL_S
+    """Answers came without a longer pause than the robot made, one a packet, in steps that the robot can take."""
+    arrived, sent = (
+        np.genfromtxt(flown.twin.folder / f"twin_{name}.csv", delimiter=",", names=True)["t_ns"] * 1e-9
+        for name in ("arrivals", "cycles")
+    )
+    assert np.diff(arrived).max() < STALL_S + np.diff(sent).max()
     answers, told = flown.report["answers"], flown.report["commanded"]
     assert (answers["doubled"], answers["garbage"], answers["seqno_steps"]) == (0, 0, 0)
     most = np.array(told["speed_limit_rad_per_s"]) * CYCLE_S

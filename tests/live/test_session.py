@@ -42,7 +42,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Flown]
     """One session that is fine, one in shadow mode, and one with every fault of link and robot that SIGTERM ends."""
     with ExitStack() as stack:
         group = Group(tmp_path_factory.mktemp("flown"), stack)
-        group.prepare("faults", "--send")
+        group.prepare("faults", "--send", "--repeat")
         group.prepare("fine", "--send", "--duration", 12)
         group.prepare("shadow", "--duration", 12)
         script = every_fault(group.folder, 9.5, begin_s=1.0)
