@@ -265,7 +265,7 @@ def test_9_no_old_target_is_live_when_the_robot_may_move_again(state: dict[str, 
 
 
 def test_10_the_loop_answers_when_called_and_not_at_a_pace_of_its_own(link: Link, robot: socket.socket) -> None:
-    """A loop with a pace of 16 to 25 ms leaves three of four packets without an answer; none of its rounds is shorter."""
+    """A loop with a pace of 16 to 25 ms leaves three of four packets unanswered; none of its rounds is shorter."""
     rounds, guide = 250, Guide()
     server = threading.Thread(target=lambda: [guide.serve(link) for _ in range(rounds)])
     server.start()
