@@ -36,6 +36,9 @@ LENGTHS = (
 #: Limbs of Alg. 2 whose swept volumes are predicted.
 LIMBS = ("HD", "THX", "URA", "LRA", "ULA", "LLA")
 
+#: The same and the lower body, of which the model only knows where the pelvis is.
+BODY = (*LIMBS, "LEGS")
+
 #: Body points of a camera's skeleton. A camera that lacks one leaves it NaN with confidence 0.
 POINTS = (
     "pelvis",
@@ -134,7 +137,7 @@ class HumanStates(Table):
     lengths_m: Floats  #: (n, 8) LENGTHS [m]
     lengths_std_m: Floats  #: (n, 8) [m]
     valid: Bools  #: (n, c) whether a row of this camera entered the update of this tick
-    residual_m: Floats  #: (n, 6) high quantile of how far LIMBS were from the model lately [m]; NaN until known
+    residual_m: Floats  #: (n, 7) high quantile of how far BODY was from the model lately [m]; NaN until known
     unseen_s: Floats  #: (n, 6) since a camera last saw the joints of LIMBS [s]; inf before the first time
     cameras: tuple[str, ...]
 

@@ -137,7 +137,8 @@ class Occupancy(Section):
     hand_m: NotNegative = 0.19
     """sound: length of the hand beyond the wrist [m]."""
     legs_radius_m: Positive = 0.20
-    """sound: radius of the lower body around the line from the floor to the pelvis [m]."""
+    """sound: least radius of the lower body around the line from the floor to the pelvis; legs seen further off, as of
+    who sits or squats, make it larger [m]."""
     legs: bool = True
     """sound: whether there is a lower body."""
     residual: bool = True

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, Floats, HumanStates, Ints, Measurements, Motion
+from hrcreplay.records import BODY, JOINTS, LENGTHS, LIMBS, STATUSES, Floats, HumanStates, Ints, Measurements, Motion
 
 Columns = dict[str, Any]
 
@@ -33,7 +33,7 @@ def truth_columns(t_ns: Ints, angles: Floats, lengths_m: Floats) -> Columns:
 
 
 _STATE = (("p", ""), ("v", "_vel"), ("a", "_acc"), ("j", "_jerk"), ("p_std", "_std"), ("v_std", "_vel_std"))
-_RESIDUAL = tuple(f"residual_{limb}" for limb in LIMBS)
+_RESIDUAL = tuple(f"residual_{limb}" for limb in BODY)
 _UNSEEN = tuple(f"unseen_{limb}" for limb in LIMBS)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -29,12 +29,12 @@ def planned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return replay.run("plan", replay.demo_log(), out=tmp_path_factory.mktemp("job") / "run", start_s=9.0, end_s=10.0)
 
 
-def _aged(folder: Path, to: Path, *names: str) -> Path:
-    """The same run as if a version had made it that knew no NEW columns in those tables."""
+def _aged(folder: Path, to: Path, *names: str, new: Mapping[str, Sequence[str]] = NEW) -> Path:
+    """The same run as if a version had made it that knew no ``new`` columns in those tables."""
     shutil.copytree(folder, to)
     meta = runs.read_meta(to)
     for name in names:
-        pq.write_table(pq.read_table(to / name).drop_columns(NEW[name]), to / name)
+        pq.write_table(pq.read_table(to / name).drop_columns(list(new[name])), to / name)
         meta["outputs"][name] = runs.sha256(to / name)
     (to / "run.json").write_text(json.dumps(meta))
     return to
@@ -64,6 +64,18 @@ def test_tables_of_an_earlier_version_are_computed_again(
         assert f"{stage}: {outcome if stage in again else f'taken over from {old}'}" in said
     mine, theirs = runs.read_meta(new)["outputs"], runs.read_meta(planned)["outputs"]
     assert {name: mine[name] for name in theirs} == theirs
+
+
+def test_states_that_tell_nothing_of_the_legs_are_computed_again(
+    planned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = _aged(planned, tmp_path / "old", "state.parquet", new={"state.parquet": ["residual_LEGS"]})
+    assert lacks(old / "state.parquet") == ("residual_LEGS",)
+    again = replay.run("predict", old, out=tmp_path / "new")
+    said = capsys.readouterr().err
+    assert f"{old / 'state.parquet'} is of an earlier version, without residual_LEGS; computed again" in said
+    for name in ("state.parquet", "occupancy.parquet"):
+        assert runs.sha256(again / name) == runs.sha256(planned / name)
 
 
 def _changed(path: Path) -> None:

@@ -24,7 +24,7 @@ from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import NS, tick_times
 from hrcreplay.progress import Bar
-from hrcreplay.records import JOINTS, Floats
+from hrcreplay.records import JOINTS, LIMBS, Floats
 from hrcreplay.report.coverage import Estimate, block_ticks, resample
 
 #: Ticks a second that are fitted to [Hz]; what no camera has seen for longer is no evidence [s]; of the bootstrap.
@@ -162,7 +162,7 @@ def _limbs(job: Job, recording: Recording, cut_ns: int) -> tightening.Held:
     horizon_s = standstill_s(foresight)
     horizon_ns = round(horizon_s * NS)
     ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / tightening.TIGHTEN_HZ)))
-    ticks = ticks[np.isfinite(states.residual_m[ticks]).all(axis=1)]  # the filter has found the person
+    ticks = ticks[np.isfinite(states.residual_m[ticks, : len(LIMBS)]).all(axis=1)]  # the filter has found the person
     end_ns = states.t_ns[ticks] + horizon_ns
     parts = ticks[end_ns <= cut_ns], ticks[(states.t_ns[ticks] > cut_ns) & (end_ns <= recording.t_ns[-1])]
     return tightening.Held(foresight, *(window(recording, part, horizon_s) for part in parts))

@@ -30,11 +30,11 @@ class Filter(NamedTuple):
     confidence: Floats  #: (c, 20)
     valid: Bools  #: (c, 20) which of its rows are used
     shows: Bools  #: (c, 6) which limbs it shows with all that carries them
-    residuals: Floats  #: (6, BINS) weights of the residuals of each limb by their size
-    weight: Floats  #: (6,) of all of them
-    samples: Ints  #: (6,) residuals so far
-    sampled_ns: Ints  #: (6,) tick of the last
-    residual: Floats  #: (6,) their quantile [m]
+    residuals: Floats  #: (7, BINS) weights of the residuals of each limb of BODY by their size
+    weight: Floats  #: (7,) of all of them
+    samples: Ints  #: (7,) residuals so far
+    sampled_ns: Ints  #: (7,) tick of the last
+    residual: Floats  #: (7,) their quantile [m]
     surprise: Floats  #: (12,) running mean of each joint's innovations squared over their variance
     spread: Floats  #: (12,) highest of it lately: the factor on the variances that are told
 
@@ -88,7 +88,7 @@ class Track(NamedTuple):
     lengths: Floats  #: (n, 8)
     lengths_std: Floats  #: (n, 8)
     valid: Bools  #: (n, c)
-    residual: Floats  #: (n, 6)
+    residual: Floats  #: (n, 7)
     unseen: Floats  #: (n, 6)
     cov: Floats  #: (n or 0, 12, 4, 4)
     damping: Floats  #: (n or 0, 12) of the derivatives, on the way to the tick

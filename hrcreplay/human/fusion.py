@@ -13,7 +13,7 @@ from hrcreplay.human.fusion_kernel import run
 from hrcreplay.human.kalman import process_variance
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.residual import BINS
-from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
+from hrcreplay.records import BODY, JOINTS, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
 
 ROWS = len(JOINTS) + len(LENGTHS)
 _NEVER_NS = -(2**62)
@@ -99,11 +99,11 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         confidence=np.zeros((c, len(POINTS))),
         valid=np.zeros((c, ROWS), dtype=np.bool_),
         shows=np.zeros((c, len(LIMBS)), dtype=np.bool_),
-        residuals=np.zeros((len(LIMBS), BINS)),
-        weight=np.zeros(len(LIMBS)),
-        samples=np.zeros(len(LIMBS), dtype=np.int64),
-        sampled_ns=np.full(len(LIMBS), _NEVER_NS),
-        residual=np.full(len(LIMBS), np.nan),
+        residuals=np.zeros((len(BODY), BINS)),
+        weight=np.zeros(len(BODY)),
+        samples=np.zeros(len(BODY), dtype=np.int64),
+        sampled_ns=np.full(len(BODY), _NEVER_NS),
+        residual=np.full(len(BODY), np.nan),
         surprise=np.ones(12),
         spread=np.ones(12),
     )
@@ -240,7 +240,7 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         lengths=np.full((n, len(LENGTHS)), np.nan),
         lengths_std=np.full((n, len(LENGTHS)), np.nan),
         valid=np.zeros((n, cameras), dtype=np.bool_),
-        residual=np.full((n, len(LIMBS)), np.nan),
+        residual=np.full((n, len(BODY)), np.nan),
         unseen=np.full((n, len(LIMBS)), np.inf),
         cov=np.full((rows, 12, 4, 4), np.nan),
         damping=np.ones((rows, 12)),

@@ -16,7 +16,7 @@ from hrcreplay.human.reach import SOUND, bounds_of, code_of, reach_row
 from hrcreplay.human.surface import Surface, surface
 from hrcreplay.human.sweep import MOST_COPIES, sweep_rot
 from hrcreplay.human.walk import box, sweep_walk
-from hrcreplay.records import LIMBS, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Ints, SweptVolumes
 
 #: A larger set is reduced before the next rotation: below, it costs less to carry all points along.
 _WORTH_REDUCING = 50
@@ -70,7 +70,7 @@ def predict(
     radius = np.tile(radii.of_limbs(), (len(states), 1))
     if code == SOUND:
         vertices, offsets = sound.sweep(states, bounds_of(limits), limits.coupled, horizon_s, margins)
-        limbs = (*LIMBS, "LEGS") if margins.legs else LIMBS
+        limbs = BODY if margins.legs else LIMBS
         return SweptVolumes(
             states.t_ns, offsets, vertices, sound.radii(states, radii.of_limbs(), margins), limbs, method
         )

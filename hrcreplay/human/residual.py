@@ -5,6 +5,10 @@ limb's residual is the largest distance of its measured points from those of the
 time, where the delay is compensated. It is taken after the tick's update and saturation, so it is about the state that
 is handed on, from frames that show the limb and all that carries it with enough confidence and without an outlier.
 
+Legs have no joints in the model. Theirs is the largest distance from the line between the floor and the fused pelvis of
+the hips, knees, ankles and feet that the frame shows, if it shows the pelvis and at least one point below the hips. The
+distance from a convex set is convex, so a bone between two points is no further off than the worse of them.
+
 The running quantile is that of all samples so far, each with the weight exp(-age / memory); a limb out of sight does
 not age for longer than it takes to be lost, so that what is known of a person outlives an occlusion. Samples are kept
 by the millimetre and rounded up.
@@ -19,11 +23,13 @@ from hrcreplay.human.filter import Filter, Rules, delay
 from hrcreplay.human.kalman import ago
 from hrcreplay.human.model import ARM_POINTS, HEAD, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.human.validity import distance
-from hrcreplay.records import Bools, Floats
+from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
 
-#: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person.
-BINS = 512
+#: No point of a leg is further from the pelvis: toes of a tall man's straight leg. What is further is no leg [m].
+REACH_M = 1.2
 _BIN_M = 0.001
+#: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person's arm.
+BINS = round(REACH_M / _BIN_M)
 #: Fewer samples say nothing of a quantile.
 LEAST = 20
 
@@ -42,6 +48,9 @@ _ENDS = np.array(
 )
 #: First of the two joints of each arm's limb.
 _FIRST = np.array([RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2])
+_LEGS = BODY.index("LEGS")
+_HIPS = np.array([POINTS.index(f"hip_{side}") for side in "rl"])
+_BELOW = np.array([POINTS.index(f"{part}_{side}") for part in ("knee", "ankle", "foot") for side in "rl"])
 
 
 @njit(cache=True)
@@ -56,6 +65,11 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
                 for k in _ENDS[limb]:
                     sample = max(sample, distance(filter_.points[c, k], model[k]))
                 _enter(filter_, limb, now, sample, rules)
+        if filter_.valid[c, :2].all() and _settled(filter_, _LEGS, now, rules):
+            below = _farthest(filter_, c, _BELOW, model[PELVIS], rules)
+            if below >= 0.0:
+                sample = max(below, _farthest(filter_, c, _HIPS, model[PELVIS], rules))
+                _enter(filter_, _LEGS, now, sample, rules)
     for limb in np.flatnonzero(filter_.sampled_ns == now):
         if filter_.samples[limb] >= LEAST:
             larger = (1.0 - rules.residual_quantile) * filter_.weight[limb]
@@ -63,10 +77,23 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
 
 
 @njit(cache=True)
+def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rules) -> float:
+    """Largest distance of some points of the legs from the line below the pelvis (3,) [m]; -1 where none is shown."""
+    farthest = -1.0
+    for k in points:
+        point = filter_.points[c, k]
+        if filter_.confidence[c, k] >= rules.confidence_min and distance(point, pelvis) <= REACH_M:
+            beyond = point[2] - max(0.0, min(point[2], pelvis[2]))
+            off = np.sqrt((point[0] - pelvis[0]) ** 2 + (point[1] - pelvis[1]) ** 2 + beyond**2)
+            farthest = max(farthest, off)
+    return farthest
+
+
+@njit(cache=True)
 def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
     """Whether no joint that carries the limb has started anew within the memory: the filter must find it first."""
-    newest = filter_.acquired_ns[:4].max()
-    if limb >= 2:
+    newest = filter_.acquired_ns[: 2 if limb == _LEGS else 4].max()
+    if 2 <= limb < _LEGS:
         first = _FIRST[limb - 2]
         newest = max(newest, filter_.acquired_ns[first - first % 4 : first + 2].max())
     return now - newest > rules.memory_ns

@@ -19,8 +19,8 @@ Why no motion leaves them, step by step:
 6. Rounding. The steps are exact in real numbers; in floating point they are off by less than 1e-12 m for people within
    a kilometre of the origin. Radii are larger by ``ROUNDING_M``. That is no tolerance for motions outside.
 
-The lower body is the line from the floor to the pelvis with its own radius, walking along: hips, and feet in a stride
-that stays within the radius.
+The lower body is the line from the floor to the pelvis with its own radius, walking along. The radius holds hips, knees
+and feet as far out as cameras have seen them lately (``residual``), or of people who stand where no camera shows legs.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from hrcreplay.human.stroll import SIDES
 from hrcreplay.human.surface import Surface, surface
 from hrcreplay.human.sweep import TRIANGLE_RAD, copies, sweep_rot
 from hrcreplay.human.walk import polygon, sweep_walk
-from hrcreplay.records import LIMBS, Floats, HumanStates, Ints
+from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Ints
 
 #: Added to every radius: more than all rounding on the way [m].
 ROUNDING_M = 1e-9
@@ -53,7 +53,9 @@ FINE_RAD = np.pi / 6.0
 MOST_CORNERS = 256
 #: A larger set is reduced before the next rotation.
 _WORTH_REDUCING = 40
-_HEAD, _THORAX, _LEGS = LIMBS.index("HD"), LIMBS.index("THX"), len(LIMBS)
+#: From the middle of a leg, where cameras put its points, to the skin: a thigh 0.5 m around [m].
+THIGH_M = 0.08
+_HEAD, _THORAX, _LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
 
 
 def sweep(
@@ -85,8 +87,10 @@ def sweep(
 def radii(states: HumanStates, limbs_m: Floats, margins: Margins) -> Floats:
     """(n, limbs) radii: of the limb (6,) [m], of what an unknown length up the chain displaces, and the residual.
 
-    A residual that is not known yet (NaN) is taken to be ``margins.residual_m``. That of the thorax tells how far the
-    pelvis is from where it stands upright, so the lower body has it too: who squats has the knees where the hips were.
+    A residual that is not known yet (NaN) is taken to be ``margins.residual_m``. That of the legs is how far their
+    middles were from the line below the pelvis, so it stands for ``margins.legs_radius_m`` where it and a thigh are
+    more. As long as it is not known, the lower body has the thorax's, which tells how far the pelvis is from where it
+    stands upright: who squats has the knees where the hips were.
     """
     off = margins.sigmas * states.lengths_std_m
     pelvis = off[:, 0]
@@ -96,7 +100,9 @@ def radii(states: HumanStates, limbs_m: Floats, margins: Margins) -> Floats:
     legs = np.full(len(states), margins.legs_radius_m + ROUNDING_M)
     if margins.residual:
         residual = np.where(np.isnan(states.residual_m), margins.residual_m, states.residual_m)
-        radius, legs = radius + residual, legs + residual[:, _THORAX]
+        seen = states.residual_m[:, _LEGS] + (THIGH_M + ROUNDING_M)
+        radius = radius + residual[:, :_LEGS]
+        legs = np.where(np.isnan(seen), legs + residual[:, _THORAX], np.maximum(legs, seen))
     return np.column_stack([radius, legs]) if margins.legs else radius
 
 

@@ -13,7 +13,7 @@ from hrcreplay.egm.codec import AXES
 from hrcreplay.live import wire
 from hrcreplay.live.records import PHASES, MotionRow
 from hrcreplay.pipeline import store as store_volumes
-from hrcreplay.records import LIMBS, Floats, HumanStates, Motion
+from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Motion
 from hrcreplay.runs import RunWriter, TableWriter
 from hrcreplay.tables import Columns, motion_columns, state_columns
 
@@ -88,7 +88,7 @@ _COUNTED = {
 def _states(looks: list[wire.Look], cameras: tuple[str, ...]) -> HumanStates:
     numbers = np.array([look.state for look in looks])
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), 12)
-    widths |= {"lengths_m": 8, "lengths_std_m": 8, "residual_m": len(LIMBS), "unseen_s": len(LIMBS)}
+    widths |= {"lengths_m": 8, "lengths_std_m": 8, "residual_m": len(BODY), "unseen_s": len(LIMBS)}
     parts = np.split(numbers, np.cumsum(list(widths.values()))[:-1], axis=1)
     return HumanStates(
         t_ns=np.array([look.t_ns for look in looks]),

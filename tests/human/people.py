@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import LimitSet, clamp
-from hrcreplay.records import LIMBS, Floats, HumanStates
+from hrcreplay.records import BODY, LIMBS, Floats, HumanStates
 
 LENGTHS_M = np.array([1.0, 0.5, 0.21, 0.19, 0.33, 0.34, 0.26, 0.27])
 
@@ -16,7 +16,7 @@ LENGTHS_M = np.array([1.0, 0.5, 0.21, 0.19, 0.33, 0.34, 0.26, 0.27])
 def states(p: Floats, v: Floats, lengths_m: Floats = LENGTHS_M) -> HumanStates:
     """States with the given postures and velocities, (n, 12) each."""
     zeros, lengths = np.zeros_like(p), np.tile(lengths_m, (len(p), 1))
-    valid, limbs = np.ones((len(p), 1), dtype=bool), np.zeros((len(p), len(LIMBS)))
+    valid = np.ones((len(p), 1), dtype=bool)
     return HumanStates(
         t_ns=np.arange(len(p)) * 4_000_000,
         p=p,
@@ -28,8 +28,8 @@ def states(p: Floats, v: Floats, lengths_m: Floats = LENGTHS_M) -> HumanStates:
         lengths_m=lengths,
         lengths_std_m=0 * lengths,
         valid=valid,
-        residual_m=limbs,
-        unseen_s=limbs,
+        residual_m=np.zeros((len(p), len(BODY))),
+        unseen_s=np.zeros((len(p), len(LIMBS))),
         cameras=("camera",),
     )
 

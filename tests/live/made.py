@@ -50,7 +50,7 @@ class Pilot:
             lengths_m=np.full((1, 8), 0.4),
             lengths_std_m=np.full((1, 8), np.nan),
             valid=np.array([[bool(skeletons), False]]),
-            residual_m=np.full((1, 6), np.nan),
+            residual_m=np.full((1, 7), np.nan),
             unseen_s=np.full((1, 6), np.inf),
             cameras=("left", "right"),
         )

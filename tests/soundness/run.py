@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,7 +46,8 @@ class Plan:
 
     @property
     def margins(self) -> Margins:
-        return Margins(sigmas=self.sigmas, latency_s=self.latency_s, hand_m=self.hand_m, legs_radius_m=0.0)
+        bare = Margins(legs_radius_m=0.0, residual=False)
+        return replace(bare, sigmas=self.sigmas, latency_s=self.latency_s, hand_m=self.hand_m)
 
     @property
     def coasted_s(self) -> float:
