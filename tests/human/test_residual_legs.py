@@ -167,8 +167,14 @@ def test_it_is_known_where_the_pelvis_and_a_point_below_the_hips_are_seen(hidden
     assert gone.unseen_s.shape == (len(gone), len(LIMBS))
 
 
-def test_it_is_not_known_before_enough_samples() -> None:
+@pytest.mark.parametrize("shoulders_s", [0.0, 0.7])
+def test_it_is_not_known_before_enough_samples(shoulders_s: float) -> None:
+    """Legs hang from the pelvis: when shoulders are seen, and turn a torso nobody knew, makes no difference."""
     frames = with_legs(2.0, STANDING_M)
+    points = frames.points_m.copy()
+    hidden = np.flatnonzero(frames.capture_ns < shoulders_s * 1e9)
+    points[hidden[:, None], rows("shoulder_l", "shoulder_r")] = np.nan
+    frames = replace(frames, points_m=points)
     states = fused(measured(frames), ticks(2.0))
     used = np.array([k for k, _ in used_frames(measured(frames), states.t_ns)])
     settled = used[states.t_ns[used] > states.t_ns[used[0]] + 500_000_000]  # found, not lost again
