@@ -19,8 +19,8 @@ Why no motion leaves them, step by step:
 6. Rounding. The steps are exact in real numbers; in floating point they are off by less than 1e-12 m for people within
    a kilometre of the origin. Radii are larger by ``ROUNDING_M``. That is no tolerance for motions outside.
 
-The lower body is the line from the floor to the pelvis with its own radius, walking along. The radius holds hips, knees
-and feet as far out as cameras have seen them lately (``residual``), or of people who stand where no camera shows legs.
+The lower body is the line from the floor to the pelvis with its own radius, walking along: that of people who stand, or
+as far out as cameras have seen hips, knees and feet lately (``residual``).
 """
 
 from __future__ import annotations
@@ -87,10 +87,10 @@ def sweep(
 def radii(states: HumanStates, limbs_m: Floats, margins: Margins) -> Floats:
     """(n, limbs) radii: of the limb (6,) [m], of what an unknown length up the chain displaces, and the residual.
 
-    A residual that is not known yet (NaN) is taken to be ``margins.residual_m``. That of the legs is how far their
-    middles were from the line below the pelvis, so it stands for ``margins.legs_radius_m`` where it and a thigh are
-    more. As long as it is not known, the lower body has the thorax's, which tells how far the pelvis is from where it
-    stands upright: who squats has the knees where the hips were.
+    A residual that is not known yet (NaN) is taken to be ``margins.residual_m``. The lower body has the thorax's, which
+    tells how far the pelvis is from where it stands upright: who squats has the knees where the hips were. That of the
+    legs is how far their middles were from the line below the pelvis; where it and a thigh are more, they are the
+    radius. Legs that were close when they were last seen make it no smaller: a table may hide that they are not now.
     """
     off = margins.sigmas * states.lengths_std_m
     pelvis = off[:, 0]
@@ -102,7 +102,7 @@ def radii(states: HumanStates, limbs_m: Floats, margins: Margins) -> Floats:
         residual = np.where(np.isnan(states.residual_m), margins.residual_m, states.residual_m)
         seen = states.residual_m[:, _LEGS] + (THIGH_M + ROUNDING_M)
         radius = radius + residual[:, :_LEGS]
-        legs = np.where(np.isnan(seen), legs + residual[:, _THORAX], np.maximum(legs, seen))
+        legs = np.fmax(legs + residual[:, _THORAX], seen)
     return np.column_stack([radius, legs]) if margins.legs else radius
 
 

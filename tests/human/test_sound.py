@@ -271,17 +271,17 @@ def test_residual_hand_and_legs() -> None:
 
 
 def test_legs_are_as_wide_as_they_were_seen() -> None:
-    """A thigh is 8 cm thick on each side of what was seen; legs near the line leave the least radius."""
-    seen_m = np.array([np.nan, 0.0, 0.11, 0.13, 0.45, 0.45])
+    """A thigh is 8 cm thick on each side of what was seen; legs near the line take nothing away."""
+    seen_m = np.array([np.nan, 0.0, 0.11, 0.25, 0.45, 0.45])
     thorax_m = np.array([0.07, 0.07, 0.07, 0.07, np.nan, 0.30])
     people = random_states(PAPER, len(seen_m), 14)
     residual = np.full((len(seen_m), 7), 0.02)
     residual[:, 1], residual[:, 6] = thorax_m, seen_m
     people = dataclasses.replace(people, residual_m=residual)
     swept = volumes(people, PAPER, dataclasses.replace(BARE, legs=True))
-    assert swept.radius_m[:, 6] == pytest.approx([0.27, 0.20, 0.20, 0.21, 0.53, 0.53])
+    assert swept.radius_m[:, 6] == pytest.approx([0.27, 0.27, 0.27, 0.33, 0.53, 0.53])
     wide = dataclasses.replace(BARE, legs=True, legs_radius_m=0.3)
-    assert volumes(people, PAPER, wide).radius_m[:, 6] == pytest.approx([0.37, 0.30, 0.30, 0.30, 0.53, 0.53])
+    assert volumes(people, PAPER, wide).radius_m[:, 6] == pytest.approx([0.37, 0.37, 0.37, 0.37, 0.53, 0.60])
     deaf = dataclasses.replace(BARE, legs=True, residual=False)
     assert volumes(people, PAPER, deaf).radius_m[:, 6] == pytest.approx(0.20)
     assert volumes(people).radius_m == pytest.approx(swept.radius_m[:, :6])  # no lower body, and no other limb's radius
