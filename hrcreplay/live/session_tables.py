@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from hrcreplay.egm.codec import AXES
+from hrcreplay.errors import LogError
 from hrcreplay.live import wire
 from hrcreplay.live.records import PHASES, MotionRow
 from hrcreplay.pipeline import store as store_volumes
@@ -53,7 +55,7 @@ class SessionTables:
     def flush(self) -> None:
         """Writes what waits."""
         if self._looks:
-            self.run.table("state", state_columns(_states(self._looks, self.cameras)))
+            self.run.table("state", state_columns(_states(self._looks, self.cameras, self.run.partial)))
         if self._answers:
             self.run.table("motion", _motion(self._answers, self.limbs, self.links))
         self._looks, self._answers = [], []
@@ -85,11 +87,17 @@ _COUNTED = {
 }
 
 
-def _states(looks: list[wire.Look], cameras: tuple[str, ...]) -> HumanStates:
+def _states(looks: list[wire.Look], cameras: tuple[str, ...], where: Path) -> HumanStates:
     numbers = np.array([look.state for look in looks])
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), 12)
     widths |= {"lengths_m": 8, "lengths_std_m": 8, "residual_m": len(BODY), "unseen_s": len(LIMBS)}
-    parts = np.split(numbers, np.cumsum(list(widths.values()))[:-1], axis=1)
+    ends = np.cumsum(list(widths.values()))
+    if numbers.shape[1] != ends[-1]:
+        raise LogError(
+            f"{where}: found {numbers.shape[1]} numbers a look where this version has {ends[-1]}; "
+            "would be right: the version of hrcreplay that recorded the session"
+        )
+    parts = np.split(numbers, ends[:-1], axis=1)
     return HumanStates(
         t_ns=np.array([look.t_ns for look in looks]),
         **dict(zip(widths, parts, strict=True)),

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,10 @@ from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live import folder, wire
 from hrcreplay.live.records import PHASES, Signal
 from hrcreplay.live.verify import verify
-from hrcreplay.records import LIMBS, STATUSES
+from hrcreplay.records import BODY, STATUSES
 from hrcreplay.tables import read_states
 from tests.live import made
 from tests.live.flights import BEGIN_NS, Flight
-
-BODY = (*LIMBS, "LEGS")
 
 
 class Stored(Flight):
@@ -163,3 +162,14 @@ def test_a_record_that_cannot_be_read_is_left_as_it_is(tmp_path: Path, messages:
     with pytest.raises(SettingsError, match="exists already; move it away"):
         folder.finish(partial)
     shutil.rmtree(partial)
+
+
+def test_a_record_of_another_version_is_left_as_it_is(tmp_path: Path, messages: list[bytes], flight: Flight) -> None:
+    sight = flight.pilot.sight
+    assert sight is not None
+    other = replace(sight.states, residual_m=sight.states.residual_m[:, 1:])
+    partial = folder.begin(tmp_path / "session")
+    made.record(partial / "log.mcap", [messages[0], wire.look(other, sight.volumes, 0)])
+    with pytest.raises(LogError, match=r"session.partial: found 100 numbers a look where this version has 101; would"):
+        folder.finish(partial)
+    assert (partial / "log.mcap").exists()
