@@ -81,5 +81,7 @@ class Live(Section):
     """A robot above this cannot follow, and stops [%]."""
     keep_recorder: bool = True
     """Whether the robot stops when nobody records any more."""
+    real_time: bool = True
+    """Whether to ask the system to run the control loop before all else and to keep it in memory."""
     zenoh: Zenoh = Zenoh()
     """Where live skeletons come from when no recording is played."""

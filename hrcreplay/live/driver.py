@@ -97,7 +97,8 @@ def _conduct(
         begun, start_ns = True, time.monotonic_ns() + anchor_ns
         loop = Loop(pilot, link, person, recorder, _loop_settings(request, settings), anchor_ns, start_ns)
         recorder.send(wire.event(loop.start_ns, {"what": "start", **start}))
-        _fly(loop, Teller(loop, screen, start, in_3d=request.foxglove is not None))
+        teller = Teller(loop, screen, start, in_3d=request.foxglove is not None)
+        _fly(loop, teller, real_time=settings.live.real_time)
     finally:
         screen.dismiss(2.0)
         person.dismiss(2.0)
@@ -107,13 +108,13 @@ def _conduct(
     return loop, finished
 
 
-def _fly(loop: Loop, teller: Teller) -> None:
+def _fly(loop: Loop, teller: Teller, *, real_time: bool) -> None:
     """The loop, alone with the robot: no garbage collector, no waiting for anybody."""
     with _signals(loop):
         gc.collect()
         gc.freeze()
         gc.disable()
-        for refused in take_precedence():
+        for refused in take_precedence() if real_time else ():
             loop.note(f"the system refuses {refused}")
         loop.begin()
         try:
