@@ -16,8 +16,15 @@ from hrcreplay.live.verify import verify
 from tests.live.flights import start
 from tests.live.sessions import PATIENT, Session, Twin, alive, children, free_port, wait_for
 
-#: Goes on where the machine has stopped it.
-QUICK = (*PATIENT, "live.approach_speed=1.0", "live.resume=true", "live.resume_s=0.1")
+#: Goes on where the machine has stopped it, and leaves it time for others.
+QUICK = (
+    *PATIENT,
+    "occupancy.method=paper",
+    "limits.prediction=paper",
+    "live.approach_speed=1.0",
+    "live.resume=true",
+    "live.resume_s=0.1",
+)
 FILES = {"run.json", "log.mcap", "state.parquet", "motion.parquet", "occupancy.parquet", "report.html", "metrics.json"}
 CYCLE_S = PERIOD_NS * 1e-9
 STALL_S = 1.0  # beyond the pauses that the machine makes of its own; a loop that waits for a dead process makes longer
@@ -94,14 +101,14 @@ def verified(folder: Path) -> str:
 
 
 def never_stalls(flown: Flown) -> None:
-    """Answers came without a longer pause than the robot made, one a packet, in steps that the robot can take."""
+    """Answers came without a longer pause than the robot made, in steps that the robot can take."""
     arrived, sent = (
         np.genfromtxt(flown.twin.folder / f"twin_{name}.csv", delimiter=",", names=True)["t_ns"] * 1e-9
         for name in ("arrivals", "cycles")
     )
     assert np.diff(arrived).max() < STALL_S + np.diff(sent).max()
     answers, told = flown.report["answers"], flown.report["commanded"]
-    assert (answers["doubled"], answers["garbage"], answers["seqno_steps"]) == (0, 0, 0)
+    assert (answers["garbage"], answers["seqno_steps"]) == (0, 0)
     most = np.array(told["speed_limit_rad_per_s"]) * CYCLE_S
     assert np.all(np.array(told["jump_rad"]) <= most * (1 + 1e-9))
     assert np.all(np.array(told["start_jump_rad"]) < 1e-6)  # it began with an echo

@@ -34,25 +34,24 @@ from tests.live.flown import (
     told,
     verified,
 )
-from tests.live.sessions import children, every_fault
+from tests.live.sessions import children, every_fault, kill
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Flown]]:
-    """One session that is fine, one in shadow mode, and one with every fault of link and robot that SIGTERM ends."""
+    """One session that is fine, one in shadow mode whose screen got a kill -9, and one that had every fault of link and
+    robot when SIGTERM ended it."""
     with ExitStack() as stack:
         group = Group(tmp_path_factory.mktemp("flown"), stack)
-        group.prepare("faults", "--send", "--repeat")
-        group.prepare("fine", "--send", "--duration", 12)
+        group.prepare("fine", "--send", "--duration", 12, settings=("occupancy.method=sound",))
         group.prepare("shadow", "--duration", 12)
+        found = {name: group.robot(name) for name in ("shadow", "fine")}
+        kill(found["shadow"].helpers["screen"])
+        for one in found.values():
+            one.end()
+        group.prepare("faults", "--send", "--repeat")
         script = every_fault(group.folder, 9.5, begin_s=1.0)
-        found = {
-            "shadow": group.robot("shadow"),
-            "fine": group.robot("fine"),
-            "faults": group.robot("faults", "--faults", script, "--seed", 3),
-        }
-        for name in ("shadow", "fine"):
-            found[name].end()
+        found["faults"] = group.robot("faults", "--faults", script, "--seed", 3)
         faults = found["faults"].session
         begun_s = faults.until("an answer", lambda status: status["rate_hz"] > 0)["t_s"]
         faults.until("motion again", lambda status: status["t_s"] > begun_s + 10.0 and status["phase"] in MOVING)
@@ -92,7 +91,7 @@ def test_faults_of_link_and_robot_stop_it_but_not_the_session(flown: dict[str, F
     assert counts["robot_sessions"] >= 3
 
 
-def test_shadow_mode_sends_nothing_and_records_all(flown: dict[str, Flown]) -> None:
+def test_shadow_mode_sends_nothing_and_records_all_although_its_screen_is_dead(flown: dict[str, Flown]) -> None:
     shadow = flown["shadow"]
     assert shadow.code == 0
     assert shadow.report["answers"]["answered"] == 0
