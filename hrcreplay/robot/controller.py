@@ -84,13 +84,10 @@ def step(
             if isinstance(solution, Solution):
                 status = stepping.LIMITED if solution.held else stepping.TRACKING
                 return sight.step(state, solution.dq_next, settings.dt_s, status)
-            reason = _REASONS.get(solution.status, stepping.NO_SOLUTION)
+            reason = stepping.NOT_FINITE if solution.status == "not finite" else stepping.NO_SOLUTION
         return sight.step(
             state, stepping.braked(state, robot.ddq_max, settings.dt_s), settings.dt_s, stepping.BRAKING, reason
         )
-
-
-_REASONS = {"not finite": stepping.NOT_FINITE, "separation failed": stepping.NO_DISTANCE}
 
 
 def solve(task: Problem) -> Solution | Unsolved:
@@ -109,8 +106,6 @@ def solve(task: Problem) -> Solution | Unsolved:
         broken = task.broken_rows(w, HELD)
         if broken.keys and not rounds:  # the rows that held the robot until now are likely to hold it again
             broken = broken.joined(task.broken_rows(AHEAD * task.dq, HELD))
-        if task.pairs.failed:
-            return Unsolved("separation failed")
         if solved and not broken.keys:
             held = any(key[0] >= 0 and z_i > BINDING for key, z_i in zip(rows.keys, z.tolist(), strict=False))
             return Solution(_by_proxqp(task, rows, w, z) if rounds else w, held, rounds)

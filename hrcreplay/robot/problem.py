@@ -56,7 +56,7 @@ class Problem:
     J_high: Floats  #: (6,) [m/s, rad/s]
     pose: RobotPose
     obstacles: Obstacles
-    pairs: Separation  #: right-hand sides of Eq. (66i)
+    room_m2: Floats  #: (s, l) right-hand sides of Eq. (66i) [m^2]
     stop_s: float  #: T_s [s]
     dq: Floats  #: (nv,) at the tick [rad/s]
 
@@ -70,18 +70,13 @@ class Problem:
         twist = self.pose.J_tcp @ w
         tcp = np.flatnonzero((twist > self.J_high + above) | (twist < self.J_low - above))
         keys: list[Key] = [(-1, i) for i in tcp.tolist()]
-        which, A, values = worst_rows(self.pose, self.obstacles, w, self.pairs.room_m2(), self.stop_s, above)
-        broken = []
-        for i, (link, limb, end, vertex) in enumerate(which.tolist()):
-            if values[i] > self.pairs.exact_room_m2(link, limb) + above:
-                broken.append(i)
-                keys.append((link, limb, end, vertex))
-        room = [self.pairs.exact_room_m2(link, limb) for link, limb, *_ in keys[len(tcp) :]]
+        which, A, _ = worst_rows(self.pose, self.obstacles, w, self.room_m2, self.stop_s, above)
+        keys.extend(map(tuple, which.tolist()))
         return BoundedRows(
             tuple(keys),
-            np.concatenate([self.pose.J_tcp[tcp], A[broken]]),
-            np.concatenate([self.J_low[tcp], np.full(len(room), -np.inf)]),
-            np.concatenate([self.J_high[tcp], room]),
+            np.concatenate([self.pose.J_tcp[tcp], A]),
+            np.concatenate([self.J_low[tcp], np.full(len(which), -np.inf)]),
+            np.concatenate([self.J_high[tcp], self.room_m2[which[:, 0], which[:, 1]]]),
         )
 
 
@@ -110,4 +105,4 @@ def problem(
     )
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
     J_low, J_high = cartesian_bounds(J, dJdq, state.dq, settings.tcp_speed_max, settings.tcp_acceleration_max, dt_s)
-    return Problem(H, g, low, high, J_low, J_high, pose, obstacles, pairs, settings.stop_s, state.dq)
+    return Problem(H, g, low, high, J_low, J_high, pose, obstacles, pairs.room_m2(), settings.stop_s, state.dq)

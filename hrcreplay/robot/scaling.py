@@ -79,8 +79,6 @@ def step(
         if sight.reason:
             return _result(sight, axes, slowest, settings.dt_s, stepping.BRAKING, sight.reason)
         fastest, slowed = _fastest(robot, reference, state, axes, sight, obstacles, settings)
-        if sight.pairs is not None and sight.pairs.failed:
-            return _result(sight, axes, slowest, settings.dt_s, stepping.BRAKING, stepping.NO_DISTANCE)
         if fastest is None or fastest.rate < slowest.rate - SAME:
             return _result(sight, axes, slowest, settings.dt_s, stepping.BRAKING, stepping.NO_SOLUTION)
         status = stepping.LIMITED if slowed else stepping.TRACKING
@@ -169,16 +167,12 @@ def _safe_rate(sight: Sight, obstacles: Obstacles, towards: Floats, rate: float,
     pairs = sight.pairs
     if pairs is None:
         return math.nan
+    room_m2 = pairs.room_m2()
     for _ in range(ROUNDS):
-        which, _, values = worst_rows(sight.pose, obstacles, rate * towards, pairs.room_m2(), stop_s, HELD)
-        slower = rate
-        for (link, limb, *_), value in zip(which.tolist(), values.tolist(), strict=True):
-            room = pairs.exact_room_m2(link, limb)
-            if value > room + HELD:
-                slower = min(slower, rate * room / value)
-        if slower == rate:
+        which, _, values = worst_rows(sight.pose, obstacles, rate * towards, room_m2, stop_s, HELD)
+        if not len(which):
             return rate
-        rate = slower
+        rate *= float((room_m2[which[:, 0], which[:, 1]] / values).min())
     return math.nan
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import coal
 import numpy as np
+from numba import njit
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.bracket import brackets, plane
+from hrcreplay.robot.distance import EXACT_M, distances
 from hrcreplay.robot.model import RobotPose
 from hrcreplay.robot.obstacles import Obstacles
 
@@ -14,72 +17,59 @@ from hrcreplay.robot.obstacles import Obstacles
 #: on a line or all in one are as good as any.
 MOST_POINTS = 32
 
-#: A distance is exact when no vertex comes closer than this [m].
-EXACT_M = 1e-10
+#: Largest difference between coal's distance and ours [m].
+AGREED_M = 1e-9
 
 _PLACE = coal.Transform3s()
 _NO_FACE = coal.StdVec_Triangle()
 _NO_FACE.append(coal.Triangle(0, 0, 0))  # a polytope must have one; the search over points does not look at it
 
 
+@dataclass(frozen=True, slots=True)
 class Separation:
-    """Distances between the axes of the links and the hulls of the limbs in one tick, made exact where asked.
+    """Distances between the axes of the links and the hulls of the limbs in one tick."""
 
-    A pair starts with certain bounds. Only the nearest pair of a tick and those whose rows come into question need
-    more, and what the controller does is the same as if all had been exact from the start.
-    """
-
-    def __init__(self, pose: RobotPose, obstacles: Obstacles, clearance_m: Floats) -> None:
-        """Bounds for every pair.
-
-        Args:
-            pose: The robot.
-            obstacles: The swept volumes, all known.
-            clearance_m: (s, l) Delta of Eq. (2) for every pair of link and limb [m].
-        """
-        self.clearance_m = clearance_m
-        self._ends, self._obstacles = pose.ends_m, obstacles
-        self._low, self._high, self._near = brackets(pose.ends_m, obstacles.vertices_m, obstacles.offsets)
-        self.exact = np.zeros(self._low.shape, dtype=bool)
-
-    def distance_m(self, link: int, limb: int) -> float:
-        """Exact distance from a link's axis to a limb's hull; 0 in penetration, NaN where coal found none [m]."""
-        if not self.exact[link, limb]:
-            first, last = self._obstacles.offsets[limb : limb + 2]
-            near = sorted(set((self._near[link, limb] - first).tolist()))
-            a, b = self._ends[link]
-            self._low[link, limb] = axis_distance(a, b, self._obstacles.vertices_m[first:last], near)
-            self.exact[link, limb] = True
-        return float(self._low[link, limb])
+    distance_m: Floats  #: (s, l) exact and not above the true one, 0 in penetration; NaN where none was found [m]
+    clearance_m: Floats  #: (s, l) Delta of Eq. (2) [m]
 
     def room_m2(self) -> Floats:
-        """(s, l) right-hand side of Eq. (14), corrected, [m^2]: exact, or else a lower bound."""
-        return np.maximum(0.0, self._low - self.clearance_m) ** 2
-
-    def exact_room_m2(self, link: int, limb: int) -> float:
-        """Right-hand side of Eq. (14), corrected, of one pair: max(0, distance - clearance)^2 [m^2]."""
-        return max(0.0, self.distance_m(link, limb) - float(self.clearance_m[link, limb])) ** 2
-
-    @property
-    def failed(self) -> bool:
-        """Whether a distance could not be found."""
-        return bool(np.isnan(self._low).any())
+        """(s, l) right-hand side of Eq. (14), corrected: max(0, distance - clearance)^2 [m^2]."""
+        return np.maximum(0.0, self.distance_m - self.clearance_m) ** 2
 
     def nearest(self) -> tuple[float, int, int]:
-        """Smallest distance between surfaces, negative where they overlap, NaN where not found [m]; link and limb."""
-        while True:
-            surface = self._low - self.clearance_m
-            link, limb = divmod(int(np.argmin(surface)), surface.shape[1])
-            if self.exact[link, limb]:
-                return float(surface[link, limb]), link, limb
-            self.distance_m(link, limb)
+        """Smallest distance between surfaces, negative where they overlap, NaN where one is [m]; link and limb."""
+        surface = self.distance_m - self.clearance_m
+        link, limb = divmod(int(np.argmin(surface)), surface.shape[1])
+        return float(surface[link, limb]), link, limb
 
 
-def separation(pose: RobotPose, obstacles: Obstacles) -> Floats:
-    """Distance between the axis of every link and the hull of every limb: (s, l) [m], 0 in penetration."""
-    limbs = len(obstacles.radius_m)
-    pairs = Separation(pose, obstacles, np.zeros((len(pose.ends_m), limbs)))
-    return np.array([[pairs.distance_m(s, k) for k in range(limbs)] for s in range(len(pose.ends_m))])
+def separation(pose: RobotPose, obstacles: Obstacles, clearance_m: Floats) -> Separation:
+    """Distances of all pairs, and of the nearest one by two methods that know nothing of each other.
+
+    Where our bounds do not close, coal has the word. The nearest pair is measured by both; where they differ neither
+    is believed.
+
+    Args:
+        pose: The robot.
+        obstacles: The swept volumes, all known.
+        clearance_m: (s, l) Delta of Eq. (2) for every pair of link and limb [m].
+    """
+    low, high, near = distances(pose.ends_m, obstacles.vertices_m, obstacles.offsets)
+    found = Separation(low, clearance_m)
+
+    def by_coal(link: int, limb: int) -> float:
+        first, last = obstacles.offsets[limb : limb + 2]
+        start = sorted(set((near[link, limb] - first).tolist()))
+        a, b = pose.ends_m[link]
+        return axis_distance(a, b, obstacles.vertices_m[first:last], start)
+
+    for link, limb in np.argwhere(~(high - low <= EXACT_M)).tolist():
+        low[link, limb] = by_coal(link, limb)
+    if low.size:
+        _, link, limb = found.nearest()
+        if not abs(by_coal(link, limb) - low[link, limb]) <= AGREED_M:
+            low[link, limb] = np.nan
+    return found
 
 
 def axis_distance(a: Floats, b: Floats, vertices_m: Floats, near: list[int]) -> float:
@@ -106,7 +96,7 @@ def axis_distance(a: Floats, b: Floats, vertices_m: Floats, near: list[int]) -> 
             return np.nan
         if above <= EXACT_M:
             return 0.0
-        below, furthest = plane(a, b, normal, vertices_m)
+        below, furthest = _plane(a, b, normal, vertices_m)
         if not above - below > EXACT_M:
             return 0.0 if below < 0.0 else below  # NaN passes through
         if furthest in chosen:
@@ -132,3 +122,25 @@ def _gjk(segment: coal.Convex, hull: coal.Convex) -> tuple[float, Floats]:
     result = coal.DistanceResult()
     distance = coal.distance(segment, _PLACE, hull, _PLACE, request, result)
     return distance, result.normal
+
+
+@njit(cache=True)
+def _plane(a: Floats, b: Floats, normal: Floats, vertices: Floats) -> tuple[float, int]:
+    """Lower bound of the distance from the planes across a normal, and the vertex that lies furthest back.
+
+    Args:
+        a: (3,) end of the segment [m].
+        b: (3,) other end [m].
+        normal: (3,) unit vector from the segment towards the hull.
+        vertices: (m, 3) [m].
+    """
+    best, depth = 0, np.inf
+    for j in range(len(vertices)):
+        along = normal[0] * vertices[j, 0] + normal[1] * vertices[j, 1] + normal[2] * vertices[j, 2]
+        if along < depth:
+            best, depth = j, along
+    back = max(
+        normal[0] * a[0] + normal[1] * a[1] + normal[2] * a[2],
+        normal[0] * b[0] + normal[1] * b[1] + normal[2] * b[2],
+    )
+    return depth - back, best

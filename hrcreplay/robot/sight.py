@@ -11,7 +11,7 @@ from hrcreplay.records import Floats
 from hrcreplay.robot import stepping
 from hrcreplay.robot.model import RobotModel, RobotPose
 from hrcreplay.robot.obstacles import Obstacles
-from hrcreplay.robot.separation import Separation
+from hrcreplay.robot.separation import Separation, separation
 from hrcreplay.robot.stepping import RobotState, Step
 
 
@@ -54,8 +54,8 @@ def observe(robot: RobotModel, state: RobotState, obstacles: Obstacles, clearanc
     if not finite or not obstacles.known:
         return Sight(pose, None, math.nan, -1, -1, stepping.NO_HUMAN if finite else stepping.NOT_FINITE)
     radius = np.array([segment.radius_m for segment in robot.segments])
-    pairs = Separation(pose, obstacles, radius[:, None] + obstacles.radius_m + clearance_m)
-    if not pairs.exact.size:
+    pairs = separation(pose, obstacles, radius[:, None] + obstacles.radius_m + clearance_m)
+    if not pairs.distance_m.size:
         return Sight(pose, pairs, math.nan, -1, -1, 0)
     surface, link, limb = pairs.nearest()
     if math.isnan(surface):

@@ -15,9 +15,10 @@ from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.obstacles import Obstacles, obstacles
 from hrcreplay.robot.problem import Problem, problem
 from hrcreplay.robot.rotation import from_vector
-from hrcreplay.robot.separation import Separation, separation
+from hrcreplay.robot.separation import Separation
 from hrcreplay.robot.sight import observe
 from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
+from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
 
 STOP_S, DT_S = 0.377, 0.004
@@ -56,7 +57,7 @@ def run(
 def all_rows(robot: RobotModel, task: Problem) -> tuple[Floats, Floats, Floats]:
     """Every row of Eq. (66g)-(66i), written down."""
     A, low, high = [task.pose.J_tcp], [task.J_low], [task.J_high]
-    distance, offsets = separation(task.pose, task.obstacles), task.obstacles.offsets
+    distance, offsets = by_coal(task.pose, task.obstacles), task.obstacles.offsets
     for link, segment in enumerate(robot.segments):
         for limb, radius in enumerate(task.obstacles.radius_m):
             vertices = task.obstacles.vertices_m[offsets[limb] : offsets[limb + 1]]

@@ -10,10 +10,10 @@ from hrcreplay.robot import stepping
 from hrcreplay.robot.controller import Solution, Unsolved, solve, step
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.obstacles import obstacles
-from hrcreplay.robot.separation import separation
 from hrcreplay.robot.stepping import RobotState
 from hrcreplay.robot.tracking import pose_error
 from tests.robot.checker import links, violation
+from tests.robot.distances import by_coal
 from tests.robot.people import person, volumes
 from tests.robot.swinging import (
     DT_S,
@@ -133,9 +133,9 @@ def test_distance_and_pair_are_those_of_all_pairs(robot: RobotModel) -> None:
     for tick, (state, made) in enumerate(run(robot, people)):
         seen = obstacles(people, tick)
         radius = np.array([segment.radius_m for segment in robot.segments])
-        surface = separation(robot.pose(state.q, state.dq), seen) - (radius[:, None] + seen.radius_m)
-        assert made.distance_m == max(0.0, surface.min())
-        assert surface[made.link, made.limb] == surface.min()
+        surface = by_coal(robot.pose(state.q, state.dq), seen) - (radius[:, None] + seen.radius_m)
+        assert made.distance_m == pytest.approx(max(0.0, surface.min()), abs=1e-9)
+        assert surface[made.link, made.limb] == pytest.approx(surface.min(), abs=1e-9)
 
 
 def test_without_limbs_there_is_no_distance(robot: RobotModel) -> None:

@@ -15,10 +15,10 @@ from hrcreplay.robot.obstacles import obstacles
 from hrcreplay.robot.paths import programmed
 from hrcreplay.robot.reference import Reference
 from hrcreplay.robot.scaling import PathState, rates, step
-from hrcreplay.robot.separation import separation
 from hrcreplay.robot.stepping import PlanSettings, Step
 from hrcreplay.robot.task import parse_task
 from tests.robot.checker import violation
+from tests.robot.distances import by_coal
 from tests.robot.people import person, volumes
 
 STOP_S, DT_S = 0.377, 0.004
@@ -87,7 +87,7 @@ def test_the_rate_is_the_largest_where_people_hold_it(robot: RobotModel, referen
         more = after.rate * 1.001 + 1e-9
         now, then = reference.sample(state.s_s), reference.sample(state.s_s + DT_S / 2 * (state.rate + more))
         pose, seen = robot.pose(now.q, state.rate * now.dq), obstacles(people, tick)
-        distance, broken = separation(pose, seen), False
+        distance, broken = by_coal(pose, seen), False
         for link, segment in enumerate(robot.segments):
             for limb in range(6):
                 vertices = seen.vertices_m[seen.offsets[limb] : seen.offsets[limb + 1]]

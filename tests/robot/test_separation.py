@@ -10,9 +10,10 @@ from scipy.optimize import nnls
 
 from hrcreplay.records import Floats
 from hrcreplay.robot import separation as module
-from hrcreplay.robot.bracket import brackets
+from hrcreplay.robot.distance import EXACT_M, distances
 from hrcreplay.robot.obstacles import obstacles
-from hrcreplay.robot.separation import Separation, axis_distance, separation
+from hrcreplay.robot.separation import axis_distance, separation
+from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
 
 
@@ -72,28 +73,40 @@ def test_a_distance_never_depends_on_where_the_search_begins() -> None:
     np.testing.assert_allclose(found, found[0], atol=2e-10)
 
 
-def test_brackets_hold_the_distance() -> None:
+def test_both_methods_find_the_same_distances() -> None:
+    """Shapes of 1 mm to 10 m, near, far and in contact; ours is proven wherever it is."""
     rng = np.random.default_rng(8)
-    for _ in range(40):
-        limbs = [SHAPES[name](rng) + rng.normal(size=3) * 0.6 for name in list(SHAPES)[:6]]
+    for _ in range(60):
+        size, away = 10.0 ** rng.uniform(-3.0, 1.0), rng.choice([0.01, 0.3, 1.0])
+        limbs = [SHAPES[name](rng) * size + rng.normal(size=3) * away for name in rng.permutation(list(SHAPES))[:6]]
         seen, pose = obstacles(volumes(limbs), 0), arm(*rng.normal(size=(4, 2, 3)) * 0.4)
-        low, high, _ = brackets(pose.ends_m, seen.vertices_m, seen.offsets)
-        exact = separation(pose, seen)
-        assert np.all(low <= exact + 1e-9)
-        assert np.all(exact <= high + 1e-9)
-        assert np.median(exact - low) < 0.02
+        low, high, near = distances(pose.ends_m, seen.vertices_m, seen.offsets)
+        exact = by_coal(pose, seen)
+        np.testing.assert_allclose(low, exact, rtol=0, atol=1e-10)
+        assert np.all(high - low <= EXACT_M)
+        assert np.all((near >= seen.offsets[:-1, None]) & (near < seen.offsets[1:, None]))
 
 
-def test_the_nearest_pair_is_that_of_all_exact_distances() -> None:
+def test_the_carriers_hold_the_nearest_point() -> None:
+    rng = np.random.default_rng(12)
+    limbs = [cloud(rng, 60, rng.uniform(0.05, 0.3, 3)) + rng.normal(size=3) for _ in range(6)]
+    seen, pose = obstacles(volumes(limbs), 0), arm(*rng.normal(size=(5, 2, 3)) * 0.4)
+    low, _, near = distances(pose.ends_m, seen.vertices_m, seen.offsets)
+    for link, limb in np.ndindex(low.shape):
+        carried = nearest_of_hull(seen.vertices_m[near[link, limb]], *pose.ends_m[link])
+        assert carried == pytest.approx(low[link, limb], abs=1e-8)
+
+
+def test_the_nearest_pair_is_that_of_all_distances() -> None:
     rng = np.random.default_rng(9)
     for _ in range(60):
         limbs = [cloud(rng, 30, rng.uniform(0.02, 0.3, 3)) + rng.normal(size=3) * 0.7 for _ in range(6)]
         seen, pose = obstacles(volumes(limbs), 0), arm(*rng.normal(size=(5, 2, 3)) * 0.4)
         clearance = rng.uniform(0.1, 0.3, (5, 6))
-        surface, link, limb = Separation(pose, seen, clearance).nearest()
-        expected = separation(pose, seen) - clearance
+        surface, link, limb = separation(pose, seen, clearance).nearest()
+        expected = by_coal(pose, seen) - clearance
         assert link * 6 + limb == np.argmin(expected)
-        assert surface == expected.min()
+        assert surface == pytest.approx(expected.min(), abs=1e-10)
 
 
 def test_obstacles_are_those_of_their_tick() -> None:
@@ -113,14 +126,39 @@ def test_a_limb_that_is_not_finite_or_empty_is_not_known(bad: float) -> None:
     assert not obstacles(volumes([np.zeros((3, 3)), np.zeros((0, 3))]), 0).known
 
 
-def test_a_failure_of_coal_is_a_distance_that_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: Any) -> tuple[float, Floats]:
-        raise RuntimeError("GJK did not converge")
+def broken(*_: Any) -> tuple[float, Floats]:
+    raise RuntimeError("GJK did not converge")
 
-    seen, pose = obstacles(volumes([np.ones((3, 3))]), 0), arm(np.zeros((2, 3)))
-    monkeypatch.setattr(module, "_gjk", broken)
-    pairs = Separation(pose, seen, np.zeros((1, 1)))
-    assert np.isnan(pairs.nearest()[0])
-    assert pairs.failed
-    monkeypatch.setattr(module, "_gjk", lambda *_: (np.nan, np.full(3, np.nan)))
-    assert np.isnan(axis_distance(np.zeros(3), np.ones(3), np.ones((3, 3)), [0]))
+
+@pytest.mark.parametrize(
+    ("name", "stub"),
+    [
+        ("_gjk", broken),
+        ("_gjk", lambda *_: (np.nan, np.full(3, np.nan))),
+        ("axis_distance", lambda *_: np.sqrt(3.0) - 2e-9),
+    ],
+)
+def test_where_coal_fails_or_differs_a_distance_is_unknown(
+    monkeypatch: pytest.MonkeyPatch, name: str, stub: Any
+) -> None:
+    seen, pose = obstacles(volumes([np.ones((3, 3)), np.full((3, 3), 2.0)]), 0), arm(np.zeros((2, 3)))
+    surface, *pair = separation(pose, seen, np.zeros((1, 2))).nearest()
+    assert surface == pytest.approx(np.sqrt(3.0), abs=1e-12)
+    assert pair == [0, 0]
+    monkeypatch.setattr(module, name, stub)
+    found = separation(pose, seen, np.zeros((1, 2)))
+    np.testing.assert_allclose(found.distance_m, [[np.nan, np.sqrt(12.0)]])
+    assert np.isnan(found.nearest()[0])
+
+
+def test_where_our_bounds_do_not_close_coal_has_the_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, pose = obstacles(volumes([np.ones((3, 3)), np.full((3, 3), 2.0)]), 0), arm(np.zeros((2, 3)))
+
+    def open_ended(*given: Any) -> tuple[Floats, Floats, Any]:
+        low, high, near = distances(*given)
+        return low - 0.1, high + 0.1, near
+
+    monkeypatch.setattr(module, "distances", open_ended)
+    np.testing.assert_allclose(
+        separation(pose, seen, np.zeros((1, 2))).distance_m, np.sqrt([[3.0, 12.0]]), rtol=0, atol=1e-12
+    )
