@@ -28,6 +28,7 @@ class Received:
         sender: Where both came from.
         t_ns: Monotonic clock right after the first of them was taken.
         count: How many datagrams those are.
+        waited: Whether they were there already when they were asked for: we are late.
     """
 
     data: bytes
@@ -35,6 +36,7 @@ class Received:
     sender: Address
     t_ns: int
     count: int
+    waited: bool
 
 
 class Link:
@@ -76,14 +78,17 @@ class Link:
     def newest(self) -> Received | None:
         """Wait for a datagram, then empty the queue. None when nothing came within the time-out."""
         deadline_ns = monotonic_ns() + self._timeout_ns
+        first = self._receive(socket.MSG_DONTWAIT)
+        waited = first is not None
         while (left_ns := deadline_ns - monotonic_ns()) > 0:
-            first = self._take(left_ns)
+            first = first or self._take(left_ns)
             if first is None:
                 return None
             t_ns = monotonic_ns()
-            received = self._choose([first, *self._drain()], t_ns)
+            received = self._choose([first, *self._drain()], t_ns, waited=waited)
             if received is not None:
                 return received
+            first, waited = None, False
         return None
 
     def answer(self, data: bytes, to: Address) -> None:
@@ -104,7 +109,7 @@ class Link:
         self._socket.close()
 
     def _take(self, wait_ns: int) -> tuple[bytes, Address] | None:
-        """The next datagram within ``wait_ns``, if there is one. The kernel waits: one call, not a poll before it."""
+        """The next datagram within ``wait_ns``, if there is one. The kernel waits."""
         wait = struct.pack("ll", wait_ns // 1_000_000_000, max(1, wait_ns % 1_000_000_000 // 1000))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, wait)
         return self._receive(0)
@@ -126,7 +131,7 @@ class Link:
             except ConnectionError:
                 self.vanished += 1
 
-    def _choose(self, lot: list[tuple[bytes, Address]], t_ns: int) -> Received | None:
+    def _choose(self, lot: list[tuple[bytes, Address]], t_ns: int, *, waited: bool) -> Received | None:
         """Those of the robot we talk to, or of the last sender while we talk to none."""
         silent = t_ns - self._heard_ns >= self._timeout_ns
         if silent and all(address != self._peer for _, address in lot):
@@ -137,4 +142,4 @@ class Link:
         if not own:
             return None
         self._heard_ns = t_ns
-        return Received(data=own[-1], older=tuple(own[:-1]), sender=sender, t_ns=t_ns, count=len(own))
+        return Received(data=own[-1], older=tuple(own[:-1]), sender=sender, t_ns=t_ns, count=len(own), waited=waited)

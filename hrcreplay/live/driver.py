@@ -135,6 +135,7 @@ def outcome(loop: Loop) -> dict[str, Any]:
         "reason": _reason(loop),
         "waiting": loop.pilot.waiting,
         "answers": loop.answers,
+        "looks_skipped": loop.skipped,
         "dropped": loop.recorder.dropped,
         "counts": {name: int(count) for name, count in sorted(loop.pilot.counts().items())},
     }

@@ -82,6 +82,7 @@ def _meta(job: Job, start: dict[str, Any], tables: SessionTables, tape: Tape) ->
         notes.append("the session was killed: its record has no end")
     counts = {name.replace(" ", "_"): int(count) for name, count in end.get("counts", {}).items()}
     counts |= dict(tables.counts) | {"messages_dropped": int(end.get("dropped", 0))}
+    counts |= {"looks_skipped": int(end.get("looks_skipped", 0))}
     return {
         **job.meta(),
         "versions": start["versions"],

@@ -1,4 +1,8 @@
-"""The control loop: a packet, an answer, a look; everything else is told to others and waited for by nobody."""
+"""The control loop: a packet, an answer, a look; everything else is told to others and waited for by nobody.
+
+A look that lasts into the next packet makes its answer late. The look after that answer is left out, so that the one
+after it is on time again: what the robot keeps clear of is then a cycle older (`live.reaction_s` has room for that).
+"""
 
 from __future__ import annotations
 
@@ -47,12 +51,14 @@ class Loop:
     notes: list[str] = field(default_factory=list)
     took: Durations = field(default_factory=Durations)
     answers: int = 0
+    skipped: int = 0  #: looks left out
     robot: str | None = None
     last: Answer | None = None
     stored: bytes | None = None  #: the latest swept volumes that were recorded whole
     _bodies: list[bytes] = field(default_factory=list)
     _beat_ns: int = 0
     _late: bool = False
+    _skipped: bool = False
     _ended: bool = False
     _stored_ns: int = 0
 
@@ -76,7 +82,12 @@ class Loop:
             self.recorder.send(wire.silence(t_ns, signals))
         else:
             self._answer(received, signals)
-        self._look()
+        self._skipped = received is not None and received.waited and not self._skipped
+        if self._skipped:
+            self.skipped += 1
+            self.pilot.prepare()
+        else:
+            self._look()
         return not self._over(signals)
 
     def _answer(self, received: Received, signals: Signal) -> None:

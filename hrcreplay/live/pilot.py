@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +34,7 @@ class Pilot:
     for ``resume_s``. From standing to moving there is but one way: from where the robot stands, at approach speed.
 
     The step of the next answer follows from what was told and seen last, so a look ends with it, and an answer has only
-    to decide whether it is taken.
+    to decide whether it is taken. Where there is no time for a look, ``prepare`` makes the step without one.
     """
 
     def __init__(self, setup: Setup, observer: Observer, session: Session) -> None:
@@ -74,6 +75,12 @@ class Pilot:
             self.fault = self.fault or error
             self.sight = self.sight if self.sight is not None and self.sight.t_ns == t_ns else None
         return self.sight
+
+    def prepare(self) -> None:
+        """Makes the step of the next answer beside what was seen last; changes nothing that is said."""
+        if self._course is not None:
+            with suppress(Exception):  # the answer fails in the same way, and says so
+                self._ready = self._course, self._step(self._course)
 
     def silence(self, t_ns: int, signals: Signal) -> None:
         """Nothing came from the robot within the time-out."""

@@ -38,6 +38,7 @@ def test_a_datagram_comes_with_its_sender_and_its_instant(link: Link) -> None:
         received = link.newest()
         assert received is not None
         assert (received.data, received.older, received.count) == (b"one", (), 1)
+        assert received.waited
         assert received.sender == own.getsockname()
         assert before <= received.t_ns <= time.monotonic_ns()
         link.answer(b"told", received.sender)
@@ -72,7 +73,9 @@ def test_it_wakes_as_soon_as_a_datagram_comes(link: Link) -> None:
         later = threading.Timer(0.05, own.send, [b"late"])
         later.start()
         began = time.monotonic()
-        assert link.newest() is not None
+        received = link.newest()
+        assert received is not None
+        assert not received.waited
         assert time.monotonic() - began < LONG_S / 2
         later.join()
 

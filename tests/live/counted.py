@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from hrcreplay.egm.channel import Datagram
@@ -12,7 +12,7 @@ from hrcreplay.egm.link import Address, Received
 from hrcreplay.egm.servo import PERIOD_NS
 from hrcreplay.egm.twin import TwinCore
 from hrcreplay.live.loop import Loop, LoopSettings
-from hrcreplay.live.records import Answer, TickEvent
+from hrcreplay.live.records import Answer, Sight, TickEvent
 from tests.live.flights import BEGIN_NS, FRAME_NS, RESPONSE_NS, Flight, far_away
 
 ROBOT: Address = ("192.0.2.1", 6510)
@@ -40,6 +40,7 @@ class Cable:
         """All that has come by now, or the next that comes within 20 ms."""
         deadline_ns = self._clock.t_ns + 20_000_000
         self._run(self._clock.t_ns)
+        waited = bool(self._coming) and self._coming[0][0] <= self._clock.t_ns
         while not self._coming or self._coming[0][0] > self._clock.t_ns:
             if self._clock.t_ns >= deadline_ns:
                 return None
@@ -48,7 +49,7 @@ class Cable:
         lot = []
         while self._coming and self._coming[0][0] <= self._clock.t_ns:
             lot.append(heapq.heappop(self._coming)[2])
-        return Received(lot[-1], tuple(lot[:-1]), ROBOT, self._clock.t_ns, len(lot))
+        return Received(lot[-1], tuple(lot[:-1]), ROBOT, self._clock.t_ns, len(lot), waited)
 
     def _run(self, until_ns: int) -> None:
         while self._cycle_ns <= until_ns:
@@ -121,6 +122,7 @@ class CountedLoop(Loop):
 
     clock: Clock = field(default_factory=Clock)
     work_ns: int = 300_000  #: from a packet to its answer
+    look_ns: int = 0  #: what a look takes
     seen: list[Answer] = field(default_factory=list)
 
     def now_ns(self) -> int:
@@ -135,7 +137,9 @@ class CountedLoop(Loop):
         return self
 
 
-def counted(flight: Flight, *, duration_s: float = math.inf, work_s: float = 0.0003) -> CountedLoop:
+def counted(
+    flight: Flight, *, duration_s: float = math.inf, work_s: float = 0.0003, look_s: float = 0.0
+) -> CountedLoop:
     """A flight's pilot and robot with the loop between them."""
     clock = Clock()
     settings = LoopSettings(
@@ -143,14 +147,20 @@ def counted(flight: Flight, *, duration_s: float = math.inf, work_s: float = 0.0
     )
     parts = Cable(flight.core, clock), Person(flight, clock), Recorder()
     loop = CountedLoop(flight.pilot, *parts, settings, 0, clock.t_ns, clock=clock)  # type: ignore[arg-type]
-    loop.work_ns = round(work_s * 1e9)
-    answer = flight.pilot.answer
+    loop.work_ns, loop.look_ns = round(work_s * 1e9), round(look_s * 1e9)
+    answer, look = flight.pilot.answer, flight.pilot.look
 
     def works(event: TickEvent) -> Answer:
         clock.t_ns += loop.work_ns
         loop.seen.append(answer(event))
         return loop.seen[-1]
 
+    def looks(t_ns: int, skeletons: Sequence[bytes]) -> Sight | None:
+        sight = look(t_ns, skeletons)
+        clock.t_ns += loop.look_ns
+        return sight
+
     flight.pilot.answer = works  # type: ignore[method-assign]
+    flight.pilot.look = looks  # type: ignore[method-assign]
     loop.begin()
     return loop

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import pytest
+
+from hrcreplay.live import watch, wire
+from hrcreplay.live.setup import build
+from hrcreplay.live.verify import Again
+from hrcreplay.planner import QpFollower
+from tests.live.counted import CountedLoop, counted
+from tests.live.flights import CYCLE_S, Flight
+
+SECONDS = 4.0
+
+
+def recorded(loop: CountedLoop) -> list[bytes]:
+    """What the recorder was told."""
+    messages: list[bytes] = loop.recorder.messages  # type: ignore[assignment]
+    return messages
+
+
+def count(loop: CountedLoop, kind: bytes) -> int:
+    return sum(wire.kind(message) == kind for message in recorded(loop))
+
+
+@pytest.mark.parametrize("look_s", [0.0041, 0.0045, 0.0049])
+def test_looks_that_do_not_fit_are_left_out_and_packets_are_not(look_s: float) -> None:
+    flight = Flight()
+    loop = counted(flight, look_s=look_s).fly(SECONDS)
+    assert count(loop, wire.REPLY) == count(loop, wire.ROBOT) == loop.answers > 0.98 * SECONDS / CYCLE_S
+    assert loop.skipped > 100
+    assert not flight.pilot.stops
+    assert loop.seen[-1].row is not None
+    assert loop.seen[-1].row.dq.any(), "it moves"
+    ages = [answer.t_ns - answer.look_ns for answer in loop.seen if answer.look_ns]
+    assert max(ages) * 1e-9 < 2 * CYCLE_S + look_s, "two looks in a row were left out"
+
+
+def test_looks_that_fit_are_all_taken() -> None:
+    loop = counted(Flight(), look_s=0.003).fly(SECONDS)
+    assert loop.skipped <= 1, "the first packet was there before the loop"
+    assert count(loop, wire.LOOK) >= loop.answers - 1
+
+
+def test_a_session_with_looks_left_out_comes_out_the_same_again() -> None:
+    loop = counted(flight := Flight(), look_s=0.0045).fly(SECONDS)
+    again = Again(build(flight.start))
+    assert all(again.differs(message) is None for message in recorded(loop))
+    assert again.ticks == loop.answers
+
+
+def test_a_step_that_cannot_be_prepared_fails_in_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight().fly(3.0)
+
+    def broken(*_args: object) -> None:
+        raise ZeroDivisionError("of the test")
+
+    monkeypatch.setattr(QpFollower, "step", broken)
+    flight.pilot._ready = None
+    flight.pilot.prepare()
+    assert flight.pilot.fault is None
+    flight.fly(0.1)
+    assert isinstance(flight.pilot.fault, ZeroDivisionError)
+    assert [why for _, why in flight.pilot.stops] == [watch.FAULT]
+
+
+def test_no_two_looks_in_a_row_are_left_out() -> None:
+    loop = counted(Flight(), work_s=0.0042).fly(1.0)
+    assert loop.skipped > 0.4 * loop.answers, "it is always late"
+    assert count(loop, wire.LOOK) > 0.4 * loop.answers
