@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -29,55 +30,95 @@ def minimiser(H: Floats, g: Floats) -> Floats:
     return _backward(L, _forward(L, -g))
 
 
+class Working(NamedTuple):
+    """A problem being solved: in the metric of the cost, ``y = L.T @ w``, H is the identity and rows have length 1."""
+
+    L: Floats  #: (n, n) of H
+    y: Floats  #: (n,)
+    A: Floats  #: (most, n) rows as they were given
+    high: Floats  #: (most,) their bounds
+    E: Floats  #: (most, n) the rows in the metric
+    h: Floats  #: (most,) their bounds there
+    norms: Floats  #: (most,) the rows' lengths there
+    z: Floats  #: (most,) multipliers there
+    held: Ints  #: (n,) rows that y lies on
+
+
 @njit(cache=True, error_model="numpy")
-def active_set(H: Floats, g: Floats, A: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Minimiser of ``w @ H @ w / 2 + g @ w`` where ``A @ w <= high``, and the rows' multipliers; NaN without one.
+def working(H: Floats, g: Floats, most: int) -> Working:
+    """A problem with room for ``most`` rows, at its minimiser without any."""
+    n, L = len(g), _cholesky(H)
+    A, E, h, norms, z = np.empty((most, n)), np.zeros((most, n)), np.empty(most), np.ones(most), np.zeros(most)
+    return Working(L, _forward(L, -g), A, np.empty(most), E, h, norms, z, np.empty(n, dtype=np.int64))
 
-    The dual method of Goldfarb and Idnani: from the minimiser without rows, one broken row after the other is moved
-    onto, in the metric of H, and rows are let go whose multipliers would turn negative. Exact after finitely many
-    steps, also where rows repeat each other or leave no room.
 
-    Args:
-        H: (n, n) positive definite.
-        g: (n,).
-        A: (m, n).
-        high: (m,); inf where a row has no bound.
+@njit(cache=True, error_model="numpy")
+def add(work: Working, i: int, row: Floats, sign: float, high: float) -> None:
+    """Row i: ``sign * row @ w <= high``; inf where it has no bound."""
+    for k in range(len(row)):
+        work.A[i, k] = sign * row[k]
+    work.high[i] = work.h[i] = high
+    e = _forward(work.L, work.A[i])
+    length = _norm(e)
+    if length > 0.0:
+        work.norms[i], work.h[i] = length, high / length
+        for k in range(len(row)):
+            work.E[i, k] = e[k] / length
 
-    Returns:
-        ``w`` (n,) and ``z`` (m,) with ``H @ w + g + A.T @ z = 0``, ``z >= 0``.
+
+@njit(cache=True, error_model="numpy")
+def settle(work: Working, rows: int, count: int) -> int:
+    """Goes on to the minimiser over the first rows, of which ``count`` are held; how many then are, -1 without one.
+
+    The dual method of Goldfarb and Idnani: one broken row after the other is moved onto, in the metric of H, and rows
+    are let go whose multipliers would turn negative. Exact after finitely many steps, also where rows repeat each
+    other or leave no room. Rows may be added between two calls.
     """
-    n, m = len(g), len(high)
-    L = _cholesky(H)
-    y = _forward(L, -g)  # y = L' w: there H is the identity
-    E, h, norms = np.zeros((m, n)), high.copy(), np.ones(m)
-    for i in range(m):
-        e = _forward(L, A[i])
-        length = _norm(e)
-        if length > 0.0:
-            norms[i], h[i] = length, high[i] / length
-            for k in range(n):
-                E[i, k] = e[k] / length
-    held, z = np.empty(n, dtype=np.int64), np.zeros(m)
-    count = 0
+    E, h, y = work.E[:rows], work.h, work.y
     for _ in range(STEPS):
         p = _worst(E, h, y)
         if p < 0:
-            return _backward(L, y), z / norms
-        count, taken = _take(E, h, p, y, z, held, count)
+            return count
+        count, taken = _take(E, h, p, y, work.z, work.held, count)
         if taken:
             continue
         if _dot(E[p], y) - h[p] <= ROUNDING:
             h[p] = _dot(E[p], y)  # where the held rows leave no room, others are broken by rounding errors
         else:
             break
-    return np.full(n, np.nan), np.full(m, np.nan)
+    return -1
+
+
+@njit(cache=True, error_model="numpy")
+def solution(work: Working, rows: int) -> tuple[Floats, Floats]:
+    """``w`` (n,) and the rows' multipliers ``z``: where it has settled ``H @ w + g + A.T @ z = 0``, ``z >= 0``."""
+    return _backward(work.L, work.y), work.z[:rows] / work.norms[:rows]
+
+
+@njit(cache=True, error_model="numpy")
+def active_set(H: Floats, g: Floats, A: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Minimiser of ``w @ H @ w / 2 + g @ w`` where ``A @ w <= high``, and the rows' multipliers; NaN without one.
+
+    Args:
+        H: (n, n) positive definite.
+        g: (n,).
+        A: (m, n).
+        high: (m,); inf where a row has no bound.
+    """
+    m = len(high)
+    work = working(H, g, m)
+    for i in range(m):
+        add(work, i, A[i], 1.0, high[i])
+    if settle(work, m, 0) < 0:
+        return np.full(len(g), np.nan), np.full(m, np.nan)
+    return solution(work, m)
 
 
 @njit(cache=True)
 def _worst(E: Floats, h: Floats, y: Floats) -> int:
     """The row that y breaks most; -1 where all hold."""
     worst, most = -1, BROKEN
-    for i in range(len(h)):
+    for i in range(len(E)):
         broken = _dot(E[i], y) - h[i]
         if broken > most:
             worst, most = i, broken

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -58,51 +59,42 @@ def approach_rows(
     return Rows(A=A, b=np.full(len(A), room_m2))
 
 
-def worst_rows(
-    pose: RobotPose, obstacles: Obstacles, dq_next: Floats, room_m2: Floats, stop_s: float, above_m2: float
-) -> tuple[Ints, Floats, Floats]:
+class Approach(NamedTuple):
+    """What the approach rows of a tick are made of."""
+
+    ends_m: Floats  #: (s, 2, 3) ends of the links' axes [m]
+    J_ends: Floats  #: (s, 2, 3, nv) their position Jacobians [m/rad]
+    vertices_m: Floats  #: (m, 3) of all limbs [m]
+    offsets: Ints  #: (l + 1,) where each limb's vertices begin
+    boxes_m: Floats  #: (l, 2, 3) around each limb's vertices [m]
+    room_m2: Floats  #: (s, l) right-hand side for every pair of link and limb [m^2]
+    stop_s: float  #: T_s [s]
+
+
+def approach(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, stop_s: float) -> Approach:
+    """The approach rows of a tick, none of them written down."""
+    hulls = obstacles
+    return Approach(pose.ends_m, pose.J_ends, hulls.vertices_m, hulls.offsets, hulls.boxes_m, room_m2, stop_s)
+
+
+@njit(cache=True)
+def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, Floats, Floats]:
     """The row of Eq. (16) that a velocity breaks most, for every pair and either end of the link.
 
     The rows are linear in the vertex, so the worst vertex is the one furthest along the end's velocity: one pass
     over the vertices checks them all, without any row being written down.
 
     Args:
-        pose: The robot.
-        obstacles: The swept volumes.
+        rows: Of the tick.
         dq_next: (nv,) [rad/s].
-        room_m2: (s, l) right-hand side for every pair of link and limb [m^2].
-        stop_s: T_s [s].
         above_m2: Rows that exceed their right-hand side by no more than this hold [m^2].
 
     Returns:
-        For the n broken ones: ``which`` (n, 4) link, limb, row of Eq. (12), row of ``obstacles.vertices_m``;
-        ``A`` (n, nv) [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2].
+        For the n broken ones: ``which`` (n, 4) link, limb, row of Eq. (12), row of ``vertices_m``; ``A`` (n, nv)
+        [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2].
     """
-    return _worst_rows(
-        pose.ends_m,
-        pose.J_ends,
-        obstacles.vertices_m,
-        obstacles.offsets,
-        obstacles.boxes_m,
-        dq_next,
-        room_m2,
-        stop_s,
-        above_m2,
-    )
-
-
-@njit(cache=True)
-def _worst_rows(
-    ends: Floats,
-    J_ends: Floats,
-    vertices: Floats,
-    offsets: Ints,
-    boxes: Floats,
-    dq: Floats,
-    room: Floats,
-    stop_s: float,
-    above: float,
-) -> tuple[Ints, Floats, Floats]:
+    ends, J_ends, vertices, offsets, boxes, room, stop_s = rows
+    dq, above = dq_next, above_m2
     links, limbs = room.shape
     which = np.empty((2 * links * limbs, 4), dtype=np.int64)
     A, values = np.empty((len(which), len(dq))), np.empty(len(which))

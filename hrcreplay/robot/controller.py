@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +9,10 @@ import proxsuite
 
 from hrcreplay.records import Floats
 from hrcreplay.robot import stepping
-from hrcreplay.robot.active_set import active_set, minimiser
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.obstacles import Obstacles
-from hrcreplay.robot.problem import BoundedRows, Problem, problem
+from hrcreplay.robot.optimum import OUTCOMES, SOLVED, Optimum, optimum
+from hrcreplay.robot.problem import Problem, problem
 from hrcreplay.robot.sight import observe
 from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
 
@@ -22,12 +21,6 @@ HELD = 1e-11
 
 #: Multiplier above which a row holds the robot back.
 BINDING = 1e-9
-
-#: Rows that this much of the present velocity breaks are among the first to be tried.
-AHEAD = 1.1
-
-#: Rounds of solving and adding broken rows before the problem counts as unsolved.
-ROUNDS = 40
 
 #: Largest gradient left, and product of a multiplier and its row's slack, with which multipliers prove a solution.
 PROVEN = 1e-9
@@ -45,7 +38,6 @@ class Solution:
 
     dq_next: Floats  #: (nv,) [rad/s]
     held: bool  #: whether an approach row holds the robot back
-    rounds: int  #: how often rows joined in
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,69 +83,44 @@ def step(
 
 
 def solve(task: Problem) -> Solution | Unsolved:
-    """The minimiser over all rows, found with few of them.
-
-    Beginning with the minimiser without rows, the rows that the candidate breaks join in and the problem is solved
-    again, until all rows of all links, limbs and vertices hold. A minimiser over some of the rows that breaks none
-    of the others is the minimiser over all of them.
-    """
-    w = minimiser(task.H, task.g)
-    if not math.isfinite(w.sum()):
-        return Unsolved("not finite")
-    solved, w = bool(np.all((task.low <= w) & (w <= task.high))), np.clip(w, task.low, task.high)
-    rows, z = BoundedRows((), np.empty((0, len(w))), np.empty(0), np.empty(0)), np.zeros(len(w))
-    for rounds in range(ROUNDS):
-        broken = task.broken_rows(w, HELD)
-        if broken.keys and not rounds:  # the rows that held the robot until now are likely to hold it again
-            broken = broken.joined(task.broken_rows(AHEAD * task.dq, HELD))
-        if solved and not broken.keys:
-            held = any(key[0] >= 0 and z_i > BINDING for key, z_i in zip(rows.keys, z.tolist(), strict=False))
-            return Solution(_by_proxqp(task, rows, w, z) if rounds else w, held, rounds)
-        before, rows = len(rows.keys), rows.joined(broken)
-        if solved and len(rows.keys) == before:
-            return Unsolved("residual")
-        w, z = _minimise(task, rows)
-        if math.isnan(w[0]):
-            return Unsolved("infeasible")
-        w, solved = np.clip(w, task.low, task.high), True
-    return Unsolved("rounds")
+    """The minimiser over all rows, proven; found as ``optimum`` does, and by proxqp where rows hold it."""
+    found = optimum(task.H, task.g, task.limits, task.rows, task.dq, HELD)
+    if found.outcome != SOLVED:
+        return Unsolved(OUTCOMES[found.outcome])
+    if not task.keeps(found.w, HELD):
+        return Unsolved("residual")
+    if not _proven(task, found):
+        return Unsolved("unproven")
+    w = _by_proxqp(task, found) if np.any(found.z) else found.w
+    return Solution(w, bool(np.any(found.z[found.fixed :] > BINDING)))
 
 
-def _minimise(task: Problem, rows: BoundedRows) -> tuple[Floats, Floats]:
-    """Minimiser over some rows and the axes' limits, and the multipliers of both, negative at a lower bound.
-
-    NaN where there is none, or none that the multipliers prove: the gradient must vanish, and only rows at their
-    bound may carry one.
-    """
-    A = np.concatenate([rows.A, np.eye(len(task.g))])
-    high, low = np.concatenate([rows.high, task.high]), np.concatenate([rows.low, task.low])
-    w, both = active_set(task.H, task.g, np.concatenate([A, -A]), np.concatenate([high, -low]))
-    z, values = both[: len(A)] - both[len(A) :], A @ w
-    gradient = task.H @ w + task.g + z @ A
-    unused = z * np.where(z > 0.0, np.minimum(high - values, 1.0), np.maximum(low - values, -1.0))
+def _proven(task: Problem, found: Optimum) -> bool:
+    """Whether the multipliers prove a minimiser: the gradient must vanish, and only rows at their bound carry one."""
+    gradient = task.H @ found.w + task.g + found.z @ found.A
+    unused = found.z * np.minimum(found.high - found.A @ found.w, 1.0)
     most = PROVEN * max(1.0, np.abs(task.g).max())
-    proven = np.abs(gradient).max() <= most and np.abs(unused).max() <= most
-    return w if proven else np.full_like(w, np.nan), z
+    return bool(np.abs(gradient).max() <= most and np.abs(unused).max() <= most and found.z.min() >= 0.0)
 
 
-def _by_proxqp(task: Problem, rows: BoundedRows, w: Floats, z: Floats) -> Floats:
+def _by_proxqp(task: Problem, known: Optimum) -> Floats:
     """The solution as proxqp returns it from a proven one, or that one where proxqp loses it.
 
     From elsewhere proxqp 0.8 misses or denies the solutions of about one problem in a hundred near people, claims a
-    few that are none, and needs 15 times as long as `active_set`. So it begins at the solution and its multipliers,
-    with the rows that hold it, and what it returns must keep all rows.
+    few that are none, and needs 15 times as long as `optimum`. So it begins at the solution and its multipliers, with
+    the rows that hold it, and what it returns must keep all rows.
     """
-    holding = np.flatnonzero(z)
-    A = np.concatenate([rows.A, np.eye(len(w))])[holding]
-    low, high = np.concatenate([rows.low, task.low])[holding], np.concatenate([rows.high, task.high])[holding]
+    holding = np.flatnonzero(known.z)
+    A, high, w = known.A[holding], known.high[holding], known.w
     cost, norms = 1.0 / task.H.diagonal().max(), 1.0 / np.linalg.norm(A, axis=1)  # its tolerances are absolute
     # the last bits of what its other backend returns depend on where its memory happens to lie
     qp = _dense.QP(len(w), 0, len(holding), False, _dense.HessianType.Dense, _dense.DenseBackend.PrimalLDLT)
     qp.settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START
     qp.settings.eps_abs, qp.settings.eps_rel = 1e-10, 0.0
     qp.settings.max_iter, qp.settings.max_iter_in = 5, 5
-    qp.init(task.H * cost, task.g * cost, None, None, A * norms[:, None], low * norms, high * norms)
-    qp.solve(w, None, cost * z[holding] / norms)
-    found = np.clip(qp.results.x, task.low, task.high)
+    low = np.full(len(holding), -np.inf)
+    qp.init(task.H * cost, task.g * cost, None, None, A * norms[:, None], low, high * norms)
+    qp.solve(w, None, cost * known.z[holding] / norms)
+    found = np.clip(qp.results.x, task.limits.low, task.limits.high)
     kept = qp.results.info.status == _SOLVED and np.abs(found - w).max() <= AGREED
-    return found if kept and not task.broken_rows(found, HELD).keys else w
+    return found if kept and task.keeps(found, HELD) else w

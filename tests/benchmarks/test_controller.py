@@ -12,10 +12,9 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from hrcreplay.robot.controller import solve, step
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.obstacles import obstacles
-from hrcreplay.robot.problem import Problem
 from hrcreplay.robot.stepping import RobotState
 from tests.robot.people import person
-from tests.robot.swinging import DT_S, HOME, SETTINGS, STOP_S, asked, base, dense, run, swing
+from tests.robot.swinging import DT_S, HOME, SETTINGS, STOP_S, Asked, asked, base, dense, run, swing
 
 TICKS = 300
 
@@ -40,7 +39,7 @@ def test_a_tick(benchmark: BenchmarkFixture, robot: RobotModel, name: str, at_m:
         benchmark.extra_info["us_per_tick"] = benchmark.stats.stats.mean / TICKS * 1e6
 
 
-def tasks(robot: RobotModel) -> Iterator[Problem]:
+def tasks(robot: RobotModel) -> Iterator[Asked]:
     people = person(TICKS, DT_S, (1.3, 0.0), 0.35, seed=1)
     state = RobotState(HOME, np.zeros(6))
     for tick in range(TICKS):
@@ -52,10 +51,10 @@ def tasks(robot: RobotModel) -> Iterator[Problem]:
 @pytest.mark.benchmark
 def test_few_rows_beside_all_rows_by_daqp(benchmark: BenchmarkFixture, robot: RobotModel) -> None:
     problems = list(tasks(robot))
-    benchmark.pedantic(lambda: [solve(task) for task in problems], rounds=3)  # type: ignore[no-untyped-call]
+    benchmark.pedantic(lambda: [solve(tick.task) for tick in problems], rounds=3)  # type: ignore[no-untyped-call]
     if benchmark.stats is None:
         return
     started = time.perf_counter()
-    for task in problems:
-        dense(robot, task)
+    for tick in problems:
+        dense(robot, tick)
     benchmark.extra_info["all rows by daqp / few rows"] = (time.perf_counter() - started) / benchmark.stats.stats.mean

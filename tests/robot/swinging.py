@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import daqp
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from hrcreplay.records import Floats, SweptVolumes
 from hrcreplay.robot.constraints import approach_rows, link_segment
 from hrcreplay.robot.controller import step
-from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.robot.model import RobotModel, RobotPose, irb140
 from hrcreplay.robot.obstacles import Obstacles, obstacles
 from hrcreplay.robot.problem import Problem, problem
 from hrcreplay.robot.rotation import from_vector
@@ -54,15 +55,25 @@ def run(
         state = made.next
 
 
-def all_rows(robot: RobotModel, task: Problem) -> tuple[Floats, Floats, Floats]:
+class Asked(NamedTuple):
+    """A problem and what it is about."""
+
+    task: Problem
+    pose: RobotPose
+    seen: Obstacles
+
+
+def all_rows(robot: RobotModel, tick: Asked) -> tuple[Floats, Floats, Floats]:
     """Every row of Eq. (66g)-(66i), written down."""
-    A, low, high = [task.pose.J_tcp], [task.J_low], [task.J_high]
-    distance, offsets = by_coal(task.pose, task.obstacles), task.obstacles.offsets
+    task, pose, seen = tick
+    limits = task.limits
+    A, low, high = [limits.J], [limits.J_low], [limits.J_high]
+    distance, offsets = by_coal(pose, seen), seen.offsets
     for link, segment in enumerate(robot.segments):
-        for limb, radius in enumerate(task.obstacles.radius_m):
-            vertices = task.obstacles.vertices_m[offsets[limb] : offsets[limb + 1]]
+        for limb, radius in enumerate(seen.radius_m):
+            vertices = seen.vertices_m[offsets[limb] : offsets[limb + 1]]
             rows = approach_rows(
-                link_segment(task.pose, link),
+                link_segment(pose, link),
                 vertices,
                 distance[link, limb],
                 clearance_m=segment.radius_m + radius,
@@ -76,21 +87,22 @@ def all_rows(robot: RobotModel, task: Problem) -> tuple[Floats, Floats, Floats]:
     return np.ascontiguousarray(every), np.concatenate(low), np.concatenate(high)
 
 
-def dense(robot: RobotModel, task: Problem) -> tuple[Floats, bool]:
+def dense(robot: RobotModel, tick: Asked) -> tuple[Floats, bool]:
     """The same problem with all rows, by another solver."""
-    A, low, high = all_rows(robot, task)
-    upper, lower = np.concatenate([task.high, high]), np.concatenate([task.low, low])
+    A, low, high = all_rows(robot, tick)
+    task = tick.task
+    upper, lower = np.concatenate([task.limits.high, high]), np.concatenate([task.limits.low, low])
     found = daqp.solve(task.H, task.g, A, upper, lower, primal_tol=1e-11, dual_tol=1e-12)
     return found[0], found[2] == 1
 
 
-def asked(robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles) -> Problem:
-    pairs = observe(robot, state, seen, 0.0).pairs
+def asked(robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles) -> Asked:
+    pose, pairs = robot.pose(state.q, state.dq), observe(robot, state, seen, 0.0).pairs
     assert isinstance(pairs, Separation)
-    return problem(robot, state, robot.pose(state.q, state.dq), T, twist, seen, pairs, SETTINGS)
+    return Asked(problem(robot, state, pose, T, twist, seen, pairs, SETTINGS), pose, seen)
 
 
-def random_tick(robot: RobotModel, rng: np.random.Generator) -> Problem:
+def random_tick(robot: RobotModel, rng: np.random.Generator) -> Asked:
     """Anything: singular wrists, robots at rest, people far and in contact."""
     q = rng.uniform(robot.q_min, robot.q_max) * 0.6
     q[4] *= rng.choice([0.0, 1e-4, 1.0, 1.0, 1.0])

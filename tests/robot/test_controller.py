@@ -37,8 +37,8 @@ def test_the_solution_is_that_of_another_solver_with_all_rows(robot: RobotModel)
     rng = np.random.default_rng(1)
     outcomes = []
     for _ in range(400):
-        task = random_tick(robot, rng)
-        mine, (expected, feasible) = solve(task), dense(robot, task)
+        tick = random_tick(robot, rng)
+        mine, (expected, feasible) = solve(tick.task), dense(robot, tick)
         assert isinstance(mine, Solution) == feasible
         if isinstance(mine, Solution):
             np.testing.assert_allclose(mine.dq_next, expected, atol=1e-6)

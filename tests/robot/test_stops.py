@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from hrcreplay.records import Floats
 from hrcreplay.robot import controller, stepping
 from hrcreplay.robot.active_set import minimiser
-from hrcreplay.robot.controller import Unsolved, solve, step
+from hrcreplay.robot.controller import Solution, Unsolved, solve, step
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.obstacles import obstacles
+from hrcreplay.robot.optimum import SOLVED, Optimum, optimum
 from hrcreplay.robot.stepping import RobotState
 from tests.robot.people import volumes
 from tests.robot.swinging import DT_S, HOME, SETTINGS, moving, random_tick, robot, swing
@@ -76,10 +79,28 @@ def test_an_unsolved_qp_is_a_stop(robot: RobotModel, monkeypatch: pytest.MonkeyP
 def test_a_solver_that_says_solved_is_not_believed(robot: RobotModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """A candidate that breaks a row although the row is in the problem is no solution."""
 
-    def careless(H: Floats, g: Floats, A: Floats, _: Floats) -> tuple[Floats, Floats]:
-        return minimiser(H, g), np.zeros(len(A))
+    def careless(H: Floats, g: Floats, *given: Any) -> Optimum:
+        found = optimum(H, g, *given)
+        return found._replace(w=minimiser(H, g), outcome=SOLVED)
 
-    monkeypatch.setattr(controller, "active_set", careless)
+    monkeypatch.setattr(controller, "optimum", careless)
     rng = np.random.default_rng(12)
-    found = [solve(random_tick(robot, rng)) for _ in range(60)]
+    found = [solve(random_tick(robot, rng).task) for _ in range(60)]
     assert Unsolved("residual") in found
+
+
+def test_a_solution_without_proof_is_not_believed(robot: RobotModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Standing still keeps all rows, yet is seldom the minimiser."""
+
+    def lazy(H: Floats, g: Floats, *given: Any) -> Optimum:
+        found = optimum(H, g, *given)
+        return found._replace(w=0.999 * found.w) if found.outcome == SOLVED else found
+
+    rng = np.random.default_rng(13)
+    ticks = [random_tick(robot, rng).task for _ in range(60)]
+    solved = [isinstance(solve(task), Solution) for task in ticks]
+    monkeypatch.setattr(controller, "optimum", lazy)
+    found = [solve(task) for task in ticks]
+    assert sum(solved) > 20
+    assert Unsolved("unproven") in found
+    assert not any(isinstance(solution, Solution) and np.any(solution.dq_next) for solution in found)

@@ -1,0 +1,120 @@
+"""The minimiser of Eq. (66) over all rows, found with few of them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.active_set import Working, add, settle, solution, working
+from hrcreplay.robot.constraints import Approach, worst_rows
+
+#: Rows that this much of the present velocity breaks are among the first to be tried.
+AHEAD = 1.1
+#: Rounds of solving and adding broken rows before the problem counts as unsolved.
+ROUNDS = 40
+#: Approach rows that may join in.
+MOST = 200
+#: What came of it; SOLVED must be the first.
+OUTCOMES = ("solved", "not finite", "infeasible", "residual", "rounds")
+SOLVED, NOT_FINITE, INFEASIBLE, RESIDUAL, UNFINISHED = range(5)
+
+
+class Limits(NamedTuple):
+    """Bounds that do not depend on people."""
+
+    low: Floats  #: (nv,) Eq. (66d)-(66f) [rad/s]
+    high: Floats  #: (nv,) [rad/s]
+    J: Floats  #: (6, nv) of the TCP
+    J_low: Floats  #: (6,) Eq. (66g), (66h): bounds on ``J @ w`` [m/s, rad/s]
+    J_high: Floats  #: (6,) [m/s, rad/s]
+
+
+class Optimum(NamedTuple):
+    """A candidate, and the rows that it was found with."""
+
+    outcome: int  #: index into ``OUTCOMES``
+    w: Floats  #: (nv,) [rad/s]
+    A: Floats  #: (m, nv) ``A @ w <= high``
+    high: Floats  #: (m,)
+    z: Floats  #: (m,) multipliers
+    fixed: int  #: rows of ``Limits``, which come first
+
+
+@njit(cache=True)
+def optimum(H: Floats, g: Floats, limits: Limits, rows: Approach, dq: Floats, above_m2: float) -> Optimum:
+    """Minimiser of ``w @ H @ w / 2 + g @ w`` within limits and clear of people.
+
+    Beginning with the minimiser without approach rows, the rows that the candidate breaks join in and the search goes
+    on, until all rows of all links, limbs and vertices hold. A minimiser over some of the rows that breaks none of the
+    others is the minimiser over all of them.
+
+    Args:
+        H: (nv, nv) positive definite.
+        g: (nv,).
+        limits: Of axes and TCP.
+        rows: Of the people.
+        dq: (nv,) at the tick: the rows that held the robot until now are likely to hold it again [rad/s].
+        above_m2: Approach rows broken by no more than this hold [m^2].
+    """
+    n = len(g)
+    work = working(H, g, 2 * n + 12 + MOST)
+    which = np.empty((MOST, 4), dtype=np.int64)
+    fixed = m = _limit(work, limits)
+    count, outcome = settle(work, m, 0), UNFINISHED
+    for round_ in range(ROUNDS):
+        if count < 0:
+            outcome = INFEASIBLE
+            break
+        w, _ = solution(work, m)
+        if not np.isfinite(w.sum()):
+            outcome = NOT_FINITE
+            break
+        w = np.minimum(np.maximum(w, limits.low), limits.high)
+        before = m
+        m, broken = _join(work, which, fixed, m, rows, w, above_m2)
+        if broken == 0:
+            outcome = SOLVED
+            break
+        if round_ == 0:
+            m, _ = _join(work, which, fixed, m, rows, AHEAD * dq, above_m2)
+        if m == before:
+            outcome = RESIDUAL
+            break
+        count = settle(work, m, count)
+    w, z = solution(work, m)
+    w = np.minimum(np.maximum(w, limits.low), limits.high)
+    return Optimum(outcome, w, work.A[:m].copy(), work.high[:m].copy(), z, fixed)
+
+
+@njit(cache=True)
+def _limit(work: Working, limits: Limits) -> int:
+    """Adds the rows of axes and TCP; returns how many."""
+    n, m = len(limits.low), 0
+    axes = np.eye(n)
+    for i in range(n):
+        add(work, m, axes[i], 1.0, limits.high[i])
+        add(work, m + 1, axes[i], -1.0, -limits.low[i])
+        m += 2
+    for i in range(len(limits.J)):
+        add(work, m, limits.J[i], 1.0, limits.J_high[i])
+        add(work, m + 1, limits.J[i], -1.0, -limits.J_low[i])
+        m += 2
+    return m
+
+
+@njit(cache=True)
+def _join(work: Working, which: Ints, fixed: int, m: int, rows: Approach, w: Floats, above: float) -> tuple[int, int]:
+    """Adds the approach rows that a velocity breaks and that are not there yet; rows there are, and broken ones."""
+    keys, A, _ = worst_rows(rows, w, above)
+    for b in range(len(keys)):
+        known = m - fixed == MOST
+        for i in range(m - fixed):
+            known = known or (which[i] == keys[b]).all()
+        if not known:
+            which[m - fixed] = keys[b]
+            add(work, m, A[b], 1.0, rows.room_m2[keys[b, 0], keys[b, 1]])
+            m += 1
+    return m, len(keys)
