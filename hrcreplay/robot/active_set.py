@@ -59,7 +59,7 @@ def add(work: Working, i: int, row: Floats, sign: float, high: float) -> None:
         work.A[i, k] = sign * row[k]
     work.high[i] = work.h[i] = high
     e = _forward(work.L, work.A[i])
-    length = _norm(e)
+    length = norm(e)
     if length > 0.0:
         work.norms[i], work.h[i] = length, high / length
         for k in range(len(row)):
@@ -165,7 +165,7 @@ def _split(E: Floats, held: Ints, count: int, e: Floats) -> tuple[Floats, Floats
         for c in range(len(e)):
             basis[i, c] = E[held[i], c]
         _remove(basis, i, basis[i], L[i])
-        L[i, i] = _norm(basis[i])
+        L[i, i] = norm(basis[i])
         for c in range(len(e)):
             basis[i, c] /= L[i, i]
     across, along = e.copy(), np.zeros(count)
@@ -230,5 +230,6 @@ def _dot(a: Floats, b: Floats) -> float:
 
 
 @njit(cache=True)
-def _norm(v: Floats) -> float:
+def norm(v: Floats) -> float:
+    """Euclidean length."""
     return math.sqrt(_dot(v, v))

@@ -84,7 +84,7 @@ def step(
 
 def solve(task: Problem) -> Solution | Unsolved:
     """The minimiser over all rows, proven; found as ``optimum`` does, and by proxqp where rows hold it."""
-    found = optimum(task.H, task.g, task.limits, task.rows, task.dq, HELD)
+    found = optimum(task.H, task.g, task.limits, task.rows, HELD)
     if found.outcome != SOLVED:
         return Unsolved(OUTCOMES[found.outcome])
     if not task.keeps(found.w, HELD):

@@ -8,17 +8,13 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.records import Floats, Ints
-from hrcreplay.robot.active_set import Working, add, settle, solution, working
+from hrcreplay.robot.active_set import Working, add, norm, settle, solution, working
 from hrcreplay.robot.constraints import Approach, worst_rows
 
-#: Rows that this much of the present velocity breaks are among the first to be tried.
-AHEAD = 1.1
-#: Rounds of solving and adding broken rows before the problem counts as unsolved.
-ROUNDS = 40
-#: Approach rows that may join in.
+#: Approach rows that may join in before the problem counts as unsolved.
 MOST = 200
 #: What came of it; SOLVED must be the first.
-OUTCOMES = ("solved", "not finite", "infeasible", "residual", "rounds")
+OUTCOMES = ("solved", "not finite", "infeasible", "residual", "too many rows")
 SOLVED, NOT_FINITE, INFEASIBLE, RESIDUAL, UNFINISHED = range(5)
 
 
@@ -44,19 +40,18 @@ class Optimum(NamedTuple):
 
 
 @njit(cache=True)
-def optimum(H: Floats, g: Floats, limits: Limits, rows: Approach, dq: Floats, above_m2: float) -> Optimum:
+def optimum(H: Floats, g: Floats, limits: Limits, rows: Approach, above_m2: float) -> Optimum:
     """Minimiser of ``w @ H @ w / 2 + g @ w`` within limits and clear of people.
 
-    Beginning with the minimiser without approach rows, the rows that the candidate breaks join in and the search goes
-    on, until all rows of all links, limbs and vertices hold. A minimiser over some of the rows that breaks none of the
-    others is the minimiser over all of them.
+    Beginning with the minimiser without approach rows, the row that the candidate breaks most joins in and the search
+    goes on, until all rows of all links, limbs and vertices hold. A minimiser over some of the rows that breaks none of
+    the others is the minimiser over all of them.
 
     Args:
         H: (nv, nv) positive definite.
         g: (nv,).
         limits: Of axes and TCP.
         rows: Of the people.
-        dq: (nv,) at the tick: the rows that held the robot until now are likely to hold it again [rad/s].
         above_m2: Approach rows broken by no more than this hold [m^2].
     """
     n = len(g)
@@ -64,7 +59,7 @@ def optimum(H: Floats, g: Floats, limits: Limits, rows: Approach, dq: Floats, ab
     which = np.empty((MOST, 4), dtype=np.int64)
     fixed = m = _limit(work, limits)
     count, outcome = settle(work, m, 0), UNFINISHED
-    for round_ in range(ROUNDS):
+    for _ in range(MOST):
         if count < 0:
             outcome = INFEASIBLE
             break
@@ -74,14 +69,9 @@ def optimum(H: Floats, g: Floats, limits: Limits, rows: Approach, dq: Floats, ab
             break
         w = np.minimum(np.maximum(w, limits.low), limits.high)
         before = m
-        m, broken = _join(work, which, fixed, m, rows, w, above_m2)
-        if broken == 0:
-            outcome = SOLVED
-            break
-        if round_ == 0:
-            m, _ = _join(work, which, fixed, m, rows, AHEAD * dq, above_m2)
+        m, clear = _join(work, which, fixed, m, rows, w, above_m2)
         if m == before:
-            outcome = RESIDUAL
+            outcome = SOLVED if clear else RESIDUAL
             break
         count = settle(work, m, count)
     w, z = solution(work, m)
@@ -106,15 +96,27 @@ def _limit(work: Working, limits: Limits) -> int:
 
 
 @njit(cache=True)
-def _join(work: Working, which: Ints, fixed: int, m: int, rows: Approach, w: Floats, above: float) -> tuple[int, int]:
-    """Adds the approach rows that a velocity breaks and that are not there yet; rows there are, and broken ones."""
-    keys, A, _ = worst_rows(rows, w, above)
+def _join(work: Working, which: Ints, fixed: int, m: int, rows: Approach, w: Floats, above: float) -> tuple[int, bool]:
+    """Adds the approach row that a velocity breaks most of those not there yet; rows then, and whether all hold."""
+    keys, A, values = worst_rows(rows, w, above)
+    worst, most = -1, 0.0
     for b in range(len(keys)):
-        known = m - fixed == MOST
-        for i in range(m - fixed):
-            known = known or (which[i] == keys[b]).all()
-        if not known:
-            which[m - fixed] = keys[b]
-            add(work, m, A[b], 1.0, rows.room_m2[keys[b, 0], keys[b, 1]])
-            m += 1
-    return m, len(keys)
+        broken = (values[b] - rows.room_m2[keys[b, 0], keys[b, 1]]) / norm(A[b])
+        if broken > most and not _among(which, m - fixed, keys[b]):
+            worst, most = b, broken
+    if worst >= 0:
+        which[m - fixed] = keys[worst]
+        add(work, m, A[worst], 1.0, rows.room_m2[keys[worst, 0], keys[worst, 1]])
+        m += 1
+    return m, len(keys) == 0
+
+
+@njit(cache=True)
+def _among(which: Ints, count: int, key: Ints) -> bool:
+    found = False
+    for i in range(count):
+        same = True
+        for k in range(len(key)):
+            same = same and which[i, k] == key[k]
+        found = found or same
+    return found

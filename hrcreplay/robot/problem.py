@@ -25,7 +25,6 @@ class Problem:
     g: Floats  #: (nv,)
     limits: Limits
     rows: Approach  #: Eq. (66i)
-    dq: Floats  #: (nv,) at the tick [rad/s]
 
     def keeps(self, w: Floats, within: float) -> bool:
         """Whether a velocity breaks no row by more than ``within`` [m^2; m/s, rad/s]."""
@@ -61,4 +60,4 @@ def problem(
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
     J_low, J_high = cartesian_bounds(J, dJdq, state.dq, settings.tcp_speed_max, settings.tcp_acceleration_max, dt_s)
     rows = approach(pose, obstacles, pairs.room_m2(), settings.stop_s)
-    return Problem(H, g, Limits(low, high, J, J_low, J_high), rows, state.dq)
+    return Problem(H, g, Limits(low, high, J, J_low, J_high), rows)
