@@ -8,7 +8,7 @@ Instants are int nanoseconds, durations float seconds; everything else is SI.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -64,20 +64,24 @@ POINTS = (
 )
 
 
+def _protect(record: Any) -> None:
+    """Gives a record that is being made views of its arrays through which nobody writes."""
+    own = vars(record)
+    for name, value in own.items():
+        if isinstance(value, np.ndarray):
+            own[name] = view = value.view()
+            view.setflags(write=False)
+
+
 @dataclass(frozen=True)
 class Table:
     """Rows over time: every array field has time as its first axis, every other field belongs to the whole table."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                view = value.view()
-                view.flags.writeable = False
-                object.__setattr__(self, field.name, view)
+        _protect(self)
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        return {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray)}
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
 
     def __len__(self) -> int:
         return len(next(iter(self._arrays().values())))
@@ -90,7 +94,7 @@ class Table:
     def join(cls, tables: Sequence[Self]) -> Self:
         """One table of all the rows, in the given order; whole-table fields are those of the first."""
         first = tables[0]
-        names = [f.name for f in fields(first) if isinstance(getattr(first, f.name), np.ndarray)]
+        names = [name for name, value in vars(first).items() if isinstance(value, np.ndarray)]
         return replace(first, **{name: np.concatenate([getattr(t, name) for t in tables]) for name in names})
 
 
@@ -158,10 +162,7 @@ class SweptVolumes:
     method: str
 
     def __post_init__(self) -> None:
-        for name in ("t_ns", "offsets", "vertices_m", "radius_m"):
-            view = getattr(self, name).view()
-            view.flags.writeable = False
-            object.__setattr__(self, name, view)
+        _protect(self)
 
     def __len__(self) -> int:
         return len(self.t_ns)
