@@ -72,8 +72,8 @@ class Cleaner:
     def _mended(self, row: Row) -> Row:
         missing: Bools = ~np.logical_and.reduce(np.isfinite(row.points_m), axis=1)
         infinite: Bools = np.logical_or.reduce(np.isinf(row.points_m), axis=1)
-        self._defects["points_not_finite"] += int((infinite | (missing & (row.confidence > 0))).sum())
-        confidence = np.where(missing | np.isnan(row.confidence), 0.0, np.clip(row.confidence, 0.0, 1.0))
+        self._defects["points_not_finite"] += int(np.count_nonzero(infinite | (missing & (row.confidence > 0))))
+        confidence = np.where(missing, 0.0, np.fmin(np.fmax(row.confidence, 0.0), 1.0))  # 0 also where it is NaN
         return row._replace(points_m=np.where(missing[:, None], np.nan, row.points_m), confidence=confidence)
 
     def rest(self) -> CameraFrames | None:
