@@ -14,6 +14,7 @@ from numba import njit
 
 from hrcreplay.human.branches import canonical_arm, wrap
 from hrcreplay.human.model import ARM_POINTS, HEAD, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, torso_rotation
+from hrcreplay.human.vectors import Vector, cross, dot, edge, norm
 from hrcreplay.records import LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements
 
 ROWS = 12 + len(LENGTHS)
@@ -183,40 +184,41 @@ def _name_arms(rows: Floats) -> None:
 @njit(cache=True)
 def _direct_row(points: Floats, rows: Floats) -> None:
     """The 12 angles and 8 lengths of one skeleton (20, 3), arms by the name with |alpha_2| <= 90 degrees."""
-    pelvis, right, left = points[PELVIS], points[_SHOULDER_R], points[_SHOULDER_L]
-    neck, line = 0.5 * (right + left), left - right
+    pelvis, right, left = _point(points, PELVIS), _point(points, _SHOULDER_R), _point(points, _SHOULDER_L)
+    neck, line = _middle(right, left), _from_to(right, left)
+    (_, elbow_r, wrist_r), (_, elbow_l, wrist_l) = ARM_POINTS
     rows[12:] = (
         pelvis[2],
-        _length(neck - pelvis),
-        _length(points[HEAD] - neck),
-        0.5 * _length(line),
-        _length(points[ARM_POINTS[1][1]] - left),
-        _length(points[ARM_POINTS[0][1]] - right),
-        _length(points[ARM_POINTS[1][2]] - points[ARM_POINTS[1][1]]),
-        _length(points[ARM_POINTS[0][2]] - points[ARM_POINTS[0][1]]),
+        norm(_from_to(pelvis, neck)),
+        norm(_from_to(neck, _point(points, HEAD))),
+        0.5 * norm(line),
+        norm(edge(points, _SHOULDER_L, elbow_l)),
+        norm(edge(points, _SHOULDER_R, elbow_r)),
+        norm(edge(points, elbow_l, wrist_l)),
+        norm(edge(points, elbow_r, wrist_r)),
     )
     if np.isnan(line[0]):
-        neck = points[NECK]
-        line = neck - right if np.isnan(left[0]) else left - neck
+        neck = _point(points, NECK)
+        line = _from_to(right, neck) if np.isnan(left[0]) else _from_to(neck, left)
     theta = np.arctan2(-line[0], line[1])  # the shoulder line is R_torso (0, 1, 0)
-    trunk = neck - pelvis
+    trunk = _from_to(pelvis, neck)
     rho = np.arctan2(trunk[0] * np.cos(theta) + trunk[1] * np.sin(theta), trunk[2])
     rows[0], rows[1], rows[2], rows[3] = pelvis[0], pelvis[1], theta, rho
     R = torso_rotation(theta, rho)
     for arm in range(2):
         shoulder, elbow, wrist = ARM_POINTS[arm]
         s = 2.0 * arm - 1.0
-        upper = _in_torso(R, s, points[shoulder], points[elbow])
-        fore = _in_torso(R, s, points[elbow], points[wrist])
-        _arm_row(upper, fore, rows[RIGHT_ARM + 4 * arm : RIGHT_ARM + 4 * arm + 4])
+        upper, fore = edge(points, shoulder, elbow), edge(points, elbow, wrist)
+        first = RIGHT_ARM + 4 * arm
+        _arm_row(_in_torso(R, s, upper), _in_torso(R, s, fore), rows[first : first + 4])
         # free of the torso's frame, so it holds where heading does not
-        rows[RIGHT_ARM + 4 * arm + 3] = _elbow_angle(points[shoulder], points[elbow], points[wrist])
+        rows[first + 3] = _elbow_angle(edge(points, elbow, shoulder), fore)
 
 
 @njit(cache=True)
-def _in_torso(R: Floats, s: float, start: Floats, end: Floats) -> tuple[float, float, float]:
-    """The bone from start to end in the torso's frame, mirrored in y for a right arm (s = -1)."""
-    x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+def _in_torso(R: Floats, s: float, bone: Vector) -> Vector:
+    """A bone in the torso's frame, mirrored in y for a right arm (s = -1)."""
+    x, y, z = bone
     return (
         R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
         s * (R[0, 1] * x + R[1, 1] * y + R[2, 1] * z),
@@ -225,7 +227,7 @@ def _in_torso(R: Floats, s: float, start: Floats, end: Floats) -> tuple[float, f
 
 
 @njit(cache=True)
-def _arm_row(upper: tuple[float, float, float], fore: tuple[float, float, float], arm: Floats) -> None:
+def _arm_row(upper: Vector, fore: Vector, arm: Floats) -> None:
     """alpha_1 to alpha_3 of a left arm whose bones point along upper and fore in the torso's frame."""
     across = np.hypot(upper[1], upper[2])
     arm[0] = np.arctan2(upper[1], -upper[2])
@@ -236,13 +238,21 @@ def _arm_row(upper: tuple[float, float, float], fore: tuple[float, float, float]
 
 
 @njit(cache=True)
-def _elbow_angle(shoulder: Floats, elbow: Floats, wrist: Floats) -> float:
-    """The angle between both bones, pi when straight; exact near both ends, unlike an arc cosine."""
-    a, b = shoulder - elbow, wrist - elbow
-    normal = np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-    return np.arctan2(_length(normal), a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+def _elbow_angle(a: Vector, b: Vector) -> float:
+    """The angle between both bones seen from the elbow, pi when straight; unlike an arc cosine exact near both ends."""
+    return np.arctan2(norm(cross(a, b)), dot(a, b))
 
 
 @njit(cache=True)
-def _length(a: Floats) -> float:
-    return np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+def _point(points: Floats, k: int) -> Vector:
+    return points[k, 0], points[k, 1], points[k, 2]
+
+
+@njit(cache=True)
+def _from_to(a: Vector, b: Vector) -> Vector:
+    return b[0] - a[0], b[1] - a[1], b[2] - a[2]
+
+
+@njit(cache=True)
+def _middle(a: Vector, b: Vector) -> Vector:
+    return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])

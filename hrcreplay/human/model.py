@@ -88,7 +88,9 @@ def skeleton_row(p: Floats, lengths: Floats, points: Floats) -> None:
 def torso_rotation(theta: float, rho: float) -> Floats:
     """R_torso = Rz(theta) Ry(rho), (3, 3)."""
     ct, st, cr, sr = np.cos(theta), np.sin(theta), np.cos(rho), np.sin(rho)
-    return np.array([[ct * cr, -st, ct * sr], [st * cr, ct, st * sr], [-sr, 0.0, cr]])
+    R = np.empty((3, 3))
+    R[0], R[1], R[2] = (ct * cr, -st, ct * sr), (st * cr, ct, st * sr), (-sr, 0.0, cr)
+    return R
 
 
 @njit(cache=True)
