@@ -83,10 +83,8 @@ class Rules(NamedTuple):
 class Track(NamedTuple):
     """What the ticks leave behind; rows before the start stay as they are."""
 
-    mean: Floats  #: (n, 12, 4)
-    std: Floats  #: (n, 12, 2) of p and v, with the factor of ``spread``
-    lengths: Floats  #: (n, 8)
-    lengths_std: Floats  #: (n, 8)
+    motion: Floats  #: (6, n, 12) p, v, a, j, and the deviations of p and v with the factor of ``spread``
+    lengths: Floats  #: (2, n, 8) and their deviations
     valid: Bools  #: (n, c)
     residual: Floats  #: (n, 7)
     unseen: Floats  #: (n, 6)

@@ -25,6 +25,8 @@ _LENGTHS_M = (0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
 _LENGTHS_STD_M = 0.1
 #: How fast a joint may be moving that nobody sees: v, a, j of x and y [m/s...], of an angle [rad/s...].
 _REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10)
+#: Whether a joint is x or y (0) or an angle (1).
+_KIND = np.repeat((0, 1), (2, 10))
 
 FusionState = Filter
 Sigmas = tuple[float, float, float, float]
@@ -153,7 +155,7 @@ def process_noise(settings: FusionSettings, j: int, dt: float, damping: float) -
 
 
 def _sigma(settings: FusionSettings) -> Floats:
-    return np.array([settings.sigma_position] * 2 + [settings.sigma_angle] * 10)
+    return np.array((settings.sigma_position, settings.sigma_angle))[_KIND]
 
 
 def _fuse(
@@ -165,20 +167,21 @@ def _fuse(
     *,
     traced: bool,
 ) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
-    after = Filter._make(array.copy() for array in state)
+    after = Filter._make([array.copy() for array in state])
     track = _track(len(ticks_ns), len(measurements.cameras), traced=traced)
     run(np.array(ticks_ns), _frames(measurements), after, _rules(settings, limits), track)
-    p, v, a, j = (track.mean[:, :, k].copy() for k in range(4))
+    p, v, a, j, p_std, v_std = track.motion
+    lengths, lengths_std = track.lengths
     states = HumanStates(
         t_ns=ticks_ns,
         p=p,
         v=v,
         a=a,
         j=j,
-        p_std=track.std[:, :, 0].copy(),
-        v_std=track.std[:, :, 1].copy(),
-        lengths_m=track.lengths,
-        lengths_std_m=track.lengths_std,
+        p_std=p_std,
+        v_std=v_std,
+        lengths_m=lengths,
+        lengths_std_m=lengths_std,
         valid=track.valid,
         residual_m=track.residual,
         unseen_s=track.unseen,
@@ -196,8 +199,8 @@ def _frames(measurements: Measurements) -> Frames:
         capture_ns=np.array(measurements.capture_ns),
         arrival_ns=np.array(measurements.arrival_ns),
         camera=np.array(measurements.camera),
-        z=np.hstack([measurements.angles, measurements.lengths_m]),
-        z_var=np.hstack([measurements.angles_std, measurements.lengths_std_m]) ** 2,
+        z=np.concatenate((measurements.angles, measurements.lengths_m), axis=1),
+        z_var=np.concatenate((measurements.angles_std, measurements.lengths_std_m), axis=1) ** 2,
         points=np.array(measurements.points_m),
         confidence=np.array(measurements.confidence),
     )
@@ -235,10 +238,8 @@ def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
 def _track(n: int, cameras: int, *, traced: bool) -> Track:
     rows = n if traced else 0
     return Track(
-        mean=np.full((n, 12, 4), np.nan),
-        std=np.full((n, 12, 2), np.nan),
-        lengths=np.full((n, len(LENGTHS)), np.nan),
-        lengths_std=np.full((n, len(LENGTHS)), np.nan),
+        motion=np.full((6, n, 12), np.nan),
+        lengths=np.full((2, n, len(LENGTHS)), np.nan),
         valid=np.zeros((n, cameras), dtype=np.bool_),
         residual=np.full((n, len(BODY)), np.nan),
         unseen=np.full((n, len(LIMBS)), np.inf),

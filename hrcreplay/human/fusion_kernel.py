@@ -162,12 +162,13 @@ def _rename(filter_: Filter) -> None:
 
 @njit(cache=True)
 def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats) -> None:
-    track.mean[k] = filter_.mean
     for j in range(12):
+        for a in range(4):
+            track.motion[a, k, j] = filter_.mean[j, a]
         for a in range(2):
-            track.std[k, j, a] = np.sqrt(factor(filter_, j, rules) * filter_.cov[j, a, a])
-    track.lengths[k] = filter_.lengths
-    track.lengths_std[k] = np.sqrt(filter_.lengths_var)
+            track.motion[4 + a, k, j] = np.sqrt(factor(filter_, j, rules) * filter_.cov[j, a, a])
+    track.lengths[0, k] = filter_.lengths
+    track.lengths[1, k] = np.sqrt(filter_.lengths_var)
     track.residual[k] = filter_.residual
     unseen(filter_, track.unseen[k])
     if len(track.cov) > 0:
