@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -35,8 +35,8 @@ class Radii:
 
     def of_limbs(self) -> Floats:
         """(6,) in the order of LIMBS [m]."""
-        head, thorax, upper, lower = astuple(self)
-        return np.array([head, thorax, upper, lower, upper, lower])
+        upper, lower = self.upper_arm, self.lower_arm
+        return np.array([self.head, self.thorax, upper, lower, upper, lower])
 
 
 def predict(
@@ -66,14 +66,11 @@ def predict(
     Raises:
         SettingsError: There is no such method.
     """
-    code = code_of(method)
-    radius = np.tile(radii.of_limbs(), (len(states), 1))
+    code, radius = code_of(method), radii.of_limbs()
     if code == SOUND:
         vertices, offsets = sound.sweep(states, bounds_of(limits), limits.coupled, horizon_s, margins)
         limbs = BODY if margins.legs else LIMBS
-        return SweptVolumes(
-            states.t_ns, offsets, vertices, sound.radii(states, radii.of_limbs(), margins), limbs, method
-        )
+        return SweptVolumes(states.t_ns, offsets, vertices, sound.radii(states, radius, margins), limbs, method)
     vertices, offsets = _predict_rows(
         np.ascontiguousarray(states.p),
         np.ascontiguousarray(states.v),
@@ -84,7 +81,7 @@ def predict(
         code,
         surface(),
     )
-    return SweptVolumes(states.t_ns, offsets, vertices, radius, LIMBS, method)
+    return SweptVolumes(states.t_ns, offsets, vertices, np.tile(radius, (len(states), 1)), LIMBS, method)
 
 
 @njit(cache=True)

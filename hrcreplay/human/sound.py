@@ -92,18 +92,28 @@ def radii(states: HumanStates, limbs_m: Floats, margins: Margins) -> Floats:
     legs is how far their middles were from the line below the pelvis; where it and a thigh are more, they are the
     radius. Legs that were close when they were last seen make it no smaller: a table may hide that they are not now.
     """
-    off = margins.sigmas * states.lengths_std_m
-    pelvis = off[:, 0]
-    shoulder = pelvis + np.hypot(off[:, 1], off[:, 3])
-    displaced = np.column_stack([pelvis, pelvis, shoulder, shoulder + off[:, 5], shoulder, shoulder + off[:, 4]])
-    radius = limbs_m + displaced + ROUNDING_M
-    legs = np.full(len(states), margins.legs_radius_m + ROUNDING_M)
-    if margins.residual:
-        residual = np.where(np.isnan(states.residual_m), margins.residual_m, states.residual_m)
-        seen = states.residual_m[:, _LEGS] + (THIGH_M + ROUNDING_M)
-        radius = radius + residual[:, :_LEGS]
-        legs = np.fmax(legs + residual[:, _THORAX], seen)
-    return np.column_stack([radius, legs]) if margins.legs else radius
+    found = np.empty((len(states), len(LIMBS) + margins.legs))
+    unknown_m = margins.residual_m if margins.residual else np.nan
+    _radii_rows(
+        margins.sigmas * states.lengths_std_m, states.residual_m, limbs_m, margins.legs_radius_m, unknown_m, found
+    )
+    return found
+
+
+@njit(cache=True)
+def _radii_rows(off: Floats, residual: Floats, limbs: Floats, legs: float, unknown: float, found: Floats) -> None:
+    """Writes the radii; without the residual where ``unknown``, what stands for one not known yet, is NaN."""
+    for i in range(len(off)):
+        pelvis = off[i, 0]
+        shoulder = pelvis + np.hypot(off[i, 1], off[i, 3])
+        displaced = (pelvis, pelvis, shoulder, shoulder + off[i, 5], shoulder, shoulder + off[i, 4])
+        for limb in range(found.shape[1]):
+            base = legs + ROUNDING_M if limb == _LEGS else limbs[limb] + displaced[limb] + ROUNDING_M
+            of = _THORAX if limb == _LEGS else limb
+            further = unknown if np.isnan(residual[i, of]) else residual[i, of]
+            found[i, limb] = base if np.isnan(unknown) else base + further
+        if len(found[i]) > _LEGS and not np.isnan(unknown):  # no less than where they were seen
+            found[i, _LEGS] = np.fmax(found[i, _LEGS], residual[i, _LEGS] + (THIGH_M + ROUNDING_M))
 
 
 @njit(cache=True)
