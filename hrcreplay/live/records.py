@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
@@ -54,7 +54,7 @@ class MotionRow:
 
     def flat(self) -> Floats:
         """(34,) all numbers one after another."""
-        return np.concatenate([getattr(self, field.name) for field in fields(self)])
+        return np.concatenate((self.q_measured, self.q, self.dq, self.u, self.ref_m, self.tcp_m, self.rest))
 
     @classmethod
     def of(cls, flat: Floats) -> MotionRow:

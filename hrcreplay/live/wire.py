@@ -20,7 +20,7 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -129,13 +129,13 @@ def read_look(message: bytes) -> Look:
 
 def flat(states: HumanStates) -> Floats:
     """The numbers of one row of states, field after field."""
-    found = (getattr(states, field.name) for field in fields(states))
+    found = vars(states).values()
     return np.concatenate([value[0] for value in found if isinstance(value, np.ndarray) and value.dtype == np.float64])
 
 
 def digest(volumes: SweptVolumes, limb: int) -> bytes:
     """What stands for one limb's volume of a single tick."""
-    what = hashlib.blake2b(volumes.vertices(0, limb).tobytes(), digest_size=_DIGEST)
+    what = hashlib.blake2b(volumes.vertices(0, limb).data, digest_size=_DIGEST)
     what.update(volumes.radius_m[0, limb].tobytes())
     return what.digest()
 
