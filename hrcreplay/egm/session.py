@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from math import isfinite
 from typing import Final
 
 import numpy as np
@@ -141,10 +142,11 @@ class Session:
         """
         if not self._due or self._last is None:
             raise ValueError("reply: no packet is waiting for one; one answer each is right")
-        if q.shape != self._q_min.shape or dq.shape != q.shape or not (np.isfinite(q).all() and np.isfinite(dq).all()):
+        finite = all(map(isfinite, (*q.tolist(), *dq.tolist())))
+        if q.shape != self._q_min.shape or dq.shape != q.shape or not finite:
             raise ValueError(f"reply: {q} rad, {dq} rad/s; {len(self._q_min)} finite joints each are right")
         if self._fresh or not self._allowed:
-            q, dq = self._last.q, np.zeros_like(q)
+            q, dq = self._last.q, np.zeros(len(q))
             self._low, self._high = np.minimum(self._q_min, q), np.maximum(self._q_max, q)
         else:
             dq = np.minimum(
