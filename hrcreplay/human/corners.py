@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hrcreplay.human.surface import MOST_SLOTS, Surface, insert, join, set_plane, sides
+from hrcreplay.human.surface import MOST_FACES, MOST_SLOTS, POINT, A, B, C, Int32s, Surface, X, Y, Z, fan, fill, hide, is_inside, is_loop, join, join_all, look, outline, set_plane
 from hrcreplay.human.vectors import Vector, cross, dot, edge, norm
 from hrcreplay.records import Bools, Floats, Ints
 
@@ -37,16 +37,29 @@ def keep_corners(points: Floats, count: int, work: Surface) -> tuple[int, int]:
     """
     keep = np.ones(count, np.bool_)
     faces, slots = _grow(points, count, work, keep) if count > 4 else (0, 0)
-    moved = np.empty(count, np.int64)
+    moved = np.full(count, -1)
+    marks = np.empty(count)  # the same for points that are the same
     kept = 0
     for i in range(count):
-        moved[i] = _same(points, kept, i) if keep[i] else -1
+        mark = points[i, 0] + 0.7 * points[i, 1] + 0.3 * points[i, 2]
+        if not keep[i]:
+            continue
+        moved[i] = _same(points, kept, i) if _among(mark, marks, kept) else kept
         if moved[i] == kept:
-            points[kept] = points[i]
+            points[kept], marks[kept] = points[i], mark
             kept += 1
     for slot in range(slots):
-        work.slots[slot] = moved[work.slots[slot]]
+        work.faces[POINT, slot] = moved[work.faces[POINT, slot]]
     return kept, faces
+
+
+@njit(cache=True)
+def _among(mark: float, marks: Floats, kept: int) -> bool:
+    """Whether a mark is among the first."""
+    alike = 0
+    for k in range(kept):
+        alike += marks[k] == mark
+    return alike > 0
 
 
 @njit(cache=True)
@@ -66,26 +79,50 @@ def _grow(points: Floats, count: int, work: Surface, keep: Bools) -> tuple[int, 
         for k in range(3):
             size = max(size, abs(points[i, k]))
     order = _seeds_first(points, count)
-    faces = _simplex(points, order, size, work)
+    width = min(count, MOST_SLOTS)
+    faces = _simplex(points, order, size, width, work)
     if faces == 0:
         return 0, 0
+    planes, triangles, owner = work
+    inner = (_mean(planes[X]), _mean(planes[Y]), _mean(planes[Z]))
     slots = 4
-    inner = 0.25 * (points[work.slots[0]] + points[work.slots[1]] + points[work.slots[2]] + points[work.slots[3]])
-    for i in order:
-        outside, beyond = sides(points[i, 0], points[i, 1], points[i, 2], faces, work)
+    for n in range(count):
+        i = order[n]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        outside, beyond = look(x, y, z, faces, planes, triangles)
         if outside == 0:
             keep[i] = False
         elif beyond > 0 and slots < MOST_SLOTS:
-            grown = insert(points, i, inner, size, faces, slots, work)
-            if grown > 0:
-                faces = grown
+            triangles[POINT, slots] = i
+            planes[X, slots], planes[Y, slots], planes[Z, slots] = x, y, z
+            hidden = hide(faces, triangles)
+            edges = outline(hidden, width, triangles, owner)
+            end = faces + edges
+            if edges == 0 or end > MOST_FACES or not is_loop(edges, triangles):
+                continue
+            if fan(inner, size, faces, edges, slots, planes, triangles):
+                join_all(faces, end, width, triangles, owner)
+                faces = fill(hidden, end, width, planes, triangles, owner)
                 slots += 1
-    # what was built in, or was near the surface, may be deep inside by now
-    for i in range(count):
-        if keep[i]:
-            outside, beyond = sides(points[i, 0], points[i, 1], points[i, 2], faces, work)
-            keep[i] = outside > 0
+    _drop_inner(points, count, faces, planes, triangles, keep)
     return faces, slots
+
+
+@njit(cache=True)
+def _drop_inner(points: Floats, count: int, faces: int, planes: Floats, triangles: Int32s, keep: Bools) -> None:
+    """Drops what was built in, or was near the surface, and is deep inside by now; its corners cannot be."""
+    corner = np.zeros(count, np.bool_)
+    for f in range(faces):
+        for k in (A, B, C):
+            corner[triangles[POINT, triangles[k, f]]] = True
+    for i in range(count):
+        if keep[i] and not corner[i]:
+            keep[i] = not is_inside(points[i, 0], points[i, 1], points[i, 2], faces, planes)
+
+
+@njit(cache=True)
+def _mean(along: Floats) -> float:
+    return 0.25 * (along[0] + along[1] + along[2] + along[3])
 
 
 @njit(cache=True)
@@ -116,7 +153,7 @@ def _seeds_first(points: Floats, count: int) -> Ints:
 
 
 @njit(cache=True)
-def _simplex(points: Floats, order: Ints, size: float, work: Surface) -> int:
+def _simplex(points: Floats, order: Ints, size: float, width: int, work: Surface) -> int:
     """Four points far from each other as the first surface; returns its 4 triangles, or 0 for a flat set."""
     a = order[0]
     b = _farthest(points, a, (0.0, 0.0, 0.0), 1, len(order))
@@ -127,11 +164,15 @@ def _simplex(points: Floats, order: Ints, size: float, work: Surface) -> int:
     area, height = norm(normal), dot(normal, edge(points, a, d))
     if area < _FLAT_M**2 or abs(height) < _FLAT_M * area:
         return 0
-    work.slots[0], work.slots[3] = a, d
-    work.slots[1], work.slots[2] = (c, b) if height > 0.0 else (b, c)
+    planes, faces, owner = work
+    p = faces[POINT]
+    p[0], p[3] = a, d
+    p[1], p[2] = (c, b) if height > 0.0 else (b, c)
+    for slot in range(4):
+        planes[X, slot], planes[Y, slot], planes[Z, slot] = points[p[slot], 0], points[p[slot], 1], points[p[slot], 2]
     for f, (i, j, k) in enumerate(((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))):
-        set_plane(points, f, i, j, k, size, work)
-        join(f, work)
+        set_plane(f, i, j, k, size, planes, faces)
+        join(f, width, faces, owner)
     return 4
 
 

@@ -117,12 +117,13 @@ def _cuts(velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float) 
 def _box(velocity: tuple[Range, Range, Range], bounds: Floats, t: float) -> tuple[Range, Range]:
     """Intervals of v and v_perp at time t."""
     ahead, left = velocity[0], velocity[1]
-    x = bounds[2:, 0]
-    y = bounds[2:, 1]
-    return (
-        (-fastest(-ahead[0], -x[0], -x[2], -x[3], t), fastest(ahead[1], x[1], x[3], x[2], t)),
-        (-fastest(-left[0], -y[0], -y[2], -y[3], t), fastest(left[1], y[1], y[3], y[2], t)),
-    )
+    return _speeds(ahead, bounds, 0, t), _speeds(left, bounds, 1, t)
+
+
+@njit(cache=True)
+def _speeds(v: Range, bounds: Floats, k: int, t: float) -> Range:
+    least, most, brake, gain = bounds[2, k], bounds[3, k], bounds[4, k], bounds[5, k]
+    return -fastest(-v[0], -least, -brake, -gain, t), fastest(v[1], most, gain, brake, t)
 
 
 @njit(cache=True)

@@ -8,175 +8,177 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hrcreplay.records import Bools, Floats, Ints
+from hrcreplay.human.vectors import Vector
+from hrcreplay.records import Floats
 
 Int32s = NDArray[np.int32]
 
 #: Most points that the surface takes in; those beyond stay as they are.
 MOST_SLOTS = 512
+#: Most triangles: no closed surface has more.
+MOST_FACES = 2 * MOST_SLOTS
 #: Rounding error of a side test over (product of the triangle's edges times largest coordinate), with a wide margin.
 _ROUNDING = 64 * np.finfo(np.float64).eps
 #: Points that stick out less are kept but not built into the surface: they would make slivers [m].
 _THIN_M = 1e-10
+#: Triangles tested before asking whether one was enough.
+_BLOCK = 32
+#: Rows of ``Surface.planes``: outward normal, not of unit length, its product with a corner, rounding error of the side
+#: test, and how far out a point must be to be built in; and of a slot: where its point is [m].
+NX, NY, NZ, OFFSET, ROUNDING, THIN, X, Y, Z = range(9)
+#: Rows of ``Surface.faces``: slots of the corners, counterclockwise from outside; for the next point to build in,
+#: whether it sees a triangle, the numbers of those, and the rim around them, from slots to slots.
+A, B, C, SEEN, HIDDEN, START, END = range(7)
+#: And of a slot: the next one on the rim, and the index of its point.
+FOLLOWS, POINT = 7, 8
 
 
 class Surface(NamedTuple):
-    """A closed surface of triangles, room for it included. Row f of the planes and faces is a triangle."""
+    """A closed surface of triangles, room for it included: few arrays, as each costs time in every call."""
 
-    planes: Floats  #: (4, faces) outward normal, not of unit length, and its product with a corner
-    slack: Floats  #: (2, faces) rounding error of the side test, and how far out a point must be to be built in
-    faces: Int32s  #: (faces, 3) slots of the corners, counterclockwise from outside
-    owner: Int32s  #: (slots, slots) the face left of the edge from one slot to another
-    slots: Ints  #: (slots,) index of the point in each slot
-    seen: Bools  #: (faces,) scratch: the faces that the next point can see
-    hidden: Ints  #: (faces,) scratch: their numbers
-    rim: Int32s  #: (2, slots) scratch: the edges around them, each from a slot to a slot
-    follows: Int32s  #: (slots,) scratch: the next slot on the rim
+    planes: Floats  #: (9, faces) a triangle or slot each column
+    faces: Int32s  #: (9, faces) a triangle, slot or edge each column
+    owner: Int32s  #: (slots^2,) the face left of the edge from slot i to slot j, at i * width + j
 
 
 def surface() -> Surface:
     """Room for a surface; one serves for any number of sets."""
-    return _surface()
+    most = 3 * MOST_FACES  # edges of as many triangles
+    return Surface(np.empty((9, MOST_FACES)), np.empty((9, most), np.int32), np.empty(MOST_SLOTS**2, np.int32))
 
 
 @njit(cache=True)
-def _surface() -> Surface:
-    faces, slots = 2 * MOST_SLOTS, MOST_SLOTS
-    return Surface(
-        np.empty((4, faces)),
-        np.empty((2, faces)),
-        np.empty((faces, 3), np.int32),
-        np.empty((slots, slots), np.int32),
-        np.empty(slots, np.int64),
-        np.empty(faces, np.bool_),
-        np.empty(faces, np.int64),
-        np.empty((2, slots), np.int32),
-        np.empty(slots, np.int32),
-    )
+def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:
+    """Whether a point is proven to be inside of all triangles."""
+    for start in range(0, count, _BLOCK):
+        outside = 0
+        for f in range(start, min(start + _BLOCK, count)):
+            height = planes[NX, f] * x + planes[NY, f] * y + planes[NZ, f] * z - planes[OFFSET, f]
+            outside += height >= -planes[ROUNDING, f]
+        if outside > 0:
+            return False
+    return True
 
 
 @njit(cache=True)
-def sides(x: float, y: float, z: float, faces: int, work: Surface) -> tuple[int, int]:
-    """For how many triangles a point is not proven to be inside, and for how many it is clearly outside."""
-    nx, ny, nz, d = work.planes[0], work.planes[1], work.planes[2], work.planes[3]
-    rounding, thin = work.slack[0], work.slack[1]
+def look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s) -> tuple[int, int]:
+    """For how many triangles a point is not proven to be inside, and how many it sees from clearly outside."""
     outside, beyond = 0, 0
-    for f in range(faces):
-        height = nx[f] * x + ny[f] * y + nz[f] * z - d[f]
-        outside += height >= -rounding[f]
-        beyond += height > thin[f]
+    for f in range(count):
+        height = planes[NX, f] * x + planes[NY, f] * y + planes[NZ, f] * z - planes[OFFSET, f]
+        outside += height >= -planes[ROUNDING, f]
+        beyond += height > planes[THIN, f]
+        faces[SEEN, f] = height > planes[THIN, f]
     return outside, beyond
 
 
 @njit(cache=True)
-def set_plane(points: Floats, f: int, i: int, j: int, k: int, size: float, work: Surface) -> None:
+def set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, faces: Int32s) -> None:
     """Writes triangle f with corners in slots i, j, k, without joining it to its neighbours."""
-    a, b, c = work.slots[i], work.slots[j], work.slots[k]
-    x, y, z = points[a, 0], points[a, 1], points[a, 2]
-    ux, uy, uz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
-    vx, vy, vz = points[c, 0] - x, points[c, 1] - y, points[c, 2] - z
+    x, y, z = planes[X, i], planes[Y, i], planes[Z, i]
+    ux, uy, uz = planes[X, j] - x, planes[Y, j] - y, planes[Z, j] - z
+    vx, vy, vz = planes[X, k] - x, planes[Y, k] - y, planes[Z, k] - z
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     edges = np.sqrt((ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz))
-    work.planes[0, f], work.planes[1, f], work.planes[2, f] = nx, ny, nz
-    work.planes[3, f] = nx * x + ny * y + nz * z
-    work.slack[0, f] = _ROUNDING * edges * size
-    work.slack[1, f] = work.slack[0, f] + _THIN_M * np.sqrt(nx * nx + ny * ny + nz * nz)
-    work.faces[f, 0], work.faces[f, 1], work.faces[f, 2] = i, j, k
+    planes[NX, f], planes[NY, f], planes[NZ, f] = nx, ny, nz
+    planes[OFFSET, f] = nx * x + ny * y + nz * z
+    rounding = _ROUNDING * edges * size
+    planes[ROUNDING, f] = rounding
+    planes[THIN, f] = rounding + _THIN_M * np.sqrt(nx * nx + ny * ny + nz * nz)
+    faces[A, f], faces[B, f], faces[C, f] = i, j, k
 
 
 @njit(cache=True)
-def join(f: int, work: Surface) -> None:
+def join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:
     """Makes triangle f the owner of its edges."""
-    i, j, k = work.faces[f, 0], work.faces[f, 1], work.faces[f, 2]
-    work.owner[i, j], work.owner[j, k], work.owner[k, i] = f, f, f
+    i, j, k = faces[A, f], faces[B, f], faces[C, f]
+    owner[i * width + j] = f
+    owner[j * width + k] = f
+    owner[k * width + i] = f
 
 
 @njit(cache=True)
-def insert(points: Floats, index: int, inner: Floats, size: float, faces: int, slots: int, work: Surface) -> int:
-    """Replaces the triangles that a point sees by a fan from their rim to it; returns the number of triangles.
-
-    Where rounding leaves no simple rim, or a new triangle that does not face outward, nothing changes: the point
-    just stays outside the surface.
-    """
-    hidden = _look(points[index], faces, work)
-    rim = _rim(hidden, work)
-    if rim == 0 or faces + rim > len(work.seen):
-        return 0
-    work.slots[slots] = index
-    for n in range(rim):
-        f = faces + n
-        set_plane(points, f, work.rim[0, n], work.rim[1, n], slots, size, work)
-        nx, ny, nz = work.planes[0, f], work.planes[1, f], work.planes[2, f]
-        if nx * inner[0] + ny * inner[1] + nz * inner[2] - work.planes[3, f] >= -work.slack[1, f]:
-            return 0
-    for f in range(faces, faces + rim):
-        work.seen[f] = False
-        join(f, work)
-    return _fill(hidden, faces + rim, work)
+def hide(count: int, faces: Int32s) -> int:
+    """Lists the triangles that the last point looked at sees; returns how many."""
+    hidden = 0
+    for f in range(count):
+        if faces[SEEN, f]:
+            faces[HIDDEN, hidden] = f
+            hidden += 1
+    return hidden
 
 
 @njit(cache=True)
-def _look(point: Floats, faces: int, work: Surface) -> int:
-    """Lists the triangles that a point sees; returns how many."""
-    x, y, z = point[0], point[1], point[2]
-    nx, ny, nz, d = work.planes[0], work.planes[1], work.planes[2], work.planes[3]
-    seen, thin, hidden = work.seen, work.slack[1], work.hidden
-    for f in range(faces):
-        seen[f] = nx[f] * x + ny[f] * y + nz[f] * z - d[f] > thin[f]
+def outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:
+    """Lists the edges between seen and unseen triangles; returns how many."""
     n = 0
-    for f in range(faces):
-        if seen[f]:
-            hidden[n] = f
-            n += 1
+    for h in range(hidden):
+        f = faces[HIDDEN, h]
+        i, j, k = faces[A, f], faces[B, f], faces[C, f]
+        faces[START, n], faces[END, n] = i, j
+        n += faces[SEEN, owner[j * width + i]] == 0
+        faces[START, n], faces[END, n] = j, k
+        n += faces[SEEN, owner[k * width + j]] == 0
+        faces[START, n], faces[END, n] = k, i
+        n += faces[SEEN, owner[i * width + k]] == 0
     return n
 
 
 @njit(cache=True)
-def _rim(hidden: int, work: Surface) -> int:
-    """Lists the edges between seen and unseen triangles; returns how many, 0 unless they are one simple loop.
+def is_loop(edges: int, faces: Int32s) -> bool:
+    """Whether the edges are one simple loop: a closed surface stays closed when that is cut out of it and filled.
 
-    A closed surface stays closed when one simple loop is cut out of it and filled anew.
+    They enter each slot as often as they leave it, so who follows them stays on them. Who is back at the start after as
+    many steps as there are edges, and not before, has been along each of them.
     """
-    n = 0
-    for h in range(hidden):
-        for k in range(3):
-            i, j = work.faces[work.hidden[h], k], work.faces[work.hidden[h], (k + 1) % 3]
-            if not work.seen[work.owner[j, i]]:
-                if n == work.rim.shape[1]:
-                    return 0
-                work.rim[0, n], work.rim[1, n] = i, j
-                n += 1
-    for e in range(n):
-        work.follows[work.rim[0, e]] = -1
-    for e in range(n):
-        if work.follows[work.rim[0, e]] != -1:
-            return 0
-        work.follows[work.rim[0, e]] = work.rim[1, e]
-    if n == 0:
-        return 0
-    corner, steps = work.follows[work.rim[0, 0]], 1
-    while corner != work.rim[0, 0] and steps < n:
-        corner = work.follows[corner]
-        steps += 1
-    return n if steps == n and corner == work.rim[0, 0] else 0
+    for e in range(edges):
+        faces[FOLLOWS, faces[START, e]] = faces[END, e]
+    start = faces[START, 0]
+    corner, back = faces[FOLLOWS, start], 0
+    for _ in range(edges - 1):
+        back += corner == start
+        corner = faces[FOLLOWS, corner]
+    return back == 0 and corner == start
 
 
 @njit(cache=True)
-def _fill(hidden: int, end: int, work: Surface) -> int:
+def fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: Floats, faces: Int32s) -> bool:
+    """Adds triangles from the edges to the point in a slot, not joined yet; returns whether all of them face outward."""
+    inward = 0
+    for n in range(edges):
+        f = count + n
+        set_plane(f, faces[START, n], faces[END, n], slot, size, planes, faces)
+        height = planes[NX, f] * inner[0] + planes[NY, f] * inner[1] + planes[NZ, f] * inner[2] - planes[OFFSET, f]
+        inward += height >= -planes[THIN, f]
+    return inward == 0
+
+
+@njit(cache=True)
+def join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) -> None:
+    """Joins new triangles to their neighbours."""
+    for f in range(start, end):
+        faces[SEEN, f] = 0
+        join(f, width, faces, owner)
+
+
+@njit(cache=True)
+def fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owner: Int32s) -> int:
     """Moves the last triangles into the places of those no longer needed; returns the number of triangles."""
     for h in range(hidden):
-        hole = work.hidden[h]
-        while end > hole and work.seen[end - 1]:
+        hole = faces[HIDDEN, h]
+        while end > hole and faces[SEEN, end - 1]:
             end -= 1
-        if end <= hole:
-            break
-        end -= 1
-        for k in range(4):
-            work.planes[k, hole] = work.planes[k, end]
-        for k in range(2):
-            work.slack[k, hole] = work.slack[k, end]
-        for k in range(3):
-            work.faces[hole, k] = work.faces[end, k]
-        work.seen[hole] = False
-        join(hole, work)
+        if end > hole:
+            end -= 1
+            _move(end, hole, planes, faces)
+            join(hole, width, faces, owner)
     return end
+
+
+@njit(cache=True)
+def _move(f: int, hole: int, planes: Floats, faces: Int32s) -> None:
+    for k in (NX, NY, NZ, OFFSET, ROUNDING, THIN):
+        planes[k, hole] = planes[k, f]
+    for k in (A, B, C):
+        faces[k, hole] = faces[k, f]
+    faces[SEEN, hole] = 0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hrcreplay.human.surface import Surface, sides
+from hrcreplay.human.surface import NX, NY, POINT, A, B, C, Surface, is_inside
 from hrcreplay.human.sweep import TRIANGLE_RAD, copies, turns
 from hrcreplay.records import Floats
 
@@ -56,6 +56,7 @@ def sweep_walk(
     cosines, sines = np.empty(most), np.empty(most)
     made = turns(heading[0], heading[1], cosines, sines, widest)
     steps = _steps_inside(points, count, faces, work)
+    sides = _directions(floor)
     n = 0
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
@@ -64,15 +65,39 @@ def sweep_walk(
             away = _away_from_turned(x, y, copy, made, cosines, sines)
             for k in (0, 2):
                 away = _widen(away, s * steps[i, k + 1] - c * steps[i, k], -s * steps[i, k] - c * steps[i, k + 1])
-            for place in floor:
-                cone = _widen(_widen(away, place[2], place[3]), place[4], place[5])
-                if cone[0] == ALL_ROUND:
+            for k in range(len(floor)):
+                if _is_between(away, k, sides):
                     continue
-                swept[n, 0] = c * x - s * y + place[0]
-                swept[n, 1] = s * x + c * y + place[1]
+                swept[n, 0] = c * x - s * y + floor[k, 0]
+                swept[n, 1] = s * x + c * y + floor[k, 1]
                 swept[n, 2] = points[i, 2]
                 n += 1
     return n
+
+
+@njit(cache=True)
+def _directions(floor: Floats) -> Floats:
+    """(k, 4) the two vectors of each place as unit vectors; zero ones stay."""
+    sides = np.zeros((len(floor), 4))
+    for k in range(len(floor)):
+        for j in (0, 2):
+            x, y = floor[k, 2 + j], floor[k, 3 + j]
+            length = np.sqrt(x * x + y * y)
+            if length > 0.0:
+                sides[k, j], sides[k, j + 1] = x / length, y / length
+    return sides
+
+
+@njit(cache=True)
+def _is_between(away: Cone, k: int, sides: Floats) -> bool:
+    """Whether a copy is no corner at a place, given the directions to it from its set and from its turned copies."""
+    if away[0] == ALL_ROUND:
+        return True
+    for j in (0, 2):
+        x, y = sides[k, j], sides[k, j + 1]
+        if x != 0.0 or y != 0.0:
+            away = _widen_to(away, x, y)
+    return away[0] == ALL_ROUND
 
 
 @njit(cache=True)
@@ -117,11 +142,18 @@ def _away_from_turned(x: float, y: float, copy: int, made: int, cosines: Floats,
 @njit(cache=True)
 def _widen(cone: Cone, x: float, y: float) -> Cone:
     """The cone with another direction in it; a zero vector is none."""
-    kind, ax, ay, bx, by = cone
     length = np.sqrt(x * x + y * y)
-    if kind == ALL_ROUND or length == 0.0:
+    if cone[0] == ALL_ROUND or length == 0.0:
         return cone
-    x, y = x / length, y / length
+    return _widen_to(cone, x / length, y / length)
+
+
+@njit(cache=True)
+def _widen_to(cone: Cone, x: float, y: float) -> Cone:
+    """The cone with a unit vector in it."""
+    kind, ax, ay, bx, by = cone
+    if kind == ALL_ROUND:
+        return cone
     if kind == EMPTY:
         return POINTED, x, y, x, y
     from_a, to_b = ax * y - ay * x, x * by - y * bx
@@ -142,9 +174,9 @@ def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floa
     """
     normals = [(EMPTY, 0.0, 0.0, 0.0, 0.0) for _ in range(count)]
     for f in range(faces):
-        for k in range(3):
-            i = work.slots[work.faces[f, k]]
-            normals[i] = _widen(normals[i], work.planes[0, f], work.planes[1, f])
+        for k in (A, B, C):
+            i = work.faces[POINT, work.faces[k, f]]
+            normals[i] = _widen(normals[i], work.planes[NX, f], work.planes[NY, f])
     steps = np.zeros((count, 4))
     for i in range(count):
         kind, ax, ay, bx, by = normals[i]
@@ -153,7 +185,6 @@ def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floa
         for k, x, y in ((0, -by, bx), (2, ay, -ax)):  # at right angles to the outermost normals
             x, y = x - _OFF_EDGE * (ax + bx), y - _OFF_EDGE * (ay + by)
             px, py = points[i, 0] + _STEP_M * x, points[i, 1] + _STEP_M * y
-            outside, _ = sides(px, py, points[i, 2], faces, work)
-            if outside == 0:
+            if is_inside(px, py, points[i, 2], faces, work.planes):
                 steps[i, k], steps[i, k + 1] = x, y
     return steps
