@@ -21,8 +21,6 @@ MOST_FACES = 2 * MOST_SLOTS
 _ROUNDING = 64 * np.finfo(np.float64).eps
 #: Points that stick out less are kept but not built into the surface: they would make slivers [m].
 _THIN_M = 1e-10
-#: Triangles tested before asking whether one was enough.
-_BLOCK = 32
 #: Rows of ``Surface.planes``: outward normal, not of unit length, its product with a corner, rounding error of the side
 #: test, and how far out a point must be to be built in; and of a slot: where its point is [m].
 NX, NY, NZ, OFFSET, ROUNDING, THIN, X, Y, Z = range(9)
@@ -50,14 +48,11 @@ def surface() -> Surface:
 @njit(cache=True)
 def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:
     """Whether a point is proven to be inside of all triangles."""
-    for start in range(0, count, _BLOCK):
-        outside = 0
-        for f in range(start, min(start + _BLOCK, count)):
-            height = planes[NX, f] * x + planes[NY, f] * y + planes[NZ, f] * z - planes[OFFSET, f]
-            outside += height >= -planes[ROUNDING, f]
-        if outside > 0:
-            return False
-    return True
+    outside = 0
+    for f in range(count):
+        height = planes[NX, f] * x + planes[NY, f] * y + planes[NZ, f] * z - planes[OFFSET, f]
+        outside += height >= -planes[ROUNDING, f]
+    return outside == 0
 
 
 @njit(cache=True)
@@ -102,9 +97,8 @@ def hide(count: int, faces: Int32s) -> int:
     """Lists the triangles that the last point looked at sees; returns how many."""
     hidden = 0
     for f in range(count):
-        if faces[SEEN, f]:
-            faces[HIDDEN, hidden] = f
-            hidden += 1
+        faces[HIDDEN, hidden] = f
+        hidden += faces[SEEN, f]
     return hidden
 
 
@@ -143,7 +137,7 @@ def is_loop(edges: int, faces: Int32s) -> bool:
 
 @njit(cache=True)
 def fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: Floats, faces: Int32s) -> bool:
-    """Adds triangles from the edges to the point in a slot, not joined yet; returns whether all of them face outward."""
+    """Adds triangles from the edges to the point in a slot, not joined yet; returns whether all face outward."""
     inward = 0
     for n in range(edges):
         f = count + n
