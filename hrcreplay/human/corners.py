@@ -39,9 +39,9 @@ from hrcreplay.records import Bools, Floats, Ints
 
 #: A set whose four most distant points are flatter than this has no surface [m].
 _FLAT_M = 1e-7
-#: (3, 13) directions whose extreme points are built in first: the axes and the diagonals of faces and space.
-_SEEDS = np.ascontiguousarray(
-    np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)], float).T
+#: Directions whose extreme points are built in first: the axes and the diagonals of faces and space.
+_SEEDS = np.array(
+    [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)], dtype=np.float64
 )
 
 
@@ -152,13 +152,17 @@ def _seeds_first(points: Floats, count: int) -> Ints:
     """Indices of the points, the extreme ones of some directions first: they make the surface big soon."""
     first = np.zeros(count, np.bool_)
     order = np.empty(count, np.int64)
-    lowest, highest = np.full(_SEEDS.shape[1], np.inf), np.full(_SEEDS.shape[1], -np.inf)
-    low, high = np.zeros(_SEEDS.shape[1], np.int64), np.zeros(_SEEDS.shape[1], np.int64)
-    for i in range(count):
-        _stretch(i, points[i, 0], points[i, 1], points[i, 2], lowest, highest, low, high)
     n = 0
-    for seed in range(_SEEDS.shape[1]):
-        for i in (low[seed], high[seed]):
+    for seed in _SEEDS:
+        x, y, z = seed[0], seed[1], seed[2]
+        low, high, lowest, highest = 0, 0, np.inf, -np.inf
+        for i in range(count):
+            along = x * points[i, 0] + y * points[i, 1] + z * points[i, 2]
+            if along < lowest:
+                low, lowest = i, along
+            if along > highest:
+                high, highest = i, along
+        for i in (low, high):
             if not first[i]:
                 first[i] = True
                 order[n] = i
@@ -168,17 +172,6 @@ def _seeds_first(points: Floats, count: int) -> Ints:
             order[n] = i
             n += 1
     return order
-
-
-@njit(cache=True)
-def _stretch(i: int, x: float, y: float, z: float, lowest: Floats, highest: Floats, low: Ints, high: Ints) -> None:
-    """Notes point i for all directions in which it is further out than those before it."""
-    for seed in range(_SEEDS.shape[1]):
-        along = _SEEDS[0, seed] * x + _SEEDS[1, seed] * y + _SEEDS[2, seed] * z
-        low[seed] = i if along < lowest[seed] else low[seed]
-        lowest[seed] = along if along < lowest[seed] else lowest[seed]
-        high[seed] = i if along > highest[seed] else high[seed]
-        highest[seed] = along if along > highest[seed] else highest[seed]
 
 
 @njit(cache=True)
