@@ -11,6 +11,7 @@ import numpy as np
 
 from hrcreplay import __version__, wiring
 from hrcreplay.audit import tightening
+from hrcreplay.audit.fit_words import lines
 from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, record
 from hrcreplay.audit.window import standstill_s, window
 from hrcreplay.errors import LogError, SettingsError
@@ -86,22 +87,10 @@ def run(
         SettingsError: A setting cannot be used, or ``out`` exists.
         LogError: A log cannot be read, is too short, or shows no arm motion.
     """
-    if not 0.0 < coverage < 1.0:
-        raise SettingsError(f"--coverage {coverage:g}: no bound holds always or never; give a share between 0 and 1")
-    if not 0.0 < held_back < 1.0:
-        raise SettingsError(f"--held-back {held_back:g}: would be right: a share between 0 and 1")
-    if cover not in COVERS:
-        raise SettingsError(f"--cover {cover}: would be right: {', '.join(COVERS)}")
-    if not logs:
-        raise SettingsError("fit-limits: found no log; give at least one")
-    if out.exists():
-        raise SettingsError(f"{out}: exists already; name another file, or remove it")
+    _refuse(logs, out, coverage, held_back, cover)
     shared = {"config": config, "overrides": overrides, "cell_file": cell_file, "start_s": start_s, "end_s": end_s}
     jobs = [resolve("fit-limits", log, **shared) for log in logs]  # type: ignore[arg-type]
-    horizons = {wiring.foresight(job).horizon_s for job in jobs}
-    if len(horizons) > 1:
-        raise SettingsError(f"occupancy.stop_s: found {sorted(horizons)} s; all logs need one horizon, set it")
-    horizon_s = horizons.pop()
+    horizon_s = _horizon_s(jobs)
     samples = [_sample(job, horizon_s, held_back) for job in jobs]
     found = _fit(samples, coverage, horizon_s)
     limits = _limits(found, samples, out.stem)
@@ -113,7 +102,28 @@ def run(
         limits = found.onto(limits, out.stem)
     facts = _facts(samples, found, limits, coverage, horizon_s, held_back) | {"covers": cover} | limbs
     write_limits(limits, facts, out)
-    return _lines(found, limits, facts)
+    return lines(found, limits, facts, STANDARD)
+
+
+def _refuse(logs: Sequence[Path], out: Path, coverage: float, held_back: float, cover: str) -> None:
+    """Raises SettingsError for what cannot be used."""
+    if not 0.0 < coverage < 1.0:
+        raise SettingsError(f"--coverage {coverage:g}: no bound holds always or never; give a share between 0 and 1")
+    if not 0.0 < held_back < 1.0:
+        raise SettingsError(f"--held-back {held_back:g}: would be right: a share between 0 and 1")
+    if cover not in COVERS:
+        raise SettingsError(f"--cover {cover}: would be right: {', '.join(COVERS)}")
+    if not logs:
+        raise SettingsError("fit-limits: found no log; give at least one")
+    if out.exists():
+        raise SettingsError(f"{out}: exists already; name another file, or remove it")
+
+
+def _horizon_s(jobs: Sequence[Job]) -> float:
+    horizons = {wiring.foresight(job).horizon_s for job in jobs}
+    if len(horizons) > 1:
+        raise SettingsError(f"occupancy.stop_s: found {sorted(horizons)} s; all logs need one horizon, set it")
+    return horizons.pop()
 
 
 def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
@@ -262,38 +272,3 @@ def _plain(share: Estimate) -> dict[str, Any]:
     """A share with its interval and its ticks; without what is not known."""
     numbers = {"share": share.value, "low": share.low, "high": share.high}
     return {key: round(value, 4) for key, value in numbers.items() if np.isfinite(value)} | {"ticks": share.samples}
-
-
-def _lines(found: Fit, limits: LimitSet, facts: dict[str, Any]) -> list[str]:
-    lines = [
-        f"{joint}: velocity {limits.v_min[j]:g} to {limits.v_max[j]:g}, acceleration {limits.a_min[j]:g} to "
-        f"{limits.a_max[j]:g}; held back {_text(facts['joints'][joint]['held_back'])}"
-        for j, joint in enumerate(JOINTS)
-        if not found.kept[j]
-    ]
-    if facts["kept"]:
-        lines.append(
-            f"too little motion to say (fewer than {fitting.EXCURSIONS} horizons with motion), so the bounds of "
-            f"{KEPT} stay: {', '.join(facts['kept'])}"
-        )
-    if len(facts["kept"]) == len(JOINTS):
-        lines.append(f"no joint was fitted: these are the rates of {KEPT} under another name")
-    if "and" in facts["positions"]:
-        lines.append(f"recorded postures leave the positions of {STANDARD}: written are {facts['positions']}")
-    for log in facts["logs"]:
-        left_out = f"; fitted to the other logs {_text(log['left_out'])}" if "left_out" in log else ""
-        lines.append(f"{log['name']}: training {_text(log['training'])}; held back {_text(log['held_back'])}{left_out}")
-    total = facts["total"]
-    if "limbs" in facts:
-        training, held_back = (_text(facts["limbs"][part]) for part in ("training", "held_back"))
-        lines.append(f"limbs in the volumes of {facts['method']}: training {training}; held back {held_back}")
-    return [*lines, f"all joints: training {_text(total['training'])}; held back {_text(total['held_back'])}"]
-
-
-def _text(share: dict[str, Any]) -> str:
-    if "share" not in share:
-        return "unknown"
-    numbers = f"{100.0 * share['share']:.1f} %"
-    if "low" in share:
-        numbers += f" ({100.0 * share['low']:.1f} to {100.0 * share['high']:.1f} %)"
-    return f"{numbers} of {share['ticks']} ticks"

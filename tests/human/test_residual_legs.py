@@ -10,7 +10,7 @@ import pytest
 from hrcreplay.human.fusion import FusionSettings
 from hrcreplay.human.residual import LEAST
 from hrcreplay.records import BODY, LIMBS, POINTS, CameraFrames, Floats, HumanStates, Measurements
-from tests.human.test_residual import RATE_HZ, bent, fused, measured, ticks, used_frames
+from tests.human.bent import RATE_HZ, bent, fused, measured, ticks, used_frames
 
 Legs = dict[str, tuple[float, float, float]]
 LEGS = BODY.index("LEGS")
