@@ -58,16 +58,19 @@ def distances(ends: Floats, vertices: Floats, offsets: Ints) -> tuple[Floats, Fl
     )
     for s in range(links):
         for k in range(limbs):
-            low[s, k], high[s, k], count = _distance(ends[s], vertices, offsets[k], offsets[k + 1], work)
+            start = near[s - 1, k, 0] if s else offsets[k]  # the link before is seldom far from this one
+            low[s, k], high[s, k], count = _distance(ends[s], vertices, offsets[k], offsets[k + 1], start, work)
             for i in range(MOST):
                 near[s, k, i] = work.codes[i if i < count else 0] // 2
     return low, high, near
 
 
 @njit(cache=True)
-def _distance(ends: Floats, vertices: Floats, first: int, last: int, on: Carriers) -> tuple[float, float, int]:
+def _distance(
+    ends: Floats, vertices: Floats, first: int, last: int, start: int, on: Carriers
+) -> tuple[float, float, int]:
     """Both bounds of one distance, and how many differences carry it."""
-    code, before, count = 2 * first, -1, 0
+    code, before, count = 2 * start, -1, 0
     low, high = 0.0, np.inf
     for _ in range(_STEPS):
         count = _shortest(on, _join(on, count, code, ends, vertices))
