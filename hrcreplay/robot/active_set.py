@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.vectors import dot, norm
 
 #: A row of unit length in the metric of the cost is broken above this.
 BROKEN = 1e-13
@@ -82,8 +83,8 @@ def settle(work: Working, rows: int, count: int) -> int:
         count, taken = _take(E, h, p, y, work.z, work.held, count)
         if taken:
             continue
-        if _dot(E[p], y) - h[p] <= ROUNDING:
-            h[p] = _dot(E[p], y)  # where the held rows leave no room, others are broken by rounding errors
+        if dot(E[p], y) - h[p] <= ROUNDING:
+            h[p] = dot(E[p], y)  # where the held rows leave no room, others are broken by rounding errors
         else:
             break
     return -1
@@ -119,7 +120,7 @@ def _worst(E: Floats, h: Floats, y: Floats) -> int:
     """The row that y breaks most; -1 where all hold."""
     worst, most = -1, BROKEN
     for i in range(len(E)):
-        broken = _dot(E[i], y) - h[i]
+        broken = dot(E[i], y) - h[i]
         if broken > most:
             worst, most = i, broken
     return worst
@@ -133,9 +134,9 @@ def _take(E: Floats, h: Floats, p: int, y: Floats, z: Floats, held: Ints, count:
     """
     while True:
         r, across = _split(E, held, count, E[p])
-        squared = _dot(across, across)
+        squared = dot(across, across)
         depends = count == len(y) or squared <= DEPENDENT
-        full = np.inf if depends else (_dot(E[p], y) - h[p]) / squared
+        full = np.inf if depends else (dot(E[p], y) - h[p]) / squared
         partial, leaving = np.inf, -1
         for j in range(count):
             if r[j] > 0.0 and z[held[j]] / r[j] < partial:
@@ -178,7 +179,7 @@ def _remove(basis: Floats, count: int, v: Floats, along: Floats) -> None:
     """Takes off v what lies along the first vectors of a basis, and adds up how much."""
     for _ in range(2):  # twice is enough
         for j in range(count):
-            part = _dot(basis[j], v)
+            part = dot(basis[j], v)
             along[j] += part
             for c in range(len(v)):
                 v[c] -= part * basis[j, c]
@@ -219,17 +220,3 @@ def _backward(L: Floats, y: Floats) -> Floats:
             rest -= L[k, i] * w[k]
         w[i] = rest / L[i, i]
     return w
-
-
-@njit(cache=True)
-def _dot(a: Floats, b: Floats) -> float:
-    total = 0.0
-    for k in range(len(a)):
-        total += a[k] * b[k]
-    return total
-
-
-@njit(cache=True)
-def norm(v: Floats) -> float:
-    """Euclidean length."""
-    return math.sqrt(_dot(v, v))

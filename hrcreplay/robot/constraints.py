@@ -11,6 +11,7 @@ from numba import njit
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.model import RobotPose
 from hrcreplay.robot.obstacles import Obstacles
+from hrcreplay.robot.vectors import dot3
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,7 @@ class Approach(NamedTuple):
     stop_s: float  #: T_s [s]
 
 
-def approach(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, stop_s: float) -> Approach:
+def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, stop_s: float) -> Approach:
     """The approach rows of a tick, none of them written down."""
     hulls = obstacles
     return Approach(pose.ends_m, pose.J_ends, hulls.vertices_m, hulls.offsets, hulls.boxes_m, room_m2, stop_s)
@@ -94,24 +95,23 @@ def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, 
         [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2].
     """
     ends, J_ends, vertices, offsets, boxes, room, stop_s = rows
-    dq, above = dq_next, above_m2
     links, limbs = room.shape
     which = np.empty((2 * links * limbs, 4), dtype=np.int64)
-    A, values = np.empty((len(which), len(dq))), np.empty(len(which))
+    A, values = np.empty((len(which), len(dq_next))), np.empty(len(which))
     n = 0
     for s in range(links):
         for end in range(2):
-            v = _times(J_ends[s, end], dq)
-            rest = -_dot(ends[s, 0], v)
+            v = _times(J_ends[s, end], dq_next)
+            rest = -dot3(ends[s, 0], v)
             if end == 1:
-                rest -= _dot(ends[s, 1] - ends[s, 0], _times(J_ends[s, 0], dq))
+                rest -= dot3(ends[s, 1] - ends[s, 0], _times(J_ends[s, 0], dq_next))
             for k in range(limbs):
-                bound = room[s, k] + above
+                bound = room[s, k] + above_m2
                 if stop_s * (_box_top(boxes[k], v) + rest) <= bound:
                     continue
                 best, top = offsets[k], -np.inf
                 for i in range(offsets[k], offsets[k + 1]):
-                    along = _dot(vertices[i], v)
+                    along = dot3(vertices[i], v)
                     if along > top:
                         best, top = i, along
                 value = stop_s * (top + rest)
@@ -151,8 +151,3 @@ def _times(J: Floats, dq: Floats) -> Floats:
         for j in range(len(dq)):
             v[i] += J[i, j] * dq[j]
     return v
-
-
-@njit(cache=True)
-def _dot(a: Floats, b: Floats) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.vectors import dot3
 
 #: A distance is proven when its bounds are this close [m].
 EXACT_M = 1e-10
@@ -140,7 +141,7 @@ def _plane(on: Carriers, count: int) -> bool:
             return False
     on.wanted[0] = 1.0
     for i in range(count - 2, -1, -1):
-        rest = -_dot(on.basis[i], on.points[0])
+        rest = -dot3(on.basis[i], on.points[0])
         for j in range(i + 1, count - 1):
             rest -= on.triangle[i, j] * on.wanted[j + 1]
         on.wanted[i + 1] = rest / on.triangle[i, i]
@@ -154,23 +155,18 @@ def _edge(on: Carriers, i: int) -> bool:
     e = on.basis[i]
     for c in range(3):
         e[c] = on.points[i + 1, c] - on.points[0, c]
-    length = math.sqrt(_dot(e, e))
+    length = math.sqrt(dot3(e, e))
     for j in range(i):
         on.triangle[j, i] = 0.0
     for _ in range(2):  # twice is enough
         for j in range(i):
-            part = _dot(on.basis[j], e)
+            part = dot3(on.basis[j], e)
             on.triangle[j, i] += part
             for c in range(3):
                 e[c] -= part * on.basis[j, c]
-    on.triangle[i, i] = math.sqrt(_dot(e, e))
+    on.triangle[i, i] = math.sqrt(dot3(e, e))
     if not on.triangle[i, i] > _FLAT * length:
         return False
     for c in range(3):
         e[c] /= on.triangle[i, i]
     return True
-
-
-@njit(cache=True)
-def _dot(a: Floats, b: Floats) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -8,8 +8,9 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.records import Floats, Ints
-from hrcreplay.robot.active_set import Working, add, norm, settle, solution, working
+from hrcreplay.robot.active_set import Working, add, settle, solution, working
 from hrcreplay.robot.constraints import Approach, worst_rows
+from hrcreplay.robot.vectors import norm
 
 #: Approach rows that may join in before the problem counts as unsolved.
 MOST = 200
@@ -63,20 +64,25 @@ def optimum(H: Floats, g: Floats, limits: Limits, rows: Approach, above_m2: floa
         if count < 0:
             outcome = INFEASIBLE
             break
-        w, _ = solution(work, m)
+        w, _ = _candidate(work, m, limits)
         if not np.isfinite(w.sum()):
             outcome = NOT_FINITE
             break
-        w = np.minimum(np.maximum(w, limits.low), limits.high)
         before = m
         m, clear = _join(work, which, fixed, m, rows, w, above_m2)
         if m == before:
             outcome = SOLVED if clear else RESIDUAL
             break
         count = settle(work, m, count)
-    w, z = solution(work, m)
-    w = np.minimum(np.maximum(w, limits.low), limits.high)
+    w, z = _candidate(work, m, limits)
     return Optimum(outcome, w, work.A[:m].copy(), work.high[:m].copy(), z, fixed)
+
+
+@njit(cache=True)
+def _candidate(work: Working, m: int, limits: Limits) -> tuple[Floats, Floats]:
+    """What it has settled on, rounded into the axes' bounds, and the multipliers."""
+    w, z = solution(work, m)
+    return np.minimum(np.maximum(w, limits.low), limits.high), z
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.bounds import cartesian_bounds, joint_bounds
-from hrcreplay.robot.constraints import Approach, approach, worst_rows
+from hrcreplay.robot.constraints import Approach, tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, RobotPose
 from hrcreplay.robot.obstacles import Obstacles
 from hrcreplay.robot.optimum import Limits
@@ -59,5 +59,5 @@ def problem(
     )
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
     J_low, J_high = cartesian_bounds(J, dJdq, state.dq, settings.tcp_speed_max, settings.tcp_acceleration_max, dt_s)
-    rows = approach(pose, obstacles, pairs.room_m2(), settings.stop_s)
+    rows = tick_rows(pose, obstacles, pairs.room_m2(), settings.stop_s)
     return Problem(H, g, Limits(low, high, J, J_low, J_high), rows)

@@ -12,7 +12,7 @@ from numba import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot import stepping
 from hrcreplay.robot.bounds import cartesian_bounds
-from hrcreplay.robot.constraints import approach, worst_rows
+from hrcreplay.robot.constraints import tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.obstacles import Obstacles
 from hrcreplay.robot.reference import Reference, ReferencePoint
@@ -167,7 +167,7 @@ def _safe_rate(sight: Sight, obstacles: Obstacles, towards: Floats, rate: float,
     pairs = sight.pairs
     if pairs is None:
         return math.nan
-    rows = approach(sight.pose, obstacles, pairs.room_m2(), stop_s)
+    rows = tick_rows(sight.pose, obstacles, pairs.room_m2(), stop_s)
     for _ in range(ROUNDS):
         which, _, values = worst_rows(rows, rate * towards, HELD)
         if not len(which):

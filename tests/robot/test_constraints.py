@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.bounds import RAD_PER_M, cartesian_bounds, joint_bounds
-from hrcreplay.robot.constraints import approach, approach_rows, link_segment, worst_rows
+from hrcreplay.robot.constraints import approach_rows, link_segment, tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.obstacles import obstacles
 from hrcreplay.robot.stepping import RobotState, braked, integrate
@@ -57,7 +57,7 @@ def test_worst_rows_are_the_worst_of_all_rows(robot: RobotModel) -> None:
         limbs = [cloud(rng, 25, rng.uniform(0.02, 0.3, 3)) + rng.normal(size=3) * 0.5 for _ in range(4)]
         seen = obstacles(volumes(limbs), 0)
         distance = by_coal(pose, seen)
-        which, A, values = worst_rows(approach(pose, seen, np.maximum(0.0, distance - 0.1) ** 2, STOP_S), dq, 0.0)
+        which, A, values = worst_rows(tick_rows(pose, seen, np.maximum(0.0, distance - 0.1) ** 2, STOP_S), dq, 0.0)
         found = {
             tuple(key[:3]): (key[3], row, value) for key, row, value in zip(which.tolist(), A, values, strict=True)
         }
