@@ -42,7 +42,8 @@ def flight() -> Flight:
 
 @pytest.fixture(scope="module")
 def messages(flight: Flight) -> list[bytes]:
-    end = {"what": "end", "reason": "Ctrl-C", "counts": {"robot lost": 2}, "dropped": 0, "stops": []}
+    end = {"what": "end", "reason": "Ctrl-C", "counts": {"robot lost": 2}, "dropped": 0, "looks_skipped": 3}
+    end |= {"stops": []}
     start = {"what": "start", **flight.start}
     note = wire.event(BEGIN_NS + 2, {"what": "note", "text": "a remark"})
     return [wire.event(BEGIN_NS - 1, start), *flight.messages, note, wire.event(BEGIN_NS + 4_000_000_000, end)]
@@ -65,6 +66,7 @@ def test_the_session_is_a_run_like_any_other(run: Path, flight: Flight) -> None:
     assert meta["created"] == "2027-01-15T07:59:59Z"
     assert meta["inputs"] == [{"path": "log.mcap", "sha256": runs.sha256(run / "log.mcap")}]
     assert meta["counts"]["robot_lost"] == 2
+    assert meta["counts"]["looks_skipped"] == 3
     assert meta["counts"]["answers"] == len(flight.answers)
     assert {*meta["outputs"]} >= {"log.mcap", "state.parquet", "motion.parquet", "occupancy.parquet", "report.html"}
     assert meta["outputs"] == {name: runs.sha256(run / name) for name in meta["outputs"]}

@@ -3,6 +3,9 @@ from __future__ import annotations
 import pytest
 
 from hrcreplay.live import watch, wire
+from hrcreplay.live.driver import outcome
+from hrcreplay.live.motion import Course, Said
+from hrcreplay.live.records import Answer, TickEvent
 from hrcreplay.live.setup import build
 from hrcreplay.live.verify import Again
 from hrcreplay.planner import QpFollower
@@ -27,7 +30,7 @@ def test_looks_that_do_not_fit_are_left_out_and_packets_are_not(look_s: float) -
     flight = Flight()
     loop = counted(flight, look_s=look_s).fly(SECONDS)
     assert count(loop, wire.REPLY) == count(loop, wire.ROBOT) == loop.answers > 0.98 * SECONDS / CYCLE_S
-    assert loop.skipped > 100
+    assert outcome(loop)["looks_skipped"] == loop.skipped > 100
     assert not flight.pilot.stops
     assert loop.seen[-1].row is not None
     assert loop.seen[-1].row.dq.any(), "it moves"
@@ -67,3 +70,25 @@ def test_no_two_looks_in_a_row_are_left_out() -> None:
     loop = counted(Flight(), work_s=0.0042).fly(1.0)
     assert loop.skipped > 0.4 * loop.answers, "it is always late"
     assert count(loop, wire.LOOK) > 0.4 * loop.answers
+
+
+def test_a_prepared_step_is_not_made_again_in_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight()
+    loop = counted(flight, work_s=0.0042)
+    step, answer, made, within = flight.pilot._step, flight.pilot.answer, [0], [0]
+
+    def counting(course: Course) -> Said:
+        made[0] += 1
+        return step(course)
+
+    def watching(event: TickEvent) -> Answer:
+        before = made[0]
+        said = answer(event)
+        within.append(made[0] - before)
+        return said
+
+    monkeypatch.setattr(flight.pilot, "_step", counting)
+    monkeypatch.setattr(flight.pilot, "answer", watching)
+    loop.fly(2.0)
+    assert loop.skipped > 100
+    assert sum(within) < 10, "but where the phase changes"
