@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hrcreplay.errors import LogError
 from hrcreplay.human import angles, fusion, hull, occupancy
 from hrcreplay.human import smooth as smoother
 from hrcreplay.human.margins import Margins
@@ -20,6 +21,9 @@ from hrcreplay.runs import RunWriter, Stopwatch
 from hrcreplay.tables import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 
 NS = 1_000_000_000
+
+#: Of a session; a longer log has an arrival of another clock among its messages [s].
+LONGEST_S = 24 * 3600
 
 
 @dataclass
@@ -74,7 +78,16 @@ class Foresight:
 
 
 def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
-    """(n,) tick times: from the first instant on, at the filter's rate, none after the last [ns]."""
+    """(n,) tick times: from the first instant on, at the filter's rate, none after the last [ns].
+
+    Raises:
+        LogError: So long a span is no session, but a message with an arrival that cannot be.
+    """
+    if end_ns - start_ns > LONGEST_S * NS:
+        raise LogError(
+            f"arrivals: the log goes on for {(end_ns - start_ns) / (3600 * NS):.0f} h from its first message to its "
+            f"last; would be right: at most {LONGEST_S // 3600} h, as a span with --start and --end"
+        )
     count = int((end_ns - start_ns) * rate_hz / NS) + 1
     ticks: Ints = start_ns + np.round(np.arange(count) * (NS / rate_hz)).astype(np.int64)
     return ticks[ticks <= end_ns]
