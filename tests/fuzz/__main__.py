@@ -54,9 +54,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _all(logs: list[int], live: list[int], commands: list[str], processes: int, keep: Path | None) -> Iterator[Trial]:
-    with ProcessPoolExecutor(processes) as pool:
-        for command in commands:
-            yield from pool.map(partial(trial, command=command, keep=keep), logs, chunksize=4)
+    for command in commands:
+        job = partial(trial, command=command, keep=keep)
+        if processes == 1:
+            yield from map(job, logs)
+            continue
+        with ProcessPoolExecutor(processes) as pool:
+            yield from pool.map(job, logs, chunksize=4)
     if live:
         with robot():  # one after the other: they share it
             for number in live:
