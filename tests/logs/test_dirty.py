@@ -122,7 +122,7 @@ def test_zero_stamps_on_tf(tmp_path: Path) -> None:
 def test_broken_messages_are_left_out(tmp_path: Path) -> None:
     with bag(tmp_path / "a", "db3") as (write, store):
         for i in range(10):
-            array = marker_array(store, BEGIN + i * PERIOD, {1: np.ones((32, 3))})
+            array = marker_array(store, BEGIN + i * PERIOD, {1: np.full((32, 3), 1.0 + i)})
             write("/body_tracking_data", "visualization_msgs/msg/MarkerArray", BEGIN + i * PERIOD, array)
     with sqlite3.connect(tmp_path / "a" / "a.db3") as db:
         db.execute("update messages set data = substr(data, 1, 200) where id = 5")
