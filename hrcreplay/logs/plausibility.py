@@ -142,8 +142,8 @@ def side_remark(camera: str, side: float) -> str | None:
     if not side < -_MIRRORED:
         return None
     return (
-        f"camera {camera}: left and right of the body are exchanged as its feet point (one axis mirrored, or left-handed "
-        "coordinates); would be right: x, y, z right-handed, left is the person's own left"
+        f"camera {camera}: left and right of the body are exchanged as its feet point (one axis mirrored, or "
+        "left-handed coordinates); would be right: x, y, z right-handed, left is the person's own left"
     )
 
 

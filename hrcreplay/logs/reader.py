@@ -47,6 +47,7 @@ class Log:
         self._remarks: list[str] = []
         self._refusals: list[str] = []
         self._track: Counter[str] = Counter()
+        self.stature_m: dict[str, float] = {}  #: camera -> how tall its bodies are, of the latest pass; NaN: not known
         self.points_seen = 0  #: points with a place and a confidence, of the latest pass
         self.header = _header(source, decoders, self._joints, self._truth, chosen=bool(options.topics))
 
@@ -110,6 +111,7 @@ class Log:
 
     def _judge(self, cleaner: Cleaner, shapes: dict[str, plausibility.Shape]) -> None:
         self.points_seen = cleaner.points.total()
+        self.stature_m = {camera: shape.stature_m for camera, shape in shapes.items()}
         for camera, shape in shapes.items():
             size = plausibility.size_remark(camera, shape.stature_m, self._unit_of(camera))
             if size is not None:
@@ -166,13 +168,14 @@ def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
             yield f"camera {camera}: {count} {DEFECTS[name]} ({share:.2g} % of its points)"
     far = cleaner.flaws[(camera, "frames_stamp_far")]
     if far:
-        yield f"camera {camera}: {far} rows captured over {STAMP_FAR_S:g} s from their arrival by their stamp; arrival used"
+        yield f"camera {camera}: {far} rows have a stamp over {STAMP_FAR_S:g} s from their arrival; arrival used"
     longest = cleaner.frozen.get(camera)
     if longest is not None and longest.seconds > _FROZEN_S:
         rows = cleaner.flaws[(camera, "frames_repeated")]
+        begin_s = (longest.begin_ns - begin_ns) / 1e9
         yield (
-            f"camera {camera} froze: for {longest.seconds:.2f} s from {(longest.begin_ns - begin_ns) / 1e9:.2f} s on it "
-            f"gave one and the same skeleton with new stamps; its {rows} rows that repeat count as silence"
+            f"camera {camera} froze: for {longest.seconds:.2f} s from {begin_s:.2f} s on it gave one and the same "
+            f"skeleton with new stamps; its {rows} rows that repeat count as silence"
         )
 
 
