@@ -48,8 +48,8 @@ def up_direction(track: Track) -> tuple[Floats, float] | None:
     mass = 0.30 * neck + 0.44 * pelvis + 0.20 * knee + 0.06 * ankle
     standing = _unit(mass - 0.5 * (ankle + foot))[upright]
     trunk = _unit(neck - pelvis)
-    for found, std in ((standing, _STANDING_STD), (trunk, _TORSO_STD)):
-        directions = found[np.isfinite(found).all(axis=1)]
+    trunk = trunk[np.isfinite(trunk).all(axis=1)]
+    for directions, std in ((standing, _STANDING_STD), (trunk, _TORSO_STD)):
         if len(directions) >= _rows_for(track, _MANY_S):
             return _middle(directions), float(std)
     return None

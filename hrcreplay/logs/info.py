@@ -188,6 +188,7 @@ def lines(summary: Summary) -> list[str]:
         f"base     {'in the log' if summary.has_base else 'none'}",
         f"truth    {'in the log' if summary.has_truth else 'none'}",
         f"joints   {', '.join(summary.joint_names) or 'none'}",
+        f"person   {', '.join(_tall(camera) for camera in summary.cameras) or 'none'}",
     ]
     delivered = {f"frames_{camera.name}" for camera in summary.cameras}  # counted with the defects, but none
     found = {name: n for name, n in summary.defects.items() if n and name not in delivered}
@@ -199,6 +200,11 @@ def lines(summary: Summary) -> list[str]:
     return out
 
 
+def _tall(camera: CameraSummary) -> str:
+    tall = "of no bone" if np.isnan(camera.stature_m) else f"{camera.stature_m:.2f} m tall by the bones"
+    return f"{tall} ({camera.name})"
+
+
 def _camera_line(camera: CameraSummary, start_ns: int) -> str:
     if camera.first_ns is None or camera.last_ns is None:
         return f"  {camera.name}: no frames"
@@ -208,6 +214,5 @@ def _camera_line(camera: CameraSummary, start_ns: int) -> str:
         f"  {camera.name}: {camera.frames} frames at {camera.rate_hz:.2f} Hz, "
         f"from {(camera.first_ns - start_ns) / 1e9:.3f} to {(camera.last_ns - start_ns) / 1e9:.3f} s, "
         f"longest gap {camera.longest_gap_s:.3f} s, delay {1e3 * camera.delay_s:.1f} ms, bodies {bodies}, "
-        f"extrinsics {'in the log' if camera.posed else 'none'}, "
-        + ("no bones seen" if np.isnan(camera.stature_m) else f"{camera.stature_m:.2f} m tall by the bones")
+        f"extrinsics {'in the log' if camera.posed else 'none'}"
     )
