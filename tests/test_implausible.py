@@ -134,4 +134,4 @@ def test_a_span_without_a_tick_names_the_option_that_was_given(
     span: dict[str, float], option: str, tmp_path: Path
 ) -> None:
     with pytest.raises(SettingsError, match=f"{option}: nothing of the log is left"):
-        ran(tmp_path, noisy(), **span)
+        ran(tmp_path, noisy(), "fuse", **span)
