@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hrcreplay import pipeline, runs, wiring
-from hrcreplay.errors import SettingsError
+from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.ingest import log_options
 from hrcreplay.job import TABLES, Job, resolve
 from hrcreplay.logs.reader import Log, open_log
@@ -58,6 +58,8 @@ def run(
         with Bar(job.stages[-1], len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
             found = run_stages(job, log, ticks_ns, chunk_ticks, sink, smooth=smooth)
+        for note in found["notes"]:
+            say(note)
         base = wiring.base(job, log)
         meta = {
             **known,
@@ -98,9 +100,9 @@ def run_stages(job: Job, log: Log, ticks_ns: Ints, size: int, sink: Sink, *, smo
         for _ in flow:
             pass
     if "fuse" in todo:
-        return {"counts": _counts(log, sink.counts), "notes": list(log.notes)}
+        return {"counts": _counts(log, sink.counts), "notes": [*log.notes, *sink.notes]}
     earlier = runs.read_meta(job.earlier) if job.earlier else {}
-    return {"counts": earlier["counts"], "notes": earlier["notes"]}
+    return {"counts": earlier["counts"], "notes": list(dict.fromkeys([*earlier["notes"], *sink.notes]))}
 
 
 def _take_over(job: Job, writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
@@ -124,12 +126,13 @@ def _take_over(job: Job, writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
 
 def _ticks(job: Job, log: Log) -> Ints:
     first, last = log.header.start_ns, log.header.end_ns
+    if first == last:
+        raise LogError(f"{job.log}: holds a single instant; would be right: two frames or more")
     start_ns = first + round((job.start_s or 0.0) * NS)
     end_ns = last if job.end_s is None else min(last, first + round(job.end_s * NS))
     if not first <= start_ns < end_ns:
-        raise SettingsError(
-            f"--start {job.start_s or 0:g}: nothing of the log is left; it lasts {(last - first) / NS:.1f} s"
-        )
+        option = f"--start {job.start_s:g}" if job.start_s is not None else f"--end {job.end_s or 0:g}"
+        raise SettingsError(f"{option}: nothing of the log is left; it lasts {(last - first) / NS:.1f} s")
     return pipeline.tick_times(start_ns, end_ns, job.settings.fusion.rate_hz)
 
 
