@@ -33,6 +33,6 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
         method=str(plan.get("method", "qp")),
         near_m=near_m,
         stationary_m_per_s=stationary_m_per_s,
-        waits=plan.get("reference", "path") == "path",
+        leash_m=float(plan.get("leash_m", 0.25)),
     )
     return metrics.sorted()
