@@ -1,4 +1,4 @@
-"""Which limbs the cameras measured. A limb that they did not is where the model supposes it, and that has to be said."""
+"""Which limbs the cameras measured: one that they did not is where the model supposes it, and a reader has to know."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from hrcreplay.runs import Run
 
 #: A limb unmeasured at more than this share of the time has to be spoken of.
 MOST = 0.5
+
+#: The tables and columns that this rests on.
+COLUMNS = {"state": tuple(f"unseen_{limb}" for limb in LIMBS), "measurements": JOINTS}
 
 #: What people call LIMBS.
 NAMES = {
@@ -55,7 +58,7 @@ def unmeasured_shares(unseen_s: Floats, memory_s: float) -> Floats:
 
 def add_limbs(metrics: MetricTable, run: Run) -> None:
     """How much of the time each limb went unmeasured, and which of its joints always did."""
-    names = [f"unseen_{limb}" for limb in LIMBS]
+    names = list(COLUMNS["state"])
     shares = np.full(len(LIMBS), np.nan)
     memory_s = float(run.meta.get("settings", {}).get("fusion", {}).get("memory_s", 0.5))
     if run.state is not None and set(names) <= set(run.state.columns):
@@ -104,9 +107,7 @@ def remarks(run: Run) -> list[str]:
     add_limbs(table, run)
     metrics = table.sorted()
     never, mostly = unmeasured(metrics)
-    lines = [f"no camera ever measured the {called(never)}: where it was is not known"] if len(never) == 1 else []
-    if len(never) > 1:
-        lines = [f"no camera ever measured the {called(never)}: where they were is not known"]
+    lines = [f"no camera ever measured the {called([limb])}: where it was is not known" for limb in never]
     lines += [
         f"the {called([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"
         for limb, share in mostly.items()

@@ -140,11 +140,11 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
         metrics.add(f"{prefix}_{name}_share", share, "1", f"share of all ticks of {what} with status '{name}'")
     reasons = motion["reason"].astype(str).to_numpy()
     for reason in sorted(set(reasons[braking])):
-        share = float((reasons[braking] == reason).sum() / len(motion))
+        count = int((reasons[braking] == reason).sum())
         slug = "_".join("".join(c if c.isalnum() else " " for c in reason.lower()).split()) or "unnamed"
-        metrics.add(
-            f"{prefix}_braking_share_{slug}", share, "1", f"share of all ticks of {what} that braked because: {reason}"
-        )
+        because = f"ticks of {what} that braked because: {reason}"
+        metrics.add(f"{prefix}_braking_ticks_{slug}", count, "1", because)
+        metrics.add(f"{prefix}_braking_share_{slug}", count / len(motion), "1", f"share of all {because}")
     metrics.add(
         f"{prefix}_moving_ticks",
         int(moving.sum()),

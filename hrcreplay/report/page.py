@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -14,6 +15,7 @@ from markupsafe import Markup
 
 from hrcreplay.records import LIMBS
 from hrcreplay.report import story
+from hrcreplay.report.flaws import flaws
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
 from hrcreplay.report.tables import PageTable, compare, percent, text_of
@@ -70,7 +72,8 @@ def render(
         inputs=inputs,
         versions=sorted(run.meta.get("versions", {}).items()),
         stages=sorted((run.meta.get("stages") or {}).items()),
-        command=str(run.meta.get("command", "")),
+        flaws=flaws(run.counts, run.notes),
+        command=shlex.join(run.meta.get("arguments") or [str(run.meta.get("command", ""))]),
         not_claimed=NOT_CLAIMED,
         metrics=[
             (name, text_of(m) if m["value"] is not None else m["reason"], m["value"] is None, m["meaning"])

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from hrcreplay.report.limbs import called, unmeasured
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
 from hrcreplay.report.tables import percent, text_of
+from hrcreplay.report.wording import happened
 from hrcreplay.runs import Run
 
 
@@ -39,14 +41,29 @@ def answers(run: Run, metrics: Mapping[str, Metric]) -> tuple[Answer, ...]:
         stage = "predicted what the person could reach" if run.occupancy is not None else "fused the cameras"
         words = f"This run {stage} and moved no robot. Run plan or report on the same log to have it answered."
         return (Answer(SAFE, "Not asked in this run.", words), Answer(COST, "Not asked in this run.", ""))
-    return (_safety(metrics), _cost(run, metrics))
+    return (_with_unmeasured(_safety(run, metrics), metrics), _cost(run, metrics))
 
 
-def _safety(metrics: Mapping[str, Metric]) -> Answer:
+def _with_unmeasured(safe: Answer, metrics: Mapping[str, Metric]) -> Answer:
+    """The answer with what was not measured of the person before it: a limb that nobody saw is not safe."""
+    never, mostly = unmeasured(metrics)
+    if not never and not mostly:
+        return safe
+    parts = [f"the {called(never)}: never measured"] if never else []
+    parts += [
+        f"the {called([limb])}: not measured at {100 * share:.0f} % of the ticks" for limb, share in mostly.items()
+    ]
+    short = f"Not known of {'; '.join(parts)}."
+    words = (
+        "Where no camera measured a limb, the prediction has only the joints' limits to go by, and nothing of this "
+        f"recording can show that it was right. Of what was measured: {safe.short[0].lower()}{safe.short[1:]} "
+    )
+    return Answer(safe.question, short, words + safe.words)
+
+
+def _safety(run: Run, metrics: Mapping[str, Metric]) -> Answer:
     ticks, moving = text_of(metrics["plan_ticks"]), text_of(metrics["plan_moving_ticks"])
     late = metrics["plan_braking_moving_ticks"]["value"]
-    nearest = metrics["plan_braking_moving_separation_min_m"]["value"]
-    unknown = metrics["plan_separation_unknown_ticks"]["value"]
     kept = (
         "the controller kept every link slow enough to stop within the stopping time short of all that the person "
         "was predicted to reach (inequality 2)"
@@ -56,22 +73,47 @@ def _safety(metrics: Mapping[str, Metric]) -> Answer:
         words = f"It stood at all {ticks} ticks."
     elif late == 0:
         short = "At every tick of this replay, by the paper's criterion."
-        words = f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}."
+        words = f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}. {_nearest(run, metrics)}"
     else:
         share = 100 * late / metrics["plan_moving_ticks"]["value"]
         short = (
             f"Not at every tick: at {text_of(metrics['plan_braking_moving_ticks'])} of {moving}, it was still braking."
         )
         words = (
-            f"At {share:.2f} % of the ticks at which the robot moved, no motion satisfied all constraints, or the "
-            "person was not known, and the robot was braking as hard as its joints can. "
+            f"At {share:.2f} % of the ticks at which the robot moved it was still braking, as hard as its joints can. "
+            f"At the other ticks, {kept}. {_nearest(run, metrics)}"
         )
-        if nearest is not None:
-            words += f"The smallest separation from the swept volumes while it did was {nearest:.3f} m. "
-        words += f"At the other ticks, {kept}."
-    if unknown:
-        words += f" At {text_of(metrics['plan_separation_unknown_ticks'])} ticks nobody could say where the person was."
-    return Answer(SAFE, short, words)
+    return Answer(SAFE, short, f"{words.strip()} {_braked(metrics)}".strip())
+
+
+def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
+    """The smallest distance, and which distance that is."""
+    nearest, late = metrics["plan_separation_min_moving_m"], metrics["plan_braking_moving_separation_min_m"]
+    if nearest["value"] is None:
+        return ""
+    stop_s = run.meta.get("settings", {}).get("occupancy", {}).get("stop_s")
+    within = "the stopping time" if stop_s is None else f"T_s = {stop_s:g} s"
+    words = (
+        f"The smallest distance while it moved was {text_of(nearest)}: from the surface of a link to the surface of "
+        f"all that the person could reach within {within}, not to the body"
+    )
+    if late["value"] is not None:
+        words += f"; while it was still braking, {text_of(late)}"
+    words += "."
+    if nearest["value"] < 0.0005:
+        words += " At 0 the constraint lets a link move along that space or away from it, but not into it."
+    return words
+
+
+def _braked(metrics: Mapping[str, Metric]) -> str:
+    """What happened at the ticks at which it braked, the most frequent reason first."""
+    mark = "plan_braking_ticks_"
+    found = [(m["value"], name.removeprefix(mark)) for name, m in metrics.items() if name.startswith(mark)]
+    parts = [
+        f"at {text_of(metrics[mark + slug])} ticks {happened(slug.replace('_', ' '))}"
+        for _, slug in sorted(found, key=lambda part: (-part[0], part[1]))
+    ]
+    return f"Why it braked, moving or standing: {'; '.join(parts)}." if parts else ""
 
 
 def _cost(run: Run, metrics: Mapping[str, Metric]) -> Answer:
@@ -120,11 +162,14 @@ def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
         ),
         Card(
             text_of(metrics["plan_separation_min_moving_m"]),
-            "smallest separation from the swept volumes while the robot moved",
-            f"at all: {text_of(metrics['plan_separation_min_m'])}, {pair[0]} \u2013 {pair[1]}" if pair[0] else "",
+            "smallest distance from a link's surface to that of what the person could reach within T_s, while it moved",
+            "not to the body"
+            + (f"; at all: {text_of(metrics['plan_separation_min_m'])}, {pair[0]} \u2013 {pair[1]}" if pair[0] else ""),
         ),
         Card(
-            percent(metrics["plan_progress_share"]), "of the programmed pace", f"baseline: {others}" if others else ""
+            percent(metrics["plan_progress_share"]),
+            "of the programmed pace, by the way that the robot made",
+            f"baseline: {others}" if others else "",
         ),
         Card(
             percent(metrics["plan_stationary_share"], 2),

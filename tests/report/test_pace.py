@@ -66,7 +66,7 @@ def test_a_robot_that_follows_exactly_keeps_the_whole_pace() -> None:
 def test_a_robot_that_follows_exactly_keeps_it_while_the_programme_stands() -> None:
     whole_s = np.arange(0, 1.8, 1 / HZ)  # ends within the first dwell
     assert share(table(whole_s, at(whole_s))) == 1.0
-    settling = at(whole_s) + [0.0, 0.0, 0.0005]
+    settling = at(whole_s) + np.array([0.0, 0.0, 0.0005])
     assert share(table(whole_s, settling)) == 1.0
 
 
@@ -121,7 +121,7 @@ def test_a_round_that_was_left_out_does_not_count() -> None:
 def test_a_programme_that_only_stands_has_no_pace() -> None:
     run = make_run(4.0)
     assert run.motion is not None
-    still = {name: run.motion[name].iloc[0] for name in run.motion if name[:4] in ("ref_", "tcp_")}
+    still = {f"{what}_{axis}": run.motion[f"{what}_{axis}"].iloc[0] for what in ("ref", "tcp") for axis in "xyz"}
     s = 0.01 * np.arange(len(run.motion))
     stands = dataclasses.replace(run, motion=run.motion.assign(**still, programme_s=s))
     found = compute(stands, near_m=0.5, stationary_m_per_s=0.001)
