@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from hrcreplay.logs.clean import DEFECTS
 
+#: Between groups of digits.
+NARROW = "\u202f"
 _CAMERA = "_<camera>"
 #: How ``DEFECTS`` begins what is none, and what is no count.
 _NONE, _INSTANT = "no defect", "an instant"
@@ -19,7 +21,7 @@ def flaws(counts: Mapping[str, int], notes: Sequence[str]) -> tuple[str, ...]:
         notes: ``notes`` of run.json.
     """
     found = [(_text(name), count) for name, count in sorted(counts.items()) if count]
-    return (*notes, *(f"{text}: {count:,}".replace(",", "\u202f") for text, count in found if text))
+    return (*notes, *(f"{text}: {f'{count:,}'.replace(',', NARROW)}" for text, count in found if text))
 
 
 def _text(name: str) -> str:

@@ -24,7 +24,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Answer:
-    """One of the two questions, the answer in a few words, and what stands behind it."""
+    """One of the two questions, the answer in a few words, and what stands behind it: a paragraph a line."""
 
     question: str
     short: str
@@ -56,7 +56,7 @@ def _with_unmeasured(safe: Answer, metrics: Mapping[str, Metric]) -> Answer:
     short = f"Not known of {'; '.join(parts)}."
     words = (
         "Where no camera measured a limb, the prediction has only the joints' limits to go by, and nothing of this "
-        f"recording can show that it was right. Of what was measured: {safe.short[0].lower()}{safe.short[1:]} "
+        f"recording can show that it was right.\nOf what was measured: {safe.short[0].lower()}{safe.short[1:]} "
     )
     return Answer(safe.question, short, words + safe.words)
 
@@ -73,7 +73,7 @@ def _safety(run: Run, metrics: Mapping[str, Metric]) -> Answer:
         words = f"It stood at all {ticks} ticks."
     elif late == 0:
         short = "At every tick of this replay, by the paper's criterion."
-        words = f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}. {_nearest(run, metrics)}"
+        words = f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}."
     else:
         share = 100 * late / metrics["plan_moving_ticks"]["value"]
         short = (
@@ -81,9 +81,9 @@ def _safety(run: Run, metrics: Mapping[str, Metric]) -> Answer:
         )
         words = (
             f"At {share:.2f} % of the ticks at which the robot moved it was still braking, as hard as its joints can. "
-            f"At the other ticks, {kept}. {_nearest(run, metrics)}"
+            f"At the other ticks, {kept}."
         )
-    return Answer(SAFE, short, f"{words.strip()} {_braked(metrics)}".strip())
+    return Answer(SAFE, short, "\n".join(part for part in (words, _nearest(run, metrics), _braked(metrics)) if part))
 
 
 def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
@@ -110,8 +110,8 @@ def _braked(metrics: Mapping[str, Metric]) -> str:
     mark = "plan_braking_ticks_"
     found = [(m["value"], name.removeprefix(mark)) for name, m in metrics.items() if name.startswith(mark)]
     parts = [
-        f"at {text_of(metrics[mark + slug])} ticks {happened(slug.replace('_', ' '))}"
-        for _, slug in sorted(found, key=lambda part: (-part[0], part[1]))
+        f"at {text_of(metrics[mark + slug])} tick{'' if count == 1 else 's'} {happened(slug.replace('_', ' '))}"
+        for count, slug in sorted(found, key=lambda part: (-part[0], part[1]))
     ]
     return f"Why it braked, moving or standing: {'; '.join(parts)}." if parts else ""
 
@@ -121,7 +121,9 @@ def _cost(run: Run, metrics: Mapping[str, Metric]) -> Answer:
     if progress["value"] is None:
         short = f"The TCP was {text_of(metrics['plan_tracking_error_mean_m'])} from its reference on average."
     else:
-        short = f"{text_of(lost)} of {text_of(metrics['span_s'])}: the task ran at {percent(progress)} of its pace."
+        short = (
+            f"It lost {text_of(lost)} of {text_of(metrics['span_s'])}: the task ran at {percent(progress)} of its pace."
+        )
     words = (
         f"The TCP left the programmed path by {text_of(metrics['plan_deviation_mean_m'])} on average and "
         f"{text_of(metrics['plan_deviation_max_m'])} at most. {_standing(metrics, 'plan', 'it')}"
@@ -153,12 +155,13 @@ def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
         f"{name} {percent(metrics[f'baseline_{name}_progress_share'])}" for name in sorted(run.baselines)
     )
     stood = ", ".join(f"{n} {percent(metrics[f'baseline_{n}_stationary_share'], 2)}" for n in sorted(run.baselines))
-    near = text_of(metrics["plan_near_ticks"])
+    near, never = text_of(metrics["plan_near_ticks"]), ", ".join(unmeasured(metrics)[0])
     return (
         Card(
             _floor_percent(1 - late / ticks) if ticks else "\u2013",
             "ticks with the constraint kept, or the robot standing",
-            f"{text_of(metrics['plan_braking_moving_ticks'])} of {text_of(metrics['plan_ticks'])} ticks still braking",
+            f"{text_of(metrics['plan_braking_moving_ticks'])} of {text_of(metrics['plan_ticks'])} ticks still braking"
+            + (f"; {never} never measured" if never else ""),
         ),
         Card(
             text_of(metrics["plan_separation_min_moving_m"]),

@@ -93,11 +93,11 @@ FUSION = (
 
 #: What happened at the ticks at which the robot braked, by the reason that its record gives (``stepping.REASONS``).
 REASONS = {
-    "no human state": "where the person was was not known: no camera had shown them lately, or not yet",
+    "no human state": "it was not known where the person is: no camera had shown them lately, or none yet",
     "no solution": "no motion satisfied all constraints",
     "separation failed": (
-        "the distance between robot and person could not be computed as surely as the constraint needs it, though "
-        "where the person was was known"
+        "the distance from the robot to what the person could reach could not be computed as surely as the constraint "
+        "needs it; where the person is was known"
     ),
     "not finite": "the robot's own state, its reference or the constraints held a number that is none",
 }
