@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from hrcreplay.report import limbs, story
 from hrcreplay.report.metrics import compute
 from hrcreplay.runs import Run
 from tests.report.synthetic import make_run
+from tests.report.test_page import read, rendered
 
 MEMORY_S = 0.5
 
@@ -88,6 +90,14 @@ def test_a_limb_measured_in_part_is_told() -> None:
     assert limbs.remarks(run) == []
     part = dataclasses.replace(run, measurements=run.measurements.assign(al3=np.nan))
     assert limbs.remarks(part) == ["the left lower arm (LLA) was measured only in part: never its al3"]
+
+
+def test_the_page_lists_every_limb(tmp_path: Path) -> None:
+    run = seen(make_run(2.0), LLA=np.inf)
+    text = " ".join(read(rendered(run, tmp_path)).text)
+    assert "Limbs, while the person was in view" in text
+    assert re.search(r"left lower arm \(LLA\)\s+100\.0 %", text)
+    assert re.search(r"right lower arm \(LRA\)\s+0\.0 %", text)
 
 
 def _without(frames: Iterator[CameraFrames], gone: list[int]) -> Iterator[CameraFrames]:
