@@ -13,7 +13,7 @@ from typing import Any
 
 from hrcreplay import __version__, runs
 from hrcreplay.cell import Cell, load_cell
-from hrcreplay.config import Settings, load_settings
+from hrcreplay.config import Settings, as_overrides, load_settings
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.limits import load_limits
@@ -78,6 +78,20 @@ class Job:
             before = hashlib.sha256((before + json.dumps(parts[stage], sort_keys=True)).encode()).hexdigest()
             digests[stage] = before
         return digests
+
+    def arguments(self, *, smooth: bool) -> list[str]:
+        """A command line that makes the same run again, wherever the settings came from: names without folders.
+
+        ``CELL.toml`` stands for the cell file, whose content is the run's ``cell``.
+        """
+        span = (("--start", self.start_s), ("--end", self.end_s))
+        return [
+            *(self.command, self.log.name),
+            *(part for name, at_s in span if at_s is not None for part in (name, f"{at_s:.12g}")),
+            *(("--cell", "CELL.toml") if self.cell is not None else ()),
+            *(("--smooth",) if smooth else ()),
+            *(part for setting in as_overrides(self.settings) for part in ("--set", setting)),
+        ]
 
     def stale(self) -> dict[str, str]:
         """Stage -> why the earlier run's tables are not those that this job would make; nor are those of later ones."""

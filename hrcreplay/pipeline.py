@@ -17,7 +17,7 @@ from hrcreplay.logs.person import PersonMemory, pick
 from hrcreplay.logs.plausibility import Stand
 from hrcreplay.logs.reader import Log
 from hrcreplay.planner import Beside, Planner
-from hrcreplay.records import LIMBS, CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.runs import RunWriter, Stopwatch
 from hrcreplay.tables import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 
@@ -116,7 +116,6 @@ def fused(
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
     passed: list[tuple[HumanStates, fusion.Trace]] = []
     stands = [Stand() for _ in log.header.cameras]
-    unseen_s = np.full(len(LIMBS), np.inf)
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
         measured = nothing(log.header.cameras)
@@ -135,14 +134,13 @@ def fused(
                 state, states, events = fusion.fuse(state, ticks, measured, eyes.filter, eyes.limits)
         sink.counts.update(events)
         ever = ever or bool(states.valid.any())
-        unseen_s = np.minimum(unseen_s, states.unseen_s[-1])
         sink.run.table("state", state_columns(states))
         sink.progress("fuse", len(ticks))
         yield states
     log.check()
     if not ever:
         raise _nobody(log, sink.counts)
-    sink.notes.extend(_oddities(log, stands, unseen_s))
+    sink.notes.extend(_oddities(log, stands))
     if smooth:
         whole = HumanStates.join([states for states, _ in passed])
         traces = [trace for _, trace in passed]
@@ -168,19 +166,12 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
     )
 
 
-def _oddities(log: Log, stands: list[Stand], unseen_s: Floats) -> Iterator[str]:
-    """What is odd about how the person stands, and the limbs that were shown but never well enough."""
+def _oddities(log: Log, stands: list[Stand]) -> Iterator[str]:
+    """What is odd about how the person stands in the world."""
     for camera, stand in zip(log.header.cameras, stands, strict=True):
         remark = stand.remark(camera)
         if remark is not None:
             yield remark
-    told = " ".join(log.notes)
-    for limb, seconds in zip(LIMBS, unseen_s.tolist(), strict=True):
-        if seconds == np.inf and f"limb {limb} " not in told:
-            yield (
-                f"limb {limb} was never measured: its points never agreed, or not with the confidence that "
-                "fusion.confidence_min asks for; its volume holds all that its joints allow"
-            )
 
 
 def nothing(cameras: tuple[str, ...]) -> Measurements:

@@ -10,6 +10,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
+
 from hrcreplay import pipeline, runs, wiring
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.ingest import log_options
@@ -18,8 +20,10 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import NS, Sink
 from hrcreplay.progress import Bar, say
 from hrcreplay.records import HumanStates, Ints
+from hrcreplay.report import limbs
+from hrcreplay.report.flaws import flaws
 from hrcreplay.reporting import write_report
-from hrcreplay.runs import RunWriter, Stopwatch
+from hrcreplay.runs import Run, RunWriter, Stopwatch
 from hrcreplay.tables import read_states
 
 REPORTS = Path("reports")
@@ -58,16 +62,18 @@ def run(
         with Bar(job.stages[-1], len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
             found = run_stages(job, log, ticks_ns, chunk_ticks, sink, smooth=smooth)
-        for note in found["notes"]:
-            say(note)
         base = wiring.base(job, log)
+        writer.close_tables()
+        found["notes"] = list(dict.fromkeys([*found["notes"], *_unmeasured(writer.partial, known, found["notes"])]))
+        for line in flaws(found["counts"], found["notes"]):
+            say(line)
         meta = {
             **known,
             **found,
+            "arguments": job.arguments(smooth=smooth),
             "T_world_base": None if base is None else base.tolist(),
             "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
         }
-        writer.close_tables()
         if command == "report":
             with sink.watch.stage("report", len(ticks_ns)):
                 write_report(job, writer, meta)
@@ -103,6 +109,16 @@ def run_stages(job: Job, log: Log, ticks_ns: Ints, size: int, sink: Sink, *, smo
         return {"counts": _counts(log, sink.counts), "notes": [*log.notes, *sink.notes]}
     earlier = runs.read_meta(job.earlier) if job.earlier else {}
     return {"counts": earlier["counts"], "notes": list(dict.fromkeys([*earlier["notes"], *sink.notes]))}
+
+
+def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str]:
+    """Remarks on limbs that were not measured, from the tables of the first stage."""
+
+    def table(name: str) -> Any:
+        path = folder / f"{name}.parquet"
+        return pq.read_table(path, columns=list(limbs.COLUMNS[name])).to_pandas() if path.exists() else None
+
+    return limbs.remarks(Run(folder, meta, state=table("state"), measurements=table("measurements")), told)
 
 
 def _take_over(job: Job, writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:

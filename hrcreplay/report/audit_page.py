@@ -63,6 +63,7 @@ def render(found: Mapping[str, Any], metrics: Mapping[str, Metric], meta: Mappin
         inputs=[{"name": PurePath(str(i["path"])).name, "sha256": i["sha256"]} for i in meta.get("inputs", [])],
         versions=sorted(meta.get("versions", {}).items()),
         stages=[],
+        flaws=(),  # of each log, in the section on the data
         command=str(meta.get("command", "")),
         not_claimed=_CLAIMS,
         metrics=[

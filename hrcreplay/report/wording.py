@@ -91,6 +91,23 @@ FUSION = (
     ("RMSE of y", "rmse_y"),
 )
 
+#: What happened at the ticks at which the robot braked, by the reason that its record gives (``stepping.REASONS``).
+REASONS = {
+    "no human state": "it was not known where the person is: no camera had shown them lately, or none yet",
+    "no solution": "no motion satisfied all constraints",
+    "separation failed": (
+        "the distance from the robot to what the person could reach could not be computed as surely as the constraint "
+        "needs it; where the person is was known"
+    ),
+    "not finite": "the robot's own state, its reference or the constraints held a number that is none",
+}
+
+
+def happened(reason: str) -> str:
+    """What happened at a tick with a reason to brake; of a reason without words, the record's own."""
+    return REASONS.get(reason, f"the record says '{reason}'")
+
+
 #: The limits of what a page can say.
 NOT_CLAIMED = (
     "hrcreplay is a research tool. It is not certified, and no page of it makes a robot cell safe or compliant.",
