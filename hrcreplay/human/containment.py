@@ -136,9 +136,7 @@ def _height(point: Floats, normal: Floats, offset: float) -> float:
 
 
 @njit(cache=True)
-def _distance(
-    point: Floats, vertices: Floats, faces: Ints, normals: Floats, offsets: Floats, behind: float
-) -> float:
+def _distance(point: Floats, vertices: Floats, faces: Ints, normals: Floats, offsets: Floats, behind: float) -> float:
     if np.isnan(point[0] + point[1] + point[2]):
         return np.nan
     if len(faces) == 0:

@@ -14,6 +14,7 @@ from tests.human.people import random_states
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], dtype=float)
 TRIANGLE = np.array([[0, 0, 0], [3, 0, 0], [0, 4, 0]], dtype=float)
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+INNER = 0.5 * SQUARE + np.array([0.25, 0.25, 0.0])
 R = 0.3
 BALL = 4 / 3 * np.pi * R**3
 TILTED = Rotation.from_rotvec([0.3, -1.1, 0.7])
@@ -51,7 +52,7 @@ SHAPES = {
     "line": (np.linspace(BOX[0], BOX[7], 40), 0.0, 0.0, np.pi * np.sqrt(14)),
     "triangle": (TRIANGLE, 0.0, 12.0, 0.5 * np.pi * 12),
     "square": (SQUARE, 0.0, 2.0, 0.5 * np.pi * 4),
-    "square with points inside": (np.concatenate([SQUARE, 0.5 * SQUARE + [0.25, 0.25, 0.0]]), 0.0, 2.0, 0.5 * np.pi * 4),
+    "square with points inside": (np.concatenate([SQUARE, INNER]), 0.0, 2.0, 0.5 * np.pi * 4),
     "box": (BOX, 6.0, 22.0, 6 * np.pi),
 }
 #: Places and how exact coordinates are there; the last two are the numbers that trackers write for what they lost.
@@ -103,14 +104,14 @@ def test_thin_sets_do_not_raise(thin_m: float, far_m: float) -> None:
 def test_what_qhull_calls_flat_is_flat(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where Qhull finds a set thinner than we do, the thinnest direction goes."""
 
-    class Solids(ConvexHull):  # type: ignore[misc]
+    class Solids(ConvexHull):
         def __init__(self, points: Floats) -> None:
             if points.shape[1] == 3:
                 raise QhullError("QH6154")
             super().__init__(points)
 
     monkeypatch.setattr("hrcreplay.human.hull.ConvexHull", Solids)
-    vertices, faces = hull(np.concatenate([SQUARE, SQUARE + [0.0, 0.0, 1e-8]]))
+    vertices, faces = hull(np.concatenate([SQUARE, SQUARE + np.array([0.0, 0.0, 1e-8])]))
     assert len(vertices) == 4
     assert len(faces) == 4
 
