@@ -88,7 +88,7 @@ def cameras(log: Mapping[str, Any]) -> PageTable:
         f"{log['log']}: thrown out",
         ("camera", "frames", "not seen", "doubted", "frames with a jump", "points that jump", "outliers in the fusion"),
         rows,
-        "None of these points is part of the recorded future. Not seen: missing, or of confidence 0. Doubted: the "
+        "No such point is part of the recorded future. Not seen: missing, or of confidence 0. Doubted: the "
         "camera trusts it too little (fusion.confidence_min), or it hangs from such a point, or the person was not "
         "known yet. A point that jumps off the person is rejected with what hangs from it. A dash: the recorded future "
         "is not from cameras. The fusion's own gate is per tick and knows only what came before.",
