@@ -21,7 +21,7 @@ bench: $(VENV)/made
 # Looks for a motion of the person that leaves the volumes of a method, on all cores.
 SAMPLES ?= 1000000
 METHOD ?= sound
-LIMITS ?= paper
+LIMITS ?= people
 soundness: $(VENV)/made
 	$(BIN)/python -m tests.soundness --samples $(SAMPLES) --method $(METHOD) --limits $(LIMITS) --processes $(shell nproc)
 

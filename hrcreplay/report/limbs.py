@@ -112,12 +112,14 @@ def remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
     add_limbs(table, run)
     metrics = table.sorted()
     never, mostly = unmeasured(metrics)
-    lines = [
-        f"{begin}: its points never agreed, or not with the confidence that fusion.confidence_min asks for; its volume "
-        "holds all that its joints allow"
-        for limb in never
-        if not any(note.startswith(begin := f"limb {limb} was never measured") for note in told)
-    ]
+    lines = []
+    for limb in never:
+        begin = f"limb {limb} was never measured"
+        if not any(note.startswith(begin) for note in told):
+            lines.append(
+                f"{begin}: its points never agreed, or not with the confidence that fusion.confidence_min asks for; "
+                "its volume holds all that its joints allow"
+            )
     lines += [
         f"the {called([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"
         for limb, share in mostly.items()
