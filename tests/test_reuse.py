@@ -16,6 +16,7 @@ from hrcreplay import replay, reuse, runs, wiring
 from hrcreplay.cell import Cell, pose_from_position
 from hrcreplay.config import Settings
 from hrcreplay.errors import SettingsError
+from hrcreplay.ingest import log_options
 from hrcreplay.job import STAGES, Job, resolve
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.reader import Log, open_log
@@ -158,8 +159,8 @@ def _job(settings: Settings, tmp: Path, **changes: Any) -> Job:
     known: dict[str, Any] = {"config": None, "overrides": (), "cell_file": None, "start_s": 2.0, "end_s": 4.0}
     overrides = () if settings.plan.task is None else (f"plan.task={settings.plan.task}",)
     job = resolve("report", replay.demo_log(), **{**known, "overrides": overrides})
-    limits = {name: load_limits(getattr(settings.limits, name)) for name in ("tracking", "prediction")}
-    return replace(job, settings=settings, **limits, **changes)
+    tracking, prediction = load_limits(settings.limits.tracking), load_limits(settings.limits.prediction)
+    return replace(job, settings=settings, tracking=tracking, prediction=prediction, **changes)
 
 
 def _ticks(job: Job, log: Any) -> Any:
@@ -202,7 +203,7 @@ def _handed(job: Job, log: Log) -> dict[str, str]:
     eyes, foresight = asdict(wiring.eyes(job, log)), asdict(wiring.foresight(job))
     for limits in (eyes["limits"], foresight["limits"]):
         del limits["name"]
-    reading = asdict(replay.log_options(job.settings))
+    reading = asdict(log_options(job.settings))
     del reading["joints_topic"]
     first = repr((eyes, reading, _ticks(job, log).tolist()))
     second = repr((foresight, replay._store_every(job)))
