@@ -146,7 +146,7 @@ def test_only_the_figures_asked_for_are_measured_and_nothing_twice(
     asked: list[str] = []
     audit = next(m for m in measurements() if m.name == "audit demo, people")
 
-    def measure(measurement: Measurement, _data: str) -> Any:
+    def measure(measurement: Measurement, _data: str, _picture: Path) -> Any:
         asked.append(measurement.name)
         return {**{name: {"value": 0.5} for name in AUDIT_KEYS}, "audit_ticks": {"value": 7}}
 
