@@ -25,8 +25,8 @@ LIMITS ?= paper
 soundness: $(VENV)/made
 	$(BIN)/python -m tests.soundness --samples $(SAMPLES) --method $(METHOD) --limits $(LIMITS) --processes $(shell nproc)
 
-# Measures every figure of the README anew, where sources changed, and writes them into it; see tests/readme. With
-# the recordings of others in $HRCREPLAY_DATA it takes hours; ONLY='"demo,"' measures what begins so.
+# Measures every figure of the README anew where sources changed, and writes them into it; see tests/readme. It goes on
+# where it was broken off. ONLY='"demo,"' measures what begins so; recordings by others are those in $HRCREPLAY_DATA.
 ONLY ?=
 readme: $(VENV)/made
 	$(BIN)/python -m tests.readme $(ONLY)

@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     README.write_text(fill(README.read_text(), facts))
     missing = [name for name in known if name not in facts]
     if missing:
-        print(f"never measured, and nan in the README: {', '.join(missing)}")
+        print(f"never measured, so the README keeps what it had: {', '.join(missing)}")
     return int(bool(missing))
 
 

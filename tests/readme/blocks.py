@@ -15,8 +15,15 @@ BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 
 def fill(text: str, facts: Facts) -> str:
-    """The README with its blocks written anew; what stands between them stays."""
-    return BLOCK.sub(lambda found: f"{found[1]}{BLOCKS[found[2]](facts)}\n{found[4]}", text)
+    """The README with its blocks written anew; a block stays as it is where one of its figures was never measured."""
+
+    def block(found: re.Match[str]) -> str:
+        try:
+            return f"{found[1]}{BLOCKS[found[2]](facts)}\n{found[4]}"
+        except KeyError:
+            return found[0]
+
+    return BLOCK.sub(block, text)
 
 
 def demo(facts: Facts) -> str:
@@ -127,15 +134,8 @@ BLOCKS: dict[str, Callable[[Facts], str]] = {
 }
 
 
-class _Missing(dict[str, Any]):
-    """Figures not measured yet: every one of them is NaN, which no table may hold in the end."""
-
-    def __missing__(self, key: str) -> float:
-        return float("nan")
-
-
 def _of(facts: Facts, name: str) -> Figures:
-    return facts[name]["figures"] if name in facts else _Missing()
+    return dict(facts[name]["figures"])
 
 
 def _table(head: Row, rows: Iterable[Row]) -> str:
