@@ -155,14 +155,18 @@ def _wrapped(text: str, first: str = "") -> str:
     return "\n".join([*lines, line.rstrip()])
 
 
-def _share(value: float) -> str:
-    """Per cent; 100 only where it is all, 0 only where it is none."""
+def _share(value: float | None) -> str:
+    """Per cent; 100 only where it is all, 0 only where it is none, a dash where nothing was seen."""
+    if value is None:
+        return "\u2013"
     if value in (0.0, 1.0):
         return f"{100 * value:.0f} %"
     return f"{min(99.9, max(0.1, 100 * value)):.1f} %"
 
 
-def _m3(value: float) -> str:
+def _m3(value: float | None) -> str:
+    if value is None:
+        return "\u2013"
     return f"{value:.1f} m\u00b3" if value >= 1.0 else f"{value:.2f} m\u00b3"
 
 

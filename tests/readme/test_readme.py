@@ -119,8 +119,10 @@ def test_a_column_holds_its_own_method_and_limits() -> None:
         assert rows[3][column] == f"{pace[0]:.1f} / {pace[1]:.1f} %"
 
 
-@pytest.mark.parametrize(("share", "text"), [(1.0, "100 %"), (0.99999, "99.9 %"), (0.0, "0 %"), (1e-9, "0.1 %")])
-def test_all_and_none_are_said_of_all_and_none_alone(share: float, text: str) -> None:
+@pytest.mark.parametrize(
+    ("share", "text"), [(1.0, "100 %"), (0.99999, "99.9 %"), (0.0, "0 %"), (1e-9, "0.1 %"), (None, "\u2013")]
+)
+def test_all_and_none_are_said_of_all_and_none_alone(share: float | None, text: str) -> None:
     facts = _made_up()
     facts["audit demo, people"]["figures"]["sound_share"] = share
     assert f"| ticks in which every limb stayed inside it | {text} |" in BLOCKS["demo"](facts)
