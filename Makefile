@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: demo test bench soundness lock clean
+.PHONY: demo test bench soundness readme lock clean
 
 demo: $(VENV)/made
 	@$(BIN)/hrcreplay demo
@@ -24,6 +24,12 @@ METHOD ?= sound
 LIMITS ?= people
 soundness: $(VENV)/made
 	$(BIN)/python -m tests.soundness --samples $(SAMPLES) --method $(METHOD) --limits $(LIMITS) --processes $(shell nproc)
+
+# Measures every figure of the README anew where sources changed, and writes them into it; see tests/readme. It goes on
+# where it was broken off. ONLY='"demo,"' measures what begins so; recordings by others are those in $HRCREPLAY_DATA.
+ONLY ?=
+readme: $(VENV)/made
+	$(BIN)/python -m tests.readme $(ONLY)
 
 # Everything from the lock, by hash and without a compiler; then the project itself, its kernels compiled once.
 $(VENV)/made: requirements.lock pyproject.toml

@@ -1,12 +1,9 @@
-"""What a run depends on: log, settings, cell, span; and which stages of an earlier run it can take over."""
+"""What a run depends on: log, settings, cell, span."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import tomllib
 from dataclasses import asdict, dataclass
-from fnmatch import fnmatch
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -17,7 +14,6 @@ from hrcreplay.config import Settings, as_overrides, load_settings
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.limits import load_limits
-from hrcreplay.tables import lacks
 
 STAGES = ("fuse", "predict", "plan")
 
@@ -56,29 +52,6 @@ class Job:
         """The stages that the command runs."""
         return STAGES[: STAGES.index(self.command) + 1] if self.command in STAGES else STAGES
 
-    def digests(self) -> dict[str, str]:
-        """Per stage the digest of all that its result depends on, the stages before it included."""
-        settings = self.settings.model_dump(mode="json")
-        parts: dict[str, Any] = {
-            "fuse": [
-                __version__,
-                self.log_sha256,
-                None if self.cell is None else self.cell.to_dict(),
-                [self.start_s, self.end_s],
-                settings["logs"],
-                settings["fusion"],
-                _plain(self.tracking),
-            ],
-            "predict": [settings["occupancy"], _plain(self.prediction)],
-            "plan": [settings["robot"], settings["plan"], self.task, _urdf_digest(self.settings)],
-        }
-        digests: dict[str, str] = {}
-        before = ""
-        for stage in STAGES:
-            before = hashlib.sha256((before + json.dumps(parts[stage], sort_keys=True)).encode()).hexdigest()
-            digests[stage] = before
-        return digests
-
     def arguments(self, *, smooth: bool) -> list[str]:
         """A command line that makes the same run again, wherever the settings came from: names without folders.
 
@@ -93,35 +66,23 @@ class Job:
             *(part for setting in as_overrides(self.settings) for part in ("--set", setting)),
         ]
 
-    def stale(self) -> dict[str, str]:
-        """Stage -> why the earlier run's tables are not those that this job would make; nor are those of later ones."""
-        if self.earlier is None:
-            return {}
-        meta, mine = runs.read_meta(self.earlier), self.digests()
-        found: dict[str, str] = {}
-        reason = None
-        for stage in self.stages:
-            if reason is None and meta.get("stages", {}).get(stage) != mine[stage]:
-                reason = f"log, cell or settings are not those of {self.earlier}"
-            reason = reason or _damage(self.earlier, stage, meta["outputs"])
-            if reason is not None:
-                found[stage] = reason
-        return found
-
     def meta(self) -> dict[str, Any]:
         """The part of run.json that is known before the first frame is read."""
-        digests = self.digests()
         return {
             "command": self.command,
-            "versions": {"hrcreplay": __version__, **{name: metadata.version(name) for name in PACKAGES}},
+            "versions": versions(),
             "inputs": [{"path": str(self.log), "sha256": self.log_sha256}],
             "settings": self.settings.model_dump(mode="json"),
             "cell": None if self.cell is None else self.cell.to_dict(),
             "task": self.task,
             "span_s": [self.start_s, self.end_s],
-            "limits": {"tracking": _plain(self.tracking), "prediction": _plain(self.prediction)},
-            "stages": {stage: digests[stage] for stage in self.stages},
+            "limits": {"tracking": plain_limits(self.tracking), "prediction": plain_limits(self.prediction)},
         }
+
+
+def versions() -> dict[str, str]:
+    """Our version and those of PACKAGES."""
+    return {"hrcreplay": __version__, **{name: metadata.version(name) for name in PACKAGES}}
 
 
 def resolve(
@@ -194,17 +155,6 @@ def unlogged(command: str, where: Path, settings: Settings, cell_file: Path | No
     )
 
 
-def _damage(folder: Path, stage: str, outputs: dict[str, str]) -> str | None:
-    """What keeps an earlier run's tables of a stage from being taken for ours."""
-    for name in sorted(name for name in outputs if any(fnmatch(name, pattern) for pattern in TABLES[stage])):
-        path = folder / name
-        if not path.exists() or runs.sha256(path) != outputs[name]:
-            return f"{path} is not as its run left it"
-        if missing := lacks(path):
-            return f"{path} is of an earlier version, without {missing[0]}"
-    return None
-
-
 def _digest(log: Path, earlier: dict[str, Any] | None) -> str:
     if log.exists():
         return runs.sha256(log)
@@ -226,7 +176,8 @@ def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] 
         raise SettingsError(f"{path}: not TOML ({error})") from error
 
 
-def _urdf_digest(settings: Settings) -> str | None:
+def urdf_digest(settings: Settings) -> str | None:
+    """SHA-256 of the robot's URDF; None for the IRB 140. Raises SettingsError where it is not there."""
     path = settings.robot.urdf
     if path is None:
         return None
@@ -235,7 +186,7 @@ def _urdf_digest(settings: Settings) -> str | None:
     return runs.sha256(path)
 
 
-def _plain(limits: LimitSet) -> dict[str, Any]:
+def plain_limits(limits: LimitSet) -> dict[str, Any]:
     """JSON form of a limit set; no bound is null."""
 
     def plain(value: Any) -> Any:

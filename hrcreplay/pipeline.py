@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
@@ -34,7 +34,7 @@ class Sink:
     watch: Stopwatch
     progress: Callable[[str, int], None]  #: stage, ticks done
     counts: Counter[str] = field(default_factory=Counter)
-    notes: list[str] = field(default_factory=list)  #: what is odd about the person or the robot's place
+    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> what is odd
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def fused(
     log.check()
     if not ever:
         raise _nobody(log, sink.counts)
-    sink.notes.extend(_oddities(log, stands))
+    sink.notes["fuse"].extend(_oddities(log, stands))
     if smooth:
         whole = HumanStates.join([states for states, _ in passed])
         traces = [trace for _, trace in passed]
@@ -255,4 +255,4 @@ def planned(
         yield
     remark = beside.remark()
     if remark is not None:
-        sink.notes.append(remark)
+        sink.notes["plan"].append(remark)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from hrcreplay import pipeline, runs, wiring
+from hrcreplay import pipeline, reuse, runs, wiring
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.ingest import log_options
 from hrcreplay.job import TABLES, Job, resolve
@@ -59,9 +59,12 @@ def run(
     with RunWriter(out or _folder(job, began)) as writer:
         log = open_log(job.log, log_options(job.settings))
         ticks_ns = _ticks(job, log)
-        with Bar(job.stages[-1], len(ticks_ns)) as bar:
+        parts = reuse.parts(job, log, ticks_ns)
+        reused = _take_over(job, parts, writer, smooth=smooth)
+        last = [stage for stage in job.stages if stage not in reused][-1:]
+        with Bar(last[0] if last else "", len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
-            found = run_stages(job, log, ticks_ns, chunk_ticks, sink, smooth=smooth)
+            found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth)
         base = wiring.base(job, log)
         writer.close_tables()
         found["notes"] = list(dict.fromkeys([*found["notes"], *_unmeasured(writer.partial, known, found["notes"])]))
@@ -71,6 +74,8 @@ def run(
             **known,
             **found,
             "arguments": job.arguments(smooth=smooth),
+            "depends_on": parts,
+            "stages": reuse.stages(job, parts),
             "T_world_base": None if base is None else base.tolist(),
             "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
         }
@@ -82,13 +87,14 @@ def run(
         return writer.folder
 
 
-def run_stages(job: Job, log: Log, ticks_ns: Ints, size: int, sink: Sink, *, smooth: bool) -> dict[str, Any]:
-    """All stages of the job in one pass; those of an earlier run that would come out the same are taken over.
+def run_stages(
+    job: Job, log: Log, ticks_ns: Ints, size: int, sink: Sink, reused: tuple[str, ...], *, smooth: bool
+) -> dict[str, Any]:
+    """All stages of the job in one pass, without those whose tables were taken over.
 
     Returns:
-        ``counts`` and ``notes`` about the data, for run.json.
+        ``counts`` and ``notes`` about the data, for run.json, and ``found_by``: those of each stage that reads the log.
     """
-    reused = _take_over(job, sink.run, smooth=smooth)
     todo = [stage for stage in job.stages if stage not in reused]
     states: Iterable[HumanStates]
     if "fuse" in todo:
@@ -105,10 +111,7 @@ def run_stages(job: Job, log: Log, ticks_ns: Ints, size: int, sink: Sink, *, smo
     if todo:
         for _ in flow:
             pass
-    if "fuse" in todo:
-        return {"counts": _counts(log, sink.counts), "notes": [*log.notes, *sink.notes]}
-    earlier = runs.read_meta(job.earlier) if job.earlier else {}
-    return {"counts": earlier["counts"], "notes": list(dict.fromkeys([*earlier["notes"], *sink.notes]))}
+    return _findings(job, log, sink, reused)
 
 
 def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str]:
@@ -121,11 +124,34 @@ def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str
     return limbs.remarks(Run(folder, meta, state=table("state"), measurements=table("measurements")), told)
 
 
-def _take_over(job: Job, writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
+def _findings(job: Job, log: Log, sink: Sink, reused: tuple[str, ...]) -> dict[str, Any]:
+    """What the stages found in the log; of a stage taken over, what the earlier run found.
+
+    Damage to the files that only this run met is told all the same.
+    """
+    joints = log.joint_defects
+    found: dict[str, tuple[Counter[str], list[str]]] = {
+        "fuse": (log.defects - joints + sink.counts, [*log.notes, *sink.notes["fuse"]]),
+        "plan": (joints, sink.notes["plan"]),
+    }
+    by_stage: dict[str, Any] = {}
+    for stage, (counts, notes) in found.items():
+        if stage in reused and job.earlier is not None:
+            theirs = runs.read_meta(job.earlier)["found_by"][stage]
+            counts = Counter[str](theirs["counts"]) | counts
+            notes = [*theirs["notes"], *notes]
+        if stage in job.stages:
+            by_stage[stage] = {"counts": _plain(counts), "notes": list(dict.fromkeys(notes))}
+    total = sum((Counter(part["counts"]) for part in by_stage.values()), Counter[str]())
+    told = [note for part in by_stage.values() for note in part["notes"]]
+    return {"counts": _plain(total), "notes": told, "found_by": by_stage}
+
+
+def _take_over(job: Job, parts: Mapping[str, str], writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
     """Copies the tables of the earlier run's stages that would come out the same, and says which those are."""
     if job.earlier is None:
         return ()
-    stale = job.stale()
+    stale = reuse.stale(job, parts)
     if smooth:
         stale.setdefault("fuse", f"{job.earlier} holds no covariances to smooth with")
     reused = tuple(stage for stage in job.stages if stage not in stale)
@@ -157,8 +183,8 @@ def _store_every(job: Job) -> float:
     return 1.0 if store_hz == "all" else max(1.0, job.settings.fusion.rate_hz / store_hz)
 
 
-def _counts(log: Log, found: Counter[str]) -> dict[str, int]:
-    return {name: int(count) for name, count in sorted((log.defects + found).items())}
+def _plain(counts: Counter[str]) -> dict[str, int]:
+    return {name: int(count) for name, count in sorted((+counts).items())}
 
 
 def _folder(job: Job, began: datetime) -> Path:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,18 +15,14 @@ from hrcreplay.pipeline import Foresight
 from hrcreplay.records import Floats, HumanStates
 from hrcreplay.report import figures, metrics, page, tables
 from hrcreplay.report.figures_human import Instant
+from hrcreplay.report.summary import lines
 from hrcreplay.runs import Run, RunWriter
 from hrcreplay.tables import read_states
 
 
 def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
     """Leaves metrics.json, the figures and report.html beside the tables that have just been written."""
-    settings = job.settings
-    near = {
-        "near_m": settings.report.near_m,
-        "stationary_m_per_s": settings.report.stationary_m_per_s,
-        "gap_s": settings.logs.gap_s,
-    }
+    near = _bounds(job.settings.model_dump())
     run = runs.read(writer.partial, meta)
     found = metrics.compute(run, **near)
     writer.text("metrics.json", runs.to_json(found))
@@ -40,6 +38,21 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
         tables.radius_table(radii),
     ]
     writer.text("report.html", page.render(run, found, folder, shown))
+
+
+def summary(folder: Path) -> list[str]:
+    """The main figures of a run, a line a stage."""
+    run = runs.read(folder)
+    return lines(run, metrics.compute(run, **_bounds(run.meta["settings"])))
+
+
+def _bounds(settings: Mapping[str, Any]) -> dict[str, float]:
+    """What the metrics ask of the settings."""
+    return {
+        "near_m": settings["report"]["near_m"],
+        "stationary_m_per_s": settings["report"]["stationary_m_per_s"],
+        "gap_s": settings["logs"]["gap_s"],
+    }
 
 
 def _instants(foresight: Foresight, run: Run) -> list[Instant]:

@@ -262,7 +262,6 @@ def _names(jobs: Sequence[Job]) -> list[str]:
 
 def _meta(jobs: Sequence[Job], began: datetime) -> dict[str, Any]:
     meta = jobs[0].meta()
-    del meta["stages"]
     others = [job.meta() for job in jobs]
     return {
         **meta,

@@ -59,6 +59,11 @@ class Log:
         return Counter(dict(sorted(found.items())))
 
     @property
+    def joint_defects(self) -> Counter[str]:
+        """Those of ``defects`` that the latest pass over the joints found."""
+        return Counter(self._track)
+
+    @property
     def notes(self) -> list[str]:
         """Remarks for the user."""
         return [*self._source.damage().notes, *self._remarks]
