@@ -19,6 +19,8 @@ from hrcreplay.pipeline import NS, Sink
 from hrcreplay.progress import Bar, say
 from hrcreplay.records import HumanStates, Ints
 from hrcreplay.reporting import write_report
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.summary import remarks, summary
 from hrcreplay.runs import RunWriter, Stopwatch
 from hrcreplay.tables import read_states
 
@@ -59,6 +61,8 @@ def run(
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
             found = run_stages(job, log, ticks_ns, chunk_ticks, sink, smooth=smooth)
         base = wiring.base(job, log)
+        if "plan" in job.stages:
+            found = _with_robot(found, wiring.robot(job, wiring.standing(job, log)))
         meta = {
             **known,
             **found,
@@ -101,6 +105,14 @@ def run_stages(job: Job, log: Log, ticks_ns: Ints, size: int, sink: Sink, *, smo
         return {"counts": _counts(log, sink.counts), "notes": list(log.notes)}
     earlier = runs.read_meta(job.earlier) if job.earlier else {}
     return {"counts": earlier["counts"], "notes": earlier["notes"]}
+
+
+def _with_robot(found: dict[str, Any], robot: RobotModel) -> dict[str, Any]:
+    """What the run tells of its robot, beside what was found; remarks on a robot from a URDF go to the terminal too."""
+    notes = [note for note in remarks(robot) if note not in found["notes"]]
+    for note in notes:
+        say(note)
+    return {**found, "notes": [*found["notes"], *notes], "robot": summary(robot)}
 
 
 def _take_over(job: Job, writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
