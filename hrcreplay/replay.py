@@ -18,9 +18,9 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import NS, Sink
 from hrcreplay.progress import Bar, say
 from hrcreplay.records import HumanStates, Ints
+from hrcreplay.report.robot_summary import remarks, summary
 from hrcreplay.reporting import write_report
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.summary import remarks, summary
 from hrcreplay.runs import RunWriter, Stopwatch
 from hrcreplay.tables import read_states
 

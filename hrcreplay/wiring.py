@@ -142,8 +142,9 @@ def robot(job: Job, T_world_base: Floats) -> RobotModel:
 @lru_cache(maxsize=4)  # a run makes its robot several times; a file that changes has another digest
 def _capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -> tuple[Segment, ...]:
     """The link capsules that a URDF's collision shapes give."""
-    chain = {"tcp_frame": tcp_frame, "base_frame": base_frame}
-    return from_urdf(files.text, np.eye(4), stop_s=1.0, meshes=dict(files.meshes), **chain).segments
+    meshes = dict(files.meshes)
+    model = from_urdf(files.text, np.eye(4), stop_s=1.0, tcp_frame=tcp_frame, base_frame=base_frame, meshes=meshes)
+    return model.segments
 
 
 def reference(job: Job, log: Source, model: RobotModel) -> tuple[Reference, int | None]:

@@ -16,6 +16,7 @@ from hrcreplay.records import LIMBS
 from hrcreplay.report import story
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
+from hrcreplay.report.robot_summary import robot_table
 from hrcreplay.report.tables import PageTable, compare, percent, text_of
 from hrcreplay.report.wording import CAMERA, CAPTIONS, FUSION, NOT_CLAIMED, PLAN_COST, PLAN_SAFETY
 from hrcreplay.runs import Run
@@ -120,6 +121,7 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             else (),
             no_plan,
         ),
+        *_robot(run, figures("robot_links")),
         Part(
             "prediction",
             "Prediction",
@@ -146,6 +148,12 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             (compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA), *_counters(run)),
         ),
     )
+
+
+def _robot(run: Run, drawn: tuple[PageFigure, ...]) -> tuple[Part, ...]:
+    """The section of the robot, where the run moved one."""
+    tables = (robot_table(run.meta["robot"]),) if "robot" in run.meta else ()
+    return (Part("robot", "Robot", "The capsules that stand for its links.", drawn, tables),) if drawn or tables else ()
 
 
 def _papers(metrics: Mapping[str, Metric]) -> str:
