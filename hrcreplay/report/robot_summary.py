@@ -44,7 +44,7 @@ def remarks(robot: RobotModel) -> tuple[str, ...]:
         widest = max(derived, key=lambda segment: segment.volume_m3 - segment.shape_m3)
         found.append(
             f"robot {robot.name}: {robot.nv} axes from {robot.base_frame} to {robot.tcp_frame}; its {len(derived)} "
-            f"capsules add {100 * (capsules / shapes - 1):.0f} % to the volume of the collision shapes in them, most at "
+            f"capsules add {100 * (capsules / shapes - 1):.0f} % to the volume of the shapes in them, most at "
             f"{widest.name}: {_LITRES * widest.volume_m3:.1f} L around {_LITRES * widest.shape_m3:.1f} L"
         )
     if robot.locked:
