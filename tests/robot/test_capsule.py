@@ -23,7 +23,7 @@ def ball(count: int, rng: np.random.Generator) -> Floats:
 def test_a_capsules_own_surface_gives_it_back(length: float) -> None:
     rng = np.random.default_rng(1)
     turn = Rotation.from_rotvec([0.4, -1.0, 0.3])
-    ends = turn.apply([[0, 0, -length / 2], [0, 0, length / 2]]) + [0.3, -0.2, 0.5]
+    ends = turn.apply([[0, 0, -length / 2], [0, 0, length / 2]]) + np.array([0.3, -0.2, 0.5])
     points = np.vstack([end + 0.06 * ball(400, rng) for end in ends])
     start, end, radius = fit(points)
     assert outside_m(points, start, end, radius) <= 1e-6
