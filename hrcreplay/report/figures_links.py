@@ -47,9 +47,9 @@ def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
         Solid(ends, float(radius), colours[body])
         for body, ends, radius in zip(pose.bodies, pose.ends_m, pose.radius_m, strict=True)
     ]
-    rows = -(-len(names) // 5)
-    figure = style.new_figure(3.9 + 0.17 * rows)
-    axes = style.panels(figure, 1, 2, left_in=0.62, top_in=0.3, bottom_in=0.6 + 0.17 * rows, gap_in=(0.3, 0.62))[0]
+    rows = -(-(len(names) + 1) // 5)
+    figure = style.new_figure(3.9 + 0.18 * rows)
+    axes = style.panels(figure, 1, 2, left_in=0.62, top_in=0.3, bottom_in=0.5 + 0.18 * rows, gap_in=(0.3, 0.62))[0]
     views = (view_from(_beside(pose, base_m), 0.12), ABOVE)
     for ax, view in zip(axes, views, strict=True):
         _draw(ax, view, solids, pose, base_m)
