@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import tomllib
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -14,6 +15,7 @@ from hrcreplay.config import Settings, as_overrides, load_settings
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.limits import load_limits
+from hrcreplay.urdf_files import read_urdf
 
 STAGES = ("fuse", "predict", "plan")
 
@@ -71,7 +73,7 @@ class Job:
         return {
             "command": self.command,
             "versions": versions(),
-            "inputs": [{"path": str(self.log), "sha256": self.log_sha256}],
+            "inputs": [{"path": str(self.log), "sha256": self.log_sha256}, *_urdf_inputs(self.settings)],
             "settings": self.settings.model_dump(mode="json"),
             "cell": None if self.cell is None else self.cell.to_dict(),
             "task": self.task,
@@ -177,13 +179,14 @@ def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] 
 
 
 def urdf_digest(settings: Settings) -> str | None:
-    """SHA-256 of the robot's URDF; None for the IRB 140. Raises SettingsError where it is not there."""
-    path = settings.robot.urdf
-    if path is None:
-        return None
-    if not path.is_file():
-        raise SettingsError(f"robot.urdf: {path} is not a file; name a URDF, or leave it out for the IRB 140")
-    return runs.sha256(path)
+    """Of the robot's URDF and the meshes that its link capsules come from; None for the IRB 140."""
+    digests = [file["sha256"] for file in _urdf_inputs(settings)]
+    return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else None
+
+
+def _urdf_inputs(settings: Settings) -> list[dict[str, str]]:
+    files = read_urdf(settings.robot)
+    return [] if files is None else [{"path": path, "sha256": digest} for path, digest in files.inputs]
 
 
 def plain_limits(limits: LimitSet) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import NS, Sink
 from hrcreplay.progress import Bar, say
 from hrcreplay.records import HumanStates, Ints
-from hrcreplay.report import limbs
+from hrcreplay.report import limbs, robot_summary
 from hrcreplay.report.flaws import flaws
 from hrcreplay.reporting import write_report
 from hrcreplay.runs import Run, RunWriter, Stopwatch
@@ -67,7 +67,12 @@ def run(
             found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth)
         base = wiring.base(job, log)
         writer.close_tables()
-        found["notes"] = list(dict.fromkeys([*found["notes"], *_unmeasured(writer.partial, known, found["notes"])]))
+        notes = [*found["notes"], *_unmeasured(writer.partial, known, found["notes"])]
+        if "plan" in job.stages:
+            robot = wiring.robot(job, wiring.standing(job, log))
+            notes += robot_summary.remarks(robot)
+            found["robot"] = robot_summary.summary(robot)
+        found["notes"] = list(dict.fromkeys(notes))
         for line in flaws(found["counts"], found["notes"]):
             say(line)
         meta = {

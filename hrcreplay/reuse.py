@@ -62,7 +62,7 @@ def parts(job: Job, log: Source, ticks_ns: Ints) -> dict[str, str]:
         found |= {
             "base": None if base is None else base.tolist(),
             "programme": job.task or log.header.task or {"joints_topic": settings["logs"]["joints_topic"]},
-            "settings robot": [_without(settings["robot"], "urdf"), urdf_digest(job.settings)],
+            "settings robot": [_without(settings["robot"], "urdf", "packages"), urdf_digest(job.settings)],
             "settings plan": _without(settings["plan"], "task"),
         }
     return {name: _digest(part) for name, part in found.items()}

@@ -19,6 +19,7 @@ from hrcreplay.report.flaws import flaws
 from hrcreplay.report.limbs import called
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
+from hrcreplay.report.robot_summary import robot_table
 from hrcreplay.report.tables import PageTable, compare, percent, text_of
 from hrcreplay.report.wording import CAMERA, CAPTIONS, FUSION, NOT_CLAIMED, PLAN_COST, PLAN_SAFETY
 from hrcreplay.runs import Run
@@ -127,6 +128,7 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             else (),
             no_plan,
         ),
+        *_robot(run, figures("robot_links")),
         Part(
             "prediction",
             "Prediction",
@@ -157,6 +159,12 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             ),
         ),
     )
+
+
+def _robot(run: Run, drawn: tuple[PageFigure, ...]) -> tuple[Part, ...]:
+    """The section of the robot, where the run moved one."""
+    tables = (robot_table(run.meta["robot"]),) if "robot" in run.meta else ()
+    return (Part("robot", "Robot", "The capsules that stand for its links.", drawn, tables),) if drawn or tables else ()
 
 
 def _papers(metrics: Mapping[str, Metric]) -> str:

@@ -21,6 +21,10 @@ CAPTIONS = {
         "As the paper's Fig. 13. Programmed and actual path of the TCP, and the largest deviation between them with "
         "its length. Shaded: the swept volumes of the person at that tick. The paper's own deviation is 0.221 m."
     ),
+    "robot_links": (
+        "The robot as its distances see it: a capsule around each collision shape of its links, at the tick of the "
+        "smallest separation, beside the swept volumes of the person. The square is the robot's base."
+    ),
     "fig17_volumes": (
         "As the paper's Fig. 17. What the person could reach within the stopping time at four instants, limb radii "
         "included: from positions and velocities; by the older method, from positions alone; and as this run did it, "

@@ -33,9 +33,9 @@ def test_the_first_screen_tells_what_was_wrong_and_only_then(tmp_path: Path) -> 
     run = dataclasses.replace(make_run(2.0), counts={"chunks_unreadable": 2, "frames_kinect": 60})
     text = " ".join(read(rendered(run, tmp_path)).text)
     first = text[: text.index("not a certificate")]
-    assert "What was wrong with the log" in first
+    assert "Remarks on the recording and the robot" in first
     assert "damaged chunks of an MCAP file; left out: 2" in first
     assert "header stamps are zero: arrival times used" in first  # the run's note
     assert "rows delivered" not in first
     clean = dataclasses.replace(run, counts={"frames_kinect": 60}, notes=())
-    assert "What was wrong with the log" not in " ".join(read(rendered(clean, tmp_path)).text)
+    assert "Remarks on the recording and the robot" not in " ".join(read(rendered(clean, tmp_path)).text)
