@@ -255,3 +255,10 @@ def test_a_robot_that_was_never_let_go_is_said_to_have_stood() -> None:
     safe, _ = story.answers(still, compute(still, near_m=0.5, stationary_m_per_s=0.001))
     assert safe.short == "The robot never moved."
     assert safe.words.startswith("It stood at all 400 ticks.")
+
+
+def test_an_interval_does_not_break_at_its_dash(tmp_path: Path) -> None:
+    run = make_run(2.0)
+    shown = tables.PageTable("shares", ("", "here"), (("limb", "99.5 (97.1\u2013100.0)"),))
+    html = page.render(run, compute(run, near_m=0.5, stationary_m_per_s=0.001), tmp_path, [shown])
+    assert "<td>99.5 (97.1\u2013\u2060100.0)</td>" in html
