@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: demo test bench soundness readme lock clean
+.PHONY: demo test bench soundness fuzz readme lock clean
 
 demo: $(VENV)/made
 	@$(BIN)/hrcreplay demo
@@ -30,6 +30,13 @@ soundness: $(VENV)/made
 ONLY ?=
 readme: $(VENV)/made
 	$(BIN)/python -m tests.readme $(ONLY)
+
+# Spoils logs at random and puts them through the commands: no traceback, no other exit code, nothing half-written.
+LOGS ?= 500
+LIVE ?= 100
+SEED ?= 1
+fuzz: $(VENV)/made
+	$(BIN)/python -m tests.fuzz --logs $(LOGS) --live $(LIVE) --seed $(SEED)
 
 # Everything from the lock, by hash and without a compiler; then the project itself, its kernels compiled once.
 $(VENV)/made: requirements.lock pyproject.toml

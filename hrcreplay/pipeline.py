@@ -25,6 +25,9 @@ NS = 1_000_000_000
 #: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
 _LOST = ("points_", "person_frames_without", "frames_repeated", "frames_out_of_order")
 
+#: Of a session; a longer log has an arrival of another clock among its messages [s].
+LONGEST_S = 24 * 3600
+
 
 @dataclass
 class Sink:
@@ -79,7 +82,16 @@ class Foresight:
 
 
 def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
-    """(n,) tick times: from the first instant on, at the filter's rate, none after the last [ns]."""
+    """(n,) tick times: from the first instant on, at the filter's rate, none after the last [ns].
+
+    Raises:
+        LogError: So long a span is no session, but a message with an arrival that cannot be.
+    """
+    if end_ns - start_ns > LONGEST_S * NS:
+        raise LogError(
+            f"arrivals: the log goes on for {(end_ns - start_ns) / (3600 * NS):.0f} h from its first message to its "
+            f"last; would be right: at most {LONGEST_S // 3600} h, as a span with --start and --end"
+        )
     count = int((end_ns - start_ns) * rate_hz / NS) + 1
     ticks: Ints = start_ns + np.round(np.arange(count) * (NS / rate_hz)).astype(np.int64)
     return ticks[ticks <= end_ns]

@@ -136,13 +136,18 @@ class RunWriter:
         path.parent.mkdir(exist_ok=True)
         path.write_text(text)
 
-    def finish(self, meta: Mapping[str, Any]) -> None:
-        """Writes run.json with the digest of every output and gives the folder its name."""
+    def finish(self, meta: Mapping[str, Any], *, complete: bool = True) -> None:
+        """Writes run.json with the digest of every output and gives the folder its name.
+
+        Args:
+            meta: All else that run.json has.
+            complete: No for a session that broke off, whatever could be made of its record.
+        """
         self.close_tables()
         self.text("timing.json", to_json(self.timing))
         names = sorted(p.relative_to(self.partial).as_posix() for p in self.partial.rglob("*") if p.is_file())
         outputs = {name: sha256(self.partial / name) for name in names if name not in NOT_DETERMINISTIC}
-        self.text("run.json", to_json({**meta, "outputs": outputs, "complete": True}))
+        self.text("run.json", to_json({**meta, "outputs": outputs, "complete": complete}))
         self.partial.rename(self.folder)
 
     def __exit__(
@@ -183,8 +188,12 @@ def is_run(path: Path) -> bool:
     return (path / "run.json").is_file()
 
 
-def read_meta(folder: Path) -> dict[str, Any]:
+def read_meta(folder: Path, *, broken_off: bool = False) -> dict[str, Any]:
     """run.json of a complete run.
+
+    Args:
+        folder: Of the run.
+        broken_off: Whether a live session that crashed will do as well.
 
     Raises:
         SettingsError: Not a run folder, or the run did not end.
@@ -193,6 +202,12 @@ def read_meta(folder: Path) -> dict[str, Any]:
         meta: dict[str, Any] = json.loads((folder / "run.json").read_text())
     except (OSError, ValueError) as error:
         raise SettingsError(f"{folder}: no run folder (run.json is missing or broken)") from error
+    if not meta.get("complete") and meta.get("crashes"):
+        if broken_off:
+            return meta
+        raise SettingsError(
+            f"{folder}: a live session that broke off ({meta['crashes'][0]}); give its log: {folder / 'log.mcap'}"
+        )
     if not meta.get("complete"):
         raise SettingsError(f"{folder}: the run did not end (complete is false); run it again")
     return meta

@@ -11,8 +11,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from hrcreplay import replay, runs
-from hrcreplay.errors import SettingsError
+from hrcreplay import pipeline, replay, runs
+from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, SweptVolumes
@@ -64,6 +64,15 @@ def test_ticks_are_the_filters_rate(demo: Run) -> None:
     assert demo.state is not None
     assert set(np.diff(demo.state["t_ns"])) == {4_000_000}
     assert len(demo.state) == 15_001
+
+
+def test_a_span_of_more_than_a_day_is_refused() -> None:
+    day_ns = 24 * 3600 * pipeline.NS
+    assert len(pipeline.tick_times(5, day_ns + 5, 0.01)) == 865
+    with pytest.raises(
+        LogError, match=r"arrivals: the log goes on for 36 h .*at most 24 h, as a span with --start and"
+    ):
+        pipeline.tick_times(5, 3 * day_ns // 2, 0.01)
 
 
 def test_fusion_meets_its_bars_on_the_demo(demo_folder: Path, demo: Run) -> None:

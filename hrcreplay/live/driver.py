@@ -8,7 +8,7 @@ import shutil
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,10 +17,11 @@ from typing import Any
 
 from hrcreplay.config import Settings
 from hrcreplay.egm.link import Link
-from hrcreplay.errors import LiveStopped, LogError, SettingsError
-from hrcreplay.live import folder, watch, wire
+from hrcreplay.errors import HrcReplayError, LiveStopped, LogError, SettingsError
+from hrcreplay.live import crash, folder, watch, wire
 from hrcreplay.live.helpers import Helper, step_back, take_precedence
-from hrcreplay.live.loop import Loop, LoopSettings
+from hrcreplay.live.last_resort import bring_to_rest
+from hrcreplay.live.loop import ENDING, Loop, LoopSettings
 from hrcreplay.live.pilot import Pilot
 from hrcreplay.live.records import Signal
 from hrcreplay.live.setup import build, live_job, start_table
@@ -60,72 +61,130 @@ def run(request: Request) -> Path:
     Raises:
         SettingsError: A setting, the cell, the task, the port or the output folder cannot be used.
         LogError: The recording of the person cannot be read.
-        LiveStopped: The session ended by a stop reason; its record is complete all the same.
+        LiveStopped: The session ended by a stop reason, or a part of it crashed; then its record is not complete.
     """
-    job, header = live_job(request.human, request.config, request.overrides, request.cell)
-    live = job.settings.live
-    start = start_table(job, header, sending=request.send)
-    pilot = build(start)
-    with closing(Link("", live.port if request.port is None else request.port, WAIT_S)) as link:
-        warm(start)
-        partial = folder.begin(request.out)
-        loop, finished = _conduct(request, job.settings, start, pilot, link, partial)
+    partial = folder.begin(request.out)
     try:
-        done = folder.finish(partial)
+        with ExitStack() as stack:
+            prepared = _prepare(request, stack)
+            loop, crashes = _conduct(request, prepared, partial)
+    except _CrashedError:
+        raise _broken_off(partial, crash.read(partial)) from None
+    except (HrcReplayError, KeyboardInterrupt, SystemExit):
+        if not (partial / folder.LOG).exists():
+            shutil.rmtree(partial, ignore_errors=True)  # there is nothing in it
+        raise
+    except Exception as error:  # whatever it is
+        raise _broken_off(partial, [crash.write(partial, crash.CONTROL, error)]) from None
+    done = _finish(partial, crashes)
+    _verdict(loop, done, crashes)
+    return done
+
+
+def _finish(partial: Path, crashes: list[str]) -> Path:
+    """The run folder of a session that is over."""
+    try:
+        return folder.finish(partial)
     except KeyboardInterrupt:
         again = f"hrcreplay verify {partial} --finish"
         raise LiveStopped(
             f"interrupted while its run folder was made; the record is whole, go on with: {again}"
         ) from None
-    if pilot.fault is not None:
-        raise pilot.fault
-    _verdict(loop, done, finished)
-    return done
+    except HrcReplayError:
+        if not crashes:
+            raise
+        raise _broken_off(partial, crashes) from None
+    except Exception as error:  # whatever it is
+        raise _broken_off(partial, [*crashes, crash.write(partial, crash.FOLDER, error)]) from None
 
 
-def _conduct(
-    request: Request, settings: Settings, start: dict[str, Any], pilot: Pilot, link: Link, partial: Path
-) -> tuple[Loop, int | None]:
-    """The loop with the processes around it; the loop, which is over, and the recorder's exit code."""
+def _broken_off(partial: Path, crashes: list[str]) -> LiveStopped:
+    """What to say of a session that no run folder can be made of; what there is of it says the same."""
+    folder.leave(partial, crashes)
+    return LiveStopped(f"{crashes[0]}; not complete: what there is of the record, and the traceback, is in {partial}")
+
+
+class _CrashedError(Exception):
+    """A helper crashed before the session began; its file says how."""
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A session before its processes start."""
+
+    settings: Settings
+    start: dict[str, Any]
+    pilot: Pilot
+    link: Link
+
+
+def _prepare(request: Request, stack: ExitStack) -> _Prepared:
+    """Settings, pilot, port; every kernel compiled."""
+    job, header = live_job(request.human, request.config, request.overrides, request.cell)
+    port = job.settings.live.port if request.port is None else request.port
+    start = start_table(job, header, sending=request.send)
+    pilot = build(start)
+    link = stack.enter_context(closing(Link("", port, WAIT_S)))
+    warm(start)
+    return _Prepared(job.settings, start, pilot, link)
+
+
+def _conduct(request: Request, prepared: _Prepared, partial: Path) -> tuple[Loop, list[str]]:
+    """The loop with the processes around it; the loop, which is over, and what is to be said of crashes."""
+    settings = prepared.settings
     anchor_ns = time.time_ns() - time.monotonic_ns()
-    recorder = Helper("hrcreplay.live.recorder", ["--path", str(partial / "log.mcap")])
-    person = Helper("hrcreplay.live.person", _person_arguments(request, settings, anchor_ns))
-    screen = Helper("hrcreplay.live.screen", _screen_arguments(request))
+    to_record = ["--path", str(partial / folder.LOG)]
+    recorder = Helper(crash.RECORDER, "hrcreplay.live.recorder", to_record, partial)
+    person_arguments = _person_arguments(request, settings, anchor_ns)
+    person = Helper(crash.PERSON, "hrcreplay.live.person", person_arguments, partial, told=(2, 3))
+    screen = Helper(crash.SCREEN, "hrcreplay.live.screen", _screen_arguments(request), partial)
     begun = False
     try:
         _await_person(person, request.human)
         begun, start_ns = True, time.monotonic_ns() + anchor_ns
-        loop = Loop(pilot, link, person, recorder, _loop_settings(request, settings), anchor_ns, start_ns)
-        recorder.send(wire.event(loop.start_ns, {"what": "start", **start}))
-        teller = Teller(loop, screen, start, in_3d=request.foxglove is not None)
-        _fly(loop, teller, real_time=settings.live.real_time)
+        parts = prepared.pilot, prepared.link, person, recorder
+        loop = Loop(*parts, _loop_settings(request, settings), anchor_ns, start_ns, screen)
+        recorder.send(wire.event(loop.start_ns, {"what": "start", **prepared.start}))
+        crashes = _fly(loop, prepared.start, partial, real_time=settings.live.real_time, in_3d=bool(request.foxglove))
     finally:
         screen.dismiss(2.0)
         person.dismiss(2.0)
-        finished = recorder.dismiss(PATIENCE_S)
+        if recorder.dismiss(PATIENCE_S) is None:
+            crash.write(partial, crash.RECORDER, f"did not finish within {PATIENCE_S:g} s")
         if not begun:
-            shutil.rmtree(partial, ignore_errors=True)  # there is nothing in it
-    return loop, finished
+            (partial / folder.LOG).unlink(missing_ok=True)  # there is nothing in it
+    return loop, list(dict.fromkeys([*crashes, *crash.read(partial)]))
 
 
-def _fly(loop: Loop, teller: Teller, *, real_time: bool) -> None:
-    """The loop, alone with the robot: no garbage collector, no waiting for anybody."""
+def _fly(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, in_3d: bool) -> list[str]:
+    """The loop, alone with the robot: no garbage collector, no waiting for anybody. Returns its crashes."""
+    found: list[Exception] = []
     with _signals(loop):
         gc.collect()
         gc.freeze()
         gc.disable()
-        for refused in take_precedence() if real_time else ():
-            loop.note(f"the system refuses {refused}")
-        loop.begin()
         try:
+            for refused in take_precedence() if real_time else ():
+                loop.note(f"the system refuses {refused}")
+            teller = Teller(loop, start, in_3d=in_3d)
+            loop.begin()
             while loop.turn():
                 teller.tell()
+        except Exception as error:  # whatever it is, the robot is braked first
+            found.append(error)
+            bring_to_rest(loop, crash.said_of(error))
         finally:
             step_back()
             gc.enable()
             gc.unfreeze()
-        loop.recorder.send(wire.event(loop.now_ns(), {"what": "end", **outcome(loop)}))
-        teller.tell(last=True)
+        try:
+            loop.recorder.send(wire.event(loop.now_ns(), {"what": "end", **outcome(loop)}))
+            teller.tell(last=True)
+        except Exception as error:  # whatever it is
+            found.append(error)
+    if loop.pilot.fault is not None:
+        found.insert(0, loop.pilot.fault)
+    return [crash.write(partial, crash.CONTROL, error) for error in found]
 
 
 def outcome(loop: Loop) -> dict[str, Any]:
@@ -142,17 +201,19 @@ def outcome(loop: Loop) -> dict[str, Any]:
 
 
 def _reason(loop: Loop) -> str:
-    return loop.pilot.stop or watch.of_signals(loop.caught)
+    return loop.pilot.stop or watch.of_signals(loop.caught | (loop.signals & ENDING))
 
 
-def _verdict(loop: Loop, done: Path, finished: int | None) -> None:
-    if finished != 0:
-        raise LiveStopped(f"{done}: the recorder did not finish (exit code {finished}); the log may lack its end")
+def _verdict(loop: Loop, done: Path, crashes: list[str]) -> None:
+    if crashes:
+        raise LiveStopped(f"{crashes[0]}; braked; the record, not complete, and the traceback are in {done}")
     reason = _reason(loop)
     if reason and reason not in (watch.SESSION_OVER, watch.RECORDING_OVER):
         at = next((t_ns for t_ns, why in loop.pilot.stops if why == reason), None)
         when = "" if at is None else f" after {(at - loop.start_ns) / 1e9:.1f} s"
-        raise LiveStopped(f"stopped by: {reason}{when}; the record is in {done}")
+        last_words = [note.removeprefix("failed ") for note in loop.notes if note.startswith("failed ")]
+        why = f" ({last_words[-1]})" if reason == watch.PERSON_DEAD and last_words else ""
+        raise LiveStopped(f"stopped by: {reason}{why}{when}; the record is in {done}")
 
 
 @contextmanager
@@ -188,7 +249,9 @@ def _await_person(person: Helper, human: Path | None) -> None:
             if message[:1] == b"N" and text.startswith("ready"):
                 return
         time.sleep(0.01)
-    raise kind(f"{human or 'live.zenoh'}: the human side did not get ready; see what it said above")
+    if not person.alive:
+        raise _CrashedError
+    raise kind(f"{human or 'live.zenoh'}: the human side did not get ready within {PATIENCE_S:g} s")
 
 
 def _loop_settings(request: Request, settings: Settings) -> LoopSettings:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from hrcreplay import runs, wiring
 from hrcreplay.errors import SettingsError
 from hrcreplay.ingest import log_options
 from hrcreplay.job import Job
+from hrcreplay.live import crash
 from hrcreplay.live.session_tables import SessionTables
 from hrcreplay.live.setup import job_of
 from hrcreplay.live.tape import Tape
@@ -57,11 +59,27 @@ def finish(partial: Path) -> Path:
     tables.flush()
     _measure(job, writer)
     writer.close_tables()
-    meta = _meta(job, start, tables, tape)
+    crashes = crash.read(partial)
+    meta = _meta(job, start, tables, tape, crashes)
     write_report(job, writer, meta)
     writer.timing.update(tables.timing())
-    writer.finish(meta)
+    writer.finish(meta, complete=not crashes)
     return writer.folder
+
+
+def leave(partial: Path, crashes: list[str]) -> None:
+    """Leaves of a session that no run folder can be made of its log and its crashes, and says so in run.json."""
+    for path in sorted(partial.iterdir()):
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != LOG and not path.name.startswith(crash.PREFIX):
+            path.unlink()
+    (partial / "run.json").write_text(runs.to_json(_crashed(crashes) | {"command": "live", "complete": False}))
+
+
+def _crashed(crashes: list[str]) -> dict[str, Any]:
+    """What run.json has of crashes."""
+    return {"crashes": crashes, "reason": crashes[0]} if crashes else {}
 
 
 def _measure(job: Job, writer: RunWriter) -> None:
@@ -73,12 +91,13 @@ def _measure(job: Job, writer: RunWriter) -> None:
         writer.table("measurements", measurement_columns(measured))
 
 
-def _meta(job: Job, start: dict[str, Any], tables: SessionTables, tape: Tape) -> dict[str, Any]:
+def _meta(job: Job, start: dict[str, Any], tables: SessionTables, tape: Tape, crashes: list[str]) -> dict[str, Any]:
     """run.json of the session."""
     end: dict[str, Any] = next((event for event in tables.events if event.get("what") == "end"), {})
     notes = [str(event["text"]) for event in tables.events if event.get("what") == "note"]
     notes += [f"{LOG}: {flaw}" for flaw in tape.flaws]
-    if not end:
+    notes += [f"not complete: {line}" for line in crashes]
+    if not end and not crashes:
         notes.append("the session was killed: its record has no end")
     counts = {name.replace(" ", "_"): int(count) for name, count in end.get("counts", {}).items()}
     counts |= dict(tables.counts) | {"messages_dropped": int(end.get("dropped", 0))}
@@ -95,4 +114,5 @@ def _meta(job: Job, start: dict[str, Any], tables: SessionTables, tape: Tape) ->
         "reason": end.get("reason"),
         "counts": dict(sorted(counts.items())),
         "notes": notes,
+        **_crashed(crashes),
     }

@@ -8,6 +8,12 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from hrcreplay.live import crash
+
+#: Module through which every helper starts; see process.py.
+ENTRY = "hrcreplay.live.process"
 
 _LARGEST = 1 << 20  #: no message is larger
 _BUFFER = 4 << 20  #: of messages under way: seconds of them
@@ -17,8 +23,21 @@ _AT_ONCE = 256  #: messages taken at once, so that a flood does not hold up the 
 class Helper:
     """A process of ours, with a socket whose far end it holds."""
 
-    def __init__(self, module: str, arguments: Sequence[str]) -> None:
-        """Starts ``python -m module --fd N arguments``, in a session of its own: Ctrl-C is for control alone."""
+    def __init__(
+        self, part: str, module: str, arguments: Sequence[str], folder: Path, told: tuple[int, ...] = ()
+    ) -> None:
+        """Starts ``module --fd N arguments`` in a session of its own: Ctrl-C is for control alone.
+
+        Args:
+            part: Which part of the session it is, of crash.py.
+            module: Module to run.
+            arguments: Of it, beside the socket.
+            folder: Where it leaves its traceback if it crashes.
+            told: Exit codes beside 0 of a process that has told why it ends: no crash.
+        """
+        self.part = part
+        self._folder = folder
+        self._told = (0, *told)
         near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         for end in (near, far):
             _enlarge(end)
@@ -28,7 +47,7 @@ class Helper:
         self.dropped = 0  #: messages that it did not take
         with far:
             self.process = subprocess.Popen(  # noqa: S603 - our own modules
-                [sys.executable, "-m", module, "--fd", str(far.fileno()), *arguments],
+                [sys.executable, "-m", ENTRY, str(folder), part, module, "--fd", str(far.fileno()), *arguments],
                 pass_fds=(far.fileno(),),
                 start_new_session=True,
                 stdin=subprocess.DEVNULL,
@@ -69,16 +88,26 @@ class Helper:
                 pass
         return self.alive
 
+    def crashed(self) -> bool:
+        """Whether it has ended as nobody foresaw; no for one that lives, or is about to end."""
+        return not self.alive and self.process.poll() not in (None, *self._told)
+
     def dismiss(self, patience_s: float) -> int | None:
-        """Closes the socket, which ends the process; its exit code, None where it had to be killed."""
+        """Closes the socket, which ends the process; its exit code, None where it had to be killed.
+
+        A process that crashed has left a file in the run folder; of one that could not, this leaves it.
+        """
         self._socket.close()
         self.alive = False
         try:
-            return self.process.wait(patience_s)
+            code = self.process.wait(patience_s)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
             return None
+        if self.crashed() and not crash.left(self._folder, self.part):
+            crash.write(self._folder, self.part, crash.end_of(code))
+        return code
 
 
 def _enlarge(end: socket.socket) -> None:

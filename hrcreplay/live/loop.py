@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
-from hrcreplay.egm.link import Link, Received
+from hrcreplay.egm.link import Address, Link, Received
 from hrcreplay.live import wire
 from hrcreplay.live.durations import Durations
 from hrcreplay.live.helpers import Helper
@@ -17,8 +17,16 @@ from hrcreplay.live.pilot import Pilot
 from hrcreplay.live.records import Answer, Signal, TickEvent
 from hrcreplay.live.watch import REFUSED
 
-#: Signals after which the session ends as soon as the robot stands.
-ENDING = Signal.INTERRUPT | Signal.TERMINATE | Signal.DURATION | Signal.PERSON_ENDED
+#: Signals after which the session ends as soon as the robot stands. A process that is gone does not come back.
+ENDING = (
+    Signal.INTERRUPT
+    | Signal.TERMINATE
+    | Signal.DURATION
+    | Signal.PERSON_ENDED
+    | Signal.PERSON_DEAD
+    | Signal.RECORDER_DEAD
+    | Signal.SCREEN_DEAD
+)
 
 #: Answers at speed 0 before we leave: a robot keeps obeying the last one.
 FAREWELLS = 5
@@ -47,13 +55,18 @@ class Loop:
     settings: LoopSettings
     anchor_ns: int
     start_ns: int
+    screen: Helper | None = None
     caught: Signal = Signal.NONE  #: by the handlers of the operating system's signals
+    signals: Signal = Signal.NONE  #: of the latest turn
     notes: list[str] = field(default_factory=list)
     took: Durations = field(default_factory=Durations)
     answers: int = 0
     skipped: int = 0  #: looks left out
     robot: str | None = None
     last: Answer | None = None
+    sent: bytes | None = None  #: the latest reply that went to the robot
+    sender: Address | None = None  #: where the robot's packets come from
+    pending: Received | None = None  #: what is not answered yet
     stored: bytes | None = None  #: the latest swept volumes that were recorded whole
     _bodies: list[bytes] = field(default_factory=list)
     _beat_ns: int = 0
@@ -74,8 +87,8 @@ class Loop:
 
     def turn(self) -> bool:
         """One turn; False when the session is over."""
-        received = self.link.newest()
-        signals = self._signals()
+        received = self.pending = self.link.newest()
+        signals = self.signals = self._signals()
         if received is None:
             t_ns = self.now_ns()
             self.pilot.silence(t_ns, signals)
@@ -95,6 +108,8 @@ class Loop:
         answer = self.pilot.answer(event)
         if answer.datagram is not None and self.settings.sending:
             self.link.answer(answer.datagram, received.sender)
+            self.sent, self.sender = answer.datagram, received.sender
+        self.pending = None
         took_ns = self.now_ns() - event.t_ns
         self._late = took_ns > self.settings.overrun_s * 1e9
         self.robot = "{}:{}".format(*received.sender)
@@ -155,6 +170,8 @@ class Loop:
             found |= Signal.PERSON_LATE
         if self.settings.keep_recorder and not self.recorder.notice():
             found |= Signal.RECORDER_DEAD
+        if self.screen is not None and self.screen.crashed():
+            found |= Signal.SCREEN_DEAD
         if self._late:
             found |= Signal.OVERRUN
         return found

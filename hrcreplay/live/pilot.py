@@ -202,8 +202,9 @@ class Pilot:
         return said if finite else self._give_up(course, watch.NOT_FINITE)
 
     def _give_up(self, course: Course, why: str) -> Said:
-        """The stop of a robot whose step cannot be taken."""
-        self._stop(self._heard_ns or 0, why)
+        """The stop of a robot whose step cannot be taken; once, however often it fails while the robot brakes."""
+        if not self.stop or self.phase in (records.APPROACH, records.FOLLOWING):
+            self._stop(self._heard_ns or 0, why)
         return brake(self.setup, course, _UNSEEN)
 
     def _step(self, course: Course) -> Said:

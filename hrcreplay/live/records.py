@@ -29,6 +29,7 @@ class Signal(IntFlag):
     PERSON_ENDED = 32  #: the recording of the person is over
     RECORDER_DEAD = 64  #: the recorder's process has ended
     OVERRUN = 128  #: the answer before this one came too late
+    SCREEN_DEAD = 256  #: the screen's process has crashed
 
 
 @dataclass(frozen=True, slots=True)

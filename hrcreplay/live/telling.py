@@ -9,7 +9,6 @@ from typing import Any
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.live import scene
-from hrcreplay.live.helpers import Helper
 from hrcreplay.live.loop import Loop
 from hrcreplay.live.records import PHASES
 from hrcreplay.live.status import CameraStatus, Latency, Status
@@ -22,9 +21,8 @@ _SECOND_NS = 1_000_000_000
 class Teller:
     """Keeps the screen informed; costs the loop nothing between two tellings."""
 
-    def __init__(self, loop: Loop, screen: Helper, names: dict[str, Any], *, in_3d: bool) -> None:
+    def __init__(self, loop: Loop, names: dict[str, Any], *, in_3d: bool) -> None:
         self._loop = loop
-        self._screen = screen
         self._names = names
         self._scene = in_3d
         self._told_ns = 0
@@ -34,7 +32,7 @@ class Teller:
         if in_3d:
             radii = [segment.radius_m for segment in loop.pilot.setup.robot.segments]
             cast = scene.Cast(limbs=names["limbs"], links=names["links"], radii_m=radii)
-            screen.send(b"J" + json.dumps(cast).encode())
+            self._send(b"J" + json.dumps(cast).encode())
 
     def tell(self, *, last: bool = False) -> None:
         """Tells, where it is time."""
@@ -43,9 +41,13 @@ class Teller:
             return
         self._told_ns = now_ns
         self._count(now_ns)
-        self._screen.send(b"S" + json.dumps(self._status(now_ns)).encode())
+        self._send(b"S" + json.dumps(self._status(now_ns)).encode())
         if self._scene:
             self._show()
+
+    def _send(self, message: bytes) -> None:
+        if self._loop.screen is not None:
+            self._loop.screen.send(message)
 
     def _show(self) -> None:
         """The person, the volumes and the robot, for whoever draws them."""
@@ -54,7 +56,7 @@ class Teller:
             return
         points = skeleton(sight.states.p, sight.states.lengths_m)[0]
         pose = self._loop.pilot.setup.robot.pose(answer.row.q, answer.row.dq)
-        self._screen.send(b"P" + scene.pack(sight.t_ns, points, pose.ends_m, volumes))
+        self._send(b"P" + scene.pack(sight.t_ns, points, pose.ends_m, volumes))
 
     def _count(self, now_ns: int) -> None:
         """Rates of the last second."""

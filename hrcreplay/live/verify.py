@@ -71,7 +71,7 @@ def _session(run: Path, build: Build) -> Verdict:
     again = Again(build(tape.start()))
     difference = None
     for message in tape.messages():
-        if tape.flaws:
+        if tape.flaws or again.crashed:
             break
         difference = again.differs(message)
         if difference is not None:
@@ -85,18 +85,19 @@ def _session(run: Path, build: Build) -> Verdict:
     if lines:
         return Verdict(identical=False, lines=(*lines, f"identical until then: {again.ticks} ticks"))
     end = "" if again.ended and tape.finished else "; the record breaks off: the session or its recorder was killed"
+    end = f"; then control crashed: {again.crashed}" if again.crashed else end
     return Verdict(identical=True, lines=(f"identical: {again.ticks} ticks, {again.looks} looks{end}",))
 
 
 def _changed(run: Path) -> Iterator[str]:
     """The files of a complete run that are not those it left."""
     try:
-        meta = runs.read_meta(run)
+        meta = runs.read_meta(run, broken_off=True)
     except SettingsError as error:
         if run.suffix != ".partial":  # of which only the log counts
             yield str(error)
         return
-    for name, digest in sorted(meta["outputs"].items()):
+    for name, digest in sorted(meta.get("outputs", {}).items()):
         path = run / name
         if not path.exists():
             yield f"{path}: is gone"
@@ -111,6 +112,7 @@ class Again:
         self.ticks = 0  #: answers so far
         self.looks = 0
         self.ended = False
+        self.crashed = ""  #: how control crashed, after which no pilot answered
         self._pilot = pilot
         self._start_ns: int | None = None
         self._last_ns = 0
@@ -137,6 +139,9 @@ class Again:
             self._start_ns = t_ns
         self._last_ns = t_ns
         found = None
+        if kind == wire.EVENT and (event := wire.read_event(message)).get("what") == "crash":
+            self.crashed = str(event["text"])
+            return None
         if self._reply is not None and kind != wire.REPLY:
             found = _both("reply", "none", f"{len(self._reply)} bytes")
         elif self._suspect and kind != wire.VOLUMES:

@@ -16,12 +16,13 @@ SESSION_OVER, RECORDING_OVER = "session over", "recording of the person over"
 
 INTERRUPTED, TERMINATED = "Ctrl-C", "SIGTERM"
 PERSON_DEAD, PERSON_LATE = "human side dead", "human side late"
-RECORDER_DEAD, OVERRUN, SILENT = "recorder dead", "tick overrun", "robot silent"
+RECORDER_DEAD, SCREEN_DEAD = "recorder dead", "screen dead"
+OVERRUN, SILENT = "tick overrun", "robot silent"
 NO_FRAME, UNCERTAIN, NOT_FINITE, TRACKING = "no fresh frame", "state uncertain", "not finite", "tracking error"
 FAULT = "internal error"
 
 #: What ends a session whose robot may have been stopped for another reason.
-ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
+ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED, PERSON_DEAD, RECORDER_DEAD, SCREEN_DEAD)
 
 #: Robots that are not answered at all.
 REFUSED = ("radians", "axes")
@@ -35,6 +36,7 @@ SIGNALS = {
     Signal.PERSON_DEAD: PERSON_DEAD,
     Signal.PERSON_LATE: PERSON_LATE,
     Signal.RECORDER_DEAD: RECORDER_DEAD,
+    Signal.SCREEN_DEAD: SCREEN_DEAD,
     Signal.OVERRUN: OVERRUN,
 }
 

@@ -59,9 +59,16 @@ class Group:
         self._stack = stack
         self._sessions: dict[str, Session] = {}
 
-    def prepare(self, name: str, *arguments: object, settings: tuple[str, ...] = (), port: int | None = None) -> None:
+    def prepare(
+        self,
+        name: str,
+        *arguments: object,
+        settings: tuple[str, ...] = (),
+        port: int | None = None,
+        bug: str = "",
+    ) -> None:
         """Starts a session."""
-        made = Session(self.folder / name, port or free_port(), *arguments, settings=(*QUICK, *settings))
+        made = Session(self.folder / name, port or free_port(), *arguments, settings=(*QUICK, *settings), bug=bug)
         self._sessions[name] = self._stack.enter_context(made)
 
     def robot(self, name: str, *arguments: object) -> Flown:

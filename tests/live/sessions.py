@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from hrcreplay.egm.faults import KINDS
+from tests.live.crashing import BUG
 from tests.live.flights import DEMO
 
 PATIENCE_S = 120.0  # only a process that hangs takes so long
@@ -81,9 +82,11 @@ def every_fault(folder: Path, seconds: float, begin_s: float = 5.0) -> Path:
 class Command:
     """A command in a process of its own; its lines are read as they come."""
 
-    def __init__(self, *arguments: object) -> None:
+    def __init__(self, *arguments: object, bug: str = "") -> None:
+        """With a bug in one place, as crashing.py has it."""
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "hrcreplay", *map(str, arguments)],
+            [sys.executable, "-m", "tests.live.crashing" if bug else "hrcreplay", *map(str, arguments)],
+            env=os.environ | {BUG: bug},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -116,13 +119,19 @@ class Session(Command):
     """`hrcreplay live` with its status as JSON."""
 
     def __init__(
-        self, folder: Path, port: int, *arguments: object, settings: Sequence[str] = PATIENT, human: Path | None = DEMO
+        self,
+        folder: Path,
+        port: int,
+        *arguments: object,
+        settings: Sequence[str] = PATIENT,
+        human: Path | None = DEMO,
+        bug: str = "",
     ) -> None:
         self.folder = folder
         self.port = port
         person = () if human is None else ("--human", human)
         sets = [word for setting in settings for word in ("--set", setting)]
-        super().__init__("live", "--json", "--port", port, "--out", folder, *person, *arguments, *sets)
+        super().__init__("live", "--json", "--port", port, "--out", folder, *person, *arguments, *sets, bug=bug)
 
     @property
     def partial(self) -> Path:

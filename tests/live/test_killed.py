@@ -1,4 +1,4 @@
-"""Sessions that lose a process to ``kill -9``: control goes on, and the robot brakes where it must."""
+"""Sessions that lose a process to ``kill -9`` or to a bug: the robot is braked, and one line and the record say so."""
 
 from __future__ import annotations
 
@@ -11,18 +11,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.live import wire
+from hrcreplay import runs
+from hrcreplay.errors import SettingsError
+from hrcreplay.live import crash, wire
 from hrcreplay.live.records import APPROACH, FOLLOWING
 from hrcreplay.live.tape import Tape
-from tests.live.flown import MOVING, Flown, Group, brakes_for, leaves_nobody, never_stalls, told, verified
+from tests.live.flown import MOVING, Flown, Group, brakes_for, leaves_nobody, never_stalls, read_json, told, verified
 from tests.live.sessions import kill
+
+#: Session -> part and place of its bug.
+BUGS = {
+    "recorder": "recorder/hrcreplay.live.topics:split",
+    "screen": "screen/hrcreplay.live.channel:Channel.receive",
+    "status": "control/hrcreplay.live.telling:Teller._status",
+}
 
 
 def moving(group: Group, *names: str) -> dict[str, Flown]:
     """Sessions whose robots move; two at a time, lest they be short of processors."""
     for name in names:
         settings = ("live.keep_recorder=false",) if name == "kept" else ()
-        group.prepare(name, "--send", "--repeat", settings=settings)
+        bug = f"{BUGS[name]}@{group.folder / name}.bug" if name in BUGS else ""
+        group.prepare(name, "--send", "--repeat", settings=settings, bug=bug)
     found = {name: group.robot(name) for name in names}
     for one in found.values():
         one.session.until("motion", lambda status: status["phase"] in MOVING and status["tcp_speed"] > 0.0)
@@ -31,19 +41,20 @@ def moving(group: Group, *names: str) -> dict[str, Flown]:
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Flown]]:
-    """Sessions whose robot was moving when a process got a kill -9."""
+    """Sessions whose robot was moving when a process got a kill -9, or a bug struck."""
     with ExitStack() as stack:
         group = Group(tmp_path_factory.mktemp("killed"), stack)
         found = moving(group, "person", "recorder")
-        for name, one in found.items():
-            kill(one.helpers[name])
-        for one in found.values():
-            one.session.until_phase("holding")
-            one.session.interrupt()
+        kill(found["person"].helpers["person"])
+        (group.folder / "recorder.bug").touch()
         for one in found.values():
             one.end()
-        found |= moving(group, "kept", "control")
-        kill(found["control"].session.pid)
+        crashed = moving(group, "screen", "status")
+        for name, one in crashed.items():
+            (group.folder / f"{name}.bug").touch()
+            one.end()
+        found |= crashed | moving(group, "kept", "dead")
+        kill(found["dead"].session.pid)
         kill(found["kept"].helpers["recorder"])
         kept = found["kept"].session.until("a dead recorder", lambda status: not status["recorder"]["alive"])
         assert "recorder dead" not in kept["stops"]
@@ -55,8 +66,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Flown
 
 def test_without_the_human_side_it_brakes_and_goes_on_answering(killed: dict[str, Flown]) -> None:
     one = killed["person"]
-    assert one.code == 4
-    assert told(one).startswith("hrcreplay: stopped by: human side dead after ")
+    assert not_complete(one) == "human side: killed by SIGKILL"
     brakes_for("human side dead", one.folder)
     never_stalls(one)
     verified(one.folder)
@@ -65,16 +75,52 @@ def test_without_the_human_side_it_brakes_and_goes_on_answering(killed: dict[str
 
 def test_without_the_recorder_it_brakes_and_goes_on_answering(killed: dict[str, Flown]) -> None:
     one = killed["recorder"]
-    assert one.code == 4
+    assert not_complete(one).startswith("recorder: ZeroDivisionError: put there by a test (hrcreplay/live/recorder.py:")
     assert json.loads(one.session.out[-1])["reason"] == "recorder dead"
-    assert "the recorder did not finish" in told(one)
     never_stalls(one)
     assert verified(one.folder).endswith("the record breaks off: the session or its recorder was killed")
+    leaves_nobody(one.helpers)
+
+
+def test_without_the_screen_it_brakes_and_goes_on_answering(killed: dict[str, Flown]) -> None:
+    one = killed["screen"]
+    assert not_complete(one).startswith("screen: ZeroDivisionError: put there by a test (hrcreplay/live/screen.py:")
+    brakes_for("screen dead", one.folder)
+    never_stalls(one)
+    verified(one.folder)
+    leaves_nobody(one.helpers)
+
+
+def test_a_bug_in_control_brakes_and_goes_on_answering(killed: dict[str, Flown]) -> None:
+    one = killed["status"]
+    assert not_complete(one).startswith("control: ZeroDivisionError: put there by a test (hrcreplay/live/telling.py:")
+    brakes_for("internal error", one.folder)
+    never_stalls(one)
+    assert "; then control crashed: ZeroDivisionError" in verified(one.folder)
+    leaves_nobody(one.helpers)
+
+
+def not_complete(one: Flown) -> str:
+    """What a session that crashed says of it, everywhere the same."""
+    assert one.code == 4
+    said, _, where = told(one).removeprefix("hrcreplay: ").rpartition("; braked; ")
+    assert where == f"the record, not complete, and the traceback are in {one.folder}\n"
+    assert not one.session.partial.exists()
+    meta = read_json(one.folder / "run.json")
+    assert (meta["complete"], meta["reason"], meta["crashes"]) == (False, said, [said])
+    assert f"not complete: {said}" in meta["notes"]
+    assert crash.read(one.folder) == [said]
+    (kept,) = one.folder.glob("crash_*.txt")
+    assert ("Traceback (most recent call last)" in kept.read_text()) == ("ZeroDivisionError" in said)
+    with pytest.raises(SettingsError, match="a live session that broke off"):
+        runs.read_meta(one.folder)
+    return said
 
 
 def test_it_flies_on_without_the_recorder_where_a_setting_says_so(killed: dict[str, Flown]) -> None:
     one = killed["kept"]
     assert json.loads(one.session.out[-1])["reason"] == "Ctrl-C"
+    assert not_complete(one) == "recorder: killed by SIGKILL"
     never_stalls(one)
     verified(one.folder)
 
@@ -82,7 +128,7 @@ def test_it_flies_on_without_the_recorder_where_a_setting_says_so(killed: dict[s
 def test_without_control_the_robot_stops_by_itself_and_is_echoed_by_the_next_session(
     killed: dict[str, Flown], tmp_path: Path
 ) -> None:
-    one = killed["control"]
+    one = killed["dead"]
     one.session.end()
     leaves_nobody(one.helpers)
     rows = [

@@ -1,0 +1,276 @@
+"""A bug in any part of a session: the robot is braked, one line tells of it, and the record is not complete."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hrcreplay import cli
+from hrcreplay.egm.codec import Correction, decode_correction
+from hrcreplay.egm.link import Received
+from hrcreplay.egm.session import Session
+from hrcreplay.errors import LiveStopped
+from hrcreplay.live import crash, driver, folder, helpers, last_resort, pilot, telling, watch, wire
+from hrcreplay.live.loop import FAREWELLS, Loop
+from hrcreplay.live.observer import Observer
+from hrcreplay.live.setup import build
+from hrcreplay.live.verify import Again
+from hrcreplay.planner import QpFollower
+from hrcreplay.robot import stepping
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.stepping import RobotState
+from tests.live.counted import Cable, CountedLoop, counted
+from tests.live.crashing import BUG, failing
+from tests.live.flights import BEGIN_NS, CYCLE_S, DEMO, Flight
+from tests.live.sessions import children
+
+#: Where a bug may be; those of the stages the pilot catches itself.
+PLACES: dict[str, tuple[Any, str]] = {
+    "fusion": (Observer, "look"),
+    "controller": (QpFollower, "step"),
+    "every pose": (RobotModel, "pose"),
+    "packets": (pilot, "decode_robot"),
+    "conversation": (Session, "hear_all"),
+    "reply": (Session, "reply"),
+    "encoding": (pilot, "encode_correction"),
+    "watchdog": (watch, "of_person"),
+    "age of the frames": (Observer, "age_s"),
+    "messages of the human side": (Loop, "_hear_person"),
+    "record of an answer": (wire, "answer"),
+    "record of a packet": (wire, "robot"),
+    "record of a look": (wire, "look"),
+    "status": (telling.Teller, "_status"),
+    "link": (Cable, "newest"),
+}
+MOVING_S = 0.45
+
+
+class Sent:
+    """What went to the robot of a session with a bug."""
+
+    def __init__(self, place: str, at_s: float, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.flight = Flight(overrides=("live.approach_speed=1.0",))
+        self.loop: CountedLoop = counted(self.flight, duration_s=10.0)
+        self.sent: list[tuple[int, Correction]] = []
+        send = self.loop.link.answer
+        clock = self.loop.clock
+
+        def sends(data: bytes, to: Any) -> None:
+            self.sent.append((clock.t_ns, decode_correction(data)))
+            send(data, to)
+
+        def sleeps(seconds: float) -> None:
+            clock.t_ns += round(seconds * 1e9)
+
+        monkeypatch.setattr(self.loop.link, "answer", sends)
+        monkeypatch.setattr(time, "sleep", sleeps)
+        self.before: int | None = None  #: replies before the bug struck
+
+        def fails() -> bool:
+            if clock.t_ns < BEGIN_NS + round(at_s * 1e9):
+                return False
+            self.before = len(self.sent) if self.before is None else self.before
+            return True
+
+        owner, name = PLACES[place]
+        monkeypatch.setattr(owner, name, failing(getattr(owner, name), fails))
+        self.lines = driver._fly(self.loop, self.flight.start, folder, real_time=False, in_3d=False)
+
+    def after(self) -> list[Correction]:
+        """From the last reply before the bug on."""
+        assert self.before is not None
+        return [reply for _, reply in self.sent[self.before - 1 :]]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_bug_anywhere_in_control_brakes_a_moving_robot_to_rest(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Sent(place, MOVING_S, tmp_path, monkeypatch)
+    robot, replies = found.flight.robot, found.after()
+    assert np.abs(replies[0].dq).max() > 3.0, "it was fast"
+    state = RobotState(replies[0].q, replies[0].dq)
+    for reply in replies[1:]:
+        state = stepping.integrate(state, stepping.braked(state, robot.ddq_max, CYCLE_S), CYCLE_S)[1]
+        np.testing.assert_allclose(reply.q, state.q, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(reply.dq, state.dq, rtol=0, atol=1e-12)
+        state = RobotState(reply.q, reply.dq)
+    assert not any(np.any(reply.dq) for reply in replies[-FAREWELLS:])
+    assert all((two.seqno - one.seqno) % 2**32 == 1 for one, two in pairwise(replies))
+    gaps = np.diff([t_ns for t_ns, _ in found.sent]) * 1e-9
+    assert gaps.max() < 3 * CYCLE_S, "it went on being answered"
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_bug_is_one_line_and_a_traceback_in_the_folder(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """In the first tick, before which nothing was sent: the robot is never told to move."""
+    found = Sent(place, 0.0, tmp_path, monkeypatch)
+    assert found.lines
+    assert all(line.startswith("control: ZeroDivisionError: put there by a test (") for line in found.lines)
+    assert crash.read(tmp_path) == found.lines[:1]
+    text = (tmp_path / "crash_control.txt").read_text()
+    assert text.startswith(f"{found.lines[0]}\n\nTraceback (most recent call last):\n")
+    assert text.count("put there\nby a test") >= len(found.lines)
+    assert not any(np.any(reply.dq) for _, reply in found.sent)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
+    try:
+        stepping.braked("nonsense", np.ones(6), 0.004)  # type: ignore[arg-type]
+    except AttributeError as error:
+        said = crash.said_of(error)
+    lines = Path(stepping.__file__).read_text().splitlines()
+    number = next(i for i, line in enumerate(lines, 1) if "speed = np.abs(state.dq)" in line)
+    assert (
+        said == f"AttributeError: 'str' object has no attribute 'dq' (hrcreplay/robot/stepping.py:{number}, in braked)"
+    )
+
+
+def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
+    brake = last_resort.Brake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7)
+    brake.hear([9.0] * 6)  # it lags
+    assert brake.dq == [20.0] * 6
+    brake.hear([11.0] * 6)
+    said = decode_correction(brake.step(0))
+    assert brake.at_rest
+    assert said.seqno == 8
+    np.testing.assert_allclose(said.q, np.radians(11.0))
+
+
+def test_a_brake_stays_within_the_joints_limits() -> None:
+    brake = last_resort.Brake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0)
+    said = [decode_correction(brake.step(0)) for _ in range(20)]
+    assert brake.at_rest
+    np.testing.assert_allclose(np.degrees([reply.q[:5] for reply in said]).max(), 90.0)
+    np.testing.assert_allclose(np.degrees([reply.q[5] for reply in said]), 95.0)  # outside: not further
+
+
+def test_garbage_is_not_answered_and_silence_ends_it() -> None:
+    flight = Flight().fly(MOVING_S)
+    loop = counted(flight)
+    loop.sent, loop.sender = flight.answers[-1].datagram, ("192.0.2.1", 6510)
+    lot = [Received(b"\xff", (), loop.sender, 0, 1, False)]
+    told: list[bytes] = []
+
+    class Silent:
+        def newest(self) -> Received | None:
+            return lot.pop() if lot else None
+
+        def answer(self, data: bytes, _to: Any) -> None:
+            told.append(data)
+
+    loop.link = Silent()  # type: ignore[assignment]
+    last_resort.bring_to_rest(loop, "why")
+    assert not told
+
+
+def test_a_session_that_crashed_comes_out_the_same_again_until_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Sent("reply", MOVING_S, tmp_path, monkeypatch)
+    monkeypatch.undo()
+    messages: list[bytes] = found.loop.recorder.messages  # type: ignore[assignment]
+    kinds = [wire.kind(message) for message in messages]
+    events = [wire.read_event(message) for message in messages if wire.kind(message) == wire.EVENT]
+    assert [event["what"] for event in events] == ["crash", "end"]
+    assert events[1]["reason"] == watch.FAULT
+    again = Again(build(found.flight.start))
+    crashed_at = next(i for i, message in enumerate(messages) if b'"crash"' in message)
+    assert all(again.differs(message) is None for message in messages[: crashed_at + 1])
+    assert again.crashed.startswith("ZeroDivisionError: put there by a test")
+    rows = [wire.motion_row(wire.read_answer(m)) for m in messages[crashed_at:] if wire.kind(m) == wire.ANSWER]
+    assert kinds[crashed_at:].count(wire.REPLY) == len(rows) > 50 + FAREWELLS
+    assert rows[0] is not None
+    assert rows[0].dq.any()
+    assert rows[-1] is not None
+    assert not rows[-1].dq.any()
+
+
+def test_a_recording_that_cannot_be_read_any_further_is_named() -> None:
+    loop = counted(Flight())
+    loop.pilot.stop = watch.PERSON_DEAD
+    loop.notes += ["failed log.mcap: no further", "a later remark"]
+    with pytest.raises(
+        LiveStopped, match=r"stopped by: human side dead \(log.mcap: no further\); the record is in run"
+    ):
+        driver._verdict(loop, Path("run"), [])
+
+
+# --- bugs before and after the flight ---
+
+
+class Live:
+    """`hrcreplay live` in this process, without a robot, for a moment."""
+
+    def __init__(self, out: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+        words = ["live", "--json", "--human", DEMO, "--duration", "0.2", "--port", "0", "--out", out]
+        monkeypatch.setattr(sys, "argv", ["hrcreplay", *map(str, words)])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        self.code = left.value.code
+        self.err = capfd.readouterr().err
+        self.partial = out.with_name(out.name + ".partial")
+        self.files = {path.name for path in self.partial.iterdir()}
+        assert not out.exists()
+        assert not children(os.getpid())
+
+    def told(self, part: str) -> str:
+        """What all of it says, and where that is."""
+        (line,) = self.err.splitlines()
+        said, _, where = line.removeprefix("hrcreplay: ").partition("; ")
+        assert self.code == 4
+        assert where == f"not complete: what there is of the record, and the traceback, is in {self.partial}"
+        assert crash.read(self.partial) == [said]
+        assert said.startswith(f"{part}: ZeroDivisionError: put there by a test (")
+        meta = json.loads((self.partial / "run.json").read_text())
+        assert meta == {"command": "live", "complete": False, "reason": said, "crashes": [said]}
+        return said
+
+
+def broken(*_args: object, **_named: object) -> None:
+    raise ZeroDivisionError("put there by a test")
+
+
+def test_a_bug_before_the_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(driver, "warm", broken)
+    live = Live(tmp_path / "out", monkeypatch, capfd)
+    live.told(crash.CONTROL)
+    assert live.files == {"run.json", "crash_control.txt"}
+
+
+def test_a_bug_in_the_human_side_before_the_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(driver, "warm", lambda _start: None)
+    monkeypatch.setattr(helpers, "ENTRY", "tests.live.crashing")
+    monkeypatch.setenv(BUG, f"human side/hrcreplay.live.playback:Playback.due@{tmp_path}")
+    live = Live(tmp_path / "out", monkeypatch, capfd)
+    live.told(crash.PERSON)
+    assert live.files == {"run.json", "crash_human_side.txt"}
+
+
+def test_a_bug_in_the_report_leaves_the_record_to_be_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(driver, "warm", lambda _start: None)
+    with monkeypatch.context() as within:
+        within.setattr(folder, "write_report", broken)
+        live = Live(tmp_path / "out", monkeypatch, capfd)
+    live.told(crash.FOLDER)
+    assert live.files == {"run.json", "crash_run_folder.txt", "log.mcap"}
+    monkeypatch.setattr(folder, "write_report", lambda *_: None)
+    meta = json.loads((folder.finish(live.partial) / "run.json").read_text())
+    assert meta["complete"] is False
