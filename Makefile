@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: demo test bench soundness fuzz lock clean
+.PHONY: demo test bench soundness fuzz readme lock clean
 
 demo: $(VENV)/made
 	@$(BIN)/hrcreplay demo
@@ -21,9 +21,15 @@ bench: $(VENV)/made
 # Looks for a motion of the person that leaves the volumes of a method, on all cores.
 SAMPLES ?= 1000000
 METHOD ?= sound
-LIMITS ?= paper
+LIMITS ?= people
 soundness: $(VENV)/made
 	$(BIN)/python -m tests.soundness --samples $(SAMPLES) --method $(METHOD) --limits $(LIMITS) --processes $(shell nproc)
+
+# Measures every figure of the README anew where sources changed, and writes them into it; see tests/readme. It goes on
+# where it was broken off. ONLY='"demo,"' measures what begins so; recordings by others are those in $HRCREPLAY_DATA.
+ONLY ?=
+readme: $(VENV)/made
+	$(BIN)/python -m tests.readme $(ONLY)
 
 # Spoils logs at random and puts them through the commands: no traceback, no other exit code, nothing half-written.
 LOGS ?= 500

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hrcreplay.cell import Cell, Residual
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.human.floor import Floor, find_floor, floor_frame, up_direction
+from hrcreplay.human.floor import LEVEL_VIEW, Floor, find_floor, floor_frame, up_direction
 from hrcreplay.human.registration import Registration, Track, disagreement, register, transform
 from hrcreplay.logs.person import PersonMemory, pick
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import CameraFrames, Floats
+from hrcreplay.records import POINTS, CameraFrames, Floats
 
 _WINDOW_S = 10.0  # a long log is looked at in windows, long enough for clock offsets
 _WINDOWS = 60  # evenly spaced: ten minutes in all, so a log of any length fits in memory
 _TOGETHER_S = 0.1  # two cameras saw the person together when their frames are this close
 _FEW = 30  # frames together that are too few to register
 _TILTED_RAD = np.radians(4.0)  # up known less well than this is worth a remark
-_APART_M = 0.25  # more than this (median) and it was not the same person
+#: How far two cameras are apart about one movement: 17 to 50 mm (median) between real sensors, 38 to 450 mm between
+#: recordings of different movements, which a rigid transform and an offset can bring that near to one another.
+_APART_M, _DOUBTFUL_M = 0.15, 0.06
+
+
+class Survey(NamedTuple):
+    """A calibration and where it found the person."""
+
+    cell: Cell
+    lines: tuple[str, ...]  #: main figures, and what --base needs: where the person stood, which way the axes point
 
 
 class Pair(NamedTuple):
@@ -31,7 +40,12 @@ class Pair(NamedTuple):
     b: int
 
 
-def calibrate(
+def calibrate(log: Log, *given: Any, **options: Any) -> Cell:
+    """The cell that ``survey`` finds; takes and raises the same."""
+    return survey(log, *given, **options).cell
+
+
+def survey(
     log: Log,
     reference: str | None = None,
     up: Sequence[float] | None = None,
@@ -40,7 +54,7 @@ def calibrate(
     jump_m: float = 0.8,
     memory_s: float = 2.0,
     search_s: float = 2.0,
-) -> Cell:
+) -> Survey:
     """Finds where the cameras of a log stand and how their clocks differ.
 
     The world's origin is the floor under the reference camera, z is up and x the camera's viewing direction along the
@@ -59,12 +73,15 @@ def calibrate(
         Poses of all cameras, clock offsets, and residuals of every pair that saw the person together.
 
     Raises:
-        SettingsError: No such camera, or ``up`` is no direction.
-        LogError: The cameras did not see one person together, or floor and up cannot be told.
+        SettingsError: No such camera, ``up`` is no direction, or ``height_m`` no height.
+        LogError: The cameras did not see one person together, what they saw is no person, or floor and up cannot be
+            told.
     """
     cameras = log.header.cameras
     root = _root(cameras, reference, log)
     direction = _direction(up)
+    if height_m is not None and not 0.0 <= height_m < np.inf:
+        raise SettingsError(f"height: found {height_m:g}; would be right: metres above the floor, 0 or more")
     tracks = collect(log, jump_m, memory_s)
     ties = _tree(tracks, root)
     found = {root: Registration(np.eye(4), 0.0)}
@@ -78,12 +95,37 @@ def calibrate(
         )
     floor = _floor(tracks, found, root, direction, height_m, log)
     T_world_root = floor_frame(floor)
-    return Cell(
-        T_world_camera={name: T_world_root @ found[i].T_a_b for i, name in enumerate(cameras)},
+    poses = {name: T_world_root @ found[i].T_a_b for i, name in enumerate(cameras)}
+    residuals = _residuals(cameras, tracks, found)
+    cell = Cell(
+        T_world_camera=poses,
         clock_offset_s={name: found[i].offset_s for i, name in enumerate(cameras)},
-        residuals=_residuals(cameras, tracks, found),
-        notes=_notes(floor, cameras[root]),
+        residuals=residuals,
+        notes=(*_notes(floor, cameras[root]), *_doubts(residuals)),
     )
+    return Survey(cell, whereabouts(cell, tracks, cameras[root]))
+
+
+def whereabouts(cell: Cell, tracks: list[Track], root: str) -> tuple[str, ...]:
+    """Where the person stood in the cell's world and which way its axes point: what a robot's base is placed by."""
+    looks_along = abs(cell.T_world_camera[root][2, 2]) <= LEVEL_VIEW
+    x = f"x points where {root} looks, along the floor" if looks_along else f"x points along {root}'s own x"
+    there = [transform(T, track.points_m) for T, track in zip(cell.T_world_camera.values(), tracks, strict=True)]
+    pelvis = np.concatenate([points[:, POINTS.index("pelvis")] for points in there])
+    head = np.concatenate([points[:, POINTS.index("head"), 2] for points in there])
+    pelvis, head = pelvis[np.isfinite(pelvis).all(axis=1)], head[np.isfinite(head)]
+    lines = [f"world: origin on the floor under {root}, z up, {x}, y to the left of x"]
+    if len(pelvis):
+        middle, (low, high) = np.median(pelvis, axis=0), np.percentile(pelvis, [5, 95], axis=0)
+        tall = f", head {np.percentile(head, 90):.2f} m above the floor" if len(head) else ""
+        lines.append(
+            f"the person stood at x = {middle[0]:.2f}, y = {middle[1]:.2f} m (median; nine tenths within "
+            f"x {low[0]:.2f} to {high[0]:.2f}, y {low[1]:.2f} to {high[1]:.2f}){tall}; --base is in this world"
+        )
+    for name, T in cell.T_world_camera.items():
+        at = f"at x = {T[0, 3]:.2f}, y = {T[1, 3]:.2f}, z = {T[2, 3]:.2f} m"
+        lines.append(f"{name}: {at}, clock {1e3 * cell.clock_offset_s[name]:+.1f} ms")
+    return tuple(lines)
 
 
 def collect(log: Log, jump_m: float, memory_s: float) -> list[Track]:
@@ -97,6 +139,7 @@ def collect(log: Log, jump_m: float, memory_s: float) -> list[Track]:
         within = _in_window(mine, log.header.start_ns, log.header.end_ns)
         if len(rows := mine.rows(within)):
             kept.append(rows)
+    log.check()
     if not kept:
         raise LogError(f"{log.header.path}: no skeleton; would be right: a log with a person in it")
     table = CameraFrames.join(kept)
@@ -167,10 +210,12 @@ def _tie(tracks: list[Track], pair: Pair, known: Registration, search_s: float, 
     rest = disagreement(a, b, found) if found is not None else None
     if found is None or rest is None:
         raise LogError(f"{log.header.path}: cameras {names} share too few points; would be right: 4 in each frame")
-    if rest.median_m > _APART_M:
+    width_s = float(np.median(np.diff(a.t_ns))) / 1e9  # the offset is refined by as much
+    if rest.median_m > _APART_M or abs(found.offset_s) > search_s + width_s:
         raise LogError(
-            f"{log.header.path}: cameras {names} stay {rest.median_m * 1e3:.0f} mm apart (median); "
-            f"would be right: below {_APART_M * 1e3:.0f} mm, one person and clocks within {search_s:g} s"
+            f"{log.header.path}: cameras {names} do not fit each other: {rest.median_m * 1e3:.0f} mm apart (median) at "
+            f"a clock offset of {found.offset_s:+.2f} s; would be right: recordings of one person at one time, below "
+            f"{_APART_M * 1e3:.0f} mm and within {search_s:g} s"
         )
     return Registration(known.T_a_b @ found.T_a_b, known.offset_s + found.offset_s)
 
@@ -181,6 +226,15 @@ def _notes(floor: Floor, camera: str) -> tuple[str, ...]:
     degrees = np.degrees(floor.tilt_std_rad)
     doubt = f"up is known to about {degrees:.0f} degrees only, as nobody walked or stood straight"
     return (f"{doubt}; give up in the frame of {camera} where it is known (--up)",)
+
+
+def _doubts(residuals: tuple[Residual, ...]) -> Iterator[str]:
+    for rest in residuals:
+        if rest.median_m > _DOUBTFUL_M:
+            yield (
+                f"{rest.a} and {rest.b} stay {1e3 * rest.median_m:.0f} mm apart (median), where one movement leaves "
+                "20 to 50 mm: did they see one person at one time?"
+            )
 
 
 def _residuals(cameras: tuple[str, ...], tracks: list[Track], found: dict[int, Registration]) -> tuple[Residual, ...]:

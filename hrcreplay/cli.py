@@ -152,7 +152,16 @@ def _stage(command: str, text: str) -> None:
             smooth=smooth,
             chunk_ticks=chunk_ticks,
         )
+        _summarize(folder)
         sys.stdout.write(f"{folder}\n")
+
+
+def _summarize(folder: Path) -> None:
+    """The main figures of a run for the user, beside its folder for the next program."""
+    from hrcreplay import progress, reporting
+
+    for line in reporting.summary(folder):
+        progress.say(line)
 
 
 _stage("fuse", "Stage 1: merge the cameras' skeletons into one person (state.parquet).")
@@ -228,6 +237,7 @@ def demo(
     folder = replay.run(
         "report", replay.demo_log(), out=out, config=config, overrides=overrides, chunk_ticks=chunk_ticks
     )
+    _summarize(folder)
     sys.stdout.write(f"{folder / 'report.html'}\n")
 
 

@@ -6,8 +6,10 @@ Rooms below never see these models: the drivers hand them plain values.
 
 from __future__ import annotations
 
+import json
+import re
 import tomllib
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -15,6 +17,9 @@ from pydantic import BaseModel, ValidationError
 from hrcreplay.errors import SettingsError
 from hrcreplay.sections import Fusion, Limits, Logs, Occupancy, Plan, Report, Robot, Section
 from hrcreplay.sections_live import Live
+
+#: Words that TOML takes for something else than a text.
+_WORDS = frozenset({"true", "false", "inf", "nan"})
 
 
 class Settings(Section):
@@ -55,6 +60,32 @@ def load_settings(
         return Settings.model_validate(table)
     except ValidationError as error:
         raise SettingsError(f"{where}: {_first_problem(error)}") from error
+
+
+def as_overrides(settings: Settings) -> tuple[str, ...]:
+    """The settings that are not the defaults, as ``section.key=value``; files by their names, without folders."""
+    found = []
+    for name in sorted(Settings.model_fields):
+        section, usual = getattr(settings, name), getattr(Settings(), name)
+        for key in sorted(type(section).model_fields):
+            value = getattr(section, key)
+            if value != getattr(usual, key) and value is not None:
+                found.append(f"{name}.{key}={_toml(value)}")
+    return tuple(found)
+
+
+def _toml(value: Any, *, inside: bool = False) -> str:
+    """A value as ``--set`` takes it: TOML, or a plain word."""
+    if isinstance(value, BaseModel):
+        value = value.model_dump(exclude_none=True)
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(key)} = {_toml(part, inside=True)}" for key, part in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml(part, inside=True) for part in value) + "]"
+    if isinstance(value, PurePath) or (isinstance(value, str) and value.endswith(".toml")):
+        value = PurePath(value).name
+    plain = isinstance(value, str) and re.fullmatch(r"[A-Za-z_][\w.-]*", value) and value not in _WORDS
+    return str(value) if plain and not inside else json.dumps(value)
 
 
 def _override(table: dict[str, Any], text: str) -> None:

@@ -99,8 +99,11 @@ def calibrate(
     settings = load_settings(config, overrides)
     axis = None if up is None else _numbers("--up", up, 3)
     place = None if base is None else _numbers("--base", base, 4)
-    cell = calibration.calibrate(
-        open_log(log, log_options(settings)),
+    if height_m is not None and not 0.0 <= height_m < np.inf:
+        raise SettingsError(f"--height {height_m:g}: would be right: metres above the floor, 0 or more, e.g. 1.6")
+    opened = open_log(log, log_options(settings))
+    cell, stood = calibration.survey(
+        opened,
         reference,
         axis,
         height_m,
@@ -114,8 +117,7 @@ def calibrate(
         f"{r.a} - {r.b}: apart by {1e3 * r.median_m:.0f} mm (median), {1e3 * r.p95_m:.0f} mm (p95) at {r.points} points"
         for r in cell.residuals
     ]
-    lines += [f"{name}: clock {1e3 * offset:+.1f} ms" for name, offset in cell.clock_offset_s.items()]
-    return lines + list(cell.notes)
+    return [*lines, *stood, *opened.notes, *cell.notes]
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:

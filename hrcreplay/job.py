@@ -1,23 +1,21 @@
-"""What a run depends on: log, settings, cell, span; and which stages of an earlier run it can take over."""
+"""What a run depends on: log, settings, cell, span."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 import tomllib
 from dataclasses import asdict, dataclass
-from fnmatch import fnmatch
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from hrcreplay import __version__, runs
 from hrcreplay.cell import Cell, load_cell
-from hrcreplay.config import Settings, load_settings
+from hrcreplay.config import Settings, as_overrides, load_settings
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.limits import load_limits
-from hrcreplay.tables import lacks
+from hrcreplay.urdf_files import read_urdf
 
 STAGES = ("fuse", "predict", "plan")
 
@@ -56,58 +54,37 @@ class Job:
         """The stages that the command runs."""
         return STAGES[: STAGES.index(self.command) + 1] if self.command in STAGES else STAGES
 
-    def digests(self) -> dict[str, str]:
-        """Per stage the digest of all that its result depends on, the stages before it included."""
-        settings = self.settings.model_dump(mode="json")
-        parts: dict[str, Any] = {
-            "fuse": [
-                __version__,
-                self.log_sha256,
-                None if self.cell is None else self.cell.to_dict(),
-                [self.start_s, self.end_s],
-                settings["logs"],
-                settings["fusion"],
-                _plain(self.tracking),
-            ],
-            "predict": [settings["occupancy"], _plain(self.prediction)],
-            "plan": [settings["robot"], settings["plan"], self.task, _urdf_digest(self.settings)],
-        }
-        digests: dict[str, str] = {}
-        before = ""
-        for stage in STAGES:
-            before = hashlib.sha256((before + json.dumps(parts[stage], sort_keys=True)).encode()).hexdigest()
-            digests[stage] = before
-        return digests
+    def arguments(self, *, smooth: bool) -> list[str]:
+        """A command line that makes the same run again, wherever the settings came from: names without folders.
 
-    def stale(self) -> dict[str, str]:
-        """Stage -> why the earlier run's tables are not those that this job would make; nor are those of later ones."""
-        if self.earlier is None:
-            return {}
-        meta, mine = runs.read_meta(self.earlier), self.digests()
-        found: dict[str, str] = {}
-        reason = None
-        for stage in self.stages:
-            if reason is None and meta.get("stages", {}).get(stage) != mine[stage]:
-                reason = f"log, cell or settings are not those of {self.earlier}"
-            reason = reason or _damage(self.earlier, stage, meta["outputs"])
-            if reason is not None:
-                found[stage] = reason
-        return found
+        ``CELL.toml`` stands for the cell file, whose content is the run's ``cell``.
+        """
+        span = (("--start", self.start_s), ("--end", self.end_s))
+        return [
+            *(self.command, self.log.name),
+            *(part for name, at_s in span if at_s is not None for part in (name, f"{at_s:.12g}")),
+            *(("--cell", "CELL.toml") if self.cell is not None else ()),
+            *(("--smooth",) if smooth else ()),
+            *(part for setting in as_overrides(self.settings) for part in ("--set", setting)),
+        ]
 
     def meta(self) -> dict[str, Any]:
         """The part of run.json that is known before the first frame is read."""
-        digests = self.digests()
         return {
             "command": self.command,
-            "versions": {"hrcreplay": __version__, **{name: metadata.version(name) for name in PACKAGES}},
-            "inputs": [{"path": str(self.log), "sha256": self.log_sha256}],
+            "versions": versions(),
+            "inputs": [{"path": str(self.log), "sha256": self.log_sha256}, *_urdf_inputs(self.settings)],
             "settings": self.settings.model_dump(mode="json"),
             "cell": None if self.cell is None else self.cell.to_dict(),
             "task": self.task,
             "span_s": [self.start_s, self.end_s],
-            "limits": {"tracking": _plain(self.tracking), "prediction": _plain(self.prediction)},
-            "stages": {stage: digests[stage] for stage in self.stages},
+            "limits": {"tracking": plain_limits(self.tracking), "prediction": plain_limits(self.prediction)},
         }
+
+
+def versions() -> dict[str, str]:
+    """Our version and those of PACKAGES."""
+    return {"hrcreplay": __version__, **{name: metadata.version(name) for name in PACKAGES}}
 
 
 def resolve(
@@ -180,17 +157,6 @@ def unlogged(command: str, where: Path, settings: Settings, cell_file: Path | No
     )
 
 
-def _damage(folder: Path, stage: str, outputs: dict[str, str]) -> str | None:
-    """What keeps an earlier run's tables of a stage from being taken for ours."""
-    for name in sorted(name for name in outputs if any(fnmatch(name, pattern) for pattern in TABLES[stage])):
-        path = folder / name
-        if not path.exists() or runs.sha256(path) != outputs[name]:
-            return f"{path} is not as its run left it"
-        if missing := lacks(path):
-            return f"{path} is of an earlier version, without {missing[0]}"
-    return None
-
-
 def _digest(log: Path, earlier: dict[str, Any] | None) -> str:
     if log.exists():
         return runs.sha256(log)
@@ -212,16 +178,18 @@ def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] 
         raise SettingsError(f"{path}: not TOML ({error})") from error
 
 
-def _urdf_digest(settings: Settings) -> str | None:
-    path = settings.robot.urdf
-    if path is None:
-        return None
-    if not path.is_file():
-        raise SettingsError(f"robot.urdf: {path} is not a file; name a URDF, or leave it out for the IRB 140")
-    return runs.sha256(path)
+def urdf_digest(settings: Settings) -> str | None:
+    """Of the robot's URDF and the meshes that its link capsules come from; None for the IRB 140."""
+    digests = [file["sha256"] for file in _urdf_inputs(settings)]
+    return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else None
 
 
-def _plain(limits: LimitSet) -> dict[str, Any]:
+def _urdf_inputs(settings: Settings) -> list[dict[str, str]]:
+    files = read_urdf(settings.robot)
+    return [] if files is None else [{"path": path, "sha256": digest} for path, digest in files.inputs]
+
+
+def plain_limits(limits: LimitSet) -> dict[str, Any]:
     """JSON form of a limit set; no bound is null."""
 
     def plain(value: Any) -> Any:

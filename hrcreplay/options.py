@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -58,6 +59,9 @@ def as_overrides(
 
 def span(start: float | None, end: float | None) -> dict[str, Any]:
     """The part of the log to use, as arguments. Raises SettingsError where nothing is between the two."""
+    for option, seconds in (("--start", start), ("--end", end)):
+        if seconds is not None and not math.isfinite(seconds):
+            raise SettingsError(f"{option} {seconds:g}: would be right: seconds from the log's start, e.g. {option} 10")
     if start is not None and end is not None and end <= start:
         raise SettingsError(f"--end {end:g}: not after --start {start:g}; give a later second")
     return {"start_s": start, "end_s": end}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
@@ -14,13 +14,16 @@ from hrcreplay.human import smooth as smoother
 from hrcreplay.human.margins import Margins
 from hrcreplay.human.model import LimitSet
 from hrcreplay.logs.person import PersonMemory, pick
+from hrcreplay.logs.plausibility import Stand
 from hrcreplay.logs.reader import Log
-from hrcreplay.planner import Planner
+from hrcreplay.planner import Beside, Planner
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.runs import RunWriter, Stopwatch
 from hrcreplay.tables import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 
 NS = 1_000_000_000
+#: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
+_LOST = ("points_", "person_frames_without", "frames_repeated", "frames_out_of_order")
 
 #: Of a session; a longer log has an arrival of another clock among its messages [s].
 LONGEST_S = 24 * 3600
@@ -34,6 +37,7 @@ class Sink:
     watch: Stopwatch
     progress: Callable[[str, int], None]  #: stage, ticks done
     counts: Counter[str] = field(default_factory=Counter)
+    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> what is odd
 
 
 @dataclass(frozen=True)
@@ -114,11 +118,17 @@ def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterat
 def fused(
     log: Log, ticks_ns: Ints, size: int, eyes: Eyes, sink: Sink, *, smooth: bool = False
 ) -> Iterator[HumanStates]:
-    """Stage 1: camera frames to the fused person; leaves measurements and state, and ``smooth`` where asked."""
+    """Stage 1: camera frames to the fused person; leaves measurements and state, and ``smooth`` where asked.
+
+    Raises:
+        LogError: At the end: what the log shows is certainly no person, or nobody was ever seen.
+    """
     state = fusion.start(log.header.cameras)
     memory = PersonMemory()
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
     passed: list[tuple[HumanStates, fusion.Trace]] = []
+    stands = [Stand() for _ in log.header.cameras]
+    ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
         measured = nothing(log.header.cameras)
         if seen is not None:
@@ -126,6 +136,8 @@ def fused(
                 memory, measured, found = eyes.measure(seen, memory)
             sink.counts.update(found)
             sink.run.table("measurements", measurement_columns(measured))
+            for stand, c in zip(stands, range(len(stands)), strict=True):
+                stand.add(measured.points_m[measured.camera == c])
         with sink.watch.stage("fuse", len(ticks)):
             if smooth:
                 state, states, events, trace = fusion.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
@@ -133,9 +145,14 @@ def fused(
             else:
                 state, states, events = fusion.fuse(state, ticks, measured, eyes.filter, eyes.limits)
         sink.counts.update(events)
+        ever = ever or bool(states.valid.any())
         sink.run.table("state", state_columns(states))
         sink.progress("fuse", len(ticks))
         yield states
+    log.check()
+    if not ever:
+        raise _nobody(log, sink.counts)
+    sink.notes["fuse"].extend(_oddities(log, stands))
     if smooth:
         whole = HumanStates.join([states for states, _ in passed])
         traces = [trace for _, trace in passed]
@@ -144,6 +161,29 @@ def fused(
             damping=np.concatenate([trace.damping for trace in traces]),
         )
         sink.run.table("smooth", state_columns(smoother.smooth(whole, trace, eyes.filter)))
+
+
+def _nobody(log: Log, found: Counter[str]) -> LogError:
+    """What to tell of a log in which nobody was ever seen: what there was, and what would be right."""
+    rows = sum(log.defects[f"frames_{camera}"] for camera in log.header.cameras)
+    text = (
+        f"{log.header.path}: nobody was ever seen: {rows} bodies in the frames of {', '.join(log.header.cameras)} hold "
+        f"{log.points_seen} points with a place and a confidence"
+    )
+    why = [f"{name} {count}" for name, count in sorted((log.defects + found).items()) if name.startswith(_LOST)]
+    text += f" ({', '.join(why)})" if why else ""
+    return LogError(
+        f"{text}; would be right: a person's pelvis, shoulders and arms, confidence at least fusion.confidence_min. "
+        "Look at it with hrcreplay info"
+    )
+
+
+def _oddities(log: Log, stands: list[Stand]) -> Iterator[str]:
+    """What is odd about how the person stands in the world."""
+    for camera, stand in zip(log.header.cameras, stands, strict=True):
+        remark = stand.remark(camera)
+        if remark is not None:
+            yield remark
 
 
 def nothing(cameras: tuple[str, ...]) -> Measurements:
@@ -215,10 +255,16 @@ def planned(
     people: Iterable[tuple[HumanStates, SweptVolumes]], planners: dict[str, Planner], sink: Sink
 ) -> Iterator[None]:
     """Stage 3: what the robot would have done by each method; leaves a motion for each."""
+    beside = Beside(next(iter(planners.values())).dt_s)
     for states, volumes in people:
         for name, planner in planners.items():
             with sink.watch.stage(f"plan {name}", len(volumes)):
                 motion = planner.follow(states, volumes)
             sink.run.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
+            if planner.chosen:
+                beside.add(states, motion)
         sink.progress("plan", len(volumes))
         yield
+    remark = beside.remark()
+    if remark is not None:
+        sink.notes["plan"].append(remark)

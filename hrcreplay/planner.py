@@ -15,6 +15,8 @@ from hrcreplay.robot.reference import Leash, Reference, ReferencePoint, advance
 from hrcreplay.robot.scaling import PathState
 from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
 
+_FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
+
 
 class Tick(NamedTuple):
     """What a method found at a tick, and what it decided."""
@@ -84,6 +86,11 @@ class Planner:
     memory_s: float  #: without a camera for longer than this the person counts as lost [s]
     seen_ns: int | None = None
 
+    @property
+    def dt_s(self) -> float:
+        """The time between two ticks [s]."""
+        return self.follower.settings.dt_s
+
     def follow(self, states: HumanStates, volumes: SweptVolumes) -> Motion:
         """The motion of a batch of ticks."""
         robot = self.follower.robot
@@ -119,3 +126,35 @@ class Planner:
         if self.seen_ns is None or t_ns - self.seen_ns > self.memory_s * 1e9:
             around = replace(around, known=False)
         return self.follower.step(around)
+
+
+@dataclass
+class Beside:
+    """Whether the robot stands in the person from the first: at every tick of the first second in which one is seen."""
+
+    dt_s: float
+    ticks: int = 0
+    inside: bool = True
+    pair: tuple[str, str] = ("", "")  #: link and limb at the first of them
+
+    def add(self, states: HumanStates, motion: Motion) -> None:
+        """Takes a batch of ticks."""
+        rows = np.flatnonzero(np.isfinite(states.p[:, 0]) & (motion.limb >= 0))
+        rows = rows[: max(0, round(_FIRST_S / self.dt_s) - self.ticks)]
+        if not len(rows):
+            return
+        if not self.ticks:
+            self.pair = (motion.links[motion.link[rows[0]]], motion.limbs[motion.limb[rows[0]]])
+        self.ticks += len(rows)
+        self.inside = self.inside and bool((motion.distance_m[rows] <= 0.0).all())
+
+    def remark(self) -> str | None:
+        """What is to be said of it; None where there is room between the two."""
+        if not self.ticks or not self.inside:
+            return None
+        link, limb = self.pair
+        return (
+            f"the robot's link {link} stands inside the volume of the person's {limb} from the first tick with a "
+            f"person on, for {self.ticks * self.dt_s:.2f} s at least; is T_world_base right? "
+            "hrcreplay calibrate tells where the person stood"
+        )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,21 +12,18 @@ import numpy as np
 from hrcreplay import runs, wiring
 from hrcreplay.job import Job
 from hrcreplay.pipeline import Foresight
-from hrcreplay.records import Floats, HumanStates
+from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report import figures, metrics, page, tables
 from hrcreplay.report.figures_human import Instant
+from hrcreplay.report.figures_links import LinkPose
+from hrcreplay.report.summary import lines
 from hrcreplay.runs import Run, RunWriter
 from hrcreplay.tables import read_states
 
 
 def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
     """Leaves metrics.json, the figures and report.html beside the tables that have just been written."""
-    settings = job.settings
-    near = {
-        "near_m": settings.report.near_m,
-        "stationary_m_per_s": settings.report.stationary_m_per_s,
-        "gap_s": settings.logs.gap_s,
-    }
+    near = _bounds(job.settings.model_dump())
     run = runs.read(writer.partial, meta)
     found = metrics.compute(run, **near)
     writer.text("metrics.json", runs.to_json(found))
@@ -33,7 +32,8 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
     if foresight.method == "sound" and foresight.margins.legs:
         radii["legs, of sound"] = foresight.margins.legs_radius_m
     folder = writer.partial / "figures"
-    figures.draw_all(run, folder, found, **near, volumes=_instants(foresight, run))
+    robot = _links(job, foresight, run)
+    figures.draw_all(run, folder, found, **near, volumes=_instants(foresight, run), robot=robot)
     shown = [
         tables.limit_table(job.prediction, use="prediction"),
         tables.limit_table(job.tracking, use="tracking"),
@@ -42,21 +42,62 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
     writer.text("report.html", page.render(run, found, folder, shown))
 
 
+def summary(folder: Path) -> list[str]:
+    """The main figures of a run, a line a stage."""
+    run = runs.read(folder)
+    return lines(run, metrics.compute(run, **_bounds(run.meta["settings"])))
+
+
+def _bounds(settings: Mapping[str, Any]) -> dict[str, float]:
+    """What the metrics ask of the settings."""
+    return {
+        "near_m": settings["report"]["near_m"],
+        "stationary_m_per_s": settings["report"]["stationary_m_per_s"],
+        "gap_s": settings["logs"]["gap_s"],
+    }
+
+
 def _instants(foresight: Foresight, run: Run) -> list[Instant]:
     """The swept volumes by the paper's two methods and the run's own at the instants that Fig. 17 shows."""
     wanted = figures.instants(run)
     if not len(wanted):
         return []
-    states = HumanStates.join(
-        [batch.rows(np.isin(batch.t_ns, wanted)) for batch in read_states(run.folder / "state.parquet", 4096)]
-    )
+    states = _states(run, wanted)
     methods = dict.fromkeys(("paper", "positions", foresight.method))
     by_method = {method: foresight.volumes(states, method) for method in methods}
 
-    def hulls(method: str, row: int) -> dict[str, tuple[Floats, float]]:
-        volumes = by_method[method]
-        return {
-            limb: (volumes.vertices(row, i), float(volumes.radius_m[row, i])) for i, limb in enumerate(volumes.limbs)
-        }
+    return [
+        (int(t), {method: _hulls(volumes, row) for method, volumes in by_method.items()})
+        for row, t in enumerate(states.t_ns)
+    ]
 
-    return [(int(t), {method: hulls(method, row) for method in by_method}) for row, t in enumerate(states.t_ns)]
+
+def _links(job: Job, foresight: Foresight, run: Run) -> LinkPose | None:
+    """The robot's capsules and the swept volumes at the tick of the smallest separation."""
+    if run.motion is None or not len(run.motion) or run.T_world_base is None:
+        return None
+    robot = wiring.robot(job, run.T_world_base)
+    row = run.motion.iloc[figures.nearest_tick(run.motion)]
+    q = row[[f"q{axis}" for axis in range(1, robot.nv + 1)]].to_numpy(dtype=float)
+    if not np.isfinite(q).all():
+        return None
+    states = _states(run, np.array([row["t_ns"]]))
+    hulls = _hulls(foresight.volumes(states), 0) if len(states) else {}
+    return LinkPose(
+        t_ns=int(row["t_ns"]),
+        distance_m=float(row["distance_m"]),
+        bodies=tuple(segment.body for segment in robot.segments),
+        ends_m=robot.pose(q, np.zeros(robot.nv)).ends_m,
+        radius_m=np.array([segment.radius_m for segment in robot.segments]),
+        volumes={limb: (points, radius) for limb, (points, radius) in hulls.items() if np.isfinite(points).all()},
+    )
+
+
+def _states(run: Run, wanted_ns: Ints) -> HumanStates:
+    """The fused person at some ticks."""
+    batches = read_states(run.folder / "state.parquet", 4096)
+    return HumanStates.join([batch.rows(np.isin(batch.t_ns, wanted_ns)) for batch in batches])
+
+
+def _hulls(volumes: SweptVolumes, row: int) -> dict[str, tuple[Floats, float]]:
+    return {limb: (volumes.vertices(row, i), float(volumes.radius_m[row, i])) for i, limb in enumerate(volumes.limbs)}

@@ -153,10 +153,12 @@ class RunWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for table in self.tables.values():
-            table.close()
-        if self.partial.exists():
-            shutil.rmtree(self.partial)
+        try:
+            for table in self.tables.values():
+                table.close()
+        finally:
+            if self.partial.exists():
+                shutil.rmtree(self.partial)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from hrcreplay.records import POINTS
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 Sigmas = tuple[NotNegative, NotNegative, NotNegative, NotNegative]
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -162,17 +163,33 @@ class LinkSettings(Section):
     """Radius of the capsule [m]."""
 
 
+class Offset(Section):
+    """A pose seen from another frame."""
+
+    position_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """Its origin [m]."""
+    rpy_deg: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """Its orientation, Rz(yaw) Ry(pitch) Rx(roll) [deg]."""
+
+
 class Robot(Section):
     """The manipulator. Default: ABB IRB 140."""
 
     urdf: Path | None = None
-    """Another robot's URDF; none: the IRB 140."""
+    """Another robot's URDF; none: the IRB 140. Joints that do not lie between base and tool are locked at zero."""
+    packages: tuple[Path, ...] = ()
+    """Directories of the packages whose meshes that URDF names (package://); searched before the directories at and
+    above the URDF, and those of ROS_PACKAGE_PATH."""
+    base_frame: str | None = None
+    """Frame of that URDF that stands on T_world_base; none: its root."""
     tcp_frame: str | None = None
-    """Frame of that URDF that carries the tool; none: its last frame."""
+    """Frame of that URDF that carries the tool; none: the last one that revolute joints move."""
     tool_m: NotNegative = 0.10
     """TCP beyond the flange, along its z axis [m]."""
+    tcp_offset: Offset = Offset()
+    """TCP from there, for a tool that is not straight."""
     links: tuple[LinkSettings, ...] = ()
-    """Link segments; none: the IRB 140's, or derived from the URDF's collision shapes."""
+    """Link segments; none: the IRB 140's, or derived from the URDF's collision shapes, meshes among them."""
     acceleration: tuple[Positive, ...] = ()
     """Joint acceleration limits [rad/s^2]; none: top speed / T_s of every axis."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -21,8 +22,10 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.paths import programmed, recorded
 from hrcreplay.robot.reference import Leash, Reference
+from hrcreplay.robot.rotation import from_rpy
 from hrcreplay.robot.stepping import PlanSettings
 from hrcreplay.robot.task import parse_task
+from hrcreplay.urdf_files import UrdfFiles, read_urdf
 
 
 class Source(Protocol):
@@ -104,24 +107,44 @@ def robot(job: Job, T_world_base: Floats) -> RobotModel:
     Raises:
         SettingsError: The URDF or a robot setting cannot be used.
     """
-    settings, stop_s = job.settings.robot, job.settings.occupancy.stop_s
-    if settings.urdf is None:
-        if settings.links or settings.tcp_frame:
-            raise SettingsError("robot.links: found links for the IRB 140; they go with another robot's robot.urdf")
-        return irb140(T_world_base, stop_s=stop_s, tool_m=settings.tool_m, acceleration=settings.acceleration)
+    settings, stop_s, files = job.settings.robot, job.settings.occupancy.stop_s, read_urdf(job.settings.robot)
+    T_tool_tcp = np.eye(4)
+    T_tool_tcp[:3, :3] = from_rpy(np.radians(settings.tcp_offset.rpy_deg))
+    T_tool_tcp[:3, 3] = settings.tcp_offset.position_m
+    if files is None:
+        other = [key for key in ("links", "tcp_frame", "base_frame", "packages") if getattr(settings, key)]
+        if other:
+            raise SettingsError(f"robot.{other[0]}: found {other[0]} for the IRB 140; it goes with a robot.urdf")
+        return irb140(
+            T_world_base,
+            stop_s=stop_s,
+            tool_m=settings.tool_m,
+            T_tool_tcp=T_tool_tcp,
+            acceleration=settings.acceleration,
+        )
     segments = tuple(
         Segment(name=link.name, body=link.body, start_m=link.start_m, end_m=link.end_m, radius_m=link.radius_m)
         for link in settings.links
     )
     return from_urdf(
-        settings.urdf.read_text(),
+        files.text,
         T_world_base,
         stop_s=stop_s,
         tcp_frame=settings.tcp_frame,
+        base_frame=settings.base_frame,
         tool_m=settings.tool_m,
-        segments=segments,
+        T_tool_tcp=T_tool_tcp,
+        segments=segments or _capsules(files, settings.tcp_frame, settings.base_frame),
         acceleration=settings.acceleration,
     )
+
+
+@lru_cache(maxsize=4)  # a run makes its robot several times; a file that changes has another digest
+def _capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -> tuple[Segment, ...]:
+    """The link capsules that a URDF's collision shapes give."""
+    meshes = dict(files.meshes)
+    model = from_urdf(files.text, np.eye(4), stop_s=1.0, tcp_frame=tcp_frame, base_frame=base_frame, meshes=meshes)
+    return model.segments
 
 
 def reference(job: Job, log: Source, model: RobotModel) -> tuple[Reference, int | None]:

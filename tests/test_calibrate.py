@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.calibrate import calibrate, collect
+from hrcreplay.calibrate import calibrate, collect, survey
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.human.registration import Track, rigid, transform
+from hrcreplay.human.registration import Disagreement, Registration, Track, rigid, transform
 from hrcreplay.logs.importer import import_azure, import_keraal, import_kinect2
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
@@ -186,7 +187,7 @@ def test_what_cannot_be_calibrated_is_told(tmp_path: Path) -> None:
     other = walker(15.0)
     blind = Track(a.t_ns, a.points_m, np.where(np.arange(20) < 12, a.confidence, 0.0))
     rng = np.random.default_rng(5)
-    strange = Track(other.t_ns, other.points_m + np.cumsum(rng.normal(0, 0.05, other.points_m.shape), 0), a.confidence)
+    strange = Track(other.t_ns, other.points_m + np.cumsum(rng.normal(0, 0.05, (len(a), 1, 3)), 0), a.confidence)
     later = Track(a.t_ns + 10**12, a.points_m, a.confidence)
     log = _log(tmp_path / "one.mcap", {"a": a})
     with pytest.raises(SettingsError, match="reference camera: found 'z'; would be right: a"):
@@ -195,7 +196,7 @@ def test_what_cannot_be_calibrated_is_told(tmp_path: Path) -> None:
         calibrate(log, up=(0, 0, 0))
     with pytest.raises(LogError, match="camera b hardly saw the person together"):
         calibrate(_log(tmp_path / "later.mcap", {"a": a, "b": later}))
-    with pytest.raises(LogError, match=r"stay \d+ mm apart \(median\); would be right"):
+    with pytest.raises(LogError, match=r"do not fit each other: \d+ mm apart \(median\)"):
         calibrate(_log(tmp_path / "strange.mcap", {"a": a, "b": strange}))
     with pytest.raises(LogError, match=r"no feet .*--height"):
         calibrate(_log(tmp_path / "blind.mcap", {"a": blind}))
@@ -206,3 +207,74 @@ def test_a_log_that_does_not_show_where_up_is_says_so() -> None:
     demo = open_log(Path(__file__).parents[1] / "datasets" / "demo.mcap")
     with pytest.raises(LogError, match=r"give the reference camera's height above it \(--height\) and up"):
         calibrate(demo, jump_m=0.8, memory_s=2.0)
+
+
+def test_it_tells_where_the_person_stood_and_which_way_x_points(tmp_path: Path) -> None:
+    """By the truth of the walker: a figure of eight about (3, 0), before a camera 1.6 m up that looks along x."""
+    cell, lines = survey(_log(tmp_path / "log.mcap", {"a": _by_camera_a()}))
+    assert (
+        lines[0]
+        == "world: origin on the floor under a, z up, x points where a looks, along the floor, y to the left of x"
+    )
+    found = [float(number) for number in re.findall(r"-?\d+\.\d+", lines[1])]
+    pelvis = walker(15.0).points_m[:, 0] + [3.0, 0.0, 0.0]
+    low, high = np.percentile(pelvis, [5, 95], axis=0)
+    truth = [*np.median(pelvis, axis=0)[:2], low[0], high[0], low[1], high[1], 1.65]
+    np.testing.assert_allclose(found, truth, atol=0.06)
+    assert lines[2].startswith("a: at x = 0.00, y = ")
+    assert cell.T_world_camera["a"][2, 3] == pytest.approx(1.6, abs=0.03)
+
+
+def test_x_of_a_camera_that_looks_down_is_its_own(tmp_path: Path) -> None:
+    down = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 4.0]))
+    person = walker(15.0)
+    track = Track(person.t_ns, transform(np.asarray(np.linalg.inv(down)), person.points_m), person.confidence)
+    _, lines = survey(_log(tmp_path / "log.mcap", {"a": track}))
+    assert "x points along a's own x" in lines[0]
+
+
+@pytest.mark.parametrize(("a", "b"), [("walking", "squatting"), ("squatting", "walking")])
+def test_recordings_of_different_movements_are_refused(a: str, b: str, tmp_path: Path) -> None:
+    files = {name: data_path(f"sevivi_azure_single/{name}_positions_3d.csv.gz") for name in (a, b)}
+    import_azure(files, tmp_path / "log.mcap")
+    with pytest.raises(
+        LogError, match=r"do not fit each other: \d+ mm apart \(median\) at a clock offset of"
+    ) as refused:
+        calibrate(open_log(tmp_path / "log.mcap"))
+    assert refused.value.exit_code == 3
+
+
+def test_clocks_further_apart_than_searched_are_refused(tmp_path: Path) -> None:
+    """A movement that repeats fits at another lap too, but no clock may be that far off."""
+    a = _by_camera_a()
+    b = reobserve(a, Truth(POSE, 0.0), 4)
+    far = Registration(POSE, -3.1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hrcreplay.calibrate.register", lambda *_, **__: far)
+        patch.setattr("hrcreplay.calibrate.disagreement", lambda *_: Disagreement(0.03, 0.1, 1000, 0.0))
+        with pytest.raises(LogError, match=r"30 mm apart \(median\) at a clock offset of -3.10 s; would be right"):
+            calibrate(_log(tmp_path / "log.mcap", {"a": a, "b": b}))
+
+
+def test_cameras_that_hardly_fit_are_doubted(tmp_path: Path) -> None:
+    """One that errs by 8 cm at every point, as none does about the same movement."""
+    a = _by_camera_a()
+    b = reobserve(a, Truth(POSE, 0.0), 5)
+    noise = np.random.default_rng(6).normal(0.0, 0.06, b.points_m.shape)
+    cell = calibrate(_log(tmp_path / "log.mcap", {"a": a, "b": Track(b.t_ns, b.points_m + noise, b.confidence)}))
+    (rest,) = cell.residuals
+    assert 0.06 < rest.median_m < 0.15
+    assert f"a and b stay {1e3 * rest.median_m:.0f} mm apart (median), where one movement leaves" in cell.notes[-1]
+
+
+def test_millimetres_are_no_person_to_calibrate_by(tmp_path: Path) -> None:
+    a = _by_camera_a()
+    log = _log(tmp_path / "log.mcap", {"a": Track(a.t_ns, 1e3 * a.points_m, a.confidence)})
+    with pytest.raises(LogError, match="millimetres were taken for metres"):
+        calibrate(log)
+
+
+@pytest.mark.parametrize("height_m", [np.nan, np.inf, -0.1])
+def test_a_height_that_is_none_is_refused(height_m: float, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="would be right: metres above the floor, 0 or more"):
+        calibrate(_log(tmp_path / "log.mcap", {"a": _by_camera_a()}), height_m=height_m)

@@ -54,7 +54,9 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_stdout_carries_only_the_run_folder(run: Run) -> None:
     code, out, err = run("fuse", DEMO, "--out", "here", *SHORT)
-    assert (code, out, err) == (0, "here\n", "")
+    assert (code, out) == (0, "here\n")
+    assert err.startswith("hrcreplay: fuse: 101 ticks, person known in 98.0 %; frames with the person: kinect 13, ")
+    assert len(err.splitlines()) == 1
     assert Path("here/state.parquet").exists()
 
 
@@ -103,6 +105,15 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
     "urdf missing": (("plan", DEMO, "--set", "robot.urdf=none.urdf"), 2, "none.urdf is not a file"),
     "end before start": (("fuse", DEMO, "--start", 5, "--end", 4), 2, "--end 4: not after --start 5"),
     "span outside": (("fuse", DEMO, "--start", 90), 2, "nothing of the log is left; it lasts 60.0 s"),
+    "start is no number": (("fuse", DEMO, "--start", "nan"), 2, "--start nan: would be right: seconds from the log's"),
+    "end is endless": (("report", DEMO, "--end", "inf"), 2, "--end inf: would be right: seconds from the log's start"),
+    "text for a log": (("info", "people.csv"), 3, "hrcreplay import azure|kinect2|keraal people.csv --out LOG.mcap"),
+    "calibrate height": (
+        ("calibrate", DEMO, "--out", "c.toml", "--height", "nan"),
+        2,
+        "--height nan: would be right: metres above the floor, 0 or more",
+    ),
+    "calibrate below the floor": (("calibrate", DEMO, "--out", "c.toml", "--height", -1), 2, "--height -1: would be"),
     "unknown topic": (("fuse", DEMO, "--topic", "/nose"), 3, "/nose"),
     "unknown kind": (("import", "xbox", "a.csv", "--out", "a.mcap"), 2, "found 'xbox'; would be right: azure"),
     "camera twice": (
@@ -123,6 +134,7 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
 def test_bad_input_is_one_line_and_leaves_nothing(run: Run, tmp_path: Path, case: str) -> None:
     Path("empty.mcap").touch()
     Path("text.bag").write_text("not a bag\n" * 20)
+    Path("people.csv").write_text("timestamp;body_idx;PELVIS (c)\n1;2;3\n")
     Path("taken").mkdir()
     Path("other.toml").write_text(CELL_WITHOUT_BASE.replace("kinect", "third"))
     Path("moon.toml").write_text(TASK_OUT_OF_REACH)

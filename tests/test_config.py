@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hrcreplay.config import Settings, load_settings
+from hrcreplay.config import Settings, as_overrides, load_settings
 from hrcreplay.errors import SettingsError
 
 
@@ -32,6 +32,27 @@ def test_settings_of_an_earlier_run_come_back_whole() -> None:
     settings = load_settings(None, ("occupancy.store_hz=all", "plan.q_p=[0.2, 0.3]"))
     again = load_settings(None, (), settings.model_dump(mode="json"))
     assert again == settings
+
+
+def test_settings_that_are_not_the_defaults_as_a_command_line_gives_them() -> None:
+    assert as_overrides(Settings()) == ()
+    given = (
+        "fusion.rate_hz=100.0",
+        'limits.prediction="inf"',
+        'live.zenoh={connect = ["tcp/cell:7447"], mode = "client"}',
+        'logs.decoders=[{topic = "/bodies", camera = "left", points = "bodies.points", index = {head = 3}}]',
+        'logs.topics=["/tf", "/two words"]',
+        "occupancy.method=paper",
+        "plan.q_p=[0.2, 0.3]",
+        "robot.urdf=/somewhere/on/disk/arm.urdf",
+    )
+    settings = load_settings(None, given)
+    told = as_overrides(settings)
+    assert "robot.urdf=arm.urdf" in told
+    assert [text.split("=")[0] for text in told] == [text.split("=")[0] for text in given]
+    again = load_settings(None, told)
+    robot = settings.robot.model_copy(update={"urdf": Path("arm.urdf")})
+    assert again == settings.model_copy(update={"robot": robot})
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -14,6 +16,7 @@ import pytest
 from hrcreplay import replay, runs
 from hrcreplay.audit import driver
 from hrcreplay.errors import LogError
+from hrcreplay.job import resolve
 from hrcreplay.tables import COLUMNS, lacks
 
 #: What tables of the version before had not.
@@ -38,6 +41,25 @@ def _aged(folder: Path, to: Path, *names: str, new: Mapping[str, Sequence[str]] 
         meta["outputs"][name] = runs.sha256(to / name)
     (to / "run.json").write_text(json.dumps(meta))
     return to
+
+
+def test_the_arguments_of_a_run_are_the_same_however_it_was_asked_for(planned: Path, tmp_path: Path) -> None:
+    """So a page that shows them has the same bytes; and they hold no folder."""
+    shared: Any = {"cell_file": None, "start_s": 9.0, "end_s": 10.0}
+    file = tmp_path / "settings.toml"
+    file.write_text(f'[plan]\nleash_m = 0.2\n[limits]\nprediction = "{tmp_path / "own.toml"}"\n')
+    (tmp_path / "own.toml").write_text((resources.files("hrcreplay.limits") / "people.toml").read_text())
+    overrides = (f"limits.prediction={tmp_path / 'own.toml'}", "plan.leash_m=0.2")
+    asked = [
+        resolve("report", replay.demo_log(), config=file, overrides=(), **shared),
+        resolve("report", replay.demo_log(), config=None, overrides=overrides, **shared),
+        resolve("report", planned, config=None, overrides=overrides, cell_file=None, start_s=None, end_s=None),
+    ]
+    told = "report demo.mcap --start 9 --end 10 --smooth --set limits.prediction=own.toml --set plan.leash_m=0.2"
+    for job in asked:
+        assert job.arguments(smooth=True) == told.split()
+    plain = runs.read_meta(planned)["arguments"]
+    assert plain == ["plan", "demo.mcap", "--start", "9", "--end", "10"]
 
 
 def test_our_tables_lack_nothing(planned: Path) -> None:

@@ -58,7 +58,7 @@ def test_another_urdf_with_given_links_moves_as_the_built_in_robot(tmp_path: Pat
 
 def test_links_without_a_urdf_are_refused(tmp_path: Path) -> None:
     link = '{name = "a", body = "b", start_m = [0,0,0], end_m = [0,0,1], radius_m = 0.1}'
-    with pytest.raises(SettingsError, match=r"robot\.links: found links for the IRB 140"):
+    with pytest.raises(SettingsError, match=r"robot\.links: found links for the IRB 140; it goes with a robot\.urdf"):
         _plan(replay.demo_log(), tmp_path / "x", f"robot.links=[{link}]")
 
 

@@ -13,13 +13,14 @@ import pyarrow as pa
 
 from hrcreplay import runs, wiring
 from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, methods
+from hrcreplay.audit.recording import TRUTH
 from hrcreplay.audit.window import standstill_s, travel
 from hrcreplay.errors import SettingsError
 from hrcreplay.human import reach
 from hrcreplay.job import Job, resolve
 from hrcreplay.progress import say
 from hrcreplay.records import LIMBS
-from hrcreplay.report import audit_page, figures_audit
+from hrcreplay.report import audit_checked, audit_page, figures_audit
 from hrcreplay.report.audit_metrics import curve_point, escapes, flat, joint_figures, method_figures
 from hrcreplay.report.coverage import DRAWS, LEVEL, Resampling, block_ticks, resample
 from hrcreplay.runs import RunWriter, Stopwatch
@@ -71,9 +72,10 @@ def run(
         audits = [audit_log(job, name, watch) for job, name in zip(jobs, _names(jobs), strict=True)]
         for audit in audits:
             _write_rows(audit, writer)
-            for note in audit.notes:
-                say(f"{audit.name}: {note}")
         found = figures(audits)
+        for log in found["logs"]:
+            for note in log["notes"]:
+                say(f"{log['log']}: {note}")
         _write_escapes(found, writer)
         writer.close_tables()
         writer.text("audit.json", runs.to_json(found))
@@ -85,7 +87,23 @@ def run(
         writer.text("report.html", audit_page.render(found, metrics, meta, folder))
         writer.timing.update(watch.summary(1.0 / AUDIT_HZ))
         writer.finish(meta)
+        for line in _summary(found):
+            say(line)
         return writer.folder
+
+
+def _summary(found: dict[str, Any]) -> list[str]:
+    """The main figures, a line a log."""
+    method, lines = found["method"], []
+    for log in found["logs"]:
+        whole = log["methods"][method]["all"]
+        share, room, deepest = whole["covered_share"], whole["union_m3"]["value"], whole["escape_max_m"]
+        words = f"audit: {log['log']}: {method}, {log['limits']}: every limb that was checked "
+        words += f"({audit_checked.scope(log, method)}) inside in {100.0 * share['value']:.1f} % of "
+        words += f"{share['samples']:,} ticks"
+        words += "" if room is None else f"; union {room:.1f} m3"
+        lines.append(words + ("" if deepest is None else f"; deepest escape {1e3 * deepest:.0f} mm"))
+    return lines
 
 
 def _alike(jobs: Sequence[Job]) -> None:
@@ -107,7 +125,8 @@ def _alike(jobs: Sequence[Job]) -> None:
 
 def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
     """All that audit.json holds."""
-    horizon_s = standstill_s(wiring.foresight(audits[0].job))
+    foresight = wiring.foresight(audits[0].job)
+    horizon_s = standstill_s(foresight)
     lengths = [len(audit.outcomes[methods()[0]]) for audit in audits]
     block = block_ticks(horizon_s, AUDIT_HZ, max(lengths))
     drawn = resample(lengths, block, horizon_s * AUDIT_HZ, SEED)
@@ -125,22 +144,27 @@ def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
                 "ticks": lengths[k],
                 "counts": audit.recording.counts,
                 "cameras": _cameras(audit),
-                "notes": list(audit.notes),
+                "points": audit.points,
                 "methods": _methods([audit], mine),
                 "joints": _joints([audit], mine),
                 "curve": _curves([audit]),
                 "escapes": {method: escapes(outcome, start_ns) for method, outcome in audit.outcomes.items()},
             }
         )
+        logs[-1]["notes"] = [*audit.notes, *audit_checked.notes(logs[-1], foresight.method)]
     return {
         "horizon_s": horizon_s,
         "audit_hz": AUDIT_HZ,
         "interval": {"level": LEVEL, "block_ticks": block, "draws": DRAWS, "seed": SEED},
-        "method": audits[0].job.settings.occupancy.method,
+        "method": foresight.method,
         "own_methods": list(reach.METHODS),
         "logs": logs,
         "total": {
             "ticks": sum(lengths),
+            "points": {
+                limb: {point: sum(audit.points[limb][point] for audit in audits) for point in points}
+                for limb, points in audits[0].points.items()
+            },
             "methods": _methods(audits, drawn),
             "joints": _joints(audits, drawn),
             "curve": _curves(audits),
@@ -214,12 +238,18 @@ def _cameras(audit: LogAudit) -> dict[str, dict[str, int | None]]:
     counts = audit.recording.counts
     names = {
         "frames": "frames",
+        "unseen_points": "audit_unseen_points",
+        "doubted_points": "audit_doubted_points",
         "rejected_frames": "audit_rejected_frames",
         "rejected_points": "audit_rejected_points",
         "outlier_points": "outlier_points",
     }
+    unasked = audit.recording.source == TRUTH
     return {
-        camera: {key: counts.get(f"{name}_{camera}") for key, name in names.items()}
+        camera: {
+            key: None if unasked and name.startswith("audit") else counts.get(f"{name}_{camera}", 0)
+            for key, name in names.items()
+        }
         for camera in audit.recording.states.cameras
     }
 
@@ -232,7 +262,6 @@ def _names(jobs: Sequence[Job]) -> list[str]:
 
 def _meta(jobs: Sequence[Job], began: datetime) -> dict[str, Any]:
     meta = jobs[0].meta()
-    del meta["stages"]
     others = [job.meta() for job in jobs]
     return {
         **meta,

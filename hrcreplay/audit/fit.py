@@ -78,7 +78,7 @@ def run(
         end_s: Last one.
         held_back: Share of every log's time, its end.
         cover: ``joints``: of ticks with all fitted joints in their intervals of Alg. 1. ``limbs``: of ticks with
-            all limbs in the volumes of ``occupancy.method``, margins and all.
+            all limbs that were seen, the lower body too, in the volumes of ``occupancy.method``, margins and all.
 
     Returns:
         What the user should know, line by line.
@@ -108,9 +108,13 @@ def run(
 def _refuse(logs: Sequence[Path], out: Path, coverage: float, held_back: float, cover: str) -> None:
     """Raises SettingsError for what cannot be used."""
     if not 0.0 < coverage < 1.0:
-        raise SettingsError(f"--coverage {coverage:g}: no bound holds always or never; give a share between 0 and 1")
+        raise SettingsError(f"--coverage {coverage:g}: would be right: a share above 0 and below 1, e.g. 0.99")
+    if held_back == 0.0:
+        raise SettingsError("--held-back 0: nothing is left to try the fit on; would be right: a share, e.g. 0.3")
+    if held_back == 1.0:
+        raise SettingsError("--held-back 1: nothing is left to fit to; would be right: a share, e.g. 0.3")
     if not 0.0 < held_back < 1.0:
-        raise SettingsError(f"--held-back {held_back:g}: would be right: a share between 0 and 1")
+        raise SettingsError(f"--held-back {held_back:g}: would be right: a share above 0 and below 1, e.g. 0.3")
     if cover not in COVERS:
         raise SettingsError(f"--cover {cover}: would be right: {', '.join(COVERS)}")
     if not logs:
@@ -190,7 +194,8 @@ def _tightened(
         parts = [tightening.stayed(one.foresight, getattr(one, name), limits)[:, None] for one in people]
         shares[name] = _plain(_share(parts, horizon_s, tightening.TIGHTEN_HZ))
         shares[f"{name}_by_log"] = [_plain(_share([part], horizon_s, tightening.TIGHTEN_HZ)) for part in parts]
-    return found, {"factor": round(factor, 4), "method": people[0].foresight.method, "limbs": shares}
+    method, gaps = people[0].foresight.method, tightening.unchecked(people)
+    return found, {"factor": round(factor, 4), "method": method, "not_checked": gaps, "limbs": shares}
 
 
 def _fit(samples: Sequence[Sample], coverage: float, horizon_s: float) -> Fit:

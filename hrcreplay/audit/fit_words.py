@@ -38,10 +38,16 @@ def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) ->
         left_out = f"; fitted to the other logs {_text(log['left_out'])}" if "left_out" in log else ""
         told.append(f"{log['name']}: training {_text(log['training'])}; held back {_text(log['held_back'])}{left_out}")
     total = facts["total"]
+    told.append(f"all joints: training {_text(total['training'])}; held back {_text(total['held_back'])}")
     if "limbs" in facts:
+        if facts["not_checked"]:
+            told.append(f"not checked, so nothing is said of it: {', '.join(facts['not_checked'])}")
+        legs = "LEGS included" if "LEGS" not in facts["not_checked"] else "not LEGS"
         training, held_back = (_text(facts["limbs"][part]) for part in ("training", "held_back"))
-        told.append(f"limbs in the volumes of {facts['method']}: training {training}; held back {held_back}")
-    return [*told, f"all joints: training {_text(total['training'])}; held back {_text(total['held_back'])}"]
+        what = f"every limb that was checked ({legs}) in its volume of {facts['method']}"
+        told.append(f"{what}: training {training}; held back {held_back}")
+    told[-1] = f"fit-limits: {limits.name}: {told[-1]}"
+    return told
 
 
 def _text(share: dict[str, Any]) -> str:

@@ -19,7 +19,7 @@ from hrcreplay.job import Job
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import NS, Foresight, tick_times
 from hrcreplay.progress import Bar
-from hrcreplay.records import JOINTS, LIMBS, Floats, Ints, SweptVolumes
+from hrcreplay.records import JOINTS, Floats, Ints, SweptVolumes
 from hrcreplay.report.audit_metrics import Outcome
 from hrcreplay.runs import Stopwatch
 
@@ -43,6 +43,7 @@ class LogAudit:
     outcomes: dict[str, Outcome]  #: by method, our own first
     joints: dict[str, Floats]  #: by method of ours: (n, 12) of ``joints_inside``
     curve: dict[str, dict[float, Outcome]]  #: by method of ours and factor
+    points: dict[str, dict[str, int]]  #: limb -> each point beyond its ends -> at how many ticks it was checked
     notes: tuple[str, ...]
 
 
@@ -109,6 +110,11 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         for method in methods():
             with watch.stage(f"audit {method}", len(rows)):
                 outcomes[method] = _hold(foresight, future, method, EVERY, progress)
+        if not np.isfinite(outcomes[foresight.method].beyond_m).any():
+            raise LogError(
+                f"{job.log}: nothing to check: no limb was both predicted and seen to the end of the horizon of "
+                f"{horizon_s:g} s"
+            )
         for method in reach.METHODS:
             with watch.stage(f"curve {method}", len(rows)):
                 curve[method] = _curve(foresight, future, method, outcomes[method], progress)
@@ -116,8 +122,8 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
     for method in reach.METHODS:
         interval = reach.reachable(future.states, foresight.limits, foresight.horizon_s, method, foresight.margins)
         joints[method] = joints_inside(recording, future.states, interval, horizon_s)
-    notes = (*log.notes, *_remarks(recording, outcomes, horizon_s))
-    return LogAudit(job, name, recording, outcomes, joints, curve, notes)
+    notes = (*log.notes, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))
+    return LogAudit(job, name, recording, outcomes, joints, curve, future.points(), notes)
 
 
 def _audited(recording: Recording, rate_hz: float, horizon_s: float) -> Ints:
@@ -156,7 +162,7 @@ def _curve(
     return dict(sorted(found.items()))
 
 
-def _remarks(recording: Recording, outcomes: dict[str, Outcome], horizon_s: float) -> tuple[str, ...]:
+def _remarks(recording: Recording, audited_s: float, horizon_s: float) -> tuple[str, ...]:
     """What the reader of one log's figures must know."""
     notes = [f"the recorded future is the {recording.source}"]
     went = travel(recording.joints)
@@ -169,12 +175,6 @@ def _remarks(recording: Recording, outcomes: dict[str, Outcome], horizon_s: floa
         notes.append(f"hardly moved, so the audit says little of their bounds: {', '.join(still)}")
     if (went[4:] < LITTLE[4:]).all():
         notes.append("no arm motion: the shares of the arms say nothing of a person at work")
-    first = next(iter(outcomes.values()))
-    unseen = {limb: int(np.isnan(first.beyond_m[:, i]).sum()) for i, limb in enumerate(LIMBS)}
-    if any(unseen.values()):
-        parts = ", ".join(f"{limb} {count}" for limb, count in unseen.items() if count)
-        notes.append(f"not seen to the horizon's end, so not counted, of {len(first)} ticks: {parts}")
-    seconds = len(first) / AUDIT_HZ
-    if seconds < 10.0 * horizon_s:
-        notes.append(f"only {seconds:.1f} s audited: the intervals are wide")
+    if audited_s < 10.0 * horizon_s:
+        notes.append(f"only {audited_s:.1f} s audited: the intervals are wide")
     return tuple(notes)

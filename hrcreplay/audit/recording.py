@@ -59,10 +59,10 @@ def record(log: Log, ticks_ns: Ints, eyes: Eyes, progress: Callable[[int], None]
     """Reads the span of ``ticks_ns``.
 
     The recorded future is the ground truth where the log has it. Else the points of the cameras, at their capture
-    times, that the cameras trust and that are either within the filter's outlier distance of the smoothed person, who
-    knows what came later, or at the end of a bone of the person's own length: who squats or bends sideways leaves the
-    model, not the room, and must not be thrown out for it; a marker that jumps away takes no bone along. Else the
-    smoothed person. Recorded joints are those of the truth, else of the smoothed person.
+    times, that the cameras trust (confidence 0 is not seen) and that are either within the filter's outlier distance of
+    the smoothed person, who knows what came later, or at the end of a bone of the person's own length: who squats or
+    bends sideways leaves the model, not the room, and must not be thrown out for it; a marker that jumps away takes no
+    bone along. Else the smoothed person. Recorded joints are those of the truth, else of the smoothed person.
 
     Raises:
         LogError: No camera saw anybody.
@@ -139,33 +139,48 @@ def _smoothed(stretches: Iterator[Stretch], eyes: Eyes) -> tuple[HumanStates, Me
 
 
 def _believed(seen: Measurements, best: HumanStates, eyes: Eyes) -> tuple[Floats, Counter[str]]:
-    """The measured points (m, 20, 3) without those that fail a gate, and how many failed per camera."""
+    """The measured points (m, 20, 3) that are believed, and how many per camera are not, by why.
+
+    A missing point and one of confidence 0 were not seen. One that the camera trusts too little, that hangs from such a
+    point, or that was seen before the person was known, is doubted: nobody can say whether it is right. One that the
+    camera trusts and that fails a gate jumps off the person: it is rejected, with what hangs from it.
+    """
     tick = np.clip(np.searchsorted(best.t_ns, seen.capture_ns), 0, len(best) - 1)
     expected = skeleton(best.p[tick], best.lengths_m[tick])
-    measured: Bools = np.asarray(np.isfinite(seen.points_m).all(axis=2))
-    good = measured & (seen.confidence >= eyes.filter.confidence_min)
+    measured: Bools = np.asarray(np.isfinite(seen.points_m).all(axis=2)) & (seen.confidence > 0.0)
+    trusted = measured & (seen.confidence >= eyes.filter.confidence_min)
+    good, jumped = trusted.copy(), np.zeros_like(trusted)
     points = seen.points_m.copy()
-    neck = POINTS.index("neck")  # the model's: the middle of the shoulders
-    points[:, neck] = 0.5 * (points[:, POINTS.index("shoulder_l")] + points[:, POINTS.index("shoulder_r")])
-    near = np.linalg.norm(points - expected, axis=2) <= eyes.filter.outlier_m
-    good[:, neck] = measured[:, neck]
+    neck, right, left = (POINTS.index(name) for name in ("neck", "shoulder_r", "shoulder_l"))
+    points[:, neck] = 0.5 * (points[:, left] + points[:, right])  # the model's: the middle of the shoulders
+    good[:, neck] = trusted[:, left] & trusted[:, right]
+    off = np.linalg.norm(points - expected, axis=2)
     for name, start, length, part in _BONES:
         k, j = POINTS.index(name), POINTS.index(start)
         own = part * best.lengths_m[tick, LENGTHS.index(length)]
-        right = np.abs(np.linalg.norm(points[:, k] - points[:, j], axis=1) - own) <= _BONE_M
-        good[:, k] &= near[:, k] | (right & good[:, j])
+        fits = np.abs(np.linalg.norm(points[:, k] - points[:, j], axis=1) - own) <= _BONE_M
+        good[:, k] &= (off[:, k] <= eyes.filter.outlier_m) | (fits & good[:, j])
+        jumped[:, k] = trusted[:, k] & ~good[:, k] & np.isfinite(off[:, k])
     for name, (parent, longest_m) in _HANGING.items():
         for side in "lr":
             k = POINTS.index(f"{name}_{side}")
             j = POINTS.index(parent if parent in POINTS else f"{parent}_{side}")
-            apart = np.linalg.norm(seen.points_m[:, k] - seen.points_m[:, j], axis=1)
-            good[:, k] &= good[:, j] & (apart <= longest_m)
-    rejected = measured & ~good
+            fits = np.linalg.norm(seen.points_m[:, k] - seen.points_m[:, j], axis=1) <= longest_m
+            jumped[:, k] = trusted[:, k] & (jumped[:, j] | (good[:, j] & ~fits))
+            good[:, k] &= good[:, j] & fits
+    return np.where((good & measured)[..., None], seen.points_m, np.nan), _disbelieved(seen, measured, good, jumped)
+
+
+def _disbelieved(seen: Measurements, measured: Bools, good: Bools, jumped: Bools) -> Counter[str]:
+    """Per camera the points that were not seen, were doubted, or jump; and the frames with one that jumps."""
     counts: Counter[str] = Counter()
     for c, camera in enumerate(seen.cameras):
-        counts[f"audit_rejected_points_{camera}"] = int(rejected[seen.camera == c].sum())
-        counts[f"audit_rejected_frames_{camera}"] = int(rejected[seen.camera == c].any(axis=1).sum())
-    return np.where(good[..., None], seen.points_m, np.nan), counts
+        mine = seen.camera == c
+        counts[f"audit_unseen_points_{camera}"] = int((~measured[mine]).sum())
+        counts[f"audit_doubted_points_{camera}"] = int((measured & ~good & ~jumped)[mine].sum())
+        counts[f"audit_rejected_points_{camera}"] = int(jumped[mine].sum())
+        counts[f"audit_rejected_frames_{camera}"] = int(jumped[mine].any(axis=1).sum())
+    return counts
 
 
 def _plain(log: Log, found: Counter[str]) -> dict[str, int]:

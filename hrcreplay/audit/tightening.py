@@ -11,7 +11,7 @@ from hrcreplay.audit.window import Window, hold
 from hrcreplay.human.fitting import Fit
 from hrcreplay.human.model import LimitSet
 from hrcreplay.pipeline import Foresight
-from hrcreplay.records import Bools, Floats
+from hrcreplay.records import BODY, Bools, Floats
 
 #: Ticks a second whose volumes are held against the recorded future [Hz].
 TIGHTEN_HZ = 12.5
@@ -30,8 +30,23 @@ class Held:
     held_back: Window
 
 
+def unchecked(people: Sequence[Held]) -> list[str]:
+    """Limbs, and points of other limbs, that were never seen to a horizon's end, so that nothing is said of them."""
+    parts = [part for one in people for part in (one.training, one.held_back)]
+    volumes = people[0].foresight.volumes(parts[0].states.rows(slice(0, 0))).limbs
+    limbs = [limb for limb in BODY if limb not in volumes or not any(part.checked(limb).any() for part in parts)]
+    points = [
+        f"{point} of {limb}"
+        for limb, names in parts[0].points().items()
+        if limb not in limbs
+        for point in names
+        if not any(part.points()[limb][point] for part in parts)
+    ]
+    return limbs + points
+
+
 def stayed(foresight: Foresight, future: Window, limits: LimitSet) -> Floats:
-    """(n,) whether all limbs stayed in their volumes until the horizon: 1, 0, or NaN where none was recorded."""
+    """(n,) whether all limbs that were seen stayed in their volumes until the horizon: 1, 0, or NaN where none was."""
     volumes = replace(foresight, limits=limits).volumes(future.states)
     worst = hold(volumes, future, np.zeros(len(future.states), dtype=bool)).worst_m()
     return np.where(np.isfinite(worst), (worst == 0.0).astype(float), np.nan)

@@ -14,7 +14,8 @@ from hrcreplay.records import LIMBS, POINTS, Bools, Floats, HumanStates, Ints, S
 from hrcreplay.report.audit_metrics import Outcome
 from hrcreplay.report.series import difference
 
-#: Recorded points of a limb. The first two must have been seen near the end of the horizon, or the limb is not audited.
+#: Recorded points of a limb. The first two, its ends, must have been seen near the end of the horizon, or the limb is
+#: not checked.
 LIMB_POINTS = {
     "HD": ("neck", "head"),
     "THX": ("pelvis", "shoulder_r", "shoulder_l"),
@@ -44,11 +45,25 @@ class Window:
     limbs: dict[str, Floats]  #: limb -> (m, k, 3) its recorded points, world [m]
     first: Ints  #: (n,) row of the first recorded instant after the tick
     last: Ints  #: (n,) row past the last one within the horizon
-    end: Ints  #: (n,) row of the first one in the last quarter of the horizon
+    seen: dict[str, Bools]  #: limb -> (n, k) whether a point was seen in the last quarter of the horizon
 
     def rows(self, which: slice | Ints) -> Window:
         """The same for some of the ticks."""
-        return Window(self.states.rows(which), self.limbs, self.first[which], self.last[which], self.end[which])
+        seen = {limb: part[which] for limb, part in self.seen.items()}
+        return Window(self.states.rows(which), self.limbs, self.first[which], self.last[which], seen)
+
+    def checked(self, limb: str) -> Bools:
+        """(n,) whether the limb can be checked: both its ends were seen near the horizon's end."""
+        return np.asarray(self.seen[limb][:, :2].all(axis=1))
+
+    def points(self) -> dict[str, dict[str, int]]:
+        """Limb -> each point beyond its ends -> at how many of the ticks that check the limb it was seen too."""
+        return {
+            limb: {
+                point: int((self.seen[limb][:, 2 + k] & self.checked(limb)).sum()) for k, point in enumerate(names[2:])
+            }
+            for limb, names in LIMB_POINTS.items()
+        }
 
 
 def window(recording: Recording, ticks: Ints, horizon_s: float) -> Window:
@@ -70,7 +85,14 @@ def window(recording: Recording, ticks: Ints, horizon_s: float) -> Window:
     first = np.searchsorted(recording.t_ns, states.t_ns, side="right")
     last = np.searchsorted(recording.t_ns, states.t_ns + horizon_ns, side="right")
     end = np.searchsorted(recording.t_ns, states.t_ns + round(_END * horizon_ns), side="right")
-    return Window(states, limbs, first, last, end)
+    return Window(states, limbs, first, last, {limb: _seen(part, end, last) for limb, part in limbs.items()})
+
+
+def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
+    """(n, k) whether each of the points (m, k, 3) was recorded in any row from ``first`` (n,) up to ``last`` (n,)."""
+    count = np.zeros((len(recorded) + 1, recorded.shape[1]), np.int64)
+    np.cumsum(np.isfinite(recorded).all(axis=2), axis=0, out=count[1:])
+    return np.asarray(count[last] > count[first])
 
 
 def hold(volumes: SweptVolumes, future: Window, counted: Bools, first_sample: int = 0) -> Outcome:
@@ -84,7 +106,8 @@ def hold(volumes: SweptVolumes, future: Window, counted: Bools, first_sample: in
     """
     n, limbs = len(volumes), volumes.limbs
     beyond, size = np.full((n, len(limbs)), np.nan), np.full((n, len(limbs)), np.nan)
-    union, union_std = np.full(n, np.nan), np.full(n, np.nan)
+    union, union_std, upper, upper_std = np.full((4, n), np.nan)
+    checked = np.column_stack([future.checked(limb) for limb in limbs])
     for i in range(n):
         solids = []
         for k, limb in enumerate(limbs):
@@ -93,21 +116,21 @@ def hold(volumes: SweptVolumes, future: Window, counted: Bools, first_sample: in
                 continue
             solid = Solid.around(vertices, float(volumes.radius_m[i, k]))
             size[i, k] = solid.volume_m3()
-            if limb in LIMBS:
-                solids.append(solid)
-            beyond[i, k] = _farthest(solid, future, i, limb)
-        if counted[i] and len(solids) == len(LIMBS):
-            union[i], union_std[i] = union_volume_m3(solids, _COUNT, _COUNT * (first_sample + i))
-    return Outcome(volumes.t_ns, beyond, np.array(volumes.radius_m), size, union, union_std, limbs)
+            solids.append(solid)
+            if checked[i, k]:
+                beyond[i, k] = _farthest(solid, future, i, limb)
+        if counted[i] and len(solids) == len(limbs):
+            upper[i], upper_std[i] = union_volume_m3(solids[: len(LIMBS)], _COUNT, _COUNT * (first_sample + i))
+            union[i], union_std[i] = upper[i], upper_std[i]
+            if len(limbs) > len(LIMBS):
+                union[i], union_std[i] = union_volume_m3(solids, _COUNT, _COUNT * (first_sample + i))
+    radius = np.array(volumes.radius_m)
+    return Outcome(volumes.t_ns, beyond, radius, size, union, union_std, upper, upper_std, limbs)
 
 
 def _farthest(solid: Solid, future: Window, tick: int, limb: str) -> float:
-    """How far the limb's recorded points get from a hull [m]; NaN where it was not seen near the horizon's end."""
-    recorded = future.limbs[limb]
-    late = recorded[future.end[tick] : future.last[tick], :2, 0]
-    if not np.isfinite(late).any(axis=0).all():
-        return np.nan
-    points = recorded[future.first[tick] : future.last[tick]].reshape(-1, 3)
+    """How far the recorded points of a limb, some of them seen, get from a hull [m]."""
+    points = future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
     return float(np.nanmax(solid.distances_m(points)))
 
 

@@ -21,8 +21,12 @@ ROWS = 12 + len(LENGTHS)
 _SHOULDER_R, _SHOULDER_L = ARM_POINTS[0][0], ARM_POINTS[1][0]
 _USED = (PELVIS, NECK, HEAD, *ARM_POINTS[0], *ARM_POINTS[1])
 _STEP_M = 1e-6
+#: Two points nearer than this are one place: no bone lies between them, so it has neither length nor direction [m].
+LEAST_BONE_M = 1e-3
 #: A variance that leaves a filter untouched [rad^2, m^2].
 _UNOBSERVED = 1e6
+#: No variance is less: a sum of squares that rounds to 0 would count as a certainty [rad^2, m^2].
+_LEAST_VARIANCE = 1e-18
 _LEAST_CONFIDENCE = 0.05
 
 
@@ -62,7 +66,8 @@ def inverse(points_m: Floats) -> tuple[Floats, Floats]:
 
     Returns:
         Angles (n, 12) JOINTS [m, m, rad...], arms by their canonical names (see branches), and lengths (n, 8)
-        LENGTHS [m]. NaN where a point is missing. At a singular posture the angle that cannot be observed is 0.
+        LENGTHS [m]. NaN where a point is missing, or where the two ends of a bone are in one place. At a singular
+        posture the angle that cannot be observed is 0.
     """
     rows = np.full((len(points_m), ROWS), np.nan)
     _inverse_rows(np.ascontiguousarray(points_m, dtype=np.float64), rows)
@@ -146,9 +151,11 @@ def _variances_row(points: Floats, point_variance: Floats, variances: Floats) ->
             squares = J[row, k, 0] ** 2 + J[row, k, 1] ** 2 + J[row, k, 2] ** 2
             if squares > 0.0:
                 variance += squares * point_variance[k]
+            elif np.isnan(squares):  # a step more and there is no bone
+                variance = _UNOBSERVED
         if 2 <= row < 12:
             variance *= 1.0 + 4.0 * variance
-        variances[row] = min(variance, _UNOBSERVED)
+        variances[row] = max(_LEAST_VARIANCE, min(variance, _UNOBSERVED))
 
 
 @njit(cache=True)
@@ -189,30 +196,38 @@ def _direct_row(points: Floats, rows: Floats) -> None:
     (_, elbow_r, wrist_r), (_, elbow_l, wrist_l) = ARM_POINTS
     rows[12:] = (
         pelvis[2],
-        norm(_from_to(pelvis, neck)),
-        norm(_from_to(neck, _point(points, HEAD))),
-        0.5 * norm(line),
-        norm(edge(points, _SHOULDER_L, elbow_l)),
-        norm(edge(points, _SHOULDER_R, elbow_r)),
-        norm(edge(points, elbow_l, wrist_l)),
-        norm(edge(points, elbow_r, wrist_r)),
+        norm(_bone(_from_to(pelvis, neck))),
+        norm(_bone(_from_to(neck, _point(points, HEAD)))),
+        0.5 * norm(_bone(line)),
+        norm(_bone(edge(points, _SHOULDER_L, elbow_l))),
+        norm(_bone(edge(points, _SHOULDER_R, elbow_r))),
+        norm(_bone(edge(points, elbow_l, wrist_l))),
+        norm(_bone(edge(points, elbow_r, wrist_r))),
     )
     if np.isnan(line[0]):
         neck = _point(points, NECK)
         line = _from_to(right, neck) if np.isnan(left[0]) else _from_to(neck, left)
+    line, trunk = _bone(line), _bone(_from_to(pelvis, neck))
     theta = np.arctan2(-line[0], line[1])  # the shoulder line is R_torso (0, 1, 0)
-    trunk = _from_to(pelvis, neck)
     rho = np.arctan2(trunk[0] * np.cos(theta) + trunk[1] * np.sin(theta), trunk[2])
     rows[0], rows[1], rows[2], rows[3] = pelvis[0], pelvis[1], theta, rho
     R = torso_rotation(theta, rho)
     for arm in range(2):
         shoulder, elbow, wrist = ARM_POINTS[arm]
         s = 2.0 * arm - 1.0
-        upper, fore = edge(points, shoulder, elbow), edge(points, elbow, wrist)
+        upper, fore = _bone(edge(points, shoulder, elbow)), _bone(edge(points, elbow, wrist))
         first = RIGHT_ARM + 4 * arm
         _arm_row(_in_torso(R, s, upper), _in_torso(R, s, fore), rows[first : first + 4])
         # free of the torso's frame, so it holds where heading does not
-        rows[first + 3] = _elbow_angle(edge(points, elbow, shoulder), fore)
+        rows[first + 3] = _elbow_angle((-upper[0], -upper[1], -upper[2]), fore)
+
+
+@njit(cache=True)
+def _bone(ends: Vector) -> Vector:
+    """The same, or NaN where both ends are in one place: that bone cannot be observed."""
+    if norm(ends) < LEAST_BONE_M:
+        return np.nan, np.nan, np.nan
+    return ends
 
 
 @njit(cache=True)

@@ -73,7 +73,7 @@ def nearest_arm(arm: Floats, reference: Floats, variance: Floats) -> None:
     other = (arm[0] + np.pi, np.pi - arm[1], arm[2] + np.pi)
     ours, theirs = 0.0, 0.0
     for j in range(3):
-        if np.isfinite(arm[j]):
+        if np.isfinite(arm[j]) and variance[j] > 0.0:
             ours += (arm[j] - reference[j]) ** 2 / variance[j]
             theirs += wrap(other[j] - reference[j]) ** 2 / variance[j]
     if theirs < ours:

@@ -12,7 +12,9 @@ from hrcreplay.human.hull import hull, sphere_swept_volume_m3
 from hrcreplay.records import Bools, Floats, Ints
 
 #: A triangle counts as seen by a point that is not clearly behind it: in the plane of a flat set nothing is in front.
+#: How far behind is clear, and how far relative to the largest coordinate.
 _BEHIND_M = 1e-9
+_COARSE = 16.0 * float(np.finfo(np.float64).eps)
 #: Largest root of g^4 = g + 1: powers of 1/g fill a cube evenly (a generalised golden ratio).
 _G = 1.2207440846057594759
 _STEPS = np.array([1.0 / _G, 1.0 / _G**2, 1.0 / _G**3])
@@ -73,16 +75,28 @@ def union_volume_m3(solids: Sequence[Solid], points: int, first: int = 0) -> tup
 @njit(cache=True)
 def _distances(points: Floats, vertices: Floats, faces: Ints) -> Floats:
     normals, offsets = _planes(vertices, faces)
+    behind = _behind(vertices)
     found = np.empty(len(points))
     for i in range(len(points)):
-        found[i] = _distance(points[i], vertices, faces, normals, offsets)
+        found[i] = _distance(points[i], vertices, faces, normals, offsets, behind)
     return found
+
+
+@njit(cache=True)
+def _behind(vertices: Floats) -> float:
+    """How far behind a triangle a point must be to be clearly behind it [m]."""
+    size = 0.0
+    for vertex in vertices:
+        for k in range(3):
+            size = max(size, abs(vertex[k]))
+    return max(_BEHIND_M, _COARSE * size)
 
 
 @njit(cache=True)
 def _mark(points: Floats, vertices: Floats, faces: Ints, radius: float, inside: Bools) -> None:
     """Sets ``inside`` where a point is within ``radius`` of the hull."""
     normals, offsets = _planes(vertices, faces)
+    behind = _behind(vertices)
     low, high = vertices[0].copy(), vertices[0].copy()
     for vertex in vertices:
         for k in range(3):
@@ -97,7 +111,7 @@ def _mark(points: Floats, vertices: Floats, faces: Ints, radius: float, inside: 
             outside = _height(point, normals[f], offsets[f]) > radius
             f += 1
         if not outside:
-            inside[i] = _distance(point, vertices, faces, normals, offsets) <= radius
+            inside[i] = _distance(point, vertices, faces, normals, offsets, behind) <= radius
 
 
 @njit(cache=True)
@@ -122,7 +136,7 @@ def _height(point: Floats, normal: Floats, offset: float) -> float:
 
 
 @njit(cache=True)
-def _distance(point: Floats, vertices: Floats, faces: Ints, normals: Floats, offsets: Floats) -> float:
+def _distance(point: Floats, vertices: Floats, faces: Ints, normals: Floats, offsets: Floats, behind: float) -> float:
     if np.isnan(point[0] + point[1] + point[2]):
         return np.nan
     if len(faces) == 0:
@@ -130,7 +144,7 @@ def _distance(point: Floats, vertices: Floats, faces: Ints, normals: Floats, off
     nearest = np.inf
     for f in range(len(faces)):
         height = _height(point, normals[f], offsets[f])
-        if height > -_BEHIND_M and height * height < nearest:
+        if height > -behind and height * height < nearest:
             a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
             nearest = min(nearest, _triangle(point, a, b, c, normals[f], height))
     return 0.0 if nearest == np.inf else np.sqrt(nearest)

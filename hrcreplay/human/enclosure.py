@@ -9,13 +9,9 @@ from numba import njit
 
 from hrcreplay.human.excursion import Stops, interval, stops
 from hrcreplay.human.margins import Margins
+from hrcreplay.human.model import SHOWN_BY
 from hrcreplay.human.stroll import SIDES, body_velocity, corners_of, turned, walked
-from hrcreplay.records import LIMBS, Floats, HumanStates
-
-#: Index into LIMBS of the limb whose points show each joint of JOINTS.
-_SHOWN_BY = np.array(
-    [LIMBS.index(limb) for limb in ("THX",) * 4 + ("URA",) * 2 + ("LRA",) * 2 + ("ULA",) * 2 + ("LLA",) * 2]
-)
+from hrcreplay.records import Floats, HumanStates
 
 Range = tuple[float, float]
 
@@ -32,7 +28,7 @@ class Likely(NamedTuple):
 
 def likely(states: HumanStates, margins: Margins) -> Likely:
     """The states that ``sound`` starts from."""
-    unseen = np.where(states.unseen_s > margins.memory_s, states.unseen_s, 0.0)[:, _SHOWN_BY]
+    unseen = np.where(states.unseen_s > margins.memory_s, states.unseen_s, 0.0)[:, SHOWN_BY]
     off = (margins.sigmas * states.p_std, margins.sigmas * states.v_std)
     return Likely(*(np.ascontiguousarray(a) for a in (states.p, states.v, *off, unseen)))
 

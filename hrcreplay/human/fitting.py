@@ -14,8 +14,8 @@ import numpy as np
 
 from hrcreplay.errors import LogError
 from hrcreplay.human.branches import canonical, nearest
-from hrcreplay.human.model import LimitSet, clamp
-from hrcreplay.records import LIMBS, Bools, Floats, HumanStates, Ints, Table
+from hrcreplay.human.model import SHOWN_BY, LimitSet, clamp
+from hrcreplay.records import Bools, Floats, HumanStates, Ints, Table
 
 #: A joint that moves less than this within a horizon is at rest [m, m, rad...].
 STIR = np.array([0.03] * 2 + [np.radians(5.0)] * 10)
@@ -33,10 +33,6 @@ _LEVER_M = np.array([1.0, 1.0, 0.5, 0.5] + 2 * [0.6, 0.6, 0.4, 0.4])
 _OUTSIDE = np.radians(0.1)
 _ROUNDING = 1e-9
 _ARMS = slice(4, 12)
-#: Index into LIMBS of the limb whose points show each joint of JOINTS.
-_SHOWN_BY = np.array(
-    [LIMBS.index(limb) for limb in ("THX",) * 4 + ("URA",) * 2 + ("LRA",) * 2 + ("ULA",) * 2 + ("LLA",) * 2]
-)
 
 
 @dataclass(frozen=True)
@@ -102,7 +98,7 @@ def futures(
 
 def believed(joints: Floats, unseen_s: Floats, memory_s: float) -> Floats:
     """Rows of JOINTS (n, 12), NaN where no camera had seen a joint's limb for longer; ``unseen_s`` (n, 6) by LIMBS."""
-    return np.where((unseen_s <= memory_s)[:, _SHOWN_BY], joints, np.nan)
+    return np.where((unseen_s <= memory_s)[:, SHOWN_BY], joints, np.nan)
 
 
 def leave(p: Floats, limits: LimitSet) -> Bools:

@@ -18,6 +18,8 @@ _FOOT_STD_M = 0.02
 _STEP_M = 0.1  # a tracker repeats its error while a foot rests: each place counts as one measurement
 _REST_S = 0.3  # a foot that is shorter at a place only passes there
 _MANY_S = 1.0  # rows worth this long are needed to tell anything
+#: A view whose z is less points along the floor enough to give it a direction: 60 degrees up or down.
+LEVEL_VIEW = float(np.sin(np.radians(60)))
 _SURE = 0.5  # feet of at most this confidence are guesses of the tracker
 
 
@@ -101,7 +103,7 @@ def floor_frame(floor: Floor) -> Floats:
     the sensor's own x where it looks up or down by more than 60 degrees, as the frame of a motion capture system does.
     """
     view = np.array([0.0, 0.0, 1.0])
-    if abs(floor.up @ view) > np.sin(np.radians(60)):
+    if abs(floor.up @ view) > LEVEL_VIEW:
         view = np.array([1.0, 0.0, 0.0])
     x = _unit(view - (floor.up @ view) * floor.up)
     return rigid(np.stack([x, np.cross(floor.up, x), floor.up]), np.array([0.0, 0.0, floor.height_m]))
@@ -113,7 +115,9 @@ def _point(track: Track, name: str) -> Floats:
 
 
 def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+    """Directions (..., 3); NaN where a vector has no length."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0.0, length, np.nan))
 
 
 def _length(vectors: Floats) -> Floats:

@@ -96,9 +96,11 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
             continue
         R = filter_.uses[c] * filter_.z_var[c, row]
         if row >= 12:
-            gain = filter_.lengths_var[row - 12] / (filter_.lengths_var[row - 12] + R)
-            filter_.lengths[row - 12] += gain * (z[row] - filter_.lengths[row - 12])
-            filter_.lengths_var[row - 12] *= 1.0 - gain
+            both = filter_.lengths_var[row - 12] + R
+            if both > 0.0:  # else the length is known exactly, and so is the row
+                gain = filter_.lengths_var[row - 12] / both
+                filter_.lengths[row - 12] += gain * (z[row] - filter_.lengths[row - 12])
+                filter_.lengths_var[row - 12] *= 1.0 - gain
         elif now - filter_.row_ns[row] > rules.memory_ns:
             _acquire(filter_, row, z[row], R, rules.rest_std[row])
             filter_.acquired_ns[row] = now

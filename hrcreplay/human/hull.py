@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.human.vectors import cross, dot, edge, norm
 from hrcreplay.records import Floats, Ints
 
 #: A set thinner than this in a direction has no extent in it [m].
 _THIN_M = 1e-9
+#: Nor has one thinner than this times its largest coordinate: far from the origin that is how coarse coordinates are.
+_COARSE = 16.0 * float(np.finfo(np.float64).eps)
 
 
 def hull(points_m: Floats) -> tuple[Floats, Ints]:
@@ -21,26 +23,36 @@ def hull(points_m: Floats) -> tuple[Floats, Ints]:
 
     Returns:
         ``vertices`` (m, 3) [m], the corners in the order of the points, and ``faces`` (f, 3), three rows of vertices
-        for each triangle, counterclockwise seen from outside. A flat set's triangles are there for both sides; two
-        points or one have none.
+        for each triangle, counterclockwise seen from outside. A flat set's triangles are there for both sides; a line
+        has its two ends and no triangles, a point itself.
     """
     axes = _axes(points_m)
-    if len(axes) == 3:
-        solid = ConvexHull(points_m)
-        corners = np.sort(solid.vertices)
-        faces = np.searchsorted(corners, solid.simplices).astype(np.int64)
-        _turn_outward(points_m[corners], faces, solid.neighbors)
-        return points_m[corners], faces
-    if len(axes) == 2:
-        around = ConvexHull(points_m @ axes.T).vertices  # counterclockwise
-        corners = np.sort(around)
-        loop = np.searchsorted(corners, around)
-        # from different corners, so that no two triangles lie left of one edge
-        return points_m[corners], np.concatenate([_fan(loop), _fan(np.roll(loop, -1))[:, ::-1]])
+    while len(axes) > 1:
+        try:
+            return _solid(points_m) if len(axes) == 3 else _flat(points_m, axes)
+        except QhullError:  # too thin to be told from a flat set in floating point: then it is one
+            axes = axes[:-1]
     if len(axes) == 1:
-        along = points_m @ axes[0]
+        along = (points_m - points_m[0]) @ axes[0]
         return points_m[np.sort([along.argmin(), along.argmax()])], np.empty((0, 3), np.int64)
     return points_m[:1], np.empty((0, 3), np.int64)
+
+
+def _solid(points_m: Floats) -> tuple[Floats, Ints]:
+    solid = ConvexHull(points_m)
+    corners = np.sort(solid.vertices)
+    faces = np.searchsorted(corners, solid.simplices).astype(np.int64)
+    _turn_outward(points_m[corners], faces, solid.neighbors)
+    return points_m[corners], faces
+
+
+def _flat(points_m: Floats, axes: Floats) -> tuple[Floats, Ints]:
+    """The polygon in the plane of two axes (2, 3), with both sides."""
+    around = ConvexHull((points_m - points_m[0]) @ axes.T).vertices  # counterclockwise
+    corners = np.sort(around)
+    loop = np.searchsorted(corners, around)
+    # from different corners, so that no two triangles lie left of one edge
+    return points_m[corners], np.concatenate([_fan(loop), _fan(np.roll(loop, -1))[:, ::-1]])
 
 
 @njit(cache=True)
@@ -123,7 +135,8 @@ def _measures(vertices: Floats, faces: Ints) -> tuple[float, float, float]:
 
 def _axes(points_m: Floats) -> Floats:
     """(0 to 3, 3) principal directions in which the set has an extent, the longest first."""
-    _, _, directions = np.linalg.svd(points_m - points_m.mean(axis=0), full_matrices=False)
-    extents = np.ptp(points_m @ directions.T, axis=0)
-    axes: Floats = directions[extents > _THIN_M]
+    centred = points_m - points_m.mean(axis=0)
+    _, _, directions = np.linalg.svd(centred, full_matrices=False)
+    extents = np.ptp(centred @ directions.T, axis=0)
+    axes: Floats = directions[extents > max(_THIN_M, _COARSE * float(np.abs(points_m).max()))]
     return axes

@@ -40,12 +40,17 @@ def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> floa
 
 @njit(cache=True)
 def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
-    """The Kalman update of one joint by one scalar row; returns the innovation squared over its variance."""
+    """The Kalman update of one joint by one scalar row; returns the innovation squared over its variance.
+
+    A row whose innovation has no variance, or none that a number can hold, tells nothing: it changes nothing.
+    """
     Ph = np.empty(4)
     for a in range(4):
         Ph[a] = dot(P[a], h)
     S = dot(h, Ph) + R
     innovation = z - dot(h, mean)
+    if not (0.0 < S < np.inf and np.isfinite(innovation)):
+        return 0.0
     for a in range(4):
         mean[a] += Ph[a] / S * innovation
         for b in range(4):

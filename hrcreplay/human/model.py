@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from hrcreplay.records import POINTS, Floats
+from hrcreplay.records import LIMBS, POINTS, Floats
 
 #: First of the four joints of each arm in JOINTS, and s of the kinematics: +1 on the left.
 RIGHT_ARM, LEFT_ARM = 4, 8
@@ -18,6 +18,10 @@ RIGHT_ARM, LEFT_ARM = 4, 8
 PELVIS, NECK, HEAD = (POINTS.index(name) for name in ("pelvis", "neck", "head"))
 #: Rows: right, left. Columns: shoulder, elbow, wrist.
 ARM_POINTS = tuple(tuple(POINTS.index(f"{name}_{side}") for name in ("shoulder", "elbow", "wrist")) for side in "rl")
+#: Index into LIMBS of the limb whose points show each joint of JOINTS.
+SHOWN_BY = np.array(
+    [LIMBS.index(limb) for limb in ("THX",) * 4 + ("URA",) * 2 + ("LRA",) * 2 + ("ULA",) * 2 + ("LLA",) * 2]
+)
 _DEGREE = np.pi / 180.0
 
 

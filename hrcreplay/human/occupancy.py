@@ -12,11 +12,11 @@ from hrcreplay.human.chain import kinematic_chain
 from hrcreplay.human.corners import keep_corners
 from hrcreplay.human.margins import STANDARD, Margins
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.reach import SOUND, bounds_of, code_of, reach_row
+from hrcreplay.human.reach import SOUND, bounds_of, code_of, never_measured, reach_row
 from hrcreplay.human.surface import Surface, surface
 from hrcreplay.human.sweep import MOST_COPIES, sweep_rot
 from hrcreplay.human.walk import box, sweep_walk
-from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import BODY, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes
 
 #: A larger set is reduced before the next rotation: below, it costs less to carry all points along.
 _WORTH_REDUCING = 50
@@ -74,6 +74,7 @@ def predict(
     vertices, offsets = _predict_rows(
         np.ascontiguousarray(states.p),
         np.ascontiguousarray(states.v),
+        never_measured(states),
         np.ascontiguousarray(states.lengths_m),
         bounds_of(limits),
         limits.coupled,
@@ -88,6 +89,7 @@ def predict(
 def _predict_rows(
     p: Floats,
     v: Floats,
+    never: Bools,
     lengths: Floats,
     bounds: Floats,
     coupled: bool,
@@ -101,7 +103,7 @@ def _predict_rows(
     low, high = np.empty(12), np.empty(12)
     n = 0
     for i in range(len(p)):
-        reach_row(p[i], v[i], bounds, coupled, horizon, method, low, high)
+        reach_row(p[i], v[i], never[i], bounds, coupled, horizon, method, low, high)
         for limb in range(limbs):
             swept, count = _sweep_limb(limb, low, high, lengths[i], work)
             if n + count > len(vertices):

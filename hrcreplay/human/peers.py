@@ -80,7 +80,8 @@ def ends(p: Floats, lengths_m: Floats, hand_m: float) -> list[Floats]:
     found = [points[:, (NECK, HEAD)], points[:, (PELVIS, ARM_POINTS[0][0], ARM_POINTS[1][0])]]
     for shoulder, elbow, wrist in ARM_POINTS:
         forearm = points[:, wrist] - points[:, elbow]
-        tip = points[:, wrist] + hand_m * forearm / np.linalg.norm(forearm, axis=1, keepdims=True)
+        length = np.linalg.norm(forearm, axis=1, keepdims=True)
+        tip = points[:, wrist] + hand_m * forearm / np.where(length > 0.0, length, np.nan)  # no forearm, no direction
         found += [points[:, (shoulder, elbow)], np.stack([points[:, elbow], tip], axis=1)]
     return found
 

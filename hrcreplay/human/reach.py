@@ -10,8 +10,8 @@ from numba import njit
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.enclosure import enclose
 from hrcreplay.human.margins import STANDARD, Margins
-from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds
-from hrcreplay.records import Floats, HumanStates, Ints, Table
+from hrcreplay.human.model import SHOWN_BY, LimitSet, alpha_2_bounds, alpha_3_bounds
+from hrcreplay.records import Bools, Floats, HumanStates, Ints, Table
 
 #: Ways to predict, in the order of their codes in the kernels: the two of the literature, and what encloses.
 PRINTED = ("paper", "positions")
@@ -36,7 +36,8 @@ def reachable(
     ``paper``: Eq. (20)-(30), corrected, for walking and Alg. 1 for the other joints: from positions, velocities and
     bounds on velocity and acceleration. ``positions``: the older way of [26], from positions and velocity bounds.
     Both hold the angles within their limits, with (34b), (34c) taken over the reachable interval of what they depend
-    on; a posture that is itself outside stays included. ``sound``: every motion under the limits from every likely
+    on; a posture that is itself outside stays included. An arm joint that nobody ever measured may be anywhere within
+    its limits, whatever the method. ``sound``: every motion under the limits from every likely
     state, at all times until the horizon and the latency are over; x and y are those of a polygon, see ``stroll``.
 
     Args:
@@ -55,8 +56,13 @@ def reachable(
         return Reach(states.t_ns, low, high)
     low, high = np.empty_like(states.p), np.empty_like(states.p)
     p, v = np.ascontiguousarray(states.p), np.ascontiguousarray(states.v)
-    _reach_rows(p, v, bounds_of(limits), limits.coupled, horizon_s, code, low, high)
+    _reach_rows(p, v, never_measured(states), bounds_of(limits), limits.coupled, horizon_s, code, low, high)
     return Reach(states.t_ns, low, high)
+
+
+def never_measured(states: HumanStates) -> Bools:
+    """(n, 12) joints of which no camera has shown anything yet: the filter only has a guess of them."""
+    return np.ascontiguousarray(np.isinf(states.unseen_s)[:, SHOWN_BY])
 
 
 def code_of(method: str) -> int:
@@ -77,17 +83,33 @@ def bounds_of(limits: LimitSet) -> Floats:
 
 @njit(cache=True)
 def _reach_rows(
-    p: Floats, v: Floats, bounds: Floats, coupled: bool, horizon: float, method: int, low: Floats, high: Floats
+    p: Floats,
+    v: Floats,
+    never: Bools,
+    bounds: Floats,
+    coupled: bool,
+    horizon: float,
+    method: int,
+    low: Floats,
+    high: Floats,
 ) -> None:
     for i in range(len(p)):
-        reach_row(p[i], v[i], bounds, coupled, horizon, method, low[i], high[i])
+        reach_row(p[i], v[i], never[i], bounds, coupled, horizon, method, low[i], high[i])
 
 
 @njit(cache=True)
 def reach_row(
-    p: Floats, v: Floats, bounds: Floats, coupled: bool, horizon: float, method: int, low: Floats, high: Floats
+    p: Floats,
+    v: Floats,
+    never: Bools,
+    bounds: Floats,
+    coupled: bool,
+    horizon: float,
+    method: int,
+    low: Floats,
+    high: Floats,
 ) -> None:
-    """Writes the reachable interval of every joint from p, v (12,) into low, high (12,)."""
+    """Writes the reachable interval of every joint from p, v (12,) into low, high (12,); ``never`` was it measured."""
     _walk(p, v, bounds, horizon, method, low, high)
     for j in range(3, 12):
         if method == PAPER:
@@ -99,7 +121,9 @@ def reach_row(
             least, most = alpha_2_bounds(low[j - 1], high[j - 1])
         elif coupled and j in (6, 10):
             least, most = alpha_3_bounds(low[j - 2], high[j - 2], low[j - 1], high[j - 1])
-        if not np.isnan(low[j] + high[j]):
+        if never[j]:
+            low[j], high[j] = least, most
+        elif not np.isnan(low[j] + high[j]):
             low[j], high[j] = max(least, min(low[j], most)), max(least, min(high[j], most))
         _include(p, j, low, high)
 

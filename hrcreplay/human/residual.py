@@ -119,11 +119,13 @@ def _since(now: int, then: int) -> float:
 
 @njit(cache=True)
 def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) -> None:
-    """Lets the earlier samples of a limb age, and adds one of weight 1."""
+    """Lets the earlier samples of a limb age, and adds one of weight 1; one that is no distance is none."""
+    if not sample >= 0.0:
+        return
     age = min(now - filter_.sampled_ns[limb], rules.memory_ns) * 1e-9
     kept = np.exp(-age / rules.residual_memory_s)
     filter_.residuals[limb] *= kept
-    filter_.residuals[limb, min(int(sample / _BIN_M), BINS - 1)] += 1.0
+    filter_.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf is no whole number
     filter_.weight[limb] = kept * filter_.weight[limb] + 1.0
     filter_.samples[limb] += 1
     filter_.sampled_ns[limb] = now

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from hrcreplay import __version__, wiring
 from hrcreplay.cell import Cell
 from hrcreplay.config import Settings, load_settings
+from hrcreplay.egm.codec import AXES
 from hrcreplay.egm.session import Session
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet
@@ -102,6 +103,9 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         )
     known, scene = job.meta(), Scene(header)
     T_world_base, eyes = wiring.standing(job, scene), wiring.eyes(job, scene)
+    robot = wiring.robot(job, T_world_base)
+    if robot.nv != AXES:
+        raise SettingsError(f"robot.urdf: {robot.name} has {robot.nv} axes; live drives robots of {AXES} over EGM")
     volumes = Observer(eyes, wiring.foresight(job), header.cameras, job.settings.logs.gap_s).look(0, ()).volumes
     return {
         "hrcreplay": __version__,
@@ -115,7 +119,7 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         "sending": sending,
         "limbs": list(volumes.limbs),
         "method": volumes.method,
-        "links": [segment.name for segment in wiring.robot(job, T_world_base).segments],
+        "links": [segment.name for segment in robot.segments],
     }
 
 

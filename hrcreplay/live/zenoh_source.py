@@ -22,7 +22,7 @@ from hrcreplay.live.playback import Message as Outgoing
 from hrcreplay.live.playback import frames_of, ready, same
 from hrcreplay.logs import decode_markers, decode_tf, rostypes
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.clean import DEFECTS, Cleaner
+from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
 from hrcreplay.logs.decode_generic import GenericDecoder
 from hrcreplay.logs.decode_markers import MarkerDecoder
 from hrcreplay.logs.decode_own import OwnDecoder
@@ -34,6 +34,7 @@ _OWN = "hrcreplay.Skeleton"
 _RMW_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")  # in the keys of rmw_zenoh: <domain>/<topic>/<type>/<hash>
 _KNOWN = (decode_markers.TYPE, *decode_tf.TYPES)
 _AHEAD_NS = 10**9  # a capture further in the future would make all that follow look late
+_FAR_NS = round(STAMP_FAR_S * 1e9)
 _OLD_NS = 10**9  # an older capture hints at clocks that are not set
 _GAP_S = 0.2
 
@@ -102,7 +103,8 @@ class Stream:
         age_ns = 0 if row.capture_ns is None else now_ns - row.capture_ns
         if not -_AHEAD_NS < age_ns < _OLD_NS and "clocks" not in self._told:
             self._told.add("clocks")
-            what = "before; used as it is" if age_ns > 0 else "after; left out"
+            kept = "its arrival is used" if age_ns > _FAR_NS else "used as it is"
+            what = f"before; {kept}" if age_ns > 0 else "after; left out"
             yield self._note(f"captured {abs(age_ns) / 1e9:.3f} s {what}. Set the clocks of both computers")
 
     def _rows(self, key: str, data: bytes, now_ns: int) -> list[Row]:

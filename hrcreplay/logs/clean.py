@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from hrcreplay.logs.skeletons import Row
-from hrcreplay.records import Bools, CameraFrames
+from hrcreplay.records import POINTS, Bools, CameraFrames, Floats
 
 #: Every name in ``Log.defects``, with what was done about it. <camera> stands for a camera's name.
 DEFECTS: Mapping[str, str] = {
@@ -19,18 +20,91 @@ DEFECTS: Mapping[str, str] = {
     "frames_duplicate": "rows of the same camera, body and capture as the one before; dropped",
     "frames_header_stamp_zero": "rows with a capture time of zero; their arrival is used",
     "frames_out_of_order": "rows captured before an earlier delivered one of the same camera and body; dropped",
+    "frames_repeated": "rows with a new capture time and the very points of the row before; dropped, as not seen anew",
+    "frames_stamp_far": "rows captured too far from their arrival by their stamp; their arrival is used",
     "gaps_<camera>": "silences of a camera longer than logs.gap_s",
     "joints_incomplete": "joint states that lack a joint of the first; left out",
     "joints_out_of_order": "joint states not later than the one before; dropped",
     "messages_missing": "messages that metadata.yaml promises and the files do not give",
     "messages_undecodable": "messages that do not follow their type; left out",
+    "points_at_origin": "points exactly in the camera itself, as trackers write 'not tracked'; made missing",
+    "points_coincident": "points in one place with the other end of their bone; both made missing",
     "points_not_finite": "points with a coordinate that is no number; made missing, with confidence 0",
+    "points_too_far": "points further away than a camera can see; made missing",
     "truncated_at_ns": "an instant: the last arrival before the file breaks off; what is whole is used",
     "unindexed": "a ROS 1 bag without a usable index; read by going through it",
 }
 
+#: A coordinate beyond this was not measured by a depth camera in a robot's cell [m].
+FAR_M = 100.0
+#: Two ends of a bone that are nearer than this are one place [m].
+TOGETHER_M = 1e-3
+#: A capture further than this from its arrival is no capture time: no robot waits so long, no clock is so wrong [s].
+STAMP_FAR_S = 10.0
+
 _ALWAYS = ("frames_duplicate", "frames_header_stamp_zero", "frames_out_of_order", "points_not_finite")
 _CHUNK_NS = 10**9
+_FAR_NS = round(STAMP_FAR_S * 1e9)
+
+#: The two ends of the bones that the person's model is measured by. Hands, hips and legs are not among them: trackers
+#: that know no hand put it where the wrist is.
+_PAIRS = (
+    ("shoulder_l", "shoulder_r"),
+    ("pelvis", "neck"),
+    ("neck", "head"),
+    *((f"shoulder_{side}", f"elbow_{side}") for side in "lr"),
+    *((f"elbow_{side}", f"wrist_{side}") for side in "lr"),
+)
+_A, _B = (np.array([POINTS.index(pair[end]) for pair in _PAIRS]) for end in (0, 1))
+
+
+class Mended(NamedTuple):
+    """A row as it is handed on, and what had to be done to its points."""
+
+    row: Row
+    flaws: tuple[tuple[str, int], ...]  #: name in DEFECTS -> points
+
+
+def mended(row: Row) -> Mended:
+    """The row with all that is no point of a body made missing: NaN, with confidence 0.
+
+    Of two ends of a bone in one place neither can be believed. A point of confidence 0 was said to be missing: it is
+    made so, and not counted.
+    """
+    points, told = row.points_m, row.confidence > 0
+    largest = np.abs(points).max(axis=1)  # NaN where a coordinate is
+    strange: Bools = np.isinf(points).any(axis=1) | (np.isnan(largest) & told)
+    origin: Bools = largest == 0.0
+    far: Bools = (largest > FAR_M) & np.isfinite(largest)
+    missing: Bools = ~np.isfinite(largest) | origin | far
+    kept = np.where(missing[:, None], np.nan, points)
+    together = _together(kept)
+    missing |= together
+    confidence = np.where(missing, 0.0, np.fmin(np.fmax(row.confidence, 0.0), 1.0))  # 0 also where it is NaN
+    whole = row._replace(points_m=np.where(missing[:, None], np.nan, points), confidence=confidence)
+    found = {
+        "points_not_finite": strange,
+        "points_at_origin": origin & told,
+        "points_too_far": far & told,
+        "points_coincident": together & told,
+    }
+    return Mended(whole, tuple((name, int(which.sum())) for name, which in found.items() if which.any()))
+
+
+def _together(points: Floats) -> Bools:
+    """(20,) points that lie where the other end of one of _PAIRS does."""
+    apart = points[_A] - points[_B]
+    same = (apart * apart).sum(axis=1) < TOGETHER_M**2
+    found = np.zeros(len(points), dtype=np.bool_)
+    found[_A[same]] = found[_B[same]] = True
+    return found
+
+
+class Repeats(NamedTuple):
+    """The longest time for which a camera gave one and the same skeleton."""
+
+    seconds: float
+    begin_ns: int  #: its first arrival
 
 
 class Cleaner:
@@ -42,8 +116,13 @@ class Cleaner:
         self._gap_ns = round(gap_s * 1e9)
         self._defects = defects
         self._newest: dict[tuple[str, int], int] = {}
+        self._last: dict[tuple[str, int], tuple[Row, int]] = {}  # of each body: its last new skeleton, and its arrival
         self._rows: list[tuple[int, int, Row]] = []
         self.heard: dict[str, tuple[int, int]] = {}  #: camera -> first and last arrival
+        self.seen: dict[str, Bools] = {}  #: camera -> (20,) points it ever gave a place and a confidence
+        self.points: Counter[str] = Counter()  #: camera -> points with a place and a confidence
+        self.flaws: Counter[tuple[str, str]] = Counter()  #: (camera, name in DEFECTS) -> points or rows
+        self.frozen: dict[str, Repeats] = {}  #: camera -> its longest standstill
         for name in (*_ALWAYS, *(f"{kind}_{camera}" for kind in ("frames", "gaps") for camera in cameras)):
             defects[name] += 0
 
@@ -58,23 +137,55 @@ class Cleaner:
         """Takes a row; gives the chunk that ends before it, if one does."""
         self.hear(row.camera, arrival_ns)
         self._defects["frames_header_stamp_zero"] += row.stamp_zero
-        capture_ns = arrival_ns if row.capture_ns is None else row.capture_ns
+        capture_ns = self._captured(row, arrival_ns)
         newest_ns = self._newest.get((row.camera, row.body))
         if newest_ns is not None and capture_ns <= newest_ns:
             self._defects["frames_duplicate" if capture_ns == newest_ns else "frames_out_of_order"] += 1
             return None
         self._newest[(row.camera, row.body)] = capture_ns
+        whole, flaws = mended(row)
+        for name, count in flaws:
+            self._flaw(row.camera, name, count)
+        if self._repeats(whole, arrival_ns):
+            return None
+        known = whole.confidence > 0
+        self.seen[row.camera] = self.seen.get(row.camera, False) | known
+        self.points[row.camera] += int(known.sum())
         self._defects[f"frames_{row.camera}"] += 1
         chunk = self.rest() if self._rows and arrival_ns - self._rows[0][1] >= _CHUNK_NS else None
-        self._rows.append((capture_ns, arrival_ns, self._mended(row)))
+        self._rows.append((capture_ns, arrival_ns, whole))
         return chunk
 
-    def _mended(self, row: Row) -> Row:
-        missing: Bools = ~np.logical_and.reduce(np.isfinite(row.points_m), axis=1)
-        infinite: Bools = np.logical_or.reduce(np.isinf(row.points_m), axis=1)
-        self._defects["points_not_finite"] += int(np.count_nonzero(infinite | (missing & (row.confidence > 0))))
-        confidence = np.where(missing, 0.0, np.fmin(np.fmax(row.confidence, 0.0), 1.0))  # 0 also where it is NaN
-        return row._replace(points_m=np.where(missing[:, None], np.nan, row.points_m), confidence=confidence)
+    def _captured(self, row: Row, arrival_ns: int) -> int:
+        """When the row was captured; its arrival where its stamp cannot be right."""
+        if row.capture_ns is None:
+            return arrival_ns
+        if abs(row.capture_ns - arrival_ns) > _FAR_NS:
+            self._flaw(row.camera, "frames_stamp_far", 1)
+            return arrival_ns
+        return row.capture_ns
+
+    def _repeats(self, row: Row, arrival_ns: int) -> bool:
+        """Whether the row shows the very skeleton of the one before it, which no sensor measures twice."""
+        key = (row.camera, row.body)
+        before = self._last.get(key)
+        if (
+            before is None
+            or not row.confidence.any()
+            or not np.array_equal(before[0].points_m, row.points_m, equal_nan=True)
+            or not np.array_equal(before[0].confidence, row.confidence)
+        ):
+            self._last[key] = (row, arrival_ns)
+            return False
+        self._flaw(row.camera, "frames_repeated", 1)
+        lasted_s = (arrival_ns - before[1]) / 1e9
+        if lasted_s > self.frozen.get(row.camera, Repeats(0.0, 0)).seconds:
+            self.frozen[row.camera] = Repeats(lasted_s, before[1])
+        return True
+
+    def _flaw(self, camera: str, name: str, count: int) -> None:
+        self._defects[name] += count
+        self.flaws[(camera, name)] += count
 
     def rest(self) -> CameraFrames | None:
         """What is not handed out yet."""

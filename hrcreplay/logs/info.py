@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hrcreplay.logs.plausibility import Stand
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import CameraFrames
+from hrcreplay.records import CameraFrames, Floats
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class CameraSummary:
     delay_s: float  #: median from capture to arrival, with the offset of the two clocks in it [s]
     bodies: dict[int, int]  #: body id -> rows
     posed: bool  #: whether its extrinsics are in the log
+    stature_m: float  #: how tall its bodies are by their bones, median [m]; NaN where no bone was seen
 
 
 @dataclass(frozen=True)
@@ -97,12 +99,16 @@ def summarize(log: Log) -> Summary:
     """
     header = log.header
     tallies = [_Tally() for _ in header.cameras]
+    stands = {name: Stand() for name in header.cameras if name in header.T_world_camera}
     for frames in log.frames():
         _count(frames, tallies)
+        for name, stand in stands.items():
+            rows = frames.points_m[frames.camera == header.cameras.index(name)]
+            stand.add(_taken(header.T_world_camera[name], rows))
     for _ in log.joints():
         pass  # for the defects of the joint track
     cameras = tuple(
-        _camera(name, tally, posed=name in header.T_world_camera)
+        _camera(name, tally, log.stature_m[name], posed=name in header.T_world_camera)
         for name, tally in zip(header.cameras, tallies, strict=True)
     )
     return Summary(
@@ -117,9 +123,13 @@ def summarize(log: Log) -> Summary:
         has_truth=header.has_truth,
         joint_names=header.joint_names,
         defects=dict(log.defects),
-        notes=tuple(log.notes),
+        notes=(*log.notes, *(remark for name, stand in stands.items() if (remark := stand.remark(name)))),
         missing=tuple(_missing(log, cameras)),
     )
+
+
+def _taken(T: Floats, points_m: Floats) -> Floats:
+    return np.asarray(points_m @ T[:3, :3].T + T[:3, 3])
 
 
 def _count(frames: CameraFrames, tallies: list[_Tally]) -> None:
@@ -128,7 +138,7 @@ def _count(frames: CameraFrames, tallies: list[_Tally]) -> None:
         tallies[camera].add(capture_ns, arrival_ns, body)
 
 
-def _camera(name: str, tally: _Tally, *, posed: bool) -> CameraSummary:
+def _camera(name: str, tally: _Tally, stature_m: float, *, posed: bool) -> CameraSummary:
     several = tally.frames > 1
     return CameraSummary(
         name=name,
@@ -140,6 +150,7 @@ def _camera(name: str, tally: _Tally, *, posed: bool) -> CameraSummary:
         delay_s=float(np.median(tally.delays_ns)) / 1e9 if tally.frames else float("nan"),
         bodies=dict(sorted(tally.bodies.items())),
         posed=posed,
+        stature_m=stature_m,
     )
 
 
@@ -177,6 +188,7 @@ def lines(summary: Summary) -> list[str]:
         f"base     {'in the log' if summary.has_base else 'none'}",
         f"truth    {'in the log' if summary.has_truth else 'none'}",
         f"joints   {', '.join(summary.joint_names) or 'none'}",
+        f"person   {', '.join(_tall(camera) for camera in summary.cameras) or 'none'}",
     ]
     delivered = {f"frames_{camera.name}" for camera in summary.cameras}  # counted with the defects, but none
     found = {name: n for name, n in summary.defects.items() if n and name not in delivered}
@@ -186,6 +198,11 @@ def lines(summary: Summary) -> list[str]:
     if summary.missing:
         out += ["missing for the next step", *(f"  {sentence}" for sentence in summary.missing)]
     return out
+
+
+def _tall(camera: CameraSummary) -> str:
+    tall = "of no bone" if np.isnan(camera.stature_m) else f"{camera.stature_m:.2f} m tall by the bones"
+    return f"{tall} ({camera.name})"
 
 
 def _camera_line(camera: CameraSummary, start_ns: int) -> str:

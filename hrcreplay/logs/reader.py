@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from hrcreplay.logs import choose, tracks
-from hrcreplay.logs.clean import Cleaner
+from hrcreplay.errors import LogError
+from hrcreplay.logs import choose, plausibility, tracks
+from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
 from hrcreplay.logs.decode_generic import GenericDecoder
 from hrcreplay.logs.log import Header, JointTrack, Truth
 from hrcreplay.logs.messages import Topic, Undecodable
@@ -18,6 +19,9 @@ from hrcreplay.logs.tracks import JointTopic
 from hrcreplay.records import CameraFrames
 
 _LATE_NS = 10**9  # a camera absent for so long at either end of the log is worth a remark
+_FROZEN_S = 0.5  # so is one that gives the same skeleton for so long
+#: What is told of points that were made missing, and of rows that repeat.
+_TOLD = ("points_at_origin", "points_coincident", "points_not_finite", "points_too_far")
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,10 @@ class Log:
         self._truth = tracks.truth_topic(source)
         self._reading: Counter[str] = Counter()
         self._remarks: list[str] = []
+        self._refusals: list[str] = []
         self._track: Counter[str] = Counter()
+        self.stature_m: dict[str, float] = {}  #: camera -> how tall its bodies are, of the latest pass; NaN: not known
+        self.points_seen = 0  #: points with a place and a confidence, of the latest pass
         self.header = _header(source, decoders, self._joints, self._truth, chosen=bool(options.topics))
 
     @property
@@ -50,6 +57,11 @@ class Log:
         found = self._source.damage().defects + self._track
         found.update(self._reading)  # unlike +, keeps a count of zero
         return Counter(dict(sorted(found.items())))
+
+    @property
+    def joint_defects(self) -> Counter[str]:
+        """Those of ``defects`` that the latest pass over the joints found."""
+        return Counter(self._track)
 
     @property
     def notes(self) -> list[str]:
@@ -70,7 +82,9 @@ class Log:
         self._reading.clear()
         self._remarks = [note for decoder in self._decoders for note in decoder.notes]
         decoders = {decoder.topic: decoder.fresh() for decoder in self._decoders}
+        self._refusals, self.points_seen = [], 0
         cleaner = Cleaner(self.header.cameras, self._options.gap_s, self._reading)
+        shapes = {camera: plausibility.Shape() for camera in self.header.cameras}
         for message in self._source.messages(list(decoders), start_ns, end_ns):
             decoder = decoders[message.topic.name]
             try:
@@ -81,6 +95,7 @@ class Log:
             if decoder.always_heard:
                 cleaner.hear(decoder.cameras[0], message.arrival_ns)
             for row in rows:
+                shapes[row.camera].add(row.points_m)
                 chunk = cleaner.add(row, message.arrival_ns)
                 if chunk is not None:
                     yield chunk
@@ -88,6 +103,38 @@ class Log:
         if chunk is not None:
             yield chunk
         self._remark(cleaner, start_ns, end_ns)
+        self._judge(cleaner, shapes)
+
+    def check(self) -> None:
+        """Refuses what the latest whole pass showed to be certainly no person.
+
+        Raises:
+            LogError: What was found, and what would mend it.
+        """
+        if self._refusals:
+            raise LogError(f"{self.header.path}: {self._refusals[0]}")
+
+    def _judge(self, cleaner: Cleaner, shapes: dict[str, plausibility.Shape]) -> None:
+        self.points_seen = cleaner.points.total()
+        self.stature_m = {camera: shape.stature_m for camera, shape in shapes.items()}
+        for camera, shape in shapes.items():
+            size = plausibility.size_remark(camera, shape.stature_m, self._unit_of(camera))
+            if size is not None:
+                self._remarks.append(size)
+                if shape.certain and plausibility.impossible(shape.stature_m):
+                    self._refusals.append(size)
+            side = plausibility.side_remark(camera, shape.side)
+            if side is not None:
+                self._remarks.append(side)
+        self._remarks.extend(plausibility.unmeasured(cleaner.seen))
+
+    def _unit_of(self, camera: str) -> str:
+        """Where the unit of a camera's points is set."""
+        for decoder in self._decoders:
+            if camera in decoder.cameras and isinstance(decoder, GenericDecoder):
+                other = "m" if decoder.unit == "mm" else "mm"
+                return f'would be right, in its [[logs.decoders]]: unit = "{other}", or points in {decoder.unit}'
+        return "would be right: points in metres"
 
     def joints(self) -> Iterator[JointTrack]:
         """The robot's joint track in order of time, in chunks of at most 1 s; nothing where there is none."""
@@ -114,6 +161,27 @@ class Log:
                 self._remarks.append(f"camera {camera} starts {(first - begin) / 1e9:.2f} s after the log")
             if end - last > _LATE_NS:
                 self._remarks.append(f"camera {camera} ends {(end - last) / 1e9:.2f} s before the log")
+            self._remarks.extend(_flaws(camera, cleaner, begin))
+
+
+def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
+    """What was wrong with a camera's points and stamps."""
+    for name in _TOLD:
+        count = cleaner.flaws[(camera, name)]
+        if count:
+            share = 100.0 * count / (count + cleaner.points[camera])
+            yield f"camera {camera}: {count} {DEFECTS[name]} ({share:.2g} % of its points)"
+    far = cleaner.flaws[(camera, "frames_stamp_far")]
+    if far:
+        yield f"camera {camera}: {far} rows have a stamp over {STAMP_FAR_S:g} s from their arrival; arrival used"
+    longest = cleaner.frozen.get(camera)
+    if longest is not None and longest.seconds > _FROZEN_S:
+        rows = cleaner.flaws[(camera, "frames_repeated")]
+        begin_s = (longest.begin_ns - begin_ns) / 1e9
+        yield (
+            f"camera {camera} froze: for {longest.seconds:.2f} s from {begin_s:.2f} s on it gave one and the same "
+            f"skeleton with new stamps; its {rows} rows that repeat count as silence"
+        )
 
 
 def open_log(path: Path, options: LogOptions = LogOptions(), *, skeletons: bool = True) -> Log:

@@ -79,7 +79,8 @@ class RosStream:
                 for c, arrival_ns, data in opened.messages(wanted, start_ns, end_ns):
                     yield Message(arrival_ns, self._topics[(c.topic, c.msgtype)], self._unpack(data))
         except _BROKEN as error:
-            raise LogError(f"{self._path}: broken in the middle ({error}); copy it again") from error
+            found = str(error) or type(error).__name__  # struct and zlib say what they found, EOFError does not
+            raise LogError(f"{self._path}: broken in the middle ({found}); copy it again") from error
 
 
 def _parser(path: Path, connection: Connection, *, cdr: bool) -> Callable[[bytes], Any]:

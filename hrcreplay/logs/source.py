@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import tempfile
+import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
@@ -22,6 +24,8 @@ from hrcreplay.logs.ros_stream import open_bag, open_db3
 
 _SQLITE = b"SQLite format 3\0"
 _KNOWN = "known are MCAP files, ROS 1 bags (.bag) and ROS 2 bags (a folder with metadata.yaml, or a .db3 file)"
+
+_IMPORT = ". It is text: hrcreplay import azure|kinect2|keraal {path} --out LOG.mcap makes a log of a tracker's CSV"
 
 
 @dataclass
@@ -114,7 +118,18 @@ def _file(path: Path, *, zstd_messages: bool = False) -> Stream:
         return open_bag(path)
     if head.startswith(_SQLITE) and path.suffix == ".db3":
         return open_db3(path, zstd_messages=zstd_messages)
-    raise LogError(f"{path}: is no log of a known kind; {_KNOWN}")
+    text = _IMPORT.format(path=path) if _is_text(path) else ""
+    raise LogError(f"{path}: is no log of a known kind; {_KNOWN}{text}")
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file begins with lines of text, plain or gzipped."""
+    try:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            head = file.read(4096)
+    except (OSError, EOFError, zlib.error):
+        return False
+    return path.suffix.lower() != ".bag" and bool(head) and all(byte >= 32 or byte in b"\t\r\n" for byte in head)
 
 
 def _folder(path: Path) -> Source:

@@ -9,10 +9,17 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.records import JOINTS, LIMBS, Bools, Floats, Ints, Table
+from hrcreplay.report.audit_checked import never
 from hrcreplay.report.coverage import Estimate, Resampling
 from hrcreplay.report.metrics_table import Metric, MetricTable
 from hrcreplay.report.series import stretches
 
+#: Several limbs together -> what their share is of.
+WHAT = {
+    "all": "every limb that was checked in its own volume",
+    "upper": "every limb that was checked, the lower body left out, in its own volume",
+}
+UNCHECKED = "not checked: not seen to the end of a horizon"
 #: Rounding of a distance [m].
 _ROUNDING_M = 1e-9
 #: Ticks of one escape may have so many ticks without one between them.
@@ -29,18 +36,20 @@ class Outcome(Table):
     )
     radius_m: Floats  #: (n, l) of the ball
     volume_m3: Floats  #: (n, l) NaN where the limb could not be predicted
-    union_m3: Floats  #: (n,) of the six LIMBS together; NaN where not computed
+    union_m3: Floats  #: (n,) of all limbs together; NaN where not computed
     union_std_m3: Floats  #: (n,) standard error of the counting behind it
-    limbs: tuple[str, ...]
+    upper_m3: Floats  #: (n,) of the six LIMBS together, for which every method has volumes
+    upper_std_m3: Floats  #: (n,)
+    limbs: tuple[str, ...]  #: LIMBS first
 
     def escape_m(self) -> Floats:
         """(n, l) how far the limb left its volume within the horizon; 0 inside, NaN where not audited [m]."""
         depth = self.beyond_m - self.radius_m
         return np.where(np.isnan(depth), np.nan, np.where(depth > _ROUNDING_M, depth, 0.0))
 
-    def worst_m(self) -> Floats:
-        """(n,) largest escape of the six LIMBS, each from its own volume; NaN where none was audited [m]."""
-        escapes = self.escape_m()[:, : len(LIMBS)]
+    def worst_m(self, limbs: int | None = None) -> Floats:
+        """(n,) largest escape of all limbs or the first so many, each from its own volume; NaN: none checked [m]."""
+        escapes = self.escape_m()[:, :limbs]
         known = np.isfinite(escapes).any(axis=1)
         return np.where(known, np.where(np.isnan(escapes), -1.0, escapes).max(axis=1), np.nan)
 
@@ -56,14 +65,21 @@ def method_figures(
         body_radius_m: Radius of each limb itself, Table 2 [m].
 
     Returns:
-        ``all`` (the six LIMBS, each in its own volume) and each limb -> name -> figure.
+        ``all`` (all limbs that the method has volumes for, each in its own), ``upper`` (the six LIMBS, for which all
+        methods have them) and each limb -> name -> figure.
     """
     whole = Outcome.join(outcomes)
     escapes = whole.escape_m()
-    found: dict[str, Any] = {"all": _escape_figures(whole.worst_m(), resampling)}
-    found["all"]["union_m3"] = resampling.mean(whole.union_m3).plain()
-    found["all"]["union_counting_error"] = resampling.mean(whole.union_std_m3 / whole.union_m3).plain()["value"]
-    found["all"]["sum_m3"] = resampling.mean(whole.volume_m3[:, : len(LIMBS)].sum(axis=1)).plain()
+    found: dict[str, Any] = {}
+    for part, limbs, union, std in (
+        ("all", len(whole.limbs), whole.union_m3, whole.union_std_m3),
+        ("upper", len(LIMBS), whole.upper_m3, whole.upper_std_m3),
+    ):
+        figures = _escape_figures(whole.worst_m(limbs), resampling)
+        figures["union_m3"] = resampling.mean(union).plain()
+        figures["union_counting_error"] = resampling.mean(_ratio(std, union)).plain()["value"]
+        figures["sum_m3"] = resampling.mean(whole.volume_m3[:, :limbs].sum(axis=1)).plain()
+        found[part] = figures
     for i, limb in enumerate(whole.limbs):
         found[limb] = _escape_figures(escapes[:, i], resampling)
         found[limb]["volume_m3"] = resampling.mean(whole.volume_m3[:, i]).plain()
@@ -81,6 +97,11 @@ def _escape_figures(escape_m: Floats, resampling: Resampling) -> dict[str, Any]:
         "escape_p95_m": resampling.quantile(deep, 0.95).plain(),
         "escape_max_m": _number(np.nanmax(deep)) if np.isfinite(deep).any() else None,
     }
+
+
+def _ratio(part: Floats, whole: Floats) -> Floats:
+    """Shares; NaN where there is no whole."""
+    return np.asarray(part / np.where(whole > 0.0, whole, np.nan))
 
 
 def _hits(values: Floats, most: Floats) -> Floats:
@@ -103,12 +124,12 @@ def joint_figures(inside: Floats, travel: Floats, resampling: Resampling) -> dic
 
 
 def curve_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:
-    """Coverage of all limbs and volume of their union, of one method under one limit set."""
+    """Coverage of the six LIMBS and volume of their union, of one method under one limit set."""
     whole = Outcome.join(outcomes)
-    worst = whole.worst_m()
+    worst = whole.worst_m(len(LIMBS))
     return {
         "covered_share": resampling.share(_hits(worst, np.zeros(len(worst)))).plain(),
-        "union_m3": resampling.mean(whole.union_m3).plain(),
+        "union_m3": resampling.mean(whole.upper_m3).plain(),
     }
 
 
@@ -180,17 +201,24 @@ def flat(found: Mapping[str, Any]) -> dict[str, Metric]:
     for method, parts in found["total"]["methods"].items():
         for part, figures in parts.items():
             share = figures["covered_share"]
-            what = "every limb in its own volume" if part == "all" else f"{part} in its volume"
+            what = WHAT.get(part, f"{part} in its volume")
             name = f"audit_{method}_{part}"
             meaning = f"share of ticks with {what} for the whole horizon, by {method}"
-            table.add(f"{name}_covered_share", share["value"], "1", meaning)
+            table.add(f"{name}_covered_share", share["value"], "1", meaning, reason=UNCHECKED)
             for end in ("low", "high"):
-                table.add(f"{name}_covered_share_{end}", share[end], "1", f"its 95 % interval: {end} end")
-            table.add(f"{name}_escape_max_m", figures["escape_max_m"], "m", "deepest escape", reason="no escape")
-            key = "union_m3" if part == "all" else "volume_m3"
-            room = "mean volume of the union of the six limbs" if part == "all" else "mean volume"
+                table.add(
+                    f"{name}_covered_share_{end}", share[end], "1", f"its 95 % interval: {end} end", reason=UNCHECKED
+                )
+            table.add(f"{name}_ticks", share["samples"], "1", "ticks at which it was checked")
+            reason = "no escape" if share["samples"] else UNCHECKED
+            table.add(f"{name}_escape_max_m", figures["escape_max_m"], "m", "deepest escape", reason=reason)
+            key = "union_m3" if part in WHAT else "volume_m3"
+            room = "mean volume of their union" if part in WHAT else "mean volume"
             table.add(f"{name}_{key}", figures[key]["value"], "m^3", room)
     table.add("audit_ticks", found["total"]["ticks"], "1", "audited ticks of all logs")
+    gaps = never(found["total"], found["method"])
+    meaning = "limbs, and points of other limbs, of which the audit says nothing: they were never seen"
+    table.add("audit_not_checked", ", ".join(gaps) or "nothing", "", meaning)
     return table.sorted()
 
 

@@ -12,6 +12,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from hrcreplay.records import JOINTS, LIMBS
+from hrcreplay.report import audit_checked
 from hrcreplay.report.audit_metrics import text, volume_at
 from hrcreplay.report.figures_audit import METHODS, in_order
 from hrcreplay.report.metrics_table import Metric
@@ -21,17 +22,19 @@ from hrcreplay.report.tables import PageTable, text_of
 
 CAPTIONS = {
     "audit_coverage": (
-        "Share of the ticks at which every limb stayed in its own volume for the whole horizon, against the room that "
-        "the volumes take. Diamonds: our methods with the limit set as given; lines: its velocity and acceleration "
-        "bounds scaled by the factors written beside them. Squares: peers. Bars: 95 % intervals. Faint: each log."
+        "Share of the ticks at which every limb that was checked, the lower body left out, stayed in its own volume "
+        "for the whole horizon, against the room that these volumes take: not all methods have a lower body. "
+        "Diamonds: our methods with the limit set as given; lines: its velocity and acceleration bounds scaled by the "
+        "factors written beside them. Squares: peers. Bars: 95 % intervals. Faint: each log."
     ),
-    "audit_limbs": "Coverage and mean volume of each limb, with 95 % intervals.",
+    "audit_limbs": "Coverage, where checked, and mean volume of each limb, with 95 % intervals.",
     "audit_joints": (
         "Share of the ticks at which a joint's recorded future stayed inside its reachable interval: the bound that "
         "fails shows here."
     ),
 }
 _CLAIMS = (
+    "A limb or a point that was not checked may have been anywhere.",
     "Coverage on these logs says nothing of other people, other tasks or faster days than those recorded.",
     "Recorded points are points of a skeleton. The share with the limb's own thickness is given per limb.",
     "Intervals rest on the ticks of these logs alone; where a log is short or the person still, they are wide.",
@@ -63,6 +66,7 @@ def render(found: Mapping[str, Any], metrics: Mapping[str, Metric], meta: Mappin
         inputs=[{"name": PurePath(str(i["path"])).name, "sha256": i["sha256"]} for i in meta.get("inputs", [])],
         versions=sorted(meta.get("versions", {}).items()),
         stages=[],
+        flaws=(),  # of each log, in the section on the data
         command=str(meta.get("command", "")),
         not_claimed=_CLAIMS,
         metrics=[
@@ -77,16 +81,20 @@ def _answer(found: Mapping[str, Any]) -> Answer:
     whole = found["total"]["methods"][method]["all"]
     share = whole["covered_share"]
     if share["value"] is None:
-        return Answer("Did the person stay in the predicted volumes?", "Nobody was seen for a whole horizon.", "")
+        return Answer("Did the person stay in the predicted volumes?", "No limb could be checked.", "")
     sources = sorted({log["recorded_future"] for log in found["logs"]})
+    limits = sorted({log["limits"] for log in found["logs"]})
     words = (
-        f"Method {METHODS.get(method, method)}: at so many of {share['samples']} ticks, every limb's recorded points "
-        f"({', '.join(sources)}) stayed in that limb's volume for all of the next {found['horizon_s']:g} s. "
+        f"Method {METHODS.get(method, method)}, limits {', '.join(limits)}: at so many of {share['samples']} ticks, "
+        f"every limb that was checked ({audit_checked.scope(found['total'], method)}) stayed with its recorded points "
+        f"({', '.join(sources)}) in its own volume for all of the next {found['horizon_s']:g} s. "
         f"95 % interval {100 * share['low']:.1f} to {100 * share['high']:.1f} %."
     )
     deepest = whole["escape_max_m"]
     if deepest is not None:
         words += f" The deepest escape was {100 * deepest:.1f} cm."
+    for note in audit_checked.notes(found["total"], method):
+        words += f" {note[0].upper()}{note[1:]}."
     return Answer(
         "Did the person stay in the predicted volumes?", f"At {100 * share['value']:.2f} % of the ticks.", words
     )
@@ -122,9 +130,11 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> Part:
     if len(rows) > 1:
         rows.append(("total", found["total"]))
 
-    def table(title: str, key: str, scale: float, decimals: int, note: str) -> PageTable:
+    every = "Ticks with every limb that was checked"
+
+    def table(title: str, key: str, scale: float, decimals: int, note: str, limbs: str = "all") -> PageTable:
         body = tuple(
-            (name, *(text(part["methods"][m]["all"][key], scale, decimals) for m in methods)) for name, part in rows
+            (name, *(text(part["methods"][m][limbs][key], scale, decimals) for m in methods)) for name, part in rows
         )
         return PageTable(title, ("log", *_named(methods)), body, note)
 
@@ -143,36 +153,45 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> Part:
         "Did the recorded person stay in what was predicted, and how much room did the prediction take?",
         (_figure(folder, "audit_coverage"),),
         (
-            table("Ticks with every limb covered [%]", "covered_share", 100.0, 1, way),
-            table("Union of the six limbs' volumes, mean [m\u00b3]", "union_m3", 1.0, 2, _counted(error)),
+            table(f"{every} covered [%]", "covered_share", 100.0, 1, f"{_lower(found)} {way}"),
+            table("Union of all the limbs' volumes, mean [m\u00b3]", "union_m3", 1.0, 2, _counted(error)),
             table("Escape depth where a limb escaped, median [mm]", "escape_p50_m", 1e3, 0, ""),
             table("Escape depth where a limb escaped, 95th percentile [mm]", "escape_p95_m", 1e3, 0, ""),
+            table(f"{every} covered, the lower body left out [%]", "covered_share", 100.0, 1, "", "upper"),
+            table("Union of the volumes, the lower body left out, mean [m\u00b3]", "union_m3", 1.0, 2, "", "upper"),
         ),
     )
 
 
 def _counted(error: float) -> str:
-    return (
-        f"Counted out with evenly spread points; standard error at most {100 * error:.1f} % a tick. The six limbs "
-        "only, so that methods with and without legs compare."
-    )
+    return f"Counted out with evenly spread points; standard error at most {100 * error:.1f} % a tick."
+
+
+def _lower(found: Mapping[str, Any]) -> str:
+    """Which methods have a lower body that can leave its volume."""
+    methods = found["total"]["methods"]
+    have = [METHODS.get(m, m) for m in in_order(methods) if "LEGS" in methods[m]]
+    if not have:
+        return "No method has a volume for the lower body."
+    return f"The lower body is among the limbs of {', '.join(have)} alone: others have no volume for it."
 
 
 def _equal(found: Mapping[str, Any]) -> str:
     """How much room our methods take where their curves reach a peer's coverage less half a percent."""
     peer = found["total"]["methods"].get("v2_a50")
-    if peer is None or peer["all"]["covered_share"]["value"] is None or peer["all"]["union_m3"]["value"] is None:
+    if peer is None or peer["upper"]["covered_share"]["value"] is None or not peer["upper"]["union_m3"]["value"]:
         return ""
-    target = peer["all"]["covered_share"]["value"] - 0.005
+    target = peer["upper"]["covered_share"]["value"] - 0.005
     parts = []
     for method, curve in found["total"]["curve"].items():
         room = volume_at(curve, target)
         if room is not None:
-            parts.append(f"{METHODS.get(method, method)} {100 * room / peer['all']['union_m3']['value']:.0f} %")
+            parts.append(f"{METHODS.get(method, method)} {100 * room / peer['upper']['union_m3']['value']:.0f} %")
     if not parts:
         return ""
     peers = METHODS["v2_a50"]
-    return f"At the coverage of {peers} less half a percent, along the curves, of its volume: {', '.join(parts)}."
+    at = f"At the coverage of {peers} less half a percent, along the curves"
+    return f"{at}, the lower body left out, of its volume: {', '.join(parts)}."
 
 
 def _limbs(found: Mapping[str, Any], folder: Path) -> Part:
@@ -185,22 +204,27 @@ def _limbs(found: Mapping[str, Any], folder: Path) -> Part:
         for limb in limbs:
             cells = [figures[m].get(limb, {}).get(key) for m in methods]
             if any(cell is not None for cell in cells):
-                body.append((limb, *("\u2013" if c is None else text(c, scale, decimals) for c in cells)))
+                body.append((limb, *("\u2013" if c is None else _cell(c, scale, decimals) for c in cells)))
         return PageTable(title, ("limb", *_named(methods)), tuple(body), note)
 
     deepest = [(limb, *(_millimetres(figures[m].get(limb, {}).get("escape_max_m")) for m in methods)) for limb in limbs]
     return Part(
         "limbs",
         "Limbs",
-        "Each limb in its own volume.",
+        "Each limb in its own volume. A dash: the method has no volume for it, or nobody left it.",
         (_figure(folder, "audit_limbs"),),
         (
-            table("Ticks covered [%]", "covered_share", 100.0, 1),
+            audit_checked.table(found["total"], found["method"]),
+            table("Ticks covered, of those checked [%]", "covered_share", 100.0, 1),
             table("Ticks covered with the limb's own thickness, Table 2 [%]", "whole_limb_share", 100.0, 1),
             PageTable("Deepest escape [mm]", ("limb", *_named(methods)), tuple(deepest)),
             table("Volume, mean [m\u00b3]", "volume_m3", 1.0, 2),
         ),
     )
+
+
+def _cell(figure: Mapping[str, Any], scale: float, decimals: int) -> str:
+    return text(figure, scale, decimals) if figure["samples"] else "not checked"
 
 
 def _millimetres(value: float | None) -> str:
@@ -226,7 +250,7 @@ def _data(found: Mapping[str, Any]) -> Part:
     for log in found["logs"]:
         rows = [(f"limits of the prediction: {log['limits']}",), *((note,) for note in log["notes"])]
         tables.append(PageTable(f"{log['log']}: {log['ticks']} ticks", ("",), tuple(rows)))
-        tables.append(_cameras(log))
+        tables.append(audit_checked.cameras(log))
         counts = tuple((name.replace("_", " "), str(count)) for name, count in log["counts"].items())
         tables.append(PageTable(f"{log['log']}: what was counted on the way", ("", "count"), counts))
         tables += [_escapes(log, method) for method in found["own_methods"]]
@@ -236,21 +260,6 @@ def _data(found: Mapping[str, Any]) -> Part:
         "What each log was held against, what was thrown out, and when somebody left a volume.",
         (),
         tuple(table for table in tables if table.rows),
-    )
-
-
-def _cameras(log: Mapping[str, Any]) -> PageTable:
-    """What of each camera's points was not believed."""
-    rows = tuple(
-        (camera, *("\u2013" if count is None else str(count) for count in counts.values()))
-        for camera, counts in log["cameras"].items()
-    )
-    return PageTable(
-        f"{log['log']}: thrown out",
-        ("camera", "frames", "frames with a point rejected", "points rejected", "outliers in the fusion"),
-        rows,
-        "Points that jump off the person are rejected: they are no part of the recorded future. A dash: the recorded "
-        "future is not from cameras. The fusion's own gate is per tick and knows only what came before.",
     )
 
 

@@ -6,11 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from hrcreplay.records import Ints
-from hrcreplay.report import figures_human, figures_quality, figures_robot, style
+from hrcreplay.report import figures_human, figures_links, figures_quality, figures_robot, style
 from hrcreplay.report.figures_human import Instant
+from hrcreplay.report.figures_links import LinkPose
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
 from hrcreplay.report.series import columns, times
@@ -54,6 +56,12 @@ def instants(run: Run, count: int = 4, step_s: float = 1.0) -> Ints:
     return found if len(np.unique(found)) == count else none
 
 
+def nearest_tick(motion: pd.DataFrame) -> int:
+    """Row of the smallest separation of a plan; the first where none is known."""
+    distance_m = motion["distance_m"].to_numpy(dtype=float)
+    return int(np.argmin(np.where(np.isnan(distance_m), np.inf, distance_m)))
+
+
 def draw_all(
     run: Run,
     folder: Path,
@@ -63,6 +71,7 @@ def draw_all(
     stationary_m_per_s: float,
     gap_s: float = 0.2,
     volumes: Sequence[Instant] = (),
+    robot: LinkPose | None = None,
 ) -> tuple[str, ...]:
     """Draws what the run has data for into ``folder`` as ``<name>.png`` and ``<name>.svg``.
 
@@ -74,6 +83,7 @@ def draw_all(
         stationary_m_per_s: A TCP slower than this stands [m/s].
         gap_s: A camera silent for longer has a gap [s].
         volumes: The swept volumes by several methods at the ticks that :func:`instants` names.
+        robot: The capsules of the robot's links at the tick that :func:`nearest_tick` names.
 
     Returns:
         The names drawn.
@@ -96,6 +106,9 @@ def draw_all(
             slow_m_per_s=stationary_m_per_s,
         )
         makers["stationary_share"] = lambda: figures_robot.stationary_share(metrics)
+    if robot is not None and run.T_world_base is not None:
+        pose, base = robot, run.T_world_base
+        makers["robot_links"] = lambda: figures_links.links(pose, t0_ns, base)
     if state is not None and volumes:
         fused = state
         makers["fig17_volumes"] = lambda: figures_human.volumes(volumes, fused, t0_ns)

@@ -60,30 +60,44 @@ def trade_off(found: Mapping[str, Any]) -> Figure:
     for method in in_order(total["methods"]):
         colour = COLOURS.get(method, style.INK)
         if len(found["logs"]) > 1:
-            each = [log["methods"][method]["all"] for log in found["logs"]]
+            each = [log["methods"][method]["upper"] for log in found["logs"]]
             _scatter(ax, each, colour)
         curve = total["curve"].get(method)
         if curve:
             _curve(ax, curve, colour)
-        _cross(ax, total["methods"][method]["all"], colour, METHODS.get(method, method), curve is not None)
+        _cross(ax, total["methods"][method]["upper"], colour, METHODS.get(method, method), curve is not None)
     _coverage_axis(ax, "y")
-    ax.set_xscale("log")
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    ax.set(xlabel="volume of the six limbs' union, mean [m\u00b3]", ylabel="ticks with every limb covered")
+    _volume_axis(ax, "x")
+    ax.set(xlabel="volume of the union without the lower body, mean [m\u00b3]", ylabel="ticks with every limb covered")
     ax.set_title("Coverage against volume")
     figure.legend(*_unique(ax), loc="upper right", ncols=3, bbox_to_anchor=(0.985, 0.995))
     return figure
 
 
+def _drawn(figures: Mapping[str, Any]) -> bool:
+    """Whether a method has a place in the figure: a volume of 0 has none on an axis of powers."""
+    return bool(figures["union_m3"]["value"]) and figures["covered_share"]["value"] is not None
+
+
+def _volume_axis(ax: Axes, which: str) -> None:
+    """An axis of powers of ten, also where nothing was drawn on it."""
+    axis = ax.yaxis if which == "y" else ax.xaxis
+    high = (ax.dataLim.intervaly if which == "y" else ax.dataLim.intervalx)[1]
+    if not 0.0 < high < np.inf:
+        (ax.set_ylim if which == "y" else ax.set_xlim)(0.1, 10.0)
+    (ax.set_yscale if which == "y" else ax.set_xscale)("log")
+    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+
+
 def _scatter(ax: Axes, each: Sequence[Mapping[str, Any]], colour: str) -> None:
     """One faint dot a log."""
-    pairs = [(p["union_m3"]["value"], p["covered_share"]["value"]) for p in each]
-    known = np.array([pair for pair in pairs if None not in pair], dtype=float).reshape(-1, 2)
+    pairs = [(p["union_m3"]["value"], p["covered_share"]["value"]) for p in each if _drawn(p)]
+    known = np.array(pairs, dtype=float).reshape(-1, 2)
     ax.plot(known[:, 0], known[:, 1], ".", ms=5, color=colour, alpha=0.35, mew=0, clip_on=False)
 
 
 def _curve(ax: Axes, curve: Sequence[Mapping[str, Any]], colour: str) -> None:
-    known = [p for p in curve if p["union_m3"]["value"] is not None and p["covered_share"]["value"] is not None]
+    known = [p for p in curve if _drawn(p)]
     x = [p["union_m3"]["value"] for p in known]
     y = [p["covered_share"]["value"] for p in known]
     ax.plot(x, y, "-", color=colour, lw=1.2, alpha=0.8)
@@ -104,7 +118,7 @@ def _curve(ax: Axes, curve: Sequence[Mapping[str, Any]], colour: str) -> None:
 def _cross(ax: Axes, figures: Mapping[str, Any], colour: str, label: str, ours: bool) -> None:
     """A method with both intervals."""
     x, y = figures["union_m3"], figures["covered_share"]
-    if x["value"] is None or y["value"] is None:
+    if not _drawn(figures):
         return
     ax.errorbar(
         x["value"],
@@ -163,7 +177,7 @@ def limbs(found: Mapping[str, Any]) -> Figure:
         x = np.array(at) + 0.8 * ((k + 0.5) / len(shown) - 0.5)
         for (ax,), key in zip(rows, ("covered_share", "volume_m3"), strict=True):
             figures = [methods[method][names[i]][key] for i in at]
-            known = [i for i, f in enumerate(figures) if f["value"] is not None]
+            known = [i for i, f in enumerate(figures) if f["value"] is not None and (f["value"] or ax is rows[0][0])]
             ax.errorbar(
                 x[known],
                 [figures[i]["value"] for i in known],
@@ -178,8 +192,7 @@ def limbs(found: Mapping[str, Any]) -> Figure:
     above, below = rows[0][0], rows[1][0]
     _coverage_axis(above, "y")
     above.set_title("Ticks with the limb in its own volume")
-    below.set_yscale("log")
-    below.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    _volume_axis(below, "y")
     below.set_title("Volume, mean [m\u00b3]")
     below.set_xticks(range(len(names)), names)
     below.set_xlim(-0.6, len(names) - 0.4)

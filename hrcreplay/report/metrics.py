@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hrcreplay.report.limbs import add_limbs
 from hrcreplay.report.metrics_fusion import add_fusion
 from hrcreplay.report.metrics_plan import add_plan
 from hrcreplay.report.metrics_quality import add_occupancy, add_quality
@@ -24,6 +25,7 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
     plan = run.meta.get("settings", {}).get("plan", {})
     metrics = MetricTable()
     add_quality(metrics, run, gap_s)
+    add_limbs(metrics, run)
     add_occupancy(metrics, run.occupancy)
     add_fusion(metrics, run, gap_s)
     add_plan(
@@ -33,6 +35,6 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
         method=str(plan.get("method", "qp")),
         near_m=near_m,
         stationary_m_per_s=stationary_m_per_s,
-        waits=plan.get("reference", "path") == "path",
+        leash_m=float(plan.get("leash_m", 0.25)),
     )
     return metrics.sorted()

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from hrcreplay.records import STATUSES, Bools, Floats
 from hrcreplay.report.metrics_table import MetricTable
+from hrcreplay.report.pace import pace
 from hrcreplay.report.series import durations_s, times
 
 #: Figures that the paper prints for its own experiments; its logs were never published.
@@ -42,7 +43,7 @@ def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -
     near = numbers(motion, "distance_m") <= near_m
     stands = numbers(motion, "tcp_speed") < stationary_m_per_s
     wanted = numbers(motion, "ref_speed") >= stationary_m_per_s
-    waits = time_lost_s(motion) > 0.5 * durations_s(times(motion))
+    waits = waited_s(motion) > 0.5 * durations_s(times(motion))
     return near, stands & (wanted | waits)
 
 
@@ -85,12 +86,12 @@ def deviation_m(motion: pd.DataFrame) -> Floats:
     return np.asarray(np.linalg.norm(tcp - path_feet(tcp, vectors(motion, "ref")), axis=1))
 
 
-def time_lost_s(motion: pd.DataFrame) -> Floats:
+def waited_s(motion: pd.DataFrame) -> Floats:
     """(n,) how much of each tick the reference waited for the robot instead of going on [s]; 0 after the last tick."""
-    lost = durations_s(times(motion))
-    lost[:-1] -= np.diff(numbers(motion, "programme_s"))
-    lost[-1:] = 0.0  # what the reference does after the last tick is not known
-    return np.clip(lost, 0.0, None)
+    waited = durations_s(times(motion))
+    waited[:-1] -= np.diff(numbers(motion, "programme_s"))
+    waited[-1:] = 0.0  # what the reference does after the last tick is not known
+    return np.clip(waited, 0.0, None)
 
 
 def cycles(motion: pd.DataFrame, *, at_m: float = 0.002, away_m: float = 0.05) -> int:
@@ -110,7 +111,7 @@ def add_plan(
     method: str,
     near_m: float,
     stationary_m_per_s: float,
-    waits: bool,
+    leash_m: float,
 ) -> None:
     """Everything about the motion, the baselines' likewise, and the paper's own figures beside them."""
     if motion is None:
@@ -124,7 +125,7 @@ def add_plan(
         _add_separation(metrics, prefix, table, what, stationary_m_per_s)
         _add_stationary(metrics, prefix, table, what, near_m, stationary_m_per_s)
         _add_path(metrics, prefix, table, what)
-        _add_progress(metrics, prefix, table, what, waits=waits)
+        _add_progress(metrics, prefix, table, what, leash_m)
     for name, (value, unit, meaning) in PAPER.items():
         metrics.add(name, value, unit, meaning)
 
@@ -139,11 +140,11 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
         metrics.add(f"{prefix}_{name}_share", share, "1", f"share of all ticks of {what} with status '{name}'")
     reasons = motion["reason"].astype(str).to_numpy()
     for reason in sorted(set(reasons[braking])):
-        share = float((reasons[braking] == reason).sum() / len(motion))
+        count = int((reasons[braking] == reason).sum())
         slug = "_".join("".join(c if c.isalnum() else " " for c in reason.lower()).split()) or "unnamed"
-        metrics.add(
-            f"{prefix}_braking_share_{slug}", share, "1", f"share of all ticks of {what} that braked because: {reason}"
-        )
+        because = f"ticks of {what} that braked because: {reason}"
+        metrics.add(f"{prefix}_braking_ticks_{slug}", count, "1", because)
+        metrics.add(f"{prefix}_braking_share_{slug}", count / len(motion), "1", f"share of all {because}")
     metrics.add(
         f"{prefix}_moving_ticks",
         int(moving.sum()),
@@ -240,7 +241,7 @@ def _p95(values: Floats) -> float:
     return float(np.quantile(values, 0.95))
 
 
-def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, *, waits: bool) -> None:
+def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, leash_m: float) -> None:
     tcp_speed, ref_speed = numbers(motion, "tcp_speed"), numbers(motion, "ref_speed")
     for name, speed, meaning in (
         ("tcp_speed", tcp_speed, "speed of the TCP"),
@@ -265,20 +266,20 @@ def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what:
         f"times the reference came back to its first point, {what}",
         reason="the reference never came back to its first point",
     )
-    lost = float(np.nansum(time_lost_s(motion))) if len(motion) else 0.0
-    total = float(durations_s(times(motion)).sum())
-    reason = "with plan.reference = time the reference never waits: see the tracking error instead"
+    found = pace(motion, leash_m)
+    reason = "the programme stands for all of the time"
     metrics.add(
         f"{prefix}_time_lost_s",
-        lost if waits else None,
+        None if found is None else found[1] - found[0],
         "s",
-        f"time that the reference waited for the robot, {what}",
+        f"by how much {what} was behind its programme at the last tick: the way made, in the programme's own time",
         reason=reason,
     )
     metrics.add(
         f"{prefix}_progress_share",
-        1.0 - lost / total if waits and total > 0 else None,
+        None if found is None or found[1] <= 0 else found[0] / found[1],
         "1",
-        f"share of the time that {what} did not lose: 1 is the programme at full speed",
+        f"pace kept: the programmed time of the way that the robot itself made, over the time it had, {what}; 1 is the "
+        "programme at full speed, 0 a robot that did not move. The reference, which runs ahead, does not count",
         reason=reason,
     )

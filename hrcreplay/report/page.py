@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -14,11 +15,17 @@ from markupsafe import Markup
 
 from hrcreplay.records import LIMBS
 from hrcreplay.report import story
+from hrcreplay.report.flaws import flaws
+from hrcreplay.report.limbs import called
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
+from hrcreplay.report.robot_summary import robot_table
 from hrcreplay.report.tables import PageTable, compare, percent, text_of
 from hrcreplay.report.wording import CAMERA, CAPTIONS, FUSION, NOT_CLAIMED, PLAN_COST, PLAN_SAFETY
 from hrcreplay.runs import Run
+
+#: Suffixes of the metrics of each limb.
+_LIMB = ("unmeasured_share", "joints_unmeasured")
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,8 @@ def render(
         inputs=inputs,
         versions=sorted(run.meta.get("versions", {}).items()),
         stages=sorted((run.meta.get("stages") or {}).items()),
-        command=str(run.meta.get("command", "")),
+        flaws=flaws(run.counts, run.notes),
+        command=shlex.join(run.meta.get("arguments") or [str(run.meta.get("command", ""))]),
         not_claimed=NOT_CLAIMED,
         metrics=[
             (name, text_of(m) if m["value"] is not None else m["reason"], m["value"] is None, m["meaning"])
@@ -120,6 +128,7 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             else (),
             no_plan,
         ),
+        *_robot(run, figures("robot_links")),
         Part(
             "prediction",
             "Prediction",
@@ -143,9 +152,19 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             "Data quality",
             "What the log held, and what was wrong with it.",
             figures("data_quality"),
-            (compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA), *_counters(run)),
+            (
+                compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA),
+                *_limbs(metrics),
+                *_counters(run),
+            ),
         ),
     )
+
+
+def _robot(run: Run, drawn: tuple[PageFigure, ...]) -> tuple[Part, ...]:
+    """The section of the robot, where the run moved one."""
+    tables = (robot_table(run.meta["robot"]),) if "robot" in run.meta else ()
+    return (Part("robot", "Robot", "The capsules that stand for its links.", drawn, tables),) if drawn or tables else ()
 
 
 def _papers(metrics: Mapping[str, Metric]) -> str:
@@ -193,6 +212,18 @@ def _fusion_table(metrics: Mapping[str, Metric], seen: Sequence[str]) -> PageTab
         )
     columns = {"fused": "fusion", **{name: f"camera_{name}" for name in seen}}
     return compare("Errors against ground truth", metrics, columns, FUSION, note)
+
+
+def _limbs(metrics: Mapping[str, Metric]) -> tuple[PageTable, ...]:
+    shares, joints = ([metrics[f"limb_{limb}_{what}"] for limb in LIMBS] for what in _LIMB)
+    rows = [
+        (called([limb]), percent(share), text_of(names))
+        for limb, share, names in zip(LIMBS, shares, joints, strict=True)
+    ]
+    if shares[0]["value"] is None:
+        return ()
+    columns = ("", "ticks without a measurement", "joints never measured")
+    return (PageTable("Limbs, while the person was in view", columns, tuple(rows)),)
 
 
 def _counters(run: Run) -> tuple[PageTable, ...]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from hrcreplay.report.limbs import called, unmeasured
 from hrcreplay.report.metrics_quality import cameras
 from hrcreplay.report.metrics_table import Metric
 from hrcreplay.report.tables import percent, text_of
+from hrcreplay.report.wording import happened
 from hrcreplay.runs import Run
 
 
@@ -22,7 +24,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Answer:
-    """One of the two questions, the answer in a few words, and what stands behind it."""
+    """One of the two questions, the answer in a few words, and what stands behind it: a paragraph a line."""
 
     question: str
     short: str
@@ -39,14 +41,29 @@ def answers(run: Run, metrics: Mapping[str, Metric]) -> tuple[Answer, ...]:
         stage = "predicted what the person could reach" if run.occupancy is not None else "fused the cameras"
         words = f"This run {stage} and moved no robot. Run plan or report on the same log to have it answered."
         return (Answer(SAFE, "Not asked in this run.", words), Answer(COST, "Not asked in this run.", ""))
-    return (_safety(metrics), _cost(run, metrics))
+    return (_with_unmeasured(_safety(run, metrics), metrics), _cost(run, metrics))
 
 
-def _safety(metrics: Mapping[str, Metric]) -> Answer:
+def _with_unmeasured(safe: Answer, metrics: Mapping[str, Metric]) -> Answer:
+    """The answer with what was not measured of the person before it: a limb that nobody saw is not safe."""
+    never, mostly = unmeasured(metrics)
+    if not never and not mostly:
+        return safe
+    parts = [f"the {called(never)}: never measured"] if never else []
+    parts += [
+        f"the {called([limb])}: not measured at {100 * share:.0f} % of the ticks" for limb, share in mostly.items()
+    ]
+    short = f"Not known of {'; '.join(parts)}."
+    words = (
+        "Where no camera measured a limb, the prediction has only the joints' limits to go by, and nothing of this "
+        f"recording can show that it was right.\nOf what was measured: {safe.short[0].lower()}{safe.short[1:]} "
+    )
+    return Answer(safe.question, short, words + safe.words)
+
+
+def _safety(run: Run, metrics: Mapping[str, Metric]) -> Answer:
     ticks, moving = text_of(metrics["plan_ticks"]), text_of(metrics["plan_moving_ticks"])
     late = metrics["plan_braking_moving_ticks"]["value"]
-    nearest = metrics["plan_braking_moving_separation_min_m"]["value"]
-    unknown = metrics["plan_separation_unknown_ticks"]["value"]
     kept = (
         "the controller kept every link slow enough to stop within the stopping time short of all that the person "
         "was predicted to reach (inequality 2)"
@@ -63,15 +80,40 @@ def _safety(metrics: Mapping[str, Metric]) -> Answer:
             f"Not at every tick: at {text_of(metrics['plan_braking_moving_ticks'])} of {moving}, it was still braking."
         )
         words = (
-            f"At {share:.2f} % of the ticks at which the robot moved, no motion satisfied all constraints, or the "
-            "person was not known, and the robot was braking as hard as its joints can. "
+            f"At {share:.2f} % of the ticks at which the robot moved it was still braking, as hard as its joints can. "
+            f"At the other ticks, {kept}."
         )
-        if nearest is not None:
-            words += f"The smallest separation from the swept volumes while it did was {nearest:.3f} m. "
-        words += f"At the other ticks, {kept}."
-    if unknown:
-        words += f" At {text_of(metrics['plan_separation_unknown_ticks'])} ticks nobody could say where the person was."
-    return Answer(SAFE, short, words)
+    return Answer(SAFE, short, "\n".join(part for part in (words, _nearest(run, metrics), _braked(metrics)) if part))
+
+
+def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
+    """The smallest distance, and which distance that is."""
+    nearest, late = metrics["plan_separation_min_moving_m"], metrics["plan_braking_moving_separation_min_m"]
+    if nearest["value"] is None:
+        return ""
+    stop_s = run.meta.get("settings", {}).get("occupancy", {}).get("stop_s")
+    within = "the stopping time" if stop_s is None else f"T_s = {stop_s:g} s"
+    words = (
+        f"The smallest distance while it moved was {text_of(nearest)}: from the surface of a link to the surface of "
+        f"all that the person could reach within {within}, not to the body"
+    )
+    if late["value"] is not None:
+        words += f"; while it was still braking, {text_of(late)}"
+    words += "."
+    if nearest["value"] < 0.0005:
+        words += " At 0 the constraint lets a link move along that space or away from it, but not into it."
+    return words
+
+
+def _braked(metrics: Mapping[str, Metric]) -> str:
+    """What happened at the ticks at which it braked, the most frequent reason first."""
+    mark = "plan_braking_ticks_"
+    found = [(m["value"], name.removeprefix(mark)) for name, m in metrics.items() if name.startswith(mark)]
+    parts = [
+        f"at {text_of(metrics[mark + slug])} tick{'' if count == 1 else 's'} {happened(slug.replace('_', ' '))}"
+        for count, slug in sorted(found, key=lambda part: (-part[0], part[1]))
+    ]
+    return f"Why it braked, moving or standing: {'; '.join(parts)}." if parts else ""
 
 
 def _cost(run: Run, metrics: Mapping[str, Metric]) -> Answer:
@@ -79,7 +121,9 @@ def _cost(run: Run, metrics: Mapping[str, Metric]) -> Answer:
     if progress["value"] is None:
         short = f"The TCP was {text_of(metrics['plan_tracking_error_mean_m'])} from its reference on average."
     else:
-        short = f"{text_of(lost)} of {text_of(metrics['span_s'])}: the task ran at {percent(progress)} of its pace."
+        short = (
+            f"It lost {text_of(lost)} of {text_of(metrics['span_s'])}: the task ran at {percent(progress)} of its pace."
+        )
     words = (
         f"The TCP left the programmed path by {text_of(metrics['plan_deviation_mean_m'])} on average and "
         f"{text_of(metrics['plan_deviation_max_m'])} at most. {_standing(metrics, 'plan', 'it')}"
@@ -111,20 +155,24 @@ def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
         f"{name} {percent(metrics[f'baseline_{name}_progress_share'])}" for name in sorted(run.baselines)
     )
     stood = ", ".join(f"{n} {percent(metrics[f'baseline_{n}_stationary_share'], 2)}" for n in sorted(run.baselines))
-    near = text_of(metrics["plan_near_ticks"])
+    near, never = text_of(metrics["plan_near_ticks"]), ", ".join(unmeasured(metrics)[0])
     return (
         Card(
             _floor_percent(1 - late / ticks) if ticks else "\u2013",
             "ticks with the constraint kept, or the robot standing",
-            f"{text_of(metrics['plan_braking_moving_ticks'])} of {text_of(metrics['plan_ticks'])} ticks still braking",
+            f"{text_of(metrics['plan_braking_moving_ticks'])} of {text_of(metrics['plan_ticks'])} ticks still braking"
+            + (f"; {never} never measured" if never else ""),
         ),
         Card(
             text_of(metrics["plan_separation_min_moving_m"]),
-            "smallest separation from the swept volumes while the robot moved",
-            f"at all: {text_of(metrics['plan_separation_min_m'])}, {pair[0]} \u2013 {pair[1]}" if pair[0] else "",
+            "smallest distance from a link's surface to that of what the person could reach within T_s, while it moved",
+            "not to the body"
+            + (f"; at all: {text_of(metrics['plan_separation_min_m'])}, {pair[0]} \u2013 {pair[1]}" if pair[0] else ""),
         ),
         Card(
-            percent(metrics["plan_progress_share"]), "of the programmed pace", f"baseline: {others}" if others else ""
+            percent(metrics["plan_progress_share"]),
+            "of the programmed pace, by the way that the robot made",
+            f"baseline: {others}" if others else "",
         ),
         Card(
             percent(metrics["plan_stationary_share"], 2),

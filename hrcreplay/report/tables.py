@@ -90,6 +90,8 @@ def text_of(metric: Metric | None) -> str:
         return f"{value:,}".replace(",", "\u202f")
     if unit == "1":
         return f"{value:.3f}"
+    if unit == "s" and 0.0 < abs(value) < 1.0:
+        return f"{1e3 * value:.0f} ms" if abs(value) >= 0.0005 else "below 1 ms"
     decimals = {"s": 1, "Hz": 1, "m": 3, "m/s": 3, "m^3": 3, "rad": 4, "rad/s": 3}.get(unit, 3)
     return f"{value:.{decimals}f} {unit.replace('^3', chr(0xB3))}"
 

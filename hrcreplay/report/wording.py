@@ -21,6 +21,10 @@ CAPTIONS = {
         "As the paper's Fig. 13. Programmed and actual path of the TCP, and the largest deviation between them with "
         "its length. Shaded: the swept volumes of the person at that tick. The paper's own deviation is 0.221 m."
     ),
+    "robot_links": (
+        "The robot as its distances see it: a capsule around each collision shape of its links, at the tick of the "
+        "smallest separation, beside the swept volumes of the person. The square is the robot's base."
+    ),
     "fig17_volumes": (
         "As the paper's Fig. 17. What the person could reach within the stopping time at four instants, limb radii "
         "included: from positions and velocities; by the older method, from positions alone; and as this run did it, "
@@ -90,6 +94,23 @@ FUSION = (
     ("RMSE of x", "rmse_x"),
     ("RMSE of y", "rmse_y"),
 )
+
+#: What happened at the ticks at which the robot braked, by the reason that its record gives (``stepping.REASONS``).
+REASONS = {
+    "no human state": "it was not known where the person is: no camera had shown them lately, or none yet",
+    "no solution": "no motion satisfied all constraints",
+    "separation failed": (
+        "the distance from the robot to what the person could reach could not be computed as surely as the constraint "
+        "needs it; where the person is was known"
+    ),
+    "not finite": "the robot's own state, its reference or the constraints held a number that is none",
+}
+
+
+def happened(reason: str) -> str:
+    """What happened at a tick with a reason to brake; of a reason without words, the record's own."""
+    return REASONS.get(reason, f"the record says '{reason}'")
+
 
 #: The limits of what a page can say.
 NOT_CLAIMED = (

@@ -22,8 +22,11 @@ EXACT_M = 1e-10
 MOST = 4
 #: Steps after which rounding must be in the way.
 _STEPS = 60
-#: An edge that leaves the plane of others by less than this share of its length is in it.
-_FLAT = 1e-9
+#: An edge that leaves the plane of others by less than this share of its length is in it. Smaller shares are rounding;
+#: larger ones would take links that are nearly parallel to an edge of the hull for parallel.
+_FLAT = 1e-12
+#: A difference this short has lost digits that its direction needs [m].
+_SHORT_M = 1e-5
 
 
 class Carriers(NamedTuple):
@@ -47,8 +50,9 @@ def distances(ends: Floats, vertices: Floats, offsets: Ints) -> tuple[Floats, Fl
         offsets: (l + 1,) where each limb's vertices begin; no limb is empty.
 
     Returns:
-        Lower and upper bound, (s, l) each [m], no further apart than EXACT_M but where rounding allows no more, and 0
-        and at most EXACT_M in penetration; (s, l, MOST) rows of ``vertices`` that carry the nearest point.
+        Lower and upper bound, (s, l) each [m]. The lower one is proven by a plane between link and limb, whether or not
+        the bounds meet: they end no further apart than EXACT_M but where rounding allows no more. 0 and at most EXACT_M
+        in penetration; (s, l, MOST) rows of ``vertices`` that carry the nearest point.
     """
     links, limbs = len(ends), len(offsets) - 1
     low, high = np.empty((links, limbs)), np.empty((links, limbs))
@@ -84,6 +88,14 @@ def _distance(
         high = min(high, gap)
         if gap <= EXACT_M:
             return 0.0, high, count
+        if gap < _SHORT_M:  # across the plane of its carriers to the last digit
+            for i in range(count - 1):
+                e = on.basis[i]
+                part = x0 * e[0] + x1 * e[1] + x2 * e[2]
+                x0, x1, x2 = x0 - part * e[0], x1 - part * e[1], x2 - part * e[2]
+            gap = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+            if gap <= EXACT_M:
+                return 0.0, high, count
         vertex, depth = first, np.inf
         for j in range(first, last):
             along = x0 * vertices[j, 0] + x1 * vertices[j, 1] + x2 * vertices[j, 2]
@@ -111,34 +123,44 @@ def _join(on: Carriers, count: int, code: int, ends: Floats, vertices: Floats) -
 def _shortest(on: Carriers, count: int) -> int:
     """Moves the weights to the shortest vector of a plane through carriers that lies between them.
 
-    Carriers that end without weight are dropped; returns how many are left.
+    Carriers that end without weight, or lie in the plane of those before, are dropped; returns how many are left.
     """
-    while _plane(on, count):
+    while True:
+        flat = _plane(on, count)
+        if flat >= 0:
+            count = _drop(on, count, flat)
+            total = on.weights[:count].sum()
+            for i in range(count):
+                on.weights[i] = on.weights[i] / total if total > 0.0 else 1.0 / count
+            continue
         share, leaving = 1.0, -1
         for i in range(count):
-            if on.wanted[i] <= 0.0 and on.weights[i] <= share * (on.weights[i] - on.wanted[i]):
-                share, leaving = on.weights[i] / (on.weights[i] - on.wanted[i]), i
+            way = on.weights[i] - on.wanted[i]
+            if on.wanted[i] <= 0.0 and on.weights[i] <= share * way:
+                share, leaving = on.weights[i] / way if way > 0.0 else 0.0, i
         for i in range(count):
             on.weights[i] += share * (on.wanted[i] - on.weights[i])
         if leaving < 0:
             return count
-        count -= 1
-        for i in range(leaving, count):
-            on.weights[i], on.codes[i] = on.weights[i + 1], on.codes[i + 1]
-            for c in range(3):
-                on.points[i, c] = on.points[i + 1, c]
-    total = on.weights[: count - 1].sum()
-    for i in range(count - 1):
-        on.weights[i] /= total
-    return count - 1  # the last one is in the plane of the others
+        count = _drop(on, count, leaving)
 
 
 @njit(cache=True)
-def _plane(on: Carriers, count: int) -> bool:
-    """The wanted weights; False where the last carrier is in the plane of the others."""
+def _drop(on: Carriers, count: int, leaving: int) -> int:
+    """Takes a carrier out; returns how many are left."""
+    for i in range(leaving, count - 1):
+        on.weights[i], on.codes[i] = on.weights[i + 1], on.codes[i + 1]
+        for c in range(3):
+            on.points[i, c] = on.points[i + 1, c]
+    return count - 1
+
+
+@njit(cache=True)
+def _plane(on: Carriers, count: int) -> int:
+    """Computes the wanted weights; returns the first carrier in the plane of those before, -1 where there is none."""
     for i in range(count - 1):
         if not _edge(on, i):
-            return False
+            return i + 1
     on.wanted[0] = 1.0
     for i in range(count - 2, -1, -1):
         rest = -dot3(on.basis[i], on.points[0])
@@ -146,7 +168,7 @@ def _plane(on: Carriers, count: int) -> bool:
             rest -= on.triangle[i, j] * on.wanted[j + 1]
         on.wanted[i + 1] = rest / on.triangle[i, i]
         on.wanted[0] -= on.wanted[i + 1]
-    return True
+    return -1
 
 
 @njit(cache=True)

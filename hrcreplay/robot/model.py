@@ -1,8 +1,13 @@
-"""The robot's kinematics in the world frame. The only module that imports pinocchio."""
+"""The robot's kinematics in the world frame. The only module that imports pinocchio.
+
+It opens no file itself, but pinocchio does where a URDF has meshes: its geometry model takes their paths, not their
+bytes. That happens once, when a robot is made.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,8 +18,10 @@ from numba import njit
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Bools, Floats
 from hrcreplay.robot import irb140 as irb140_data
+from hrcreplay.robot.capsule import distance_m
 from hrcreplay.robot.segments import Segment, Vector
-from hrcreplay.robot.urdf import capsules, describe
+from hrcreplay.robot.shapes import capsules
+from hrcreplay.robot.urdf import Description, describe, with_meshes
 
 __all__ = ["RobotModel", "RobotPose", "Segment", "from_urdf", "irb140"]
 
@@ -47,6 +54,10 @@ class RobotModel:
     T_world_base: Floats  #: (4, 4)
     shoulder_m: Floats  #: (3,) origin of the first axis, world [m]
     reach_m: float  #: no pose of the TCP is further from there [m]
+    base_frame: str  #: link that stands on ``T_world_base``
+    tcp_frame: str  #: link that carries the tool
+    locked: tuple[str, ...]  #: joints off the chain, held at zero or the end of their range next to it
+    tcp_outside_m: float  #: how far the TCP is from the capsules of the last link; 0 inside one, NaN without one [m]
     _kinematics: _Kinematics = field(repr=False, compare=False)
 
     @property
@@ -116,7 +127,12 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def irb140(
-    T_world_base: Floats, *, stop_s: float, tool_m: float = 0.10, acceleration: Sequence[float] = ()
+    T_world_base: Floats,
+    *,
+    stop_s: float,
+    tool_m: float = 0.10,
+    T_tool_tcp: Floats | None = None,
+    acceleration: Sequence[float] = (),
 ) -> RobotModel:
     """The ABB IRB 140; its TCP lies ``tool_m`` beyond the flange, along the flange's z axis.
 
@@ -124,16 +140,17 @@ def irb140(
         T_world_base: (4, 4) robot base in the world [m].
         stop_s: T_s of Eq. (70) [s].
         tool_m: [m].
+        T_tool_tcp: (4, 4) TCP from there; none: there itself [m].
         acceleration: (6,) limits [rad/s^2]; none: top speed / T_s, so that every axis can stop within T_s.
     """
-    segments = irb140_data.segments(tool_m)
     return from_urdf(
         irb140_data.urdf(),
         T_world_base,
         stop_s=stop_s,
         tcp_frame="flange",
         tool_m=tool_m,
-        segments=segments,
+        T_tool_tcp=T_tool_tcp,
+        segments=irb140_data.segments(tool_m),
         acceleration=acceleration,
     )
 
@@ -144,40 +161,49 @@ def from_urdf(
     *,
     stop_s: float,
     tcp_frame: str | None = None,
+    base_frame: str | None = None,
     tool_m: float = 0.0,
+    T_tool_tcp: Floats | None = None,
     segments: Sequence[Segment] = (),
     acceleration: Sequence[float] = (),
+    meshes: Mapping[str, str] | None = None,
 ) -> RobotModel:
-    """A robot from URDF text. Joints that do not move the tool (fingers, a second arm) are held at their zero.
+    """A robot from URDF text. Joints that do not lie between base and tool are locked, where they can be at zero.
 
     Args:
-        xml: URDF text; meshes it names are not read.
-        T_world_base: (4, 4) robot base (the URDF's root link) in the world [m].
+        xml: URDF text.
+        T_world_base: (4, 4) robot base in the world [m].
         stop_s: T_s of Eq. (70) [s].
-        tcp_frame: Link that carries the tool; none: the last link of the longest chain.
-        tool_m: TCP beyond that frame, along its z axis [m].
+        tcp_frame: Link that carries the tool; none: the last that revolute joints move.
+        base_frame: Link that stands on ``T_world_base``; none: the URDF's root.
+        tool_m: TCP beyond the tool's link, along its z axis [m].
+        T_tool_tcp: (4, 4) TCP from there; none: there itself [m].
         segments: Link capsules; none: derived from the collision shapes.
         acceleration: (nv,) limits [rad/s^2]; none: top speed / T_s.
+        meshes: File that a collision mesh names -> its path; pinocchio reads it where there are no segments.
 
     Raises:
-        SettingsError: The URDF, a segment's body or the number of accelerations cannot be used.
+        SettingsError: The URDF, a mesh, a segment's body or the number of accelerations cannot be used.
     """
-    robot = describe(xml, tcp_frame)
-    segments = tuple(segments) or capsules(xml, tcp_frame)
+    robot = describe(xml, tcp_frame, base_frame)
     ddq_max = np.array(acceleration, dtype=float) if len(acceleration) else robot.dq_max / stop_s
     if ddq_max.shape != robot.dq_max.shape:
         raise SettingsError(
             f"robot.acceleration: found {len(acceleration)} values; {robot.name} has {len(robot.joints)} axes"
         )
     try:
-        model = pin.buildModelFromXML(robot.text)
+        whole = pin.buildModelFromXML(robot.text)
     except ValueError as error:
         raise SettingsError(f"robot: the URDF of {robot.name} cannot be read ({error}); check its numbers") from error
-    _place_base(model, pin.SE3(T_world_base))
-    tcp = _add_frame(model, robot.tcp, (0.0, 0.0, tool_m), "robot.tcp_frame")
-    tool = model.frames[tcp].placement
+    segments = tuple(segments) or capsules(robot.shapes, _vertices(whole, robot, meshes or {}))
+    model = _chain(whole, robot.joints)
+    _place_base(model, robot.base, pin.SE3(T_world_base))
+    offset = pin.SE3(np.eye(3), np.array([0.0, 0.0, tool_m])) * pin.SE3(np.eye(4) if T_tool_tcp is None else T_tool_tcp)
+    tcp = _add_frame(model, robot.tcp, offset, "robot.tcp_frame")
     points = [
-        _add_frame(model, s.body, end, f"robot.links: {s.name}") for s in segments for end in (s.start_m, s.end_m)
+        _add_frame(model, s.body, _shift(end), f"robot.links: {s.name}")
+        for s in segments
+        for end in (s.start_m, s.end_m)
     ]
     return RobotModel(
         name=robot.name,
@@ -189,31 +215,91 @@ def from_urdf(
         segments=segments,
         T_world_base=np.array(T_world_base, dtype=float),
         shoulder_m=np.array(model.jointPlacements[1].translation),
-        reach_m=sum(float(np.linalg.norm(link.translation)) for link in (*model.jointPlacements[2:], tool)),
+        reach_m=sum(
+            float(np.linalg.norm(link.translation))
+            for link in (*model.jointPlacements[2:], model.frames[tcp].placement)
+        ),
+        base_frame=robot.base,
+        tcp_frame=robot.tcp,
+        locked=robot.locked,
+        tcp_outside_m=_outside(model, segments, points, tcp),
         _kinematics=_Kinematics(model, points, tcp),
     )
 
 
-def _place_base(model: Any, T_world_base: Any) -> None:
-    """Moves what hangs on the root from the origin to the base, so that pinocchio's world is ours."""
+def _vertices(whole: Any, robot: Description, meshes: Mapping[str, str]) -> dict[str, Floats]:
+    """The vertices of each collision mesh, scaled, in its link's frame, by the name of the shape: each (n, 3) [m]."""
+    text, names = with_meshes(robot, meshes)
+    if not names:
+        return {}
+    try:
+        geometry = pin.buildGeomFromUrdfString(whole, text, pin.GeometryType.COLLISION)
+    except (ValueError, RuntimeError) as error:
+        raise SettingsError(f"robot: a mesh of {robot.name} cannot be read ({error}); give robot.links") from error
+    found = {shape.name: shape for shape in geometry.geometryObjects}
+    vertices = {}
+    for name, called in names.items():
+        if called not in found:
+            raise SettingsError(f"robot: the mesh of {name} cannot be read; check the numbers of its <collision>")
+        shape = found[called]
+        T_link_shape = whole.frames[shape.parentFrame].placement.inverse() * shape.placement
+        points = np.asarray(shape.geometry.vertices())
+        vertices[name] = points @ T_link_shape.rotation.T + T_link_shape.translation
+    return vertices
+
+
+def _chain(whole: Any, joints: Sequence[str]) -> Any:
+    """The model with the other joints locked where they are zero, or at the end of their range next to it."""
+    others = [i for i in range(1, whole.njoints) if whole.names[i] not in joints]
+    q = pin.neutral(whole)
+    for i in others:
+        joint = whole.joints[i]
+        if joint.nq == 1:
+            at = joint.idx_q
+            q[at] = np.clip(0.0, whole.lowerPositionLimit[at], whole.upperPositionLimit[at])
+    return pin.buildReducedModel(whole, others, q) if others else whole
+
+
+def _place_base(model: Any, base: str, T_world_base: Any) -> None:
+    """Moves what hangs on the root so that the base link is where it should be, and pinocchio's world is ours."""
+    T_world_root = T_world_base * _body(model, base, "robot.base_frame").placement.inverse()
     for joint in range(1, model.njoints):
         if model.parents[joint] == 0:
-            model.jointPlacements[joint] = T_world_base * model.jointPlacements[joint]
+            model.jointPlacements[joint] = T_world_root * model.jointPlacements[joint]
     for frame in model.frames:
         if frame.parentJoint == 0:
-            frame.placement = T_world_base * frame.placement
+            frame.placement = T_world_root * frame.placement
 
 
-def _add_frame(model: Any, body: str, offset_m: Vector, where: str) -> int:
-    """Index of a new frame at a point of a link (or of a joint's frame)."""
+def _add_frame(model: Any, body: str, offset: Any, where: str) -> int:
+    """Index of a new frame fixed on a link (or on a joint's frame)."""
+    frame = _body(model, body, where)
+    name = f"point {model.nframes}"
+    return int(model.addFrame(pin.Frame(name, frame.parentJoint, frame.placement * offset, pin.FrameType.OP_FRAME)))
+
+
+def _body(model: Any, body: str, where: str) -> Any:
     known = {frame.name: i for i, frame in reversed(list(enumerate(model.frames)))}
     known |= {frame.name: i for i, frame in enumerate(model.frames) if frame.type == pin.FrameType.BODY}
     if body not in known:
         raise SettingsError(f"{where}: the robot has no link {body!r}; it has {', '.join(sorted(known))}")
-    frame = model.frames[known[body]]
-    placement = frame.placement * pin.SE3(np.eye(3), np.array(offset_m, dtype=float))
-    name = f"point {model.nframes}"
-    return int(model.addFrame(pin.Frame(name, frame.parentJoint, placement, pin.FrameType.OP_FRAME)))
+    return model.frames[known[body]]
+
+
+def _shift(offset_m: Vector) -> Any:
+    return pin.SE3(np.eye(3), np.array(offset_m, dtype=float))
+
+
+def _outside(model: Any, segments: Sequence[Segment], points: Sequence[int], tcp: int) -> float:
+    """How far the TCP is from the nearest capsule that moves with it; NaN where none does [m]."""
+    tool = model.frames[tcp]
+    away = [math.nan]
+    for i, segment in enumerate(segments):
+        ends = [model.frames[point] for point in points[2 * i : 2 * i + 2]]
+        if ends[0].parentJoint == tool.parentJoint:
+            at = [frame.placement.translation for frame in (tool, *ends)]
+            away.append(max(0.0, float(distance_m(at[0][None], at[1], at[2])[0]) - segment.radius_m))
+    return float(np.nanmin(away)) if len(away) > 1 else math.nan
 
 
 def _support(model: Any, frame: int) -> list[bool]:

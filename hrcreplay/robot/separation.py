@@ -17,7 +17,7 @@ from hrcreplay.robot.obstacles import Obstacles
 #: on a line or all in one are as good as any.
 MOST_POINTS = 32
 
-#: Largest difference between coal's distance and ours [m].
+#: coal's distance and ours are the same when they differ by no more [m].
 AGREED_M = 1e-9
 
 _PLACE = coal.Transform3s()
@@ -29,7 +29,7 @@ _NO_FACE.append(coal.Triangle(0, 0, 0))  # a polytope must have one; the search 
 class Separation:
     """Distances between the axes of the links and the hulls of the limbs in one tick."""
 
-    distance_m: Floats  #: (s, l) exact and not above the true one, 0 in penetration; NaN where none was found [m]
+    distance_m: Floats  #: (s, l) proven lower bound, tight to rounding, 0 in penetration [m]
     clearance_m: Floats  #: (s, l) Delta of Eq. (2) [m]
 
     def room_m2(self) -> Floats:
@@ -44,31 +44,28 @@ class Separation:
 
 
 def separation(pose: RobotPose, obstacles: Obstacles, clearance_m: Floats) -> Separation:
-    """Distances of all pairs, and of the nearest one by two methods that know nothing of each other.
+    """Distances of all pairs: what is proven to be free between them, with coal's word on the nearest pair.
 
-    Where our bounds do not close, coal has the word. The nearest pair is measured by both; where they differ neither
-    is believed.
+    A plane between link and limb bounds their distance from below however far the search for the distance came, so
+    every pair has a bound and one in doubt costs only what is in doubt. coal measures the nearest pair by another
+    algorithm; where it finds less than was proven its distance counts, since the smaller one is the safe one, and
+    where it finds none ours is proven all the same.
 
     Args:
         pose: The robot.
         obstacles: The swept volumes, all known.
         clearance_m: (s, l) Delta of Eq. (2) for every pair of link and limb [m].
     """
-    low, high, near = distances(pose.ends_m, obstacles.vertices_m, obstacles.offsets)
+    low, _, near = distances(pose.ends_m, obstacles.vertices_m, obstacles.offsets)
     found = Separation(low, clearance_m)
-
-    def by_coal(link: int, limb: int) -> float:
+    if low.size:
+        _, link, limb = found.nearest()
         first, last = obstacles.offsets[limb : limb + 2]
         start = sorted(set((near[link, limb] - first).tolist()))
         a, b = pose.ends_m[link]
-        return axis_distance(a, b, obstacles.vertices_m[first:last], start)
-
-    for link, limb in np.argwhere(~(high - low <= EXACT_M)).tolist():
-        low[link, limb] = by_coal(link, limb)
-    if low.size:
-        _, link, limb = found.nearest()
-        if not abs(by_coal(link, limb) - low[link, limb]) <= AGREED_M:
-            low[link, limb] = np.nan
+        by_coal = axis_distance(a, b, obstacles.vertices_m[first:last], start)
+        if by_coal < low[link, limb] - AGREED_M:
+            low[link, limb] = by_coal
     return found
 
 
@@ -85,7 +82,7 @@ def axis_distance(a: Floats, b: Floats, vertices_m: Floats, near: list[int]) -> 
         near: Rows of ``vertices_m`` to begin with, at least one.
 
     Returns:
-        The distance, exact to EXACT_M and not above the true one [m]; 0 in penetration; NaN where coal fails.
+        The distance, exact to AGREED_M and not above the true one [m]; 0 in penetration; NaN where coal finds none.
     """
     segment = _polytope(np.stack([a, b]))
     chosen = list(near)
@@ -99,8 +96,8 @@ def axis_distance(a: Floats, b: Floats, vertices_m: Floats, near: list[int]) -> 
         below, furthest = _plane(a, b, normal, vertices_m)
         if not above - below > EXACT_M:
             return 0.0 if below < 0.0 else below  # NaN passes through
-        if furthest in chosen:
-            return np.nan
+        if furthest in chosen:  # as near as coal comes, e.g. beside an edge that is nearly parallel
+            return max(0.0, below) if above - below <= AGREED_M else np.nan
         if len(chosen) == MOST_POINTS:  # those far from the plane do not carry the nearest point
             order = np.argsort(vertices_m[chosen] @ normal, kind="stable")[: MOST_POINTS // 2]
             chosen = [chosen[i] for i in order]

@@ -1,8 +1,10 @@
-"""What hrcreplay needs from a URDF: the chain of axes that moves the tool, its limits, capsules around its shapes."""
+"""What hrcreplay needs from a URDF: the chain of axes between base and tool, its limits, the links that it moves."""
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
@@ -10,87 +12,157 @@ import numpy as np
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
-from hrcreplay.robot.rotation import from_rpy
-from hrcreplay.robot.segments import Segment
+from hrcreplay.robot.shapes import Shape, shapes
 
-_MOVING = ("revolute", "continuous")
+_TURNING = ("revolute", "continuous")
 
 
 @dataclass(frozen=True)
 class Description:
-    """A URDF reduced to one chain: every joint that does not move the tool is held at its zero."""
+    """A URDF seen as one chain of axes; every other joint is locked."""
 
     name: str
-    text: str  #: URDF with revolute joints on the chain and fixed joints elsewhere, without shapes
+    text: str  #: URDF without shapes, the endless axes of the chain as revolute joints
+    base: str  #: link that stands on ``T_world_base``
     tcp: str  #: link that carries the tool
     joints: tuple[str, ...]  #: from the base to the tool
+    locked: tuple[str, ...]  #: joints of other kinds or other branches, in the file's order
     q_min: Floats  #: (nv,) [rad]; -inf for a continuous joint
     q_max: Floats  #: (nv,) [rad]; inf for a continuous joint
     dq_max: Floats  #: (nv,) [rad/s]
+    shapes: tuple[Shape, ...]  #: collision shapes of the links that the chain moves
 
 
-def describe(xml: str, tcp_frame: str | None) -> Description:
+def describe(xml: str, tcp_frame: str | None = None, base_frame: str | None = None) -> Description:
     """Reads the chain from the base to the tool.
 
     Args:
         xml: URDF text.
-        tcp_frame: Link (or joint, for the link behind it) that carries the tool; none: the link behind the most axes,
-            the last of them in the file.
+        tcp_frame: Link (or joint, for the link behind it) that carries the tool; none: the last that revolute joints
+            move. That is, of the links behind the most axes of rotation, one without a shape if there is one, and
+            then the furthest down the tree; where the axes fork into fingers, before the fork.
+        base_frame: Link (or joint) that stands on the base; none: the root.
 
     Raises:
         SettingsError: No URDF, no such frame, or a joint on the chain that is no axis of rotation or has no limits.
     """
     robot = _parse(xml)
-    parents = {_child(joint): joint for joint in robot.findall("joint")}
-    links = [str(link.get("name")) for link in robot.findall("link")]
-    tcp = _tool_link(links, parents, tcp_frame)
-    axes = [joint for joint in reversed(_ancestors(tcp, parents)) if joint.get("type") != "fixed"]
-    if not axes:
-        raise SettingsError(f"robot: no axis moves {tcp!r}; name the tool's link with robot.tcp_frame")
-    limits = [_limits(joint) for joint in axes]
-    for joint in parents.values():
-        joint.set("type", "revolute" if joint in axes else "fixed")
-    for joint, (low, high, speed) in zip(axes, limits, strict=True):
-        for old in joint.findall("limit"):
-            joint.remove(old)
-        ends = {"lower": low, "upper": high} if math.isfinite(low) else {"lower": -1e9, "upper": 1e9}
-        values = {name: repr(value) for name, value in (ends | {"velocity": speed, "effort": 0.0}).items()}
-        ET.SubElement(joint, "limit", values)
-    for link in robot.findall("link"):
-        for shape in (*link.findall("visual"), *link.findall("collision")):
-            link.remove(shape)
-    low_high_speed = np.array(limits).T
+    tree = _Tree(robot)
+    tcp = tree.link(tcp_frame, "robot.tcp_frame") if tcp_frame is not None else _last_turned(tree)
+    base = tree.root if base_frame is None else tree.link(base_frame, "robot.base_frame")
+    below = tree.joints(base)
+    chain = [joint for joint in tree.joints(tcp) if joint not in below and joint.get("type") != "fixed"]
+    if not chain:
+        raise SettingsError(
+            f"robot: no axis between {base!r} and {tcp!r}; name the tool's link with robot.tcp_frame"
+            + (", or another robot.base_frame" if base_frame is not None else "")
+        )
+    limits = np.array([_limits(joint) for joint in chain]).T
+    found = shapes([link for name, link in tree.links.items() if not set(chain).isdisjoint(tree.joints(name))])
     return Description(
         name=robot.get("name", "robot"),
-        text=ET.tostring(robot, encoding="unicode"),
+        text=_bare(robot, dict(zip(chain, limits.T.tolist(), strict=True))),
+        base=base,
         tcp=tcp,
-        joints=tuple(str(joint.get("name")) for joint in axes),
-        q_min=low_high_speed[0],
-        q_max=low_high_speed[1],
-        dq_max=low_high_speed[2],
+        joints=tuple(str(joint.get("name")) for joint in chain),
+        locked=tuple(
+            str(joint.get("name"))
+            for joint in robot.findall("joint")
+            if joint not in chain and joint.get("type") != "fixed"
+        ),
+        q_min=limits[0],
+        q_max=limits[1],
+        dq_max=limits[2],
+        shapes=found,
     )
 
 
-def capsules(xml: str, tcp_frame: str | None) -> tuple[Segment, ...]:
-    """A capsule around every collision shape of the links that move, named after the link.
+def with_meshes(robot: Description, paths: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """The URDF with the meshes among its shapes and no other shape.
+
+    Args:
+        robot: As described.
+        paths: File that a mesh names -> its path.
+
+    Returns:
+        URDF text, and the name of each mesh's shape -> what pinocchio's geometry model calls it.
 
     Raises:
-        SettingsError: A moving link has a mesh, or no moving link has a shape.
+        SettingsError: The path of a mesh is not known.
     """
-    robot = _parse(xml)
-    parents = {_child(joint): joint for joint in robot.findall("joint")}
-    links = [str(link.get("name")) for link in robot.findall("link")]
-    chain = set(describe(xml, tcp_frame).joints)
-    found = []
-    for link, name in zip(robot.findall("link"), links, strict=True):
-        if chain.isdisjoint(str(joint.get("name")) for joint in _ancestors(name, parents)):
+    root = ET.fromstring(robot.text)  # noqa: S314  our own text
+    links = {str(link.get("name")): link for link in root.findall("link")}
+    names = {}
+    for shape in robot.shapes:
+        if shape.mesh is None:
             continue
-        shapes = link.findall("collision")
-        for number, shape in enumerate(shapes, start=1):
-            found.append(_capsule(shape, name, name if len(shapes) == 1 else f"{name}_{number}"))
-    if not found:
-        raise SettingsError("robot: no moving link of the URDF has a collision shape; give its capsules in robot.links")
-    return tuple(found)
+        if shape.mesh not in paths:
+            raise SettingsError(
+                f"robot: the collision shape of link {shape.link!r} is the mesh {shape.mesh!r}, whose file is not "
+                "known; name the directory of its package in robot.packages, or give robot.links"
+            )
+        collision = copy.deepcopy(shape.collision)
+        for mesh in collision.iter("mesh"):
+            mesh.set("filename", paths[shape.mesh])
+        names[shape.name] = f"{shape.link}_{len(links[shape.link].findall('collision'))}"
+        links[shape.link].append(collision)
+    return ET.tostring(root, encoding="unicode"), names
+
+
+class _Tree:
+    """The links of a URDF, each with the joints below it."""
+
+    def __init__(self, robot: ET.Element) -> None:
+        self.links = {str(link.get("name")): link for link in robot.findall("link")}
+        self._below = {str(joint.find("child").get("link")): joint for joint in robot.findall("joint")}  # type: ignore[union-attr]  # _parse has checked it
+        self.root = next(name for name in self.links if name not in self._below)
+
+    def joints(self, link: str) -> list[ET.Element]:
+        """Joints from the root to a link."""
+        found: list[ET.Element] = []
+        while link in self._below:
+            joint = self._below[link]
+            if joint in found:
+                raise SettingsError(f"robot: joint {joint.get('name')!r} closes a loop; a URDF is a tree")
+            found.append(joint)
+            link = str(joint.find("parent").get("link"))  # type: ignore[union-attr]  # _parse has checked it
+        return found[::-1]
+
+    def link(self, name: str, where: str) -> str:
+        """The link of that name, or behind the joint of that name."""
+        behind = {str(joint.get("name")): link for link, joint in self._below.items()}
+        if name not in self.links and name not in behind:
+            raise SettingsError(f"{where}: the URDF has no link {name!r}; it has {', '.join(self.links)}")
+        return name if name in self.links else behind[name]
+
+
+def _last_turned(tree: _Tree) -> str:
+    """The link that carries the tool where the user names none; see ``describe``."""
+    axes: dict[str, tuple[ET.Element, ...]] = {}
+    for name in tree.links:
+        moving = [joint for joint in tree.joints(name) if joint.get("type") != "fixed"]
+        if not moving or moving[-1].get("type") in _TURNING:  # behind a sliding finger is no place for a tool
+            axes[name] = tuple(joint for joint in moving if joint.get("type") in _TURNING)
+    most = max(len(turning) for turning in axes.values())
+    if most == 0:  # the chain says what it is instead
+        return max(tree.links, key=lambda name: len(tree.joints(name)))
+    ends = [name for name, turning in axes.items() if len(turning) == most]
+    shared = axes[ends[0]]
+    for name in ends[1:]:
+        same = [mine is other for mine, other in zip(shared, axes[name], strict=False)]
+        shared = shared[: same.index(False)] if False in same else shared
+    if 2 * len(shared) < most:
+        raise SettingsError(
+            f"robot: several chains of {most} axes, which end in {', '.join(ends)}; name the tool's link with "
+            "robot.tcp_frame"
+        )
+    order = list(tree.links)
+
+    def rank(name: str) -> tuple[bool, int, int]:
+        link = tree.links[name]
+        return link.find("visual") is None and link.find("collision") is None, len(tree.joints(name)), order.index(name)
+
+    return max((name for name, turning in axes.items() if turning == shared), key=rank)
 
 
 def _parse(xml: str) -> ET.Element:
@@ -98,6 +170,8 @@ def _parse(xml: str) -> ET.Element:
         robot = ET.fromstring(xml)  # noqa: S314  the user's own file; expat bounds entity expansion
     except ET.ParseError as error:
         raise SettingsError(f"robot: not a URDF ({error})") from error
+    if any("ros.org/wiki/xacro" in str(part.tag) for part in robot.iter()):
+        raise SettingsError("robot: found xacro macros; make a URDF of them first: xacro FILE.xacro > FILE.urdf")
     if robot.tag != "robot" or robot.find("link") is None:
         raise SettingsError(f"robot: found <{robot.tag}> without links; a URDF is a <robot> of links and joints")
     links = [link.get("name") for link in robot.findall("link")]
@@ -117,48 +191,36 @@ def _parse(xml: str) -> ET.Element:
     return robot
 
 
-def _child(joint: ET.Element) -> str:
-    return str(joint.find("child").get("link"))  # type: ignore[union-attr]  # _parse has checked it
-
-
-def _ancestors(link: str, parents: dict[str, ET.Element]) -> list[ET.Element]:
-    """Joints from the link down to the base."""
-    joints: list[ET.Element] = []
-    while link in parents:
-        joint = parents[link]
-        if joint in joints:
-            raise SettingsError(f"robot: joint {joint.get('name')!r} closes a loop; a URDF is a tree")
-        joints.append(joint)
-        link = str(joint.find("parent").get("link"))  # type: ignore[union-attr]  # _parse has checked it
-    return joints
-
-
-def _tool_link(links: list[str], parents: dict[str, ET.Element], tcp_frame: str | None) -> str:
-    if tcp_frame is None:
-
-        def depth(link: str) -> tuple[int, int, int]:
-            joints = _ancestors(link, parents)
-            return sum(joint.get("type") != "fixed" for joint in joints), len(joints), links.index(link)
-
-        return max(links, key=depth)
-    behind = {str(joint.get("name")): link for link, joint in parents.items()}
-    tcp = tcp_frame if tcp_frame in links else behind.get(tcp_frame)
-    if tcp is None:
-        raise SettingsError(f"robot.tcp_frame: the URDF has no link {tcp_frame!r}; it has {', '.join(links)}")
-    return tcp
+def _bare(robot: ET.Element, axes: Mapping[ET.Element, Sequence[float]]) -> str:
+    """URDF text of the kinematics alone: no shapes, and every axis of the chain an angle, endless or not."""
+    for link in robot.findall("link"):
+        for shape in (*link.findall("visual"), *link.findall("collision")):
+            link.remove(shape)
+    for joint in robot.findall("joint"):
+        if joint.get("type") not in (*_TURNING, "prismatic"):
+            continue
+        values = _limit(joint)
+        low, high, speed = axes.get(joint, (values.get("lower", 0.0), values.get("upper", 0.0), 0.0))
+        if joint in axes:
+            joint.set("type", "revolute")
+        for old in joint.findall("limit"):
+            joint.remove(old)
+        ends = {"lower": low, "upper": high} if math.isfinite(low) else {"lower": -1e9, "upper": 1e9}
+        written = {name: repr(float(value)) for name, value in (ends | {"velocity": speed, "effort": 0.0}).items()}
+        ET.SubElement(joint, "limit", written)
+    return ET.tostring(robot, encoding="unicode")
 
 
 def _limits(joint: ET.Element) -> tuple[float, float, float]:
     """Lower and upper end [rad] and top speed [rad/s] of an axis."""
     name, kind = joint.get("name"), joint.get("type")
-    if kind not in _MOVING or joint.find("mimic") is not None:
+    if kind not in _TURNING or joint.find("mimic") is not None:
         found = "a mimic joint" if joint.find("mimic") is not None else f"of type {kind}"
-        raise SettingsError(f"robot: joint {name!r} before the tool is {found}; only axes of rotation can be planned")
-    limit = joint.find("limit")
-    try:
-        values = {} if limit is None else {key: float(value) for key, value in limit.attrib.items()}
-    except ValueError as error:
-        raise SettingsError(f"robot: limits of joint {name!r} are no numbers ({error})") from error
+        raise SettingsError(
+            f"robot: joint {name!r} between base and tool is {found}; only axes of rotation can be planned, so name "
+            "another robot.tcp_frame or robot.base_frame"
+        )
+    values = _limit(joint)
     low, high = (-math.inf, math.inf) if kind == "continuous" else (values.get("lower", 0.0), values.get("upper", 0.0))
     speed = values.get("velocity", 0.0)
     if not (low < high and 0 < speed < math.inf):
@@ -168,48 +230,9 @@ def _limits(joint: ET.Element) -> tuple[float, float, float]:
     return low, high, speed
 
 
-def _capsule(collision: ET.Element, link: str, name: str) -> Segment:
-    """The capsule that encloses one collision shape, its axis along the shape's own or its longest side."""
-    geometry = collision.find("geometry")
-    shape = None if geometry is None else next(iter(geometry), None)
-    kind = "nothing" if shape is None else shape.tag
-    half = np.zeros(3)
-    if shape is not None and kind in ("cylinder", "capsule"):
-        half[2] = _measure(shape, "length") / 2
-        radius = _measure(shape, "radius")
-    elif shape is not None and kind == "sphere":
-        radius = _measure(shape, "radius")
-    elif shape is not None and kind == "box":
-        sides = _floats(shape.get("size"))
-        longest = int(np.argmax(sides))
-        half[longest] = sides[longest] / 2
-        radius = float(np.linalg.norm(np.delete(sides, longest))) / 2
-    else:
-        raise SettingsError(
-            f"robot: the collision shape of link {link!r} is {kind}; capsules are derived from capsules, cylinders, "
-            "spheres and boxes, so give robot.links"
-        )
-    if not (math.isfinite(radius) and radius > 0 and np.isfinite(half).all()):
-        raise SettingsError(f"robot: the {kind} of link {link!r} has no size; give its measures in metres")
-    origin = collision.find("origin")
-    centre = _floats(None if origin is None else origin.get("xyz"))
-    axis = from_rpy(_floats(None if origin is None else origin.get("rpy"))) @ half
-    start, end = centre - axis, centre + axis
-    return Segment(name, link, (start[0], start[1], start[2]), (end[0], end[1], end[2]), radius)
-
-
-def _measure(shape: ET.Element, key: str) -> float:
+def _limit(joint: ET.Element) -> dict[str, float]:
+    limit = joint.find("limit")
     try:
-        return float(shape.get(key, "nan"))
-    except ValueError:
-        return math.nan
-
-
-def _floats(text: str | None) -> Floats:
-    try:
-        values = np.array([float(part) for part in text.split()] if text else [0.0, 0.0, 0.0])
+        return {} if limit is None else {key: float(value) for key, value in limit.attrib.items()}
     except ValueError as error:
-        raise SettingsError(f"robot: {text!r} are no numbers; three are needed") from error
-    if values.shape != (3,):
-        raise SettingsError(f"robot: {text!r} are {len(values)} numbers; three are needed")
-    return values
+        raise SettingsError(f"robot: limits of joint {joint.get('name')!r} are no numbers ({error})") from error

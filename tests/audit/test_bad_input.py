@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hrcreplay import limits, replay
-from tests.audit.standing import frames, log_of_one_who_does_not_stir
+from tests.audit.standing import frames, log_of_one_who_does_not_stir, standing
 from tests.logs import own
 from tests.test_cli import Run, run
 
@@ -19,7 +19,7 @@ DEMO = replay.demo_log()
 PAPER = (Path(limits.__file__).parent / "paper.toml").read_text()
 SHORT = ("--start", 8, "--end", 8.3)
 FIT = ("fit-limits", DEMO, "--out", "fitted.toml")
-UNSHARED = "give a share between 0 and 1"
+SHARE = "would be right: a share above 0 and below 1, e.g."
 
 BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
     "audit shorter than the horizon": (
@@ -33,10 +33,25 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
         "demo.mcap: found 0.30 s; the part to fit on and the part held",
     ),
     "fit without arm motion": (("fit-limits", "still.mcap", "--out", "x.toml"), 3, "still.mcap: found no arm motion"),
-    "coverage of all": ((*FIT, "--coverage", 1), 2, f"--coverage 1: no bound holds always or never; {UNSHARED}"),
-    "coverage of none": ((*FIT, "--coverage", 0), 2, f"--coverage 0: no bound holds always or never; {UNSHARED}"),
-    "coverage beyond all": ((*FIT, "--coverage", 1.5), 2, "--coverage 1.5: "),
-    "coverage of nothing": ((*FIT, "--coverage", "nan"), 2, "--coverage nan: "),
+    **{
+        f"coverage of {value}": ((*FIT, "--coverage", value), 2, f"--coverage {value}: {SHARE} 0.99")
+        for value in ("0", "1", "1.5", "-0.1", "nan", "inf")
+    },
+    **{
+        f"{value} held back": ((*FIT, "--held-back", value), 2, f"--held-back {value}: {SHARE} 0.3")
+        for value in ("-0.1", "1.5", "nan", "inf")
+    },
+    "nothing held back": (
+        (*FIT, "--held-back", "0"),
+        2,
+        "--held-back 0: nothing is left to try the fit on; would be right: a share, e.g. 0.3",
+    ),
+    "all held back": (
+        (*FIT, "--held-back", "1"),
+        2,
+        "--held-back 1: nothing is left to fit to; would be right: a share, e.g. 0.3",
+    ),
+    "too little held back": ((*FIT, "--held-back", "1e-9"), 3, "both need more than the horizon of 0.377 s"),
     "fit onto an existing file": (("fit-limits", DEMO, "--out", "crossed.toml"), 2, "crossed.toml: exists already"),
     **{
         f"{command} with min over max": (
@@ -64,6 +79,8 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
         "the pose of camera left is not",
     ),
     "audit of nobody": (("audit", "nobody.mcap"), 3, "nobody.mcap: nobody was seen for longer than the horizon"),
+    "audit of a body in one place": (("audit", "oneplace.mcap"), 3, "oneplace.mcap: n"),
+    "audit of metres taken for nanometres": (("audit", "far.mcap"), 3, "far.mcap: n"),
     "audit of no log": (("audit", "none.mcap"), 3, "none.mcap: nothing is there; give a log or a run folder"),
     "one bad log of two": (("audit", DEMO, "unposed.mcap", *SHORT), 3, "mcap: "),
     "audit onto an existing folder": (("audit", DEMO, "--out", "."), 2, ".: exists already"),
@@ -82,6 +99,8 @@ def files(run: Run) -> None:
     log_of_one_who_does_not_stir(Path("still.mcap"))
     own.write(Path("unposed.mcap"), own.frames())
     own.write(Path("nobody.mcap"), frames(np.full((60, 20, 3), np.nan)), cameras={"cam": np.eye(4)})
+    own.write(Path("oneplace.mcap"), frames(np.ones((60, 20, 3))), cameras={"cam": np.eye(4)})
+    own.write(Path("far.mcap"), frames(1e9 * standing(60)), cameras={"cam": np.eye(4)})
 
 
 @pytest.mark.usefixtures("files")

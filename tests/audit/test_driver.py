@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
+import warnings
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,8 @@ from hrcreplay.audit import driver
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human import peers, reach
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.records import LIMBS
+from hrcreplay.records import BODY, LIMBS, POINTS
+from hrcreplay.report import figures_audit
 from tests.audit.standing import frames, standing
 from tests.realdata import data_path
 from tests.test_recordings import SARA, SARA_CELL
@@ -56,7 +60,11 @@ def test_an_audit_leaves_what_it_promises(folder: Path, found: dict[str, Any]) -
     assert set(table["limb"]) >= set(LIMBS)
     assert found["logs"][0]["recorded_future"] == "ground truth"
     assert found["total"]["ticks"] == 140  # (6 s - 0.377 s) at 25 Hz; the first tick is before the first frame
+    sound = found["total"]["methods"]["sound"]
+    assert sound["LEGS"]["covered_share"]["samples"] == 140
+    assert sound["all"]["union_m3"]["value"] > sound["upper"]["union_m3"]["value"]
     page = (folder / "report.html").read_text()
+    assert "every limb that was checked (LEGS included)" in page
     assert not re.search(r"\b(nan|inf|None)\b", re.sub(r"base64,[^\"]*", "", page))
     assert "every limb" in page
 
@@ -73,13 +81,14 @@ def test_the_figures_are_those_of_the_table(folder: Path, found: dict[str, Any])
         if len(deep):
             assert figures["escape_max_m"] == pytest.approx(deep[-1])
             assert figures["escape_p50_m"]["value"] == pytest.approx(deep[int(np.ceil(0.5 * len(deep))) - 1])
-    six = table[table["limb"].isin(LIMBS)]
-    whole = six.groupby(["method", "t_ns"])["escape_m"].max().groupby("method").agg(lambda worst: (worst == 0).mean())
-    for method, share in whole.items():
-        figures = found["total"]["methods"][method]["all"]
-        assert figures["covered_share"]["value"] == pytest.approx(share)
-        assert figures["covered_share"]["low"] <= share <= figures["covered_share"]["high"]
-        assert figures["union_m3"]["value"] < figures["sum_m3"]["value"]
+    for part, limbs in (("all", BODY), ("upper", LIMBS)):
+        rows = table[table["limb"].isin(limbs)]
+        worst = rows.groupby(["method", "t_ns"])["escape_m"].max().groupby("method")
+        for method, share in worst.agg(lambda escape: (escape == 0).mean()).items():
+            figures = found["total"]["methods"][method][part]
+            assert figures["covered_share"]["value"] == pytest.approx(share)
+            assert figures["covered_share"]["low"] <= share <= figures["covered_share"]["high"]
+            assert figures["union_m3"]["value"] < figures["sum_m3"]["value"]
 
 
 def test_what_must_hold_between_methods(found: dict[str, Any]) -> None:
@@ -152,7 +161,7 @@ def test_the_total_counts_every_tick_once(both: Path) -> None:
     found = json.loads((both / "audit.json").read_text())
     rows = pd.read_parquet(both / "audit.parquet")
     for method in ("paper", "positions"):
-        mine = rows[(rows["method"] == method) & rows["limb"].isin(LIMBS)]
+        mine = rows[rows["method"] == method]
         worst = mine.groupby(["log", "t_ns"])["escape_m"].max()
         total = found["total"]["methods"][method]["all"]
         assert total["covered_share"]["samples"] == found["total"]["ticks"] == len(worst) == 155
@@ -200,6 +209,57 @@ def test_a_person_who_stands_still_is_said_to(tmp_path: Path) -> None:
     share = found["total"]["methods"]["paper"]["all"]["covered_share"]
     assert share["value"] == 1.0
     assert share["low"] < 0.7  # 1.6 s are no proof
+
+
+def test_limbs_and_points_that_were_not_checked_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A camera that knows neither legs nor the left wrist, and guesses the right hand with confidence 0."""
+    seen = frames(standing(60))
+    points, confidence = seen.points_m.copy(), seen.confidence.copy()
+    hand = POINTS.index("hand_r")
+    points[:, hand], confidence[:, hand] = [9.0, 9.0, 9.0], 0.0
+    points[30:, POINTS.index("wrist_l")], confidence[30:, POINTS.index("wrist_l")] = np.nan, 0.0
+    with LogWriter(tmp_path / "half.mcap") as writer:
+        writer.camera("cam", np.eye(4))
+        writer.frames(replace(seen, points_m=points, confidence=confidence))
+    folder = driver.run([tmp_path / "half.mcap"], out=tmp_path / "run")
+    told = capsys.readouterr().err
+    gaps = "LEGS, hand_r of LRA, hand_l of LLA"
+    assert f"half: not checked at all, so nothing is said of it: {gaps}\n" in told
+    found = json.loads((folder / "audit.json").read_text())
+    arm = found["total"]["methods"]["sound"]["LLA"]["covered_share"]["samples"]
+    assert 10 < arm < 35  # seen for the first half of 1.6 s
+    assert f"half: not seen to the horizon's end, so not checked, of 40 ticks: LLA {40 - arm}\n" in told
+    assert re.search(
+        r"audit: half: sound, people: every limb that was checked \(not LEGS\) inside in 100\.0 % of 40 ticks; "
+        r"union \d\.\d m3\n$",
+        told,
+    )
+    assert found["logs"][0]["cameras"]["cam"]["rejected_points"] == 0  # no hand jumps that nobody saw
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["audit_not_checked"]["value"] == gaps
+    assert metrics["audit_sound_LEGS_covered_share"]["value"] is None
+    assert metrics["audit_sound_LLA_ticks"]["value"] == arm
+    page = (folder / "report.html").read_text()
+    assert "every limb that was checked (not LEGS)" in page
+    assert f"Not checked at all, so nothing is said of it: {gaps}." in page
+    rows = re.findall(r"<tr><th scope=\"row\">([^<]*)</th><td>([^<]*)</td></tr>", page)
+    assert ("LEGS", "not checked") in rows
+    assert ("LRA: hand_r", "not checked") in rows
+    assert ("LLA", str(arm)) in rows
+
+
+def test_figures_of_volumes_that_are_nothing_or_unknown(tmp_path: Path, found: dict[str, Any]) -> None:
+    """An axis of powers has no place for them, and says nothing about it."""
+    for nothing in (0.0, None):
+        empty = copy.deepcopy(found)
+        parts = [*empty["total"]["methods"].values(), *empty["logs"][0]["methods"].values()]
+        figures = [figure for part in parts for figure in part.values()]
+        for figure in [*figures, *(point for curve in empty["total"]["curve"].values() for point in curve)]:
+            for key in {"union_m3", "volume_m3"} & set(figure):
+                figure[key] = {"value": nothing, "low": nothing, "high": nothing, "samples": 0}
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            figures_audit.draw_all(empty, tmp_path / str(nothing))
 
 
 @pytest.mark.parametrize("name", ["exp_appraoching", "exp_box"])

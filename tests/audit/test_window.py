@@ -42,6 +42,11 @@ def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
     outcome = hold(_balls(people, 1.5), future, np.array([False]))
     assert np.isnan(outcome.beyond_m[0]).tolist() == [limb == "LLA" for limb in LIMBS]
     assert outcome.worst_m()[0] == pytest.approx(2.5)
+    assert not future.checked("LLA")[0]
+    assert future.points()["LLA"] == {"hand_l": 0}  # seen, but its limb is not checked
+    assert future.points()["LRA"] == {"hand_r": 1}
+    points[4, POINTS.index("hand_r")] = np.nan
+    assert window(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4).points()["LRA"] == {"hand_r": 0}
     assert np.isnan(outcome.union_m3[0])
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.optimize import nnls
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.containment import Solid, union_volume_m3
 from hrcreplay.records import Floats
@@ -42,6 +43,16 @@ def test_distances_are_those_of_the_nearest_convex_combination(kind: str) -> Non
         expected = [_by_least_squares(point, vertices) for point in points]
         np.testing.assert_allclose(found, expected, atol=2e-6)
         assert (found[40:] < 1e-8).all()
+
+
+@pytest.mark.parametrize("place_m", [0.0, 1e6, 1e9])
+def test_far_from_the_origin_distances_are_as_exact_as_coordinates(place_m: float) -> None:
+    """A square in its own plane, tilted: of its two sides none looks clearly towards a point beside it."""
+    turn = Rotation.from_rotvec([0.3, -1.1, 0.7])
+    square = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 2.0, 0.0], [0.0, 2.0, 0.0]])
+    points = np.array([[5.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, 1.0, 0.5], [5.0, 6.0, 0.0], [-1.0, 0.3, 0.0]])
+    found = Solid.around(turn.apply(square) + place_m, 0.1).distances_m(turn.apply(points) + place_m)
+    np.testing.assert_allclose(found, [3.0, 0.0, 0.5, 5.0, 1.0], atol=1e-9 + 20.0 * float(np.spacing(place_m)))
 
 
 def test_a_missing_point_has_no_distance() -> None:

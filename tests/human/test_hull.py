@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.hull import hull, sphere_swept_volume_m3
@@ -14,6 +14,7 @@ from tests.human.people import random_states
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], dtype=float)
 TRIANGLE = np.array([[0, 0, 0], [3, 0, 0], [0, 4, 0]], dtype=float)
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+INNER = 0.5 * SQUARE + np.array([0.25, 0.25, 0.0])
 R = 0.3
 BALL = 4 / 3 * np.pi * R**3
 TILTED = Rotation.from_rotvec([0.3, -1.1, 0.7])
@@ -41,6 +42,78 @@ def test_closed_forms(points: Floats, volume: float) -> None:
     for place in (points, tilted(points)):
         assert sphere_swept_volume_m3(place, R) == pytest.approx(volume, rel=1e-9)
         assert sphere_swept_volume_m3(*_with_radius(place)) == pytest.approx(volume, rel=1e-9)
+
+
+#: What has no body or no face, beside solids, with volume, area and mean width's integral of Steiner's formula.
+SHAPES = {
+    "point": (BOX[:1], 0.0, 0.0, 0.0),
+    "point many times": (np.tile(BOX[3], (40, 1)), 0.0, 0.0, 0.0),
+    "segment": (BOX[[0, 7]], 0.0, 0.0, np.pi * np.sqrt(14)),
+    "line": (np.linspace(BOX[0], BOX[7], 40), 0.0, 0.0, np.pi * np.sqrt(14)),
+    "triangle": (TRIANGLE, 0.0, 12.0, 0.5 * np.pi * 12),
+    "square": (SQUARE, 0.0, 2.0, 0.5 * np.pi * 4),
+    "square with points inside": (np.concatenate([SQUARE, INNER]), 0.0, 2.0, 0.5 * np.pi * 4),
+    "box": (BOX, 6.0, 22.0, 6 * np.pi),
+}
+#: Places and how exact coordinates are there; the last two are the numbers that trackers write for what they lost.
+PLACES_M = (0.0, -3.0, 1e3, 1e6, 1e9)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("place_m", PLACES_M)
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e3])
+def test_every_shape_anywhere_has_its_closed_form(shape: str, place_m: float, scale: float) -> None:
+    """Neither flat nor far nor small sets raise; they are as exact as their coordinates."""
+    points, volume, area, bend = SHAPES[shape]
+    r = R * scale
+    exact = volume * scale**3 + area * scale**2 * r + bend * scale * r**2 + 4 / 3 * np.pi * r**3
+    coarse = 1e-9 + 20.0 * float(np.spacing(abs(place_m) + 5.0 * scale)) / scale
+    for place in (scale * points, scale * TILTED.apply(points)):
+        found = sphere_swept_volume_m3(place + place_m, r)
+        if coarse < 0.01:  # else the coordinates no longer tell the shape
+            assert found == pytest.approx(exact, rel=20.0 * coarse)
+        assert 0.9 * 4 / 3 * np.pi * r**3 < found < np.inf
+
+
+@pytest.mark.parametrize("far_m", [1e9, 3e38])
+def test_a_hull_with_one_corner_far_away_is_still_one(far_m: float) -> None:
+    """Of who has one point at 1e9: a cone with its tip out there."""
+    points = np.concatenate([BOX, [[far_m, 0.0, 0.0]]])
+    vertices, faces = hull(points)
+    assert np.isin([0.0, far_m], vertices[:, 0]).all()
+    assert np.isfinite(sphere_swept_volume_m3(points, R))
+    assert faces.max(initial=0) < len(vertices)
+
+
+@pytest.mark.parametrize("thin_m", [0.0, 1e-17, 1e-15, 1e-14, 1e-12, 2e-9, 1e-6])
+@pytest.mark.parametrize("far_m", [1.0, 1e5, 1e9])
+def test_thin_sets_do_not_raise(thin_m: float, far_m: float) -> None:
+    rng = np.random.default_rng(4)
+    for thickness in ([1.0, 1.0, thin_m], [1.0, thin_m, thin_m], [thin_m] * 3):
+        for across in (1.0, 1e3):
+            cloud = across * rng.uniform(-1.0, 1.0, (30, 3)) * thickness
+            for points in (cloud, TILTED.apply(cloud) + far_m):
+                vertices, faces = hull(points)
+                assert 1 <= len(vertices) <= len(points)
+                volume = sphere_swept_volume_m3(points, R, None)
+                assert volume >= (1.0 - 1e-9) * BALL
+                edges = [(int(face[k]), int(face[(k + 1) % 3])) for face in faces for k in range(3)]
+                assert {(j, i) for i, j in edges} == set(edges)
+
+
+def test_what_qhull_calls_flat_is_flat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where Qhull finds a set thinner than we do, the thinnest direction goes."""
+
+    class Solids(ConvexHull):
+        def __init__(self, points: Floats) -> None:
+            if points.shape[1] == 3:
+                raise QhullError("QH6154")
+            super().__init__(points)
+
+    monkeypatch.setattr("hrcreplay.human.hull.ConvexHull", Solids)
+    vertices, faces = hull(np.concatenate([SQUARE, SQUARE + np.array([0.0, 0.0, 1e-8])]))
+    assert len(vertices) == 4
+    assert len(faces) == 4
 
 
 def _with_radius(points: Floats) -> tuple[Floats, float, Ints]:

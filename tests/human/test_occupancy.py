@@ -9,9 +9,9 @@ from scipy.spatial import ConvexHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.human import occupancy
 from hrcreplay.human.hull import sphere_swept_volume_m3
-from hrcreplay.human.model import LimitSet, skeleton
+from hrcreplay.human.model import LimitSet, clamp, skeleton
 from hrcreplay.human.occupancy import Radii
-from hrcreplay.human.reach import PRINTED, reachable
+from hrcreplay.human.reach import METHODS, PRINTED, reachable
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from tests.human.people import LENGTHS_M, directions, limb_points, random_states, raw_cloud, states
@@ -193,3 +193,26 @@ def test_table_2_and_the_frame_of_the_record() -> None:
 def test_an_unknown_method_is_named() -> None:
     with pytest.raises(SettingsError, match=r"occupancy\.method: found 'sphere'"):
         predict(standing(), method="sphere")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_arm_that_nobody_measured_may_be_anywhere_within_its_limits(method: str) -> None:
+    """Forward kinematics of random arms at the torso that is known, against the arm's volumes."""
+    people = random_states(PAPER, 3, 15)
+    unseen = np.zeros((3, len(LIMBS)))
+    arm = [LIMBS.index("URA"), LIMBS.index("LRA")]
+    unseen[:, arm] = np.inf
+    known = predict(people, method=method)
+    volumes = predict(dataclasses.replace(people, unseen_s=unseen), method=method)
+    rng = np.random.default_rng(1)
+    for i in range(len(people)):
+        p = np.tile(people.p[i], (4000, 1))
+        p[:, 4:8] = rng.uniform(PAPER.p_min[4:8], PAPER.p_max[4:8], (len(p), 4))
+        points = skeleton(clamp(p, PAPER), np.tile(LENGTHS_M, (len(p), 1)))
+        for k, limb in enumerate(LIMBS):
+            swept = volumes.vertices(i, k)
+            if k in arm:
+                reached = np.concatenate([limb_points(point, limb) for point in points])
+                assert (support(reached) <= support(swept) + 1e-12).all(), limb
+            else:
+                np.testing.assert_array_equal(swept, known.vertices(i, k))

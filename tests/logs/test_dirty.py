@@ -8,7 +8,7 @@ import numpy as np
 
 from hrcreplay.logs.clean import DEFECTS
 from hrcreplay.logs.reader import Log, LogOptions, open_log
-from hrcreplay.records import CameraFrames
+from hrcreplay.records import POINTS, CameraFrames
 from tests.logs import own
 from tests.logs.bags import KINDS, OPENNI, bag, make, marker_array, openni_at, transform, write_openni
 
@@ -73,6 +73,81 @@ def test_points_that_are_no_numbers(tmp_path: Path) -> None:
     assert log.defects["points_not_finite"] == 2
 
 
+def test_points_that_no_body_has_are_missing(tmp_path: Path) -> None:
+    """'Not tracked' at the origin, places no camera sees, two ends of a bone in one place."""
+    table = own.frames(6, cameras=("one",))
+    points, confidence = table.points_m.copy(), np.full((6, 20), 0.75)
+    at = {name: i for i, name in enumerate(POINTS)}
+    points[1] = 0.0
+    points[2, [at["elbow_l"], at["wrist_l"], at["hand_l"]]] = 0.0
+    confidence[2, at["hand_l"]] = 0.0  # said to be missing
+    points[3, at["head"]], points[3, at["knee_r"]] = 1e9, 3e38
+    points[4, at["shoulder_l"]] = points[4, at["shoulder_r"]]
+    points[5, at["neck"]] = points[5, at["pelvis"]] + 5e-4
+    points[5, at["hand_r"]] = points[5, at["wrist_r"]]  # as trackers do that know no hand
+    log = opened(tmp_path, changed(table, points_m=points, confidence=confidence))
+    frames = own.read(log)
+    gone = np.zeros((6, 20), dtype=bool)
+    gone[1] = True
+    gone[2, [at["elbow_l"], at["wrist_l"], at["hand_l"]]] = True
+    gone[3, [at["head"], at["knee_r"]]] = True
+    gone[4, [at["shoulder_l"], at["shoulder_r"]]] = True
+    gone[5, [at["neck"], at["pelvis"]]] = True
+    np.testing.assert_array_equal(np.isnan(frames.points_m).all(axis=2), gone)
+    np.testing.assert_array_equal(frames.confidence, np.where(gone, 0.0, np.where(confidence > 0, 0.75, 0.0)))
+    np.testing.assert_array_equal(frames.points_m[~gone], points.astype(np.float32)[~gone])
+    counted = {name: log.defects[f"points_{name}"] for name in ("at_origin", "too_far", "coincident", "not_finite")}
+    assert counted == {"at_origin": 22, "too_far": 2, "coincident": 4, "not_finite": 0}
+    origin = f"22 {DEFECTS['points_at_origin']} (19 % of its points)"
+    assert f"camera one: {origin}" in log.notes
+    assert any("2 points further away than a camera can see" in note for note in log.notes)
+
+
+def test_a_camera_that_freezes_is_silent(tmp_path: Path) -> None:
+    """Identical points with fresh stamps are no frames; what moves again is."""
+    which = [0, 1, 2, *([3] * 40), 4, 5]
+    table = own.frames(10, cameras=("one",), which=which)
+    captures = BEGIN + np.arange(45) * PERIOD
+    log = opened(tmp_path, changed(table, capture_ns=captures, arrival_ns=captures + 5_000_000))
+    frames = own.read(log)
+    np.testing.assert_array_equal(frames.capture_ns, captures[[0, 1, 2, 3, 43, 44]])
+    assert (log.defects["frames_repeated"], log.defects["frames_one"]) == (39, 6)
+    (said,) = (note for note in log.notes if "froze" in note)
+    assert said.startswith("camera one froze: for 1.30 s from 0.10 s on it gave one and the same skeleton")
+    assert said.endswith("its 39 rows that repeat count as silence")
+
+
+def test_a_repeated_frame_now_and_then_is_counted_only(tmp_path: Path) -> None:
+    table = own.frames(10, cameras=("one",), which=[0, 1, 1, 2, 3])
+    captures = BEGIN + np.arange(5) * PERIOD
+    log = opened(tmp_path, changed(table, capture_ns=captures, arrival_ns=captures + 5_000_000))
+    assert len(own.read(log)) == 4
+    assert log.defects["frames_repeated"] == 1
+    assert not any("froze" in note for note in log.notes)
+
+
+def test_bodies_of_nobody_do_not_freeze(tmp_path: Path) -> None:
+    table = own.frames(10, cameras=("one",))
+    log = opened(tmp_path, changed(table, points_m=np.zeros((10, 20, 3))))
+    assert len(own.read(log)) == 10
+    assert log.defects["frames_repeated"] == 0
+
+
+def test_stamps_that_cannot_be_give_way_to_arrival(tmp_path: Path) -> None:
+    """Zero, an hour ahead (all that follow would look late), an hour behind."""
+    table = own.frames(6, cameras=("one",))
+    captures = table.capture_ns.copy()
+    captures[1], captures[2], captures[3] = 0, captures[2] + 3600 * 10**9, captures[3] - 3600 * 10**9
+    arrivals = table.capture_ns + 40_000_000 * (np.arange(6) == 0) + 5_000_000
+    log = opened(tmp_path, changed(table, capture_ns=captures, arrival_ns=np.maximum.accumulate(arrivals)))
+    frames = own.read(log)
+    assert len(frames) == 6
+    np.testing.assert_array_equal(frames.capture_ns[1:4], frames.arrival_ns[1:4])
+    np.testing.assert_array_equal(frames.capture_ns[[0, 4, 5]], captures[[0, 4, 5]])
+    assert log.defects["frames_stamp_far"] == 3
+    assert "camera one: 3 rows have a stamp over 10 s from their arrival; arrival used" in log.notes
+
+
 def test_gaps_are_counted_by_camera(tmp_path: Path) -> None:
     which = [k for k in range(200) if not (k % 2 == 0 and (40 <= k < 60 or 100 <= k < 140))]
     log = opened(tmp_path, own.frames(200, which=which), gap_s=0.5)
@@ -122,7 +197,7 @@ def test_zero_stamps_on_tf(tmp_path: Path) -> None:
 def test_broken_messages_are_left_out(tmp_path: Path) -> None:
     with bag(tmp_path / "a", "db3") as (write, store):
         for i in range(10):
-            array = marker_array(store, BEGIN + i * PERIOD, {1: np.ones((32, 3))})
+            array = marker_array(store, BEGIN + i * PERIOD, {1: np.full((32, 3), 1.0 + i)})
             write("/body_tracking_data", "visualization_msgs/msg/MarkerArray", BEGIN + i * PERIOD, array)
     with sqlite3.connect(tmp_path / "a" / "a.db3") as db:
         db.execute("update messages set data = substr(data, 1, 200) where id = 5")

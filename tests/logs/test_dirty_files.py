@@ -186,3 +186,16 @@ def test_bag_with_a_damaged_chunk(tmp_path: Path, form: rosbag1.Writer.Compressi
     path.write_bytes(data)
     with pytest.raises(LogError, match=r"a\.bag: (broken in the middle|the log holds no messages that are whole)"):
         list(open_log(path).frames())
+
+
+def test_a_reader_that_fails_without_a_word_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with bag(tmp_path / "a.bag", "ros1") as (write, store):
+        write_openni(write, store, frames=4, start_ns=own.BEGIN_NS)
+    source = open_source(tmp_path / "a.bag")
+
+    def fail(*_: object) -> None:
+        raise OSError
+
+    monkeypatch.setattr("rosbags.rosbag1.Reader.messages", fail)
+    with pytest.raises(LogError, match=r"a.bag: broken in the middle \(OSError\); copy it again"):
+        list(source.messages(["/tf"]))

@@ -24,7 +24,8 @@ def _frames(path: Path) -> CameraFrames:
 
 
 def _azure_row(t_us: int | str, body: int = 1, confidence: str = "2") -> str:
-    return ";".join([str(t_us), str(body), *([confidence, "100.0", "-200.0", "3000.0"] * 32)])
+    joints = [value for joint in range(32) for value in (confidence, f"{100.0 + 10 * joint}", "-200.0", "3000.0")]
+    return ";".join([str(t_us), str(body), *joints])
 
 
 def _azure_header() -> str:
@@ -49,10 +50,13 @@ def test_azure_files(name: str, tmp_path: Path) -> None:
     track, frames = read_azure(source), _frames(tmp_path / "log.mcap")
     assert "arrival is taken as capture" in notes[0]
     assert frames.cameras == ("left",)
-    np.testing.assert_array_equal(frames.capture_ns, track.t_ns)
-    np.testing.assert_array_equal(frames.arrival_ns, track.t_ns)
-    np.testing.assert_allclose(frames.points_m, track.points_m, atol=1e-6)
-    np.testing.assert_array_equal(frames.confidence, track.confidence)
+    new = np.ones(len(track), dtype=bool)  # these files repeat a row here and there where the sensor lost a frame
+    new[1:] = (np.diff(track.points_m.astype(np.float32), axis=0) != 0.0).any(axis=(1, 2))
+    assert new.mean() > 0.97
+    np.testing.assert_array_equal(frames.capture_ns, track.t_ns[new])
+    np.testing.assert_array_equal(frames.arrival_ns, track.t_ns[new])
+    np.testing.assert_allclose(frames.points_m, track.points_m[new], atol=1e-6)
+    np.testing.assert_array_equal(frames.confidence, track.confidence[new])
 
 
 def test_azure_confidence_and_bodies(tmp_path: Path) -> None:

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hrcreplay.records import LIMBS, Floats
-from hrcreplay.report import audit_metrics
+from hrcreplay.records import BODY, LIMBS, Floats
+from hrcreplay.report import audit_checked, audit_metrics
 from hrcreplay.report.audit_metrics import Outcome
 from hrcreplay.report.coverage import Resampling, block_ticks, resample
 
@@ -23,7 +23,9 @@ def _outcome(beyond: Floats, radius: float = 0.1) -> Outcome:
         volume_m3=np.full((n, limbs), 0.5),
         union_m3=np.where(np.arange(n) % 2 == 0, 2.0, np.nan),
         union_std_m3=np.where(np.arange(n) % 2 == 0, 0.02, np.nan),
-        limbs=LIMBS,
+        upper_m3=np.where(np.arange(n) % 2 == 0, 1.5, np.nan),
+        upper_std_m3=np.where(np.arange(n) % 2 == 0, 0.015, np.nan),
+        limbs=BODY[:limbs],
     )
 
 
@@ -140,6 +142,59 @@ def test_escapes_by_hand() -> None:
     assert figures["all"]["union_m3"]["samples"] == 4
     assert figures["all"]["union_counting_error"] == pytest.approx(0.01)
     assert figures["all"]["sum_m3"]["value"] == 3.0
+
+
+def test_every_limb_is_every_limb_that_was_checked() -> None:
+    """The lower body leaves at one tick and is not seen at another; an arm is never seen."""
+    beyond = np.full((8, 7), 0.05)
+    beyond[3, 6], beyond[4, 6], beyond[5, 0] = 0.25, np.nan, 0.12
+    beyond[:, 5] = np.nan
+    beyond[7] = np.nan
+    outcome = _outcome(beyond)
+    np.testing.assert_allclose(outcome.worst_m(), [0, 0, 0, 0.15, 0, 0.02, 0, np.nan], atol=1e-12)
+    figures = audit_metrics.method_figures([outcome], _once(8), {})
+    assert figures["all"]["covered_share"]["value"] == pytest.approx(5 / 7)
+    assert figures["all"]["escape_max_m"] == pytest.approx(0.15)
+    assert figures["all"]["union_m3"]["value"] == 2.0
+    assert figures["all"]["sum_m3"]["value"] == 3.5
+    assert figures["upper"]["covered_share"]["value"] == pytest.approx(6 / 7)
+    assert figures["upper"]["escape_max_m"] == pytest.approx(0.02)
+    assert figures["upper"]["union_m3"]["value"] == 1.5
+    assert figures["upper"]["sum_m3"]["value"] == 3.0
+    assert [figures[limb]["covered_share"]["samples"] for limb in BODY] == [7, 7, 7, 7, 7, 0, 6]
+    assert audit_metrics.curve_point([outcome], _once(8))["covered_share"]["value"] == pytest.approx(6 / 7)
+
+    points = {limb: dict.fromkeys(names, count) for limb, (names, count) in _POINTS.items()}
+    part = {"ticks": 8, "points": points, "methods": {"sound": figures}}
+    assert audit_checked.never(part, "sound") == ["LLA", "hand_r of LRA"]
+    assert audit_checked.scope(part, "sound") == "not LLA"
+    late = "not seen to the horizon's end, so not checked"
+    assert audit_checked.notes(part, "sound") == [
+        "not checked at all, so nothing is said of it: LLA, hand_r of LRA",
+        f"{late}, of 8 ticks: HD 1, THX 1, URA 1, LRA 1, ULA 1, LEGS 2, foot_l of LEGS 5",
+    ]
+    rows = {row[0]: row[1] for row in audit_checked.table(part, "sound").rows}
+    assert (rows["HD"], rows["LLA"], rows["LRA: hand_r"]) == ("7", "not checked", "not checked")
+    assert (rows["LEGS: foot_l"], rows["THX: shoulder_l"]) == ("3", "7")
+    found = {"total": part, "method": "sound"}
+    metrics = audit_metrics.flat(found | {"total": part | {"methods": {"sound": figures}}})
+    assert metrics["audit_not_checked"]["value"] == "LLA, hand_r of LRA"
+    assert metrics["audit_sound_LLA_covered_share"]["value"] is None
+    assert metrics["audit_sound_LLA_covered_share"]["reason"] == "not checked: not seen to the end of a horizon"
+    assert metrics["audit_sound_LLA_escape_max_m"]["reason"] == "not checked: not seen to the end of a horizon"
+    assert metrics["audit_sound_LEGS_ticks"]["value"] == 6
+
+
+#: Limb -> points beyond its ends, and at how many ticks they were seen.
+_POINTS = {
+    "HD": ((), 0),
+    "THX": (("shoulder_l",), 7),
+    "URA": ((), 0),
+    "LRA": (("hand_r",), 0),
+    "ULA": ((), 0),
+    "LLA": (("hand_l",), 0),
+    "LEGS": (("foot_l",), 3),
+}
 
 
 def test_logs_together_are_their_ticks_together() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from hrcreplay.records import JOINTS
 from hrcreplay.report.metrics import compute
-from hrcreplay.report.metrics_plan import cycles, path_feet, time_lost_s
+from hrcreplay.report.metrics_plan import cycles, path_feet, waited_s
 from hrcreplay.runs import Run
 from tests.report.synthetic import T0_NS, make_run
 
@@ -230,23 +230,26 @@ def test_distance_from_a_path_is_to_its_segments() -> None:
     assert np.isnan(feet[3]).all()
 
 
-def test_time_lost_is_what_the_reference_waited() -> None:
+def test_a_reference_waits_where_its_time_stands() -> None:
     """10 s, of which the reference waits in the seconds 2 to 7."""
     t_s = np.arange(0, 10, 0.01)
     goes_on = (t_s < 2) | (t_s >= 7)
     programme_s = np.concatenate([[0.0], np.cumsum(np.where(goes_on, 0.01, 0.0))[:-1]])
     motion = pd.DataFrame({"t_ns": (t_s * 1e9).round().astype(np.int64), "programme_s": programme_s})
-    lost = time_lost_s(motion)
-    assert lost.sum() == pytest.approx(5.0, abs=1e-9)
-    assert lost[~goes_on] == pytest.approx(0.01)
-    assert lost[goes_on] == pytest.approx(0.0)
+    waited = waited_s(motion)
+    assert waited.sum() == pytest.approx(5.0, abs=1e-9)
+    assert waited[~goes_on] == pytest.approx(0.01)
+    assert waited[goes_on] == pytest.approx(0.0)
 
 
-def test_no_time_is_lost_by_a_reference_that_runs_with_the_clock(run: Run) -> None:
+def test_pace_is_that_of_the_robot_whatever_the_reference_does(run: Run, found: dict[str, dict[str, Any]]) -> None:
+    for prefix in ("plan", "baseline_scaling"):
+        lost, pace = found[f"{prefix}_time_lost_s"]["value"], found[f"{prefix}_progress_share"]["value"]
+        assert lost == pytest.approx((1 - pace) * found["span_s"]["value"])
+        assert "itself made" in found[f"{prefix}_progress_share"]["meaning"]
     settings = {**run.meta["settings"], "plan": {"method": "qp", "reference": "time"}}
-    found = metrics_of(dataclasses.replace(run, meta={**run.meta, "settings": settings}))
-    assert found["plan_time_lost_s"]["value"] is None
-    assert "plan.reference" in found["plan_time_lost_s"]["reason"]
+    other = metrics_of(dataclasses.replace(run, meta={**run.meta, "settings": settings}))
+    assert other["plan_progress_share"] == found["plan_progress_share"]
 
 
 def test_cycles_count_returns() -> None:

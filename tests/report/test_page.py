@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shlex
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 from hrcreplay.human.model import LimitSet
-from hrcreplay.report import figures, page, story, tables
+from hrcreplay.report import figures, page, story, tables, wording
 from hrcreplay.report.metrics import compute
+from hrcreplay.robot import stepping
 from hrcreplay.runs import Run
 from tests.report.synthetic import make_run
 
@@ -143,6 +145,70 @@ def test_a_robot_that_kept_the_constraint_throughout(tmp_path: Path) -> None:
     assert "Not at every tick" not in text
 
 
+def test_every_reason_to_brake_has_its_words() -> None:
+    assert set(stepping.REASONS[1:]) <= set(wording.REASONS)
+    assert len({wording.happened(reason) for reason in stepping.REASONS[1:]}) == len(stepping.REASONS) - 1
+    assert wording.happened("no oil") == "the record says 'no oil'"
+
+
+def test_the_verdict_says_by_reason_what_happened(tmp_path: Path) -> None:
+    """Where the distance failed somebody knew where the person was."""
+    run = make_run(4.0)
+    assert run.motion is not None
+    n = len(run.motion)
+    reason = np.where(np.arange(n) < 30, "separation failed", np.where(np.arange(n) == 30, "no oil", ""))
+    status = np.where(reason == "", "tracking", "braking")
+    braked = dataclasses.replace(run, motion=run.motion.assign(status=status, reason=reason, tcp_speed=0.2))
+    text = " ".join(read(rendered(braked, tmp_path)).text)
+    said = wording.REASONS["separation failed"]
+    assert f"at 30 ticks {said}; at 1 tick the record says 'no oil'." in text
+    assert "nobody could say" not in text
+    assert wording.REASONS["no human state"] not in text
+
+
+def test_the_smallest_distance_says_which_it_is() -> None:
+    run = make_run(4.0)
+    assert run.motion is not None
+    touching = dataclasses.replace(run, motion=run.motion.assign(distance_m=0.0, status="limited", reason=""))
+    metrics = compute(touching, near_m=0.5, stationary_m_per_s=0.001)
+    safe, _ = story.answers(touching, metrics)
+    assert (
+        "The smallest distance while it moved was 0.000 m: from the surface of a link to the surface of all that the "
+        "person could reach within T_s = 0.377 s, not to the body."
+    ) in safe.words
+    assert "At 0 the constraint lets a link move along that space or away from it, but not into it." in safe.words
+    card = story.cards(touching, metrics)[1]
+    assert card.value == "0.000 m"
+    assert "from a link's surface to that of what the person could reach within T_s" in card.label
+    assert card.detail.startswith("not to the body")
+
+
+def test_times_below_a_second_are_not_rounded_to_nothing() -> None:
+    def metric(value: float) -> dict[str, object]:
+        return {"value": value, "unit": "s", "meaning": ""}
+
+    assert tables.text_of(metric(0.0337)) == "34 ms"
+    assert tables.text_of(metric(0.0001)) == "below 1 ms"
+    assert tables.text_of(metric(0.0)) == "0.0 s"
+    assert tables.text_of(metric(1.25)) == "1.2 s"
+
+
+def test_a_tables_cells_wrap_rather_than_be_cut_off(html: str) -> None:
+    style = html[html.index("<style>") : html.index("</style>")]
+    assert "nowrap" not in style
+    assert re.search(r"\.scroll \{[^}]*overflow-x: auto", style)
+
+
+def test_the_page_gives_the_command_that_makes_it_again(tmp_path: Path) -> None:
+    run = make_run(2.0)
+    arguments = ["report", "demo.mcap", "--start", "8", "--cell", "CELL.toml", "--set", 'logs.topics=["/a b"]']
+    again = dataclasses.replace(run, meta={**run.meta, "arguments": arguments})
+    text = " ".join(read(rendered(again, tmp_path)).text)
+    assert shlex.join(["hrcreplay", *arguments]) in text
+    assert "what it held stands in run.json under cell" in text
+    assert "hrcreplay report" in " ".join(read(rendered(run, tmp_path)).text)  # a run of an earlier version
+
+
 def test_a_fused_run_explains_what_is_missing(tmp_path: Path) -> None:
     text = " ".join(read(rendered(make_run(4.0, human=False, robot=False), tmp_path)).text)
     assert "Not asked in this run." in text
@@ -189,3 +255,10 @@ def test_a_robot_that_was_never_let_go_is_said_to_have_stood() -> None:
     safe, _ = story.answers(still, compute(still, near_m=0.5, stationary_m_per_s=0.001))
     assert safe.short == "The robot never moved."
     assert safe.words.startswith("It stood at all 400 ticks.")
+
+
+def test_an_interval_does_not_break_at_its_dash(tmp_path: Path) -> None:
+    run = make_run(2.0)
+    shown = tables.PageTable("shares", ("", "here"), (("limb", "99.5 (97.1\u2013100.0)"),))
+    html = page.render(run, compute(run, near_m=0.5, stationary_m_per_s=0.001), tmp_path, [shown])
+    assert "<td>99.5 (97.1\u2013\u2060100.0)</td>" in html

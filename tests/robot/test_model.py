@@ -218,7 +218,8 @@ def test_capsules_enclose_the_collision_shapes() -> None:
         p = R.apply(surface) + centre
         share = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
         distance = np.linalg.norm(p - a - share[:, None] * (b - a), axis=1)
-        assert distance.max() == pytest.approx(segment.radius_m)
+        assert -1e-12 <= segment.radius_m - distance.max() <= 1e-4
+    assert np.linalg.norm(np.subtract(robot.segments[1].end_m, robot.segments[1].start_m)) < 0.6
     assert robot.segments[2].start_m == robot.segments[2].end_m == pytest.approx((0.1, 0.2, 0.3))
     assert np.linalg.norm(np.subtract(robot.segments[3].end_m, robot.segments[3].start_m)) == pytest.approx(0.2)
 
@@ -271,11 +272,16 @@ MESH = robot_xml(link("base"), link("arm", "<mesh filename='a.stl'/>"), joint("j
     [
         ("<robot", {}, "robot: not a URDF"),
         ("<sdf><link name='a'/></sdf>", {}, "robot: found <sdf>"),
-        (MESH, {}, "shape of link 'arm' is mesh; .* give robot.links"),
+        (
+            MESH,
+            {},
+            "link 'arm' is the mesh 'a.stl', whose file is not known; .* robot.packages, or give robot.l",
+        ),
+        (MESH.replace("<mesh filename='a.stl'/>", "<cone/>"), {}, "link 'arm' is cone; .* give robot.links"),
         (MESH.replace("mesh", "sphere"), {}, "the sphere of link 'arm' has no size"),
         (robot_xml(link("base"), link("arm"), joint("j", "base", "arm")), {}, "no moving link .* robot.links"),
         (ONE_AXIS, {"tcp_frame": "tool0"}, "robot.tcp_frame: the URDF has no link 'tool0'; it has base, arm"),
-        (ONE_AXIS, {"tcp_frame": "base"}, "no axis moves 'base'"),
+        (ONE_AXIS, {"tcp_frame": "base"}, "no axis between 'base' and 'base'"),
         (ONE_AXIS, {"acceleration": [1.0, 2.0]}, "robot.acceleration: found 2 values; other has 1 axes"),
         (ONE_AXIS, {"segments": [Segment("a", "b", (0, 0, 0), (0, 0, 1), 0.1)]}, "robot.links: a: .* no link 'b'"),
         (ONE_AXIS.replace("revolute", "prismatic"), {}, "joint 'lift' .* of type prismatic; only axes of rotation"),

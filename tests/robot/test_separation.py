@@ -130,28 +130,28 @@ def broken(*_: Any) -> tuple[float, Floats]:
     raise RuntimeError("GJK did not converge")
 
 
-@pytest.mark.parametrize(
-    ("name", "stub"),
-    [
-        ("_gjk", broken),
-        ("_gjk", lambda *_: (np.nan, np.full(3, np.nan))),
-        ("axis_distance", lambda *_: np.sqrt(3.0) - 2e-9),
-    ],
-)
-def test_where_coal_fails_or_differs_a_distance_is_unknown(
+@pytest.mark.parametrize(("name", "stub"), [("_gjk", broken), ("_gjk", lambda *_: (np.nan, np.full(3, np.nan)))])
+def test_where_coal_finds_no_distance_ours_is_proven_all_the_same(
     monkeypatch: pytest.MonkeyPatch, name: str, stub: Any
 ) -> None:
     seen, pose = obstacles(volumes([np.ones((3, 3)), np.full((3, 3), 2.0)]), 0), arm(np.zeros((2, 3)))
+    monkeypatch.setattr(module, name, stub)
     surface, *pair = separation(pose, seen, np.zeros((1, 2))).nearest()
     assert surface == pytest.approx(np.sqrt(3.0), abs=1e-12)
     assert pair == [0, 0]
-    monkeypatch.setattr(module, name, stub)
+
+
+@pytest.mark.parametrize(("by_coal", "counts"), [(1.5, 1.5), (0.0, 0.0), (1.8, np.sqrt(3.0))])
+def test_of_two_distances_of_the_nearest_pair_the_smaller_counts(
+    monkeypatch: pytest.MonkeyPatch, by_coal: float, counts: float
+) -> None:
+    seen, pose = obstacles(volumes([np.ones((3, 3)), np.full((3, 3), 2.0)]), 0), arm(np.zeros((2, 3)))
+    monkeypatch.setattr(module, "axis_distance", lambda *_: by_coal)
     found = separation(pose, seen, np.zeros((1, 2)))
-    np.testing.assert_allclose(found.distance_m, [[np.nan, np.sqrt(12.0)]])
-    assert np.isnan(found.nearest()[0])
+    np.testing.assert_allclose(found.distance_m, [[counts, np.sqrt(12.0)]])
 
 
-def test_where_our_bounds_do_not_close_coal_has_the_word(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pair_whose_bounds_do_not_meet_counts_with_the_lower_one(monkeypatch: pytest.MonkeyPatch) -> None:
     seen, pose = obstacles(volumes([np.ones((3, 3)), np.full((3, 3), 2.0)]), 0), arm(np.zeros((2, 3)))
 
     def open_ended(*given: Any) -> tuple[Floats, Floats, Any]:
@@ -159,6 +159,6 @@ def test_where_our_bounds_do_not_close_coal_has_the_word(monkeypatch: pytest.Mon
         return low - 0.1, high + 0.1, near
 
     monkeypatch.setattr(module, "distances", open_ended)
-    np.testing.assert_allclose(
-        separation(pose, seen, np.zeros((1, 2))).distance_m, np.sqrt([[3.0, 12.0]]), rtol=0, atol=1e-12
-    )
+    found = separation(pose, seen, np.zeros((1, 2)))
+    np.testing.assert_allclose(found.distance_m, np.sqrt([[3.0, 12.0]]) - 0.1, rtol=0, atol=1e-12)
+    assert found.nearest() == pytest.approx((np.sqrt(3.0) - 0.1, 0, 0))

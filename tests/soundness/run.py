@@ -46,6 +46,11 @@ class Plan:
 
     @property
     def margins(self) -> Margins:
+        """Those of the volumes, without what is the same on both sides: the thickness of limbs, and the residual.
+
+        A body that is off the model by no more than the residual is inside a volume with that ball around it wherever
+        the model is inside the volume without: so the model is held against the latter.
+        """
         bare = Margins(legs_radius_m=0.0, residual=False)
         return replace(bare, sigmas=self.sigmas, latency_s=self.latency_s, hand_m=self.hand_m)
 

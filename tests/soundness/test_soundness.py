@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hrcreplay import wiring
+from hrcreplay.config import load_settings
+from hrcreplay.human.reach import METHODS
+from hrcreplay.job import unlogged
 from hrcreplay.records import LIMBS, HumanStates, SweptVolumes
 from tests.soundness import run as sampling
 from tests.soundness.__main__ import main
@@ -16,7 +22,8 @@ from tests.soundness.run import Plan, Result, escaped, run, sample_states
 SEED = 2020
 #: A million in all.
 SHARES = {
-    "exact": (Plan("sound", "paper", SEED), 400_000),
+    "exact": (Plan("sound", "paper", SEED), 300_000),
+    "as predicted by default": (Plan("sound", "people", SEED, sigmas=1.0, hand_m=0.19), 100_000),
     "people": (Plan("sound", "human", SEED), 150_000),
     "likely": (Plan("sound", "paper", SEED, sigmas=3.0, latency_s=0.05, hand_m=0.19), 200_000),
     "unseen": (Plan("sound", "paper", SEED, sigmas=3.0, unseen_s=0.8), 50_000),
@@ -81,12 +88,40 @@ def test_any_split_over_any_processes_gives_the_same() -> None:
 
 
 def test_the_command_tells_of_escapes(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--samples", "3000", "--method", "paper", "--processes", "1"]) == 1
+    arguments = ["--samples", "3000", "--processes", "1", "--limits", "paper"]
+    assert main([*arguments, "--method", "paper"]) == 0  # the print encloses less: that is no failure
     out = capsys.readouterr().out
-    assert "3,000 motions from 3 states" in out
+    assert "within 0 sigma, hand of 0 m, seed 0: 3,000 motions from 3 states" in out
     assert "motions escaped; worst margin outside" in out
-    assert main(["--samples", "1000", "--method", "sound", "--processes", "1"]) == 0
+    assert main(["--samples", "1000", "--method", "sound", "--limits", "paper", "--processes", "1"]) == 0
     assert "no motion escaped; worst margin inside by 0.00" in capsys.readouterr().out
+
+
+def test_the_command_fails_where_a_motion_leaves_a_sound_volume(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "predict", shortened(sampling.predict))
+    assert main(["--samples", "1000", "--processes", "1"]) == 1
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_command_samples_what_predict_does_by_default(method: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """And prints one line for machines that says so."""
+    assert main(["--samples", "2000", "--method", method, "--processes", "1", "--json"]) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    found = json.loads(line)
+    sound = method == "sound"
+    settings = load_settings()
+    foresight = wiring.foresight(unlogged("predict", Path(), settings, None))
+    assert (found["method"], found["limits"]) == (method, foresight.limits.name)
+    assert found["horizon_s"] == foresight.horizon_s
+    assert found["latency_s"] == foresight.margins.latency_s
+    assert found["sigmas"] == (foresight.margins.sigmas if sound else 0.0)  # the print knows no margins
+    assert found["hand_m"] == (foresight.margins.hand_m if sound else 0.0)
+    plan = Plan(method, "people", 0, sigmas=found["sigmas"], hand_m=found["hand_m"])
+    result = run(plan, 2000, processes=1)
+    assert (found["samples"], found["states"]) == (2000, 2)
+    assert found["states_let_out"] == result.states_with_escapes[-1]
+    assert found["share"] == result.states_with_escapes[-1] / 2
+    assert found["worst_mm"] == 1e3 * result.margin_m.max()
 
 
 def test_the_command_tells_of_wrong_limits(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,113 @@
+"""The smallest capsule around a set of points."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from scipy.optimize import minimize
+from scipy.spatial import ConvexHull, QhullError
+
+from hrcreplay.records import Floats
+
+#: Ends are rounded to 0.1 mm and the radius up to it: the last bits of the search rarely reach an output.
+_DECIMALS = 4
+
+
+def fit(points_m: Floats) -> tuple[Floats, Floats, float]:
+    """A capsule of small volume that encloses points.
+
+    Nelder and Mead's simplex over the axis' direction, its place and the radius, from each principal axis of the
+    points; the ends follow, as near to each other as the points allow. The radius is last, and encloses every point.
+
+    Args:
+        points_m: (n, 3) [m].
+
+    Returns:
+        Both ends (3,) and the radius [m].
+    """
+    corners, centre = _corners(points_m), np.asarray(points_m).mean(axis=0)
+    axes = np.linalg.eigh((corners - centre).T @ (corners - centre))[1].T
+    size = float(np.linalg.norm(np.ptp(corners, axis=0))) or 1.0
+    shapes = [(corners, centre, np.roll(axes, -first, axis=0), size) for first in range(3)]
+    simplex = 0.15 * np.vstack([np.zeros(5), np.eye(5)])
+    coarse = [_search(shape, simplex, 200) for shape in shapes]
+    best = min(range(3), key=lambda i: float(coarse[i].fun))
+    fine = _search(shapes[best], coarse[best].x + 0.3 * simplex, 400)  # the first simplex may have gone flat
+    line, low, high, _ = _on_axis(fine.x, *shapes[best])
+    start, end = line[0] + low * line[1], line[0] + high * line[1]
+    start, end = np.round(start, _DECIMALS), np.round(end, _DECIMALS)
+    steps = math.floor(float(distance_m(corners, start, end).max()) * 10**_DECIMALS) + 1
+    return start, end, steps / 10**_DECIMALS
+
+
+def distance_m(points_m: Floats, start_m: Floats, end_m: Floats) -> Floats:
+    """(n,) distance of (n, 3) points from a segment [m]."""
+    along = end_m - start_m
+    share = np.clip((points_m - start_m) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(points_m - start_m - share[:, None] * along, axis=1))
+
+
+def capsule_m3(length_m: float, radius_m: float) -> float:
+    """Volume of a capsule whose axis is ``length_m`` long [m^3]."""
+    return math.pi * radius_m**2 * (length_m + 4.0 / 3.0 * radius_m)
+
+
+def hull_m3(points_m: Floats) -> float:
+    """Volume of the convex hull of (n, 3) points; 0 where they lie in a plane [m^3]."""
+    try:
+        return float(ConvexHull(points_m).volume)
+    except (QhullError, ValueError):
+        return 0.0
+
+
+def _corners(points_m: Floats) -> Floats:
+    """The vertices of the hull, which the capsule encloses with all the others; of flat sets the points themselves."""
+    points = np.unique(points_m, axis=0)
+    try:
+        return points[np.sort(ConvexHull(points).vertices)]
+    except (QhullError, ValueError):
+        return points
+
+
+def _search(shape: tuple[Floats, Floats, Floats, float], simplex: Floats, iterations: int) -> Any:
+    options = {"initial_simplex": simplex, "xatol": 1e-5, "fatol": 0.0, "maxiter": iterations, "maxfev": 2 * iterations}
+    return minimize(_volume, simplex[0], shape, "Nelder-Mead", options=options)
+
+
+def _volume(x: Floats, corners: Floats, centre: Floats, frame: Floats, size: float) -> float:
+    """Volume over the cube of the points' size, so that large and small shapes stop alike."""
+    _, low, high, radius = _on_axis(x, corners, centre, frame, size)
+    return capsule_m3(high - low, radius) / size**3
+
+
+@njit(cache=True)
+def _on_axis(
+    x: Floats, corners: Floats, centre: Floats, frame: Floats, size: float
+) -> tuple[Floats, float, float, float]:
+    """The shortest capsule on one axis: direction x[0:2], place x[2:4], radius least where x[4] is zero.
+
+    Returns:
+        Origin and direction of the axis (2, 3), where on it the capsule's ends are, and its radius.
+    """
+    line = np.empty((2, 3))
+    line[0] = centre + size * (x[2] * frame[1] + x[3] * frame[2])
+    line[1] = frame[0] + x[0] * frame[1] + x[1] * frame[2]
+    line[1] /= math.sqrt((line[1] * line[1]).sum())
+    count = len(corners)
+    along, off2 = np.empty(count), np.empty(count)
+    (ox, oy, oz), (ax, ay, az) = line
+    for i in range(count):
+        dx, dy, dz = corners[i, 0] - ox, corners[i, 1] - oy, corners[i, 2] - oz
+        along[i] = dx * ax + dy * ay + dz * az
+        off2[i] = max(dx * dx + dy * dy + dz * dz - along[i] * along[i], 0.0)
+    radius2 = off2.max() * (1.0 + x[4] * x[4])
+    low, high = math.inf, -math.inf
+    for i in range(count):
+        half = math.sqrt(radius2 - off2[i])  # a ball centred within this of the corner's foot holds the corner
+        low, high = min(low, along[i] + half), max(high, along[i] - half)
+    if low > high:  # one ball is enough
+        low = high = 0.5 * (low + high)
+    return line, low, high, math.sqrt(radius2)

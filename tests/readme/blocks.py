@@ -1,0 +1,174 @@
+"""The parts of the README that hold figures, written from docs/figures.json."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from tests.readme.measurements import DEMO_RUNS, MARGINS, RECORDINGS, Figures
+
+Facts = Mapping[str, Any]
+Row = Iterable[str]
+
+BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+
+
+def fill(text: str, facts: Facts) -> str:
+    """The README with its blocks written anew; a block stays as it is where one of its figures was never measured."""
+
+    def block(found: re.Match[str]) -> str:
+        try:
+            return f"{found[1]}{BLOCKS[found[2]](facts)}\n{found[4]}"
+        except KeyError:
+            return found[0]
+
+    return BLOCK.sub(block, text)
+
+
+def demo(facts: Facts) -> str:
+    """The demo log by what is enclosed, and what is to be said of it."""
+    runs = [_of(facts, f"demo, {method}, {limits}") for method, limits in DEMO_RUNS]
+    audits = [(_of(facts, f"audit demo, {limits}"), method) for method, limits in DEMO_RUNS]
+
+    def both(name: str) -> list[str]:
+        return [f"{100 * r[f'plan_{name}']:.1f} / {100 * r[f'baseline_scaling_{name}']:.1f} %" for r in runs]
+
+    late = [f"{r['plan_braking_moving_ticks']:,} / {r['baseline_scaling_braking_moving_ticks']:,}" for r in runs]
+    head = [f"`{method}`, `{limits}`" for method, limits in DEMO_RUNS]
+    head[0] += " (default)"
+    head[-1] += " (as printed)"
+    rows = [
+        ["space the person could reach, all limbs (`audit`)", *(_m3(a[f"{method}_union_m3"]) for a, method in audits)],
+        ["ticks in which every limb stayed inside it", *(_share(a[f"{method}_share"]) for a, method in audits)],
+        ["standing still, of the ticks with at most 0.5 m of separation", *both("stationary_share")],
+        ["pace, of the programmed", *both("progress_share")],
+        ["largest deviation from the programmed path, QP", *(f"{r['plan_deviation_max_m']:.2f} m" for r in runs)],
+        [f"of {runs[0]['plan_ticks']:,} ticks, those braking while still moving", *late],
+    ]
+    left = 1.0 - audits[-1][0]["paper_share"]
+    paper = [f"{100 * runs[0][f'paper_stationary_share_{name}']:.2f} %" for name in ("qp", "scaling")]
+    words = (
+        "The worker reaches into the robot's workspace all the time: what is safe there is slow. The printed "
+        f"prediction is fast because the worker leaves it in {_share(left)} of the ticks. The paper reports that the "
+        f"robot stood in {paper[0]} (QP) and {paper[1]} (scaling) of the time near people, in experiments whose logs "
+        "were never published: compare in kind only. Against ground truth the error (RMSE) of the fused joint angles "
+        f"is {runs[0]['fusion_angle_rmse_ratio']:.2f} of that of the better camera's raw angles, and the error of the "
+        f"angular velocities {runs[0]['fusion_velocity_rmse_ratio']:.2f} of that of its differenced angles."
+    )
+    return f"{_table(['', *head], rows)}\n\n{_wrapped(words)}"
+
+
+_ENCLOSES = {
+    "sound": "every motion of the model under the limits, from every state within `occupancy.sigmas` of the estimate, "
+    "over the braking time and the latency; a hand, a lower body, and what the body was off the model",
+    "paper": "Eq. (20)-(30), Alg. 1 and 2 as printed, corrected only where the print computes nothing",
+    "positions": "what positions and velocity bounds alone give, as printed",
+}
+
+
+def soundness(facts: Facts) -> str:
+    """Whether sampled motions got out of each method's volumes."""
+    rows = []
+    for method, encloses in _ENCLOSES.items():
+        cells = []
+        for limits in ("people", "paper"):
+            found = _of(facts, f"soundness, {method}, {limits}")
+            if found["states_let_out"] == 0:
+                cells.append(f"none of {_count(found['samples'])}")
+            else:
+                cells.append(f"from {_share(found['share'])} of the states, by up to {found['worst_mm']:.0f} mm")
+        name = f"`{method}` (default)" if method == "sound" else f"`{method}`"
+        rows.append([name, encloses, *cells])
+    head = ["method", "what it encloses", "motions that got out, `people`", "Table 1 (`paper`)"]
+    bare = _of(facts, "audit demo, bare, paper")
+    words = (
+        "`sound` is sampled with its default margins; the other two know none. On the demo log with Table 1, exact "
+        f"states and no margins, the volume of `sound` is {bare['sound_union_m3'] / bare['paper_union_m3']:.2f} times "
+        f"that of `paper`, and that of `positions` {bare['positions_union_m3'] / bare['paper_union_m3']:.1f} times."
+    )
+    return f"{_table(head, rows)}\n\n{_wrapped(words)}"
+
+
+def recordings(facts: Facts) -> str:
+    """The demo and the recordings by others: how often everybody stayed inside, and what that took."""
+    names = {"demo (simulated)": "audit demo", **{name: f"recording, {name}" for name in RECORDINGS}}
+    rows = []
+    for name, key in names.items():
+        people, paper = _of(facts, f"{key}, people"), _of(facts, f"{key}, paper")
+        pairs = [(people, "sound"), (paper, "sound"), (people, "paper"), (paper, "paper"), (people, "v2_a50")]
+        cells = [f"{_share(of[f'{method}_share'])}, {_m3(of[f'{method}_union_m3'])}" for of, method in pairs]
+        rows.append([name, *cells, _share(people["legs_share"])])
+    head = ["recording", *(f"`{method}`, `{limits}`" for method, limits in DEMO_RUNS)]
+    return _table([*head, "capsules of v \u2264 2 m/s, a \u2264 50 m/s\u00b2", "lower body, `sound`"], rows)
+
+
+def margins(facts: Facts) -> str:
+    """What the default limits and margins rest on."""
+    people, plain = _of(facts, "people.toml"), _of(facts, "audit demo, people")["sound_union_m3"]
+    other = {name: _m3(_of(facts, f"audit demo, {name}")["sound_union_m3"]) for name in MARGINS}
+    held = "all" if people["held"] == people["ticks"] else f"{people['held']:,}"
+    default = (
+        f"`people` is the default because it held {held} of the {people['ticks']:,} ticks of these {people['logs']} "
+        "logs that it was not fitted on; Table 1 holds fewer people, as the table shows. Nobody in these logs walked "
+        "fast: fit your own people with `fit-limits`, and ask `audit`."
+    )
+    sigmas = (
+        "`occupancy.sigmas` is 1. The reported deviations follow the surprises of the measurements, and all joints "
+        f"are off at once in the worst direction; with 3 the volume on the demo log is {other['3 sigma']} instead of "
+        f"{_m3(plain)}."
+    )
+    parts = (
+        f"Without the hand the volume on the demo log is {other['no hand']}, without the distance of the body from "
+        f"the model {other['no residual']}."
+    )
+    items = (default, sigmas, parts)
+    return "\n".join(_wrapped(item, "- ") for item in items)
+
+
+BLOCKS: dict[str, Callable[[Facts], str]] = {
+    "demo": demo,
+    "soundness": soundness,
+    "recordings": recordings,
+    "margins": margins,
+}
+
+
+def _of(facts: Facts, name: str) -> Figures:
+    return dict(facts[name]["figures"])
+
+
+def _table(head: Row, rows: Iterable[Row]) -> str:
+    head = list(head)
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |").replace(" --- ", "---") for line in lines)
+
+
+def _wrapped(text: str, first: str = "") -> str:
+    """Lines of at most 120 characters."""
+    lines, line = [], first
+    for word in text.split(" "):
+        if len(line) + len(word) > 120:
+            lines.append(line.rstrip())
+            line = " " * len(first)
+        line += f"{word} "
+    return "\n".join([*lines, line.rstrip()])
+
+
+def _share(value: float | None) -> str:
+    """Per cent; 100 only where it is all, 0 only where it is none, a dash where nothing was seen."""
+    if value is None:
+        return "\u2013"
+    if value in (0.0, 1.0):
+        return f"{100 * value:.0f} %"
+    return f"{min(99.9, max(0.1, 100 * value)):.1f} %"
+
+
+def _m3(value: float | None) -> str:
+    if value is None:
+        return "\u2013"
+    return f"{value:.1f} m\u00b3" if value >= 1.0 else f"{value:.2f} m\u00b3"
+
+
+def _count(number: float) -> str:
+    return f"{number / 1e6:g} million"

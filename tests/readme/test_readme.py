@@ -1,0 +1,171 @@
+"""The README's figures are those of docs/figures.json, and the quick ones of these are still what comes out."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+
+from hrcreplay import replay, runs
+from hrcreplay.cli import app
+from hrcreplay.report import metrics
+from hrcreplay.runs import Run
+from tests.readme import __main__ as readme
+from tests.readme.blocks import BLOCK, BLOCKS, fill
+from tests.readme.measurements import DEMO, ROOT, Measurement, load, measurements, of_people, of_report
+from tests.soundness import __main__ as soundness
+
+FACTS = load(readme.FACTS)
+README = readme.README.read_text()
+CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+#: What is measured and not given: a share, a volume, a depth, how many times.
+MEASURED = re.compile(r"\d(?:[\d.,]*) (?:%|mm\b|m\u00b3|times\b|million\b)|\d\.\d+ of\b")
+
+
+def test_the_readme_holds_the_figures_that_were_measured() -> None:
+    assert {name for _, name, _, _ in BLOCK.findall(README)} == set(BLOCKS)
+    assert fill(README, FACTS) == README, "make readme"
+
+
+def test_every_figure_was_measured() -> None:
+    known = {measurement.name: measurement for measurement in measurements()}
+    assert set(FACTS) == {*known, "people.toml"}
+    for name, measurement in known.items():
+        assert FACTS[name]["command"] == " && ".join(measurement.commands)
+
+
+def test_no_figure_stands_outside_of_what_is_measured() -> None:
+    assert not MEASURED.findall(BLOCK.sub("", CODE.sub("", README)))
+    assert len(MEASURED.findall(README)) > 50
+
+
+def _same(name: str, found: dict[str, Any]) -> None:
+    """To the digits that a machine of another kind may round otherwise."""
+    stated = FACTS[name]["figures"]
+    assert set(stated) == set(found)
+    for key, value in found.items():
+        assert stated[key] == pytest.approx(value, rel=1e-6), key
+
+
+def test_the_demo_by_default(demo_folder: Path) -> None:
+    _same("demo, sound, people", of_report(json.loads((demo_folder / "metrics.json").read_text())))
+
+
+def test_the_demo_as_printed(printed: Run) -> None:
+    _same("demo, paper, paper", of_report(metrics.compute(printed, near_m=0.5, stationary_m_per_s=0.001)))
+
+
+def test_the_limits_of_people() -> None:
+    _same("people.toml", of_people())
+
+
+@pytest.mark.parametrize("measurement", measurements(), ids=lambda measurement: measurement.name)
+def test_the_commands_parse(measurement: Measurement) -> None:
+    commands: Any = typer.main.get_command(app)
+    for command in measurement.commands:
+        module, *words = shlex.split(command.format(tmp="tmp", data="data"))
+        if module == "hrcreplay":
+            commands.commands[words[0]].make_context(words[0], words[1:])
+        else:
+            assert module == "tests.soundness"
+            soundness._parser().parse_args(words)
+
+
+def _made_up() -> dict[str, Any]:
+    """Facts of which every figure can be told from every other."""
+    numbers = iter(np.linspace(0.1, 0.9, 2000).tolist())
+    facts: dict[str, Any] = {}
+    for measurement in measurements():
+        found = measurement.keep(_Numbers(numbers))
+        facts[measurement.name] = {"figures": dict(found)}
+    return facts | {"people.toml": {"figures": {"logs": 3, "ticks": 5, "held": 5}}}
+
+
+AUDIT_KEYS = [
+    f"audit_{method}_{key}"
+    for method in ("sound", "paper", "positions", "v2_a50")
+    for key in ("all_covered_share", "all_union_m3", "LEGS_covered_share")
+]
+
+
+class _Numbers(dict[str, Any]):
+    """Metrics with a number of their own for each name that is asked for."""
+
+    def __init__(self, numbers: Any) -> None:
+        self._numbers = numbers
+
+    def __missing__(self, key: str) -> Any:
+        number = next(self._numbers)
+        return number if key in ("samples", "states", "states_let_out", "share", "worst_mm") else {"value": number}
+
+
+def test_a_column_holds_its_own_method_and_limits() -> None:
+    facts, pairs = _made_up(), [("sound", "people"), ("sound", "paper"), ("paper", "people"), ("paper", "paper")]
+    text = BLOCKS["demo"](facts)
+    head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[:8]]
+    assert [re.findall(r"`(\w+)`", cell) for cell in head[1:]] == [list(pair) for pair in pairs]
+    for column, (method, limits) in enumerate(pairs, start=1):
+        audit = facts[f"audit demo, {limits}"]["figures"]
+        run = facts[f"demo, {method}, {limits}"]["figures"]
+        assert rows[0][column] == f"{audit[f'{method}_union_m3']:.2f} m\u00b3"
+        assert rows[1][column] == f"{100 * audit[f'{method}_share']:.1f} %"
+        pace = [100 * run[f"{prefix}_progress_share"] for prefix in ("plan", "baseline_scaling")]
+        assert rows[3][column] == f"{pace[0]:.1f} / {pace[1]:.1f} %"
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(1.0, "100 %"), (0.99999, "99.9 %"), (0.0, "0 %"), (1e-9, "0.1 %"), (None, "\u2013")]
+)
+def test_all_and_none_are_said_of_all_and_none_alone(share: float | None, text: str) -> None:
+    facts = _made_up()
+    facts["audit demo, people"]["figures"]["sound_share"] = share
+    assert f"| ticks in which every limb stayed inside it | {text} |" in BLOCKS["demo"](facts)
+
+
+def test_a_block_of_which_a_figure_is_missing_stays() -> None:
+    text = "<!-- figures: margins -->\nold\n<!-- end -->\n<!-- figures: demo -->\nold\n<!-- end -->\n"
+    facts = _made_up()
+    del facts["audit demo, 3 sigma"]
+    kept, written = fill(text, facts).split("<!-- end -->\n")[:2]
+    assert kept == "<!-- figures: margins -->\nold\n"
+    assert "old" not in written
+
+
+def test_only_the_figures_asked_for_are_measured_and_nothing_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And without the recordings of others their figures stay."""
+    for name, path in (("FACTS", "figures.json"), ("README", "README.md"), ("CACHE", ".readme")):
+        monkeypatch.setattr(readme, name, tmp_path / path)
+    monkeypatch.delenv("HRCREPLAY_DATA", raising=False)
+    (tmp_path / "README.md").write_text("<!-- figures: demo -->\n<!-- end -->\n")
+    old = _made_up()
+    (tmp_path / "figures.json").write_text(json.dumps(old))
+    asked: list[str] = []
+    audit = next(m for m in measurements() if m.name == "audit demo, people")
+
+    def measure(measurement: Measurement, _data: str, _picture: Path) -> Any:
+        asked.append(measurement.name)
+        return {**{name: {"value": 0.5} for name in AUDIT_KEYS}, "audit_ticks": {"value": 7}}
+
+    monkeypatch.setattr(readme, "_measure", measure)
+    for _ in range(2):
+        assert readme.main(["audit demo, people", "recording"]) == 0
+    assert asked == [audit.name]
+    new = json.loads((tmp_path / "figures.json").read_text())
+    assert new["audit demo, people"]["figures"]["ticks"] == 7
+    assert new["demo, sound, people"] == old["demo, sound, people"]
+    assert (
+        "recording, Kinect v2, waving, people: left as it was, for HRCREPLAY_DATA is not set" in capsys.readouterr().out
+    )
+    assert "| 0.50 m\u00b3 |" in (tmp_path / "README.md").read_text()
+
+
+def test_the_shipped_log_is_the_one_that_is_measured() -> None:
+    assert runs.sha256(replay.demo_log()) == runs.sha256(ROOT / DEMO)
