@@ -206,7 +206,8 @@ def _reason(loop: Loop) -> str:
 
 def _verdict(loop: Loop, done: Path, crashes: list[str]) -> None:
     if crashes:
-        raise LiveStopped(f"{crashes[0]}; braked; the record, not complete, and the traceback are in {done}")
+        braked = "braked; " if loop.pilot.stops else ""
+        raise LiveStopped(f"{crashes[0]}; {braked}the record, not complete, and the traceback are in {done}")
     reason = _reason(loop)
     if reason and reason not in (watch.SESSION_OVER, watch.RECORDING_OVER):
         at = next((t_ns for t_ns, why in loop.pilot.stops if why == reason), None)

@@ -77,8 +77,9 @@ def bring_to_rest(loop: Loop, why: str) -> None:
         why: What the record is to say of it.
     """
     with suppress(Exception):
-        loop.pilot.stop = watch.FAULT
-        loop.pilot.stops.append((loop.now_ns(), watch.FAULT))
+        if loop.pilot.stop != watch.FAULT:
+            loop.pilot.stop = watch.FAULT
+            loop.pilot.stops.append((loop.now_ns(), watch.FAULT))
         loop.recorder.send(wire.event(loop.now_ns(), {"what": "crash", "text": why}))
     brake, sender = _brake(loop), loop.sender
     if brake is None or sender is None:

@@ -35,7 +35,7 @@ PORT = "HRCREPLAY_FUZZ_PORT"
 
 #: A live session's settings: nobody waits for an approach at a tenth of the speed.
 _SETTINGS = (*PATIENT, "live.approach_speed=1.0", "occupancy.method=paper", "limits.prediction=paper")
-_SECONDS = 0.4
+_SECONDS = 0.8
 _LEAST = 4  # frames of a camera that is clean, from which there must be a state
 
 
@@ -84,7 +84,7 @@ def _words(command: str, log: Path, out: Path) -> list[str]:
     if command != LIVE:
         return [command, str(log), "--out", str(out)]
     port = os.environ.get(PORT, "0")
-    words = ["live", "--human", str(log), "--duration", str(_SECONDS), "--json", "--send", "--port", port]
+    words = ["live", "--human", str(log), "--repeat", "--duration", str(_SECONDS), "--json", "--send", "--port", port]
     return [*words, "--out", str(out), *(word for setting in _SETTINGS for word in ("--set", setting))]
 
 

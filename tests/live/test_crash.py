@@ -105,6 +105,7 @@ def test_a_bug_anywhere_in_control_brakes_a_moving_robot_to_rest(
         state = RobotState(reply.q, reply.dq)
     assert not any(np.any(reply.dq) for reply in replies[-FAREWELLS:])
     assert all((two.seqno - one.seqno) % 2**32 == 1 for one, two in pairwise(replies))
+    assert [why for _, why in found.flight.pilot.stops] == [watch.FAULT]
     gaps = np.diff([t_ns for t_ns, _ in found.sent]) * 1e-9
     assert gaps.max() < 3 * CYCLE_S, "it went on being answered"
 
