@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from hrcreplay import replay, runs
+from hrcreplay.audit import driver
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.records import POINTS, CameraFrames, Floats
 from tests.logs import own
@@ -61,6 +62,9 @@ def test_millimetres_are_refused_with_what_would_mend_them(tmp_path: Path) -> No
     table = noisy()
     with pytest.raises(LogError, match=r"m tall; a person is 0.5 to 2.3 m: millimetres were taken for metres"):
         ran(tmp_path, with_points(table, 1e3 * table.points_m))
+    assert nothing_left(tmp_path)
+    with pytest.raises(LogError, match="millimetres were taken for metres"):
+        driver.run([tmp_path / "a.mcap"], out=tmp_path / "audit")
     assert nothing_left(tmp_path)
 
 

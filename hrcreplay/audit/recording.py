@@ -108,6 +108,7 @@ def _fuse(
         state, states, events, trace = fusion.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
         counts.update(events)
         yield measured, states, trace
+    log.check()
     if measured is None:
         raise LogError(f"{log.header.path}: no camera saw anybody; an audit needs a person")
 

@@ -47,7 +47,7 @@ def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
         Solid(ends, float(radius), colours[body])
         for body, ends, radius in zip(pose.bodies, pose.ends_m, pose.radius_m, strict=True)
     ]
-    rows = -(-(len(names) + 1) // 5)
+    rows = -(-(len(names) + 1) // 4)
     figure = style.new_figure(3.9 + 0.18 * rows)
     axes = style.panels(figure, 1, 2, left_in=0.62, top_in=0.3, bottom_in=0.5 + 0.18 * rows, gap_in=(0.3, 0.62))[0]
     views = (view_from(_beside(pose, base_m), 0.12), ABOVE)
@@ -59,7 +59,7 @@ def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
     handles = [Patch(color=colours[name], lw=0, label=name) for name in names]
     if pose.volumes:
         handles.append(Patch(facecolor=style.FAINT, alpha=0.3, lw=0, label="swept volumes of the person"))
-    figure.legend(handles=handles, loc="lower center", ncols=5, bbox_to_anchor=(0.5, 0.01))
+    figure.legend(handles=handles, loc="lower center", ncols=4, bbox_to_anchor=(0.5, 0.01))
     return figure
 
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -168,6 +168,14 @@ def test_a_missing_point_takes_only_what_rests_on_it(missing: str) -> None:
 @settings(max_examples=60, deadline=None)
 @given(arrays(np.float64, (1, 20, 3), elements=st.floats(-5, 5, allow_nan=False)))
 def test_any_finite_points_have_finite_angles_that_reproduce_the_arms(points: Floats) -> None:
+    """Where the two ends of a bone are apart; see test_degenerate for those that are not."""
+    points = points + np.outer(np.arange(20), [0.011, 0.007, 0.013])
+    middle = 0.5 * (points[0, AT["shoulder_l"]] + points[0, AT["shoulder_r"]])
+    bones = [points[0, AT["shoulder_l"]] - middle, points[0, AT["pelvis"]] - middle, points[0, AT["head"]] - middle]
+    for side in "rl":
+        shoulder, elbow, wrist = (points[0, AT[f"{name}_{side}"]] for name in ("shoulder", "elbow", "wrist"))
+        bones += [elbow - shoulder, wrist - elbow]
+    assume(min(np.linalg.norm(bones, axis=1)) > 1e-3)
     found, found_pi = inverse(points)
     assert np.isfinite(found).all()
     assert np.isfinite(found_pi).all()

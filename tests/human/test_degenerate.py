@@ -25,7 +25,7 @@ HEAD, NECK, PELVIS = (POINTS.index(name) for name in ("head", "neck", "pelvis"))
 ARM_R = [POINTS.index(f"{name}_r") for name in ("shoulder", "elbow", "wrist")]
 SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
 #: Numbers that loggers and trackers write for 'nothing', and what a broken byte makes of a coordinate.
-VALUES = (0.0, 1e-9, 1e-4, 5e-4, 1e-3, -1.0, 1e3, 1e9, 3e38, 1e160, 1e300)
+VALUES = (0.0, 1e-9, 1e-4, 5e-4, 1e-3, -1.0, 1e3, 1e9, 3e38)
 
 
 def body() -> Floats:

@@ -74,7 +74,9 @@ def test_the_end_is_told_when_it_is_due_and_once(tmp_path: Path) -> None:
     last_ns = int(frames.arrival_ns[-1] - frames.arrival_ns[0])
     assert len(skeletons(drained(playback, last_ns - 1))) == len(frames) - 1
     end = list(playback.due(last_ns))
-    assert [kind for kind, _ in end] == [b"F", b"N", b"Z"]
+    kinds = [kind for kind, _ in end]
+    assert (kinds[0], kinds[-1]) == (b"F", b"Z")
+    assert set(kinds[1:-1]) == {b"N"}  # remarks on the recording, among them that its random points are no person
     assert list(playback.due(last_ns + 10**9)) == []
     assert playback.next_ns(last_ns) is None
 

@@ -36,14 +36,20 @@ def notes(messages: list[tuple[bytes, bytes]]) -> list[str]:
     return [payload.decode() for kind, payload in messages if kind == b"N"]
 
 
+def spread(at: float) -> Any:
+    """(32, 3) places of joints, the first beginning with ``at``: no two of a body are one place."""
+    return np.arange(96.0).reshape(32, 3) / 64.0 + at
+
+
 def markers(stamp_ns: int, bodies: dict[int, Any] | None = None) -> bytes:
     store = store_of("ros2")
-    message = marker_array(store, stamp_ns, bodies or {1: np.ones((32, 3))})
+    message = marker_array(store, stamp_ns, bodies or {1: spread(1.0)})
     return bytes(store.serialize_cdr(message, "visualization_msgs/msg/MarkerArray"))
 
 
 def own(capture_ns: int, **change: Any) -> bytes:
-    values = {"capture_ns": capture_ns, "camera": "x", "body": 2, "points": [1.0] * 60, "confidence": [1.0] * 20}
+    points = [1.0 + k / 64.0 + capture_ns % 1009 / 1000.0 for k in range(60)]  # nobody is measured twice the same
+    values = {"capture_ns": capture_ns, "camera": "x", "body": 2, "points": points, "confidence": [1.0] * 20}
     return pb.Skeleton(**(values | change)).SerializeToString()
 
 
@@ -52,7 +58,7 @@ def own(capture_ns: int, **change: Any) -> bytes:
 
 def test_the_type_comes_from_the_key_of_rmw_zenoh_and_all_bodies_are_read() -> None:
     stream = Stream("kinect", KeySettings(MARKER_KEY, "cdr"))
-    bodies = {3: np.full((32, 3), 0.25), 1: np.full((32, 3), 2.0)}
+    bodies = {3: spread(0.25), 1: spread(2.0)}
     sent = skeletons(list(stream.take(MARKER_KEY, markers(NOW_NS - 40_000_000, bodies), NOW_NS)))
     assert [(s.body, s.points[0], s.camera, s.capture_ns) for s in sent] == [
         (1, 2.0, "kinect", NOW_NS - 40_000_000),
@@ -83,7 +89,8 @@ def test_transforms_of_a_tracker() -> None:
 
 def test_a_stamp_of_zero_is_the_receipt_and_told_once() -> None:
     stream = Stream("kinect", KeySettings(MARKER_KEY, "cdr"))
-    first, second = (list(stream.take(MARKER_KEY, markers(0), NOW_NS + i)) for i in range(2))
+    sent = (markers(0, {1: spread(1.0 + i)}) for i in range(2))
+    first, second = (list(stream.take(MARKER_KEY, data, NOW_NS + i)) for i, data in enumerate(sent))
     assert [s.capture_ns for s in skeletons(first + second)] == [NOW_NS, NOW_NS + 1]
     assert notes(first) == [
         "live.zenoh.keys.kinect: frames_header_stamp_zero: rows with a capture time of zero; their arrival is used"

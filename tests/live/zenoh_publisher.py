@@ -31,12 +31,12 @@ PERSON_DEFINITION = (
 
 def markers_m(i: int) -> np.ndarray[Any, Any]:
     """(32, 3) positions of the i-th message."""
-    return np.arange(3 * len(AZURE_JOINTS)).reshape(-1, 3) / 64.0 + i
+    return np.arange(3 * len(AZURE_JOINTS)).reshape(-1, 3) / 64.0 + i % 50
 
 
 def own_points(i: int) -> list[float]:
     """The points of the i-th message."""
-    return [k / 64.0 - i for k in range(60)]
+    return [k / 64.0 - i % 50 for k in range(60)]
 
 
 def payloads() -> dict[str, Callable[[int, int], bytes]]:
