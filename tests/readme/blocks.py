@@ -39,7 +39,10 @@ def demo(facts: Facts) -> str:
     head[0] += " (default)"
     head[-1] += " (as printed)"
     rows = [
-        ["space the person could reach, all limbs; `sound` has a lower body (`audit`)", *(_m3(a[f"{method}_union_m3"]) for a, method in audits)],
+        [
+            "space the person could reach, all limbs; `sound` has a lower body (`audit`)",
+            *(_m3(a[f"{method}_union_m3"]) for a, method in audits),
+        ],
         ["ticks in which every limb stayed inside it", *(_share(a[f"{method}_share"]) for a, method in audits)],
         ["standing still, of the ticks with at most 0.5 m of separation", *both("stationary_share")],
         ["pace, of the programmed", *both("progress_share")],
