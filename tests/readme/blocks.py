@@ -84,7 +84,7 @@ def soundness(facts: Facts) -> str:
         name = f"`{method}` (default)" if method == "sound" else f"`{method}`"
         rows.append([name, encloses, *cells])
     head = ["method", "what it encloses", "motions that got out, `people`", "Table 1 (`paper`)"]
-    bare = _of(facts, "audit demo, bare, paper")
+    bare = _of(facts, "audit excerpt, bare, paper")
     words = (
         "`sound` is sampled with its default margins; the other two know none. On the demo log with Table 1, exact "
         f"states and no margins, the volume of `sound` is {bare['sound_union_m3'] / bare['paper_union_m3']:.2f} times "
@@ -108,8 +108,8 @@ def recordings(facts: Facts) -> str:
 
 def margins(facts: Facts) -> str:
     """What the default limits and margins rest on."""
-    people, plain = _of(facts, "people.toml"), _of(facts, "audit demo, people")["sound_union_m3"]
-    other = {name: _m3(_of(facts, f"audit demo, {name}")["sound_union_m3"]) for name in MARGINS}
+    people = _of(facts, "people.toml")
+    other = {name: _m3(_of(facts, f"audit excerpt, {name}")["sound_union_m3"]) for name in MARGINS}
     held = "all" if people["held"] == people["ticks"] else f"{people['held']:,}"
     default = (
         f"`people` is the default because it held {held} of the {people['ticks']:,} ticks of these {people['logs']} "
@@ -118,11 +118,11 @@ def margins(facts: Facts) -> str:
     )
     sigmas = (
         "`occupancy.sigmas` is 1. The reported deviations follow the surprises of the measurements, and all joints "
-        f"are off at once in the worst direction; with 3 the volume on the demo log is {other['3 sigma']} instead of "
-        f"{_m3(plain)}."
+        f"are off at once in the worst direction; with 3 the volume on 15 s of the demo log is {other['3 sigma']} "
+        f"instead of {other['default']}."
     )
     parts = (
-        f"Without the hand the volume on the demo log is {other['no hand']}, without the distance of the body from "
+        f"Without the hand it is {other['no hand']}, without the distance of the body from "
         f"the model {other['no residual']}."
     )
     items = (default, sigmas, parts)

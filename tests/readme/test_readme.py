@@ -131,7 +131,7 @@ def test_all_and_none_are_said_of_all_and_none_alone(share: float | None, text: 
 def test_a_block_of_which_a_figure_is_missing_stays() -> None:
     text = "<!-- figures: margins -->\nold\n<!-- end -->\n<!-- figures: demo -->\nold\n<!-- end -->\n"
     facts = _made_up()
-    del facts["audit demo, 3 sigma"]
+    del facts["audit excerpt, 3 sigma"]
     kept, written = fill(text, facts).split("<!-- end -->\n")[:2]
     assert kept == "<!-- figures: margins -->\nold\n"
     assert "old" not in written
