@@ -30,7 +30,8 @@ BUGS = {
 def moving(group: Group, *names: str) -> dict[str, Flown]:
     """Sessions whose robots move; two at a time, lest they be short of processors."""
     for name in names:
-        settings = ("live.keep_recorder=false",) if name == "kept" else ()
+        # a double that the machine holds up for a moment is not to be what stops it
+        settings = ("live.keep_recorder=false",) if name == "kept" else ("live.silent_s=2.0",)
         bug = f"{BUGS[name]}@{group.folder / name}.bug" if name in BUGS else ""
         group.prepare(name, "--send", "--repeat", settings=settings, bug=bug)
     found = {name: group.robot(name) for name in names}
