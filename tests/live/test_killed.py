@@ -31,8 +31,8 @@ def moving(group: Group, *names: str) -> dict[str, Flown]:
     """Sessions whose robots move; two at a time, lest they be short of processors."""
     for name in names:
         # a double that the machine holds up is not to be what stops it
-        settings = ("live.silent_s=2.0", "live.tracking_rad=6.0")
-        settings += ("live.keep_recorder=false",) if name == "kept" else ()
+        kept = ("live.keep_recorder=false",) if name == "kept" else ()
+        settings = ("live.silent_s=2.0", "live.tracking_rad=6.0", *kept)
         bug = f"{BUGS[name]}@{group.folder / name}.bug" if name in BUGS else ""
         group.prepare(name, "--send", "--repeat", settings=settings, bug=bug)
     found = {name: group.robot(name) for name in names}
