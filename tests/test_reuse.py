@@ -22,6 +22,7 @@ from hrcreplay.limits import load_limits
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.pipeline import tick_times
+from tests.robot.test_model import ONE_AXIS
 
 ALL = "fuse predict plan"
 #: Every setting and the stages whose result depends on it. A new setting has to be put here by hand: think which.
@@ -66,11 +67,11 @@ STALE = {
     "occupancy.residual": "predict plan",
     "occupancy.residual_unknown_m": "predict plan",
     "robot.urdf": "plan",
-    "robot.tcp_frame": "plan",
-    "robot.base_frame": "plan",
     "robot.packages": "",  # what they hold counts, by the digests of its files
-    "robot.tcp_offset": "plan",
+    "robot.base_frame": "plan",
+    "robot.tcp_frame": "plan",
     "robot.tool_m": "plan",
+    "robot.tcp_offset": "plan",
     "robot.links": "plan",
     "robot.acceleration": "plan",
     "plan.method": "plan",
@@ -196,7 +197,7 @@ def test_a_setting_makes_the_stages_stale_that_depend_on_it(
     log: Log, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("robot.urdf").write_text("<robot/>")
+    Path("robot.urdf").write_text(ONE_AXIS)
     source: Any = log
     if name == "logs.joints_topic":  # nobody asks for joints where there is a task
         source = SimpleNamespace(header=replace(log.header, task=None))
@@ -232,7 +233,7 @@ def _copy(path: Path, to: Path) -> Path:
 
 
 def test_files_count_by_what_they_hold(log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.urdf").write_text("<robot/>")
+    (tmp_path / "a.urdf").write_text(ONE_AXIS)
     limits = _copy(Path(load_limits.__code__.co_filename).parent / "people.toml", tmp_path / "own.toml")
 
     def job(urdf: str, limit_set: str) -> Job:
@@ -244,7 +245,7 @@ def test_files_count_by_what_they_hold(log: Log, tmp_path: Path, monkeypatch: py
     assert _stale((first, log), (job("a.urdf", str(limits)), log)) == ""
     _copy(tmp_path / "a.urdf", tmp_path / "b.urdf")
     assert _stale((first, log), (job("b.urdf", "people"), log)) == ""
-    (tmp_path / "b.urdf").write_text("<robot />")
+    (tmp_path / "b.urdf").write_text(ONE_AXIS + "\n")
     assert _stale((first, log), (job("b.urdf", "people"), log)) == "plan"
 
 
