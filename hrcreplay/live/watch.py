@@ -22,7 +22,7 @@ NO_FRAME, UNCERTAIN, NOT_FINITE, TRACKING = "no fresh frame", "state uncertain",
 FAULT = "internal error"
 
 #: What ends a session whose robot may have been stopped for another reason.
-ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED, PERSON_DEAD, RECORDER_DEAD, SCREEN_DEAD)
+ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
 
 #: Robots that are not answered at all.
 REFUSED = ("radians", "axes")

@@ -22,6 +22,7 @@ from hrcreplay.records import Floats
 _ROS_JOINTS, _OWN_JOINTS, _OWN_TRUTH = "sensor_msgs/JointState", "hrcreplay.JointState", "hrcreplay.Truth"
 _OWN_CAMERA, _OWN_TASK, _OWN_BASE = "hrcreplay.Camera", "hrcreplay.Task", "hrcreplay.Base"
 _CHUNK_NS = 10**9
+_RIGID = 1e-2  # of the axes of a pose: those of a recording may have been rounded, those of a cell file not so much
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,13 @@ def _pose(values: Any, message: Message) -> Floats:
     if len(values) != 16:
         raise LogError(f"{message.topic.name}: a pose of {len(values)} numbers; 16 are right")
     pose = np.array(values, dtype=np.float64).reshape(4, 4)
+    if not np.isfinite(pose).all():
+        raise LogError(f"{message.topic.name}: a pose with {pose[~np.isfinite(pose)][0]}; finite numbers are right")
+    R = pose[:3, :3]
+    off = float(np.abs(R @ R.T - np.eye(3)).max())
+    if off > _RIGID or np.linalg.det(R) < 0.0 or (pose[3] != (0.0, 0.0, 0.0, 1.0)).any():
+        what = f"axes off by {off:.2g}" if off > _RIGID else "a mirror image, or a last row that is not 0 0 0 1"
+        raise LogError(f"{message.topic.name}: a pose with {what}; a rotation and a place are right")
     pose.flags.writeable = False
     return pose
 

@@ -338,7 +338,7 @@ _COMMON = SPOILERS[: SPOILERS.index(shapes)]
 @st.composite
 def clips(draw: Draw) -> Clip:
     """A clip of the demo log with one to four things wrong: mostly with what trackers say, else with the file."""
-    made = clip(draw(st.sampled_from((0.0, 6.0, 14.0, 21.0, 33.0, 47.0))), draw(st.sampled_from((0.3, 0.5, 0.6))))
+    made = clip(draw(st.sampled_from((0.4, 6.0, 14.0, 21.0, 33.0, 47.0))), draw(st.sampled_from((0.3, 0.5, 0.6))))
     wrong = st.lists(st.sampled_from(_COMMON) | st.sampled_from(SPOILERS), min_size=1, max_size=4)
     for spoiler in draw(wrong):
         spoiler(made, draw)

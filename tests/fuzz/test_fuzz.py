@@ -18,9 +18,9 @@ from tests.fuzz.trial import LIVE, trial
 from tests.live.sessions import Command
 
 #: How many logs go through each command, by what they cost.
-SHARE = {"fuse": 60, "audit": 6, "report": 4}
+SHARE = {"fuse": 100, "audit": 10, "report": 6}
 #: Live sessions, beside a robot double.
-SESSIONS = 4
+SESSIONS = 6
 
 
 @pytest.mark.parametrize("command", SHARE)
@@ -89,7 +89,7 @@ def half(*_args: object, out: Path, **_named: object) -> Path:
     [
         (bug, ["exit code 1", "traceback: ZeroDivisionError: put there by a test (cli.py:"]),
         (leftovers, ["left behind: ['out.partial']", "no line that says why"]),
-        (half, ["not complete"]),
+        (half, ["a run folder in spite of the error"]),
     ],
 )
 def test_it_finds_what_was_planted(

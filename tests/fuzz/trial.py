@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import sys
 import tempfile
 import traceback
@@ -100,6 +101,8 @@ def _run(found: Trial, words: list[str], folder: Path) -> None:
             cli.main()
         except SystemExit as left:
             found.code = left.code if isinstance(left.code, int) else 1
+            if found.code == 128 + signal.SIGTERM:
+                raise  # it is the fuzzer that is to end
         except BaseException:  # whatever it is
             found.code = 1
             captured.append(traceback.format_exc())

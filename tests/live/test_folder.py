@@ -35,7 +35,7 @@ def flight() -> Flight:
     """Somebody comes near; Ctrl-C after 2 s. By the method with the most limbs."""
     return Stored(
         overrides=("occupancy.method=sound",),
-        walk=lambda s: (max(0.8, 3.0 - s), 0.2),
+        walk=lambda s: (3.0 - 0.9 * s, 0.2),
         signals=lambda s: Signal.INTERRUPT if s > 2.0 else Signal.NONE,
     ).fly(2.3)
 
