@@ -30,7 +30,6 @@ BEGIN_NS = 1_800_000_000_000_000_000
 RESPONSE_NS = 300_000
 CYCLE_S = PERIOD_NS * 1e-9
 FRAME_NS = 33_000_000
-SWAY_M = 1e-4  #: nobody stands so still that two frames are the same; a camera whose frames are is frozen
 LENGTHS_M = np.array([[0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
 
 #: Where somebody stands over time, from the robot's base [m]; None: no camera sees them.
@@ -120,7 +119,6 @@ class Flight:
         bend = 0.1 + 0.002 * np.sin(1e-9 * (t_ns - BEGIN_NS))  # nobody stands like a frozen picture
         joints = np.array([[base[0] + place_m[0], base[1] + place_m[1], np.pi, bend, *(0.1, 0.5, 0.0, 1.8) * 2]])
         to_camera = np.linalg.inv(np.array(self.start["cameras"][camera]))
-        joints[0, :2] += SWAY_M * np.sin(t_ns * 1e-9 + np.arange(2))
         points = skeleton(joints, LENGTHS_M)[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
         message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=1)
         message.points.extend(points.ravel().tolist())

@@ -62,10 +62,11 @@ def test_plan(run: Run) -> None:
     assert mine.startswith(f"qp: {100.0 * pace:.1f} % of the programmed pace, ")
 
 
-def test_a_programme_that_never_waits_has_no_pace(run: Run) -> None:
+def test_a_programme_that_never_waits_has_a_pace_too(run: Run) -> None:
     settings = {**run.meta["settings"], "plan": {"method": "qp", "reference": "time"}}
     timed = dataclasses.replace(run, meta={**run.meta, "settings": settings})
-    assert "pace" not in _lines(timed)["plan"]
+    assert _lines(timed)["plan"] == _lines(run)["plan"]
+    assert "of the programmed pace" in _lines(timed)["plan"]
 
 
 def test_only_what_the_run_holds(run: Run) -> None:
