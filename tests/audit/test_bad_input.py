@@ -80,7 +80,7 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
     ),
     "audit of nobody": (("audit", "nobody.mcap"), 3, "nobody.mcap: nobody was seen for longer than the horizon"),
     "audit of a body in one place": (("audit", "oneplace.mcap"), 3, "oneplace.mcap: n"),
-    "audit of metres taken for nanometres": (("audit", "far.mcap"), 3, "far.mcap: n"),
+    "audit of metres taken for nanometres": (("audit", "far.mcap"), 3, "far.mcap: camera cam: by its bones"),
     "audit of no log": (("audit", "none.mcap"), 3, "none.mcap: nothing is there; give a log or a run folder"),
     "one bad log of two": (("audit", DEMO, "unposed.mcap", *SHORT), 3, "mcap: "),
     "audit onto an existing folder": (("audit", DEMO, "--out", "."), 2, ".: exists already"),
