@@ -48,8 +48,8 @@ MARGINS = {
 }
 #: Motions that are sampled for each method and limit set.
 SAMPLES = {
-    ("sound", "people"): 200_000,
-    ("sound", "paper"): 200_000,
+    ("sound", "people"): 2_000_000,
+    ("sound", "paper"): 2_000_000,
     ("paper", "people"): 200_000,
     ("paper", "paper"): 200_000,
     ("positions", "people"): 200_000,
