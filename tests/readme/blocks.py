@@ -85,10 +85,11 @@ def soundness(facts: Facts) -> str:
         rows.append([name, encloses, *cells])
     head = ["method", "what it encloses", "motions that got out, `people`", "Table 1 (`paper`)"]
     bare = _of(facts, "audit excerpt, bare, paper")
+    sound, positions = (bare[f"{method}_union_m3"] / bare["paper_union_m3"] for method in ("sound", "positions"))
     words = (
         "`sound` is sampled with its default margins; the other two know none. On 15 s of the demo log, with Table "
-        f"1, exact states and no margins, the volume of `sound` with its lower body is {bare['sound_union_m3'] / bare['paper_union_m3']:.2f} times "
-        f"that of `paper`, and that of `positions` {bare['positions_union_m3'] / bare['paper_union_m3']:.1f} times."
+        f"1, exact states and no margins, the volume of `sound` with its lower body is {sound:.2f} times that of "
+        f"`paper`, and that of `positions` {positions:.1f} times."
     )
     return f"{_table(head, rows)}\n\n{_wrapped(words)}"
 
