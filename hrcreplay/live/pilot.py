@@ -91,6 +91,7 @@ class Pilot:
 
     def answer(self, event: TickEvent) -> Answer:
         """The reply to what the robot sent, and why it is that one."""
+        self._hear_nothing(event.t_ns)  # also where the packet that ends a silence comes before its time-out is seen
         packets = [_decoded(data) for data in event.datagrams]
         cycles = {packet.clock_ns for packet in packets if packet is not None}
         self._behind_ns = (self._behind_ns or event.t_ns) if len(cycles) > 1 else None

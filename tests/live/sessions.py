@@ -31,6 +31,8 @@ PATIENT = (
     "live.fresh_s=10.0",
     "live.uncertain_m=1e3",
     "live.uncertain_rad=1e3",
+    "live.silent_s=10.0",
+    "live.tracking_rad=10.0",
 )
 
 

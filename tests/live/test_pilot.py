@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -125,6 +126,23 @@ def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
     assert flight.phases().count("echo") == 2
     replies = [answer for answer in flight.answers if answer.phase == records.ECHO]
     assert_array_equal([answer.row.dq for answer in replies if answer.row is not None], 0.0)
+    steps_keep_the_limits(flight)
+
+
+class Suspended(Flight):
+    """A control process that the machine stopped from 2 to 2.5 s: nobody tells the pilot of the silence meanwhile."""
+
+    def _guide(self, t_ns: int, datagrams: list[bytes]) -> Iterator[bytes]:
+        if not 2.0 <= (t_ns - BEGIN_NS) * 1e-9 < 2.5:
+            yield from super()._guide(t_ns, datagrams)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_silence_that_only_the_next_packet_tells_of_stops_the_robot_too(resume: bool) -> None:
+    flight = Suspended(overrides=(f"live.resume={str(resume).lower()}",)).fly(6.0)
+    assert [why for _, why in flight.pilot.stops] == [watch.SILENT]
+    assert flight.phases().count("echo") == 2
+    assert flight.phases().count("approach") == 1 + resume  # it goes on only where that was asked for
     steps_keep_the_limits(flight)
 
 

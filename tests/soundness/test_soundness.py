@@ -91,7 +91,7 @@ def test_the_command_tells_of_escapes(capsys: pytest.CaptureFixture[str]) -> Non
     arguments = ["--samples", "3000", "--processes", "1", "--limits", "paper"]
     assert main([*arguments, "--method", "paper"]) == 0  # the print encloses less: that is no failure
     out = capsys.readouterr().out
-    assert "within 0 sigma, hand of 0 m, seed 0: 3,000 motions from 3 states" in out
+    assert "within 0 sigma, hand of 0 m, seed 0: 3,000 motions from 3 states" in " ".join(out.split())
     assert "motions escaped; worst margin outside" in out
     assert main(["--samples", "1000", "--method", "sound", "--limits", "paper", "--processes", "1"]) == 0
     assert "no motion escaped; worst margin inside by 0.00" in capsys.readouterr().out
