@@ -9,23 +9,13 @@ import numpy as np
 
 from hrcreplay import calibrate as calibration
 from hrcreplay.cell import pose_from_position, write_cell
-from hrcreplay.config import Settings, load_settings
+from hrcreplay.config import load_settings
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs import importer, info
-from hrcreplay.logs.decode_generic import GenericDecoder
-from hrcreplay.logs.reader import LogOptions, open_log
+from hrcreplay.logs.reader import open_log
+from hrcreplay.wiring import log_options
 
 KINDS = ("azure", "kinect2", "keraal")
-
-
-def log_options(settings: Settings) -> LogOptions:
-    """How to read a log."""
-    return LogOptions(
-        topics=settings.logs.topics,
-        decoders=tuple(GenericDecoder(**decoder.model_dump()) for decoder in settings.logs.decoders),
-        joints_topic=settings.logs.joints_topic,
-        gap_s=settings.logs.gap_s,
-    )
 
 
 def describe(path: Path, config: Path | None, overrides: tuple[str, ...]) -> list[str]:

@@ -14,7 +14,6 @@ import pyarrow.parquet as pq
 
 from hrcreplay import pipeline, reuse, runs, wiring
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.ingest import log_options
 from hrcreplay.job import TABLES, Job, resolve
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import NS, Sink
@@ -25,6 +24,7 @@ from hrcreplay.report.flaws import flaws
 from hrcreplay.reporting import write_report
 from hrcreplay.runs import Run, RunWriter, Stopwatch
 from hrcreplay.tables import read_states
+from hrcreplay.wiring import log_options
 
 REPORTS = Path("reports")
 

@@ -9,13 +9,16 @@ from typing import Protocol
 import numpy as np
 
 from hrcreplay.cell import Cell
+from hrcreplay.config import Settings
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.angles import PointNoise
 from hrcreplay.human.fusion import FusionSettings
 from hrcreplay.human.margins import Margins
 from hrcreplay.human.occupancy import Radii
 from hrcreplay.job import Job
+from hrcreplay.logs.decode_generic import GenericDecoder
 from hrcreplay.logs.log import Header, JointTrack
+from hrcreplay.logs.reader import LogOptions
 from hrcreplay.pipeline import Eyes, Foresight
 from hrcreplay.planner import Planner, QpFollower, ScalingFollower
 from hrcreplay.records import Floats
@@ -26,6 +29,16 @@ from hrcreplay.robot.rotation import from_rpy
 from hrcreplay.robot.stepping import PlanSettings
 from hrcreplay.robot.task import parse_task
 from hrcreplay.urdf_files import UrdfFiles, read_urdf
+
+
+def log_options(settings: Settings) -> LogOptions:
+    """How to read a log."""
+    return LogOptions(
+        topics=settings.logs.topics,
+        decoders=tuple(GenericDecoder(**decoder.model_dump()) for decoder in settings.logs.decoders),
+        joints_topic=settings.logs.joints_topic,
+        gap_s=settings.logs.gap_s,
+    )
 
 
 class Source(Protocol):

@@ -16,12 +16,12 @@ from hrcreplay import replay, reuse, runs, wiring
 from hrcreplay.cell import Cell, pose_from_position
 from hrcreplay.config import Settings
 from hrcreplay.errors import SettingsError
-from hrcreplay.ingest import log_options
 from hrcreplay.job import STAGES, Job, resolve
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.pipeline import tick_times
+from hrcreplay.wiring import log_options
 from tests.robot.test_model import ONE_AXIS
 
 ALL = "fuse predict plan"

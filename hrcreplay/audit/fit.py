@@ -19,7 +19,6 @@ from hrcreplay.human import fitting
 from hrcreplay.human.ballistic import ballistic
 from hrcreplay.human.fitting import Fit, Futures
 from hrcreplay.human.model import LimitSet
-from hrcreplay.ingest import log_options
 from hrcreplay.job import Job, resolve
 from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
@@ -27,6 +26,7 @@ from hrcreplay.pipeline import NS, tick_times
 from hrcreplay.progress import Bar
 from hrcreplay.records import JOINTS, LIMBS, Floats
 from hrcreplay.report.coverage import Estimate, block_ticks, resample
+from hrcreplay.wiring import log_options
 
 #: Ticks a second that are fitted to [Hz]; what no camera has seen for longer is no evidence [s]; of the bootstrap.
 FIT_HZ, SEEN_S, SEED = 25.0, 0.25, 3

@@ -14,7 +14,6 @@ from hrcreplay.audit.window import Window, hold, joints_inside, standstill_s, tr
 from hrcreplay.errors import LogError
 from hrcreplay.human import peers, reach
 from hrcreplay.human.model import LimitSet
-from hrcreplay.ingest import log_options
 from hrcreplay.job import Job
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import NS, Foresight, tick_times
@@ -22,6 +21,7 @@ from hrcreplay.progress import Bar
 from hrcreplay.records import JOINTS, Floats, Ints, SweptVolumes
 from hrcreplay.report.audit_metrics import Outcome
 from hrcreplay.runs import Stopwatch
+from hrcreplay.wiring import log_options
 
 #: Ticks a second that are audited [Hz]; the union is counted out at, and the curve rests on, one in so many.
 AUDIT_HZ, EVERY = 25.0, 5

@@ -9,7 +9,6 @@ from typing import Any
 
 from hrcreplay import runs, wiring
 from hrcreplay.errors import SettingsError
-from hrcreplay.ingest import log_options
 from hrcreplay.job import Job
 from hrcreplay.live import crash
 from hrcreplay.live.session_tables import SessionTables
@@ -20,6 +19,7 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.reporting import write_report
 from hrcreplay.runs import RunWriter
 from hrcreplay.tables import measurement_columns
+from hrcreplay.wiring import log_options
 
 LOG = "log.mcap"
 _PARTIAL = ".partial"

@@ -17,7 +17,6 @@ from hrcreplay.egm.codec import AXES
 from hrcreplay.egm.session import Session
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet
-from hrcreplay.ingest import log_options
 from hrcreplay.job import Job, resolve, unlogged
 from hrcreplay.live import watch
 from hrcreplay.live.motion import Follower, Setup
@@ -27,6 +26,7 @@ from hrcreplay.logs.log import Header, JointTrack
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import Floats
 from hrcreplay.robot.reference import Reference
+from hrcreplay.wiring import log_options
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from itertools import islice
 
 from hrcreplay.errors import LogError
@@ -11,7 +10,7 @@ from hrcreplay.logs.decode_generic import GenericDecoder
 from hrcreplay.logs.decode_markers import MarkerDecoder
 from hrcreplay.logs.decode_own import OwnDecoder
 from hrcreplay.logs.decode_tf import TfDecoder
-from hrcreplay.logs.messages import Topic
+from hrcreplay.logs.messages import Topic, listed
 from hrcreplay.logs.skeletons import Decoder
 from hrcreplay.logs.source import Source
 
@@ -55,11 +54,6 @@ def choose(source: Source, names: tuple[str, ...], described: tuple[GenericDecod
 def none_found(source: Source) -> LogError:
     """What to tell the user where no topic carries skeletons."""
     return LogError(f"{source.path}: no skeleton topic; found {listed(source.topics())}.\n{_HOW}")
-
-
-def listed(found: Iterable[Topic]) -> str:
-    """Topics and their types in one line."""
-    return ", ".join(f"{topic.name} ({topic.type})" for topic in found) or "no topics at all"
 
 
 def _known(source: Source, topic: Topic, *, asked: bool) -> Decoder | None:

@@ -25,6 +25,11 @@ class Topic:
     parse: Callable[[bytes], Any]  #: bytes of a message -> its fields; raises Undecodable
 
 
+def listed(found: Iterable[Topic]) -> str:
+    """Topics and their types in one line."""
+    return ", ".join(f"{topic.name} ({topic.type})" for topic in found) or "no topics at all"
+
+
 class Message(NamedTuple):
     """A message as it lies in the file."""
 

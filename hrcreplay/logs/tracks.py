@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.choose import listed
 from hrcreplay.logs.decode_own import points_of
 from hrcreplay.logs.log import JointTrack, Truth
-from hrcreplay.logs.messages import Message, Topic, Undecodable
+from hrcreplay.logs.messages import Message, Topic, Undecodable, listed
 from hrcreplay.logs.skeletons import stamp_ns
 from hrcreplay.logs.source import Source
 from hrcreplay.records import Floats
