@@ -1,5 +1,5 @@
 """``python -m hrcreplay``."""
 
-from hrcreplay.cli import main
+from hrcreplay.cli.app import main
 
 main()

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from hrcreplay import replay, runs
-from hrcreplay.runs import Run
+from hrcreplay.run import replay
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import Run
 
 
 @pytest.fixture(scope="session")
@@ -19,11 +20,11 @@ def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def printed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The plan on the shipped log by the paper's own prediction, with which the robot meets the person at speed."""
     overrides = ("occupancy.store_hz=all", "occupancy.method=paper", "limits.prediction=paper")
-    return runs.read(
+    return run_folder.read(
         replay.run("plan", replay.demo_log(), out=tmp_path_factory.mktemp("printed") / "run", overrides=overrides)
     )
 
 
 @pytest.fixture(scope="session")
 def demo(demo_folder: Path) -> Run:
-    return runs.read(demo_folder)
+    return run_folder.read(demo_folder)

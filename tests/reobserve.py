@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.registration import MIRROR, Track, rigid
+from hrcreplay.calibration.registration import MIRROR, Track, rigid
 from hrcreplay.records import POINTS, Floats
 
 _ARM = ("CLAVICLE", "SHOULDER", "ELBOW", "WRIST", "HAND", "HANDTIP", "THUMB")

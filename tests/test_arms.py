@@ -11,11 +11,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from hrcreplay import replay, runs
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, from_urdf
-from hrcreplay.sections import Robot
-from hrcreplay.urdf_files import read_urdf
+from hrcreplay.run import replay
+from hrcreplay.run.job import read_urdf
+from hrcreplay.settings.sections import Robot
+from hrcreplay.store import run_folder
 from tests.arms import ARMS, Arm
 
 COLLADA = "{http://www.collada.org/2005/11/COLLADASchema}"
@@ -131,7 +132,7 @@ def test_it_drives_the_demo_to_the_page(name: str, tmp_path: Path) -> None:
     if command == "report":  # the scaling beside it is tried with the others
         overrides = (*overrides, "plan.baselines=[]")
     folder = replay.run(command, replay.demo_log(), out=tmp_path / "run", start_s=8.0, end_s=9.0, overrides=overrides)
-    run, meta = runs.read(folder), json.loads((folder / "run.json").read_text())
+    run, meta = run_folder.read(folder), json.loads((folder / "run.json").read_text())
     assert run.motion is not None
     assert run.T_world_base is not None
     joints = meta["robot"]["joints"]

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.calibrate import calibrate, collect, survey
+from hrcreplay.calibration.calibrate import calibrate, collect, survey
+from hrcreplay.calibration.registration import Disagreement, Registration, Track, rigid, transform
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.human.registration import Disagreement, Registration, Track, rigid, transform
-from hrcreplay.logs.importer import import_azure, import_keraal, import_kinect2
+from hrcreplay.logs.importers import import_azure, import_keraal, import_kinect2
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import CameraFrames, Floats
@@ -250,8 +250,8 @@ def test_clocks_further_apart_than_searched_are_refused(tmp_path: Path) -> None:
     b = reobserve(a, Truth(POSE, 0.0), 4)
     far = Registration(POSE, -3.1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hrcreplay.calibrate.register", lambda *_, **__: far)
-        patch.setattr("hrcreplay.calibrate.disagreement", lambda *_: Disagreement(0.03, 0.1, 1000, 0.0))
+        patch.setattr("hrcreplay.calibration.calibrate.register", lambda *_, **__: far)
+        patch.setattr("hrcreplay.calibration.calibrate.disagreement", lambda *_: Disagreement(0.03, 0.1, 1000, 0.0))
         with pytest.raises(LogError, match=r"30 mm apart \(median\) at a clock offset of -3.10 s; would be right"):
             calibrate(_log(tmp_path / "log.mcap", {"a": a, "b": b}))
 

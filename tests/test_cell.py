@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.cell import Cell, Residual, load_cell, pose_from_position, write_cell
+from hrcreplay.calibration.cell import Cell, Residual, load_cell, pose_from_position, write_cell
+from hrcreplay.calibration.registration import rigid
 from hrcreplay.errors import SettingsError
-from hrcreplay.human.registration import rigid
 
 T = rigid(Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix(), np.array([1.0, -2.0, 0.5]))
 EYE = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from hrcreplay import __version__, cli, replay
+from hrcreplay import __version__
+from hrcreplay.cli import app
+from hrcreplay.run import replay
 from tests.logs import own
 
 Run = Callable[..., tuple[int, str, str]]
@@ -23,7 +25,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
     def call(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["hrcreplay", *map(str, arguments)])
         with pytest.raises(SystemExit) as left:
-            cli.main()
+            app.main()
         out, err = capsys.readouterr()
         return int(left.value.code or 0), out, err
 
@@ -46,7 +48,9 @@ def test_version(run: Run) -> None:
 
 
 def test_help_imports_nothing_heavy() -> None:
-    code = "import sys; sys.argv = ['hrcreplay', '--help']\nfrom hrcreplay.cli import main\ntry:\n main()\nfinally:\n"
+    code = (
+        "import sys; sys.argv = ['hrcreplay', '--help']\nfrom hrcreplay.cli.app import main\ntry:\n main()\nfinally:\n"
+    )
     code += " heavy = {'numpy', 'pandas', 'numba', 'matplotlib', 'pydantic', 'pinocchio'} & set(sys.modules)\n"
     code += " sys.exit(3 if heavy else 0)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from hrcreplay.config import Settings, as_overrides, load_settings
 from hrcreplay.errors import SettingsError
+from hrcreplay.settings.load import Settings, as_overrides, load_settings
 
 
 def test_defaults_are_the_papers() -> None:

@@ -11,13 +11,12 @@ import pytest
 from datasets import make_demo
 from datasets.recipe import cameras, scene, worker
 from datasets.recipe.sensors import Sensor
-from hrcreplay.human.angles import inverse
-from hrcreplay.human.branches import nearest
-from hrcreplay.human.model import skeleton
+from hrcreplay.human.fusion.inverse_kinematics import inverse
+from hrcreplay.human.model import nearest, skeleton
 from hrcreplay.records import POINTS, CameraFrames, Floats
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.paths import programmed
-from hrcreplay.robot.task import parse_task
+from hrcreplay.robot.programme.path import programmed
+from hrcreplay.robot.programme.task import parse_task
 
 SHIPPED = Path(__file__).parents[1] / "datasets" / "demo.mcap"
 AT = {name: index for index, name in enumerate(POINTS)}

@@ -11,15 +11,16 @@ import pytest
 import typer
 
 from hrcreplay import errors
-from hrcreplay.cell import Cell
-from hrcreplay.cli import app
-from hrcreplay.config import Settings, load_settings
+from hrcreplay.calibration.cell import Cell
+from hrcreplay.cli.app import app
 from hrcreplay.egm import motion_link_pb2, session
-from hrcreplay.egm.faults import KINDS, load_faults
-from hrcreplay.live import topics, watch
-from hrcreplay.robot import stepping
-from hrcreplay.robot.task import parse_task
-from hrcreplay.sections_live import Live
+from hrcreplay.egm.robot_double.faults import KINDS, load_faults
+from hrcreplay.live.control import watchdog
+from hrcreplay.live.record import topics
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.settings.load import Settings, load_settings
+from hrcreplay.settings.sections import Live
 
 ROOT = Path(__file__).parent.parent
 LIVE = ROOT / "docs" / "live.md"
@@ -141,8 +142,8 @@ def test_the_program_shown_is_the_one_in_the_file() -> None:
 
 def test_every_stop_reason_is_in_the_table() -> None:
     heard = session.Heard(answer=True, fresh=False, allowed=False, reason="", ended=False, lost=0)
-    constants = {value for name, value in vars(watch).items() if name.isupper() and isinstance(value, str)}
-    reasons = {*constants, *watch.SIGNALS.values(), *watch.REFUSED, *session.STOPS, watch.of_robot(heard)}
+    constants = {value for name, value in vars(watchdog).items() if name.isupper() and isinstance(value, str)}
+    reasons = {*constants, *watchdog.SIGNALS.values(), *watchdog.REFUSED, *session.STOPS, watchdog.of_robot(heard)}
     table = rows(section(7), "| reason |")
     assert sorted(row[0].strip("`") for row in table) == sorted(reasons)
     assert all(len(row) == 3 and all(row) for row in table)
@@ -151,7 +152,7 @@ def test_every_stop_reason_is_in_the_table() -> None:
 def test_refusals_and_reasons_of_the_plan_are_explained() -> None:
     for refusal in session.REFUSALS:
         assert f"`{refusal}`" in section(7)
-    assert {row[1].strip("`") for row in rows(section(7), "| status |")} == set(stepping.REASONS)
+    assert {row[1].strip("`") for row in rows(section(7), "| status |")} == set(control_step.REASONS)
 
 
 def test_exit_codes() -> None:

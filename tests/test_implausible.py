@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hrcreplay import replay, runs
 from hrcreplay.audit import driver
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.records import POINTS, CameraFrames, Floats
+from hrcreplay.run import replay
+from hrcreplay.store import run_folder
 from tests.logs import own
 from tests.logs.test_plausibility import CAMERA, seen, with_points
 
@@ -79,7 +80,7 @@ def test_a_coincident_or_lost_start_is_no_crash(tmp_path: Path) -> None:
     points[24:32, at["neck"]] = points[24:32, at["pelvis"]]
     points[32:36, at["head"]] = 1e9
     folder = ran(tmp_path, with_points(table, points))
-    run = runs.read(folder)
+    run = run_folder.read(folder)
     assert run.state is not None
     assert np.isfinite(run.state[["x", "y", "theta", "ar1", "al4"]].to_numpy()[-1]).all()
     assert {name: run.counts[name] for name in run.counts if name.startswith("points_")} == {
@@ -95,7 +96,7 @@ def test_a_frozen_camera_no_longer_shows_the_person(tmp_path: Path, capsys: pyte
     points = table.points_m.copy()
     points[40:] = points[39]
     folder = ran(tmp_path, with_points(table, points))
-    state = runs.read(folder).state
+    state = run_folder.read(folder).state
     assert state is not None
     seen_ns = state["t_ns"][state["valid_left"]].to_numpy()
     froze_ns = int(table.arrival_ns[39])
@@ -103,14 +104,14 @@ def test_a_frozen_camera_no_longer_shows_the_person(tmp_path: Path, capsys: pyte
     assert state["t_ns"].iloc[-1] - seen_ns[-1] > 1.5e9
     said = "camera left froze: for 1.63 s from 1.30 s on it gave one and the same skeleton"
     assert said in capsys.readouterr().err
-    assert any(note.startswith(said) for note in runs.read(folder).notes)
+    assert any(note.startswith(said) for note in run_folder.read(folder).notes)
 
 
 def test_an_upside_down_world_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     T = np.diag([1.0, -1.0, -1.0, 1.0]) @ WORLD
     log = own.write(tmp_path / "a.mcap", noisy(), cameras={"left": T})
     folder = replay.run("fuse", log, out=tmp_path / "run")
-    assert any("stands upside down" in note for note in runs.read(folder).notes)
+    assert any("stands upside down" in note for note in run_folder.read(folder).notes)
     assert "stands upside down" in capsys.readouterr().err
 
 
@@ -120,7 +121,7 @@ def test_a_base_inside_the_person_is_told(x: float, inside: bool, tmp_path: Path
     cell = tmp_path / "cell.toml"
     cell.write_text(f"T_world_base = {{ position_m = [{x}, 0.0, 0.65], yaw_deg = 0.0 }}\n")
     folder = replay.run("plan", replay.demo_log(), out=tmp_path / "run", cell_file=cell, start_s=8.0, end_s=9.3)
-    run = runs.read(folder)
+    run = run_folder.read(folder)
     assert run.state is not None
     assert run.state["x"].median() == pytest.approx(1.28, abs=0.1)
     said = [note for note in run.notes if "stands inside the volume of the person's" in note]

@@ -13,11 +13,12 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from hrcreplay import replay, runs
 from hrcreplay.audit import driver
 from hrcreplay.errors import LogError
-from hrcreplay.job import resolve
-from hrcreplay.tables import COLUMNS, lacks
+from hrcreplay.run import replay
+from hrcreplay.run.job import resolve
+from hrcreplay.store import run_folder
+from hrcreplay.store.tables import COLUMNS, lacks
 
 #: What tables of the version before had not.
 NEW = {
@@ -35,10 +36,10 @@ def planned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _aged(folder: Path, to: Path, *names: str, new: Mapping[str, Sequence[str]] = NEW) -> Path:
     """The same run as if a version had made it that knew no ``new`` columns in those tables."""
     shutil.copytree(folder, to)
-    meta = runs.read_meta(to)
+    meta = run_folder.read_meta(to)
     for name in names:
         pq.write_table(pq.read_table(to / name).drop_columns(list(new[name])), to / name)
-        meta["outputs"][name] = runs.sha256(to / name)
+        meta["outputs"][name] = run_folder.sha256(to / name)
     (to / "run.json").write_text(json.dumps(meta))
     return to
 
@@ -58,7 +59,7 @@ def test_the_arguments_of_a_run_are_the_same_however_it_was_asked_for(planned: P
     told = "report demo.mcap --start 9 --end 10 --smooth --set limits.prediction=own.toml --set plan.leash_m=0.2"
     for job in asked:
         assert job.arguments(smooth=True) == told.split()
-    plain = runs.read_meta(planned)["arguments"]
+    plain = run_folder.read_meta(planned)["arguments"]
     assert plain == ["plan", "demo.mcap", "--start", "9", "--end", "10"]
 
 
@@ -84,7 +85,7 @@ def test_tables_of_an_earlier_version_are_computed_again(
     for stage in ("fuse", "predict", "plan"):
         outcome = f"{old / table} is of an earlier version, without {NEW[table][0]}; computed again"
         assert f"{stage}: {outcome if stage in again else f'taken over from {old}'}" in said
-    mine, theirs = runs.read_meta(new)["outputs"], runs.read_meta(planned)["outputs"]
+    mine, theirs = run_folder.read_meta(new)["outputs"], run_folder.read_meta(planned)["outputs"]
     assert {name: mine[name] for name in theirs} == theirs
 
 
@@ -97,7 +98,7 @@ def test_states_that_tell_nothing_of_the_legs_are_computed_again(
     said = capsys.readouterr().err
     assert f"{old / 'state.parquet'} is of an earlier version, without residual_LEGS; computed again" in said
     for name in ("state.parquet", "occupancy.parquet"):
-        assert runs.sha256(again / name) == runs.sha256(planned / name)
+        assert run_folder.sha256(again / name) == run_folder.sha256(planned / name)
 
 
 def _changed(path: Path) -> None:
@@ -113,7 +114,7 @@ def test_tables_that_were_changed_since_are_computed_again(
     new = replay.run("plan", tmp_path / "old", out=tmp_path / "new")
     assert "fuse: " in (said := capsys.readouterr().err)
     assert "state.parquet is not as its run left it; computed again" in said
-    assert runs.read_meta(new)["outputs"] == runs.read_meta(planned)["outputs"]
+    assert run_folder.read_meta(new)["outputs"] == run_folder.read_meta(planned)["outputs"]
 
 
 def test_an_audit_takes_an_old_run(planned: Path, tmp_path: Path) -> None:
@@ -125,7 +126,7 @@ def test_an_audit_takes_an_old_run(planned: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("key", ["inputs", "settings", "cell", "task", "span_s"])
 def test_a_run_that_does_not_tell_how_it_was_made_is_refused(planned: Path, tmp_path: Path, key: str) -> None:
     shutil.copytree(planned, tmp_path / "old")
-    meta = runs.read_meta(planned)
+    meta = run_folder.read_meta(planned)
     del meta[key]
     (tmp_path / "old" / "run.json").write_text(json.dumps(meta))
     with pytest.raises(LogError, match=rf"old: its run\.json lacks {key}, .*; give the log itself"):

@@ -9,7 +9,9 @@ from typing import Any
 
 import pytest
 
-from hrcreplay import ingest, replay, runs
+from hrcreplay.cli import log_commands
+from hrcreplay.run import replay
+from hrcreplay.store import run_folder
 from tests.realdata import data_path
 
 TASK = """
@@ -73,7 +75,7 @@ IMPORTS: dict[str, tuple[str, dict[str, str], dict[str, Any]]] = {
 
 def _check(folder: Path, seconds: float) -> dict[str, Any]:
     """What every report must hold; returns its metrics."""
-    run = runs.read(folder)
+    run = run_folder.read(folder)
     assert run.motion is not None
     assert run.occupancy is not None
     assert run.meta["complete"] is True
@@ -95,9 +97,9 @@ def test_an_imported_recording_from_import_to_page(tmp_path: Path, name: str) ->
     paths = [
         f"{camera}={data_path(file)}" if kind != "keraal" else str(data_path(file)) for camera, file in files.items()
     ]
-    ingest.import_files(kind, paths, log, 30.0)
+    log_commands.import_files(kind, paths, log, 30.0)
     place = {"reference": None, "up": None, "height_m": None, "base": "1.0,0,0.65,0", **options}
-    ingest.calibrate(log, cell, None, (), **place)
+    log_commands.calibrate(log, cell, None, (), **place)
     folder = replay.run(
         "report", log, out=tmp_path / "run", cell_file=cell, end_s=4.0, overrides=(f"plan.task={task}",)
     )
@@ -126,4 +128,4 @@ def test_a_bag_with_a_message_type_of_its_own_to_page(tmp_path: Path, name: str)
     metrics = _check(folder, 6.0)
     assert metrics["camera_mocap_rate_hz"]["value"] == pytest.approx(60.0, rel=0.02)
     assert metrics["count_frames_header_stamp_zero"]["value"] > 300
-    assert any("header stamps are zero" in note for note in runs.read(folder).notes)
+    assert any("header stamps are zero" in note for note in run_folder.read(folder).notes)

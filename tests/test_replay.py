@@ -11,17 +11,18 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from hrcreplay import pipeline, replay, runs
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, SweptVolumes
+from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.obstacles import obstacles
-from hrcreplay.robot.paths import programmed
-from hrcreplay.robot.stepping import RobotState
-from hrcreplay.robot.task import parse_task
-from hrcreplay.runs import Run
+from hrcreplay.robot.programme.path import programmed
+from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.run import replay, stages
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import Run
 from tests.robot import checker
 from tests.robot.swinging import asked, dense
 
@@ -32,7 +33,7 @@ def _short(command: str, source: Path, out: Path, **options: Any) -> Path:
 
 
 def _meta(folder: Path) -> dict[str, Any]:
-    return runs.read_meta(folder)
+    return run_folder.read_meta(folder)
 
 
 def test_a_run_leaves_what_the_contract_says(demo_folder: Path, demo: Run) -> None:
@@ -55,7 +56,7 @@ def test_a_run_leaves_what_the_contract_says(demo_folder: Path, demo: Run) -> No
     meta = demo.meta
     assert meta["complete"] is True
     assert np.array(meta["T_world_base"]).shape == (4, 4)
-    assert meta["inputs"][0]["sha256"] == runs.sha256(replay.demo_log())
+    assert meta["inputs"][0]["sha256"] == run_folder.sha256(replay.demo_log())
     made = {p.relative_to(demo_folder).as_posix() for p in demo_folder.rglob("*") if p.is_file()}
     assert set(meta["outputs"]) == made - {"run.json", "timing.json"}
 
@@ -67,12 +68,12 @@ def test_ticks_are_the_filters_rate(demo: Run) -> None:
 
 
 def test_a_span_of_more_than_a_day_is_refused() -> None:
-    day_ns = 24 * 3600 * pipeline.NS
-    assert len(pipeline.tick_times(5, day_ns + 5, 0.01)) == 865
+    day_ns = 24 * 3600 * stages.NS
+    assert len(stages.tick_times(5, day_ns + 5, 0.01)) == 865
     with pytest.raises(
         LogError, match=r"arrivals: the log goes on for 36 h .*at most 24 h, as a span with --start and"
     ):
-        pipeline.tick_times(5, 3 * day_ns // 2, 0.01)
+        stages.tick_times(5, 3 * day_ns // 2, 0.01)
 
 
 def test_fusion_meets_its_bars_on_the_demo(demo_folder: Path, demo: Run) -> None:
@@ -173,7 +174,7 @@ def test_a_stage_takes_over_an_earlier_run_or_says_why_not(tmp_path: Path, capsy
 
 def test_smooth_comes_nearer_to_the_truth_than_the_filter(tmp_path: Path) -> None:
     folder = _short("fuse", replay.demo_log(), tmp_path / "s", smooth=True)
-    run = runs.read(folder)
+    run = run_folder.read(folder)
     assert run.truth is not None
     assert run.state is not None
     smooth = pq.read_table(folder / "smooth.parquet").to_pandas()
@@ -214,8 +215,8 @@ def test_a_tick_uses_no_frame_that_was_still_on_the_wire(tmp_path: Path) -> None
     """Cutting the log right after a tick changes nothing of what the ticks before knew."""
     log = open_log(replay.demo_log())
     assert log.header.end_ns - log.header.start_ns == 60_000_000_000
-    short = runs.read(replay.run("fuse", replay.demo_log(), out=tmp_path / "short", end_s=3.0))
-    longer = runs.read(replay.run("fuse", replay.demo_log(), out=tmp_path / "longer", end_s=4.0))
+    short = run_folder.read(replay.run("fuse", replay.demo_log(), out=tmp_path / "short", end_s=3.0))
+    longer = run_folder.read(replay.run("fuse", replay.demo_log(), out=tmp_path / "longer", end_s=4.0))
     assert short.state is not None
     assert longer.state is not None
     assert short.state.equals(longer.state.iloc[: len(short.state)])

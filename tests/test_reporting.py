@@ -6,26 +6,29 @@ import re
 
 import pytest
 
-from hrcreplay import replay, reporting, runs
-from hrcreplay.human.margins import Margins
-from hrcreplay.human.occupancy import Radii
+from hrcreplay.human.prediction.sound_reach import Margins
+from hrcreplay.human.prediction.swept_volumes import Radii
 from hrcreplay.limits import load_limits
-from hrcreplay.pipeline import Foresight
 from hrcreplay.records import LIMBS
-from hrcreplay.runs import Run
+from hrcreplay.run import replay, report
+from hrcreplay.run.stages import Foresight
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import Run
 
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Run:
     out = tmp_path_factory.mktemp("sound") / "run"
     overrides = ("occupancy.method=sound", "occupancy.store_hz=5")
-    return runs.read(replay.run("report", replay.demo_log(), out=out, overrides=overrides, start_s=8.0, end_s=12.0))
+    return run_folder.read(
+        replay.run("report", replay.demo_log(), out=out, overrides=overrides, start_s=8.0, end_s=12.0)
+    )
 
 
 def test_the_figure_of_volumes_holds_the_runs_own_method(sound: Run) -> None:
     radii = Radii(head=0.12, thorax=0.15, upper_arm=0.07, lower_arm=0.07)
     foresight = Foresight(load_limits("paper"), 0.377, radii, Margins(), "sound")
-    (_, methods), *others = reporting._instants(foresight, sound)
+    (_, methods), *others = report._instants(foresight, sound)
     assert len(others) == 3
     assert list(methods) == ["paper", "positions", "sound"]
     assert list(methods["paper"]) == list(LIMBS)

@@ -12,16 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay import replay, reuse, runs, wiring
-from hrcreplay.cell import Cell, pose_from_position
-from hrcreplay.config import Settings
+from hrcreplay.calibration.cell import Cell, pose_from_position
 from hrcreplay.errors import SettingsError
-from hrcreplay.job import STAGES, Job, resolve
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.pipeline import tick_times
-from hrcreplay.wiring import log_options
+from hrcreplay.run import build, replay
+from hrcreplay.run import replay as reuse
+from hrcreplay.run.build import log_options
+from hrcreplay.run.job import STAGES, Job, resolve
+from hrcreplay.run.stages import tick_times
+from hrcreplay.settings.load import Settings
+from hrcreplay.store import run_folder
 from tests.robot.test_model import ONE_AXIS
 
 ALL = "fuse predict plan"
@@ -180,7 +182,7 @@ def _ticks(job: Job, log: Any) -> Any:
 
 
 def _stages(job: Job, log: Any) -> dict[str, str]:
-    return reuse.stages(job, reuse.parts(job, log, _ticks(job, log)))
+    return reuse.stage_digests(job, reuse.dependencies(job, log, _ticks(job, log)))
 
 
 def _stale(a: tuple[Job, Any], b: tuple[Job, Any]) -> str:
@@ -207,14 +209,14 @@ def test_a_setting_makes_the_stages_stale_that_depend_on_it(
 
 def _handed(job: Job, log: Log) -> dict[str, str]:
     """What the first two stages are handed, however it came about, and how the third weighs."""
-    eyes, foresight = asdict(wiring.eyes(job, log)), asdict(wiring.foresight(job))
+    eyes, foresight = asdict(build.eyes(job, log)), asdict(build.foresight(job))
     for limits in (eyes["limits"], foresight["limits"]):
         del limits["name"]
     reading = asdict(log_options(job.settings))
     del reading["joints_topic"]
     first = repr((eyes, reading, _ticks(job, log).tolist()))
     second = repr((foresight, replay._store_every(job)))
-    return {"fuse": first, "predict": second, "plan": repr(wiring.plan_settings(job, 0.004))}
+    return {"fuse": first, "predict": second, "plan": repr(build.plan_settings(job, 0.004))}
 
 
 @pytest.mark.parametrize("name", STALE)
@@ -273,7 +275,7 @@ def test_log_span_task_and_versions_count(log: Log, tmp_path: Path, monkeypatch:
     assert _stale((plain, log), (replace(plain, task=log.header.task), log)) == ""
     assert _stale((plain, log), (replace(plain, task={"waypoints": []}), log)) == "plan"
     before = _stages(plain, log)
-    monkeypatch.setattr("hrcreplay.reuse.versions", lambda: {"hrcreplay": "9"})
+    monkeypatch.setattr("hrcreplay.run.replay.versions", lambda: {"hrcreplay": "9"})
     assert all(_stages(plain, log)[stage] != before[stage] for stage in STAGES)
 
 
@@ -291,7 +293,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _same(a: Path, b: Path) -> bool:
-    mine, theirs = runs.read_meta(a), runs.read_meta(b)
+    mine, theirs = run_folder.read_meta(a), run_folder.read_meta(b)
     return all(mine[key] == theirs[key] for key in mine if key != "created")
 
 
@@ -310,7 +312,7 @@ def test_another_base_takes_over_the_person_and_comes_out_like_a_fresh_run(
     assert "is T_world_base right?" in said[-1], "the robot stands among the person's limbs there"
     fresh = replay.run("report", replay.demo_log(), out=tmp_path / "fresh", cell_file=cell, start_s=9.0, end_s=9.6)
     assert _same(moved, fresh)
-    mine, theirs = runs.read_meta(moved)["outputs"], runs.read_meta(reported)["outputs"]
+    mine, theirs = run_folder.read_meta(moved)["outputs"], run_folder.read_meta(reported)["outputs"]
     assert mine["motion.parquet"] != theirs["motion.parquet"]
     assert all(mine[name] == theirs[name] for name in ("measurements.parquet", "state.parquet", "occupancy.parquet"))
 
@@ -352,7 +354,7 @@ def test_what_each_stage_found_in_the_log_stays_with_it(log: Log, tmp_path: Path
     """The joint track's flaws are the plan's: a task file in its place leaves them behind, and only them."""
     path = _with_joints(tmp_path / "log.mcap", log)
     joints = replay.run("plan", path, out=tmp_path / "joints")
-    counts = runs.read_meta(joints)["counts"]
+    counts = run_folder.read_meta(joints)["counts"]
     assert counts["joints_out_of_order"] == 2
     task = tmp_path / "task.toml"
     task.write_text(
@@ -361,8 +363,8 @@ def test_what_each_stage_found_in_the_log_stays_with_it(log: Log, tmp_path: Path
     with_task = replay.run("plan", joints, out=tmp_path / "task", overrides=(f"plan.task={task}",))
     fresh = replay.run("plan", path, out=tmp_path / "fresh", overrides=(f"plan.task={task}",))
     assert _same(with_task, fresh)
-    assert "joints_out_of_order" not in runs.read_meta(fresh)["counts"]
+    assert "joints_out_of_order" not in run_folder.read_meta(fresh)["counts"]
     fused = replay.run("fuse", path, out=tmp_path / "fused")
-    assert "joints_out_of_order" not in runs.read_meta(fused)["counts"]
+    assert "joints_out_of_order" not in run_folder.read_meta(fused)["counts"]
     again = replay.run("plan", fused, out=tmp_path / "again")
     assert _same(again, joints)

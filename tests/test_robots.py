@@ -8,17 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay import replay, runs
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.robot import irb140
+from hrcreplay.run import replay
+from hrcreplay.store import run_folder
 
 AXES = [f"q{i}" for i in range(1, 7)]
 
 
-def _plan(log: Path, out: Path, *overrides: str) -> runs.Run:
-    return runs.read(replay.run("plan", log, out=out, start_s=8.0, end_s=10.0, overrides=overrides))
+def _plan(log: Path, out: Path, *overrides: str) -> run_folder.Run:
+    return run_folder.read(replay.run("plan", log, out=out, start_s=8.0, end_s=10.0, overrides=overrides))
 
 
 #: The prediction with which the robot moves most.
@@ -68,7 +69,7 @@ def test_a_recorded_joint_track_is_the_programme_where_there_is_no_task(tmp_path
     q = rest + np.outer(0.2 * np.sin(1.5 * (t_s - 8.0)), swing)
     names = [f"joint_{i}" for i in range(1, 7)]
     log = _without_task(tmp_path / "track.mcap", names=names, t_ns=np.round(t_s * 1e9).astype(np.int64), q=q)
-    run = runs.read(replay.run("plan", log, out=tmp_path / "run", overrides=("plan.method=scaling", *PRINTED)))
+    run = run_folder.read(replay.run("plan", log, out=tmp_path / "run", overrides=("plan.method=scaling", *PRINTED)))
     assert run.motion is not None
     t_ns = run.motion["t_ns"].to_numpy()
     expected = np.column_stack([np.interp(run.motion["programme_s"] + 8.0, t_s, column) for column in q.T])

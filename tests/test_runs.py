@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay import runs
 from hrcreplay.errors import SettingsError
+from hrcreplay.store import run_folder
 
 
 def _columns(first: int, last: int) -> dict[str, np.ndarray]:
@@ -20,7 +20,7 @@ def _columns(first: int, last: int) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("size", [1, 250, 5000, 10_000])
 def test_table_bytes_do_not_depend_on_the_size_of_the_chunks(tmp_path: Path, size: int) -> None:
     def write(name: str, step: int) -> bytes:
-        writer = runs.TableWriter(tmp_path / name)
+        writer = run_folder.TableWriter(tmp_path / name)
         for first in range(0, 10_000, step):
             writer.write(_columns(first, min(first + step, 10_000)))
         writer.close()
@@ -31,7 +31,7 @@ def test_table_bytes_do_not_depend_on_the_size_of_the_chunks(tmp_path: Path, siz
 
 def test_every_nan_is_written_alike(tmp_path: Path) -> None:
     for name, nan in (("a", np.nan), ("b", -np.nan)):
-        writer = runs.TableWriter(tmp_path / name)
+        writer = run_folder.TableWriter(tmp_path / name)
         writer.write({"x": np.array([1.0, nan, 2.0])})
         writer.close()
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
@@ -41,30 +41,30 @@ def test_digest_is_that_of_the_system_tool(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"abc" * 100_000)
     expected = subprocess.run(["sha256sum", str(path)], capture_output=True, text=True, check=True).stdout.split()[0]
-    assert runs.sha256(path) == expected
+    assert run_folder.sha256(path) == expected
 
 
 def test_a_run_appears_whole(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "run"
-    with runs.RunWriter(folder) as run:
+    with run_folder.RunWriter(folder) as run:
         run.table("state", _columns(0, 10))
         run.text("figures/a.svg", "<svg/>")
         assert not folder.exists()
         assert json.loads((run.partial / "run.json").read_text())["complete"] is False
         run.finish({"command": "fuse"})
-    meta = runs.read_meta(folder)
+    meta = run_folder.read_meta(folder)
     assert meta["complete"] is True
     assert sorted(meta["outputs"]) == ["figures/a.svg", "state.parquet"]
     for name, digest in meta["outputs"].items():
         assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
-    read = runs.read(folder)
+    read = run_folder.read(folder)
     assert read.state is not None
     np.testing.assert_array_equal(read.state["x"], _columns(0, 10)["x"])
     assert read.motion is None
 
 
 def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), runs.RunWriter(tmp_path / "run") as run:
+    with pytest.raises(ZeroDivisionError), run_folder.RunWriter(tmp_path / "run") as run:
         run.table("state", _columns(0, 10))
         _ = 1 / 0
     assert list(tmp_path.iterdir()) == []
@@ -74,21 +74,21 @@ def test_an_existing_folder_is_refused_untouched(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "mine").write_text("precious")
     with pytest.raises(SettingsError, match=r"run: exists already; name another folder with --out"):
-        runs.RunWriter(tmp_path / "run").__enter__()
+        run_folder.RunWriter(tmp_path / "run").__enter__()
     assert (tmp_path / "run" / "mine").read_text() == "precious"
 
 
 def test_a_run_that_is_under_way_is_not_read_and_not_overwritten(tmp_path: Path) -> None:
-    with runs.RunWriter(tmp_path / "run") as run:
+    with run_folder.RunWriter(tmp_path / "run") as run:
         with pytest.raises(SettingsError, match="did not end"):
-            runs.read_meta(run.partial)
+            run_folder.read_meta(run.partial)
         with pytest.raises(SettingsError, match="under way or was killed"):
-            runs.RunWriter(tmp_path / "run").__enter__()
+            run_folder.RunWriter(tmp_path / "run").__enter__()
 
 
 def test_stopwatch_spreads_a_call_over_its_ticks() -> None:
     now = iter([0, 10_000_000, 20_000_000, 50_000_000])
-    watch = runs.Stopwatch(lambda: next(now))
+    watch = run_folder.Stopwatch(lambda: next(now))
     for ticks in (10, 1):
         with watch.stage("fuse", ticks):
             pass

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from hrcreplay import replay
+from hrcreplay.run import replay
 
 PLACES = [(0.30, 0.25), (0.30, 0.10), (0.30, 0.25), (-0.30, 0.25), (-0.30, 0.10), (-0.30, 0.25)]
 

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.config import load_settings
 from hrcreplay.errors import SettingsError
-from hrcreplay.job import Job, unlogged, urdf_digest
-from hrcreplay.live.setup import live_job, start_table
-from hrcreplay.report.robot_summary import remarks, robot_table, summary
+from hrcreplay.live.control.setup import live_job, start_table
+from hrcreplay.report.tables import remarks, robot_table, summary
 from hrcreplay.robot.model import from_urdf
-from hrcreplay.urdf_files import read_urdf
-from hrcreplay.wiring import robot as robot_of
+from hrcreplay.run.build import robot as robot_of
+from hrcreplay.run.job import Job, read_urdf, unlogged, urdf_digest
+from hrcreplay.settings.load import load_settings
 from tests.live.flights import DEMO
 from tests.robot.test_model import joint, link, robot_xml
 

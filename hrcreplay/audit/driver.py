@@ -11,19 +11,28 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from hrcreplay import runs, wiring
-from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, methods
+from hrcreplay.audit import page
+from hrcreplay.audit.bootstrap import DRAWS, LEVEL, Resampling, block_ticks, resample
+from hrcreplay.audit.figures import draw_all
+from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, methods, standstill_s, travel
+from hrcreplay.audit.metrics import (
+    checked_scope,
+    curve_point,
+    escapes,
+    flat,
+    joint_figures,
+    method_figures,
+    unchecked_notes,
+)
 from hrcreplay.audit.recording import TRUTH
-from hrcreplay.audit.window import standstill_s, travel
 from hrcreplay.errors import SettingsError
-from hrcreplay.human import reach
-from hrcreplay.job import Job, resolve
-from hrcreplay.progress import say
+from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.records import LIMBS
-from hrcreplay.report import audit_checked, audit_page, figures_audit
-from hrcreplay.report.audit_metrics import curve_point, escapes, flat, joint_figures, method_figures
-from hrcreplay.report.coverage import DRAWS, LEVEL, Resampling, block_ticks, resample
-from hrcreplay.runs import RunWriter, Stopwatch
+from hrcreplay.run import build
+from hrcreplay.run.job import Job, resolve
+from hrcreplay.run.stages import say
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 #: Columns of escapes.parquet.
 _ESCAPES = pa.schema(
@@ -78,13 +87,13 @@ def run(
                 say(f"{log['log']}: {note}")
         _write_escapes(found, writer)
         writer.close_tables()
-        writer.text("audit.json", runs.to_json(found))
+        writer.text("audit.json", run_folder.to_json(found))
         meta = _meta(jobs, began)
         folder = writer.partial / "figures"
-        figures_audit.draw_all(found, folder)
+        draw_all(found, folder)
         metrics = flat(found)
-        writer.text("metrics.json", runs.to_json(metrics))
-        writer.text("report.html", audit_page.render(found, metrics, meta, folder))
+        writer.text("metrics.json", run_folder.to_json(metrics))
+        writer.text("report.html", page.render(found, metrics, meta, folder))
         writer.timing.update(watch.summary(1.0 / AUDIT_HZ))
         writer.finish(meta)
         for line in _summary(found):
@@ -99,7 +108,7 @@ def _summary(found: dict[str, Any]) -> list[str]:
         whole = log["methods"][method]["all"]
         share, room, deepest = whole["covered_share"], whole["union_m3"]["value"], whole["escape_max_m"]
         words = f"audit: {log['log']}: {method}, {log['limits']}: every limb that was checked "
-        words += f"({audit_checked.scope(log, method)}) inside in {100.0 * share['value']:.1f} % of "
+        words += f"({checked_scope(log, method)}) inside in {100.0 * share['value']:.1f} % of "
         words += f"{share['samples']:,} ticks"
         words += "" if room is None else f"; union {room:.1f} m3"
         lines.append(words + ("" if deepest is None else f"; deepest escape {1e3 * deepest:.0f} mm"))
@@ -108,7 +117,7 @@ def _summary(found: dict[str, Any]) -> list[str]:
 
 def _alike(jobs: Sequence[Job]) -> None:
     """Refuses logs whose ticks cannot be counted together."""
-    foresights = [wiring.foresight(job) for job in jobs]
+    foresights = [build.foresight(job) for job in jobs]
     for what, values in (
         ("occupancy.stop_s and latency_s", [standstill_s(one) for one in foresights]),
         ("occupancy.method", [one.method for one in foresights]),
@@ -125,7 +134,7 @@ def _alike(jobs: Sequence[Job]) -> None:
 
 def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
     """All that audit.json holds."""
-    foresight = wiring.foresight(audits[0].job)
+    foresight = build.foresight(audits[0].job)
     horizon_s = standstill_s(foresight)
     lengths = [len(audit.outcomes[methods()[0]]) for audit in audits]
     block = block_ticks(horizon_s, AUDIT_HZ, max(lengths))
@@ -151,13 +160,13 @@ def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
                 "escapes": {method: escapes(outcome, start_ns) for method, outcome in audit.outcomes.items()},
             }
         )
-        logs[-1]["notes"] = [*audit.notes, *audit_checked.notes(logs[-1], foresight.method)]
+        logs[-1]["notes"] = [*audit.notes, *unchecked_notes(logs[-1], foresight.method)]
     return {
         "horizon_s": horizon_s,
         "audit_hz": AUDIT_HZ,
         "interval": {"level": LEVEL, "block_ticks": block, "draws": DRAWS, "seed": SEED},
         "method": foresight.method,
-        "own_methods": list(reach.METHODS),
+        "own_methods": list(reachable_sets.METHODS),
         "logs": logs,
         "total": {
             "ticks": sum(lengths),
@@ -173,7 +182,7 @@ def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
 
 
 def _methods(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
-    radii = wiring.foresight(audits[0].job).radii
+    radii = build.foresight(audits[0].job).radii
     body = dict(zip(LIMBS, radii.of_limbs().tolist(), strict=True))
     return {method: method_figures([audit.outcomes[method] for audit in audits], drawn, body) for method in methods()}
 
@@ -182,12 +191,12 @@ def _joints(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
     went = np.max([travel(audit.recording.joints) for audit in audits], axis=0)
     return {
         method: joint_figures(np.concatenate([audit.joints[method] for audit in audits]), went, drawn)
-        for method in reach.METHODS
+        for method in reachable_sets.METHODS
     }
 
 
 def _curves(audits: Sequence[LogAudit]) -> dict[str, Any]:
-    horizon_s = standstill_s(wiring.foresight(audits[0].job))
+    horizon_s = standstill_s(build.foresight(audits[0].job))
 
     def point(method: str, factor: float) -> dict[str, Any]:
         outcomes = [audit.curve[method][factor] for audit in audits]
@@ -196,7 +205,7 @@ def _curves(audits: Sequence[LogAudit]) -> dict[str, Any]:
         block = block_ticks(horizon_s, rate_hz, max(lengths))
         return {"factor": factor, **curve_point(outcomes, resample(lengths, block, horizon_s * rate_hz, SEED))}
 
-    return {method: [point(method, factor) for factor in factors(method)] for method in reach.METHODS}
+    return {method: [point(method, factor) for factor in factors(method)] for method in reachable_sets.METHODS}
 
 
 def _write_rows(audit: LogAudit, writer: RunWriter) -> None:

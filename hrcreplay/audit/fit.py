@@ -1,4 +1,9 @@
-"""``fit-limits``: from logs of people to the limit set that holds them."""
+"""``fit-limits``: from logs of people to the limit set that holds them.
+
+What ``fit-limits`` tells the user, line by line.
+
+Fitted accelerations scaled until the volumes, not the joints, hold the people of the logs as often as was asked.
+"""
 
 from __future__ import annotations
 
@@ -9,24 +14,137 @@ from typing import Any
 
 import numpy as np
 
-from hrcreplay import __version__, wiring
-from hrcreplay.audit import tightening
-from hrcreplay.audit.fit_words import lines
+from hrcreplay import __version__
+from hrcreplay.audit import fit_limits
+from hrcreplay.audit.bootstrap import Estimate, block_ticks, resample
+from hrcreplay.audit.fit_limits import Fit, Futures, ballistic
+from hrcreplay.audit.log_audit import Window, hold, standstill_s, window
 from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, record
-from hrcreplay.audit.window import standstill_s, window
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.human import fitting
-from hrcreplay.human.ballistic import ballistic
-from hrcreplay.human.fitting import Fit, Futures
 from hrcreplay.human.model import LimitSet
-from hrcreplay.job import Job, resolve
 from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
-from hrcreplay.pipeline import NS, tick_times
-from hrcreplay.progress import Bar
-from hrcreplay.records import JOINTS, LIMBS, Floats
-from hrcreplay.report.coverage import Estimate, block_ticks, resample
-from hrcreplay.wiring import log_options
+from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
+from hrcreplay.run import build
+from hrcreplay.run.build import log_options
+from hrcreplay.run.job import Job, resolve
+from hrcreplay.run.stages import NS, Bar, Foresight, tick_times
+
+
+def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) -> list[str]:
+    """What the user should know of a fit.
+
+    Args:
+        found: The fit.
+        limits: The limit set made of it.
+        facts: Its provenance.
+        standard: Limit set whose positions are taken where nobody was outside of them.
+    """
+    told = [
+        f"{joint}: velocity {limits.v_min[j]:g} to {limits.v_max[j]:g}, acceleration {limits.a_min[j]:g} to "
+        f"{limits.a_max[j]:g}; held back {_text(facts['joints'][joint]['held_back'])}"
+        for j, joint in enumerate(JOINTS)
+        if not found.kept[j]
+    ]
+    if facts["kept"]:
+        told.append(
+            f"too little motion to say (fewer than {fit_limits.EXCURSIONS} horizons with motion), so the bounds of "
+            f"{facts['kept_from']} stay: {', '.join(facts['kept'])}"
+        )
+    if len(facts["kept"]) == len(JOINTS):
+        told.append(f"no joint was fitted: these are the rates of {facts['kept_from']} under another name")
+    if "and" in facts["positions"]:
+        told.append(f"recorded postures leave the positions of {standard}: written are {facts['positions']}")
+    for log in facts["logs"]:
+        left_out = f"; fitted to the other logs {_text(log['left_out'])}" if "left_out" in log else ""
+        told.append(f"{log['name']}: training {_text(log['training'])}; held back {_text(log['held_back'])}{left_out}")
+    total = facts["total"]
+    told.append(f"all joints: training {_text(total['training'])}; held back {_text(total['held_back'])}")
+    if "limbs" in facts:
+        if facts["not_checked"]:
+            told.append(f"not checked, so nothing is said of it: {', '.join(facts['not_checked'])}")
+        legs = "LEGS included" if "LEGS" not in facts["not_checked"] else "not LEGS"
+        training, held_back = (_text(facts["limbs"][part]) for part in ("training", "held_back"))
+        what = f"every limb that was checked ({legs}) in its volume of {facts['method']}"
+        told.append(f"{what}: training {training}; held back {held_back}")
+    told[-1] = f"fit-limits: {limits.name}: {told[-1]}"
+    return told
+
+
+def _text(share: dict[str, Any]) -> str:
+    if "share" not in share:
+        return "unknown"
+    numbers = f"{100.0 * share['share']:.1f} %"
+    if "low" in share:
+        numbers += f" ({100.0 * share['low']:.1f} to {100.0 * share['high']:.1f} %)"
+    return f"{numbers} of {share['ticks']} ticks"
+
+
+#: Ticks a second whose volumes are held against the recorded future [Hz].
+TIGHTEN_HZ = 12.5
+#: Share of the ticks of each side of a joint that its acceleration holds before all are scaled.
+BEFORE = 0.9
+#: The smallest factor tried: minutes of a few people do not show all that they do. How often its interval is halved.
+_SMALLEST, _HALVINGS = 0.6, 4
+
+
+@dataclass(frozen=True)
+class Held:
+    """One log's person in parts: to fit on, and held back."""
+
+    foresight: Foresight
+    training: Window
+    held_back: Window
+
+
+def unchecked(people: Sequence[Held]) -> list[str]:
+    """Limbs, and points of other limbs, that were never seen to a horizon's end, so that nothing is said of them."""
+    parts = [part for one in people for part in (one.training, one.held_back)]
+    volumes = people[0].foresight.volumes(parts[0].states.rows(slice(0, 0))).limbs
+    limbs = [limb for limb in BODY if limb not in volumes or not any(part.checked(limb).any() for part in parts)]
+    points = [
+        f"{point} of {limb}"
+        for limb, names in parts[0].points().items()
+        if limb not in limbs
+        for point in names
+        if not any(part.points()[limb][point] for part in parts)
+    ]
+    return limbs + points
+
+
+def stayed(foresight: Foresight, future: Window, limits: LimitSet) -> Floats:
+    """(n,) whether all limbs that were seen stayed in their volumes until the horizon: 1, 0, or NaN where none was."""
+    volumes = replace(foresight, limits=limits).volumes(future.states)
+    worst = hold(volumes, future, np.zeros(len(future.states), dtype=bool)).worst_m()
+    return np.where(np.isfinite(worst), (worst == 0.0).astype(float), np.nan)
+
+
+def tightening_factor(people: Sequence[Held], found: Fit, positions: LimitSet, share: float) -> float:
+    """The smallest factor on the fitted accelerations with which the volumes hold a share of the training ticks.
+
+    Half of the ticks that may be missed are kept in reserve, for other ticks than those fitted on. Ticks that even the
+    fitted accelerations do not hold, for what no bound can mend (a limb that is not where the model has it, a joint
+    that keeps the standard bounds), do not count: they would drive the bounds of all others up.
+    """
+
+    def held(scale: float) -> Bools:
+        limits = scaled(found, scale).onto(positions, positions.name)
+        return np.concatenate([stayed(one.foresight, one.training, limits) == 1.0 for one in people])
+
+    best = held(1.0)
+    low, high = _SMALLEST, 1.0
+    for _ in range(_HALVINGS):
+        middle = float(np.sqrt(low * high))
+        enough = (held(middle) & best).sum() >= 0.5 * (1.0 + share) * best.sum()
+        low, high = (low, middle) if enough else (middle, high)
+    return high
+
+
+def scaled(found: Fit, scale: float) -> Fit:
+    """The fit with its own accelerations scaled; joints that keep the standard bounds keep them."""
+    by = np.where(found.kept, 1.0, scale)
+    return replace(found, a_min=by * found.a_min, a_max=by * found.a_max)
+
 
 #: Ticks a second that are fitted to [Hz]; what no camera has seen for longer is no evidence [s]; of the bootstrap.
 FIT_HZ, SEEN_S, SEED = 25.0, 0.25, 3
@@ -46,7 +164,7 @@ class Sample:
     training: Futures
     held_back: Futures
     outside: bool  #: whether a training posture is outside the standard positions
-    limbs: tightening.Held
+    limbs: Held
 
 
 def run(
@@ -97,7 +215,7 @@ def run(
     limbs: dict[str, Any] = {}
     if cover == "limbs":
         training = Futures.join([sample.training for sample in samples])
-        found = ballistic(training, load_limits(KEPT), tightening.BEFORE, horizon_s)
+        found = ballistic(training, load_limits(KEPT), BEFORE, horizon_s)
         found, limbs = _tightened([sample.limbs for sample in samples], found, limits, coverage, horizon_s)
         limits = found.onto(limits, out.stem)
     facts = _facts(samples, found, limits, coverage, horizon_s, held_back) | {"covers": cover} | limbs
@@ -124,7 +242,7 @@ def _refuse(logs: Sequence[Path], out: Path, coverage: float, held_back: float, 
 
 
 def _horizon_s(jobs: Sequence[Job]) -> float:
-    horizons = {wiring.foresight(job).horizon_s for job in jobs}
+    horizons = {build.foresight(job).horizon_s for job in jobs}
     if len(horizons) > 1:
         raise SettingsError(f"occupancy.stop_s: found {sorted(horizons)} s; all logs need one horizon, set it")
     return horizons.pop()
@@ -145,13 +263,13 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
     ticks_ns = tick_times(begin_ns, end_ns, rate_hz)
     stage = f"reading {job.log.name}"
     with Bar(stage, len(ticks_ns)) as bar:
-        recording = record(log, ticks_ns, wiring.eyes(job, log), lambda n: bar.advance(stage, n))
+        recording = record(log, ticks_ns, build.eyes(job, log), lambda n: bar.advance(stage, n))
     states, joints = recording.states, recording.joints
     if recording.source != TRUTH:
-        joints = fitting.believed(joints, states.unseen_s, SEEN_S)
+        joints = fit_limits.believed(joints, states.unseen_s, SEEN_S)
     every = max(1, round(rate_hz / FIT_HZ))
     ticks = np.arange(0, len(states), every)
-    some = fitting.futures(
+    some = fit_limits.futures(
         states,
         ticks[np.isfinite(states.p[ticks]).all(axis=1)],
         recording.joints_t_ns,
@@ -166,42 +284,42 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
         TRUTH if recording.source == TRUTH else SMOOTHED,
         some.rows(some.t_ns + round(horizon_s * NS) <= cut_ns),
         some.rows(some.t_ns > cut_ns),
-        bool(fitting.leave(training.p, load_limits(STANDARD)).any()),
+        bool(fit_limits.leave(training.p, load_limits(STANDARD)).any()),
         _limbs(job, recording, cut_ns),
     )
 
 
-def _limbs(job: Job, recording: Recording, cut_ns: int) -> tightening.Held:
-    foresight, states = wiring.foresight(job), recording.states
+def _limbs(job: Job, recording: Recording, cut_ns: int) -> Held:
+    foresight, states = build.foresight(job), recording.states
     horizon_s = standstill_s(foresight)
     horizon_ns = round(horizon_s * NS)
-    ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / tightening.TIGHTEN_HZ)))
+    ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / TIGHTEN_HZ)))
     ticks = ticks[np.isfinite(states.residual_m[ticks, : len(LIMBS)]).all(axis=1)]  # the filter has found the person
     end_ns = states.t_ns[ticks] + horizon_ns
     parts = ticks[end_ns <= cut_ns], ticks[(states.t_ns[ticks] > cut_ns) & (end_ns <= recording.t_ns[-1])]
-    return tightening.Held(foresight, *(window(recording, part, horizon_s) for part in parts))
+    return Held(foresight, *(window(recording, part, horizon_s) for part in parts))
 
 
 def _tightened(
-    people: Sequence[tightening.Held], found: Fit, limits: LimitSet, coverage: float, horizon_s: float
+    people: Sequence[Held], found: Fit, limits: LimitSet, coverage: float, horizon_s: float
 ) -> tuple[Fit, dict[str, Any]]:
     """The fit with the accelerations that hold the limbs, and what it holds of all logs together and of each."""
-    factor = tightening.factor(people, found, limits, coverage)
-    found = tightening.scaled(found, factor)
+    factor = tightening_factor(people, found, limits, coverage)
+    found = scaled(found, factor)
     limits = found.onto(limits, limits.name)
     shares: dict[str, Any] = {}
     for name in ("training", "held_back"):
-        parts = [tightening.stayed(one.foresight, getattr(one, name), limits)[:, None] for one in people]
-        shares[name] = _plain(_share(parts, horizon_s, tightening.TIGHTEN_HZ))
-        shares[f"{name}_by_log"] = [_plain(_share([part], horizon_s, tightening.TIGHTEN_HZ)) for part in parts]
-    method, gaps = people[0].foresight.method, tightening.unchecked(people)
+        parts = [stayed(one.foresight, getattr(one, name), limits)[:, None] for one in people]
+        shares[name] = _plain(_share(parts, horizon_s, TIGHTEN_HZ))
+        shares[f"{name}_by_log"] = [_plain(_share([part], horizon_s, TIGHTEN_HZ)) for part in parts]
+    method, gaps = people[0].foresight.method, unchecked(people)
     return found, {"factor": round(factor, 4), "method": method, "not_checked": gaps, "limbs": shares}
 
 
 def _fit(samples: Sequence[Sample], coverage: float, horizon_s: float) -> Fit:
     training = Futures.join([sample.training for sample in samples])
     try:
-        return fitting.fit(training, load_limits(KEPT), coverage, horizon_s)
+        return fit_limits.fit(training, load_limits(KEPT), coverage, horizon_s)
     except LogError as error:
         raise LogError(f"{', '.join(sample.name for sample in samples)}: {error}") from error
 
@@ -217,7 +335,7 @@ def _limits(found: Fit, samples: Sequence[Sample], name: str) -> LimitSet:
 
 def _share(within: Sequence[Floats], horizon_s: float, rate_hz: float = FIT_HZ) -> Estimate:
     """Share of the ticks of some logs in which all joints stayed inside, with its interval."""
-    hits = [fitting.together(part) for part in within]
+    hits = [fit_limits.together(part) for part in within]
     lengths = [len(part) for part in hits]
     drawn = resample(lengths, block_ticks(horizon_s, rate_hz, max(lengths)), horizon_s * rate_hz, SEED)
     return drawn.share(np.concatenate(hits))
@@ -228,8 +346,8 @@ def _facts(
 ) -> dict[str, Any]:
     """The limit set's provenance."""
     fitted = ~found.kept
-    trained = [fitting.inside(sample.training, found, horizon_s) for sample in samples]
-    held = [fitting.inside(sample.held_back, found, horizon_s) for sample in samples]
+    trained = [fit_limits.inside(sample.training, found, horizon_s) for sample in samples]
+    held = [fit_limits.inside(sample.held_back, found, horizon_s) for sample in samples]
 
     def shares(training: Sequence[Floats], rest: Sequence[Floats]) -> dict[str, Any]:
         return {
@@ -244,9 +362,9 @@ def _facts(
         facts |= {key: s for key, s in (("start_s", sample.job.start_s), ("end_s", sample.job.end_s)) if s is not None}
         facts |= shares(trained[i : i + 1], held[i : i + 1])
         others = [*samples[:i], *samples[i + 1 :]]
-        if any(fitting.arms_move(other.training).any() for other in others):
+        if any(fit_limits.arms_move(other.training).any() for other in others):
             foreign = _fit(others, coverage, horizon_s)
-            both = [fitting.inside(part, foreign, horizon_s) for part in (sample.training, sample.held_back)]
+            both = [fit_limits.inside(part, foreign, horizon_s) for part in (sample.training, sample.held_back)]
             facts["left_out"] = _plain(_share([np.concatenate(both)[:, ~foreign.kept]], horizon_s))
         logs.append(facts)
     each = {

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hrcreplay.errors import LogError
-from hrcreplay.human import angles, fusion, smooth
+from hrcreplay.human.fusion import fuse, inverse_kinematics
 from hrcreplay.human.model import skeleton
-from hrcreplay.logs.person import PersonMemory
+from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
-from hrcreplay.pipeline import Eyes, batches
 from hrcreplay.records import LENGTHS, POINTS, Bools, Floats, HumanStates, Ints, Measurements
+from hrcreplay.run.stages import Eyes, batches
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
 
@@ -75,7 +75,7 @@ def record(log: Log, ticks_ns: Ints, eyes: Eyes, progress: Callable[[int], None]
         states = HumanStates.join([states for _, states, _ in stretches])
         t_ns = np.concatenate([part.t_ns for part in truth])
         points = np.concatenate([part.points_m for part in truth])
-        joints, _ = angles.inverse(points)
+        joints, _ = inverse_kinematics.inverse(points)
         return Recording(states, t_ns, points, t_ns, joints, TRUTH, _plain(log, counts))
     states, seen, best = _smoothed(stretches, eyes)
     points, rejected = _believed(seen, best, eyes)
@@ -87,14 +87,14 @@ def record(log: Log, ticks_ns: Ints, eyes: Eyes, progress: Callable[[int], None]
     return Recording(states, t_ns, points, best.t_ns, best.p, source, _plain(log, counts))
 
 
-Stretch = tuple[Measurements, HumanStates, fusion.Trace]
+Stretch = tuple[Measurements, HumanStates, fuse.Trace]
 
 
 def _fuse(
     log: Log, ticks_ns: Ints, eyes: Eyes, counts: Counter[str], progress: Callable[[int], None]
 ) -> Iterator[Stretch]:
     """Stage 1 from the first stretch on in which a camera saw somebody."""
-    state, memory = fusion.start(log.header.cameras), PersonMemory()
+    state, memory = fuse.start(log.header.cameras), PersonMemory()
     measured: Measurements | None = None
     for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _STRETCH):
         progress(len(ticks))
@@ -105,7 +105,7 @@ def _fuse(
             measured = measured.rows(slice(0, 0))
         else:
             continue
-        state, states, events, trace = fusion.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
+        state, states, events, trace = fuse.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
         counts.update(events)
         yield measured, states, trace
     log.check()
@@ -116,17 +116,17 @@ def _fuse(
 def _smoothed(stretches: Iterator[Stretch], eyes: Eyes) -> tuple[HumanStates, Measurements, HumanStates]:
     """The states, the measurements and the smoothed states of all stretches."""
     seen, passed, best = [], [], []
-    held: tuple[HumanStates, fusion.Trace] | None = None
+    held: tuple[HumanStates, fuse.Trace] | None = None
 
-    def finish(held: tuple[HumanStates, fusion.Trace], after: tuple[HumanStates, fusion.Trace] | None) -> None:
+    def finish(held: tuple[HumanStates, fuse.Trace], after: tuple[HumanStates, fuse.Trace] | None) -> None:
         states, trace = held
         if after is not None:
             states = HumanStates.join([states, after[0].rows(slice(0, _LATER))])
-            trace = fusion.Trace(
+            trace = fuse.Trace(
                 cov=np.concatenate([trace.cov, after[1].cov[:_LATER]]),
                 damping=np.concatenate([trace.damping, after[1].damping[:_LATER]]),
             )
-        best.append(smooth.smooth(states, trace, eyes.filter).rows(slice(0, len(held[0]))))
+        best.append(fuse.smooth(states, trace, eyes.filter).rows(slice(0, len(held[0]))))
 
     for measured, states, trace in stretches:
         seen.append(measured)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.files import write_whole
 from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds
 from hrcreplay.records import JOINTS, Floats
+from hrcreplay.store.run_folder import write_whole
 
 _HERE = Path(__file__).parent
 NAMES = ("paper", "human", "people")

@@ -1,22 +1,125 @@
-"""`hrcreplay verify`: what a session's record says came out, against what comes out of it again, bit for bit."""
+"""`hrcreplay verify`: what a session's record says came out, against what comes out of it again, bit for bit.
+
+Runs the command of a replay again from its run.json, and compares what comes out with what came out.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
-from hrcreplay import runs
 from hrcreplay.egm.codec import AXES
-from hrcreplay.errors import SettingsError
-from hrcreplay.live import records, setup, verify_replay, wire
-from hrcreplay.live.records import Answer, Sight, Signal, TickEvent
-from hrcreplay.live.tape import Tape
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.live.control import setup
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import Answer, Sight, Signal, TickEvent
+from hrcreplay.live.record.log_reader import Tape
 from hrcreplay.records import STATUSES, Floats, SweptVolumes
-from hrcreplay.tables import state_columns
+from hrcreplay.run import replay
+from hrcreplay.store import run_folder
+from hrcreplay.store.tables import state_columns
+
+COMMANDS = ("fuse", "predict", "plan", "report")
+_CONTEXT = ("versions", "limits", "task", "cell")  #: of run.json: what else may make a difference
+
+
+def replay_again(run: Path) -> Iterator[str]:
+    """What is not the same when a replay is run again; nothing where all of it is.
+
+    Raises:
+        SettingsError: No complete run of a replay.
+        LogError: The log of the run is gone.
+    """
+    meta = run_folder.read_meta(run)
+    if meta["command"] not in COMMANDS:
+        raise SettingsError(
+            f"{run}: a run of {meta['command']}; those that can be run again are live sessions, {', '.join(COMMANDS)}"
+        )
+    log, digest = Path(meta["inputs"][0]["path"]), meta["inputs"][0]["sha256"]
+    if not log.exists():
+        raise LogError(f"{log}: the log of {run} is gone; put it back, or start where its path leads to it")
+    if (now := run_folder.sha256(log)) != digest:
+        yield f"{log}: is not the log of this run: SHA-256 recorded {digest}, now {now}"
+        return
+    with TemporaryDirectory(prefix="hrcreplay-") as temporary:
+        # A run folder that says all of itself and holds nothing, so that nothing can be taken over from it.
+        plan = Path(temporary) / "plan"
+        plan.mkdir()
+        (plan / "run.json").write_text(json.dumps({**meta, "stages": {}, "outputs": {}}))
+        smooth = "smooth.parquet" in meta["outputs"]
+        made = replay.run(meta["command"], plan, out=Path(temporary) / "again", smooth=smooth)
+        yield from _compared(run, meta, made)
+
+
+def _compared(run: Path, meta: dict[str, Any], made: Path) -> Iterator[str]:
+    now = run_folder.read_meta(made)
+    recorded, found = meta["outputs"], now["outputs"]
+    different = [name for name in sorted({*recorded, *found}) if recorded.get(name) != found.get(name)]
+    for name in different:
+        if name not in found:
+            yield f"{name}: recorded, but not made again"
+        elif name not in recorded:
+            yield f"{name}: not recorded, but made again"
+        else:
+            where = _table(run / name, made / name) if name.endswith(".parquet") else None
+            yield f"{name}: {where or 'not the same bytes again'}"
+    for key in _CONTEXT if different else ():
+        yield from _context(key, meta.get(key), now.get(key))
+
+
+def _context(key: str, recorded: Any, now: Any) -> Iterator[str]:
+    if recorded == now:
+        return
+    if not isinstance(recorded, dict) or not isinstance(now, dict):
+        yield f"{key}: not that of the run"
+        return
+    for name in sorted({*recorded, *now}):
+        if recorded.get(name) != now.get(name):
+            values = f": recorded {recorded.get(name)}, now {now.get(name)}" if key == "versions" else ""
+            yield f"{key} of {name}{values}" if values else f"{key}: {name} is not that of the run"
+
+
+def _table(recorded: Path, made: Path) -> str | None:
+    """The first row, and in it the first column, that differs between two tables."""
+    try:
+        tables = pq.read_table(recorded), pq.read_table(made)
+    except (OSError, pa.ArrowException):
+        return None
+    names = [table.column_names for table in tables]
+    if names[0] != names[1]:
+        return f"columns: recorded {len(names[0])}, again {len(names[1])}"
+    rows = min(len(table) for table in tables)
+    firsts = {name: _row(*(table.column(name)[:rows] for table in tables)) for name in names[0]}
+    row = min((found for found in firsts.values() if found is not None), default=None)
+    if row is None:
+        lengths = [len(table) for table in tables]
+        return None if lengths[0] == lengths[1] else f"rows: recorded {lengths[0]}, again {lengths[1]}"
+    name = next(name for name, found in firsts.items() if found == row)
+    mine, yours = (table.column(name)[row].as_py() for table in tables)
+    return f"row {row}, {name}: recorded {mine!r}, again {yours!r}"
+
+
+def _row(recorded: pa.ChunkedArray, made: pa.ChunkedArray) -> int | None:
+    """The first row in which two columns differ by a bit."""
+    if recorded.type != made.type:
+        return 0
+    if pa.types.is_floating(recorded.type):
+        mine, yours = (column.to_numpy().view(np.int64) for column in (recorded, made))
+        different = np.flatnonzero(mine != yours)
+        return int(different[0]) if len(different) else None
+    if recorded.equals(made):
+        return None
+    pairs = zip(recorded.to_pylist(), made.to_pylist(), strict=True)
+    return next((i for i, (mine, yours) in enumerate(pairs) if mine != yours), None)
+
 
 LOG = "log.mcap"
 _ROW = (
@@ -49,7 +152,7 @@ class Pilot(Protocol):
 Build = Callable[[dict[str, Any]], Pilot]
 
 
-def verify(run: Path, build: Build = setup.build) -> Verdict:
+def verify(run: Path, build: Build = setup.build_pilot) -> Verdict:
     """Runs a live session or a replay again from what its folder holds, and compares.
 
     Args:
@@ -61,7 +164,7 @@ def verify(run: Path, build: Build = setup.build) -> Verdict:
         LogError: The log of the run cannot be read.
     """
     if not (run / LOG).exists():
-        lines = [*verify_replay.again(run), *_changed(run)]
+        lines = [*replay_again(run), *_changed(run)]
         return Verdict(identical=False, lines=tuple(lines)) if lines else Verdict(identical=True, lines=("identical",))
     return _session(run, build)
 
@@ -92,7 +195,7 @@ def _session(run: Path, build: Build) -> Verdict:
 def _changed(run: Path) -> Iterator[str]:
     """The files of a complete run that are not those it left."""
     try:
-        meta = runs.read_meta(run, broken_off=True)
+        meta = run_folder.read_meta(run, broken_off=True)
     except SettingsError as error:
         if run.suffix != ".partial":  # of which only the log counts
             yield str(error)
@@ -101,7 +204,7 @@ def _changed(run: Path) -> Iterator[str]:
         path = run / name
         if not path.exists():
             yield f"{path}: is gone"
-        elif runs.sha256(path) != digest:
+        elif run_folder.sha256(path) != digest:
             yield f"{path}: is not as the run left it"
 
 
@@ -122,29 +225,29 @@ class Again:
         self._sight: Sight | None = None
         self._suspect = ""  # a limb whose volume is not that of the record; perhaps it is there whole
         self._take = {
-            wire.ROBOT: self._robot,
-            wire.REPLY: self._replied,
-            wire.FRAME: self._frame,
-            wire.LOOK: self._look,
-            wire.VOLUMES: self._volumes,
-            wire.ANSWER: self._answer,
-            wire.SILENCE: self._silence,
-            wire.EVENT: self._event,
+            codec.ROBOT: self._robot,
+            codec.REPLY: self._replied,
+            codec.FRAME: self._frame,
+            codec.LOOK: self._look,
+            codec.VOLUMES: self._volumes,
+            codec.ANSWER: self._answer,
+            codec.SILENCE: self._silence,
+            codec.EVENT: self._event,
         }
 
     def differs(self, message: bytes) -> str | None:
         """The first thing about a message, or due before it, that is not the same again."""
-        kind, t_ns = wire.kind(message), wire.clock_ns(message)
+        kind, t_ns = codec.kind(message), codec.clock_ns(message)
         if self._start_ns is None:
             self._start_ns = t_ns
         self._last_ns = t_ns
         found = None
-        if kind == wire.EVENT and (event := wire.read_event(message)).get("what") == "crash":
+        if kind == codec.EVENT and (event := codec.read_event(message)).get("what") == "crash":
             self.crashed = str(event["text"])
             return None
-        if self._reply is not None and kind != wire.REPLY:
+        if self._reply is not None and kind != codec.REPLY:
             found = _both("reply", "none", f"{len(self._reply)} bytes")
-        elif self._suspect and kind != wire.VOLUMES:
+        elif self._suspect and kind != codec.VOLUMES:
             found = self._suspect
         else:
             found = self._take[kind](message)
@@ -158,41 +261,41 @@ class Again:
         return f"tick {max(0, self.ticks - 1)} at {(t_ns - (self._start_ns or 0)) / 1e9:.3f} s: {found}"
 
     def _robot(self, message: bytes) -> None:
-        self._datagrams.append(wire.body(message))
+        self._datagrams.append(codec.body(message))
 
     def _frame(self, message: bytes) -> None:
-        self._frames.append(wire.body(message))
+        self._frames.append(codec.body(message))
 
     def _silence(self, message: bytes) -> None:
-        self._pilot.silence(wire.clock_ns(message), wire.read_silence(message))
+        self._pilot.silence(codec.clock_ns(message), codec.read_silence(message))
 
     def _event(self, message: bytes) -> str | None:
-        what = wire.read_event(message).get("what")
+        what = codec.read_event(message).get("what")
         self.ended = what == "end"
         if what != "blind":
             return None
         frames, self._frames = self._frames, []
-        self._sight = self._pilot.look(wire.clock_ns(message), frames)
+        self._sight = self._pilot.look(codec.clock_ns(message), frames)
         return None if self._sight is None else _both("look", "failed", "none of it")
 
     def _look(self, message: bytes) -> str | None:
         frames, self._frames = self._frames, []
-        recorded = wire.read_look(message)
+        recorded = codec.read_look(message)
         if len(frames) != recorded.skeletons:
             return f"the record has {len(frames)} of the {recorded.skeletons} skeletons of this look"
         sight = self._sight = self._pilot.look(recorded.t_ns, frames)
         self.looks += 1
         if sight is None:
             return _both("look", "done", "failed")
-        if wire.look(sight.states, sight.volumes, len(frames)) == message:
+        if codec.look(sight.states, sight.volumes, len(frames)) == message:
             return None
         columns = state_columns(sight.states)
         cameras = [f"valid_{camera}" for camera in sight.states.cameras]
         names = [name for name in columns if name != "t_ns" and name not in cameras]
-        found = _first(names, recorded.state, wire.flat(sight.states))
+        found = _first(names, recorded.state, codec.flat(sight.states))
         found = found or _first(cameras, list(recorded.valid), list(sight.states.valid[0].tobytes()))
         if found is None:
-            digests = [wire.digest(sight.volumes, limb) for limb in range(len(sight.volumes.limbs))]
+            digests = [codec.digest(sight.volumes, limb) for limb in range(len(sight.volumes.limbs))]
             whole = [f"volume of {limb} (digest)" for limb in sight.volumes.limbs]
             self._suspect = _first(whole, [d.hex() for d in recorded.digests], [d.hex() for d in digests]) or ""
         return found
@@ -202,25 +305,25 @@ class Again:
         if self._sight is None:
             return _both("volumes", "some", "none")
         volumes = self._sight.volumes
-        if wire.whole(volumes) == message:
+        if codec.whole(volumes) == message:
             return suspect or None
-        return _volume(wire.read_whole(message, volumes.limbs, volumes.method), volumes) or suspect or None
+        return _volume(codec.read_whole(message, volumes.limbs, volumes.method), volumes) or suspect or None
 
     def _answer(self, message: bytes) -> str | None:
         datagrams, self._datagrams = tuple(self._datagrams), []
-        recorded = wire.read_answer(message)
+        recorded = codec.read_answer(message)
         self.ticks += 1
         if len(datagrams) != recorded.datagrams:
             return f"the record has {len(datagrams)} of the {recorded.datagrams} packets of this tick"
         again = self._pilot.answer(TickEvent(recorded.t_ns, datagrams, recorded.signals))
         self._reply = again.datagram
-        said = wire.read_answer(wire.answer(again, recorded.signals, len(datagrams), recorded.took_us))
+        said = codec.read_answer(codec.answer(again, recorded.signals, len(datagrams), recorded.took_us))
         return _first(
             ("phase", "status", "reason", "look_ns", "limb", "link"), _decision(recorded), _decision(said)
         ) or (_first(_ROW, _numbers(recorded), _numbers(said)))
 
     def _replied(self, message: bytes) -> str | None:
-        _, recorded = wire.read_reply(message)
+        _, recorded = codec.read_reply(message)
         again, self._reply = self._reply, None
         if again is None:
             return _both("reply", f"{len(recorded)} bytes", "none")
@@ -231,9 +334,9 @@ class Again:
         return _first([f"byte {i} of the reply" for i in range(len(again))], list(recorded), list(again))
 
 
-def _decision(found: wire.Answered) -> list[Any]:
+def _decision(found: codec.Answered) -> list[Any]:
     return [
-        records.PHASES[found.phase],
+        codec.PHASES[found.phase],
         STATUSES[found.status],
         found.reason,
         found.look_ns,
@@ -242,7 +345,7 @@ def _decision(found: wire.Answered) -> list[Any]:
     ]
 
 
-def _numbers(found: wire.Answered) -> Floats:
+def _numbers(found: codec.Answered) -> Floats:
     return np.empty(0) if found.row is None else found.row
 
 

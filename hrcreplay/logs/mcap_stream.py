@@ -22,7 +22,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 from zstandard import ZstdError
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs import rostypes
+from hrcreplay.logs import ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.messages import Damage, Message, Part, Topic, Undecodable, in_order
 
@@ -225,7 +225,7 @@ def _records(file: IO[bytes], offset: int, length: int) -> list[McapRecord]:
 
 
 def _type(schema: Schema | None) -> str:
-    return rostypes.plain(schema.name) if schema else "unknown"
+    return ros_bags.plain(schema.name) if schema else "unknown"
 
 
 def _parser(path: Path, channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
@@ -235,7 +235,7 @@ def _parser(path: Path, channel: Channel, schema: Schema | None) -> Callable[[by
     if schema and channel.message_encoding in ("cdr", "ros1"):
         form = "idl" if schema.encoding == "ros2idl" else "msg"
         definition = schema.data.decode(errors="replace")
-        return rostypes.parser(where, schema.name, definition, form, cdr=channel.message_encoding == "cdr")
+        return ros_bags.parser(where, schema.name, definition, form, cdr=channel.message_encoding == "cdr")
     return partial(_unknown, where, channel.message_encoding)
 
 

@@ -1,14 +1,24 @@
-"""Raw messages of any kind of file, and how several files or chunks become one stream in order of arrival."""
+"""Raw messages of any kind of file, and how several files or chunks become one stream in order of arrival.
+
+Topics and message types of our own log; skeleton.proto has the messages.
+
+Which joint of which tracker is which of our POINTS. What a tracker lacks is left missing.
+
+What every skeleton decoder gives: rows, one a body a frame.
+"""
 
 from __future__ import annotations
 
 import heapq
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from hrcreplay.errors import LogError
+from hrcreplay.records import POINTS, Floats
 
 
 class Undecodable(LogError):
@@ -100,3 +110,142 @@ def in_order(parts: Iterable[Part]) -> Iterator[Message]:
             heapq.heappop(heads)
         else:
             heapq.heapreplace(heads, (following.arrival_ns, order, following, messages))
+
+
+PROFILE = "hrcreplay"  #: profile in the MCAP header, by which our logs are known
+TASK = "/task"
+BASE = "/robot/base"
+JOINTS = "/robot/joints"
+TRUTH = "/truth"
+
+
+def skeleton_topic(camera: str) -> str:
+    """Topic of a camera's skeletons."""
+    return f"/camera/{camera}/skeleton"
+
+
+def camera_info_topic(camera: str) -> str:
+    """Topic of what is known of a camera."""
+    return f"/camera/{camera}/info"
+
+
+def camera_of_topic(topic: str) -> str:
+    """The camera that a topic of ours is about."""
+    return topic.split("/")[2]
+
+
+_SIDES = (("l", "LEFT", "Left", "left"), ("r", "RIGHT", "Right", "right"))
+
+#: Azure Kinect Body Tracking: joint index -> name.
+AZURE_JOINTS = (
+    *("PELVIS", "SPINE_NAVEL", "SPINE_CHEST", "NECK"),
+    *("CLAVICLE_LEFT", "SHOULDER_LEFT", "ELBOW_LEFT", "WRIST_LEFT", "HAND_LEFT", "HANDTIP_LEFT", "THUMB_LEFT"),
+    *("CLAVICLE_RIGHT", "SHOULDER_RIGHT", "ELBOW_RIGHT", "WRIST_RIGHT", "HAND_RIGHT", "HANDTIP_RIGHT", "THUMB_RIGHT"),
+    *("HIP_LEFT", "KNEE_LEFT", "ANKLE_LEFT", "FOOT_LEFT", "HIP_RIGHT", "KNEE_RIGHT", "ANKLE_RIGHT", "FOOT_RIGHT"),
+    *("HEAD", "NOSE", "EYE_LEFT", "EAR_LEFT", "EYE_RIGHT", "EAR_RIGHT"),
+)
+
+#: Kinect v2: joint index -> name.
+KINECT2_JOINTS = (
+    *("SpineBase", "SpineMid", "Neck", "Head"),
+    *("ShoulderLeft", "ElbowLeft", "WristLeft", "HandLeft", "ShoulderRight", "ElbowRight", "WristRight", "HandRight"),
+    *("HipLeft", "KneeLeft", "AnkleLeft", "FootLeft", "HipRight", "KneeRight", "AnkleRight", "FootRight"),
+    *("SpineShoulder", "HandTipLeft", "ThumbLeft", "HandTipRight", "ThumbRight"),
+)
+
+_PAIRED = ("shoulder", "elbow", "wrist", "hand", "hip", "knee", "ankle", "foot")
+
+#: POINTS -> joint of the Azure Kinect.
+AZURE_POINTS: Mapping[str, str] = {"pelvis": "PELVIS", "chest": "SPINE_CHEST", "neck": "NECK", "head": "HEAD"} | {
+    f"{joint}_{s}": f"{joint.upper()}_{side}" for joint in _PAIRED for s, side, _, _ in _SIDES
+}
+
+#: POINTS -> joint of the Kinect v2. Its Neck lies above the shoulder line, where our neck is.
+KINECT2_POINTS: Mapping[str, str] = {
+    "pelvis": "SpineBase",
+    "chest": "SpineMid",
+    "neck": "SpineShoulder",
+    "head": "Head",
+} | {f"{joint}_{s}": f"{joint.title()}{side}" for joint in _PAIRED for s, _, side, _ in _SIDES}
+
+#: POINTS -> frame of openni_tracker, taken as named: OpenNI may mirror left and right, which no log tells.
+#: It has no ankle (its foot is the ankle's place) and no wrist: the hand stands for the wrist, or no forearm could
+#: be seen. The pelvis is the middle of its hips.
+OPENNI_POINTS: Mapping[str, str] = {"chest": "torso", "neck": "neck", "head": "head"} | {
+    f"{point}_{s}": f"{side}_{joint}"
+    for point, joint in (
+        *(("shoulder", "shoulder"), ("elbow", "elbow"), ("wrist", "hand"), ("hand", "hand")),
+        *(("hip", "hip"), ("knee", "knee"), ("foot", "foot")),
+    )
+    for s, _, _, side in _SIDES
+}
+
+#: Joints that openni_tracker publishes of a person, without the trailing id.
+OPENNI_JOINTS = frozenset(OPENNI_POINTS.values())
+
+#: Azure Kinect joint index -> index into POINTS.
+AZURE_INDEX: Mapping[int, int] = {
+    AZURE_JOINTS.index(joint): POINTS.index(point) for point, joint in AZURE_POINTS.items()
+}
+
+#: Kinect v2 joint index -> index into POINTS.
+KINECT2_INDEX: Mapping[int, int] = {
+    KINECT2_JOINTS.index(joint): POINTS.index(point) for point, joint in KINECT2_POINTS.items()
+}
+
+
+class Row(NamedTuple):
+    """One body in one frame, not yet cleaned."""
+
+    capture_ns: int | None  #: None: the arrival is the best that is known
+    camera: str
+    body: int
+    points_m: Floats  #: (20, 3) camera frame [m]; NaN where the sensor has no such point
+    confidence: Floats  #: (20,); 0 where the sensor has no such point
+    stamp_zero: bool = False  #: whether the capture is missing because a ROS header's stamp is zero
+
+
+class Decoder(Protocol):
+    """Reads the skeletons of one topic."""
+
+    @property
+    def topic(self) -> str:
+        """The topic."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras on it."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of how it reads."""
+
+    @property
+    def always_heard(self) -> bool:
+        """Whether a message without a body still tells that the camera (the only one) is alive."""
+
+    def fresh(self) -> Decoder:
+        """The decoder at the start of a pass, with nothing remembered."""
+
+    def rows(self, message: Message) -> list[Row]:
+        """The rows that are complete with this message. Raises Undecodable, LogError."""
+
+
+def blank() -> tuple[Floats, Floats]:
+    """Points and confidence of a body of which nothing is known."""
+    return np.full((len(POINTS), 3), np.nan), np.zeros(len(POINTS))
+
+
+def stamp_ns(stamp: Any, where: str) -> int:
+    """A ROS time as nanoseconds."""
+    try:
+        return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    except AttributeError as error:
+        raise LogError(
+            f"{where}: found {stamp!r} for a capture time; a field of type time is needed, or none"
+        ) from error
+
+
+def camera_of(name: str) -> str:
+    """A camera's name from a topic or a frame: without slashes, as it is used in names of columns."""
+    return name.strip("/").replace("/", "_")

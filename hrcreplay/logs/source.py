@@ -17,10 +17,10 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs import bag_recovery, mcap_stream, topics
+from hrcreplay.logs import mcap_stream, ros_bags
 from hrcreplay.logs.mcap_stream import McapStream
-from hrcreplay.logs.messages import Damage, Message, Part, Stream, Topic, in_order
-from hrcreplay.logs.ros_stream import open_bag, open_db3
+from hrcreplay.logs.messages import PROFILE, Damage, Message, Part, Stream, Topic, in_order
+from hrcreplay.logs.ros_bags import open_bag, open_db3
 
 _SQLITE = b"SQLite format 3\0"
 _KNOWN = "known are MCAP files, ROS 1 bags (.bag) and ROS 2 bags (a folder with metadata.yaml, or a .db3 file)"
@@ -100,7 +100,7 @@ def open_source(path: Path) -> Source:
 
 def _single(path: Path) -> Source:
     stream = _file(path)
-    kind = stream.profile if stream.profile in (topics.PROFILE, "ros1", "ros2") else "mcap"
+    kind = stream.profile if stream.profile in (PROFILE, "ros1", "ros2") else "mcap"
     return Source(path, kind, [stream])
 
 
@@ -114,7 +114,7 @@ def _file(path: Path, *, zstd_messages: bool = False) -> Stream:
         raise LogError(f"{path}: the log holds no messages (0 bytes)")
     if head.startswith(mcap_stream.MAGIC):
         return McapStream(path)
-    if head.startswith(bag_recovery.MAGIC):
+    if head.startswith(ros_bags.MAGIC):
         return open_bag(path)
     if head.startswith(_SQLITE) and path.suffix == ".db3":
         return open_db3(path, zstd_messages=zstd_messages)

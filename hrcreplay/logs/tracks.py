@@ -1,4 +1,7 @@
-"""What travels in a log beside the skeletons: cameras' poses, task, base, joints, truth."""
+"""What travels in a log beside the skeletons: cameras' poses, task, base, joints, truth.
+
+What a log says of itself and the tracks that travel in it beside the camera frames.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,50 @@ import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.decode_own import points_of
-from hrcreplay.logs.log import JointTrack, Truth
-from hrcreplay.logs.messages import Message, Topic, Undecodable, listed
-from hrcreplay.logs.skeletons import stamp_ns
+from hrcreplay.logs.decoders import points_of
+from hrcreplay.logs.messages import Message, Topic, Undecodable, listed, stamp_ns
 from hrcreplay.logs.source import Source
-from hrcreplay.records import Floats
+from hrcreplay.records import Floats, Ints, Table
+
+
+@dataclass(frozen=True)
+class Header:
+    """All that is known of a log before its first frame."""
+
+    path: Path
+    kind: str  #: "hrcreplay", "mcap", "ros1" or "ros2"
+    cameras: tuple[str, ...]
+    T_world_camera: dict[str, Floats]  #: (4, 4); only of the cameras whose extrinsics are in the log
+    task: dict[str, Any] | None  #: programmed task in the log, of the same structure as a task file
+    start_ns: int  #: first arrival of a skeleton, joint state or truth; of anything where there are none
+    end_ns: int  #: last arrival of anything
+    T_world_base: Floats | None  #: (4, 4) robot base, where the log knows it
+    has_truth: bool
+    joint_names: tuple[str, ...]  #: of the joint track; () where there is none
+
+
+@dataclass(frozen=True)
+class JointTrack(Table):
+    """Robot joints as the log has them, a row a message."""
+
+    t_ns: Ints  #: (n,)
+    q: Floats  #: (n, nv) [rad]
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Truth(Table):
+    """The person by a reference better than the cameras, a row an instant."""
+
+    t_ns: Ints  #: (n,)
+    points_m: Floats  #: (n, 20, 3) POINTS in the world [m]
+
 
 _ROS_JOINTS, _OWN_JOINTS, _OWN_TRUTH = "sensor_msgs/JointState", "hrcreplay.JointState", "hrcreplay.Truth"
 _OWN_CAMERA, _OWN_TASK, _OWN_BASE = "hrcreplay.Camera", "hrcreplay.Task", "hrcreplay.Base"

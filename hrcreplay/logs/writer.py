@@ -15,8 +15,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import CompressionType, Writer
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.logs import messages
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs import topics
 from hrcreplay.records import POINTS, CameraFrames, Floats, Ints
 
 _CHUNK_BYTES = 256 * 1024  # some ten seconds of two cameras: small enough to seek by, large enough to compress
@@ -52,7 +52,9 @@ class LogWriter:
         self._temporary = Path(name)
         self._file: IO[bytes] = os.fdopen(handle, "wb")
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile=topics.PROFILE, library="hrcreplay")  # the library's version would change the bytes
+        self._writer.start(
+            profile=messages.PROFILE, library="hrcreplay"
+        )  # the library's version would change the bytes
         return self
 
     def __exit__(
@@ -82,15 +84,15 @@ class LogWriter:
             raise SettingsError(f"camera {name!r}: declared twice, empty or with a slash; name each camera once")
         self._cameras.append(name)
         values = [] if T_world_camera is None else np.asarray(T_world_camera, dtype=np.float64).ravel().tolist()
-        self._latch(topics.info(name), pb.Camera(camera=name, T_world_camera=values))
+        self._latch(messages.camera_info_topic(name), pb.Camera(camera=name, T_world_camera=values))
 
     def task(self, task: dict[str, Any]) -> None:
         """Adds the programmed task: a dictionary as a task file gives it."""
-        self._latch(topics.TASK, pb.Task(json=json.dumps(task, sort_keys=True)))
+        self._latch(messages.TASK, pb.Task(json=json.dumps(task, sort_keys=True)))
 
     def base(self, T_world_base: Floats) -> None:
         """Adds the pose (4, 4) of the robot's base in the world."""
-        self._latch(topics.BASE, pb.Base(T_world_base=np.asarray(T_world_base, dtype=np.float64).ravel().tolist()))
+        self._latch(messages.BASE, pb.Base(T_world_base=np.asarray(T_world_base, dtype=np.float64).ravel().tolist()))
 
     def frames(self, frames: CameraFrames) -> None:
         """Adds camera frames; cameras not declared yet are declared, of unknown pose."""
@@ -108,17 +110,17 @@ class LogWriter:
                 points=points[i].tolist(),
                 confidence=frames.confidence[i].tolist(),
             )
-            self._write(topics.skeleton(name), message, int(frames.arrival_ns[i]), capture_ns)
+            self._write(messages.skeleton_topic(name), message, int(frames.arrival_ns[i]), capture_ns)
 
     def truth(self, t_ns: Ints, points_m: Floats) -> None:
         """Adds the true person: (n,) instants and (n, 20, 3) POINTS in the world [m]."""
         for t, points in zip(t_ns.tolist(), points_m.reshape(len(t_ns), 3 * len(POINTS)).tolist(), strict=True):
-            self._write(topics.TRUTH, pb.Truth(t_ns=t, points=points), t, t)
+            self._write(messages.TRUTH, pb.Truth(t_ns=t, points=points), t, t)
 
     def joints(self, names: Sequence[str], t_ns: Ints, q: Floats) -> None:
         """Adds the robot's joints: (n,) instants and (n, nv) positions [rad]."""
         for t, row in zip(t_ns.tolist(), q.tolist(), strict=True):
-            self._write(topics.JOINTS, pb.JointState(t_ns=t, names=names, q=row), t, t)
+            self._write(messages.JOINTS, pb.JointState(t_ns=t, names=names, q=row), t, t)
 
     def _latch(self, topic: str, message: Any) -> None:
         self._latched.append((topic, message))

@@ -10,13 +10,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from hrcreplay.records import Ints
-from hrcreplay.report import figures_human, figures_links, figures_quality, figures_robot, style
+from hrcreplay.report import drawing, figures_human, figures_robot
 from hrcreplay.report.figures_human import Instant
-from hrcreplay.report.figures_links import LinkPose
-from hrcreplay.report.metrics_quality import cameras
-from hrcreplay.report.metrics_table import Metric
-from hrcreplay.report.series import columns, times
-from hrcreplay.runs import Run
+from hrcreplay.report.figures_robot import LinkPose
+from hrcreplay.report.metrics import Metric, columns, times
+from hrcreplay.report.metrics_data import cameras
+from hrcreplay.store.run_folder import Run
 
 
 def start_ns(run: Run) -> int:
@@ -78,7 +77,7 @@ def draw_all(
     Args:
         run: The run's tables.
         folder: Made if need be.
-        metrics: What :func:`hrcreplay.report.metrics.compute` found.
+        metrics: What :func:`hrcreplay.run.report.compute` found.
         near_m: The stationary share counts ticks with a separation of at most this [m].
         stationary_m_per_s: A TCP slower than this stands [m/s].
         gap_s: A camera silent for longer has a gap [s].
@@ -108,18 +107,18 @@ def draw_all(
         makers["stationary_share"] = lambda: figures_robot.stationary_share(metrics)
     if robot is not None and run.T_world_base is not None:
         pose, base = robot, run.T_world_base
-        makers["robot_links"] = lambda: figures_links.links(pose, t0_ns, base)
+        makers["robot_links"] = lambda: figures_robot.links(pose, t0_ns, base)
     if state is not None and volumes:
         fused = state
         makers["fig17_volumes"] = lambda: figures_human.volumes(volumes, fused, t0_ns)
     if run.measurements is not None and len(run.measurements):
         makers["fig18_coordinate"] = lambda: figures_human.coordinate(run, t0_ns, gap_s)
-        makers["data_quality"] = lambda: figures_quality.data_quality(run, t0_ns, gap_s)
+        makers["data_quality"] = lambda: figures_human.data_quality(run, t0_ns, gap_s)
     if state is not None and len(state) > 1:
         makers["joint_angles"] = lambda: figures_human.joint_angles(run, t0_ns, gap_s)
     if metrics["fusion_angle_rmse"]["value"] is not None:
         makers["fusion_error"] = lambda: figures_human.fusion_error(metrics, cameras(run))
     for name, make in makers.items():
-        with style.style():
-            style.save(make(), folder, name)
+        with drawing.style():
+            drawing.save(make(), folder, name)
     return tuple(makers)

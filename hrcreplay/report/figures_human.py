@@ -1,4 +1,7 @@
-"""Figures of the person: swept volumes (Fig. 17), one coordinate (Fig. 18), all joints, and errors."""
+"""Figures of the person: swept volumes (Fig. 17), one coordinate (Fig. 18), all joints, and errors.
+
+The figure of the data that went in.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, Ints
-from hrcreplay.report import style
-from hrcreplay.report.metrics_fusion import errors
-from hrcreplay.report.metrics_quality import cameras
-from hrcreplay.report.metrics_table import Metric
-from hrcreplay.report.series import ANGLES, broken, columns, envelope, seconds_from, times, wrap
-from hrcreplay.report.solids import Solid, View, bones, outline, picture, view_from
-from hrcreplay.runs import Run
+from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
+from hrcreplay.report import drawing
+from hrcreplay.report.drawing import Solid, View, bones, outline, picture, view_from
+from hrcreplay.report.metrics import ANGLES, Metric, broken, columns, envelope, seconds_from, stretches, times, wrap
+from hrcreplay.report.metrics_data import cameras, errors, seconds_since
+from hrcreplay.store.run_folder import Run
 
 #: One instant of Fig. 17: t_ns, and per method and limb the swept volume: (m, 3) vertices, world [m], and radius [m].
 Instant = tuple[int, Mapping[str, Mapping[str, tuple[Floats, float]]]]
@@ -53,8 +54,8 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
     people = [_skeleton_at(state, t_ns) for t_ns, _ in instants]
     heading = float(np.nanmean([heading for _, heading in people]))
     view = view_from(heading - 0.9, 0.28)
-    figure = style.new_figure(0.55 + 2.35 * len(methods))
-    grid = style.panels(
+    figure = drawing.new_figure(0.55 + 2.35 * len(methods))
+    grid = drawing.panels(
         figure, len(methods), len(instants), left_in=0.5, right_in=0.1, top_in=0.34, bottom_in=0.3, gap_in=(0.12, 0.08)
     )
     centres = [view.flat(points[[POINTS.index("pelvis")]])[0] for points, _ in people]
@@ -69,7 +70,7 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
     for row, method in enumerate(methods):
         for column, (t_ns, found) in enumerate(instants):
             ax = grid[row][column]
-            style.set_window(ax, low.tolist(), high.tolist())
+            drawing.set_window(ax, low.tolist(), high.tolist())
             _draw_person(ax, found[method], people[column][0], view, centres[column], (low, high))
             if row == 0:
                 later = (t_ns - instants[0][0]) * 1e-9
@@ -82,7 +83,7 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
         grid[row][0].set_ylabel(METHODS.get(method, method), fontweight="bold")
     _scale_bar(grid[-1][-1], float(high[0]), float(low[1]))
     drawn = {limb for limbs in instants[0][1].values() for limb in limbs}
-    handles = [Patch(color=colour, lw=0, label=limb) for limb, colour in style.LIMBS.items() if limb in drawn]
+    handles = [Patch(color=colour, lw=0, label=limb) for limb, colour in drawing.LIMBS.items() if limb in drawn]
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), bbox_to_anchor=(0.5, 0.005))
     return figure
 
@@ -101,21 +102,21 @@ def _draw_person(
     centre: Floats,
     window: tuple[Floats, Floats],
 ) -> None:
-    solids = [Solid(vertices, radius, to_rgb(style.LIMBS[limb])) for limb, (vertices, radius) in limbs.items()]
+    solids = [Solid(vertices, radius, to_rgb(drawing.LIMBS[limb])) for limb, (vertices, radius) in limbs.items()]
     low, high = window
     image = picture(solids, view, low + centre, high + centre, (high[1] - low[1]) / 320.0)
     image[..., 3] *= 0.78
     ax.imshow(image, origin="lower", extent=(low[0], high[0], low[1], high[1]), aspect="auto", interpolation="bilinear")
-    style.set_window(ax, low.tolist(), high.tolist())
+    drawing.set_window(ax, low.tolist(), high.tolist())
     for solid in solids:
         edge = outline(solid.vertices_m, solid.radius_m, view) - centre
         if len(edge):
             ax.add_patch(Polygon(edge, fill=False, edgecolor=solid.colour, lw=0.8, alpha=0.6))
-    ax.add_collection(LineCollection([pair - centre for pair in bones(points, view)], colors=style.INK, lw=1.6))
+    ax.add_collection(LineCollection([pair - centre for pair in bones(points, view)], colors=drawing.INK, lw=1.6))
 
 
 def _scale_bar(ax: Axes, right: float, low: float) -> None:
-    ax.plot([right - 0.5, right], [low, low], color=style.INK, lw=1.4, solid_capstyle="butt")
+    ax.plot([right - 0.5, right], [low, low], color=drawing.INK, lw=1.4, solid_capstyle="butt")
     ax.annotate("0.5 m", (right - 0.25, low), xytext=(0, 3), textcoords="offset points", ha="center", fontsize=8)
 
 
@@ -125,26 +126,26 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
     unit, factor, error_unit, error_factor = (
         ("deg", 180 / np.pi, "deg", 180 / np.pi) if joint in ANGLES else ("m", 1.0, "mm", 1e3)
     )
-    figure = style.new_figure(4.2 if found else 2.6)
-    rows = style.panels(figure, 2 if found else 1, heights=[1.5, 1.0] if found else None, share_x=True, top_in=0.34)
+    figure = drawing.new_figure(4.2 if found else 2.6)
+    rows = drawing.panels(figure, 2 if found else 1, heights=[1.5, 1.0] if found else None, share_x=True, top_in=0.34)
     ax = rows[0][0]
-    for camera, colour in zip(cameras(run), style.CAMERAS * 3, strict=False):
+    for camera, colour in zip(cameras(run), drawing.CAMERAS * 3, strict=False):
         seconds, values = _seen(run, camera, joint, t0_ns, gap_s)
         ax.plot(*envelope(seconds, factor * values), color=colour, lw=0.9, label=camera)
     if run.state is not None:
         seconds = seconds_from(times(run.state), t0_ns)
         values = factor * run.state[joint].to_numpy(dtype=float)
-        ax.plot(*envelope(seconds, values), color=style.FUSED, lw=1.6, label="fused")
+        ax.plot(*envelope(seconds, values), color=drawing.FUSED, lw=1.6, label="fused")
     if run.truth is not None:
         seconds = seconds_from(times(run.truth), t0_ns)
         values = factor * run.truth[joint].to_numpy(dtype=float)
-        ax.plot(*envelope(seconds, values), color=style.TRUTH, lw=0.9, ls=(0, (4, 2)), label="truth")
+        ax.plot(*envelope(seconds, values), color=drawing.TRUTH, lw=0.9, ls=(0, (4, 2)), label="truth")
     ax.set(title=f"Coordinate {LABELS[joint]} of the person", ylabel=f"{LABELS[joint]} [{unit}]")
-    style.legend_above(ax)
+    drawing.legend_above(ax)
     if found:
         below = rows[1][0]
         for source, colour in zip(
-            [*cameras(run), "fused"], [*(style.CAMERAS * 3)[: len(cameras(run))], style.FUSED], strict=True
+            [*cameras(run), "fused"], [*(drawing.CAMERAS * 3)[: len(cameras(run))], drawing.FUSED], strict=True
         ):
             if source in found:
                 seconds = seconds_from(found[source].t_ns, t0_ns)
@@ -175,35 +176,36 @@ def _span(ax: Axes, run: Run, t0_ns: int) -> None:
 
 def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
     """All twelve joints: what the cameras saw (dots), the fused state and the truth."""
-    figure = style.new_figure(5.6)
-    grid = style.panels(figure, 4, 3, share_x=True, gap_in=(0.26, 0.55), top_in=0.5, left_in=0.6)
+    figure = drawing.new_figure(5.6)
+    grid = drawing.panels(figure, 4, 3, share_x=True, gap_in=(0.26, 0.55), top_in=0.5, left_in=0.6)
     seen = cameras(run)
     for k, joint in enumerate(JOINTS):
         ax = grid[k % 4][k // 4]
         factor = 180 / np.pi if joint in ANGLES else 1.0
-        for camera, colour in zip(seen, style.CAMERAS * 3, strict=False):
+        for camera, colour in zip(seen, drawing.CAMERAS * 3, strict=False):
             seconds, values = _seen(run, camera, joint, t0_ns, gap_s)
             some = slice(None, None, max(1, len(seconds) // 900))
             ax.plot(seconds[some], factor * values[some], ".", ms=1.5, color=colour, alpha=0.5, mew=0, rasterized=True)
         if run.state is not None:
             seconds = seconds_from(times(run.state), t0_ns)
             values = factor * run.state[joint].to_numpy(dtype=float)
-            ax.plot(*envelope(seconds, values, 350), color=style.FUSED, lw=1.0)
+            ax.plot(*envelope(seconds, values, 350), color=drawing.FUSED, lw=1.0)
             _limits_of(ax, values)
         if run.truth is not None:
             seconds = seconds_from(times(run.truth), t0_ns)
             values = _beside_fused(run, joint, times(run.truth), run.truth[joint].to_numpy(dtype=float))
-            ax.plot(*envelope(seconds, factor * values, 350), color=style.TRUTH, lw=0.7, ls=(0, (4, 2)))
+            ax.plot(*envelope(seconds, factor * values, 350), color=drawing.TRUTH, lw=0.7, ls=(0, (4, 2)))
         ax.set_title(f"{LABELS[joint]} [{'deg' if joint in ANGLES else 'm'}]", fontweight="normal", pad=2.5)
     for column in grid[-1]:
         column.set_xlabel("time [s]")
     _span(grid[-1][0], run, t0_ns)
     handles = [
-        Line2D([], [], ls="", marker="o", ms=3, color=c, label=n) for n, c in zip(seen, style.CAMERAS * 3, strict=False)
+        Line2D([], [], ls="", marker="o", ms=3, color=c, label=n)
+        for n, c in zip(seen, drawing.CAMERAS * 3, strict=False)
     ]
-    handles.append(Line2D([], [], color=style.FUSED, label="fused"))
+    handles.append(Line2D([], [], color=drawing.FUSED, label="fused"))
     if run.truth is not None:
-        handles.append(Line2D([], [], color=style.TRUTH, lw=0.7, ls=(0, (4, 2)), label="truth"))
+        handles.append(Line2D([], [], color=drawing.TRUTH, lw=0.7, ls=(0, (4, 2)), label="truth"))
     figure.legend(handles=handles, loc="upper right", ncols=6, bbox_to_anchor=(0.985, 0.995))
     return figure
 
@@ -229,10 +231,10 @@ def _limits_of(ax: Axes, values: Floats) -> None:
 
 def fusion_error(metrics: Mapping[str, Metric], names: Sequence[str]) -> Figure:
     """RMSE per angle and pooled, of each camera's raw angles and of the fused state; velocities likewise."""
-    figure = style.new_figure(3.9)
-    rows = style.panels(figure, 2, gap_in=(0.34, 0.0), top_in=0.34, bottom_in=0.3, share_x=True)
+    figure = drawing.new_figure(3.9)
+    rows = drawing.panels(figure, 2, gap_in=(0.34, 0.0), top_in=0.34, bottom_in=0.3, share_x=True)
     sources = [*names, "fused"]
-    colours = [*(style.CAMERAS * 3)[: len(names)], style.FUSED]
+    colours = [*(drawing.CAMERAS * 3)[: len(names)], drawing.FUSED]
     width = 0.8 / len(sources)
     for (ax,), kind, unit in zip(rows, ("", "velocity_"), ("deg", "deg/s"), strict=True):
         for s, (source, colour) in enumerate(zip(sources, colours, strict=True)):
@@ -249,5 +251,63 @@ def fusion_error(metrics: Mapping[str, Metric], names: Sequence[str]) -> Figure:
     rows[0][0].set_title("Angles")
     rows[1][0].set_title("Angular velocities (cameras: differenced)")
     rows[1][0].set_xticks([*range(len(ANGLES)), len(ANGLES) + 0.35], [*(LABELS[joint] for joint in ANGLES), "pooled"])
-    style.legend_above(rows[0][0])
+    drawing.legend_above(rows[0][0])
     return figure
+
+
+def data_quality(run: Run, t0_ns: int, gap_s: float) -> Figure:
+    """Per camera: when its frames held the person, when the filter used them, and its gaps."""
+    names = cameras(run)
+    figure = drawing.new_figure(0.95 + 0.42 * (len(names) + 1))
+    ax = drawing.panels(figure, 1, left_in=1.0, top_in=0.36)[0][0]
+    end_s = 0.0
+    anything: Bools | None = None
+    for row, camera in enumerate(names):
+        colour = (drawing.CAMERAS * 3)[row]
+        if run.measurements is not None:
+            seen = np.sort(times(run.measurements[run.measurements["camera"] == camera], "capture_ns"))
+            seconds = seconds_from(seen, t0_ns)
+            end_s = max(end_s, float(seconds[-1]) if len(seconds) else 0.0)
+            ax.broken_barh(_frame_bars(seconds, gap_s), (row - 0.32, 0.64), facecolors=colour, alpha=0.3, lw=0)
+        if run.state is not None and f"valid_{camera}" in run.state:
+            valid = run.state[f"valid_{camera}"].to_numpy(dtype=bool)
+            recent = seconds_since(run.state, valid) <= gap_s
+            anything = recent if anything is None else anything | recent
+            seconds = seconds_from(times(run.state), t0_ns)
+            end_s = max(end_s, float(seconds[-1]))
+            ax.broken_barh(_tick_bars(seconds, recent), (row - 0.16, 0.32), facecolors=colour, lw=0)
+    if anything is not None and run.state is not None:
+        seconds = seconds_from(times(run.state), t0_ns)
+        ax.broken_barh(_tick_bars(seconds, anything), (len(names) - 0.16, 0.32), facecolors=drawing.BLUE, lw=0)
+        for start, width in _tick_bars(seconds, ~anything):
+            ax.broken_barh([(start, width)], (len(names) - 0.16, 0.32), facecolors=drawing.VERMILLION, lw=0)
+            if width > 0.02 * end_s:
+                ax.annotate(
+                    f"{width:.1f} s", (start + 0.5 * width, len(names) + 0.2), ha="center", va="top", fontsize=7.5
+                )
+    ax.set(xlim=(0, end_s), ylim=(len(names) + 0.62, -0.5), xlabel="time [s]")
+    ax.set_yticks(range(len(names) + 1), [*names, "any camera"])
+    ax.tick_params(axis="y", length=0)
+    ax.grid(visible=False, axis="y")
+    handles = [
+        Patch(color=drawing.FAINT, alpha=0.4, lw=0, label="frames with the person"),
+        Patch(color=drawing.FAINT, lw=0, label=f"used by the filter within {gap_s:g} s"),
+        Patch(color=drawing.VERMILLION, lw=0, label="none used"),
+    ]
+    drawing.legend_above(ax, handles=handles)
+    return figure
+
+
+def _frame_bars(seconds: Floats, gap_s: float) -> list[tuple[float, float]]:
+    """Stretches of frames no further apart than ``gap_s`` as (start, width) [s]."""
+    if not len(seconds):
+        return []
+    breaks = np.flatnonzero(np.diff(seconds) > gap_s)
+    starts = seconds[np.append(0, breaks + 1)]
+    ends = seconds[np.append(breaks, len(seconds) - 1)]
+    return [(float(a), float(b - a)) for a, b in zip(starts, ends, strict=True)]
+
+
+def _tick_bars(seconds: Floats, mask: Bools) -> list[tuple[float, float]]:
+    last = len(seconds) - 1
+    return [(float(seconds[a]), float(seconds[min(b, last)] - seconds[a])) for a, b in stretches(mask)]

@@ -1,22 +1,26 @@
-"""Figures of the robot's motion: its path (Fig. 13), its speed (Fig. 14), its status, and how often it stood."""
+"""Figures of the robot's motion: its path (Fig. 13), its speed (Fig. 14), its status, and how often it stood.
+
+Figure of the robot: the capsules that stand for its links, beside what the person could reach.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
 from hrcreplay.records import STATUSES, Floats
-from hrcreplay.report import style
+from hrcreplay.report import drawing
+from hrcreplay.report.drawing import Solid, View, outline, picture, view_from
+from hrcreplay.report.metrics import Metric, envelope, seconds_from, stretches, thin_path, times
 from hrcreplay.report.metrics_plan import numbers, path_feet, stationary, vectors
-from hrcreplay.report.metrics_table import Metric
-from hrcreplay.report.series import envelope, seconds_from, stretches, thin_path, times
-from hrcreplay.report.solids import View, outline, view_from
 
 ABOVE = View(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 1.0, 0.0]), toward=np.array([0.0, 0.0, 1.0]))
 SIDE = view_from(-0.5 * np.pi, 0.0)
@@ -38,13 +42,13 @@ def path(
     worst = int(np.argmax(np.where(np.isfinite(far), far, -1.0)))
     t_ns = times(motion)
     limbs = _limbs_at(occupancy, int(t_ns[worst]))
-    figure = style.new_figure(3.6)
-    axes = style.panels(figure, 1, 3, left_in=0.62, top_in=0.62, gap_in=(0.3, 0.62))[0]
+    figure = drawing.new_figure(3.6)
+    axes = drawing.panels(figure, 1, 3, left_in=0.62, top_in=0.62, gap_in=(0.3, 0.62))[0]
     everything = np.vstack([reference, tcp])
     if T_world_base is not None:
         everything = np.vstack([everything, T_world_base[:3, 3]])
         for ax, view in zip(axes[:2], (ABOVE, SIDE), strict=True):
-            ax.plot(*view.flat(T_world_base[None, :3, 3]).T, "s", color=style.INK, ms=6, zorder=3)
+            ax.plot(*view.flat(T_world_base[None, :3, 3]).T, "s", color=drawing.INK, ms=6, zorder=3)
     _draw_path(axes[0], ABOVE, reference, tcp, limbs, everything, 0.15)
     axes[0].set(title="From above", xlabel="x [m]", ylabel="y [m]")
     _draw_path(axes[1], SIDE, reference, tcp, limbs, everything, 0.15)
@@ -56,9 +60,9 @@ def path(
     axes[2].set(title=title, xlabel="in its vertical plane [m]", ylabel="z [m]")
     for ax, view in zip(axes, (ABOVE, SIDE, detail), strict=True):
         ends = view.flat(np.vstack([feet[worst], tcp[worst]]))
-        ax.plot(*ends.T, color=style.INK, lw=1.0, zorder=6)
-        ax.plot(*ends[0], "o", color=style.NOMINAL, ms=4.5, zorder=7)
-        ax.plot(*ends[1], "o", color=style.ACTUAL, ms=4.5, zorder=7)
+        ax.plot(*ends.T, color=drawing.INK, lw=1.0, zorder=6)
+        ax.plot(*ends[0], "o", color=drawing.NOMINAL, ms=4.5, zorder=7)
+        ax.plot(*ends[1], "o", color=drawing.ACTUAL, ms=4.5, zorder=7)
     if left:
         _label_length(axes[2], detail.flat(np.vstack([feet[worst], tcp[worst]])), f"{far[worst]:.3f} m")
     _path_legend(figure, with_limbs=bool(limbs), with_base=T_world_base is not None)
@@ -82,13 +86,13 @@ def _label_length(ax: Axes, ends: Floats, text: str) -> None:
 
 def _path_legend(figure: Figure, *, with_limbs: bool, with_base: bool) -> None:
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=style.NOMINAL, lw=1.4, label="programmed"),
-        Line2D([], [], color=style.ACTUAL, lw=1.2, label="actual"),
+        Line2D([], [], color=drawing.NOMINAL, lw=1.4, label="programmed"),
+        Line2D([], [], color=drawing.ACTUAL, lw=1.2, label="actual"),
     ]
     if with_base:
-        handles.append(Line2D([], [], ls="", marker="s", ms=5, color=style.INK, label="robot base"))
+        handles.append(Line2D([], [], ls="", marker="s", ms=5, color=drawing.INK, label="robot base"))
     if with_limbs:
-        handles.append(Patch(color=style.FAINT, alpha=0.4, label="swept volumes of the person at that tick"))
+        handles.append(Patch(color=drawing.FAINT, alpha=0.4, label="swept volumes of the person at that tick"))
     width, height = figure.get_size_inches()
     figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.62 / width, 1 - 0.06 / height), ncols=4)
 
@@ -125,27 +129,27 @@ def _draw_path(
     for limb, vertices, radius in limbs:
         edge = outline(vertices, radius, view)
         if len(edge):
-            colour = style.LIMBS.get(limb, style.FAINT)
+            colour = drawing.LIMBS.get(limb, drawing.FAINT)
             ax.add_patch(Polygon(edge, facecolor=colour, alpha=0.22, lw=0))
             ax.add_patch(Polygon(edge, fill=False, edgecolor=colour, lw=0.7, alpha=0.8))
-    ax.plot(*view.flat(thin_path(tcp, 0.004)).T, color=style.ACTUAL, lw=0.9, alpha=0.85, zorder=4)
-    ax.plot(*view.flat(thin_path(reference, 0.004)).T, color=style.NOMINAL, lw=1.3, zorder=5)
+    ax.plot(*view.flat(thin_path(tcp, 0.004)).T, color=drawing.ACTUAL, lw=0.9, alpha=0.85, zorder=4)
+    ax.plot(*view.flat(thin_path(reference, 0.004)).T, color=drawing.NOMINAL, lw=1.3, zorder=5)
     flat = view.flat(shown[np.isfinite(shown).all(axis=1)])
-    style.set_window(ax, (flat.min(axis=0) - margin_m).tolist(), (flat.max(axis=0) + margin_m).tolist())
+    drawing.set_window(ax, (flat.min(axis=0) - margin_m).tolist(), (flat.max(axis=0) + margin_m).tolist())
 
 
 def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
     """Fig. 14: programmed speed; actual speed with braking shaded; separation from the swept volumes."""
     seconds = seconds_from(times(motion), t0_ns)
-    figure = style.new_figure(4.6)
-    rows = style.panels(figure, 3, heights=[1.0, 1.0, 1.0], gap_in=(0.34, 0.0), share_x=True, top_in=0.26)
+    figure = drawing.new_figure(4.6)
+    rows = drawing.panels(figure, 3, heights=[1.0, 1.0, 1.0], gap_in=(0.34, 0.0), share_x=True, top_in=0.26)
     nominal, actual, separation = (row[0] for row in rows)
-    nominal.plot(*envelope(seconds, numbers(motion, "ref_speed")), color=style.NOMINAL, lw=0.9)
+    nominal.plot(*envelope(seconds, numbers(motion, "ref_speed")), color=drawing.NOMINAL, lw=0.9)
     nominal.set(title="Programmed TCP speed", ylabel="m/s")
-    actual.plot(*envelope(seconds, numbers(motion, "tcp_speed")), color=style.ACTUAL, lw=0.9)
+    actual.plot(*envelope(seconds, numbers(motion, "tcp_speed")), color=drawing.ACTUAL, lw=0.9)
     actual.set(title="Actual TCP speed", ylabel="m/s")
-    separation.plot(*envelope(seconds, numbers(motion, "distance_m")), color=style.PURPLE, lw=1.0)
-    separation.axhline(near_m, color=style.INK, lw=0.8, ls=(0, (4, 3)))
+    separation.plot(*envelope(seconds, numbers(motion, "distance_m")), color=drawing.PURPLE, lw=1.0)
+    separation.axhline(near_m, color=drawing.INK, lw=0.8, ls=(0, (4, 3)))
     separation.set(title="Separation from the swept volumes", ylabel="m", xlabel="time [s]", ylim=(0, None))
     high = max(_top(motion, "ref_speed"), _top(motion, "tcp_speed")) * 1.08
     nominal.set_ylim(0, high)
@@ -153,9 +157,9 @@ def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
     for ax in (actual, separation):
         _shade(ax, seconds, motion, "braking")
     separation.set_xlim(seconds[0], seconds[-1])
-    style.legend_above(actual, handles=[Patch(color=style.STATUS["braking"], alpha=0.25, lw=0, label="braking")])
-    near = Line2D([], [], color=style.INK, lw=0.8, ls=(0, (4, 3)), label=f"near: {near_m:g} m")
-    style.legend_above(separation, handles=[near])
+    drawing.legend_above(actual, handles=[Patch(color=drawing.STATUS["braking"], alpha=0.25, lw=0, label="braking")])
+    near = Line2D([], [], color=drawing.INK, lw=0.8, ls=(0, (4, 3)), label=f"near: {near_m:g} m")
+    drawing.legend_above(separation, handles=[near])
     return figure
 
 
@@ -168,7 +172,7 @@ def _top(motion: pd.DataFrame, name: str) -> float:
 def _shade(ax: Axes, seconds: Floats, motion: pd.DataFrame, status: str) -> None:
     bars = _bars(seconds, (motion["status"] == status).to_numpy(dtype=bool))
     ax.broken_barh(
-        bars, (0, 1), transform=ax.get_xaxis_transform(), facecolors=style.STATUS[status], alpha=0.2, lw=0, zorder=0
+        bars, (0, 1), transform=ax.get_xaxis_transform(), facecolors=drawing.STATUS[status], alpha=0.2, lw=0, zorder=0
     )
 
 
@@ -196,37 +200,37 @@ def status(
 ) -> Figure:
     """What the plan and each baseline did over time, and when each stood near the person though it should move."""
     tables = {f"plan: {method}": motion, **baselines}
-    figure = style.new_figure(0.95 + 0.62 * len(tables))
-    ax = style.panels(figure, 1, left_in=0.9, top_in=0.36)[0][0]
+    figure = drawing.new_figure(0.95 + 0.62 * len(tables))
+    ax = drawing.panels(figure, 1, left_in=0.9, top_in=0.36)[0][0]
     for row, table in enumerate(tables.values()):
         seconds = seconds_from(times(table), t0_ns)
         kind = table["status"].to_numpy()
         for value in STATUSES:  # the gravest is drawn last and stays visible
             bars = _bars(seconds, kind == value)
-            ax.broken_barh(bars, (row - 0.12, 0.44), facecolors=style.STATUS[value], lw=0)
+            ax.broken_barh(bars, (row - 0.12, 0.44), facecolors=drawing.STATUS[value], lw=0)
         near, stands = stationary(table, near_m, slow_m_per_s)
-        ax.broken_barh(_bars(seconds, near), (row - 0.36, 0.16), facecolors=style.FAINT, alpha=0.45, lw=0)
-        ax.broken_barh(_bars(seconds, near & stands), (row - 0.36, 0.16), facecolors=style.INK, lw=0)
+        ax.broken_barh(_bars(seconds, near), (row - 0.36, 0.16), facecolors=drawing.FAINT, alpha=0.45, lw=0)
+        ax.broken_barh(_bars(seconds, near & stands), (row - 0.36, 0.16), facecolors=drawing.INK, lw=0)
     seconds = seconds_from(times(motion), t0_ns)
     ax.set(ylim=(len(tables) - 0.5, -0.55), xlim=(seconds[0], seconds[-1]), xlabel="time [s]")
     ax.set_yticks(range(len(tables)), list(tables))
     ax.tick_params(axis="y", length=0)
     ax.grid(visible=False, axis="y")
-    handles = [Patch(color=style.STATUS[value], lw=0, label=value) for value in STATUSES]
+    handles = [Patch(color=drawing.STATUS[value], lw=0, label=value) for value in STATUSES]
     handles += [
-        Patch(color=style.FAINT, alpha=0.45, lw=0, label=f"within {near_m:g} m"),
-        Patch(color=style.INK, lw=0, label="and standing"),
+        Patch(color=drawing.FAINT, alpha=0.45, lw=0, label=f"within {near_m:g} m"),
+        Patch(color=drawing.INK, lw=0, label="and standing"),
     ]
-    style.legend_above(ax, handles=handles)
+    drawing.legend_above(ax, handles=handles)
     return figure
 
 
 def stationary_share(metrics: Mapping[str, Metric]) -> Figure:
     """Stationary share of the plan and its baselines on this log, with the paper's two figures beside them."""
     method = metrics["plan_method"]["value"]
-    rows = [(f"this log: {method}", "plan", style.BLUE)]
+    rows = [(f"this log: {method}", "plan", drawing.BLUE)]
     rows += [
-        (f"this log: {name}", f"baseline_{name}", style.ORANGE)
+        (f"this log: {name}", f"baseline_{name}", drawing.ORANGE)
         for name in sorted(n.split("_")[1] for n in metrics if n.startswith("baseline_") and n.endswith("_near_ticks"))
     ]
     paper = [
@@ -234,8 +238,8 @@ def stationary_share(metrics: Mapping[str, Metric]) -> Figure:
         ("the paper's: scaling", "paper_stationary_share_scaling"),
     ]
     count = len(rows) + len(paper)
-    figure = style.new_figure(0.7 + 0.36 * count)
-    ax = style.panels(figure, 1, left_in=1.55, top_in=0.12, right_in=1.6)[0][0]
+    figure = drawing.new_figure(0.7 + 0.36 * count)
+    ax = drawing.panels(figure, 1, left_in=1.55, top_in=0.12, right_in=1.6)[0][0]
     for y, (_, prefix, colour) in enumerate(rows):
         share = metrics[f"{prefix}_stationary_share"]["value"]
         ticks = metrics[f"{prefix}_near_ticks"]["value"]
@@ -244,10 +248,95 @@ def stationary_share(metrics: Mapping[str, Metric]) -> Figure:
         ax.annotate(text, (100 * (share or 0.0), y), xytext=(5, 0), textcoords="offset points", va="center")
     for y, (_, name) in enumerate(paper, start=len(rows)):
         value = 100 * metrics[name]["value"]
-        ax.barh(y, value, height=0.62, facecolor="none", edgecolor=style.FAINT, hatch="////", lw=0.8)
+        ax.barh(y, value, height=0.62, facecolor="none", edgecolor=drawing.FAINT, hatch="////", lw=0.8)
         ax.annotate(f"{value:.2f} %, other data", (value, y), xytext=(5, 0), textcoords="offset points", va="center")
     ax.set(xlim=(0, 100), ylim=(count - 0.45, -0.55), xlabel="stationary share of the near ticks [%]")
     ax.set_yticks(range(count), [row[0] for row in rows] + [row[0] for row in paper])
     ax.tick_params(axis="y", length=0)
     ax.grid(visible=False, axis="y")
     return figure
+
+
+_COLOURS = (
+    drawing.BLUE,
+    drawing.ORANGE,
+    drawing.GREEN,
+    drawing.PURPLE,
+    drawing.SKY,
+    drawing.VERMILLION,
+    drawing.YELLOW,
+)
+_MARGIN_M = 0.12
+
+
+@dataclass(frozen=True)
+class LinkPose:
+    """The robot's capsules at one tick, and the swept volumes of that tick."""
+
+    t_ns: int
+    distance_m: float  #: surface to surface, NaN where it is not known [m]
+    bodies: tuple[str, ...]  #: link that each of the s capsules belongs to
+    ends_m: Floats  #: (s, 2, 3) world [m]
+    radius_m: Floats  #: (s,) [m]
+    volumes: Mapping[str, tuple[Floats, float]]  #: limb -> (m, 3) vertices, world, and radius [m]
+
+
+def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
+    """The capsules from the side, with the person to one hand, and from above; the swept volumes in outline.
+
+    Args:
+        pose: What to draw.
+        t0_ns: Start of the run [ns].
+        T_world_base: (4, 4) robot base in the world [m].
+    """
+    base_m = T_world_base[:3, 3]
+    names = list(dict.fromkeys(pose.bodies))
+    colours = {name: to_rgb(_COLOURS[i % len(_COLOURS)]) for i, name in enumerate(names)}
+    solids = [
+        Solid(ends, float(radius), colours[body])
+        for body, ends, radius in zip(pose.bodies, pose.ends_m, pose.radius_m, strict=True)
+    ]
+    rows = -(-(len(names) + 1) // 4)
+    figure = drawing.new_figure(3.9 + 0.18 * rows)
+    axes = drawing.panels(figure, 1, 2, left_in=0.62, top_in=0.3, bottom_in=0.5 + 0.18 * rows, gap_in=(0.3, 0.62))[0]
+    views = (view_from(_beside(pose, base_m), 0.12), ABOVE)
+    for ax, view in zip(axes, views, strict=True):
+        _draw(ax, view, solids, pose, base_m)
+    near = "" if np.isnan(pose.distance_m) else f", {pose.distance_m:.3f} m from the person's volumes"
+    axes[0].set(title=f"At {(pose.t_ns - t0_ns) * 1e-9:.1f} s{near}", xlabel="across [m]", ylabel="up [m]")
+    axes[1].set(title="From above", xlabel="x [m]", ylabel="y [m]")
+    handles = [Patch(color=colours[name], lw=0, label=name) for name in names]
+    if pose.volumes:
+        handles.append(Patch(facecolor=drawing.FAINT, alpha=0.3, lw=0, label="swept volumes of the person"))
+    figure.legend(handles=handles, loc="lower center", ncols=4, bbox_to_anchor=(0.5, 0.01))
+    return figure
+
+
+def _beside(pose: LinkPose, base_m: Floats) -> float:
+    """The azimuth of who sees robot and person side by side [rad]."""
+    if not pose.volumes:
+        return -0.5 * np.pi
+    person = np.mean([vertices.mean(axis=0) for vertices, _ in pose.volumes.values()], axis=0)
+    return float(np.arctan2(person[1] - base_m[1], person[0] - base_m[0]) - 0.5 * np.pi)
+
+
+def _draw(ax: Axes, view: View, solids: list[Solid], pose: LinkPose, base_m: Floats) -> None:
+    edges = [outline(solid.vertices_m, solid.radius_m, view) for solid in solids]
+    corners = np.vstack([*edges, view.flat(base_m[None])])
+    low, high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
+    drawing.set_window(ax, low.tolist(), high.tolist())
+    for limb, (vertices, radius) in pose.volumes.items():
+        edge = outline(vertices, radius, view)
+        if len(edge):
+            colour = drawing.LIMBS.get(limb, drawing.FAINT)
+            ax.add_patch(Polygon(edge, facecolor=colour, alpha=0.12, lw=0, zorder=0))
+            ax.add_patch(Polygon(edge, fill=False, edgecolor=colour, lw=0.7, alpha=0.7, zorder=0))
+    image = picture(solids, view, low, high, (high[1] - low[1]) / 420.0)
+    extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    limits = ax.get_xlim(), ax.get_ylim()
+    ax.imshow(image, origin="lower", extent=extent, aspect="auto", interpolation="bilinear", zorder=2)
+    ax.set(xlim=limits[0], ylim=limits[1])
+    for edge in edges:
+        if len(edge):
+            ax.add_patch(Polygon(edge, fill=False, edgecolor=drawing.INK, lw=0.5, alpha=0.6, zorder=3))
+    ax.plot(*view.flat(base_m[None]).T, "s", color=drawing.INK, ms=6, zorder=4)

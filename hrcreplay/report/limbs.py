@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 
 from hrcreplay.records import JOINTS, LIMBS, Bools, Floats
-from hrcreplay.report.metrics_table import Metric, MetricTable
-from hrcreplay.runs import Run
+from hrcreplay.report.metrics import Metric, MetricTable
+from hrcreplay.store.run_folder import Run
 
 #: A limb unmeasured at more than this share of the time has to be spoken of.
 MOST = 0.5

@@ -1,40 +1,159 @@
-"""Everything that metrics.json holds, from a run's tables alone."""
+"""Time series as the report needs them: interpolation, derivatives, stretches, and fewer points for drawing.
+
+The table that metrics.json holds: name -> value, unit and meaning; null with a reason where one does not apply.
+"""
 
 from __future__ import annotations
 
-from hrcreplay.report.limbs import add_limbs
-from hrcreplay.report.metrics_fusion import add_fusion
-from hrcreplay.report.metrics_plan import add_plan
-from hrcreplay.report.metrics_quality import add_occupancy, add_quality
-from hrcreplay.report.metrics_table import Metric, MetricTable
-from hrcreplay.runs import Run
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hrcreplay.human.model import nearest
+from hrcreplay.records import JOINTS, Bools, Floats, Ints
+
+Metric = dict[str, Any]
 
 
-def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float = 0.2) -> dict[str, Metric]:
-    """Metrics of a run: name -> value, unit, meaning; null with a reason where one does not apply, never 0.
+class MetricTable:
+    """Collects metrics. A number that is not finite becomes null, and then the reason is written beside it."""
+
+    def __init__(self) -> None:
+        self._metrics: dict[str, Metric] = {}
+
+    def add(self, name: str, value: float | str | None, unit: str, meaning: str, *, reason: str = "no samples") -> None:
+        """Adds one metric; ``reason`` says why it is null, if it is."""
+        if not isinstance(value, str) and value is not None:
+            number = value.item() if isinstance(value, np.generic) else value
+            value = number if np.isfinite(number) else None
+        metric: Metric = {"value": value, "unit": unit, "meaning": meaning}
+        if value is None:
+            metric["reason"] = reason
+        self._metrics[name] = metric
+
+    def sorted(self) -> dict[str, Metric]:
+        """All metrics, by name."""
+        return dict(sorted(self._metrics.items()))
+
+
+#: The ten angles of Eq. (37); x and y are lengths.
+ANGLES = JOINTS[2:]
+
+#: Which columns of a (n, 12) table of JOINTS are angles.
+IS_ANGLE: Bools = np.array([joint in ANGLES for joint in JOINTS])
+
+
+def wrap(angle_rad: Floats) -> Floats:
+    """Angles brought into [-pi, pi) [rad]."""
+    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def difference(a: Floats, b: Floats) -> Floats:
+    """``a - b`` of rows of JOINTS, (n, 12) [m, m, rad...]; arms by the same name, angles the short way round."""
+    apart = nearest(a, b) - b
+    return np.where(IS_ANGLE, wrap(apart), apart)
+
+
+def columns(table: pd.DataFrame, suffix: str = "") -> Floats:
+    """(n, 12) the columns of JOINTS with a suffix."""
+    return table[[joint + suffix for joint in JOINTS]].to_numpy(dtype=float)
+
+
+def times(table: pd.DataFrame, name: str = "t_ns") -> Ints:
+    """(n,) a column of instants [ns]."""
+    return table[name].to_numpy(dtype=np.int64)
+
+
+def seconds_from(t_ns: Ints, t0_ns: int) -> Floats:
+    """(n,) time since ``t0_ns`` [s]."""
+    return np.asarray((t_ns - t0_ns) * 1e-9, dtype=np.float64)
+
+
+def interpolate(t_ns: Ints, values: Floats, at_ns: Ints, *, angles: bool) -> Floats:
+    """Rows of JOINTS, or of their rates, between the two samples around each instant, linear.
 
     Args:
-        run: The run's tables; those of stages that were not run are None.
-        near_m: The stationary share counts ticks with a separation of at most this [m].
-        stationary_m_per_s: A TCP slower than this stands [m/s].
-        gap_s: A camera silent for longer has a gap [s].
+        t_ns: (n,) instants of the samples, increasing [ns].
+        values: (n, 12) samples [m, m, rad...].
+        at_ns: (m,) instants asked for [ns].
+        angles: The columns of angles are angles, which go the short way round; else they are rates.
 
     Returns:
-        Sorted by name, plain Python values, finite numbers only.
+        (m, 12); NaN outside the samples' span and where one of the two samples is NaN. An instant that meets a
+        sample gets that sample, whatever its neighbours are.
     """
-    plan = run.meta.get("settings", {}).get("plan", {})
-    metrics = MetricTable()
-    add_quality(metrics, run, gap_s)
-    add_limbs(metrics, run)
-    add_occupancy(metrics, run.occupancy)
-    add_fusion(metrics, run, gap_s)
-    add_plan(
-        metrics,
-        run.motion,
-        run.baselines,
-        method=str(plan.get("method", "qp")),
-        near_m=near_m,
-        stationary_m_per_s=stationary_m_per_s,
-        leash_m=float(plan.get("leash_m", 0.25)),
-    )
-    return metrics.sorted()
+    if len(t_ns) < 2 or not len(at_ns):
+        return np.full((len(at_ns), values.shape[1]), np.nan)
+    left = np.clip(np.searchsorted(t_ns, at_ns, side="right") - 1, 0, len(t_ns) - 2)
+    step = t_ns[left + 1] - t_ns[left]
+    fraction = ((at_ns - t_ns[left]) / step)[:, None]
+    change = difference(values[left + 1], values[left]) if angles else values[left + 1] - values[left]
+    found = values[left] + fraction * change
+    found = np.where(fraction == 0.0, values[left], np.where(fraction == 1.0, values[left + 1], found))
+    outside = (at_ns < t_ns[0]) | (at_ns > t_ns[-1])
+    return np.where(outside[:, None], np.nan, found)
+
+
+def central_differences(t_ns: Ints, values: Floats) -> Floats:
+    """(n, 12) rates of rows of JOINTS by central differences [m/s, m/s, rad/s...]; NaN at both ends."""
+    rate = np.full(values.shape, np.nan)
+    if len(t_ns) > 2:
+        rate[1:-1] = difference(values[2:], values[:-2]) / ((t_ns[2:] - t_ns[:-2]) * 1e-9)[:, None]
+    return rate
+
+
+def stretches(mask: Bools) -> Ints:
+    """(k, 2) the runs of true in ``mask``, each as [first, past the last)."""
+    edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
+    return np.column_stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)]).astype(np.int64)
+
+
+def durations_s(t_ns: Ints) -> Floats:
+    """(n,) how long each tick lasts: until the next one; the last as long as the median [s]."""
+    if len(t_ns) < 2:
+        return np.zeros(len(t_ns))
+    steps = np.diff(t_ns) * 1e-9
+    return np.append(steps, np.median(steps))
+
+
+def broken(x: Floats, y: Floats, gap: float) -> tuple[Floats, Floats]:
+    """A line with a NaN put in wherever its abscissa leaps by more than ``gap``."""
+    leaps = np.flatnonzero(np.diff(x) > gap) + 1
+    return np.insert(x, leaps, x[leaps - 1]), np.insert(y, leaps, np.nan)
+
+
+def envelope(x: Floats, y: Floats, bins: int = 700) -> tuple[Floats, Floats]:
+    """Fewer points that draw the same line: of each bin of rows its lowest and its highest point, in order.
+
+    Args:
+        x: (n,) abscissae, increasing.
+        y: (n,) ordinates; NaN breaks the line.
+        bins: How many bins; a table of at most 4 rows a bin is returned as it is.
+
+    Returns:
+        ``x`` and ``y`` of the points kept. A bin without a finite value keeps one NaN.
+    """
+    if len(x) <= 4 * bins:
+        return x, y
+    size = -(-len(x) // bins)
+    padded = np.full(size * bins, np.nan)
+    padded[: len(y)] = y
+    table = padded.reshape(bins, size)
+    missing = np.isnan(table)
+    first = np.arange(bins) * size
+    lowest = first + np.argmin(np.where(missing, np.inf, table), axis=1)
+    highest = first + np.argmax(np.where(missing, -np.inf, table), axis=1)
+    gaps = (first + np.argmax(missing, axis=1))[missing.any(axis=1)]
+    kept = np.unique(np.concatenate([lowest, highest, gaps]))
+    kept = kept[kept < len(x)]
+    return x[kept], y[kept]
+
+
+def thin_path(points: Floats, tolerance: float) -> Floats:
+    """(m, d) a path through fewer of its (n, d) points: one wherever it has moved by ``tolerance``, and the last."""
+    if len(points) < 3:
+        return points
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    _, first = np.unique(np.floor(travelled / tolerance), return_index=True)
+    return points[np.union1d(first, [len(points) - 1])]

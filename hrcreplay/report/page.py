@@ -15,14 +15,24 @@ from markupsafe import Markup
 
 from hrcreplay.records import LIMBS
 from hrcreplay.report import story
-from hrcreplay.report.flaws import flaws
 from hrcreplay.report.limbs import called
-from hrcreplay.report.metrics_quality import cameras
-from hrcreplay.report.metrics_table import Metric
-from hrcreplay.report.robot_summary import robot_table
-from hrcreplay.report.tables import PageTable, compare, percent, text_of
-from hrcreplay.report.wording import CAMERA, CAPTIONS, FUSION, NOT_CLAIMED, PLAN_COST, PLAN_SAFETY
-from hrcreplay.runs import Run
+from hrcreplay.report.metrics import Metric
+from hrcreplay.report.metrics_data import cameras
+from hrcreplay.report.story import flaws
+from hrcreplay.report.tables import (
+    CAMERA,
+    CAPTIONS,
+    FUSION,
+    NOT_CLAIMED,
+    PLAN_COST,
+    PLAN_SAFETY,
+    PageTable,
+    compare,
+    percent,
+    robot_table,
+    text_of,
+)
+from hrcreplay.store.run_folder import Run
 
 #: Suffixes of the metrics of each limb.
 _LIMB = ("unmeasured_share", "joints_unmeasured")
@@ -56,7 +66,7 @@ def render(
 
     Args:
         run: The run's tables.
-        metrics: What :func:`hrcreplay.report.metrics.compute` found.
+        metrics: What :func:`hrcreplay.run.report.compute` found.
         figures_dir: Where :func:`hrcreplay.report.figures.draw_all` drew.
         tables: Tables 1 and 2 as used, shown with the prediction.
         title: Name of the session; none: the name of the first input.

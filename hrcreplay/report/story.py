@@ -1,16 +1,48 @@
-"""The answer in words and headline numbers. Says what the replay shows, and never more than that."""
+"""The answer in words and headline numbers. Says what the replay shows, and never more than that.
+
+What was wrong with a log, in lines for a page's first screen and a terminal.
+
+A run in a line for each stage, from the metrics that its page shows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from hrcreplay.logs.clean import DEFECTS
 from hrcreplay.report.limbs import called, unmeasured
-from hrcreplay.report.metrics_quality import cameras
-from hrcreplay.report.metrics_table import Metric
-from hrcreplay.report.tables import percent, text_of
-from hrcreplay.report.wording import happened
-from hrcreplay.runs import Run
+from hrcreplay.report.metrics import Metric
+from hrcreplay.report.metrics_data import cameras
+from hrcreplay.report.tables import happened, percent, text_of
+from hrcreplay.store.run_folder import Run
+
+#: Between groups of digits.
+NARROW = "\u202f"
+_CAMERA = "_<camera>"
+#: How ``DEFECTS`` begins what is none, and what is no count.
+_NONE, _INSTANT = "no defect", "an instant"
+
+
+def flaws(counts: Mapping[str, int], notes: Sequence[str]) -> tuple[str, ...]:
+    """The notes of a run, then what was counted of each defect of its log; nothing of a clean log.
+
+    Args:
+        counts: ``counts`` of run.json; what is no defect of the log is left out.
+        notes: ``notes`` of run.json.
+    """
+    found = [(_text(name), count) for name, count in sorted(counts.items()) if count]
+    return (*notes, *(f"{text}: {f'{count:,}'.replace(',', NARROW)}" for text, count in found if text))
+
+
+def _text(name: str) -> str:
+    """What ``DEFECTS`` says of a counter; empty where it counts no defect. A note tells of the instant."""
+    for known, text in DEFECTS.items():
+        stem = known.removesuffix(_CAMERA)
+        of_camera = stem != known and name.startswith(f"{stem}_")
+        if (name == known or (of_camera and name not in DEFECTS)) and not text.startswith((_NONE, _INSTANT)):
+            return f"camera {name.removeprefix(f'{stem}_')}, {text}" if of_camera else text
+    return ""
 
 
 @dataclass(frozen=True)
@@ -211,3 +243,57 @@ def _human_cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
         total = text_of(metrics[f"occupancy_{method}_sum_m3"])
         found.append(Card(total, "mean sum of the six swept volumes", f"method '{method}'"))
     return tuple(found)
+
+
+Metrics = Mapping[str, Metric]
+
+
+def lines(run: Run, metrics: Metrics) -> list[str]:
+    """The main figures of each stage that the run holds; of a report also its answers.
+
+    Args:
+        run: The run's tables.
+        metrics: What :func:`hrcreplay.run.report.compute` found.
+    """
+    found = []
+    if run.state is not None:
+        found.append(f"fuse: {_fuse(run, metrics)}")
+    if run.occupancy is not None:
+        found.append(f"predict: {_predict(run, metrics)}")
+    if run.motion is not None:
+        others = {name: f"baseline_{name}" for name in sorted(run.baselines)}
+        plans = {str(metrics["plan_method"]["value"]): "plan", **others}
+        found.append("plan: " + "; ".join(f"{name}: {_plan(metrics, prefix)}" for name, prefix in plans.items()))
+    if run.meta.get("command") == "report":
+        found.append("report: " + " ".join(answer.short for answer in answers(run, metrics)))
+    return [line.replace("\u202f", ",") for line in found]  # the page's separator is not in every terminal's font
+
+
+def _fuse(run: Run, metrics: Metrics) -> str:
+    ticks = metrics["ticks"]["value"]
+    unknown = metrics["ticks_before_first_state"]["value"] + metrics["ticks_state_lost"]["value"]
+    frames = ", ".join(f"{name} {text_of(metrics[f'camera_{name}_frames'])}" for name in cameras(run))
+    outliers = sum(count for name, count in run.counts.items() if name.startswith("outlier_points_"))
+    return (
+        f"{text_of(metrics['ticks'])} ticks, person known in {100 * (1 - unknown / ticks):.1f} %; "
+        f"frames with the person: {frames}; {outliers:,} outlier points"
+    )
+
+
+def _predict(run: Run, metrics: Metrics) -> str:
+    settings = run.meta["settings"]["occupancy"]
+    limits = run.meta["limits"]["prediction"]["name"]
+    name = f"occupancy_{settings['method']}"
+    words = f"{settings['method']}, {limits}: the six limbs {text_of(metrics.get(f'{name}_sum_m3'))}"
+    if f"{name}_LEGS_m3" in metrics:
+        words += f", lower body {text_of(metrics[f'{name}_LEGS_m3'])}"
+    return words + " (means of the stored ticks; overlaps of limbs count twice)"
+
+
+def _plan(metrics: Metrics, prefix: str) -> str:
+    words = [f"{text_of(metrics[f'{prefix}_braking_moving_ticks'])} ticks braking while moving"]
+    if metrics[f"{prefix}_stationary_share"]["value"] is not None:
+        words.insert(0, f"standing in {percent(metrics[f'{prefix}_stationary_share'])} of the near ticks")
+    if metrics[f"{prefix}_progress_share"]["value"] is not None:
+        words.insert(0, f"{percent(metrics[f'{prefix}_progress_share'])} of the programmed pace")
+    return ", ".join(words)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from hrcreplay.robot.segments import Segment
+from hrcreplay.robot.link_capsules import Segment
 
 #: Axis: offset from the axis before it, at zero [m]; direction at zero; range [deg]; top speed [deg/s].
 _AXES = (

@@ -18,9 +18,7 @@ from numba import njit
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Bools, Floats
 from hrcreplay.robot import irb140 as irb140_data
-from hrcreplay.robot.capsule import distance_m
-from hrcreplay.robot.segments import Segment, Vector
-from hrcreplay.robot.shapes import capsules
+from hrcreplay.robot.link_capsules import Segment, Vector, capsules, distance_m
 from hrcreplay.robot.urdf import Description, describe, with_meshes
 
 __all__ = ["RobotModel", "RobotPose", "Segment", "from_urdf", "irb140"]

@@ -12,7 +12,7 @@ import numpy as np
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
-from hrcreplay.robot.shapes import Shape, shapes
+from hrcreplay.robot.link_capsules import Shape, shapes
 
 _TURNING = ("revolute", "continuous")
 

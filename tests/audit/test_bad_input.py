@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay import limits, replay
+from hrcreplay import limits
+from hrcreplay.run import replay
 from tests.audit.standing import frames, log_of_one_who_does_not_stir, standing
 from tests.logs import own
 from tests.test_cli import Run, run

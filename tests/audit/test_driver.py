@@ -15,13 +15,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hrcreplay import replay, runs
-from hrcreplay.audit import driver
+from hrcreplay.audit import baselines, driver
+from hrcreplay.audit import figures as figures_audit
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.human import peers, reach
+from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import BODY, LIMBS, POINTS
-from hrcreplay.report import figures_audit
+from hrcreplay.run import replay
+from hrcreplay.store import run_folder
 from tests.audit.standing import frames, standing
 from tests.realdata import data_path
 from tests.test_recordings import SARA, SARA_CELL
@@ -56,7 +57,7 @@ def test_an_audit_leaves_what_it_promises(folder: Path, found: dict[str, Any]) -
         assert (folder / "figures" / f"{name}.png").stat().st_size > 5_000
     table = pd.read_parquet(folder / "audit.parquet")
     assert {"t_ns", "log", "method", "limb", "covered", "escape_m", "volume_m3"} <= set(table.columns)
-    assert set(table["method"]) == {*reach.METHODS, *peers.PEERS}
+    assert set(table["method"]) == {*reachable_sets.METHODS, *baselines.PEERS}
     assert set(table["limb"]) >= set(LIMBS)
     assert found["logs"][0]["recorded_future"] == "ground truth"
     assert found["total"]["ticks"] == 140  # (6 s - 0.377 s) at 25 Hz; the first tick is before the first frame
@@ -137,7 +138,7 @@ def test_every_escape_is_a_row_by_every_method(folder: Path) -> None:
 
 def test_same_bytes_again(folder: Path, tmp_path: Path) -> None:
     again = driver.run([replay.demo_log()], out=tmp_path / "again", start_s=START_S, end_s=END_S, overrides=TABLE_1)
-    assert runs.read_meta(again)["outputs"] == runs.read_meta(folder)["outputs"]
+    assert run_folder.read_meta(again)["outputs"] == run_folder.read_meta(folder)["outputs"]
 
 
 @pytest.fixture(scope="module")
@@ -274,7 +275,7 @@ def test_teleports_of_a_real_bag_do_not_count_as_motion(tmp_path: Path, name: st
     assert log["recorded_future"] == "camera points"
     assert log["counts"]["audit_rejected_frames_mocap"] >= 0
     assert found["total"]["methods"]["v2_a50"]["all"]["covered_share"]["value"] > 0.9
-    for method in reach.METHODS:
+    for method in reachable_sets.METHODS:
         assert all(e["deepest_m"] < 1.0 for e in log["escapes"][method])
     deepest = found["total"]["methods"]["paper"]["all"]["escape_max_m"]
     assert deepest is None or deepest < 1.0

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay import replay, runs
 from hrcreplay.audit import fit
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS
+from hrcreplay.run import replay
+from hrcreplay.store import run_folder
 from tests.audit.standing import log_of_one_who_does_not_stir
 from tests.realdata import data_path
 from tests.test_recordings import SARA, SARA_CELL
@@ -44,7 +45,7 @@ def test_the_file_is_a_limit_set(fitted: tuple[Path, list[str]]) -> None:
 
 def test_provenance_tells_the_log_and_what_was_reached(provenance: dict[str, Any]) -> None:
     (log,) = provenance["logs"]
-    assert log["sha256"] == runs.sha256(replay.demo_log())
+    assert log["sha256"] == run_folder.sha256(replay.demo_log())
     assert log["recorded_future"] == "ground truth"
     assert provenance["coverage_requested"] == 0.99
     assert provenance["total"]["training"]["share"] >= 0.99
@@ -73,7 +74,7 @@ def test_a_stage_takes_the_file(tmp_path: Path, fitted: tuple[Path, list[str]]) 
         start_s=10.0,
         end_s=11.0,
     )
-    assert runs.read(folder).meta["limits"]["prediction"]["name"] == "worker"
+    assert run_folder.read(folder).meta["limits"]["prediction"]["name"] == "worker"
 
 
 def test_the_same_logs_give_the_same_bytes(tmp_path: Path, fitted: tuple[Path, list[str]]) -> None:

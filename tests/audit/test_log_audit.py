@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hrcreplay import replay
 from hrcreplay.audit import driver
 from hrcreplay.records import JOINTS
+from hrcreplay.run import replay
 
 
 def _audit(out: Path, *overrides: str) -> tuple[dict[str, Any], pd.DataFrame]:

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from hrcreplay.audit import driver, recording
-from hrcreplay.human.angles import PointNoise
-from hrcreplay.human.fusion import FusionSettings
+from hrcreplay.human.fusion.fuse import FusionSettings
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.pipeline import Eyes
 from hrcreplay.records import POINTS, Bools, Floats, Measurements
+from hrcreplay.run.stages import Eyes
 from tests.audit.standing import frames, standing
 from tests.human.people import states
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit import recording
+from hrcreplay.audit.log_audit import hold, joints_inside, travel, window
 from hrcreplay.audit.recording import Recording
-from hrcreplay.audit.window import hold, joints_inside, travel, window
-from hrcreplay.human import reach
+from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.records import JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
 from tests.human.people import states
 
@@ -59,13 +59,13 @@ def test_a_joint_stays_inside_whatever_its_name_and_turn() -> None:
     joints[6:, 5] = np.nan
     low, high = np.full((2, 12), -0.05), np.full((2, 12), 0.05)
     recording = _recording(np.zeros((8, len(POINTS), 3)), joints, people)
-    inside = joints_inside(recording, people, reach.Reach(people.t_ns, low, high), 0.2)
+    inside = joints_inside(recording, people, reachable_sets.Reach(people.t_ns, low, high), 0.2)
     assert inside[0, JOINTS.index("theta")] == 1.0  # 0.01, 0.02
     assert inside[1, JOINTS.index("theta")] == 1.0  # 0.04, 0.05
     assert inside[0, 4] == 1.0  # 0.02, 0.04
     assert inside[1, 4] == 0.0  # 0.08, 0.10
     late = joints_inside(
-        recording, replace(people, t_ns=people.t_ns + 600_000_000), reach.Reach(people.t_ns, low, high), 0.2
+        recording, replace(people, t_ns=people.t_ns + 600_000_000), reachable_sets.Reach(people.t_ns, low, high), 0.2
     )
     assert late[0, 4] == 0.0
     assert np.isnan(late[1]).all()  # the recording is over

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from hrcreplay.robot.controller import solve, step
+from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.qp_controller import solve, step
+from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.obstacles import obstacles
-from hrcreplay.robot.stepping import RobotState
 from tests.robot.people import person
 from tests.robot.swinging import DT_S, HOME, SETTINGS, STOP_S, Asked, asked, base, dense, run, swing
 

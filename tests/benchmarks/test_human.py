@@ -12,8 +12,8 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.linalg import block_diag
 
-from hrcreplay.human.angles import PointNoise, measure
-from hrcreplay.human.fusion import FusionSettings, fuse, start
+from hrcreplay.human.fusion.fuse import FusionSettings, fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import CameraFrames, Ints, Measurements

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from scipy.spatial import ConvexHull
 
-from hrcreplay.human.occupancy import Radii, predict
-from hrcreplay.human.reach import reachable
+from hrcreplay.human.prediction.reachable_sets import reachable
+from hrcreplay.human.prediction.swept_volumes import Radii, predict
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS
 from tests.human.people import random_states, raw_cloud

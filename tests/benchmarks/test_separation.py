@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from hrcreplay.robot.distance import distances
+from hrcreplay.geometry.segment_hull_distance import distances
+from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.obstacles import obstacles
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
 from tests.robot.swinging import HOME, robot

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.egm.codec import Correction, RobotPacket, decode_robot, encode_correction
-from hrcreplay.egm.faults import Fault
-from hrcreplay.egm.rehearsal import rehearse
-from hrcreplay.egm.servo import PERIOD_NS
-from hrcreplay.egm.twin import TwinCore, TwinSettings
-from hrcreplay.egm.twin_report import TwinReport, report_of
+from hrcreplay.egm.robot_double.faults import Fault
+from hrcreplay.egm.robot_double.report import TwinReport, report_of
+from hrcreplay.egm.robot_double.servo import PERIOD_NS
+from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
 from hrcreplay.records import Floats
+from tests.egm.rehearsal import rehearse
 
 T = PERIOD_NS * 1e-9
 HOME = np.radians((0.0, 0.0, 0.0, 0.0, 30.0, 0.0))

@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from hrcreplay.egm.channel import Channel, Datagram
-from hrcreplay.egm.faults import KINDS, LINK_FAULTS, Fault, load_faults, random_faults
-from hrcreplay.egm.servo import PERIOD_NS
+from hrcreplay.egm.robot_double.faults import KINDS, LINK_FAULTS, Channel, Datagram, Fault, load_faults, random_faults
+from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.errors import SettingsError
 
 MS = 1_000_000

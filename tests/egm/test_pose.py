@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hrcreplay.egm.codec import AXES
-from hrcreplay.egm.pose import flange_pose
+from hrcreplay.egm.codec import AXES, flange_pose
 from hrcreplay.robot.model import irb140
 
 #: Axis 2 and 3 [deg], wrist centre x and z [mm].

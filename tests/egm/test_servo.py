@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.egm.codec import Correction
-from hrcreplay.egm.servo import IRB140, PERIOD_NS, Axes, Servo, ServoSettings
+from hrcreplay.egm.robot_double.servo import IRB140, PERIOD_NS, Axes, Servo, ServoSettings
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
 

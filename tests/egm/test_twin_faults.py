@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from hrcreplay.egm import motion_link_pb2 as messages
-from hrcreplay.egm.channel import Datagram
 from hrcreplay.egm.codec import Correction, Motors, Rapid, encode_correction
-from hrcreplay.egm.faults import KINDS, Fault, random_faults
-from hrcreplay.egm.servo import PERIOD_NS, ServoSettings
-from hrcreplay.egm.twin import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.faults import KINDS, Datagram, Fault, random_faults
+from hrcreplay.egm.robot_double.servo import PERIOD_NS, ServoSettings
+from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
 from tests.egm.rehearsals import HOME, Guide, T, ramp, ramp_until, rehearsed, shown
 
 

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.egm.channel import Datagram
 from hrcreplay.egm.codec import Correction, encode_correction
-from hrcreplay.egm.faults import Fault
-from hrcreplay.egm.twin import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.faults import Datagram, Fault
+from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
 from hrcreplay.records import Floats
 from tests.egm.rehearsals import HOME, Guide, T, ramp, ramp_until, rehearsed, shown, still
 

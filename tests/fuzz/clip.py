@@ -12,8 +12,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
+from hrcreplay.logs import messages
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs import topics
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import CameraFrames, Floats
 
@@ -97,7 +97,7 @@ def write(made: Clip, path: Path) -> Path:
     """The log of a clip."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=4096, compression=CompressionType.ZSTD, use_chunking=made.indexed)
-        writer.start(profile=topics.PROFILE, library="hrcreplay")
+        writer.start(profile=messages.PROFILE, library="hrcreplay")
         _fill(_Channels(writer), made)
         if made.whole:
             writer.finish()  # type: ignore[no-untyped-call]
@@ -132,16 +132,16 @@ def _fill(channels: _Channels, made: Clip) -> None:
     first_ns = max(0, min((frame.arrival_ns for frame in made.frames), default=0))
     for name, pose in made.poses.items():
         camera = pb.Camera(camera=name, T_world_camera=pose)
-        channels.add(topics.info(name), camera, first_ns, first_ns, made, None)
+        channels.add(messages.camera_info_topic(name), camera, first_ns, first_ns, made, None)
     if made.task is not None:
-        channels.add(topics.TASK, pb.Task(json=made.task), first_ns, first_ns, made, None)
+        channels.add(messages.TASK, pb.Task(json=made.task), first_ns, first_ns, made, None)
     if made.base is not None:
-        channels.add(topics.BASE, pb.Base(T_world_base=made.base), first_ns, first_ns, made, None)
+        channels.add(messages.BASE, pb.Base(T_world_base=made.base), first_ns, first_ns, made, None)
     for state in made.joints:
         message = pb.JointState(t_ns=state.t_ns, names=state.names, q=state.q)
-        channels.add(topics.JOINTS, message, max(0, state.t_ns), max(0, state.t_ns), made, None)
+        channels.add(messages.JOINTS, message, max(0, state.t_ns), max(0, state.t_ns), made, None)
     for t_ns, points in made.truth:
-        channels.add(topics.TRUTH, pb.Truth(t_ns=t_ns, points=points.ravel().tolist()), t_ns, t_ns, made, None)
+        channels.add(messages.TRUTH, pb.Truth(t_ns=t_ns, points=points.ravel().tolist()), t_ns, t_ns, made, None)
     for frame in made.frames:
         skeleton = pb.Skeleton(
             capture_ns=frame.capture_ns,
@@ -151,7 +151,7 @@ def _fill(channels: _Channels, made: Clip) -> None:
             confidence=np.asarray(frame.confidence).ravel().tolist(),
         )
         stamp_ns = min(max(0, frame.capture_ns), 2**63 - 1)
-        channels.add(topics.skeleton(frame.camera), skeleton, frame.arrival_ns, stamp_ns, made, frame.payload)
+        channels.add(messages.skeleton_topic(frame.camera), skeleton, frame.arrival_ns, stamp_ns, made, frame.payload)
 
 
 def _cut(data: bytes, what: str, at: int, number: int) -> bytes:

@@ -8,9 +8,9 @@ from typing import NoReturn
 import numpy as np
 import pytest
 
-from hrcreplay import replay
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import CameraFrames
+from hrcreplay.run import replay
 from tests.fuzz.__main__ import main, robot
 from tests.fuzz.clip import DEMO, clip, write
 from tests.fuzz.spoil import SPOILERS, spoilt

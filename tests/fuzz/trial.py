@@ -21,9 +21,10 @@ from unittest import mock
 import numpy as np
 import pyarrow.parquet as pq
 
-from hrcreplay import cli, runs
-from hrcreplay.live import driver
+from hrcreplay.cli import app
+from hrcreplay.live import session
 from hrcreplay.records import JOINTS
+from hrcreplay.store import run_folder
 from tests.fuzz.clip import CAMERAS, Clip, write
 from tests.fuzz.spoil import spoilt
 from tests.live.sessions import PATIENT, children
@@ -92,13 +93,13 @@ def _words(command: str, log: Path, out: Path) -> list[str]:
 def _run(found: Trial, words: list[str], folder: Path) -> None:
     with (
         mock.patch.object(sys, "argv", ["hrcreplay", *words]),
-        mock.patch.object(driver, "warm"),  # the kernels are warm after the first
+        mock.patch.object(session, "warm"),  # the kernels are warm after the first
         warnings.catch_warnings(record=True) as remarks,
         _captured(folder / "stderr") as captured,
     ):
         warnings.simplefilter("always")
         try:
-            cli.main()
+            app.main()
         except SystemExit as left:
             found.code = left.code if isinstance(left.code, int) else 1
             if found.code == 128 + signal.SIGTERM:
@@ -171,7 +172,7 @@ def _incomplete(out: Path) -> list[str]:
     meta: dict[str, Any] = json.loads((out / "run.json").read_text())
     if not meta.get("complete"):
         return [f"not complete: {meta.get('crashes')}"]
-    damaged = [name for name, digest in meta["outputs"].items() if runs.sha256(out / name) != digest]
+    damaged = [name for name, digest in meta["outputs"].items() if run_folder.sha256(out / name) != digest]
     return [f"not as the run left it: {damaged}"] if damaged else []
 
 

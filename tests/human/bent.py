@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.angles import PointNoise, measure
-from hrcreplay.human.fusion import FusionSettings, fuse, start
+from hrcreplay.human.fusion.fuse import FusionSettings, fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
 from hrcreplay.limits import load_limits
 from hrcreplay.records import POINTS, CameraFrames, HumanStates, Ints, Measurements
 

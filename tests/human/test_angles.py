@@ -6,9 +6,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hrcreplay.human.angles import DEPENDS, PointNoise, inverse, inverse_jacobian, measure
-from hrcreplay.human.branches import canonical, nearest
-from hrcreplay.human.model import skeleton
+from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, PointNoise, inverse, inverse_jacobian, measure
+from hrcreplay.human.model import canonical, nearest, skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, POINTS, Bools, Floats
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, lengths, postures

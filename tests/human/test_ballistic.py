@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hrcreplay.human.ballistic import ballistic
-from hrcreplay.human.fitting import Futures, inside
+from hrcreplay.audit.fit_limits import Futures, ballistic, inside
 from hrcreplay.limits import load_limits
 
 PAPER = load_limits("paper")

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.containment import Solid, union_volume_m3
+from hrcreplay.audit.containment import Solid, union_volume_m3
 from hrcreplay.records import Floats
 
 

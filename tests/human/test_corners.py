@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from hrcreplay.human.corners import keep_corners
-from hrcreplay.human.surface import surface
+from hrcreplay.geometry.hull_reduction import keep_corners, surface
 from hrcreplay.records import Floats
 from tests.human.people import directions
 

@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hrcreplay.human import fusion, occupancy
-from hrcreplay.human.angles import PointNoise, inverse, measure
-from hrcreplay.human.hull import hull
-from hrcreplay.human.margins import STANDARD
+from hrcreplay.geometry.convex_hull import hull
+from hrcreplay.human.fusion import fuse
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise, inverse, measure
 from hrcreplay.human.model import LimitSet, skeleton
+from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.human.prediction.sound_reach import STANDARD
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, CameraFrames, Floats, HumanStates
 from tests.human import sightings
@@ -84,10 +85,10 @@ def frames(points: Floats, confidence: Floats) -> CameraFrames:
     )
 
 
-def followed(seen: CameraFrames, rules: fusion.FusionSettings) -> HumanStates:
+def followed(seen: CameraFrames, rules: fuse.FusionSettings) -> HumanStates:
     ticks = np.arange(0, int(seen.arrival_ns[-1]) + TICK_NS, TICK_NS)
     measured = measure(seen, np.stack([np.eye(4)] * 2), PointNoise())
-    return fusion.fuse(fusion.start(sightings.CAMERAS), ticks, measured, rules, LIMITS)[1]
+    return fuse.fuse(fuse.start(sightings.CAMERAS), ticks, measured, rules, LIMITS)[1]
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
@@ -104,10 +105,10 @@ def test_no_skeleton_breaks_the_kernels(seed: int, value: float, reuse: bool) ->
     confidence = np.where(np.isfinite(points[..., 0]), 1.0, 0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # overflow: the numbers ask for it
-        states = followed(frames(points, confidence), fusion.FusionSettings(stale="reuse" if reuse else "skip"))
+        states = followed(frames(points, confidence), fuse.FusionSettings(stale="reuse" if reuse else "skip"))
         for method in ("sound", "paper", "positions"):
-            volumes = occupancy.predict(
-                states, LIMITS, horizon_s=0.4, radii=occupancy.Radii(), method=method, margins=STANDARD
+            volumes = swept_volumes.predict(
+                states, LIMITS, horizon_s=0.4, radii=swept_volumes.Radii(), method=method, margins=STANDARD
             )
             for tick in (20, len(states) - 1):
                 for limb in range(len(volumes.limbs)):

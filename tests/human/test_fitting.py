@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hrcreplay.audit import fit_limits
+from hrcreplay.audit.fit_limits import Futures
 from hrcreplay.errors import LogError
-from hrcreplay.human import fitting
-from hrcreplay.human.fitting import Futures
-from hrcreplay.human.reach import reachable
+from hrcreplay.human.prediction.reachable_sets import reachable
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, HumanStates, Ints
 from tests.human.people import random_states, states
@@ -41,7 +41,7 @@ def bang_bang(seconds: float, seed: int) -> HumanStates:
 
 def seen(person: HumanStates, every: int = 10) -> Futures:
     ticks = np.arange(0, len(person), every)
-    return fitting.futures(person, ticks, person.t_ns, person.p, horizon_s=T_S, memory_s=0.5)
+    return fit_limits.futures(person, ticks, person.t_ns, person.p, horizon_s=T_S, memory_s=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -50,18 +50,18 @@ def training() -> Futures:
 
 
 def test_known_bounds_are_found_and_hold_on_a_motion_that_was_not_used(training: Futures) -> None:
-    found = fitting.fit(training, PAPER, 0.9999, T_S)
+    found = fit_limits.fit(training, PAPER, 0.9999, T_S)
     for j, bounds in KNOWN.items():
         fitted = [found.v_min[j], found.v_max[j], found.a_min[j], found.a_max[j]]
         # trapezoids of the made motion against Alg. 1's parabolas, and the grid of velocity bounds
         np.testing.assert_allclose(fitted, bounds, rtol=0.12)
-    held_back = fitting.inside(seen(bang_bang(120.0, seed=2)), found, T_S)
-    share = np.nanmean(fitting.together(held_back[:, list(KNOWN)]))
+    held_back = fit_limits.inside(seen(bang_bang(120.0, seed=2)), found, T_S)
+    share = np.nanmean(fit_limits.together(held_back[:, list(KNOWN)]))
     assert share > 0.99
 
 
 def test_joints_at_rest_keep_the_standard_bounds(training: Futures) -> None:
-    found = fitting.fit(training, PAPER, 0.99, T_S)
+    found = fit_limits.fit(training, PAPER, 0.99, T_S)
     still = [j for j in range(12) if j not in KNOWN]
     assert found.kept.tolist() == [j in still for j in range(12)]
     for name in ("v_min", "v_max", "a_min", "a_max"):
@@ -71,29 +71,29 @@ def test_joints_at_rest_keep_the_standard_bounds(training: Futures) -> None:
 
 @pytest.mark.parametrize("share", [0.8, 0.9])
 def test_the_share_is_reached_by_all_joints_together_and_hardly_exceeded(training: Futures, share: float) -> None:
-    found = fitting.fit(training, PAPER, share, T_S)
-    reached = np.nanmean(fitting.together(fitting.inside(training, found, T_S)[:, ~found.kept]))
+    found = fit_limits.fit(training, PAPER, share, T_S)
+    reached = np.nanmean(fit_limits.together(fit_limits.inside(training, found, T_S)[:, ~found.kept]))
     assert share <= reached <= share + 0.3 * (1.0 - share)
 
 
 def test_less_coverage_needs_shorter_intervals(training: Futures) -> None:
     def length(share: float) -> float:
-        found = fitting.fit(training, PAPER, share, T_S)
-        return float(fitting.farthest(training.v, found.v_max, found.a_max, T_S)[:, list(KNOWN)].mean())
+        found = fit_limits.fit(training, PAPER, share, T_S)
+        return float(fit_limits.farthest(training.v, found.v_max, found.a_max, T_S)[:, list(KNOWN)].mean())
 
     assert length(0.8) < length(0.95) < length(0.999)
 
 
 def test_no_pair_of_bounds_that_misses_no_tick_has_clearly_shorter_intervals(training: Futures) -> None:
-    found = fitting.fit(training, PAPER, 0.9999, T_S)
+    found = fit_limits.fit(training, PAPER, 0.9999, T_S)
     j = 4
     v, gone = training.v[:, j], training.up[:, j]
     v, gone = v[np.isfinite(gone)], gone[np.isfinite(gone)]
-    fitted = fitting.farthest(v[:, None], found.v_max[j : j + 1], found.a_max[j : j + 1], T_S).mean()
+    fitted = fit_limits.farthest(v[:, None], found.v_max[j : j + 1], found.a_max[j : j + 1], T_S).mean()
     shortest = np.inf
     for v_max in np.linspace(1.5, 5.0, 71):
         for a_max in np.geomspace(1.0, 100.0, 81):
-            reach = fitting.farthest(v[:, None], np.array([v_max]), np.array([a_max]), T_S)[:, 0]
+            reach = fit_limits.farthest(v[:, None], np.array([v_max]), np.array([a_max]), T_S)[:, 0]
             if (gone <= reach).all():
                 shortest = min(shortest, float(reach.mean()))
     assert fitted <= 1.08 * shortest  # 5 % are spent on less acceleration, some on the grid
@@ -103,17 +103,17 @@ def test_a_glitch_is_given_up_rather_than_fitted(training: Futures) -> None:
     up = training.up.copy()
     up[700:705, 4] += 5.0
     glitch = replace(training, up=up)
-    honest, found = (fitting.fit(some, PAPER, 0.998, T_S) for some in (training, glitch))
+    honest, found = (fit_limits.fit(some, PAPER, 0.998, T_S) for some in (training, glitch))
     assert found.v_max[4] < 1.2 * honest.v_max[4]
-    assert (fitting.inside(glitch, found, T_S)[700:705, 4] == 0.0).all()
+    assert (fit_limits.inside(glitch, found, T_S)[700:705, 4] == 0.0).all()
 
 
 def test_farthest_is_alg_1() -> None:
     person = random_states(HUMAN, 500, seed=3)
     wide = replace(HUMAN, p_min=np.full(12, -1e9), p_max=np.full(12, 1e9))
     reach = reachable(person, wide, T_S, "paper")
-    high = fitting.farthest(person.v, HUMAN.v_max, HUMAN.a_max, T_S)
-    low = -fitting.farthest(-person.v, -HUMAN.v_min, -HUMAN.a_min, T_S)
+    high = fit_limits.farthest(person.v, HUMAN.v_max, HUMAN.a_max, T_S)
+    low = -fit_limits.farthest(-person.v, -HUMAN.v_min, -HUMAN.a_min, T_S)
     np.testing.assert_allclose((reach.high - person.p)[:, 3:], high[:, 3:], atol=1e-12)
     np.testing.assert_allclose((reach.low - person.p)[:, 3:], low[:, 3:], atol=1e-12)
 
@@ -138,7 +138,7 @@ def test_an_arm_that_changes_its_name_has_not_moved() -> None:
     other = person.p.copy()
     other[:, 4:7] = other[:, 4:7] * [1, -1, 1] + [-np.pi, np.pi, np.pi]
     other[:, 2] += 2.0 * np.pi
-    found = fitting.futures(person, np.arange(0, 100), person.t_ns, other, horizon_s=T_S, memory_s=0.5)
+    found = fit_limits.futures(person, np.arange(0, 100), person.t_ns, other, horizon_s=T_S, memory_s=0.5)
     np.testing.assert_allclose(found.up[:50], 0.0, atol=1e-9)
 
 
@@ -165,18 +165,18 @@ def test_no_arm_motion_is_refused() -> None:
     p, v = person.p.copy(), person.v.copy()
     p[:, 4:], v[:, 4:] = p[0, 4:], 0.0
     with pytest.raises(LogError, match="no arm motion"):
-        fitting.fit(seen(states(p, v)), PAPER, 0.99, T_S)
+        fit_limits.fit(seen(states(p, v)), PAPER, 0.99, T_S)
 
 
 def test_postures_outside_the_positions_are_seen() -> None:
     inside = random_states(PAPER, 50, seed=7).p.copy()
-    assert not fitting.leave(inside, PAPER).any()
+    assert not fit_limits.leave(inside, PAPER).any()
     inside[10, 3] = np.radians(-60.0)
     inside[20] = np.nan
-    rows: Ints = np.flatnonzero(fitting.leave(inside, PAPER))
+    rows: Ints = np.flatnonzero(fit_limits.leave(inside, PAPER))
     assert rows.tolist() == [10]
 
 
 def test_together_counts_a_tick_where_any_joint_was_recorded() -> None:
     within: Floats = np.array([[1.0, 1.0], [1.0, np.nan], [0.0, np.nan], [np.nan, np.nan], [1.0, 0.0]])
-    np.testing.assert_array_equal(fitting.together(within), [1.0, 1.0, 0.0, np.nan, 0.0])
+    np.testing.assert_array_equal(fit_limits.together(within), [1.0, 1.0, 0.0, np.nan, 0.0])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.floor import find_floor, floor_frame, up_direction
-from hrcreplay.human.registration import Track, rigid, transform
+from hrcreplay.calibration.floor import find_floor, floor_frame, up_direction
+from hrcreplay.calibration.registration import Track, rigid, transform
 from hrcreplay.records import POINTS, Floats
 from tests.reobserve import angle_deg, walker
 

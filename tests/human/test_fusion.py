@@ -8,8 +8,8 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from scipy.linalg import block_diag
 
-from hrcreplay.human.angles import PointNoise, measure
-from hrcreplay.human.fusion import FusionSettings, FusionState, fuse, start
+from hrcreplay.human.fusion.fuse import FusionSettings, FusionState, fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, POINTS, HumanStates

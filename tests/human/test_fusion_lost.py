@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hrcreplay.human.angles import PointNoise, measure
-from hrcreplay.human.fusion import FusionSettings, fuse, start
+from hrcreplay.human.fusion.fuse import FusionSettings, fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
 from hrcreplay.records import POINTS, Measurements
 from tests.human.filtered import WIDE, fused, standing, ticks, until
 from tests.human.sightings import CAMERAS, NEUTRAL, frames_of, random_measurements

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.hull import hull, sphere_swept_volume_m3
-from hrcreplay.human.occupancy import Radii, predict
+from hrcreplay.geometry.convex_hull import hull, sphere_swept_volume_m3
+from hrcreplay.human.prediction.swept_volumes import Radii, predict
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, Ints
 from tests.human.people import random_states
@@ -110,7 +110,7 @@ def test_what_qhull_calls_flat_is_flat(monkeypatch: pytest.MonkeyPatch) -> None:
                 raise QhullError("QH6154")
             super().__init__(points)
 
-    monkeypatch.setattr("hrcreplay.human.hull.ConvexHull", Solids)
+    monkeypatch.setattr("hrcreplay.geometry.convex_hull.ConvexHull", Solids)
     vertices, faces = hull(np.concatenate([SQUARE, SQUARE + np.array([0.0, 0.0, 1e-8])]))
     assert len(vertices) == 4
     assert len(faces) == 4

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.human import occupancy
-from hrcreplay.human.hull import sphere_swept_volume_m3
+from hrcreplay.geometry.convex_hull import sphere_swept_volume_m3
 from hrcreplay.human.model import LimitSet, clamp, skeleton
-from hrcreplay.human.occupancy import Radii
-from hrcreplay.human.reach import METHODS, PRINTED, reachable
+from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.human.prediction.reachable_sets import METHODS, PRINTED, reachable
+from hrcreplay.human.prediction.swept_volumes import Radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from tests.human.people import LENGTHS_M, directions, limb_points, random_states, raw_cloud, states
@@ -22,7 +22,7 @@ ALONG = directions(1500, 1)
 
 
 def predict(people: HumanStates, limits: LimitSet = PAPER, method: str = "paper", horizon_s: float = T) -> SweptVolumes:
-    return occupancy.predict(people, limits, horizon_s=horizon_s, radii=Radii(), method=method)
+    return swept_volumes.predict(people, limits, horizon_s=horizon_s, radii=Radii(), method=method)
 
 
 def support(points: Floats) -> Floats:

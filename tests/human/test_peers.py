@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hrcreplay.audit import baselines
+from hrcreplay.audit.containment import Solid
 from hrcreplay.errors import SettingsError
-from hrcreplay.human import peers
-from hrcreplay.human.containment import Solid
 from hrcreplay.human.model import skeleton
-from hrcreplay.human.occupancy import Radii
+from hrcreplay.human.prediction.swept_volumes import Radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, SweptVolumes
 from tests.human.people import random_states, states
@@ -34,7 +34,7 @@ def _axes(people: HumanStates, limb: str, later_s: float = 0.0) -> Floats:
 
 
 def _predict(people: HumanStates, method: str, horizon_s: float = HORIZON_S) -> SweptVolumes:
-    return peers.predict(people, horizon_s=horizon_s, radii=RADII, hand_m=HAND_M, method=method)
+    return baselines.predict(people, horizon_s=horizon_s, radii=RADII, hand_m=HAND_M, method=method)
 
 
 def _solid(volumes: SweptVolumes, tick: int, limb: str) -> Solid:
@@ -113,7 +113,7 @@ def test_iso_13855_is_the_limb_with_its_approach_speed_around() -> None:
     assert _solid(volumes, 0, "URA").volume_m3() == pytest.approx(capsule)
 
 
-@pytest.mark.parametrize("method", peers.PEERS)
+@pytest.mark.parametrize("method", baselines.PEERS)
 def test_the_lower_arm_ends_at_the_tip_of_the_hand(method: str) -> None:
     people = random_states(load_limits("paper"), 4, seed=9)
     volumes = _predict(people, method)
@@ -124,7 +124,7 @@ def test_the_lower_arm_ends_at_the_tip_of_the_hand(method: str) -> None:
         assert solid.distances_m(tip[None])[0] <= solid.radius_m - 0.07 + 1e-9
 
 
-@pytest.mark.parametrize("method", peers.PEERS)
+@pytest.mark.parametrize("method", baselines.PEERS)
 def test_a_person_not_known_yet_has_no_volume(method: str) -> None:
     people = states(np.full((2, 12), np.nan), np.full((2, 12), np.nan))
     volumes = _predict(people, method)

@@ -7,7 +7,7 @@ import pytest
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.reach import PRINTED, reachable
+from hrcreplay.human.prediction.reachable_sets import PRINTED, reachable
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, Floats
 from tests.human.people import random_states, states

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.registration import (
+from hrcreplay.calibration.registration import (
     MIRROR,
     Registration,
     Track,

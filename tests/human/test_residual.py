@@ -10,14 +10,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from hrcreplay.human.angles import PointNoise, inverse, measure
-from hrcreplay.human.fusion import FusionSettings, fuse, start
+from hrcreplay.human.fusion.fuse import FusionSettings, fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise, inverse, measure
+from hrcreplay.human.fusion.model_residual import LEAST
 from hrcreplay.human.model import skeleton
-from hrcreplay.human.residual import LEAST
-from hrcreplay.logs.person import PersonMemory, pick
+from hrcreplay.logs.clean import PersonMemory, pick
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats, HumanStates, Ints, Measurements
-from hrcreplay.tables import read_states, state_columns
+from hrcreplay.store.tables import read_states, state_columns
 from tests.human.bent import RATE_HZ, WIDE, bent, fused, measured, ticks, used_frames
 
 DEMO = Path(__file__).parents[2] / "datasets" / "demo.mcap"

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hrcreplay.human.fusion import FusionSettings
-from hrcreplay.human.residual import LEAST
+from hrcreplay.human.fusion.fuse import FusionSettings
+from hrcreplay.human.fusion.model_residual import LEAST
 from hrcreplay.records import BODY, LIMBS, POINTS, CameraFrames, Floats, HumanStates, Measurements
 from tests.human.bent import RATE_HZ, bent, fused, measured, ticks, used_frames
 

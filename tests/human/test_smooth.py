@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hrcreplay.human.angles import PointNoise, measure
-from hrcreplay.human.fusion import FusionSettings, fuse, fuse_traced, start
+from hrcreplay.human.fusion.fuse import FusionSettings, fuse, fuse_traced, smooth, start
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
 from hrcreplay.human.model import skeleton
-from hrcreplay.human.smooth import smooth
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of

@@ -9,13 +9,12 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.excursion import rise
-from hrcreplay.human.hull import sphere_swept_volume_m3
-from hrcreplay.human.margins import Margins
+from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning, sphere_swept_volume_m3
 from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds, skeleton
-from hrcreplay.human.occupancy import Radii, predict
-from hrcreplay.human.outer import CORNERS, DIRECTIONS, around, reach_turning
-from hrcreplay.human.reach import reachable
+from hrcreplay.human.prediction.joint_reach import rise
+from hrcreplay.human.prediction.reachable_sets import reachable
+from hrcreplay.human.prediction.sound_reach import Margins
+from hrcreplay.human.prediction.swept_volumes import Radii, predict
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from tests.human.people import limb_points, random_states, states

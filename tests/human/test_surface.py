@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from hrcreplay.human.surface import END, START, is_loop, surface
+from hrcreplay.geometry.hull_reduction import END, START, is_loop, surface
 
 
 @pytest.mark.parametrize(

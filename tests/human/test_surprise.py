@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hrcreplay.human.angles import PointNoise, measure
-from hrcreplay.human.fusion import FusionSettings, fuse_traced, start
-from hrcreplay.human.fusion import fuse as fuse_all
+from hrcreplay.human.fusion.fuse import FusionSettings, fuse_traced, start
+from hrcreplay.human.fusion.fuse import fuse as fuse_all
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements

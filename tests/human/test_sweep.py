@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.sweep import MOST_COPIES, sweep_lin, sweep_rot
+from hrcreplay.human.prediction.sweep import MOST_COPIES, sweep_lin, sweep_rot
 from hrcreplay.records import Floats
 
 POINT = np.array([[0.4, -0.3, 0.7]])

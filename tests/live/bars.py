@@ -28,7 +28,7 @@ def measure(out: Path, seconds: float, *, faults: bool) -> tuple[dict[str, Any],
     """Runs both; reports of the doubles, the echo loop's first."""
     wrong = ("--faults", every_fault(out, seconds)) if faults else ()
     ports = free_port(), free_port()
-    echo = [sys.executable, "-m", "hrcreplay.egm.echo", "--port", str(ports[0]), "--fifo", "50"]
+    echo = [sys.executable, "-m", "tests.egm.echo", "--port", str(ports[0]), "--fifo", "50"]
     settings = ("live.resume=true",) if faults else ()
     arguments = ("--send", *(["--repeat"] if seconds > RECORDED_S else []))
     with Session(out / "session", ports[1], *arguments, settings=settings) as session:

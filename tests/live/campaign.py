@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 
 from hrcreplay.egm.codec import BadPacket, decode_robot
-from hrcreplay.egm.faults import KINDS, Fault, random_faults
-from hrcreplay.live.records import PHASES
+from hrcreplay.egm.robot_double.faults import KINDS, Fault, random_faults
+from hrcreplay.live.record.codec import PHASES
 from tests.live.flights import CYCLE_S, Flight, steps_keep_the_limits
 
 SECONDS = 6.0

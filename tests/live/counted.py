@@ -7,12 +7,12 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from hrcreplay.egm.channel import Datagram
 from hrcreplay.egm.link import Address, Received
-from hrcreplay.egm.servo import PERIOD_NS
-from hrcreplay.egm.twin import TwinCore
-from hrcreplay.live.loop import Loop, LoopSettings
-from hrcreplay.live.records import Answer, Sight, TickEvent
+from hrcreplay.egm.robot_double.faults import Datagram
+from hrcreplay.egm.robot_double.servo import PERIOD_NS
+from hrcreplay.egm.robot_double.twin import TwinCore
+from hrcreplay.live.control.loop import Loop, LoopSettings
+from hrcreplay.live.record.codec import Answer, Sight, TickEvent
 from tests.live.flights import BEGIN_NS, FRAME_NS, RESPONSE_NS, Flight, far_away
 
 ROBOT: Address = ("192.0.2.1", 6510)

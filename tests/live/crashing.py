@@ -39,18 +39,18 @@ def plant(bug: str) -> None:
 
 def main() -> None:
     """Control where the arguments are a command line; else one of the helpers, of those the one with the bug."""
-    from hrcreplay.live import crash, helpers, process
+    from hrcreplay.live import processes
 
-    helpers.ENTRY = __spec__.name if __spec__ is not None else ""
+    processes.ENTRY = __spec__.name if __spec__ is not None else ""
     bug = os.environ[BUG]
     helper = sys.argv[1:2] != ["live"]
     part, _, where = bug.partition("/")
-    if part == (sys.argv[2] if helper else crash.CONTROL):
+    if part == (sys.argv[2] if helper else processes.CONTROL):
         plant(where)
     if helper:
-        process.main()
+        processes.main()
         return
-    from hrcreplay.cli import main as command_line
+    from hrcreplay.cli.app import main as command_line
 
     command_line()
 

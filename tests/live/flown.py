@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
-from hrcreplay.egm.servo import PERIOD_NS
+from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.live.verify import verify
 from tests.live.flights import start
 from tests.live.sessions import PATIENT, Session, Twin, alive, children, free_port, wait_for

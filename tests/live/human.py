@@ -21,7 +21,7 @@ class Human:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.anchor_ns = time.time_ns() - time.monotonic_ns()
         with theirs:
-            command = [sys.executable, "-m", "hrcreplay.live.person", "--fd", str(theirs.fileno())]
+            command = [sys.executable, "-m", "hrcreplay.live.person.source", "--fd", str(theirs.fileno())]
             self.process = subprocess.Popen(
                 [*command, "--anchor", str(self.anchor_ns), *arguments],
                 pass_fds=(theirs.fileno(),),

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.egm import motion_link_pb2 as egm
-from hrcreplay.live import records, wire
-from hrcreplay.live.recorder import SessionWriter
-from hrcreplay.live.records import Answer, MotionRow, Sight, Signal, TickEvent
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import Answer, MotionRow, Sight, Signal, TickEvent
+from hrcreplay.live.record.recorder import SessionWriter
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.records import LIMBS, HumanStates, SweptVolumes
-from hrcreplay.robot.obstacles import obstacles
+from hrcreplay.robot.control.separation import obstacles
 
 START_NS = 1_700_000_000_000_000_000
 TICK_NS = 4_032_000
@@ -67,7 +67,7 @@ class Pilot:
         reply = egm.SensorMessage(planned=egm.Planned(joints=egm.Joints(joints=numbers))).SerializeToString()
         reason = "Ctrl-C" if Signal.INTERRUPT in event.signals else ""
         status = 2 if reason else 0
-        return Answer(event.t_ns, self.looked_ns, reply, records.FOLLOWING, status, reason, 1, -1, row)
+        return Answer(event.t_ns, self.looked_ns, reply, codec.FOLLOWING, status, reason, 1, -1, row)
 
     def silence(self, t_ns: int, signals: Signal) -> None:  # noqa: ARG002 - part of what a pilot is
         """A silence moves the robot too."""
@@ -90,28 +90,28 @@ def datagram(number: int) -> bytes:
 
 def session(ticks: int, *, pilot: Pilot | None = None) -> Iterator[bytes]:
     """What control records: garbage and a skeleton of nobody among it, a silence, a Ctrl-C near the end."""
-    yield wire.event(START_NS, START)
+    yield codec.event(START_NS, START)
     pilot = pilot or Pilot(START)
     for k in range(ticks):
         t_ns = START_NS + (k + 1) * TICK_NS
         if k == ticks // 2:
-            yield wire.silence(t_ns - 1000, Signal.PERSON_LATE)
+            yield codec.silence(t_ns - 1000, Signal.PERSON_LATE)
             pilot.silence(t_ns - 1000, Signal.PERSON_LATE)
         datagrams = (b"\xff garbage", b"", datagram(k)) if k % 7 == 3 else (datagram(k),)
         signals = Signal.INTERRUPT if k == ticks - 2 else Signal(0)
-        yield from (wire.robot(t_ns, data) for data in datagrams)
+        yield from (codec.robot(t_ns, data) for data in datagrams)
         answer = pilot.answer(TickEvent(t_ns, datagrams, signals))
-        yield wire.answer(answer, signals, len(datagrams), 300 + k % 50)
+        yield codec.answer(answer, signals, len(datagrams), 300 + k % 50)
         if answer.datagram is not None:
-            yield wire.reply(t_ns, answer.datagram, sent=k > 2)
+            yield codec.reply(t_ns, answer.datagram, sent=k > 2)
         skeletons = [skeleton(k, ("left", "right")[k % 2]), skeleton(k, "nobody's")] if k % 5 == 0 else []
         look_ns = t_ns + 500_000
-        yield from (wire.frame(look_ns, data) for data in skeletons)
+        yield from (codec.frame(look_ns, data) for data in skeletons)
         sight = pilot.look(look_ns, skeletons)
-        yield wire.look(sight.states, sight.volumes, len(skeletons))
+        yield codec.look(sight.states, sight.volumes, len(skeletons))
         if k % 10 == 0:
-            yield wire.whole(sight.volumes)
-    yield wire.event(START_NS + (ticks + 2) * TICK_NS, {"what": "end", "reason": "Ctrl-C"})
+            yield codec.whole(sight.volumes)
+    yield codec.event(START_NS + (ticks + 2) * TICK_NS, {"what": "end", "reason": "Ctrl-C"})
 
 
 def record(path: Path, messages: list[bytes], *, chunk: int = 100, finish: bool = True) -> Path:

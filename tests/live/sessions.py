@@ -15,12 +15,13 @@ from threading import Thread
 from types import TracebackType
 from typing import Any, Self
 
-from hrcreplay.egm.faults import KINDS
+from hrcreplay.egm.robot_double.faults import KINDS
 from tests.live.crashing import BUG
 from tests.live.flights import DEMO
 
 PATIENCE_S = 120.0  # only a process that hangs takes so long
-HELPERS = ("person", "recorder", "screen")
+#: The processes beside control, and the modules that they run.
+HELPERS = {"person": "person.source", "recorder": "record.recorder", "screen": "view.screen"}
 
 #: A machine that also does other work may be late; what a session then does is another test's matter. Sessions side by
 #: side before everything else would leave their robots no time.
@@ -56,7 +57,7 @@ def children(pid: int) -> dict[str, int]:
     found: dict[str, int] = {}
     for number in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         words = Path(f"/proc/{number}/cmdline").read_bytes().split(b"\0")
-        found |= {name: int(number) for name in HELPERS if f"hrcreplay.live.{name}".encode() in words}
+        found |= {name: int(number) for name, module in HELPERS.items() if f"hrcreplay.live.{module}".encode() in words}
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hrcreplay.egm.faults import KINDS, LINK_FAULTS, Fault
+from hrcreplay.egm.robot_double.faults import KINDS, LINK_FAULTS, Fault
 from tests.live.campaign import session, violations
 from tests.live.flights import CYCLE_S
 

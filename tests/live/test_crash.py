@@ -13,20 +13,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay import cli
+from hrcreplay.cli import app
 from hrcreplay.egm.codec import Correction, decode_correction
 from hrcreplay.egm.link import Received
 from hrcreplay.egm.session import Session
 from hrcreplay.errors import LiveStopped
-from hrcreplay.live import crash, driver, folder, helpers, last_resort, pilot, telling, watch, wire
-from hrcreplay.live.loop import FAREWELLS, Loop
-from hrcreplay.live.observer import Observer
-from hrcreplay.live.setup import build
+from hrcreplay.live import processes, session
+from hrcreplay.live.control import last_resort, pilot, watchdog
+from hrcreplay.live.control.loop import FAREWELLS, Loop
+from hrcreplay.live.control.perception import Observer
+from hrcreplay.live.control.setup import build_pilot
+from hrcreplay.live.record import codec, folder
 from hrcreplay.live.verify import Again
-from hrcreplay.planner import QpFollower
-from hrcreplay.robot import stepping
+from hrcreplay.live.view import status_publisher
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.stepping import RobotState
+from hrcreplay.run.followers import QpFollower
 from tests.live.counted import Cable, CountedLoop, counted
 from tests.live.crashing import BUG, failing
 from tests.live.flights import BEGIN_NS, CYCLE_S, DEMO, Flight
@@ -41,13 +44,13 @@ PLACES: dict[str, tuple[Any, str]] = {
     "conversation": (Session, "hear_all"),
     "reply": (Session, "reply"),
     "encoding": (pilot, "encode_correction"),
-    "watchdog": (watch, "of_person"),
+    "watchdog": (watchdog, "of_person"),
     "age of the frames": (Observer, "age_s"),
     "messages of the human side": (Loop, "_hear_person"),
-    "record of an answer": (wire, "answer"),
-    "record of a packet": (wire, "robot"),
-    "record of a look": (wire, "look"),
-    "status": (telling.Teller, "_status"),
+    "record of an answer": (codec, "answer"),
+    "record of a packet": (codec, "robot"),
+    "record of a look": (codec, "look"),
+    "status": (status_publisher.Teller, "_status"),
     "link": (Cable, "newest"),
 }
 MOVING_S = 0.45
@@ -82,7 +85,7 @@ class Sent:
 
         owner, name = PLACES[place]
         monkeypatch.setattr(owner, name, failing(getattr(owner, name), fails))
-        self.lines = driver._fly(self.loop, self.flight.start, folder, real_time=False, in_3d=False)
+        self.lines = session._fly(self.loop, self.flight.start, folder, real_time=False, in_3d=False)
 
     def after(self) -> list[Correction]:
         """From the last reply before the bug on."""
@@ -99,13 +102,13 @@ def test_a_bug_anywhere_in_control_brakes_a_moving_robot_to_rest(
     assert np.abs(replies[0].dq).max() > 3.0, "it was fast"
     state = RobotState(replies[0].q, replies[0].dq)
     for reply in replies[1:]:
-        state = stepping.integrate(state, stepping.braked(state, robot.ddq_max, CYCLE_S), CYCLE_S)[1]
+        state = control_step.integrate(state, control_step.braked(state, robot.ddq_max, CYCLE_S), CYCLE_S)[1]
         np.testing.assert_allclose(reply.q, state.q, rtol=0, atol=1e-12)
         np.testing.assert_allclose(reply.dq, state.dq, rtol=0, atol=1e-12)
         state = RobotState(reply.q, reply.dq)
     assert not any(np.any(reply.dq) for reply in replies[-FAREWELLS:])
     assert all((two.seqno - one.seqno) % 2**32 == 1 for one, two in pairwise(replies))
-    assert [why for _, why in found.flight.pilot.stops] == [watch.FAULT]
+    assert [why for _, why in found.flight.pilot.stops] == [watchdog.FAULT]
     gaps = np.diff([t_ns for t_ns, _ in found.sent]) * 1e-9
     assert gaps.max() < 3 * CYCLE_S, "it went on being answered"
 
@@ -118,7 +121,7 @@ def test_a_bug_is_one_line_and_a_traceback_in_the_folder(
     found = Sent(place, 0.0, tmp_path, monkeypatch)
     assert found.lines
     assert all(line.startswith("control: ZeroDivisionError: put there by a test (") for line in found.lines)
-    assert crash.read(tmp_path) == found.lines[:1]
+    assert processes.read(tmp_path) == found.lines[:1]
     text = (tmp_path / "crash_control.txt").read_text()
     assert text.startswith(f"{found.lines[0]}\n\nTraceback (most recent call last):\n")
     assert text.count("put there\nby a test") >= len(found.lines)
@@ -128,14 +131,13 @@ def test_a_bug_is_one_line_and_a_traceback_in_the_folder(
 
 def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
     try:
-        stepping.braked("nonsense", np.ones(6), 0.004)  # type: ignore[arg-type]
+        control_step.braked("nonsense", np.ones(6), 0.004)  # type: ignore[arg-type]
     except AttributeError as error:
-        said = crash.said_of(error)
-    lines = Path(stepping.__file__).read_text().splitlines()
+        said = processes.said_of(error)
+    lines = Path(control_step.__file__).read_text().splitlines()
     number = next(i for i, line in enumerate(lines, 1) if "speed = np.abs(state.dq)" in line)
-    assert (
-        said == f"AttributeError: 'str' object has no attribute 'dq' (hrcreplay/robot/stepping.py:{number}, in braked)"
-    )
+    place = f"hrcreplay/robot/control/control_step.py:{number}, in braked"
+    assert said == f"AttributeError: 'str' object has no attribute 'dq' ({place})"
 
 
 def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
@@ -182,16 +184,16 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
     found = Sent("reply", MOVING_S, tmp_path, monkeypatch)
     monkeypatch.undo()
     messages: list[bytes] = found.loop.recorder.messages  # type: ignore[assignment]
-    kinds = [wire.kind(message) for message in messages]
-    events = [wire.read_event(message) for message in messages if wire.kind(message) == wire.EVENT]
+    kinds = [codec.kind(message) for message in messages]
+    events = [codec.read_event(message) for message in messages if codec.kind(message) == codec.EVENT]
     assert [event["what"] for event in events] == ["crash", "end"]
-    assert events[1]["reason"] == watch.FAULT
-    again = Again(build(found.flight.start))
+    assert events[1]["reason"] == watchdog.FAULT
+    again = Again(build_pilot(found.flight.start))
     crashed_at = next(i for i, message in enumerate(messages) if b'"crash"' in message)
     assert all(again.differs(message) is None for message in messages[: crashed_at + 1])
     assert again.crashed.startswith("ZeroDivisionError: put there by a test")
-    rows = [wire.motion_row(wire.read_answer(m)) for m in messages[crashed_at:] if wire.kind(m) == wire.ANSWER]
-    assert kinds[crashed_at:].count(wire.REPLY) == len(rows) > 50 + FAREWELLS
+    rows = [codec.motion_row(codec.read_answer(m)) for m in messages[crashed_at:] if codec.kind(m) == codec.ANSWER]
+    assert kinds[crashed_at:].count(codec.REPLY) == len(rows) > 50 + FAREWELLS
     assert rows[0] is not None
     assert rows[0].dq.any()
     assert rows[-1] is not None
@@ -200,12 +202,12 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
 
 def test_a_recording_that_cannot_be_read_any_further_is_named() -> None:
     loop = counted(Flight())
-    loop.pilot.stop = watch.PERSON_DEAD
+    loop.pilot.stop = watchdog.PERSON_DEAD
     loop.notes += ["failed log.mcap: no further", "a later remark"]
     with pytest.raises(
         LiveStopped, match=r"stopped by: human side dead \(log.mcap: no further\); the record is in run"
     ):
-        driver._verdict(loop, Path("run"), [])
+        session._verdict(loop, Path("run"), [])
 
 
 # --- bugs before and after the flight ---
@@ -218,7 +220,7 @@ class Live:
         words = ["live", "--json", "--human", DEMO, "--duration", "0.2", "--port", "0", "--out", out]
         monkeypatch.setattr(sys, "argv", ["hrcreplay", *map(str, words)])
         with pytest.raises(SystemExit) as left:
-            cli.main()
+            app.main()
         self.code = left.value.code
         self.err = capfd.readouterr().err
         self.partial = out.with_name(out.name + ".partial")
@@ -232,7 +234,7 @@ class Live:
         said, _, where = line.removeprefix("hrcreplay: ").partition("; ")
         assert self.code == 4
         assert where == f"not complete: what there is of the record, and the traceback, is in {self.partial}"
-        assert crash.read(self.partial) == [said]
+        assert processes.read(self.partial) == [said]
         assert said.startswith(f"{part}: ZeroDivisionError: put there by a test (")
         meta = json.loads((self.partial / "run.json").read_text())
         assert meta == {"command": "live", "complete": False, "reason": said, "crashes": [said]}
@@ -246,31 +248,31 @@ def broken(*_args: object, **_named: object) -> None:
 def test_a_bug_before_the_session(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(driver, "warm", broken)
+    monkeypatch.setattr(session, "warm", broken)
     live = Live(tmp_path / "out", monkeypatch, capfd)
-    live.told(crash.CONTROL)
+    live.told(processes.CONTROL)
     assert live.files == {"run.json", "crash_control.txt"}
 
 
 def test_a_bug_in_the_human_side_before_the_session(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(driver, "warm", lambda _start: None)
-    monkeypatch.setattr(helpers, "ENTRY", "tests.live.crashing")
-    monkeypatch.setenv(BUG, f"human side/hrcreplay.live.playback:Playback.due@{tmp_path}")
+    monkeypatch.setattr(session, "warm", lambda _start: None)
+    monkeypatch.setattr(processes, "ENTRY", "tests.live.crashing")
+    monkeypatch.setenv(BUG, f"human side/hrcreplay.live.person.log_playback:Playback.due@{tmp_path}")
     live = Live(tmp_path / "out", monkeypatch, capfd)
-    live.told(crash.PERSON)
+    live.told(processes.PERSON)
     assert live.files == {"run.json", "crash_human_side.txt"}
 
 
 def test_a_bug_in_the_report_leaves_the_record_to_be_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(driver, "warm", lambda _start: None)
+    monkeypatch.setattr(session, "warm", lambda _start: None)
     with monkeypatch.context() as within:
         within.setattr(folder, "write_report", broken)
         live = Live(tmp_path / "out", monkeypatch, capfd)
-    live.told(crash.FOLDER)
+    live.told(processes.FOLDER)
     assert live.files == {"run.json", "crash_run_folder.txt", "log.mcap"}
     monkeypatch.setattr(folder, "write_report", lambda *_: None)
     meta = json.loads((folder.finish(live.partial) / "run.json").read_text())

@@ -9,13 +9,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hrcreplay import replay, runs
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.live import folder, wire
-from hrcreplay.live.records import PHASES, Signal
+from hrcreplay.live.record import codec, folder
+from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.live.verify import verify
 from hrcreplay.records import BODY, STATUSES
-from hrcreplay.tables import read_states
+from hrcreplay.run import replay
+from hrcreplay.store import run_folder
+from hrcreplay.store.tables import read_states
 from tests.live import made
 from tests.live.flights import BEGIN_NS, Flight
 
@@ -27,7 +28,7 @@ class Stored(Flight):
         super()._look(t_ns)
         sight = self.pilot.sight
         if sight is not None and len(self.states) % 10 == 1:
-            self.messages.append(wire.whole(sight.volumes))
+            self.messages.append(codec.whole(sight.volumes))
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +46,8 @@ def messages(flight: Flight) -> list[bytes]:
     end = {"what": "end", "reason": "Ctrl-C", "counts": {"robot lost": 2}, "dropped": 0, "looks_skipped": 3}
     end |= {"stops": []}
     start = {"what": "start", **flight.start}
-    note = wire.event(BEGIN_NS + 2, {"what": "note", "text": "a remark"})
-    return [wire.event(BEGIN_NS - 1, start), *flight.messages, note, wire.event(BEGIN_NS + 4_000_000_000, end)]
+    note = codec.event(BEGIN_NS + 2, {"what": "note", "text": "a remark"})
+    return [codec.event(BEGIN_NS - 1, start), *flight.messages, note, codec.event(BEGIN_NS + 4_000_000_000, end)]
 
 
 @pytest.fixture(scope="module")
@@ -58,18 +59,18 @@ def run(tmp_path_factory: pytest.TempPathFactory, messages: list[bytes]) -> Path
 
 def test_the_session_is_a_run_like_any_other(run: Path, flight: Flight) -> None:
     assert not run.with_name("session.partial").exists()
-    meta = runs.read_meta(run)
+    meta = run_folder.read_meta(run)
     assert meta["command"] == "live"
     assert meta["T_world_base"] == flight.start["T_world_base"]
     assert meta["reason"] == "Ctrl-C"
     assert meta["notes"] == ["a remark"]
     assert meta["created"] == "2027-01-15T07:59:59Z"
-    assert meta["inputs"] == [{"path": "log.mcap", "sha256": runs.sha256(run / "log.mcap")}]
+    assert meta["inputs"] == [{"path": "log.mcap", "sha256": run_folder.sha256(run / "log.mcap")}]
     assert meta["counts"]["robot_lost"] == 2
     assert meta["counts"]["looks_skipped"] == 3
     assert meta["counts"]["answers"] == len(flight.answers)
     assert {*meta["outputs"]} >= {"log.mcap", "state.parquet", "motion.parquet", "occupancy.parquet", "report.html"}
-    assert meta["outputs"] == {name: runs.sha256(run / name) for name in meta["outputs"]}
+    assert meta["outputs"] == {name: run_folder.sha256(run / name) for name in meta["outputs"]}
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["ticks"]["value"] == len(flight.states)
     assert metrics["camera_kinect_frames"]["value"] == len(flight.frames) / 2
@@ -104,7 +105,7 @@ def test_motions_are_those_of_the_session(run: Path, flight: Flight) -> None:
 
 def test_volumes_are_those_that_were_stored(run: Path, messages: list[bytes]) -> None:
     table = pd.read_parquet(run / "occupancy.parquet")
-    stored = [wire.read_whole(m, BODY, "") for m in messages if wire.kind(m) == wire.VOLUMES]
+    stored = [codec.read_whole(m, BODY, "") for m in messages if codec.kind(m) == codec.VOLUMES]
     known = [volumes for volumes in stored if np.isfinite(volumes.vertices_m).all()]
     assert sorted(set(table["t_ns"])) == [int(volumes.t_ns[0]) for volumes in known]
     last = table[table["t_ns"] == known[-1].t_ns[0]]
@@ -122,8 +123,8 @@ def test_a_real_pilot_says_the_same_again(run: Path) -> None:
 def test_the_record_can_be_replayed(run: Path, tmp_path: Path) -> None:
     own = replay.run("plan", run, out=tmp_path / "a", end_s=1.0)  # with the settings of the session
     log = replay.run("plan", run / "log.mcap", out=tmp_path / "b", end_s=1.0, overrides=("occupancy.method=sound",))
-    assert runs.read_meta(own)["outputs"] == runs.read_meta(log)["outputs"]
-    assert runs.read_meta(log)["T_world_base"] == runs.read_meta(run)["T_world_base"]
+    assert run_folder.read_meta(own)["outputs"] == run_folder.read_meta(log)["outputs"]
+    assert run_folder.read_meta(log)["T_world_base"] == run_folder.read_meta(run)["T_world_base"]
 
 
 def test_a_killed_session_can_be_finished(
@@ -138,7 +139,7 @@ def test_a_killed_session_can_be_finished(
     assert verify(partial).identical
     run = folder.finish(partial)
     assert run == tmp_path / "session"
-    assert runs.read_meta(run)["notes"] == ["the session was killed: its record has no end"]
+    assert run_folder.read_meta(run)["notes"] == ["the session was killed: its record has no end"]
     assert verify(run).identical
     with pytest.raises(SettingsError, match="no session to be finished"):
         folder.finish(run)
@@ -150,7 +151,7 @@ def test_a_session_in_which_nothing_happened_is_a_run(tmp_path: Path, messages: 
     partial = folder.begin(tmp_path / "session")
     made.record(partial / "log.mcap", [messages[0], messages[-1]])
     run = folder.finish(partial)
-    assert runs.read(run).state is None
+    assert run_folder.read(run).state is None
     assert verify(run).lines == ("identical: 0 ticks, 0 looks",)
 
 
@@ -171,7 +172,7 @@ def test_a_record_of_another_version_is_left_as_it_is(tmp_path: Path, messages: 
     assert sight is not None
     other = replace(sight.states, residual_m=sight.states.residual_m[:, 1:])
     partial = folder.begin(tmp_path / "session")
-    made.record(partial / "log.mcap", [messages[0], wire.look(other, sight.volumes, 0)])
+    made.record(partial / "log.mcap", [messages[0], codec.look(other, sight.volumes, 0)])
     with pytest.raises(LogError, match=r"session.partial: found 100 numbers a look where this version has 101; would"):
         folder.finish(partial)
     assert (partial / "log.mcap").exists()

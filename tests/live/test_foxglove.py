@@ -18,9 +18,9 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from scipy.spatial import ConvexHull
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.live import wire
-from hrcreplay.live.foxglove_stream import FoxgloveStream, mesh, upright_to
-from hrcreplay.live.scene import Cast, Scene, pack, unpack
+from hrcreplay.live.record import codec
+from hrcreplay.live.view.foxglove import FoxgloveStream, mesh, upright_to
+from hrcreplay.live.view.messages import Cast, Scene, pack, unpack
 from hrcreplay.records import POINTS, SweptVolumes
 from tests.live.statuses import status
 
@@ -45,7 +45,7 @@ def scene(t_ns: int = 1_800_000_000_123_456_789) -> Scene:
 
 
 def packed(now: Scene) -> bytes:
-    return pack(now.t_ns, now.points_m, now.ends_m, wire.whole(now.volumes))
+    return pack(now.t_ns, now.points_m, now.ends_m, codec.whole(now.volumes))
 
 
 def test_a_scene_comes_out_as_it_went_in() -> None:

@@ -11,19 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay import runs
 from hrcreplay.errors import SettingsError
-from hrcreplay.live import crash, wire
-from hrcreplay.live.records import APPROACH, FOLLOWING
-from hrcreplay.live.tape import Tape
+from hrcreplay.live import processes
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import APPROACH, FOLLOWING
+from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.store import run_folder
 from tests.live.flown import MOVING, Flown, Group, brakes_for, leaves_nobody, never_stalls, read_json, told, verified
 from tests.live.sessions import kill
 
 #: Session -> part and place of its bug.
 BUGS = {
-    "recorder": "recorder/hrcreplay.live.topics:split",
-    "screen": "screen/hrcreplay.live.channel:Channel.receive",
-    "status": "control/hrcreplay.live.telling:Teller._status",
+    "recorder": "recorder/hrcreplay.live.record.topics:split",
+    "screen": "screen/hrcreplay.live.processes:Channel.receive",
+    "status": "control/hrcreplay.live.view.status_publisher:Teller._status",
 }
 
 
@@ -77,7 +78,9 @@ def test_without_the_human_side_it_brakes_and_goes_on_answering(killed: dict[str
 
 def test_without_the_recorder_it_brakes_and_goes_on_answering(killed: dict[str, Flown]) -> None:
     one = killed["recorder"]
-    assert not_complete(one).startswith("recorder: ZeroDivisionError: put there by a test (hrcreplay/live/recorder.py:")
+    assert not_complete(one).startswith(
+        "recorder: ZeroDivisionError: put there by a test (hrcreplay/live/record/recorder.py:"
+    )
     assert json.loads(one.session.out[-1])["reason"] == "recorder dead"
     never_stalls(one)
     assert verified(one.folder).endswith("the record breaks off: the session or its recorder was killed")
@@ -86,7 +89,9 @@ def test_without_the_recorder_it_brakes_and_goes_on_answering(killed: dict[str, 
 
 def test_without_the_screen_it_brakes_and_goes_on_answering(killed: dict[str, Flown]) -> None:
     one = killed["screen"]
-    assert not_complete(one).startswith("screen: ZeroDivisionError: put there by a test (hrcreplay/live/screen.py:")
+    assert not_complete(one).startswith(
+        "screen: ZeroDivisionError: put there by a test (hrcreplay/live/view/screen.py:"
+    )
     brakes_for("screen dead", one.folder)
     never_stalls(one)
     verified(one.folder)
@@ -95,7 +100,9 @@ def test_without_the_screen_it_brakes_and_goes_on_answering(killed: dict[str, Fl
 
 def test_a_bug_in_control_brakes_and_goes_on_answering(killed: dict[str, Flown]) -> None:
     one = killed["status"]
-    assert not_complete(one).startswith("control: ZeroDivisionError: put there by a test (hrcreplay/live/telling.py:")
+    assert not_complete(one).startswith(
+        "control: ZeroDivisionError: put there by a test (hrcreplay/live/view/status_publisher.py:"
+    )
     brakes_for("internal error", one.folder)
     never_stalls(one)
     assert "; then control crashed: ZeroDivisionError" in verified(one.folder)
@@ -111,11 +118,11 @@ def not_complete(one: Flown) -> str:
     meta = read_json(one.folder / "run.json")
     assert (meta["complete"], meta["reason"], meta["crashes"]) == (False, said, [said])
     assert f"not complete: {said}" in meta["notes"]
-    assert crash.read(one.folder) == [said]
+    assert processes.read(one.folder) == [said]
     (kept,) = one.folder.glob("crash_*.txt")
     assert ("Traceback (most recent call last)" in kept.read_text()) == ("ZeroDivisionError" in said)
     with pytest.raises(SettingsError, match="a live session that broke off"):
-        runs.read_meta(one.folder)
+        run_folder.read_meta(one.folder)
     return said
 
 
@@ -134,7 +141,7 @@ def test_without_control_the_robot_stops_by_itself_and_is_echoed_by_the_next_ses
     one.session.end()
     leaves_nobody(one.helpers)
     rows = [
-        wire.read_answer(m) for m in Tape(one.session.partial / "log.mcap").messages() if wire.kind(m) == wire.ANSWER
+        codec.read_answer(m) for m in Tape(one.session.partial / "log.mcap").messages() if codec.kind(m) == codec.ANSWER
     ]
     assert rows[-1].phase in (APPROACH, FOLLOWING)
     assert not one.folder.exists()

@@ -2,13 +2,14 @@ from __future__ import annotations
 
 import pytest
 
-from hrcreplay.live import watch, wire
-from hrcreplay.live.driver import outcome
-from hrcreplay.live.motion import Course, Said
-from hrcreplay.live.records import Answer, TickEvent
-from hrcreplay.live.setup import build
+from hrcreplay.live.control import watchdog
+from hrcreplay.live.control.motion import Course, Said
+from hrcreplay.live.control.setup import build_pilot
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import Answer, TickEvent
+from hrcreplay.live.session import outcome
 from hrcreplay.live.verify import Again
-from hrcreplay.planner import QpFollower
+from hrcreplay.run.followers import QpFollower
 from tests.live.counted import CountedLoop, counted
 from tests.live.flights import CYCLE_S, Flight
 
@@ -22,14 +23,14 @@ def recorded(loop: CountedLoop) -> list[bytes]:
 
 
 def count(loop: CountedLoop, kind: bytes) -> int:
-    return sum(wire.kind(message) == kind for message in recorded(loop))
+    return sum(codec.kind(message) == kind for message in recorded(loop))
 
 
 @pytest.mark.parametrize("look_s", [0.0041, 0.0045, 0.0049])
 def test_looks_that_do_not_fit_are_left_out_and_packets_are_not(look_s: float) -> None:
     flight = Flight()
     loop = counted(flight, look_s=look_s).fly(SECONDS)
-    assert count(loop, wire.REPLY) == count(loop, wire.ROBOT) == loop.answers > 0.98 * SECONDS / CYCLE_S
+    assert count(loop, codec.REPLY) == count(loop, codec.ROBOT) == loop.answers > 0.98 * SECONDS / CYCLE_S
     assert outcome(loop)["looks_skipped"] == loop.skipped > 100
     assert not flight.pilot.stops
     assert loop.seen[-1].row is not None
@@ -41,12 +42,12 @@ def test_looks_that_do_not_fit_are_left_out_and_packets_are_not(look_s: float) -
 def test_looks_that_fit_are_all_taken() -> None:
     loop = counted(Flight(), look_s=0.003).fly(SECONDS)
     assert loop.skipped <= 1, "the first packet was there before the loop"
-    assert count(loop, wire.LOOK) >= loop.answers - 1
+    assert count(loop, codec.LOOK) >= loop.answers - 1
 
 
 def test_a_session_with_looks_left_out_comes_out_the_same_again() -> None:
     loop = counted(flight := Flight(), look_s=0.0045).fly(SECONDS)
-    again = Again(build(flight.start))
+    again = Again(build_pilot(flight.start))
     assert all(again.differs(message) is None for message in recorded(loop))
     assert again.ticks == loop.answers
 
@@ -63,13 +64,13 @@ def test_a_step_that_cannot_be_prepared_fails_in_the_answer(monkeypatch: pytest.
     assert flight.pilot.fault is None
     flight.fly(0.1)
     assert isinstance(flight.pilot.fault, ZeroDivisionError)
-    assert [why for _, why in flight.pilot.stops] == [watch.FAULT]
+    assert [why for _, why in flight.pilot.stops] == [watchdog.FAULT]
 
 
 def test_no_two_looks_in_a_row_are_left_out() -> None:
     loop = counted(Flight(), work_s=0.0042).fly(1.0)
     assert loop.skipped > 0.4 * loop.answers, "it is always late"
-    assert count(loop, wire.LOOK) > 0.4 * loop.answers
+    assert count(loop, codec.LOOK) > 0.4 * loop.answers
 
 
 def test_a_prepared_step_is_not_made_again_in_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:

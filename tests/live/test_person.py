@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from hrcreplay.errors import LogError
-from hrcreplay.live.channel import Channel, ControlGoneError
-from hrcreplay.live.person import BEAT_NS, Pace, run
-from hrcreplay.live.playback import Frame, Item, Note, Opened, Playback, passes, play
+from hrcreplay.live.person.log_playback import Frame, Item, Note, Opened, Playback, passes, play
+from hrcreplay.live.person.source import BEAT_NS, Pace, run
+from hrcreplay.live.processes import Channel, ControlGoneError
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import CameraFrames

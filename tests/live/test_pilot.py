@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from hrcreplay.egm.faults import Fault
-from hrcreplay.human import fusion
-from hrcreplay.live import records, watch
-from hrcreplay.live.observer import Observer
-from hrcreplay.live.records import PHASES, Signal
-from hrcreplay.live.setup import build
-from hrcreplay.logs.person import PersonMemory
-from hrcreplay.planner import QpFollower
+from hrcreplay.egm.robot_double.faults import Fault
+from hrcreplay.human.fusion import fuse
+from hrcreplay.live.control import watchdog
+from hrcreplay.live.control.perception import Observer
+from hrcreplay.live.control.setup import build_pilot
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import PHASES, Signal
+from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.records import STATUSES, CameraFrames, HumanStates
+from hrcreplay.run.followers import QpFollower
 from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, far_away, start, steps_keep_the_limits
 
 
@@ -54,20 +55,20 @@ def after_start(signal: Signal, at_s: float, for_s: float = np.inf) -> dict[str,
 
 
 STOPS: dict[str, dict[str, Any]] = {
-    watch.INTERRUPTED: after_start(Signal.INTERRUPT, 2.0),
-    watch.TERMINATED: after_start(Signal.TERMINATE, 2.0),
-    watch.SESSION_OVER: after_start(Signal.DURATION, 2.0),
-    watch.RECORDING_OVER: after_start(Signal.PERSON_ENDED, 2.0),
-    watch.PERSON_DEAD: after_start(Signal.PERSON_DEAD, 2.0, 0.5),
-    watch.PERSON_LATE: after_start(Signal.PERSON_LATE, 2.0, 0.5),
-    watch.RECORDER_DEAD: after_start(Signal.RECORDER_DEAD, 2.0, 0.5),
-    watch.OVERRUN: after_start(Signal.OVERRUN, 2.0, 0.004),
-    watch.NO_FRAME: {"walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0)},
-    watch.UNCERTAIN: {
+    watchdog.INTERRUPTED: after_start(Signal.INTERRUPT, 2.0),
+    watchdog.TERMINATED: after_start(Signal.TERMINATE, 2.0),
+    watchdog.SESSION_OVER: after_start(Signal.DURATION, 2.0),
+    watchdog.RECORDING_OVER: after_start(Signal.PERSON_ENDED, 2.0),
+    watchdog.PERSON_DEAD: after_start(Signal.PERSON_DEAD, 2.0, 0.5),
+    watchdog.PERSON_LATE: after_start(Signal.PERSON_LATE, 2.0, 0.5),
+    watchdog.RECORDER_DEAD: after_start(Signal.RECORDER_DEAD, 2.0, 0.5),
+    watchdog.OVERRUN: after_start(Signal.OVERRUN, 2.0, 0.004),
+    watchdog.NO_FRAME: {"walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0)},
+    watchdog.UNCERTAIN: {
         "overrides": ("live.uncertain_m=0.012", "live.fresh_s=9"),
         "walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0),
     },
-    watch.TRACKING: {"faults": (Fault("teleport", 2.0, 0.5, angle_deg=20.0),)},
+    watchdog.TRACKING: {"faults": (Fault("teleport", 2.0, 0.5, angle_deg=20.0),)},
     "motors off": {"faults": (Fault("motors_off", 2.0, 0.5),)},
     "program stopped": {"faults": (Fault("program_stop", 2.0, 0.5),)},
     "EGM error": {"faults": (Fault("egm_error", 2.0),)},
@@ -95,7 +96,9 @@ def test_every_reason_of_the_watchdog_brakes_by_67_and_holds(reason: str) -> Non
     assert len(flight.said()) >= 0.99 * len(flight.answers)  # it goes on answering
 
 
-@pytest.mark.parametrize("reason", [watch.NO_FRAME, watch.OVERRUN, "motors off", "program stopped", watch.TRACKING])
+@pytest.mark.parametrize(
+    "reason", [watchdog.NO_FRAME, watchdog.OVERRUN, "motors off", "program stopped", watchdog.TRACKING]
+)
 def test_it_goes_on_by_a_setting_only_and_from_where_it_stands(reason: str) -> None:
     kept = STOPS[reason]
     flight = Flight(**{**kept, "overrides": (*kept.get("overrides", ()), "live.resume=true")}).fly(9.0)
@@ -114,17 +117,17 @@ def test_it_tells_what_holds_it_once_another_reason_has_taken_over() -> None:
     flight = Flight(
         walk=lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0), signals=signals, overrides=("live.resume=true",)
     ).fly(5.0)
-    assert [why for _, why in flight.pilot.stops] == [watch.NO_FRAME]
+    assert [why for _, why in flight.pilot.stops] == [watchdog.NO_FRAME]
     told = {answer.t_ns: answer.reason for answer in flight.answers if answer.row is not None}
-    assert [reason for t_ns, reason in told.items() if t_ns < BEGIN_NS + 2.45e9][-1] == watch.NO_FRAME
-    assert {reason for t_ns, reason in told.items() if t_ns > BEGIN_NS + 2.7e9} == {watch.RECORDER_DEAD}
+    assert [reason for t_ns, reason in told.items() if t_ns < BEGIN_NS + 2.45e9][-1] == watchdog.NO_FRAME
+    assert {reason for t_ns, reason in told.items() if t_ns > BEGIN_NS + 2.7e9} == {watchdog.RECORDER_DEAD}
 
 
 def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
     flight = Flight(faults=(Fault("silence", 2.0, 0.5),), overrides=("live.resume=true",)).fly(6.0)
-    assert [why for _, why in flight.pilot.stops] == [watch.SILENT]
+    assert [why for _, why in flight.pilot.stops] == [watchdog.SILENT]
     assert flight.phases().count("echo") == 2
-    replies = [answer for answer in flight.answers if answer.phase == records.ECHO]
+    replies = [answer for answer in flight.answers if answer.phase == codec.ECHO]
     assert_array_equal([answer.row.dq for answer in replies if answer.row is not None], 0.0)
     steps_keep_the_limits(flight)
 
@@ -140,7 +143,7 @@ class Suspended(Flight):
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_silence_that_only_the_next_packet_tells_of_stops_the_robot_too(resume: bool) -> None:
     flight = Suspended(overrides=(f"live.resume={str(resume).lower()}",)).fly(6.0)
-    assert [why for _, why in flight.pilot.stops] == [watch.SILENT]
+    assert [why for _, why in flight.pilot.stops] == [watchdog.SILENT]
     assert flight.phases().count("echo") == 2
     assert flight.phases().count("approach") == 1 + resume  # it goes on only where that was asked for
     steps_keep_the_limits(flight)
@@ -178,13 +181,13 @@ def test_the_same_events_give_the_same_bytes() -> None:
 def test_looks_are_the_replay_tick_by_tick() -> None:
     """One fuse and one predict over all ticks give the bits that thousands of looks gave."""
     flight = Flight(walk=lambda s: (2.0 + 0.5 * np.sin(s), 0.3 * s)).fly(4.0)
-    pilot = build(start())
+    pilot = build_pilot(start())
     observer: Observer = pilot.observer
     eyes, foresight = observer._eyes, observer._foresight
     ticks = np.array([int(states.t_ns[0]) for states in flight.states])
     frames = [observer._frames(t_ns, [data]) for t_ns, data in flight.frames]
     _, measured, _ = eyes.measure(CameraFrames.join([frame for frame in frames if frame is not None]), PersonMemory())
-    _, states, _ = fusion.fuse(fusion.start(observer._cameras), ticks, measured, eyes.filter, eyes.limits)
+    _, states, _ = fuse.fuse(fuse.start(observer._cameras), ticks, measured, eyes.filter, eyes.limits)
     live = HumanStates.join(flight.states)
     for name in ("p", "v", "a", "j", "p_std", "v_std", "lengths_m", "residual_m", "unseen_s", "valid"):
         assert_array_equal(getattr(live, name), getattr(states, name), err_msg=name)
@@ -207,7 +210,7 @@ def test_a_bug_in_the_stages_brakes_the_robot_and_is_told(monkeypatch: pytest.Mo
     before = len(flight.said())
     flight.fly(1.0)
     assert isinstance(flight.pilot.fault, ZeroDivisionError)
-    assert [why for _, why in flight.pilot.stops] == [watch.FAULT]
+    assert [why for _, why in flight.pilot.stops] == [watchdog.FAULT]
     assert not moved(flight, after=before + 100)
     assert len(flight.said()) > before + 200
 

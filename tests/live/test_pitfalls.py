@@ -8,11 +8,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hrcreplay.egm.faults import Fault
-from hrcreplay.egm.servo import ServoSettings
-from hrcreplay.egm.twin import TwinSettings
-from hrcreplay.live import records, watch
-from hrcreplay.live.loop import FAREWELLS
+from hrcreplay.egm.robot_double.faults import Fault
+from hrcreplay.egm.robot_double.servo import ServoSettings
+from hrcreplay.egm.robot_double.twin import TwinSettings
+from hrcreplay.live.control import watchdog
+from hrcreplay.live.control.loop import FAREWELLS
+from hrcreplay.live.record import codec
 from hrcreplay.records import Floats
 from tests.live.counted import Cable, CountedLoop, counted
 from tests.live.flights import CYCLE_S, Flight, steps_keep_the_limits
@@ -58,7 +59,7 @@ def test_5_silence_finds_the_robot_standing() -> None:
     loop.fly(2.9)
     assert np.abs(planned(flight)[1][-1]).max() > 0.2
     loop.fly()
-    assert flight.pilot.stop == watch.SESSION_OVER
+    assert flight.pilot.stop == watchdog.SESSION_OVER
     last = flight.core.record.arrivals()[-(FAREWELLS - 1) :]
     assert not last["ref_rad_per_s"].any()
     cable(loop).pass_by(3.0)
@@ -75,7 +76,7 @@ def test_7_a_session_that_ends_by_convergence_is_told_and_the_next_one_served() 
     assert flight.core.ends == ["converged", ""]
     assert flight.pilot.fault is None
     assert not flight.pilot.stops
-    assert "converged" in {answer.reason for answer in flight.answers if answer.phase == records.WAITING}
+    assert "converged" in {answer.reason for answer in flight.answers if answer.phase == codec.WAITING}
     assert flight.phases()[:4] == ["echo", "waiting", "echo", "approach"]
     steps_keep_the_limits(flight)
     assert np.abs(planned(flight)[1][-250:]).max() > 0.1
@@ -87,7 +88,7 @@ def test_7_idling_in_a_stop_ends_a_session_but_not_ours() -> None:
     seen = lambda s: None if 0.4 < s < 2.6 else (3.0, 0.0)  # noqa: E731
     flight = Flight(overrides=RESUME, twin=converging, walk=seen).fly(4.2)
     assert flight.core.ends == ["converged", ""]
-    assert [reason for _, reason in flight.pilot.stops] == [watch.NO_FRAME]
+    assert [reason for _, reason in flight.pilot.stops] == [watchdog.NO_FRAME]
     assert flight.phases().count("echo") == 2
     steps_keep_the_limits(flight)
     assert np.abs(planned(flight)[1][-250:]).max() > 0.1
@@ -114,7 +115,7 @@ def test_10_a_loop_slower_than_the_robot_brakes_by_name_and_builds_no_backlog(tu
     assert np.abs(planned(flight)[1][-50:]).max() > 0.2
     loop.work_ns = round(turn_s * 1e9)
     loop.fly(1.5)
-    assert [reason for _, reason in flight.pilot.stops] == [watch.OVERRUN]
+    assert [reason for _, reason in flight.pilot.stops] == [watchdog.OVERRUN]
     arrivals, cycles = flight.core.record.arrivals(), flight.core.record.cycles()
     assert set(np.diff(arrivals["seqno"])) == {1}
     assert cycles["queued"].max() == 0

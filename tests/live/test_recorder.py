@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from hrcreplay.live import recorder, topics, wire
-from hrcreplay.live.tape import Tape
+from hrcreplay.live.record import codec, recorder, topics
+from hrcreplay.live.record.log_reader import Tape
 from hrcreplay.logs.reader import open_log
 from tests.live import made
 
@@ -50,19 +50,19 @@ def test_the_record_is_a_log_of_ours(tmp_path: Path, messages: list[bytes]) -> N
 def test_datagrams_lie_raw_on_their_topics_even_garbage(tmp_path: Path, messages: list[bytes]) -> None:
     rows = _by_hand(made.record(tmp_path / "log.mcap", messages))
     robot = [data for topic, _, _, data in rows if topic == "/egm/robot"]
-    assert robot == [wire.body(m) for m in messages if wire.kind(m) == wire.ROBOT]
+    assert robot == [codec.body(m) for m in messages if codec.kind(m) == codec.ROBOT]
     assert b"\xff garbage" in robot
     assert b"" in robot
-    replies = [m for m in messages if wire.kind(m) == wire.REPLY]
-    assert [d for t, _, _, d in rows if t == "/egm/correction"] == [wire.read_reply(m)[1] for m in replies[3:]]
-    assert [d for t, _, _, d in rows if t == "/egm/correction/unsent"] == [wire.read_reply(m)[1] for m in replies[:3]]
+    replies = [m for m in messages if codec.kind(m) == codec.REPLY]
+    assert [d for t, _, _, d in rows if t == "/egm/correction"] == [codec.read_reply(m)[1] for m in replies[3:]]
+    assert [d for t, _, _, d in rows if t == "/egm/correction/unsent"] == [codec.read_reply(m)[1] for m in replies[:3]]
     assert {t for t, _, _, _ in rows if t.startswith("/live/")} == {
         f"/live/{name}" for name in ("answer", "event", "frame", "look", "silence", "volumes")
     }
 
 
 def test_skeletons_that_cannot_be_read_are_on_record(tmp_path: Path) -> None:
-    messages = [wire.event(5, made.START), wire.frame(7, b"\xff\xff"), wire.frame(8, b"")]
+    messages = [codec.event(5, made.START), codec.frame(7, b"\xff\xff"), codec.frame(8, b"")]
     path = made.record(tmp_path / "log.mcap", messages)
     assert [row for row in _by_hand(path) if row[0] == topics.STRAY] == [
         (topics.STRAY, 7, 7, b"\xff\xff"),
@@ -76,7 +76,15 @@ class Process:
 
     def __init__(self, path: Path, before: Callable[[], None] | None = None) -> None:
         self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        command = [sys.executable, "-m", "hrcreplay.live.recorder", "--fd", str(theirs.fileno()), "--path", str(path)]
+        command = [
+            sys.executable,
+            "-m",
+            "hrcreplay.live.record.recorder",
+            "--fd",
+            str(theirs.fileno()),
+            "--path",
+            str(path),
+        ]
         self.popen = subprocess.Popen(
             command,
             pass_fds=(theirs.fileno(),),
@@ -153,7 +161,7 @@ def test_a_full_disk_ends_the_recorder_with_one_line(tmp_path: Path) -> None:
     with recording(path, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))) as process:
         process.control.recv(10)
         for k in range(20):
-            process.control.send(wire.robot(1000 + k, noise.bytes(5000)))
+            process.control.send(codec.robot(1000 + k, noise.bytes(5000)))
         code, said = process.end()
         assert process.control.recv(10) == b""  # this is how control knows
     assert code == 1

@@ -11,10 +11,9 @@ from io import StringIO
 
 from rich.console import Console
 
-from hrcreplay.live.channel import Channel
-from hrcreplay.live.panel import clock, line, panel
-from hrcreplay.live.screen import Lines, serve
-from hrcreplay.live.status import RecorderStatus, Status
+from hrcreplay.live.processes import Channel
+from hrcreplay.live.view.messages import RecorderStatus, Status
+from hrcreplay.live.view.screen import Lines, clock, line, panel, serve
 from tests.live.statuses import status
 
 
@@ -113,7 +112,7 @@ def run(*arguments: str, send: list[Status]) -> subprocess.CompletedProcess[str]
         ours.send(b"S" + json.dumps(now).encode())
     ours.close()
     with theirs:
-        command = [sys.executable, "-m", "hrcreplay.live.screen", "--fd", str(theirs.fileno()), *arguments]
+        command = [sys.executable, "-m", "hrcreplay.live.view.screen", "--fd", str(theirs.fileno()), *arguments]
         return subprocess.run(
             command, pass_fds=(theirs.fileno(),), capture_output=True, text=True, timeout=60.0, check=True
         )
@@ -137,7 +136,7 @@ def test_the_process_draws_on_a_terminal() -> None:
     ours.close()
     leader, follower = os.openpty()
     with theirs:
-        command = [sys.executable, "-m", "hrcreplay.live.screen", "--fd", str(theirs.fileno())]
+        command = [sys.executable, "-m", "hrcreplay.live.view.screen", "--fd", str(theirs.fileno())]
         environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
         process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stderr=follower, env=environment)
         assert process.wait(60.0) == 0

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay import cli
-from hrcreplay.live import wire
-from hrcreplay.live.tape import Tape
+from hrcreplay.cli import app
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.log_reader import Tape
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from tests.live.flights import DEMO, start
@@ -96,7 +96,7 @@ def test_shadow_mode_sends_nothing_and_records_all(flown: dict[str, Flown]) -> N
     assert shadow.report["answers"]["answered"] == 0
     assert shadow.report["answers"]["packets"]
     assert shadow.report["sessions"] == [""]
-    replies = [wire.read_reply(m) for m in Tape(shadow.folder / "log.mcap").messages() if wire.kind(m) == wire.REPLY]
+    replies = [codec.read_reply(m) for m in Tape(shadow.folder / "log.mcap").messages() if codec.kind(m) == codec.REPLY]
     assert replies
     assert not any(sent for sent, _ in replies)
 
@@ -110,7 +110,7 @@ def test_a_flipped_bit_is_found_and_named(
     (run / "log.mcap").write_bytes(data)
     monkeypatch.setattr(sys, "argv", ["hrcreplay", "verify", str(run)])
     with pytest.raises(SystemExit) as left:
-        cli.main()
+        app.main()
     assert left.value.code == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f"{run}/log.mcap: byte ")
@@ -166,7 +166,7 @@ def test_what_cannot_begin_is_one_line_and_leaves_nothing(
     words = ["live", *arguments, *port, "--out", tmp_path / "out", "--send"]
     monkeypatch.setattr(sys, "argv", ["hrcreplay", *map(str, words)])
     with pytest.raises(SystemExit) as left:
-        cli.main()
+        app.main()
     out, err = capsys.readouterr()
     assert (left.value.code, out) == (code, "")
     assert err.count("\n") == 1

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hrcreplay.errors import LogError
-from hrcreplay.live import wire
-from hrcreplay.live.tape import Tape
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.log_reader import Tape
 from hrcreplay.logs.writer import LogWriter
 from tests.live import made
 from tests.logs import own
@@ -88,7 +88,7 @@ def test_a_damaged_chunk_is_named_and_read_past(finished: Path, tmp_path: Path, 
     assert read == messages[:60] + messages[90:]
     (flaw,) = tape.flaws
     assert flaw.at_byte == third
-    last, following = ((wire.clock_ns(messages[i]) - made.START_NS) / 1e9 for i in (59, 90))
+    last, following = ((codec.clock_ns(messages[i]) - made.START_NS) / 1e9 for i in (59, 90))
     assert (flaw.after_s, flaw.before_s) == (last, following)
     assert str(flaw).startswith(f"byte {third}, between {last:.3f} s and {following:.3f} s: ")
 

@@ -10,12 +10,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from hrcreplay import replay, runs
-from hrcreplay.egm.faults import KINDS, Fault
+from hrcreplay.egm.robot_double.faults import KINDS, Fault
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.live import wire
-from hrcreplay.live.records import Answer, Signal, TickEvent
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import Answer, Signal, TickEvent
 from hrcreplay.live.verify import Verdict, verify
+from hrcreplay.run import replay
+from hrcreplay.store import run_folder
 from tests.live import made
 from tests.live.flights import BEGIN_NS, Flight
 
@@ -35,7 +36,7 @@ def _verdict(folder: Path, messages: list[bytes], build: type[made.Pilot] = made
 
 
 def _at(messages: list[bytes], kind: bytes, number: int) -> int:
-    return [i for i, message in enumerate(messages) if wire.kind(message) == kind][number]
+    return [i for i, message in enumerate(messages) if codec.kind(message) == kind][number]
 
 
 def _float(message: bytes, offset: int, change: float) -> bytes:
@@ -51,7 +52,7 @@ def test_the_same_again_is_identical(tmp_path: Path, messages: list[bytes]) -> N
     run = tmp_path / "whole"
     run.mkdir()
     made.record(run / "log.mcap", messages)
-    meta = {"complete": True, "outputs": {"log.mcap": runs.sha256(run / "log.mcap")}}
+    meta = {"complete": True, "outputs": {"log.mcap": run_folder.sha256(run / "log.mcap")}}
     (run / "run.json").write_text(json.dumps(meta))
     assert verify(run, made.Pilot) == Verdict(identical=True, lines=("identical: 60 ticks, 60 looks",))
 
@@ -71,7 +72,7 @@ class Drifting(made.Pilot):
 def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messages: list[bytes]) -> None:
     verdict = _verdict(tmp_path, messages, Drifting)
     assert not verdict.identical
-    recorded = wire.read_answer(messages[_at(messages, wire.ANSWER, 19)]).row
+    recorded = codec.read_answer(messages[_at(messages, codec.ANSWER, 19)]).row
     assert recorded is not None
     seconds = 20 * made.TICK_NS / 1e9
     q = float(recorded[2])  # of q_measured, which this pilot derives from q
@@ -83,12 +84,12 @@ def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messa
 @pytest.mark.parametrize(
     ("kind", "number", "offset", "names"),
     [
-        (wire.LOOK, 7, struct.calcsize("<cqHHHH") + 8 * (12 + 3), "rho_vel: recorded "),
-        (wire.LOOK, 7, struct.calcsize("<cqHHHH") + 8 * 79, "pi_forearm_r: recorded "),
-        (wire.ANSWER, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 17, "dq6: recorded "),
-        (wire.ANSWER, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
-        (wire.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
-        (wire.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 5), "radius of LLA: recorded 1.1, again 0.1"),
+        (codec.LOOK, 7, struct.calcsize("<cqHHHH") + 8 * (12 + 3), "rho_vel: recorded "),
+        (codec.LOOK, 7, struct.calcsize("<cqHHHH") + 8 * 79, "pi_forearm_r: recorded "),
+        (codec.ANSWER, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 17, "dq6: recorded "),
+        (codec.ANSWER, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 5), "radius of LLA: recorded 1.1, again 0.1"),
     ],
 )
 def test_changed_numbers_are_named(
@@ -97,14 +98,14 @@ def test_changed_numbers_are_named(
     changed, at = list(messages), _at(messages, kind, number)
     changed[at] = _float(changed[at], offset, 1.0)
     verdict = _verdict(tmp_path, changed)
-    tick = 10 if kind == wire.VOLUMES else 7
+    tick = 10 if kind == codec.VOLUMES else 7
     assert verdict.lines[0].startswith(f"tick {tick} at ")
     assert f" s: {names}" in verdict.lines[0]
 
 
 def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[bytes]) -> None:
-    at = _at(messages, wire.ANSWER, 58)
-    assert wire.read_answer(messages[at]).reason == "Ctrl-C"
+    at = _at(messages, codec.ANSWER, 58)
+    assert codec.read_answer(messages[at]).reason == "Ctrl-C"
     changed = list(messages)
     changed[at] = changed[at].replace(b"Ctrl-C", b"SIGINT")
     assert "tick 58 at" in (line := _verdict(tmp_path, changed).lines[0])
@@ -112,7 +113,7 @@ def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[
 
     changed = list(messages)
     changed[at + 1] = changed[at + 1][:-3] + bytes([changed[at + 1][-3] ^ 1]) + changed[at + 1][-2:]
-    reply = wire.read_reply(messages[at + 1])[1]
+    reply = codec.read_reply(messages[at + 1])[1]
     value = reply[-3]
     assert (
         _verdict(tmp_path, changed)
@@ -126,26 +127,26 @@ def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[
 
 
 def test_a_volume_that_is_not_stored_is_compared_by_digest(tmp_path: Path, messages: list[bytes]) -> None:
-    changed, at = list(messages), _at(messages, wire.LOOK, 7)
+    changed, at = list(messages), _at(messages, codec.LOOK, 7)
     changed[at] = changed[at][:-1] + bytes([changed[at][-1] ^ 64])
     assert "s: volume of LLA (digest): recorded '" in _verdict(tmp_path, changed).lines[0]
-    at = _at(messages, wire.LOOK, -1)
+    at = _at(messages, codec.LOOK, -1)
     changed = [*messages[:at], messages[at][:-1] + bytes([messages[at][-1] ^ 64])]
     assert "tick 59 at" in _verdict(tmp_path, changed).lines[0]  # nothing follows it
 
 
-@pytest.mark.parametrize(("kind", "number"), [(wire.ROBOT, 5), (wire.FRAME, 3), (wire.SILENCE, 0), (wire.EVENT, 0)])
+@pytest.mark.parametrize(("kind", "number"), [(codec.ROBOT, 5), (codec.FRAME, 3), (codec.SILENCE, 0), (codec.EVENT, 0)])
 def test_inputs_that_are_missing_or_changed_show(
     tmp_path: Path, messages: list[bytes], kind: bytes, number: int
 ) -> None:
     at = _at(messages, kind, number)
-    if kind == wire.EVENT:
+    if kind == codec.EVENT:
         with pytest.raises(LogError, match="does not begin with the start"):
             _verdict(tmp_path, messages[1:])
         return
     verdict = _verdict(tmp_path, messages[:at] + messages[at + 1 :])
     assert not verdict.identical
-    if kind != wire.SILENCE:
+    if kind != codec.SILENCE:
         assert "s: the record has " in verdict.lines[0]
 
 
@@ -153,7 +154,7 @@ def test_any_nan_is_like_any_other(tmp_path: Path, messages: list[bytes]) -> Non
     changed = list(messages)
     quiet, other = struct.pack("<d", np.nan), b"\x01\0\0\0\0\0\xf8\xff"
     for i, message in enumerate(messages):
-        if wire.kind(message) == wire.LOOK:
+        if codec.kind(message) == codec.LOOK:
             changed[i] = message.replace(quiet, other)
             assert changed[i] != message
     assert _verdict(tmp_path, changed).identical
@@ -165,7 +166,7 @@ def test_a_look_that_failed_fails_again(tmp_path: Path, messages: list[bytes]) -
             """A bug."""
 
     t_ns = made.START_NS + 10
-    record = [messages[0], wire.frame(t_ns, made.skeleton(0)), wire.event(t_ns, {"what": "blind"})]
+    record = [messages[0], codec.frame(t_ns, made.skeleton(0)), codec.event(t_ns, {"what": "blind"})]
     assert _verdict(tmp_path, record, Blind).identical
     assert "look: recorded 'failed'" in _verdict(tmp_path, record).lines[0]
 
@@ -188,7 +189,7 @@ def test_a_flipped_bit_is_named_with_its_chunk(tmp_path: Path, messages: list[by
 
 def test_a_changed_file_of_a_complete_session_is_named(tmp_path: Path, messages: list[bytes]) -> None:
     made.record(tmp_path / "log.mcap", messages)
-    outputs = {"log.mcap": runs.sha256(tmp_path / "log.mcap"), "motion.parquet": "0" * 64, "gone.svg": "0" * 64}
+    outputs = {"log.mcap": run_folder.sha256(tmp_path / "log.mcap"), "motion.parquet": "0" * 64, "gone.svg": "0" * 64}
     (tmp_path / "run.json").write_text(json.dumps({"complete": True, "outputs": outputs}))
     (tmp_path / "motion.parquet").write_text("")
     lines = verify(tmp_path, made.Pilot).lines
@@ -222,7 +223,7 @@ def test_a_replay_that_does_not_is_named_by_row_and_column(replayed: Path, tmp_p
     assert changed == (f"{run / 'motion.parquet'}: is not as the run left it",)  # it came out the same all the same
 
     meta = json.loads((run / "run.json").read_text())
-    meta["outputs"]["motion.parquet"] = runs.sha256(run / "motion.parquet")
+    meta["outputs"]["motion.parquet"] = run_folder.sha256(run / "motion.parquet")
     meta["versions"]["numpy"] = "1.0"
     (run / "run.json").write_text(json.dumps(meta))
     lines = verify(run).lines
@@ -250,7 +251,7 @@ def test_a_replay_of_another_log_is_not_run(replayed: Path, tmp_path: Path) -> N
 
 
 def test_signals_are_part_of_what_is_told(tmp_path: Path, messages: list[bytes]) -> None:
-    changed, at = list(messages), _at(messages, wire.ANSWER, 30)
+    changed, at = list(messages), _at(messages, codec.ANSWER, 30)
     offset = struct.calcsize("<cqqI")
     changed[at] = changed[at][:offset] + struct.pack("<I", Signal.INTERRUPT) + changed[at][offset + 4 :]
     assert "status: recorded 'tracking', again 'braking'" in _verdict(tmp_path, changed).lines[0]
@@ -265,6 +266,6 @@ def test_a_session_with_every_fault_is_identical(tmp_path: Path) -> None:
     assert len(flight.pilot.stops) >= 3
     run = tmp_path / "run.partial"
     run.mkdir()
-    made.record(run / "log.mcap", [wire.event(BEGIN_NS - 1, flight.start), *flight.messages], chunk=500)
+    made.record(run / "log.mcap", [codec.event(BEGIN_NS - 1, flight.start), *flight.messages], chunk=500)
     verdict = verify(run)
     assert verdict.identical, verdict.lines

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.live import zenoh_source
-from hrcreplay.live.zenoh_source import KeySettings, Stream
+from hrcreplay.live.person import zenoh_source
+from hrcreplay.live.person.zenoh_source import KeySettings, Stream
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.joints import AZURE_INDEX, OPENNI_JOINTS
+from hrcreplay.logs.messages import AZURE_INDEX, OPENNI_JOINTS
 from hrcreplay.records import POINTS
 from tests.live import zenoh_publisher
 from tests.live.human import Human

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.cell import Cell, write_cell
-from hrcreplay.egm.servo import PERIOD_NS
-from hrcreplay.live import wire
-from hrcreplay.live.records import PHASES
-from hrcreplay.live.tape import Tape
+from hrcreplay.calibration.cell import Cell, write_cell
+from hrcreplay.egm.robot_double.servo import PERIOD_NS
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import PHASES
+from hrcreplay.live.record.log_reader import Tape
 from hrcreplay.live.verify import verify
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.robot.model import irb140
@@ -104,17 +104,17 @@ def moves_only_while_seen(log: Path, stop_s: float) -> None:
     """What the robot was told, by the record: never to go on without a fresh frame, nor to jump."""
     robot = irb140(np.eye(4), stop_s=stop_s)
     captured = dict.fromkeys(POSES, 0)
-    rows: list[wire.Answered] = []
+    rows: list[codec.Answered] = []
     for message in Tape(log).messages():
-        if wire.kind(message) == wire.FRAME:
-            skeleton = pb.Skeleton.FromString(wire.body(message))
+        if codec.kind(message) == codec.FRAME:
+            skeleton = pb.Skeleton.FromString(codec.body(message))
             captured[skeleton.camera] = skeleton.capture_ns
-        elif wire.kind(message) == wire.ANSWER:
-            rows.append(wire.read_answer(message))
+        elif codec.kind(message) == codec.ANSWER:
+            rows.append(codec.read_answer(message))
             if PHASES[rows[-1].phase] in MOVING:
                 assert rows[-1].t_ns - max(captured.values()) <= FRESH_S * 1e9
     assert all(captured.values())  # both came through
-    told = [(PHASES[row.phase], wire.motion_row(row)) for row in rows]
+    told = [(PHASES[row.phase], codec.motion_row(row)) for row in rows]
     braking = 0
     for (_, one), (phase, two) in pairwise(told):
         assert one is not None

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.joints import AZURE_JOINTS
+from hrcreplay.logs.messages import AZURE_JOINTS
 from tests.logs.bags import define, header, make, marker_array, point, store_of
 
 MARKERS = "0/cell/kinect/visualization_msgs::msg::dds_::MarkerArray_/RIHS01_0"

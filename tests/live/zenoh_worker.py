@@ -13,7 +13,7 @@ import numpy as np
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.joints import AZURE_INDEX, AZURE_JOINTS
+from hrcreplay.logs.messages import AZURE_INDEX, AZURE_JOINTS
 from hrcreplay.records import Floats
 from tests.live.flights import LENGTHS_M
 from tests.logs.bags import marker_array, store_of

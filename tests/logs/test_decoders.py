@@ -10,8 +10,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs import joints
-from hrcreplay.logs.decode_generic import GenericDecoder
+from hrcreplay.logs import messages
+from hrcreplay.logs.decoders import GenericDecoder
 from hrcreplay.logs.reader import LogOptions, open_log
 from hrcreplay.records import POINTS
 from tests.logs import own
@@ -49,26 +49,26 @@ def path_of(tmp_path: Path, kind: str) -> Path:
 
 
 def test_tables_name_every_side_right() -> None:
-    for table in (joints.AZURE_POINTS, joints.KINECT2_POINTS, joints.OPENNI_POINTS):
+    for table in (messages.AZURE_POINTS, messages.KINECT2_POINTS, messages.OPENNI_POINTS):
         for name, joint in table.items():
             side = {"_l": "left", "_r": "right"}.get(name[-2:])
             assert side is None or side in joint.lower()
             assert {"left": "right", "right": "left"}.get(side or "", "none") not in joint.lower()
-    assert [joints.AZURE_JOINTS[i] for i in (0, 5, 12, 26, 31)] == [
+    assert [messages.AZURE_JOINTS[i] for i in (0, 5, 12, 26, 31)] == [
         "PELVIS",
         "SHOULDER_LEFT",
         "SHOULDER_RIGHT",
         "HEAD",
         "EAR_RIGHT",
     ]
-    assert [joints.KINECT2_JOINTS[i] for i in (0, 4, 8, 20, 24)] == [
+    assert [messages.KINECT2_JOINTS[i] for i in (0, 4, 8, 20, 24)] == [
         "SpineBase",
         "ShoulderLeft",
         "ShoulderRight",
         "SpineShoulder",
         "ThumbRight",
     ]
-    assert len(joints.AZURE_INDEX) == len(joints.KINECT2_INDEX) == len(POINTS)
+    assert len(messages.AZURE_INDEX) == len(messages.KINECT2_INDEX) == len(POINTS)
 
 
 # --- tf ---

@@ -11,8 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.logs.importer import import_azure, import_keraal, import_kinect2
-from hrcreplay.logs.pivots import find_pivot, rotations
+from hrcreplay.logs.importers import find_pivot, import_azure, import_keraal, import_kinect2, rotations
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import POINTS, CameraFrames
 from tests.realdata import data_path

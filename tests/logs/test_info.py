@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.logs.decode_generic import GenericDecoder
+from hrcreplay.logs.decoders import GenericDecoder
 from hrcreplay.logs.info import lines, summarize
 from hrcreplay.logs.reader import LogOptions, open_log
 from hrcreplay.logs.writer import LogWriter

@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from hrcreplay.human.registration import rigid
-from hrcreplay.logs.person import PersonMemory, pick
+from hrcreplay.calibration.registration import rigid
+from hrcreplay.logs.clean import PersonMemory, pick
 from hrcreplay.records import CameraFrames, Floats
 
 UNKNOWN = np.full((2, 4, 4), np.nan)

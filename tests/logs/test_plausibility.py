@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.decode_generic import GenericDecoder
+from hrcreplay.logs.decoders import GenericDecoder
 from hrcreplay.logs.info import lines, summarize
 from hrcreplay.logs.reader import Log, LogOptions, open_log
 from hrcreplay.records import POINTS, CameraFrames, Floats

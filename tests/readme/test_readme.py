@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import typer
 
-from hrcreplay import replay, runs
-from hrcreplay.cli import app
-from hrcreplay.report import metrics
-from hrcreplay.runs import Run
+from hrcreplay.cli.app import app
+from hrcreplay.run import replay, report
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import Run
 from tests.readme import __main__ as readme
 from tests.readme.blocks import BLOCK, BLOCKS, fill
 from tests.readme.measurements import DEMO, ROOT, Measurement, load, measurements, of_people, of_report
@@ -58,7 +58,7 @@ def test_the_demo_by_default(demo_folder: Path) -> None:
 
 
 def test_the_demo_as_printed(printed: Run) -> None:
-    _same("demo, paper, paper", of_report(metrics.compute(printed, near_m=0.5, stationary_m_per_s=0.001)))
+    _same("demo, paper, paper", of_report(report.compute(printed, near_m=0.5, stationary_m_per_s=0.001)))
 
 
 def test_the_limits_of_people() -> None:
@@ -168,4 +168,4 @@ def test_only_the_figures_asked_for_are_measured_and_nothing_twice(
 
 
 def test_the_shipped_log_is_the_one_that_is_measured() -> None:
-    assert runs.sha256(replay.demo_log()) == runs.sha256(ROOT / DEMO)
+    assert run_folder.sha256(replay.demo_log()) == run_folder.sha256(ROOT / DEMO)

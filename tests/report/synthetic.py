@@ -10,7 +10,7 @@ import pandas as pd
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, Floats, Ints
-from hrcreplay.runs import Run
+from hrcreplay.store.run_folder import Run
 
 LENGTHS_M = np.array([0.95, 0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.27])
 T0_NS = 1_700_000_000_000_000_000

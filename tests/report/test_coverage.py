@@ -3,10 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hrcreplay.audit import metrics as audit_checked
+from hrcreplay.audit import metrics as audit_metrics
+from hrcreplay.audit.bootstrap import Resampling, block_ticks, resample
+from hrcreplay.audit.metrics import Outcome
 from hrcreplay.records import BODY, LIMBS, Floats
-from hrcreplay.report import audit_checked, audit_metrics
-from hrcreplay.report.audit_metrics import Outcome
-from hrcreplay.report.coverage import Resampling, block_ticks, resample
 
 
 def _once(n: int) -> Resampling:
@@ -167,13 +168,13 @@ def test_every_limb_is_every_limb_that_was_checked() -> None:
     points = {limb: dict.fromkeys(names, count) for limb, (names, count) in _POINTS.items()}
     part = {"ticks": 8, "points": points, "methods": {"sound": figures}}
     assert audit_checked.never(part, "sound") == ["LLA", "hand_r of LRA"]
-    assert audit_checked.scope(part, "sound") == "not LLA"
+    assert audit_checked.checked_scope(part, "sound") == "not LLA"
     late = "not seen to the horizon's end, so not checked"
-    assert audit_checked.notes(part, "sound") == [
+    assert audit_checked.unchecked_notes(part, "sound") == [
         "not checked at all, so nothing is said of it: LLA, hand_r of LRA",
         f"{late}, of 8 ticks: HD 1, THX 1, URA 1, LRA 1, ULA 1, LEGS 2, foot_l of LEGS 5",
     ]
-    rows = {row[0]: row[1] for row in audit_checked.table(part, "sound").rows}
+    rows = {row[0]: row[1] for row in audit_checked.checked_table(part, "sound").rows}
     assert (rows["HD"], rows["LLA"], rows["LRA: hand_r"]) == ("7", "not checked", "not checked")
     assert (rows["LEGS: foot_l"], rows["THX: shoulder_l"]) == ("3", "7")
     found = {"total": part, "method": "sound"}

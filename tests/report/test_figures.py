@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from hrcreplay.report import figures, figures_human, figures_robot
-from hrcreplay.report.metrics import compute
-from hrcreplay.report.solids import Solid, outline, picture, view_from
-from hrcreplay.runs import Run
+from hrcreplay.report.drawing import Solid, outline, picture, view_from
+from hrcreplay.run.report import compute
+from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import RADII_M, T0_NS, make_run, volumes_at
 
 ALL = {

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from hrcreplay.logs.clean import DEFECTS
-from hrcreplay.report.flaws import flaws
+from hrcreplay.report.story import flaws
 from tests.report.synthetic import make_run
 from tests.report.test_page import read, rendered
 

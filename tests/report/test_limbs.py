@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay import replay, runs
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats
 from hrcreplay.report import limbs, story
-from hrcreplay.report.metrics import compute
-from hrcreplay.runs import Run
+from hrcreplay.run import replay
+from hrcreplay.run.report import compute
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import make_run
 from tests.report.test_page import read, rendered
 
@@ -129,7 +130,7 @@ def test_fusing_a_log_without_wrists_says_so_on_the_terminal_and_in_the_record(
     ]
     fused = replay.run("fuse", wristless, out=tmp_path / "fused")
     assert capsys.readouterr().err.splitlines() == [f"hrcreplay: {line}" for line in lines]
-    assert runs.read_meta(fused)["notes"] == lines
+    assert run_folder.read_meta(fused)["notes"] == lines
     predicted = replay.run("fuse", fused, out=tmp_path / "again")  # taken over: said again, and once
     assert capsys.readouterr().err.splitlines()[1:] == [f"hrcreplay: {line}" for line in lines]
-    assert runs.read_meta(predicted)["notes"] == lines
+    assert run_folder.read_meta(predicted)["notes"] == lines

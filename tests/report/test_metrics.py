@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 from hrcreplay.records import JOINTS
-from hrcreplay.report.metrics import compute
 from hrcreplay.report.metrics_plan import cycles, path_feet, waited_s
-from hrcreplay.runs import Run
+from hrcreplay.run.report import compute
+from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import T0_NS, make_run
 
 ANGLES = JOINTS[2:]

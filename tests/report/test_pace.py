@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from hrcreplay.records import Floats
-from hrcreplay.report.metrics import compute
-from hrcreplay.report.pace import pace
+from hrcreplay.report.metrics_plan import pace
+from hrcreplay.run.report import compute
 from tests.report.synthetic import T0_NS, make_run
 
 HZ = 100.0

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from hrcreplay.human.model import LimitSet
-from hrcreplay.report import figures, page, story, tables, wording
-from hrcreplay.report.metrics import compute
-from hrcreplay.robot import stepping
-from hrcreplay.runs import Run
+from hrcreplay.report import figures, page, story, tables
+from hrcreplay.report import tables as wording
+from hrcreplay.robot.control import control_step
+from hrcreplay.run.report import compute
+from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import make_run
 
 PI = np.pi
@@ -146,8 +147,8 @@ def test_a_robot_that_kept_the_constraint_throughout(tmp_path: Path) -> None:
 
 
 def test_every_reason_to_brake_has_its_words() -> None:
-    assert set(stepping.REASONS[1:]) <= set(wording.REASONS)
-    assert len({wording.happened(reason) for reason in stepping.REASONS[1:]}) == len(stepping.REASONS) - 1
+    assert set(control_step.REASONS[1:]) <= set(wording.REASONS)
+    assert len({wording.happened(reason) for reason in control_step.REASONS[1:]}) == len(control_step.REASONS) - 1
     assert wording.happened("no oil") == "the record says 'no oil'"
 
 

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from hrcreplay.records import LIMBS
-from hrcreplay.report.metrics import compute
-from hrcreplay.report.summary import lines
-from hrcreplay.runs import Run
+from hrcreplay.report.story import lines
+from hrcreplay.run.report import compute
+from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import make_run
 
 

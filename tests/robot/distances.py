@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hrcreplay.records import Floats
+from hrcreplay.robot.control.separation import Obstacles, axis_distance
 from hrcreplay.robot.model import RobotPose
-from hrcreplay.robot.obstacles import Obstacles
-from hrcreplay.robot.separation import axis_distance
 
 
 def by_coal(pose: RobotPose, seen: Obstacles) -> Floats:

@@ -9,16 +9,13 @@ import daqp
 import numpy as np
 import pytest
 
+from hrcreplay.geometry.vectors import from_vector
 from hrcreplay.records import Floats, SweptVolumes
-from hrcreplay.robot.constraints import approach_rows, link_segment
-from hrcreplay.robot.controller import step
+from hrcreplay.robot.control.approach_rows import approach_rows, link_segment
+from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, observe
+from hrcreplay.robot.control.qp_controller import Problem, problem, step
+from hrcreplay.robot.control.separation import Obstacles, Separation, obstacles
 from hrcreplay.robot.model import RobotModel, RobotPose, irb140
-from hrcreplay.robot.obstacles import Obstacles, obstacles
-from hrcreplay.robot.problem import Problem, problem
-from hrcreplay.robot.rotation import from_vector
-from hrcreplay.robot.separation import Separation
-from hrcreplay.robot.sight import observe
-from hrcreplay.robot.stepping import PlanSettings, RobotState, Step
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.paths import approach
+from hrcreplay.robot.programme.path import approach
 
 
 @pytest.fixture(scope="module")

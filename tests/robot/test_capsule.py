@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.capsule import capsule_m3, fit, hull_m3
+from hrcreplay.robot.link_capsules import capsule_m3, fit, hull_m3
 
 
 def outside_m(points: Floats, start: Floats, end: Floats, radius: float) -> float:

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from hrcreplay.records import SweptVolumes
-from hrcreplay.robot import stepping
-from hrcreplay.robot.controller import Solution, Unsolved, solve, step
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.qp_controller import Solution, Unsolved, pose_error, solve, step
+from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.obstacles import obstacles
-from hrcreplay.robot.stepping import RobotState
-from hrcreplay.robot.tracking import pose_error
 from tests.robot.checker import links, violation
 from tests.robot.distances import by_coal
 from tests.robot.people import person, volumes
@@ -57,7 +56,7 @@ def test_every_tick_of_a_replay_is_that_of_another_solver(
             continue
         task = asked(robot, state, *swing(robot, (tick + 1) * DT_S), obstacles(people, tick))
         expected, feasible = dense(robot, task)
-        assert (made.status != stepping.BRAKING) == feasible
+        assert (made.status != control_step.BRAKING) == feasible
         if feasible:
             np.testing.assert_allclose(state.dq + DT_S * made.u, expected, atol=1e-6)
 
@@ -80,7 +79,7 @@ def test_inequality_2_holds_wherever_the_robot_does_not_brake(
         stop_s=STOP_S,
     )
     assert worst.metres <= 1e-6, worst
-    assert np.count_nonzero(status == stepping.LIMITED) > 100
+    assert np.count_nonzero(status == control_step.LIMITED) > 100
 
 
 def test_the_checker_is_no_friend_of_anyone(robot: RobotModel) -> None:
@@ -108,7 +107,7 @@ def test_a_free_robot_follows_its_reference(robot: RobotModel) -> None:
         T, twist = swing(robot, (tick + 1) * DT_S)
         made = step(robot, state, T, twist, nobody, SETTINGS)
         state = made.next
-    assert made.status == stepping.TRACKING
+    assert made.status == control_step.TRACKING
     error = pose_error(robot.pose(state.q, state.dq).T_world_tcp, T)
     assert np.abs(error[:3]).max() < 1e-4
     assert np.abs(error[3:]).max() < 1e-4
@@ -145,7 +144,7 @@ def test_without_limbs_there_is_no_distance(robot: RobotModel) -> None:
     made = step(robot, moving(robot), *swing(robot, 0.0), obstacles(empty, 0), SETTINGS)
     assert np.isnan(made.distance_m)
     assert (made.link, made.limb) == (-1, -1)
-    assert made.status != stepping.BRAKING
+    assert made.status != control_step.BRAKING
 
 
 def test_the_same_ticks_give_the_same_bits(robot: RobotModel) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hrcreplay.geometry.segment_hull_distance import distances
 from hrcreplay.records import Floats
-from hrcreplay.robot.distance import distances
-from hrcreplay.robot.separation import axis_distance
+from hrcreplay.robot.control.separation import axis_distance
 from tests.robot.exact import exact_distance
 
 PAIRS = 10_000

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from hrcreplay.robot.reference import Leash, Reference, advance
+from hrcreplay.robot.programme.reference import Leash, Reference, advance
 from tests.robot.tasks import pick_and_place, robot
 
 __all__ = ["pick_and_place", "robot"]  # fixtures

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.robot.rotation import from_quaternion, from_rpy, from_vector, to_vector
+from hrcreplay.geometry.vectors import from_quaternion, from_rpy, from_vector, to_vector
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 0.3, 2.0, np.pi - 1e-6, np.pi - 1e-12])

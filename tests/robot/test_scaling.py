@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from hrcreplay.records import Floats, SweptVolumes
-from hrcreplay.robot import stepping
-from hrcreplay.robot.constraints import approach_rows, link_segment
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.approach_rows import approach_rows, link_segment
+from hrcreplay.robot.control.control_step import PlanSettings, Step
+from hrcreplay.robot.control.scaling_controller import PathState, rates, step
+from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.obstacles import obstacles
-from hrcreplay.robot.paths import programmed
-from hrcreplay.robot.reference import Reference
-from hrcreplay.robot.scaling import PathState, rates, step
-from hrcreplay.robot.stepping import PlanSettings, Step
-from hrcreplay.robot.task import parse_task
+from hrcreplay.robot.programme.path import programmed
+from hrcreplay.robot.programme.reference import Reference
+from hrcreplay.robot.programme.task import parse_task
 from tests.robot.checker import violation
 from tests.robot.distances import by_coal
 from tests.robot.people import person, volumes
@@ -56,7 +56,7 @@ def test_alone_it_runs_the_programme(robot: RobotModel, reference: Reference) ->
     state = PathState(0.0, 1.0)
     for tick in range(1000):
         made, state = step(robot, reference, state, nobody, SETTINGS)
-        assert made.status == stepping.TRACKING
+        assert made.status == control_step.TRACKING
         assert state.s_s == pytest.approx((tick + 1) * DT_S, abs=1e-9)
 
 
@@ -74,7 +74,7 @@ def test_it_stays_on_the_path_and_keeps_inequality_2(robot: RobotModel, referenc
     assert np.abs(u / robot.ddq_max).max() <= 1.0 + 1e-6
     worst = violation(q, dq, u, status, people, base(), dt_s=DT_S, stop_s=STOP_S)
     assert worst.metres <= 1e-6, worst
-    assert np.count_nonzero(status == stepping.LIMITED) > 100
+    assert np.count_nonzero(status == control_step.LIMITED) > 100
 
 
 def test_the_rate_is_the_largest_where_people_hold_it(robot: RobotModel, reference: Reference) -> None:
@@ -82,7 +82,7 @@ def test_the_rate_is_the_largest_where_people_hold_it(robot: RobotModel, referen
     rows = list(run(robot, reference, people))
     held = 0
     for tick, ((state, made), (after, _)) in enumerate(pairwise(rows)):
-        if made.status != stepping.LIMITED:
+        if made.status != control_step.LIMITED:
             continue
         more = after.rate * 1.001 + 1e-9
         now, then = reference.sample(state.s_s), reference.sample(state.s_s + DT_S / 2 * (state.rate + more))
@@ -107,7 +107,7 @@ def test_it_speeds_up_as_fast_as_the_axes_can(robot: RobotModel, reference: Refe
     state = PathState(s_s, 0.0)
     for _ in range(200):
         made, state = step(robot, reference, state, nobody, SETTINGS)
-        assert made.status == stepping.TRACKING
+        assert made.status == control_step.TRACKING
         if state.rate == 1.0:
             break
         assert np.abs(made.u / robot.ddq_max).max() == pytest.approx(1.0, abs=1e-5)
@@ -122,7 +122,7 @@ def test_without_a_known_person_it_brakes_along_the_path_until_it_stands(
     for _ in range(300):
         before = state
         made, state = step(robot, reference, state, unknown, SETTINGS)
-        assert (made.status, made.reason) == (stepping.BRAKING, stepping.NO_HUMAN)
+        assert (made.status, made.reason) == (control_step.BRAKING, control_step.NO_HUMAN)
         speeds.append(state.rate)
         if 0.0 < state.rate < before.rate:  # one axis gives all it has
             assert np.abs(made.u / robot.ddq_max).max() == pytest.approx(1.0, abs=1e-6)
@@ -131,7 +131,7 @@ def test_without_a_known_person_it_brakes_along_the_path_until_it_stands(
     assert np.all(made.u == 0.0)
     nobody = obstacles(volumes([np.full((1, 3), 50.0)]), 0)
     made, state = step(robot, reference, state, nobody, SETTINGS)
-    assert made.status == stepping.TRACKING
+    assert made.status == control_step.TRACKING
     assert state.rate > 0.0
 
 
@@ -141,14 +141,14 @@ def test_a_tcp_limit_scales_the_speed(robot: RobotModel, reference: Reference) -
     for _ in range(400):
         made, state = step(robot, reference, state, nobody, slow)
         fastest = max(fastest, np.abs(made.pose.J_tcp @ made.next.dq)[:3].max())
-        assert made.status == stepping.TRACKING
+        assert made.status == control_step.TRACKING
     assert fastest == pytest.approx(0.2, rel=1e-2)
 
 
 def test_a_state_that_is_not_a_number_stands(robot: RobotModel, reference: Reference) -> None:
     nobody = obstacles(volumes([np.full((1, 3), 50.0)]), 0)
     made, _ = step(robot, reference, PathState(0.5, np.nan), nobody, SETTINGS)
-    assert (made.status, made.reason) == (stepping.BRAKING, stepping.NOT_FINITE)
+    assert (made.status, made.reason) == (control_step.BRAKING, control_step.NOT_FINITE)
     assert np.all(made.next.dq == 0.0)
     assert np.all(made.u == 0.0)
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
+from hrcreplay.geometry.segment_hull_distance import EXACT_M, distances
 from hrcreplay.records import Floats
-from hrcreplay.robot import separation as module
-from hrcreplay.robot.distance import EXACT_M, distances
-from hrcreplay.robot.obstacles import obstacles
-from hrcreplay.robot.separation import axis_distance, separation
+from hrcreplay.robot.control import separation as module
+from hrcreplay.robot.control.separation import axis_distance, obstacles, separation
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
 

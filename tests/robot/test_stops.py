@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hrcreplay.geometry.dual_active_set_qp import minimiser
 from hrcreplay.records import Floats
-from hrcreplay.robot import controller, stepping
-from hrcreplay.robot.active_set import minimiser
-from hrcreplay.robot.controller import Solution, Unsolved, solve, step
+from hrcreplay.robot.control import control_step, qp_controller
+from hrcreplay.robot.control.approach_rows import SOLVED, Optimum, optimum
+from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.qp_controller import Solution, Unsolved, solve, step
+from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.obstacles import obstacles
-from hrcreplay.robot.optimum import SOLVED, Optimum, optimum
-from hrcreplay.robot.stepping import RobotState
 from tests.robot.people import volumes
 from tests.robot.swinging import DT_S, HOME, SETTINGS, moving, random_tick, robot, swing
 
@@ -27,7 +27,7 @@ def test_a_stop_is_as_fast_as_each_axis_can_and_exact(robot: RobotModel) -> None
     T, twist = swing(robot, 0.0)
     for tick in range(200):
         made = step(robot, state, T, twist, unknown, SETTINGS)
-        assert (made.status, made.reason) == (stepping.BRAKING, stepping.NO_HUMAN)
+        assert (made.status, made.reason) == (control_step.BRAKING, control_step.NO_HUMAN)
         expected = np.minimum(robot.ddq_max, np.maximum(-state.dq / DT_S, -robot.ddq_max))  # Eq. (67)
         np.testing.assert_allclose(made.u, expected, atol=1e-9)
         started = moving(robot).dq
@@ -47,7 +47,7 @@ def test_it_goes_on_when_the_person_is_known_again(robot: RobotModel) -> None:
     assert np.isnan(stopped.distance_m)
     assert (stopped.link, stopped.limb) == (-1, -1)
     again = step(robot, stopped.next, T, twist, nobody, SETTINGS)
-    assert again.status == stepping.TRACKING
+    assert again.status == control_step.TRACKING
     assert np.any(again.next.dq != 0.0)
 
 
@@ -61,19 +61,19 @@ def test_bad_numbers_brake_with_a_reason(robot: RobotModel, where: str, bad: flo
     made = step(robot, RobotState(q, dq), T, twist, obstacles(volumes([limb]), 0), SETTINGS)
     assert np.all(np.isfinite(made.u))
     if bad != 1e300:
-        assert made.status == stepping.BRAKING
-        assert made.reason == (stepping.NO_HUMAN if where == "vertices" else stepping.NOT_FINITE)
+        assert made.status == control_step.BRAKING
+        assert made.reason == (control_step.NO_HUMAN if where == "vertices" else control_step.NOT_FINITE)
         others = np.arange(6) != 1
-        np.testing.assert_array_equal(made.next.dq[others], stepping.braked(state, robot.ddq_max, DT_S)[others])
+        np.testing.assert_array_equal(made.next.dq[others], control_step.braked(state, robot.ddq_max, DT_S)[others])
 
 
 def test_an_unsolved_qp_is_a_stop(robot: RobotModel, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = obstacles(volumes([np.full((1, 3), 50.0)]), 0)
     state = moving(robot)
-    monkeypatch.setattr(controller, "solve", lambda _: Unsolved("PROXQP_MAX_ITER_REACHED"))
+    monkeypatch.setattr(qp_controller, "solve", lambda _: Unsolved("PROXQP_MAX_ITER_REACHED"))
     made = step(robot, state, *swing(robot, 0.0), seen, SETTINGS)
-    assert (made.status, made.reason) == (stepping.BRAKING, stepping.NO_SOLUTION)
-    np.testing.assert_array_equal(made.next.dq, stepping.braked(state, robot.ddq_max, DT_S))
+    assert (made.status, made.reason) == (control_step.BRAKING, control_step.NO_SOLUTION)
+    np.testing.assert_array_equal(made.next.dq, control_step.braked(state, robot.ddq_max, DT_S))
 
 
 def test_a_solver_that_says_solved_is_not_believed(robot: RobotModel, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,7 +83,7 @@ def test_a_solver_that_says_solved_is_not_believed(robot: RobotModel, monkeypatc
         found = optimum(H, g, *given)
         return found._replace(w=minimiser(H, g), outcome=SOLVED)
 
-    monkeypatch.setattr(controller, "optimum", careless)
+    monkeypatch.setattr(qp_controller, "optimum", careless)
     rng = np.random.default_rng(12)
     found = [solve(random_tick(robot, rng).task) for _ in range(60)]
     assert Unsolved("residual") in found
@@ -99,7 +99,7 @@ def test_a_solution_without_proof_is_not_believed(robot: RobotModel, monkeypatch
     rng = np.random.default_rng(13)
     ticks = [random_tick(robot, rng).task for _ in range(60)]
     solved = [isinstance(solve(task), Solution) for task in ticks]
-    monkeypatch.setattr(controller, "optimum", lazy)
+    monkeypatch.setattr(qp_controller, "optimum", lazy)
     found = [solve(task) for task in ticks]
     assert sum(solved) > 20
     assert Unsolved("unproven") in found

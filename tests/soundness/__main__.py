@@ -20,9 +20,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from hrcreplay.config import Settings
 from hrcreplay.errors import HrcReplayError
-from hrcreplay.human.reach import METHODS, PRINTED
+from hrcreplay.human.prediction.reachable_sets import METHODS, PRINTED
+from hrcreplay.settings.load import Settings
 from tests.soundness.run import Plan, Result, escaped, run
 
 #: What ``predict`` does unless it is told otherwise.

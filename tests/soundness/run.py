@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hrcreplay.human import occupancy
-from hrcreplay.human.margins import Margins
-from hrcreplay.human.occupancy import Radii
+from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.human.prediction.sound_reach import Margins
+from hrcreplay.human.prediction.swept_volumes import Radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
 from tests.soundness.facets import distance_m, facets_of
@@ -98,7 +98,7 @@ def corners_of(limbs: tuple[str, ...]) -> Corners:
 
 def predict(states: HumanStates, plan: Plan) -> SweptVolumes:
     """The volumes under test. Limbs have no thickness, so their radii are what the method adds for other reasons."""
-    return occupancy.predict(
+    return swept_volumes.predict(
         states,
         load_limits(plan.limits),
         horizon_s=plan.horizon_s,

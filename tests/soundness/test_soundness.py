@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay import wiring
-from hrcreplay.config import load_settings
-from hrcreplay.human.reach import METHODS
-from hrcreplay.job import unlogged
+from hrcreplay.human.prediction.reachable_sets import METHODS
 from hrcreplay.records import LIMBS, HumanStates, SweptVolumes
+from hrcreplay.run import build
+from hrcreplay.run.job import unlogged
+from hrcreplay.settings.load import load_settings
 from tests.soundness import run as sampling
 from tests.soundness.__main__ import main
 from tests.soundness.run import Plan, Result, escaped, run, sample_states
@@ -110,7 +110,7 @@ def test_the_command_samples_what_predict_does_by_default(method: str, capsys: p
     found = json.loads(line)
     sound = method == "sound"
     settings = load_settings()
-    foresight = wiring.foresight(unlogged("predict", Path(), settings, None))
+    foresight = build.foresight(unlogged("predict", Path(), settings, None))
     assert (found["method"], found["limits"]) == (method, foresight.limits.name)
     assert found["horizon_s"] == foresight.horizon_s
     assert found["latency_s"] == foresight.margins.latency_s

@@ -1,0 +1,313 @@
+"""The tightest bounds under which Alg. 1 holds what people went on to do.
+
+A joint's recorded future lies in its interval where the highest and the lowest of it do, so a tick is three numbers:
+the velocity, and how far the joint then got up and down within the horizon. For a given velocity bound each tick needs
+an acceleration bound of at least so much, in closed form; how many ticks may be missed picks one of these. Of all pairs
+that miss no more, the fit takes the one whose intervals are shortest on average.
+
+Bounds for volumes rather than for joints: what people's estimated velocities leave to their accelerations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hrcreplay.errors import LogError
+from hrcreplay.human.model import SHOWN_BY, LimitSet, canonical, clamp, nearest
+from hrcreplay.records import Bools, Floats, HumanStates, Ints, Table
+
+#: Share of the velocities that the bounds hold: what is faster is a marker that jumped.
+_FASTEST = 0.999
+
+
+def ballistic(training: Futures, standard: LimitSet, share: float, horizon_s: float) -> Fit:
+    """Bounds of another shape than ``fit``'s: velocities as fast as people are, and accelerations for the rest.
+
+    Where a velocity bound is low, a joint may have any velocity up to it, whatever the estimate says. Under these the
+    reach is where the estimated velocity leads, give or take what the accelerations change: with the same share of
+    ticks inside, swept volumes are about half as large, since a limb's place rests on many joints.
+
+    Args:
+        training: Ticks to fit on.
+        standard: Bounds that joints keep whose motion is too little to say.
+        share: Of the ticks of each side of each joint that its acceleration bound holds, in (0, 1).
+        horizon_s: T_s [s].
+    """
+    excursions = np.array(
+        [count_excursions(training.t_ns, training.moved[:, j] > STIR[j], horizon_s) for j in range(12)]
+    )
+    kept = excursions < EXCURSIONS
+    v, a = np.stack([-standard.v_min, standard.v_max]), np.stack([-standard.a_min, standard.a_max])
+    for j in np.flatnonzero(~kept).tolist():
+        known = np.isfinite(training.moved[:, j])
+        for side, speed, gone in (
+            (0, -training.v[known, j], -training.down[known, j]),
+            (1, training.v[known, j], training.up[known, j]),
+        ):
+            fastest = np.quantile(np.concatenate([speed, gone / horizon_s]), _FASTEST)
+            needed = np.quantile(least_needed(speed, gone, np.inf, horizon_s), share)
+            v[side, j], a[side, j] = rounded_up(np.maximum([fastest, needed], LEAST))
+    return Fit(-v[0], v[1], -a[0], a[1], kept, excursions)
+
+
+#: A joint that moves less than this within a horizon is at rest [m, m, rad...].
+STIR = np.array([0.03] * 2 + [np.radians(5.0)] * 10)
+#: A joint needs so many horizons with motion, none overlapping; with fewer its bounds cannot be told.
+EXCURSIONS = 10
+#: Bounds are at least this [per second; per second squared], and are rounded up to so many digits.
+LEAST, _DIGITS = 0.01, 3
+#: Velocity bounds tried; and how much longer than the shortest mean reach one with less acceleration may be.
+_TRIED, _HARDLY = 48, 1.05
+#: The ticks that may be missed are given up in about so many steps, or in steps doubled up to so many times.
+_STEPS, _DOUBLINGS = 40, 6
+#: About how far a joint is from what it moves: makes reaches of different joints comparable [m/m, m/rad].
+_LEVER_M = np.array([1.0, 1.0, 0.5, 0.5] + 2 * [0.6, 0.6, 0.4, 0.4])
+#: A posture further outside its limits than this is outside [m, m, rad...].
+_OUTSIDE = np.radians(0.1)
+_ROUNDING = 1e-9
+_ARMS = slice(4, 12)
+
+
+@dataclass(frozen=True)
+class Futures(Table):
+    """What each joint did within the horizon of a tick, seen from the fused state. (n, 12) each.
+
+    x and y are those of the body frame at the tick: forward, to the left. NaN where not recorded to the end.
+    """
+
+    t_ns: Ints  #: (n,)
+    v: Floats  #: estimated velocity [m/s, m/s, rad/s...]
+    down: Floats  #: lowest recorded position, from the estimated one [m, m, rad...]
+    up: Floats  #: highest one
+
+    @property
+    def moved(self) -> Floats:
+        """Highest minus lowest recorded position."""
+        return self.up - self.down
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Bounds (12,) and what they rest on."""
+
+    v_min: Floats
+    v_max: Floats
+    a_min: Floats
+    a_max: Floats
+    kept: Bools  #: too little motion to say, so the standard bounds stayed
+    excursions: Ints  #: horizons with motion
+
+    def onto(self, limits: LimitSet, name: str) -> LimitSet:
+        """A limit set with these bounds and the positions of ``limits``."""
+        return replace(limits, name=name, v_min=self.v_min, v_max=self.v_max, a_min=self.a_min, a_max=self.a_max)
+
+
+def futures(
+    states: HumanStates, ticks: Ints, t_ns: Ints, joints: Floats, *, horizon_s: float, memory_s: float
+) -> Futures:
+    """The recorded futures (t, t + T_s] of some ticks.
+
+    Args:
+        states: The fused person.
+        ticks: (n,) rows of ``states``.
+        t_ns: (m,) instants of the recorded joints, increasing.
+        joints: (m, 12) recorded JOINTS [m, m, rad...].
+        horizon_s: T_s [s].
+        memory_s: What no camera had seen for longer at the tick says nothing [s].
+    """
+    at = states.rows(ticks)
+    end_ns = at.t_ns + round(horizon_s * 1e9)
+    first, last = (np.searchsorted(t_ns, t, side="right") for t in (at.t_ns, end_ns))
+    c, s = np.cos(at.p[:, 2]), np.sin(at.p[:, 2])
+    low, high = np.full(at.p.shape, np.nan), np.full(at.p.shape, np.nan)
+    for i in np.flatnonzero((last > first) & (end_ns <= t_ns[-1])):
+        future = joints[first[i] : last[i]]
+        now = np.repeat(at.p[i : i + 1], len(future), axis=0)
+        apart = _turned(nearest(future, now) - now, c[i], s[i])
+        low[i], high[i] = apart.min(axis=0), apart.max(axis=0)
+    low, high = believed(low, at.unseen_s, memory_s), believed(high, at.unseen_s, memory_s)
+    return Futures(at.t_ns, _turned(at.v, c, s), low, high)
+
+
+def believed(joints: Floats, unseen_s: Floats, memory_s: float) -> Floats:
+    """Rows of JOINTS (n, 12), NaN where no camera had seen a joint's limb for longer; ``unseen_s`` (n, 6) by LIMBS."""
+    return np.where((unseen_s <= memory_s)[:, SHOWN_BY], joints, np.nan)
+
+
+def leave(p: Floats, limits: LimitSet) -> Bools:
+    """(n,) whether a posture (n, 12) is outside the position limits; False where it is not known."""
+    named = canonical(p)
+    return np.asarray((np.abs(clamp(named, limits) - named) > _OUTSIDE).any(axis=1))
+
+
+def arms_move(some: Futures) -> Bools:
+    """(n,) whether a joint of an arm moves within the horizon."""
+    return np.asarray((some.moved > STIR)[:, _ARMS].any(axis=1))
+
+
+def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -> Fit:
+    """The tightest bounds under which a share of the ticks has all fitted joints inside their intervals.
+
+    Starts from bounds that miss no tick, then lets the sides of the joints miss a few more ticks one after the other,
+    always the one whose interval becomes shorter by most for each tick that is given up, while the share allows.
+
+    Args:
+        training: Ticks to fit on.
+        standard: Bounds that joints keep whose motion is too little to say.
+        share: Of the ticks, in (0, 1).
+        horizon_s: T_s [s].
+
+    Raises:
+        LogError: No arm moved.
+    """
+    excursions = np.array(
+        [count_excursions(training.t_ns, training.moved[:, j] > STIR[j], horizon_s) for j in range(12)]
+    )
+    if not arms_move(training).any():
+        raise LogError(
+            f"found no arm motion: within no horizon of {horizon_s:g} s does a joint of an arm move by "
+            f"{np.degrees(STIR[-1]):.0f} deg; limits are fitted to logs of people at work"
+        )
+    kept = excursions < EXCURSIONS
+    sides = [_Side(training, j, upward, horizon_s) for j in np.flatnonzero(~kept).tolist() for upward in (False, True)]
+    ticks = np.isfinite(training.moved[:, ~kept]).any(axis=1).sum()
+    if sides:
+        _give_up(sides, int((1.0 - share) * ticks + _ROUNDING))
+    v, a = np.stack([-standard.v_min, standard.v_max]), np.stack([-standard.a_min, standard.a_max])
+    for side in sides:
+        at = int(side.upward), side.joint
+        v[at], a[at] = side.now.v_bound, side.now.a_bound
+    return Fit(-v[0], v[1], -a[0], a[1], kept, excursions)
+
+
+def inside(some: Futures, bounds: Fit | LimitSet, horizon_s: float) -> Floats:
+    """(n, 12) whether each joint stayed in its interval, stops aside: 1, 0, or NaN where not recorded."""
+    high = farthest(some.v, bounds.v_max, bounds.a_max, horizon_s)
+    low = -farthest(-some.v, -bounds.v_min, -bounds.a_min, horizon_s)
+    within = (some.up <= high) & (some.down >= low)
+    return np.where(np.isfinite(some.moved), within.astype(float), np.nan)
+
+
+def together(within: Floats) -> Floats:
+    """(n,) whether all joints (n, k) that were recorded stayed inside: 1, 0, or NaN where none was."""
+    return np.where(np.isfinite(within).any(axis=1), (within != 0.0).all(axis=1).astype(float), np.nan)
+
+
+def farthest(v: Floats, v_bound: Floats, a_bound: Floats, horizon_s: float) -> Floats:
+    """How far up joints get from velocities v (n, k) under bounds (k,), by Alg. 1 with Eq. (40): at least 0."""
+    t_star = np.clip((v_bound - v) / a_bound, 0.0, horizon_s)
+    return np.maximum(v * t_star + 0.5 * a_bound * t_star**2 + v_bound * (horizon_s - t_star), 0.0)
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Bounds of one side."""
+
+    v_bound: float
+    a_bound: float
+    length: float  #: shortest mean reach over the ticks with so many misses [m] or [rad]
+    missed: Ints  #: (n,) 1 where the joint got further
+
+
+class _Side:
+    """One joint's motion upward, or downward with the signs changed, and how many ticks it may miss."""
+
+    def __init__(self, some: Futures, joint: int, upward: bool, horizon_s: float) -> None:
+        self.joint, self.upward = joint, upward
+        v, gone = (some.v, some.up) if upward else (-some.v, -some.down)
+        self._v, self._gone, self._horizon_s = v[:, joint], gone[:, joint], horizon_s
+        self._known: dict[int, _Pair] = {}
+        self.misses = 0
+
+    @property
+    def now(self) -> _Pair:
+        """The bounds with as many misses as it has."""
+        return self.with_misses(self.misses)
+
+    def with_misses(self, misses: int) -> _Pair:
+        """The bounds with so many misses."""
+        if misses not in self._known:
+            self._known[misses] = self._tightest(misses)
+        return self._known[misses]
+
+    def _tightest(self, misses: int) -> _Pair:
+        """The pair with the shortest mean reach; of those hardly longer, the one with the least acceleration."""
+        known = np.isfinite(self._gone)
+        v, gone, horizon_s = self._v[known], self._gone[known], self._horizon_s
+        rank = max(0, len(v) - 1 - misses)
+        slowest = max(float(np.partition(gone, rank)[rank]) / horizon_s, LEAST)
+        free = float(np.partition(least_needed(v, gone, np.inf, horizon_s), rank)[rank])
+        tried = rounded_up(np.geomspace(slowest, max(float(v.max()) + free * horizon_s, slowest), _TRIED))
+        needed = np.array([np.partition(least_needed(v, gone, bound, horizon_s), rank)[rank] for bound in tried])
+        tried, a = tried[np.isfinite(needed)], rounded_up(np.maximum(needed[np.isfinite(needed)], LEAST))
+        lengths = farthest(v[:, None], tried, a, horizon_s).mean(axis=0)
+        k = np.argmin(np.where(lengths <= _HARDLY * lengths.min(), a, np.inf))
+        reached = farthest(self._v[:, None], tried[k : k + 1], a[k : k + 1], horizon_s)[:, 0]
+        return _Pair(float(tried[k]), float(a[k]), float(lengths.min()), (known & (self._gone > reached)).astype(int))
+
+
+def _give_up(sides: list[_Side], budget: int) -> None:
+    """Moves sides on while at most ``budget`` ticks are missed by any.
+
+    Steps of several sizes are tried, for to give up one tick of a fast motion and not the next gains nothing.
+    """
+    missed = np.sum([side.now.missed for side in sides], axis=0)
+    smallest = max(1, budget // _STEPS)
+    steps = [smallest << k for k in range(_DOUBLINGS) if smallest << k <= budget]
+    while True:
+        best, most = None, 0.0
+        lost = np.count_nonzero(missed)
+        for side in sides:
+            for step in steps:
+                then = side.with_misses(side.misses + step)
+                more = np.count_nonzero(missed + then.missed - side.now.missed) - lost
+                gain = _LEVER_M[side.joint] * (side.now.length - then.length) / max(more, 0.5)
+                if lost + more <= budget and gain > most:
+                    best, most = (side, step), gain
+        if best is None:
+            return
+        side, step = best
+        missed = missed - side.now.missed
+        side.misses += step
+        missed = missed + side.now.missed
+
+
+def least_needed(v: Floats, gone: Floats, bound: float, horizon_s: float) -> Floats:
+    """(n,) the least acceleration bound under which Alg. 1 reaches ``gone``; inf where none does.
+
+    Either the whole horizon is spent speeding up, gone = v T + a T^2 / 2, or the velocity bound V is reached, and
+    the area that the profile lacks below V is a triangle: V T - gone = (V - v)^2 / (2 a).
+    """
+    whole = np.maximum(2.0 * (gone - v * horizon_s) / horizon_s**2, 0.0)
+    if bound == np.inf:
+        return np.where(gone <= 0.0, 0.0, whole)
+    lacks = bound * horizon_s - gone
+    bent = np.where(lacks > 0.0, (bound - v) ** 2 / (2.0 * np.maximum(lacks, 1e-12)), np.inf)
+    rising = np.where(v + whole * horizon_s <= bound, whole, bent)
+    return np.where(gone <= 0.0, 0.0, np.where(v < bound, rising, np.where(lacks >= 0.0, 0.0, np.inf)))
+
+
+def rounded_up(values: Floats) -> Floats:
+    """Positive values rounded up to few digits, as the shortest decimals that say so."""
+    digits = _DIGITS - 1 - np.floor(np.log10(values)).astype(int)
+    return np.array(
+        [np.round(np.ceil(x * 10.0**n - _ROUNDING) / 10.0**n, n) for x, n in zip(values, digits.tolist(), strict=True)]
+    )
+
+
+def count_excursions(t_ns: Ints, moving: Bools, horizon_s: float) -> int:
+    """How many of the moving ticks fit behind each other without a common future."""
+    count, free_ns = 0, -1
+    for t in t_ns[moving].tolist():
+        if t >= free_ns:
+            count, free_ns = count + 1, t + round(horizon_s * 1e9)
+    return count
+
+
+def _turned(rows: Floats, c: Floats, s: Floats) -> Floats:
+    """Rows (n, 12) of JOINTS or their rates with x and y along the body's axes, Eq. (33)."""
+    turned = rows.copy()
+    turned[:, 0], turned[:, 1] = c * rows[:, 0] + s * rows[:, 1], c * rows[:, 1] - s * rows[:, 0]
+    return turned

@@ -1,0 +1,326 @@
+"""What an audit found, as figures with intervals: per method, limb and joint, for one log or several together.
+
+Which limbs and points of a recording an audit could check, and which it says nothing of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hrcreplay.audit.bootstrap import Estimate, Resampling
+from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats, Ints, Table
+from hrcreplay.report.metrics import Metric, MetricTable, stretches
+from hrcreplay.report.tables import PageTable
+
+
+def never(part: Mapping[str, Any], method: str) -> list[str]:
+    """Limbs that a method was not checked for at any tick, and points of other limbs that were never seen.
+
+    Args:
+        part: One log of audit.json, or its total.
+        method: Whose volumes.
+    """
+    limbs = [limb for limb in BODY if not ticks_of(part, method, limb)]
+    points = [
+        f"{point} of {limb}"
+        for limb, counts in part["points"].items()
+        if limb not in limbs
+        for point, count in counts.items()
+        if not count
+    ]
+    return limbs + points
+
+
+def sometimes(part: Mapping[str, Any], method: str) -> list[str]:
+    """Limbs and points that were checked at some ticks only, each with the number of those at which it was not."""
+    found = []
+    for limb, counts in part["points"].items():
+        limb_ticks = ticks_of(part, method, limb)
+        if 0 < limb_ticks < part["ticks"]:
+            found.append(f"{limb} {part['ticks'] - limb_ticks}")
+        found += [f"{point} of {limb} {part['ticks'] - n}" for point, n in counts.items() if 0 < n < limb_ticks]
+    return found
+
+
+def ticks_of(part: Mapping[str, Any], method: str, limb: str) -> int:
+    """At how many ticks a limb was held against its volume: it was seen to the horizon's end and has a volume."""
+    figures = part["methods"][method].get(limb)
+    return 0 if figures is None else int(figures["covered_share"]["samples"])
+
+
+def unchecked_notes(part: Mapping[str, Any], method: str) -> list[str]:
+    """What the reader of a log's figures must know of what was not checked."""
+    told = []
+    if gaps := never(part, method):
+        told.append(f"not checked at all, so nothing is said of it: {', '.join(gaps)}")
+    if gaps := sometimes(part, method):
+        told.append(f"not seen to the horizon's end, so not checked, of {part['ticks']} ticks: {', '.join(gaps)}")
+    return told
+
+
+def checked_scope(part: Mapping[str, Any], method: str) -> str:
+    """The limbs that a headline holds for, in a few words."""
+    missing = [limb for limb in BODY if not ticks_of(part, method, limb)]
+    return f"not {', '.join(missing)}" if missing else "LEGS included"
+
+
+def checked_table(total: Mapping[str, Any], method: str) -> PageTable:
+    """A row a limb, and one for each point beyond its two ends: at how many ticks it was checked."""
+    rows = []
+    for limb in BODY:
+        ticks = ticks_of(total, method, limb)
+        why = "not checked" if limb in total["methods"][method] else "not checked: it has no volume"
+        rows.append((limb, str(ticks) if ticks else why))
+        for point, count in total["points"].get(limb, {}).items():
+            rows.append((f"{limb}: {point}", str(count) if ticks and count else "not checked"))
+    return PageTable(
+        f"What was checked, of {total['ticks']} ticks",
+        ("limb, and points beyond its ends", "ticks"),
+        tuple(rows),
+        "A limb is checked at a tick where its two ends were seen in the last quarter of the horizon, and so is a "
+        "point. What a camera reports with confidence 0 was not seen. Nothing is said of what was not checked.",
+    )
+
+
+def checked_cameras(log: Mapping[str, Any]) -> PageTable:
+    """What of each camera's points was not believed."""
+    rows = tuple(
+        (camera, *("\u2013" if count is None else str(count) for count in counts.values()))
+        for camera, counts in log["cameras"].items()
+    )
+    return PageTable(
+        f"{log['log']}: thrown out",
+        ("camera", "frames", "not seen", "doubted", "frames with a jump", "points that jump", "outliers in the fusion"),
+        rows,
+        "No such point is part of the recorded future. Not seen: missing, or of confidence 0. Doubted: the "
+        "camera trusts it too little (fusion.confidence_min), or it hangs from such a point, or the person was not "
+        "known yet. A point that jumps off the person is rejected with what hangs from it. A dash: the recorded future "
+        "is not from cameras. The fusion's own gate is per tick and knows only what came before.",
+    )
+
+
+#: Several limbs together -> what their share is of.
+WHAT = {
+    "all": "every limb that was checked in its own volume",
+    "upper": "every limb that was checked, the lower body left out, in its own volume",
+}
+UNCHECKED = "not checked: not seen to the end of a horizon"
+#: Rounding of a distance [m].
+_ROUNDING_M = 1e-9
+#: Ticks of one escape may have so many ticks without one between them.
+_BREAK = 2
+
+
+@dataclass(frozen=True)
+class Outcome(Table):
+    """One method's volumes held against what the person did, a row an audited tick."""
+
+    t_ns: Ints  #: (n,)
+    beyond_m: (
+        Floats  #: (n, l) farthest that a recorded point of the limb got from the hull, before the ball; NaN: unseen
+    )
+    radius_m: Floats  #: (n, l) of the ball
+    volume_m3: Floats  #: (n, l) NaN where the limb could not be predicted
+    union_m3: Floats  #: (n,) of all limbs together; NaN where not computed
+    union_std_m3: Floats  #: (n,) standard error of the counting behind it
+    upper_m3: Floats  #: (n,) of the six LIMBS together, for which every method has volumes
+    upper_std_m3: Floats  #: (n,)
+    limbs: tuple[str, ...]  #: LIMBS first
+
+    def escape_m(self) -> Floats:
+        """(n, l) how far the limb left its volume within the horizon; 0 inside, NaN where not audited [m]."""
+        depth = self.beyond_m - self.radius_m
+        return np.where(np.isnan(depth), np.nan, np.where(depth > _ROUNDING_M, depth, 0.0))
+
+    def worst_m(self, limbs: int | None = None) -> Floats:
+        """(n,) largest escape of all limbs or the first so many, each from its own volume; NaN: none checked [m]."""
+        escapes = self.escape_m()[:, :limbs]
+        known = np.isfinite(escapes).any(axis=1)
+        return np.where(known, np.where(np.isnan(escapes), -1.0, escapes).max(axis=1), np.nan)
+
+
+def method_figures(
+    outcomes: Sequence[Outcome], resampling: Resampling, body_radius_m: Mapping[str, float]
+) -> dict[str, Any]:
+    """Coverage, escapes and volumes of one method.
+
+    Args:
+        outcomes: One a log, in the order of the resampling.
+        resampling: Of all their ticks.
+        body_radius_m: Radius of each limb itself, Table 2 [m].
+
+    Returns:
+        ``all`` (all limbs that the method has volumes for, each in its own), ``upper`` (the six LIMBS, for which all
+        methods have them) and each limb -> name -> figure.
+    """
+    whole = Outcome.join(outcomes)
+    escapes = whole.escape_m()
+    found: dict[str, Any] = {}
+    for part, limbs, union, std in (
+        ("all", len(whole.limbs), whole.union_m3, whole.union_std_m3),
+        ("upper", len(LIMBS), whole.upper_m3, whole.upper_std_m3),
+    ):
+        figures = _escape_figures(whole.worst_m(limbs), resampling)
+        figures["union_m3"] = resampling.mean(union).plain()
+        figures["union_counting_error"] = resampling.mean(_ratio(std, union)).plain()["value"]
+        figures["sum_m3"] = resampling.mean(whole.volume_m3[:, :limbs].sum(axis=1)).plain()
+        found[part] = figures
+    for i, limb in enumerate(whole.limbs):
+        found[limb] = _escape_figures(escapes[:, i], resampling)
+        found[limb]["volume_m3"] = resampling.mean(whole.volume_m3[:, i]).plain()
+        if limb in body_radius_m:
+            room = whole.radius_m[:, i] - body_radius_m[limb] + _ROUNDING_M
+            found[limb]["whole_limb_share"] = resampling.share(_hits(whole.beyond_m[:, i], room)).plain()
+    return found
+
+
+def _escape_figures(escape_m: Floats, resampling: Resampling) -> dict[str, Any]:
+    deep = np.where(escape_m > 0.0, escape_m, np.nan)
+    return {
+        "covered_share": resampling.share(_hits(escape_m, np.zeros(len(escape_m)))).plain(),
+        "escape_p50_m": resampling.quantile(deep, 0.5).plain(),
+        "escape_p95_m": resampling.quantile(deep, 0.95).plain(),
+        "escape_max_m": _number(np.nanmax(deep)) if np.isfinite(deep).any() else None,
+    }
+
+
+def _ratio(part: Floats, whole: Floats) -> Floats:
+    """Shares; NaN where there is no whole."""
+    return np.asarray(part / np.where(whole > 0.0, whole, np.nan))
+
+
+def _hits(values: Floats, most: Floats) -> Floats:
+    """1 where a value is at most ``most``, else 0; NaN stays."""
+    return np.where(np.isnan(values), np.nan, (values <= most).astype(float))
+
+
+def joint_figures(inside: Floats, travel: Floats, resampling: Resampling) -> dict[str, Any]:
+    """Per joint: share of ticks whose recorded future stayed inside the reachable interval, and how much it moved.
+
+    Args:
+        inside: (n, 12) 1 or 0; NaN where the joint was not recorded.
+        travel: (12,) how far the joint went in the recording, 5th to 95th percentile [m, m, rad...].
+        resampling: Of the n ticks.
+    """
+    return {
+        joint: {"inside_share": resampling.share(inside[:, j]).plain(), "travel": _number(travel[j])}
+        for j, joint in enumerate(JOINTS)
+    }
+
+
+def curve_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:
+    """Coverage of the six LIMBS and volume of their union, of one method under one limit set."""
+    whole = Outcome.join(outcomes)
+    worst = whole.worst_m(len(LIMBS))
+    return {
+        "covered_share": resampling.share(_hits(worst, np.zeros(len(worst)))).plain(),
+        "union_m3": resampling.mean(whole.upper_m3).plain(),
+    }
+
+
+def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
+    """Every escape: the ticks in a row whose prediction one limb left, when, and how far.
+
+    Times are those of the predictions; seconds count from ``start_ns``.
+    """
+    depth = outcome.escape_m()
+    seconds = (outcome.t_ns - start_ns) * 1e-9
+    found = []
+    for i, limb in enumerate(outcome.limbs):
+        for first, last in _joined(depth[:, i] > 0.0):
+            part = depth[first:last, i]
+            deepest = first + int(np.nanargmax(part))
+            found.append(
+                {
+                    "limb": limb,
+                    "from_s": round(float(seconds[first]), 3),
+                    "to_s": round(float(seconds[last - 1]), 3),
+                    "ticks": int((part > 0.0).sum()),
+                    "deepest_m": float(np.nanmax(part)),
+                    "deepest_at_s": round(float(seconds[deepest]), 3),
+                    "deepest_t_ns": int(outcome.t_ns[deepest]),
+                }
+            )
+    return sorted(found, key=lambda e: (e["from_s"], e["limb"]))
+
+
+def _joined(escaped: Bools) -> list[tuple[int, int]]:
+    """Runs of true, those joined that lie close together."""
+    runs: list[tuple[int, int]] = []
+    for first, last in stretches(escaped).tolist():
+        if runs and first - runs[-1][1] <= _BREAK:
+            runs[-1] = (runs[-1][0], last)
+        else:
+            runs.append((first, last))
+    return runs
+
+
+def volume_at(curve: Sequence[Mapping[str, Any]], share: float) -> float | None:
+    """Union volume at which a method's curve first has a coverage, between its points; None where it never has [m^3].
+
+    Args:
+        curve: Points of one method, by growing factor.
+        share: The coverage asked for.
+    """
+    before: tuple[float, float] | None = None
+    for point in curve:
+        here = (point["covered_share"]["value"], point["union_m3"]["value"])
+        if None in here:
+            continue
+        if here[0] >= share:
+            if before is None or here[0] == before[0]:
+                return float(here[1])
+            part = (share - before[0]) / (here[0] - before[0])
+            return float(np.exp((1 - part) * np.log(before[1]) + part * np.log(here[1])))
+        before = here
+    return None
+
+
+def flat(found: Mapping[str, Any]) -> dict[str, Metric]:
+    """The headline figures of all logs together, as metrics.json has them.
+
+    Args:
+        found: The content of audit.json.
+    """
+    table = MetricTable()
+    for method, parts in found["total"]["methods"].items():
+        for part, figures in parts.items():
+            share = figures["covered_share"]
+            what = WHAT.get(part, f"{part} in its volume")
+            name = f"audit_{method}_{part}"
+            meaning = f"share of ticks with {what} for the whole horizon, by {method}"
+            table.add(f"{name}_covered_share", share["value"], "1", meaning, reason=UNCHECKED)
+            for end in ("low", "high"):
+                table.add(
+                    f"{name}_covered_share_{end}", share[end], "1", f"its 95 % interval: {end} end", reason=UNCHECKED
+                )
+            table.add(f"{name}_ticks", share["samples"], "1", "ticks at which it was checked")
+            reason = "no escape" if share["samples"] else UNCHECKED
+            table.add(f"{name}_escape_max_m", figures["escape_max_m"], "m", "deepest escape", reason=reason)
+            key = "union_m3" if part in WHAT else "volume_m3"
+            room = "mean volume of their union" if part in WHAT else "mean volume"
+            table.add(f"{name}_{key}", figures[key]["value"], "m^3", room)
+    table.add("audit_ticks", found["total"]["ticks"], "1", "audited ticks of all logs")
+    gaps = never(found["total"], found["method"])
+    meaning = "limbs, and points of other limbs, of which the audit says nothing: they were never seen"
+    table.add("audit_not_checked", ", ".join(gaps) or "nothing", "", meaning)
+    return table.sorted()
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def text(figure: Mapping[str, Any] | Estimate, scale: float = 1.0, decimals: int = 1) -> str:
+    """A figure with its interval, as tables show it; a dash where there is none."""
+    plain = figure.plain() if isinstance(figure, Estimate) else figure
+    if plain["value"] is None:
+        return "\u2013"
+    value = f"{scale * plain['value']:.{decimals}f}"
+    if plain["low"] is None:
+        return value
+    return f"{value} ({scale * plain['low']:.{decimals}f}\u2013{scale * plain['high']:.{decimals}f})"

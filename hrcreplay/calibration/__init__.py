@@ -1,0 +1,1 @@
+"""Poses and clock offsets of cameras, the floor, and the cell file that keeps them."""

@@ -1,0 +1,255 @@
+"""Commands: parse, call, print the run folder. Heavy imports stand inside the commands, so that --help is quick."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hrcreplay import __version__
+from hrcreplay.cli import (
+    CellFile,
+    Chunk,
+    Config,
+    End,
+    LimitSet,
+    Out,
+    Set,
+    Smooth,
+    Source,
+    Start,
+    Topic,
+    as_overrides,
+    live,
+    span,
+)
+from hrcreplay.errors import HrcReplayError
+
+app = typer.Typer(
+    name="hrcreplay",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="""Had this controller been running, would the person have been safe, and what would it have cost the task?
+
+Replays a recorded human-robot session through three stages, fuse, predict and plan, and reports.
+Each stage takes a log (MCAP, ROS 1 or ROS 2 bag) or the run folder of an earlier stage.
+
+A research and engineering tool, not a certified safety function.""",
+    epilog="Try it: hrcreplay demo",
+)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        sys.stdout.write(f"hrcreplay {__version__}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    _: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def info(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log (MCAP, ROS 1 or ROS 2 bag).")],
+    config: Config = None,
+    settings: Set = None,
+    topic: Topic = None,
+) -> None:
+    """What a log holds, and what is missing for the next step."""
+    from hrcreplay.cli import log_commands
+
+    sys.stdout.write("\n".join(log_commands.describe(log, config, as_overrides(settings, topic))) + "\n")
+
+
+@app.command(name="import")
+def import_(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="azure, kinect2 or keraal.")],
+    files: Annotated[
+        list[str],
+        typer.Argument(metavar="[CAMERA=]FILE...", help="One file a camera; keraal: Kinect text, then optical text."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="LOG.mcap", help="Log to write.")],
+    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="keraal: rate of the Kinect, in Hz.")] = 30.0,
+) -> None:
+    """Make our log from Azure Kinect CSV, Kinect v2 CSV or KERAAL text files."""
+    from hrcreplay.cli import log_commands
+
+    for note in log_commands.import_files(kind, files, out, rate):
+        sys.stderr.write(f"hrcreplay: {note}\n")
+    sys.stdout.write(f"{out}\n")
+
+
+@app.command()
+def calibrate(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log whose cameras saw one person.")],
+    out: Annotated[Path, typer.Option("--out", metavar="CELL.toml", help="Cell file to write.")],
+    config: Config = None,
+    settings: Set = None,
+    topic: Topic = None,
+    camera: Annotated[
+        str | None,
+        typer.Option("--reference", metavar="CAMERA", help="Camera that defines the world; default the first."),
+    ] = None,
+    up: Annotated[
+        str | None,
+        typer.Option("--up", metavar="X,Y,Z", help="Up in the reference camera's frame; default from the feet."),
+    ] = None,
+    height: Annotated[
+        float | None,
+        typer.Option(
+            "--height", metavar="M", help="Reference camera above the floor, in metres; default from the feet."
+        ),
+    ] = None,
+    base: Annotated[
+        str | None, typer.Option("--base", metavar="X,Y,Z,YAW", help="Robot base in the world, in metres and degrees.")
+    ] = None,
+) -> None:
+    """Find the poses and clock offsets of the cameras from the skeletons themselves."""
+    from hrcreplay.cli import log_commands
+
+    for line in log_commands.calibrate(
+        log, out, config, as_overrides(settings, topic), reference=camera, up=up, height_m=height, base=base
+    ):
+        sys.stderr.write(f"hrcreplay: {line}\n")
+    sys.stdout.write(f"{out}\n")
+
+
+def _stage(command: str, text: str) -> None:
+    """Registers a command that runs the stages up to its own."""
+
+    @app.command(name=command, help=text)
+    def stage(
+        source: Source,
+        config: Config = None,
+        settings: Set = None,
+        topic: Topic = None,
+        limits: LimitSet = None,
+        cell: CellFile = None,
+        out: Out = None,
+        start: Start = None,
+        end: End = None,
+        smooth: Smooth = False,
+        chunk_ticks: Chunk = 250,
+    ) -> None:
+        from hrcreplay.run import replay
+
+        folder = replay.run(
+            command,
+            source,
+            out=out,
+            config=config,
+            overrides=as_overrides(settings, topic, limits),
+            cell_file=cell,
+            **span(start, end),
+            smooth=smooth,
+            chunk_ticks=chunk_ticks,
+        )
+        _summarize(folder)
+        sys.stdout.write(f"{folder}\n")
+
+
+def _summarize(folder: Path) -> None:
+    """The main figures of a run for the user, beside its folder for the next program."""
+    from hrcreplay.run import report, stages
+
+    for line in report.summary(folder):
+        stages.say(line)
+
+
+_stage("fuse", "Stage 1: merge the cameras' skeletons into one person (state.parquet).")
+_stage("predict", "Stages 1, 2: the space the person can reach within the braking time (occupancy.parquet).")
+_stage("plan", "Stages 1 to 3: what the robot would have done (motion.parquet).")
+_stage("report", "All stages, then metrics.json, figures and report.html.")
+
+
+@app.command()
+def audit(
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="LOG_OR_RUN...", help="Logs, or run folders of earlier stages.")
+    ],
+    config: Config = None,
+    settings: Set = None,
+    topic: Topic = None,
+    limits: LimitSet = None,
+    cell: CellFile = None,
+    out: Out = None,
+    start: Start = None,
+    end: End = None,
+) -> None:
+    """How often people left the volumes that were predicted for them, by method and limb."""
+    from hrcreplay.audit import driver
+
+    overrides = as_overrides(settings, topic, limits)
+    folder = driver.run(sources, out=out, config=config, overrides=overrides, cell_file=cell, **span(start, end))
+    sys.stdout.write(f"{folder}\n")
+
+
+@app.command(name="fit-limits")
+def fit_limits(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG_OR_RUN...", help="Logs of people, or runs on them.")],
+    out: Annotated[Path, typer.Option("--out", metavar="LIMITS.toml", help="Limit set to write.")],
+    coverage: Annotated[
+        float, typer.Option("--coverage", metavar="SHARE", help="Share of the ticks to cover, between 0 and 1.")
+    ] = 0.99,
+    held_back: Annotated[
+        float,
+        typer.Option("--held-back", metavar="SHARE", help="Share of each log's time, its end, that is not fitted to."),
+    ] = 0.3,
+    cover: Annotated[
+        str, typer.Option("--cover", metavar="WHAT", help="joints in their intervals, or limbs in their volumes.")
+    ] = "limbs",
+    config: Config = None,
+    settings: Set = None,
+    topic: Topic = None,
+    cell: CellFile = None,
+    start: Start = None,
+    end: End = None,
+) -> None:
+    """The tightest velocity and acceleration bounds that cover what people did; for --limits."""
+    from hrcreplay.audit import fit
+
+    overrides = as_overrides(settings, topic)
+    options = {"config": config, "overrides": overrides, "cell_file": cell, **span(start, end)}
+    for line in fit.run(logs, out=out, coverage=coverage, held_back=held_back, cover=cover, **options):
+        sys.stderr.write(f"hrcreplay: {line}\n")
+    sys.stdout.write(f"{out}\n")
+
+
+@app.command()
+def demo(
+    out: Out = None,
+    config: Config = None,
+    settings: Set = None,
+    chunk_ticks: Chunk = 250,
+) -> None:
+    """Report on the log that ships with hrcreplay: a worker beside a pick-and-place robot, two cameras, 60 s."""
+    from hrcreplay.run import replay
+
+    overrides = as_overrides(settings)
+    folder = replay.run(
+        "report", replay.demo_log(), out=out, config=config, overrides=overrides, chunk_ticks=chunk_ticks
+    )
+    _summarize(folder)
+    sys.stdout.write(f"{folder / 'report.html'}\n")
+
+
+live.register(app)
+
+
+def main() -> None:
+    """Runs the command line. A user's error is one line and an exit code, a bug keeps its traceback."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        app()
+    except HrcReplayError as error:
+        sys.stderr.write(f"hrcreplay: {error}\n")
+        sys.exit(error.exit_code)

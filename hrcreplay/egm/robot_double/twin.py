@@ -1,0 +1,333 @@
+"""A robot that is not there: the controller's side of a session, one cycle at a time, without clock or socket.
+
+What the robot double was told and what it did, as tables that grow.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hrcreplay.egm.codec import (
+    AXES,
+    WRAP,
+    BadPacket,
+    Correction,
+    Mci,
+    Motors,
+    Rapid,
+    RobotPacket,
+    decode_correction,
+    encode_robot,
+    flange_pose,
+)
+from hrcreplay.egm.robot_double.faults import Channel, Datagram, Fault, lasts
+from hrcreplay.egm.robot_double.servo import PERIOD_NS, Servo, ServoSettings
+from hrcreplay.errors import SettingsError
+from hrcreplay.records import Floats, Ints
+
+_BLOCK = 4096
+_NAN = np.full(AXES, np.nan)
+
+#: A row a cycle: its start; session from 1; seqno sent, -1 none; seqno of the message read, -1 none; messages still
+#: queued; states as sent; joints measured; joints and speed planned; reference and its speed, NaN without; utilization.
+_CYCLE = np.dtype(
+    [
+        ("t_ns", np.int64),
+        ("session", np.int64),
+        ("seqno", np.int64),
+        ("told_seqno", np.int64),
+        ("queued", np.int64),
+        ("motors", np.int64),
+        ("mci", np.int64),
+        ("rapid", np.int64),
+        ("q_rad", np.float64, AXES),
+        ("planned_rad", np.float64, AXES),
+        ("planned_rad_per_s", np.float64, AXES),
+        ("ref_rad", np.float64, AXES),
+        ("ref_rad_per_s", np.float64, AXES),
+        ("utilization", np.float64),
+    ]
+)
+#: A row a message that arrived, before any fault of the way in.
+_ARRIVAL = np.dtype(
+    [
+        ("t_ns", np.int64),
+        ("session", np.int64),
+        ("seqno", np.int64),
+        ("ref_rad", np.float64, AXES),
+        ("ref_rad_per_s", np.float64, AXES),
+    ]
+)
+
+
+class TwinRecord:
+    """Everything of one run of the double.
+
+    Attributes:
+        departed_ns: When the packets left that are owed an answer: duplicates and lost ones are not [ns].
+        garbage: Datagrams that were no message.
+    """
+
+    def __init__(self) -> None:
+        self._cycles = _Rows(_CYCLE)
+        self._arrivals = _Rows(_ARRIVAL)
+        self.departed_ns: list[int] = []
+        self.garbage = 0
+
+    def arrived(self, datagram: Datagram, session: int) -> None:
+        """Notes a datagram as it arrives."""
+        try:
+            told = decode_correction(datagram.data)
+        except BadPacket:
+            self.garbage += 1
+            return
+        self._arrivals.append((datagram.t_ns, session, told.seqno, told.q, told.dq))
+
+    def cycled(
+        self, t_ns: int, session: int, packet: RobotPacket | None, servo: Servo, told: Correction | None, queued: int
+    ) -> None:
+        """Notes a cycle after its step."""
+        seqno = -1 if packet is None else packet.seqno
+        states = (0, 0, 0) if packet is None else (packet.motors, packet.mci, packet.rapid)
+        reference = (_NAN, _NAN) if servo.reference is None else (servo.reference.q, servo.reference.dq)
+        motion = (servo.measured, servo.q, servo.dq, *reference, servo.utilization)
+        self._cycles.append((t_ns, session, seqno, -1 if told is None else told.seqno, queued, *states, *motion))
+
+    def cycles(self) -> NDArray[Any]:
+        """A structured row a cycle: t_ns, session, seqno, told_seqno, queued, motors, mci, rapid, q_rad..."""
+        return self._cycles.table()
+
+    def arrivals(self) -> NDArray[Any]:
+        """A structured row a message: t_ns, session, seqno, ref_rad, ref_rad_per_s."""
+        return self._arrivals.table()
+
+    def departures(self) -> Ints:
+        """Instants of the packets that are owed an answer, ascending; not of those that a later one overtook [ns]."""
+        departed_ns = np.array(self.departed_ns, dtype=np.int64)
+        next_ns = np.minimum.accumulate(departed_ns[::-1])[::-1][1:]
+        return departed_ns[np.append(departed_ns[:-1] <= next_ns, np.ones(len(departed_ns[-1:]), bool))]
+
+
+def columns(table: NDArray[Any]) -> tuple[list[str], Floats]:
+    """Names and values (n, m) of a structured table, fields of several axes as name_1, name_2..."""
+    names: list[str] = []
+    parts = []
+    for name in table.dtype.names or ():
+        values = table[name] if table[name].ndim == 2 else table[name][:, None]
+        names += [name] if values.shape[1] == 1 else [f"{name}_{axis}" for axis in range(1, values.shape[1] + 1)]
+        parts.append(values)
+    return names, np.concatenate(parts, axis=1, dtype=np.float64)
+
+
+class _Rows:
+    """Structured rows in blocks, so that a long session never copies what it has."""
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._full: list[NDArray[Any]] = []
+        self._block = np.zeros(_BLOCK, dtype)
+        self._used = 0
+
+    def append(self, row: tuple[Any, ...]) -> None:
+        if self._used == _BLOCK:
+            self._full.append(self._block)
+            self._block, self._used = np.zeros_like(self._block), 0
+        self._block[self._used] = row
+        self._used += 1
+
+    def table(self) -> NDArray[Any]:
+        return np.concatenate([*self._full, self._block[: self._used]])
+
+
+#: Messages that the controller's socket holds; what comes on top is lost.
+_QUEUE = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class TwinSettings:
+    """Which controller it is, and where its robot stands."""
+
+    servo: ServoSettings = field(default_factory=ServoSettings)
+    """The session as RAPID sets it up."""
+    start_deg: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 30.0, 0.0)
+    """Joints at the first cycle [deg]."""
+    version: Literal["A", "B", "C"] = "B"
+    """Edition of the messages."""
+    radians: bool = False
+    """As RobotWare below 6.07: joints in radians, no clock."""
+    restart_s: float = 1.5
+    """This long after a session has ended the program begins another; 0 is never [s]."""
+    epoch_ns: int = 1_700_000_000_000_000_000
+    """The controller's clock at the first cycle [ns]."""
+
+    def __post_init__(self) -> None:
+        axes = self.servo.axes
+        if len(self.start_deg) != AXES or not all(
+            low <= angle <= high for low, angle, high in zip(axes.low_deg, self.start_deg, axes.high_deg, strict=False)
+        ):
+            raise SettingsError(f"robot double: start {self.start_deg} deg; {AXES} joints within range would be right")
+        if self.version not in ("A", "B", "C"):
+            raise SettingsError(f"robot double: version is {self.version!r}; A, B or C would be right")
+        if not 0 <= self.restart_s < math.inf:
+            raise SettingsError(f"robot double: restart_s is {self.restart_s}; a finite number from 0 would be right")
+
+
+class TwinCore:
+    """The robot's side. Deterministic: the same instants and datagrams give the same answers for the same seed.
+
+    Attributes:
+        servo: The controller that moves.
+        record: What it was told and what it did.
+        session: Number of the session, from 1.
+        ends: How each session ended, empty for one that is cut off or goes on.
+    """
+
+    def __init__(self, settings: TwinSettings, faults: Sequence[Fault] = (), seed: int = 0) -> None:
+        self._settings = settings
+        self.servo = Servo(settings.servo, np.radians(settings.start_deg))
+        self.record = TwinRecord()
+        self.session = 1
+        self.ends = [""]
+        link = [fault for fault in faults if fault.of_link]
+        self._robot_faults = [fault for fault in faults if not fault.of_link]
+        self._happened: set[int] = set()
+        self._out = Channel((fault for fault in link if fault.direction != "in"), (seed, 0))
+        self._in = Channel((fault for fault in link if fault.direction != "out"), (seed, 1))
+        self._coming: list[tuple[int, int, bytes]] = []
+        self._coming_count = 0
+        self._queue: deque[bytes] = deque()
+        self._seqno = 0
+        self._first_ns: int | None = None
+        self._last_ns = 0
+
+    def cycle(self, t_ns: int, arrived: Sequence[Datagram]) -> list[Datagram]:
+        """One cycle: read the feedback, send it, read one queued message, move.
+
+        Args:
+            t_ns: Start of the cycle [ns]. Where whole periods have passed since the last, the robot has moved on.
+            arrived: What has come in since the last cycle, with instants of arrival.
+
+        Returns:
+            What departs, each at its own time: now, or later by a fault.
+        """
+        self._catch_up(t_ns)
+        since_s = (t_ns - (self._first_ns or 0)) * 1e-9
+        active = self._befall(t_ns, since_s)
+        self._take_in(t_ns, since_s, arrived)
+        packet = None if self._silent(t_ns, active) else self._packet(t_ns, active)
+        departing = [] if packet is None else self._send(t_ns, since_s, packet)
+        told = self._read()
+        self.servo.step(t_ns, told)
+        self.ends[-1] = self.servo.error or ("converged" if self.servo.converged else "")
+        self.record.cycled(t_ns, self.session, packet, self.servo, told, len(self._queue))
+        return departing
+
+    def sent_at(self, t_ns: int) -> None:
+        """Says when the packet of this cycle has really left; it counts as its start otherwise [ns]."""
+        if self.record.departed_ns and self.record.departed_ns[-1] == self._last_ns:
+            self.record.departed_ns[-1] = t_ns
+
+    def _catch_up(self, t_ns: int) -> None:
+        """Moves through cycles that never were, with the last reference."""
+        if self._first_ns is None:
+            self._first_ns = t_ns
+        else:
+            for passed_ns in range(self._last_ns + PERIOD_NS, t_ns - PERIOD_NS // 2, PERIOD_NS):
+                self.servo.step(passed_ns, None)
+        self._last_ns = t_ns
+
+    def _befall(self, t_ns: int, since_s: float) -> dict[str, Fault]:
+        """Applies the faults of the robot. Returns those that are on, by kind."""
+        active = {}
+        for number, fault in enumerate(self._robot_faults):
+            if not lasts(fault, since_s):
+                continue
+            active[fault.kind] = fault
+            if number not in self._happened:
+                self._happened.add(number)
+                if fault.kind == "egm_error":
+                    self.servo.fail(t_ns, "EGM error")
+                elif fault.kind == "new_session":
+                    self._begin()
+        self.servo.motors_on = "motors_off" not in active
+        self.servo.program_running = "program_stop" not in active
+        ended_ns, pause_s = self.servo.ended_ns, self._settings.restart_s
+        ready = self.servo.motors_on and self.servo.program_running
+        if ready and ended_ns is not None and pause_s and t_ns - ended_ns >= pause_s * 1e9:
+            self._begin()
+        return active
+
+    def _begin(self) -> None:
+        """A new session: counts from 0 and forgets what was queued."""
+        self.servo.begin()
+        self._queue.clear()
+        self._coming.clear()
+        self._seqno = 0
+        self.session += 1
+        self.ends.append("")
+
+    def _take_in(self, t_ns: int, since_s: float, arrived: Sequence[Datagram]) -> None:
+        """Queues what is there by now, after the faults of the way in."""
+        for datagram in arrived:
+            self.record.arrived(datagram, self.session)
+            for late in self._in.carry(datagram, since_s):
+                heapq.heappush(self._coming, (late.t_ns, self._coming_count, late.data))
+                self._coming_count += 1
+        while self._coming and self._coming[0][0] <= t_ns:
+            data = heapq.heappop(self._coming)[2]
+            if len(self._queue) < _QUEUE:
+                self._queue.append(data)
+
+    def _silent(self, t_ns: int, active: dict[str, Fault]) -> bool:
+        """Whether nothing is sent: by a fault, or because the session is over and its last states have been told."""
+        ended_ns = self.servo.ended_ns
+        return "silence" in active or (ended_ns is not None and t_ns - ended_ns > self._settings.servo.ramp_s * 1e9)
+
+    def _packet(self, t_ns: int, active: dict[str, Fault]) -> RobotPacket:
+        """What the robot says in this cycle."""
+        servo, since_ns = self.servo, t_ns - (self._first_ns or 0)
+        q = servo.measured
+        if teleport := active.get("teleport"):
+            q = q + math.radians(teleport.angle_deg) * (np.arange(1, AXES + 1) == teleport.axis)
+        if missing := active.get("nan"):
+            q = np.where(np.arange(1, AXES + 1) == missing.axis, np.nan, q)
+        running = Rapid.RUNNING if servo.moves else Rapid.STOPPED
+        mci = Mci.RUNNING if servo.moves else Mci.STOPPED
+        packet = RobotPacket(
+            seqno=self._seqno,
+            tm_ms=since_ns // 1_000_000 % WRAP,
+            clock_ns=self._settings.epoch_ns + since_ns,
+            q=q,
+            q_planned=servo.q,
+            motors=Motors.ON if servo.motors_on else Motors.OFF,
+            mci=Mci.ERROR if servo.error else mci,
+            rapid=Rapid.UNDEFINED if "rapid_undefined" in active else running,
+            converged=servo.converged,
+            utilization=servo.utilization,
+        )
+        self._seqno = (self._seqno + 1) % WRAP
+        return packet
+
+    def _send(self, t_ns: int, since_s: float, packet: RobotPacket) -> list[Datagram]:
+        """The packet's datagram after the faults of the way out."""
+        pose = flange_pose(self.servo.measured)
+        data = encode_robot(packet, version=self._settings.version, radians=self._settings.radians, q_cartesian=pose)
+        departing = self._out.carry(Datagram(t_ns, data), since_s)
+        owed_ns = [datagram.t_ns for datagram in departing if datagram.data is data]
+        if owed_ns and np.isfinite(packet.q).all():  # nobody has to answer nonsense
+            self.record.departed_ns.append(min(owed_ns))
+        return departing
+
+    def _read(self) -> Correction | None:
+        """The one message of this cycle; what is none is read and ignored."""
+        try:
+            return decode_correction(self._queue.popleft()) if self._queue else None
+        except BadPacket:
+            return None

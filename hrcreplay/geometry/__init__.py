@@ -1,0 +1,1 @@
+"""Convex hulls, support polytopes, distances, rotations and a QP solver. Knows no person and no robot. Pure."""

@@ -1,0 +1,218 @@
+"""Convex hulls of swept volumes and the size of what a ball makes of them, flat and thin sets included.
+
+Polytopes around swept sets from how far the sets reach along fixed directions: always the same number of corners.
+
+The directions are the corners of triangles around the unit sphere. For numbers that are nowhere below a set's support
+function, each triangle gives one corner: the point that is as far along its three directions as the numbers say. Any
+direction u lies over a triangle (a, b, c), so u = k a + l b + m c with weights >= 0, and no point of the set is further
+along u than k h(a) + l h(b) + m h(c): where the corner is. So the hull of the corners holds the set, whether or not
+every number is reached.
+
+How far a point gets along a direction while it turns about an axis is exact, so here no arc is widened to triangles.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numba import njit
+from scipy.spatial import ConvexHull, QhullError
+
+from hrcreplay.geometry.vectors import cross, dot, edge, norm
+from hrcreplay.records import Floats, Ints
+
+#: A set thinner than this in a direction has no extent in it [m].
+_THIN_M = 1e-9
+#: Nor has one thinner than this times its largest coordinate: far from the origin that is how coarse coordinates are.
+_COARSE = 16.0 * float(np.finfo(np.float64).eps)
+
+
+def hull(points_m: Floats) -> tuple[Floats, Ints]:
+    """Corners and triangles of a convex hull.
+
+    Args:
+        points_m: (n, 3), n >= 1, all finite [m].
+
+    Returns:
+        ``vertices`` (m, 3) [m], the corners in the order of the points, and ``faces`` (f, 3), three rows of vertices
+        for each triangle, counterclockwise seen from outside. A flat set's triangles are there for both sides; a line
+        has its two ends and no triangles, a point itself.
+    """
+    axes = _axes(points_m)
+    while len(axes) > 1:
+        try:
+            return _solid(points_m) if len(axes) == 3 else _flat(points_m, axes)
+        except QhullError:  # too thin to be told from a flat set in floating point: then it is one
+            axes = axes[:-1]
+    if len(axes) == 1:
+        along = (points_m - points_m[0]) @ axes[0]
+        return points_m[np.sort([along.argmin(), along.argmax()])], np.empty((0, 3), np.int64)
+    return points_m[:1], np.empty((0, 3), np.int64)
+
+
+def _solid(points_m: Floats) -> tuple[Floats, Ints]:
+    solid = ConvexHull(points_m)
+    corners = np.sort(solid.vertices)
+    faces = np.searchsorted(corners, solid.simplices).astype(np.int64)
+    _turn_outward(points_m[corners], faces, solid.neighbors)
+    return points_m[corners], faces
+
+
+def _flat(points_m: Floats, axes: Floats) -> tuple[Floats, Ints]:
+    """The polygon in the plane of two axes (2, 3), with both sides."""
+    around = ConvexHull((points_m - points_m[0]) @ axes.T).vertices  # counterclockwise
+    corners = np.sort(around)
+    loop = np.searchsorted(corners, around)
+    # from different corners, so that no two triangles lie left of one edge
+    return points_m[corners], np.concatenate([_fan(loop), _fan(np.roll(loop, -1))[:, ::-1]])
+
+
+@njit(cache=True)
+def _turn_outward(vertices: Floats, faces: Ints, neighbors: Ints) -> None:
+    """Makes all triangles counterclockwise from outside, in place; a sliver's own normal could not tell.
+
+    Neighbours run through the edge between them in opposite ways. That leaves one choice for all, and the hull's
+    volume is positive.
+    """
+    known = np.zeros(len(faces), np.bool_)
+    known[0] = True
+    queue = [0]
+    for f in queue:
+        for k in range(3):
+            other = neighbors[f, k]
+            if not known[other]:
+                known[other] = True
+                if _runs_same_way(faces[f], faces[other]):
+                    faces[other, 0], faces[other, 1] = faces[other, 1], faces[other, 0]
+                queue.append(other)
+    if _measures(vertices, faces)[0] < 0.0:
+        for f in range(len(faces)):
+            faces[f, 0], faces[f, 1] = faces[f, 1], faces[f, 0]
+
+
+@njit(cache=True)
+def _runs_same_way(a: Ints, b: Ints) -> bool:
+    """Whether two triangles have an edge in common, in the same direction."""
+    for i in range(3):
+        for k in range(3):
+            if a[i] == b[k] and a[(i + 1) % 3] == b[(k + 1) % 3]:
+                return True
+    return False
+
+
+def _fan(loop: Ints) -> Ints:
+    return np.column_stack([np.full(len(loop) - 2, loop[0]), loop[1:-1], loop[2:]]).astype(np.int64)
+
+
+def sphere_swept_volume_m3(points_m: Floats, radius_m: float, faces: Ints | None = None) -> float:
+    """Volume of a convex hull with a ball around every point, Eq. (41), by Steiner's formula [m^3].
+
+    V + A r + M r^2 + 4/3 pi r^3, where M is half the sum over edges of length times exterior angle. A flat set counts
+    as two-sided (A twice its area, angles of pi), so a segment gives a capsule and a point a ball.
+
+    Args:
+        points_m: (n, 3), n >= 1, all finite [m].
+        radius_m: Radius of the ball [m].
+        faces: What ``hull`` gave with these points; without it the hull is computed here.
+    """
+    if faces is None:
+        points_m, faces = hull(points_m)
+    if len(faces):
+        volume, area, bend = _measures(points_m, faces)
+    else:
+        volume, area, bend = 0.0, 0.0, np.pi * float(np.linalg.norm(points_m[-1] - points_m[0]))
+    return float(volume + area * radius_m + bend * radius_m**2 + 4.0 / 3.0 * np.pi * radius_m**3)
+
+
+@njit(cache=True)
+def _measures(vertices: Floats, faces: Ints) -> tuple[float, float, float]:
+    """V [m^3], A [m^2] and M [m] of Steiner's formula for a closed surface of triangles."""
+    left = np.zeros((len(vertices), len(vertices)), np.int32)  # the triangle left of an edge
+    normals = [(0.0, 0.0, 0.0)] * len(faces)
+    volume, area, bend = 0.0, 0.0, 0.0
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        normals[f] = cross(edge(vertices, a, b), edge(vertices, a, c))
+        volume += dot(edge(vertices, 0, a), normals[f]) / 6.0
+        area += 0.5 * norm(normals[f])
+        left[a, b], left[b, c], left[c, a] = f, f, f
+    for f in range(len(faces)):
+        for k in range(3):
+            i, j = faces[f, k], faces[f, (k + 1) % 3]
+            beyond = normals[left[j, i]]
+            angle = np.arctan2(norm(cross(normals[f], beyond)), dot(normals[f], beyond))
+            bend += 0.25 * norm(edge(vertices, i, j)) * angle  # half of it, and every edge is there twice
+    return volume, area, bend
+
+
+def _axes(points_m: Floats) -> Floats:
+    """(0 to 3, 3) principal directions in which the set has an extent, the longest first."""
+    centred = points_m - points_m.mean(axis=0)
+    _, _, directions = np.linalg.svd(centred, full_matrices=False)
+    extents = np.ptp(centred @ directions.T, axis=0)
+    axes: Floats = directions[extents > max(_THIN_M, _COARSE * float(np.abs(points_m).max()))]
+    return axes
+
+
+def _directions() -> Floats:
+    """(92, 3) unit vectors: an icosahedron's corners, two of them up and down, thirds of its edges, its faces."""
+    around = 2.0 * np.pi * np.arange(5) / 5.0
+    ring = [np.column_stack([np.cos(around + turn), np.sin(around + turn)]) * 2.0 for turn in (0.0, np.pi / 5.0)]
+    upper, lower = (np.column_stack([ring[k], np.full(5, 1.0 - 2.0 * k)]) / np.sqrt(5.0) for k in range(2))
+    corners = np.concatenate([[[0.0, 0.0, 1.0]], upper, lower, [[0.0, 0.0, -1.0]]])
+    near = corners @ corners.T > 0.4
+    thirds = [2.0 * corners[i] + corners[j] for i in range(12) for j in range(12) if i != j and near[i, j]]
+    faces = [
+        corners[i] + corners[j] + corners[k]
+        for i, j, k in combinations(range(12), 3)
+        if near[i, j] and near[j, k] and near[i, k]
+    ]
+    every = np.concatenate([corners, thirds, faces])
+    unit: Floats = every / np.linalg.norm(every, axis=1)[:, None]
+    return unit
+
+
+DIRECTIONS = _directions()
+_TRIANGLES = ConvexHull(DIRECTIONS).simplices.astype(np.int64)
+_TRIANGLES = _TRIANGLES[np.lexsort(np.sort(_TRIANGLES).T)]
+#: (corners, 3, 3): from how far along its three directions a corner is to where it is.
+_SOLUTIONS = np.linalg.inv(DIRECTIONS[_TRIANGLES])
+CORNERS = len(_TRIANGLES)
+#: The directions as (3, directions), and how far each is across each axis.
+_COLUMNS = np.ascontiguousarray(DIRECTIONS.T)
+_ACROSS = np.sqrt(1.0 - _COLUMNS**2)
+
+
+@njit(cache=True)
+def reach_turning(points: Floats, count: int, axis: int, low: float, high: float, far: Floats) -> None:
+    """Raises far (directions,) to how far points get that turn by low to high [rad] about a coordinate axis [m].
+
+    Across the axis a point gets as far as its circle where it passes the direction, else as far as at the nearer end.
+    """
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    middle, half = 0.5 * (low + high), min(0.5 * (high - low), np.pi)
+    c, s, cos_half, sin_half = np.cos(middle), np.sin(middle), np.cos(half), np.sin(half)
+    along, across, level = _COLUMNS[axis], _ACROSS[axis], np.empty((2, len(far)))
+    for d in range(len(far)):  # the directions, turned back by the middle
+        level[0, d] = c * _COLUMNS[i, d] + s * _COLUMNS[j, d]
+        level[1, d] = c * _COLUMNS[j, d] - s * _COLUMNS[i, d]
+    u, v = level[0], level[1]
+    for k in range(count):
+        x, y, z = points[k, i], points[k, j], points[k, axis]
+        r = np.sqrt(x * x + y * y)
+        for d in range(len(far)):
+            facing, circle = u[d] * x + v[d] * y, across[d] * r
+            end = cos_half * facing + sin_half * abs(u[d] * y - v[d] * x)
+            there = along[d] * z + (circle if facing >= cos_half * circle else end)
+            far[d] = there if there > far[d] else far[d]
+
+
+@njit(cache=True)
+def around(far: Floats, points: Floats) -> int:
+    """Writes the corners of the polytope for far (directions,) [m] into points (>= CORNERS, 3); returns how many."""
+    for t in range(CORNERS):
+        a, b, c = far[_TRIANGLES[t, 0]], far[_TRIANGLES[t, 1]], far[_TRIANGLES[t, 2]]
+        for k in range(3):
+            points[t, k] = _SOLUTIONS[t, k, 0] * a + _SOLUTIONS[t, k, 1] * b + _SOLUTIONS[t, k, 2] * c
+    return CORNERS

@@ -1,0 +1,363 @@
+"""Which points of a set can be corners of its convex hull: a reduction that never drops a true one.
+
+A hull is grown point by point as a closed surface of triangles. Its arithmetic is only trusted where that can be
+proven: a point goes when it is on the inner side of every triangle by more than the rounding error of that test.
+Such a point sees the whole closed surface from inside, so it is inside the hull of the surface's corners, however
+badly shaped or dented the surface may be. Everything else stays, corner or not. So does every point of a flat set.
+
+A closed surface of triangles that grows point by point: the working part of ``corners``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hrcreplay.geometry.vectors import Vector, cross, dot, edge, norm
+from hrcreplay.records import Bools, Floats, Ints
+
+Int32s = NDArray[np.int32]
+
+#: Most points that the surface takes in; those beyond stay as they are.
+MOST_SLOTS = 512
+#: Most triangles: no closed surface has more.
+MOST_FACES = 2 * MOST_SLOTS
+#: Rounding error of a side test over (product of the triangle's edges times largest coordinate), with a wide margin.
+_ROUNDING = 64 * np.finfo(np.float64).eps
+#: Points that stick out less are kept but not built into the surface: they would make slivers [m].
+_THIN_M = 1e-10
+#: Rows of ``Surface.planes``: outward normal, not of unit length, its product with a corner, rounding error of the side
+#: test, and how far out a point must be to be built in; and of a slot: where its point is [m].
+NX, NY, NZ, OFFSET, ROUNDING, THIN, X, Y, Z = range(9)
+#: Rows of ``Surface.faces``: slots of the corners, counterclockwise from outside; for the next point to build in,
+#: whether it sees a triangle, the numbers of those, and the rim around them, from slots to slots.
+A, B, C, SEEN, HIDDEN, START, END = range(7)
+#: And of a slot: the next one on the rim, and the index of its point.
+FOLLOWS, POINT = 7, 8
+
+
+class Surface(NamedTuple):
+    """A closed surface of triangles, room for it included: few arrays, as each costs time in every call."""
+
+    planes: Floats  #: (9, faces) a triangle or slot each column
+    faces: Int32s  #: (9, faces) a triangle, slot or edge each column
+    owner: Int32s  #: (slots^2,) the face left of the edge from slot i to slot j, at i * width + j
+
+
+def surface() -> Surface:
+    """Room for a surface; one serves for any number of sets."""
+    most = 3 * MOST_FACES  # edges of as many triangles
+    return Surface(np.empty((9, MOST_FACES)), np.empty((9, most), np.int32), np.empty(MOST_SLOTS**2, np.int32))
+
+
+@njit(cache=True)
+def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:
+    """Whether a point is proven to be inside of all triangles."""
+    outside = 0
+    for f in range(count):
+        height = planes[NX, f] * x + planes[NY, f] * y + planes[NZ, f] * z - planes[OFFSET, f]
+        outside += height >= -planes[ROUNDING, f]
+    return outside == 0
+
+
+@njit(cache=True)
+def look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s) -> tuple[int, int]:
+    """For how many triangles a point is not proven to be inside, and how many it sees from clearly outside."""
+    outside, beyond = 0, 0
+    for f in range(count):
+        height = planes[NX, f] * x + planes[NY, f] * y + planes[NZ, f] * z - planes[OFFSET, f]
+        outside += height >= -planes[ROUNDING, f]
+        beyond += height > planes[THIN, f]
+        faces[SEEN, f] = height > planes[THIN, f]
+    return outside, beyond
+
+
+@njit(cache=True)
+def set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, faces: Int32s) -> None:
+    """Writes triangle f with corners in slots i, j, k, without joining it to its neighbours."""
+    x, y, z = planes[X, i], planes[Y, i], planes[Z, i]
+    ux, uy, uz = planes[X, j] - x, planes[Y, j] - y, planes[Z, j] - z
+    vx, vy, vz = planes[X, k] - x, planes[Y, k] - y, planes[Z, k] - z
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    edges = np.sqrt((ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz))
+    planes[NX, f], planes[NY, f], planes[NZ, f] = nx, ny, nz
+    planes[OFFSET, f] = nx * x + ny * y + nz * z
+    rounding = _ROUNDING * edges * size
+    planes[ROUNDING, f] = rounding
+    planes[THIN, f] = rounding + _THIN_M * np.sqrt(nx * nx + ny * ny + nz * nz)
+    faces[A, f], faces[B, f], faces[C, f] = i, j, k
+
+
+@njit(cache=True)
+def join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:
+    """Makes triangle f the owner of its edges."""
+    i, j, k = faces[A, f], faces[B, f], faces[C, f]
+    owner[i * width + j] = f
+    owner[j * width + k] = f
+    owner[k * width + i] = f
+
+
+@njit(cache=True)
+def hide(count: int, faces: Int32s) -> int:
+    """Lists the triangles that the last point looked at sees; returns how many."""
+    hidden = 0
+    for f in range(count):
+        faces[HIDDEN, hidden] = f
+        hidden += faces[SEEN, f]
+    return hidden
+
+
+@njit(cache=True)
+def outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:
+    """Lists the edges between seen and unseen triangles; returns how many."""
+    n = 0
+    for h in range(hidden):
+        f = faces[HIDDEN, h]
+        i, j, k = faces[A, f], faces[B, f], faces[C, f]
+        faces[START, n], faces[END, n] = i, j
+        n += faces[SEEN, owner[j * width + i]] == 0
+        faces[START, n], faces[END, n] = j, k
+        n += faces[SEEN, owner[k * width + j]] == 0
+        faces[START, n], faces[END, n] = k, i
+        n += faces[SEEN, owner[i * width + k]] == 0
+    return n
+
+
+@njit(cache=True)
+def is_loop(edges: int, faces: Int32s) -> bool:
+    """Whether the edges are one simple loop: a closed surface stays closed when that is cut out of it and filled.
+
+    They enter each slot as often as they leave it, so who follows them stays on them. Who is back at the start after as
+    many steps as there are edges, and not before, has been along each of them.
+    """
+    for e in range(edges):
+        faces[FOLLOWS, faces[START, e]] = faces[END, e]
+    start = faces[START, 0]
+    corner, back = faces[FOLLOWS, start], 0
+    for _ in range(edges - 1):
+        back += corner == start
+        corner = faces[FOLLOWS, corner]
+    return back == 0 and corner == start
+
+
+@njit(cache=True)
+def fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: Floats, faces: Int32s) -> bool:
+    """Adds triangles from the edges to the point in a slot, not joined yet; returns whether all face outward."""
+    inward = 0
+    for n in range(edges):
+        f = count + n
+        set_plane(f, faces[START, n], faces[END, n], slot, size, planes, faces)
+        height = planes[NX, f] * inner[0] + planes[NY, f] * inner[1] + planes[NZ, f] * inner[2] - planes[OFFSET, f]
+        inward += height >= -planes[THIN, f]
+    return inward == 0
+
+
+@njit(cache=True)
+def join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) -> None:
+    """Joins new triangles to their neighbours."""
+    for f in range(start, end):
+        faces[SEEN, f] = 0
+        join(f, width, faces, owner)
+
+
+@njit(cache=True)
+def fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owner: Int32s) -> int:
+    """Moves the last triangles into the places of those no longer needed; returns the number of triangles."""
+    for h in range(hidden):
+        hole = faces[HIDDEN, h]
+        while end > hole and faces[SEEN, end - 1]:
+            end -= 1
+        if end > hole:
+            end -= 1
+            _move(end, hole, planes, faces)
+            join(hole, width, faces, owner)
+    return end
+
+
+@njit(cache=True)
+def _move(f: int, hole: int, planes: Floats, faces: Int32s) -> None:
+    for k in (NX, NY, NZ, OFFSET, ROUNDING, THIN):
+        planes[k, hole] = planes[k, f]
+    for k in (A, B, C):
+        faces[k, hole] = faces[k, f]
+    faces[SEEN, hole] = 0
+
+
+#: A set whose four most distant points are flatter than this has no surface [m].
+_FLAT_M = 1e-7
+#: Directions whose extreme points are built in first: the axes and the diagonals of faces and space.
+_SEEDS = np.array(
+    [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)], dtype=np.float64
+)
+
+
+@njit(cache=True)
+def keep_corners(points: Floats, count: int, work: Surface) -> tuple[int, int]:
+    """Moves every point that may be a corner of the hull of the first ``count`` to the front, in their order.
+
+    Args:
+        points: (m, 3), reordered in place [m].
+        count: Number of points to look at.
+        work: Left with the surface around the points.
+
+    Returns:
+        Number of points kept, and of triangles around them (0: the set is flat, or too small to have any to drop).
+    """
+    keep = np.ones(count, np.bool_)
+    faces, slots = _grow(points, count, work, keep) if count > 4 else (0, 0)
+    moved = np.full(count, -1)
+    marks = np.empty(count)  # the same for points that are the same
+    kept = 0
+    for i in range(count):
+        mark = points[i, 0] + 0.7 * points[i, 1] + 0.3 * points[i, 2]
+        if not keep[i]:
+            continue
+        moved[i] = _same(points, kept, i) if _among(mark, marks, kept) else kept
+        if moved[i] == kept:
+            points[kept], marks[kept] = points[i], mark
+            kept += 1
+    for slot in range(slots):
+        work.faces[POINT, slot] = moved[work.faces[POINT, slot]]
+    return kept, faces
+
+
+@njit(cache=True)
+def _among(mark: float, marks: Floats, kept: int) -> bool:
+    """Whether a mark is among the first."""
+    alike = 0
+    for k in range(kept):
+        alike += marks[k] == mark
+    return alike > 0
+
+
+@njit(cache=True)
+def _same(points: Floats, kept: int, i: int) -> int:
+    """Where a point stands already among the kept, or where it would go."""
+    for k in range(kept):
+        if points[k, 0] == points[i, 0] and points[k, 1] == points[i, 1] and points[k, 2] == points[i, 2]:
+            return k
+    return kept
+
+
+@njit(cache=True)
+def _grow(points: Floats, count: int, work: Surface, keep: Bools) -> tuple[int, int]:
+    """Builds the surface and says which points must stay; returns the numbers of triangles and of slots."""
+    size = 0.0
+    for i in range(count):
+        for k in range(3):
+            size = max(size, abs(points[i, k]))
+    order = _seeds_first(points, count)
+    width = min(count, MOST_SLOTS)
+    faces = _simplex(points, order, size, width, work)
+    if faces == 0:
+        return 0, 0
+    planes, triangles, owner = work
+    inner = (_mean(planes[X]), _mean(planes[Y]), _mean(planes[Z]))
+    slots = 4
+    for n in range(count):
+        i = order[n]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        outside, beyond = look(x, y, z, faces, planes, triangles)
+        if outside == 0:
+            keep[i] = False
+        elif beyond > 0 and slots < MOST_SLOTS:
+            triangles[POINT, slots] = i
+            planes[X, slots], planes[Y, slots], planes[Z, slots] = x, y, z
+            hidden = hide(faces, triangles)
+            edges = outline(hidden, width, triangles, owner)
+            end = faces + edges
+            if edges == 0 or end > MOST_FACES or not is_loop(edges, triangles):
+                continue
+            if fan(inner, size, faces, edges, slots, planes, triangles):
+                join_all(faces, end, width, triangles, owner)
+                faces = fill(hidden, end, width, planes, triangles, owner)
+                slots += 1
+    _drop_inner(points, count, faces, planes, triangles, keep)
+    return faces, slots
+
+
+@njit(cache=True)
+def _drop_inner(points: Floats, count: int, faces: int, planes: Floats, triangles: Int32s, keep: Bools) -> None:
+    """Drops what was built in, or was near the surface, and is deep inside by now; its corners cannot be."""
+    corner = np.zeros(count, np.bool_)
+    for f in range(faces):
+        for k in (A, B, C):
+            corner[triangles[POINT, triangles[k, f]]] = True
+    for i in range(count):
+        if keep[i] and not corner[i]:
+            keep[i] = not is_inside(points[i, 0], points[i, 1], points[i, 2], faces, planes)
+
+
+@njit(cache=True)
+def _mean(along: Floats) -> float:
+    return 0.25 * (along[0] + along[1] + along[2] + along[3])
+
+
+@njit(cache=True)
+def _seeds_first(points: Floats, count: int) -> Ints:
+    """Indices of the points, the extreme ones of some directions first: they make the surface big soon."""
+    first = np.zeros(count, np.bool_)
+    order = np.empty(count, np.int64)
+    n = 0
+    for seed in _SEEDS:
+        x, y, z = seed[0], seed[1], seed[2]
+        low, high, lowest, highest = 0, 0, np.inf, -np.inf
+        for i in range(count):
+            along = x * points[i, 0] + y * points[i, 1] + z * points[i, 2]
+            if along < lowest:
+                low, lowest = i, along
+            if along > highest:
+                high, highest = i, along
+        for i in (low, high):
+            if not first[i]:
+                first[i] = True
+                order[n] = i
+                n += 1
+    for i in range(count):
+        if not first[i]:
+            order[n] = i
+            n += 1
+    return order
+
+
+@njit(cache=True)
+def _simplex(points: Floats, order: Ints, size: float, width: int, work: Surface) -> int:
+    """Four points far from each other as the first surface; returns its 4 triangles, or 0 for a flat set."""
+    a = order[0]
+    b = _farthest(points, a, (0.0, 0.0, 0.0), 1, len(order))
+    along = edge(points, a, b)
+    c = _farthest(points, a, along, 2, len(order))
+    normal = cross(along, edge(points, a, c))
+    d = _farthest(points, a, normal, 3, len(order))
+    area, height = norm(normal), dot(normal, edge(points, a, d))
+    if area < _FLAT_M**2 or abs(height) < _FLAT_M * area:
+        return 0
+    planes, faces, owner = work
+    p = faces[POINT]
+    p[0], p[3] = a, d
+    p[1], p[2] = (c, b) if height > 0.0 else (b, c)
+    for slot in range(4):
+        planes[X, slot], planes[Y, slot], planes[Z, slot] = points[p[slot], 0], points[p[slot], 1], points[p[slot], 2]
+    for f, (i, j, k) in enumerate(((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))):
+        set_plane(f, i, j, k, size, planes, faces)
+        join(f, width, faces, owner)
+    return 4
+
+
+@njit(cache=True)
+def _farthest(points: Floats, a: int, v: Vector, rank: int, count: int) -> int:
+    """The point farthest from point a (1), from the line through it along v (2), or from the plane across v (3)."""
+    best, index = -1.0, a
+    for i in range(count):
+        w = edge(points, a, i)
+        if rank == 3:
+            far = abs(dot(v, w))
+        else:
+            n = cross(v, w) if rank == 2 else w
+            far = dot(n, n)
+        if far > best:
+            best, index = far, i
+    return index

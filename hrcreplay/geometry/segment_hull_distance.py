@@ -1,0 +1,194 @@
+"""The distance between a segment and the convex hull of points, proven from both sides.
+
+It is the length of the shortest difference between a vertex and an end of the segment, mixed in any proportions: the
+least vector of a hull of differences, found by Wolfe's algorithm (Mathematical Programming 11, 1976). Each vector met
+is one of that hull, so the distance is no more; the plane across it bounds the distance from below.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.geometry.vectors import dot3
+from hrcreplay.records import Floats, Ints
+
+#: A distance is proven when its bounds are this close [m].
+EXACT_M = 1e-10
+#: Differences that can carry the shortest one.
+MOST = 4
+#: Steps after which rounding must be in the way.
+_STEPS = 60
+#: An edge that leaves the plane of others by less than this share of its length is in it. Smaller shares are rounding;
+#: larger ones would take links that are nearly parallel to an edge of the hull for parallel.
+_FLAT = 1e-12
+#: A difference this short has lost digits that its direction needs [m].
+_SHORT_M = 1e-5
+
+
+class Carriers(NamedTuple):
+    """The differences whose mixture is the shortest yet, in the first rows; room for MOST."""
+
+    points: Floats  #: (MOST, 3) [m]
+    weights: Floats  #: (MOST,) positive, 1 in all
+    wanted: Floats  #: (MOST,) weights of the shortest vector of their plane, of any sign
+    basis: Floats  #: (MOST - 1, 3) orthonormal: the directions of their plane
+    triangle: Floats  #: (MOST - 1, MOST - 1) their edges in it
+    codes: Ints  #: (MOST,) twice the vertex, plus the end
+
+
+@njit(cache=True)
+def distances(ends: Floats, vertices: Floats, offsets: Ints) -> tuple[Floats, Floats, Ints]:
+    """Bounds of the distance between the axis of every link and the hull of every limb.
+
+    Args:
+        ends: (s, 2, 3) ends of the axes [m].
+        vertices: (m, 3) of all limbs [m].
+        offsets: (l + 1,) where each limb's vertices begin; no limb is empty.
+
+    Returns:
+        Lower and upper bound, (s, l) each [m]. The lower one is proven by a plane between link and limb, whether or not
+        the bounds meet: they end no further apart than EXACT_M but where rounding allows no more. 0 and at most EXACT_M
+        in penetration; (s, l, MOST) rows of ``vertices`` that carry the nearest point.
+    """
+    links, limbs = len(ends), len(offsets) - 1
+    low, high = np.empty((links, limbs)), np.empty((links, limbs))
+    near = np.empty((links, limbs, MOST), dtype=np.int64)
+    square = np.empty((MOST - 1, MOST - 1))
+    work = Carriers(
+        np.empty((MOST, 3)), np.empty(MOST), np.empty(MOST), np.empty((MOST - 1, 3)), square, np.empty(MOST, np.int64)
+    )
+    for s in range(links):
+        for k in range(limbs):
+            start = near[s - 1, k, 0] if s else offsets[k]  # the link before is seldom far from this one
+            low[s, k], high[s, k], count = _distance(ends[s], vertices, offsets[k], offsets[k + 1], start, work)
+            for i in range(MOST):
+                near[s, k, i] = work.codes[i if i < count else 0] // 2
+    return low, high, near
+
+
+@njit(cache=True)
+def _distance(
+    ends: Floats, vertices: Floats, first: int, last: int, start: int, on: Carriers
+) -> tuple[float, float, int]:
+    """Both bounds of one distance, and how many differences carry it."""
+    code, before, count = 2 * start, -1, 0
+    low, high = 0.0, np.inf
+    for _ in range(_STEPS):
+        count = _shortest(on, _join(on, count, code, ends, vertices))
+        x0, x1, x2 = 0.0, 0.0, 0.0
+        for i in range(count):
+            x0 += on.weights[i] * on.points[i, 0]
+            x1 += on.weights[i] * on.points[i, 1]
+            x2 += on.weights[i] * on.points[i, 2]
+        gap = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+        high = min(high, gap)
+        if gap <= EXACT_M:
+            return 0.0, high, count
+        if gap < _SHORT_M:  # across the plane of its carriers to the last digit
+            for i in range(count - 1):
+                e = on.basis[i]
+                part = x0 * e[0] + x1 * e[1] + x2 * e[2]
+                x0, x1, x2 = x0 - part * e[0], x1 - part * e[1], x2 - part * e[2]
+            gap = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+            if gap <= EXACT_M:
+                return 0.0, high, count
+        vertex, depth = first, np.inf
+        for j in range(first, last):
+            along = x0 * vertices[j, 0] + x1 * vertices[j, 1] + x2 * vertices[j, 2]
+            if along < depth:
+                vertex, depth = j, along
+        a = x0 * ends[0, 0] + x1 * ends[0, 1] + x2 * ends[0, 2]
+        b = x0 * ends[1, 0] + x1 * ends[1, 1] + x2 * ends[1, 2]
+        low = max(low, (depth - max(a, b)) / gap)
+        code, before = 2 * vertex + (b > a), code
+        if not high - low > EXACT_M or count == MOST or code == before:
+            break
+    return min(low, high), high, count
+
+
+@njit(cache=True)
+def _join(on: Carriers, count: int, code: int, ends: Floats, vertices: Floats) -> int:
+    """Adds a difference without weight, but for the first; returns how many there are."""
+    for c in range(3):
+        on.points[count, c] = vertices[code // 2, c] - ends[code % 2, c]
+    on.codes[count], on.weights[count] = code, 0.0 if count else 1.0
+    return count + 1
+
+
+@njit(cache=True)
+def _shortest(on: Carriers, count: int) -> int:
+    """Moves the weights to the shortest vector of a plane through carriers that lies between them.
+
+    Carriers that end without weight, or lie in the plane of those before, are dropped; returns how many are left.
+    """
+    while True:
+        flat = _plane(on, count)
+        if flat >= 0:
+            count = _drop(on, count, flat)
+            total = on.weights[:count].sum()
+            for i in range(count):
+                on.weights[i] = on.weights[i] / total if total > 0.0 else 1.0 / count
+            continue
+        share, leaving = 1.0, -1
+        for i in range(count):
+            way = on.weights[i] - on.wanted[i]
+            if on.wanted[i] <= 0.0 and on.weights[i] <= share * way:
+                share, leaving = on.weights[i] / way if way > 0.0 else 0.0, i
+        for i in range(count):
+            on.weights[i] += share * (on.wanted[i] - on.weights[i])
+        if leaving < 0:
+            return count
+        count = _drop(on, count, leaving)
+
+
+@njit(cache=True)
+def _drop(on: Carriers, count: int, leaving: int) -> int:
+    """Takes a carrier out; returns how many are left."""
+    for i in range(leaving, count - 1):
+        on.weights[i], on.codes[i] = on.weights[i + 1], on.codes[i + 1]
+        for c in range(3):
+            on.points[i, c] = on.points[i + 1, c]
+    return count - 1
+
+
+@njit(cache=True)
+def _plane(on: Carriers, count: int) -> int:
+    """Computes the wanted weights; returns the first carrier in the plane of those before, -1 where there is none."""
+    for i in range(count - 1):
+        if not _edge(on, i):
+            return i + 1
+    on.wanted[0] = 1.0
+    for i in range(count - 2, -1, -1):
+        rest = -dot3(on.basis[i], on.points[0])
+        for j in range(i + 1, count - 1):
+            rest -= on.triangle[i, j] * on.wanted[j + 1]
+        on.wanted[i + 1] = rest / on.triangle[i, i]
+        on.wanted[0] -= on.wanted[i + 1]
+    return -1
+
+
+@njit(cache=True)
+def _edge(on: Carriers, i: int) -> bool:
+    """Adds the direction from carrier 0 to carrier i + 1 to the basis, by Gram and Schmidt; False where it is in it."""
+    e = on.basis[i]
+    for c in range(3):
+        e[c] = on.points[i + 1, c] - on.points[0, c]
+    length = math.sqrt(dot3(e, e))
+    for j in range(i):
+        on.triangle[j, i] = 0.0
+    for _ in range(2):  # twice is enough
+        for j in range(i):
+            part = dot3(on.basis[j], e)
+            on.triangle[j, i] += part
+            for c in range(3):
+                e[c] -= part * on.basis[j, c]
+    on.triangle[i, i] = math.sqrt(dot3(e, e))
+    if not on.triangle[i, i] > _FLAT * length:
+        return False
+    for c in range(3):
+        e[c] /= on.triangle[i, i]
+    return True

@@ -1,0 +1,338 @@
+"""Fusion of several cameras into one moving person, Alg. 3.
+
+Offline reference: the fused person once more, knowing what came after (Rauch, Tung, Striebel).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, process_variance
+from hrcreplay.human.fusion.kernel import run
+from hrcreplay.human.fusion.model_residual import BINS
+from hrcreplay.human.model import LimitSet, nearest
+from hrcreplay.records import BODY, JOINTS, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
+
+ROWS = len(JOINTS) + len(LENGTHS)
+_NEVER_NS = -(2**62)
+#: A person nobody has measured: upright, arms hanging; and how wrong that may be [m, m, rad...].
+_NEUTRAL = (0.0, 0.0, 0.0, 0.1, 0.1, 0.3, 0.0, 2.6, 0.1, 0.3, 0.0, 2.6)
+_NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2)
+#: Median man (upper arm 0.36 m, shoulders at 1.44 m), and how wrong that may be [m].
+_LENGTHS_M = (0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
+_LENGTHS_STD_M = 0.1
+#: How fast a joint may be moving that nobody sees: v, a, j of x and y [m/s...], of an angle [rad/s...].
+_REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10)
+#: Whether a joint is x or y (0) or an angle (1).
+_KIND = np.repeat((0, 1), (2, 10))
+
+FusionState = Filter
+Sigmas = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """Settings of the filter.
+
+    The sigmas and ``coast_s`` are those with the least error against ground truth over a sweep on a recording with
+    two cameras of 25 and 30 Hz, 1-3 cm of noise and occlusions: the velocity's sigma dominates, since people reach and
+    rest, and a polynomial with a lively jerk overshoots at both ends. Ignoring delays has the smaller error there
+    while people stand, compensating them while they move; what matters for safety is the latter.
+    """
+
+    stale: Literal["skip", "reuse"] = "skip"  #: use a frame once, or at every tick until the next, R growing (4.1.1)
+    delay: Literal["compensate", "ignore"] = "compensate"  #: relate a frame to its capture time, or to the tick
+    delay_max_s: float = 0.25  #: an older frame counts as this old [s]
+    confidence_min: float = 0.2  #: least product of the confidences of the points an angle is computed from
+    outlier_m: float = 0.20  #: a point further than this from the predicted skeleton is an outlier [m]
+    bone_m: float = 0.10  #: and one at the end of a bone that is longer or shorter than the person's by more [m]
+    bone_memory_s: float = 5.0  #: unless no camera has seen that bone right for so long [s]
+    sigma_position: Sigmas = (
+        300.0,
+        100.0,
+        5.0,
+        1.0,
+    )  #: of x and y in Eq. (44): p, v, a, j [m/s^2, /s^2.5, /s^3, /s^3.5]
+    sigma_angle: Sigmas = (1500.0, 600.0, 10.0, 1.0)  #: of the angles in Eq. (44) [rad, likewise]
+    coast_s: float = 0.12  #: a joint without a valid row for longer comes to rest [s]
+    memory_s: float = (
+        0.5  #: a joint or point without a valid row for longer is lost: the next one is taken as it is [s]
+    )
+    residual_quantile: float = 0.95  #: of how far each limb's points were from the model's (see residual)
+    residual_memory_s: float = 20.0  #: one seen this long ago counts 1/e of a new one [s]
+    spread_memory_s: float = 1.0  #: the factor on the variances falls to 1/e in this time (see surprise) [s]
+    spread_least: float = 0.01  #: smallest factor on the variances
+    spread_most: float = 4.0  #: largest one
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a smoother needs beside the states: P of every tick, and how it was reached."""
+
+    cov: Floats  #: (n, 12, 4, 4) covariance of p, v, a, j
+    damping: Floats  #: (n, 12) of the derivatives on the way to the tick; 1 unless the joint was unseen
+
+
+def start(cameras: tuple[str, ...]) -> FusionState:
+    """The filter before the first frame of any camera."""
+    c = len(cameras)
+    mean, cov = np.zeros((12, 4)), np.zeros((12, 4, 4))
+    mean[:, 0] = _NEUTRAL
+    for j in range(12):
+        cov[j] = np.diag([_NEUTRAL_STD[j], *_REST_STD[j]]) ** 2
+    return Filter(
+        tick_ns=np.full(1, _NEVER_NS),
+        started=np.zeros(1, dtype=np.bool_),
+        mean=mean,
+        cov=cov,
+        lengths=np.array(_LENGTHS_M),
+        lengths_var=np.full(len(LENGTHS), _LENGTHS_STD_M**2),
+        row_ns=np.full(ROWS, _NEVER_NS),
+        acquired_ns=np.full(ROWS, _NEVER_NS),
+        point_ns=np.full(len(POINTS), _NEVER_NS),
+        bone_ns=np.full(len(LENGTHS), _NEVER_NS),
+        capture_ns=np.full(c, _NEVER_NS),
+        uses=np.full(c, -1),
+        z=np.full((c, ROWS), np.nan),
+        z_var=np.full((c, ROWS), np.nan),
+        points=np.full((c, len(POINTS), 3), np.nan),
+        confidence=np.zeros((c, len(POINTS))),
+        valid=np.zeros((c, ROWS), dtype=np.bool_),
+        shows=np.zeros((c, len(LIMBS)), dtype=np.bool_),
+        residuals=np.zeros((len(BODY), BINS)),
+        weight=np.zeros(len(BODY)),
+        samples=np.zeros(len(BODY), dtype=np.int64),
+        sampled_ns=np.full(len(BODY), _NEVER_NS),
+        residual=np.full(len(BODY), np.nan),
+        surprise=np.ones(12),
+        spread=np.ones(12),
+    )
+
+
+def fuse(
+    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: FusionSettings, limits: LimitSet
+) -> tuple[FusionState, HumanStates, Counter[str]]:
+    """Alg. 3: one tick after another, each with the frames that arrived in (previous tick, tick].
+
+    The filter is that of (42)-(57) with (44) corrected: per joint p, v, a, j under Eq. (43), per length a constant;
+    rows that are not valid are switched off in H. After each tick the state is saturated by (62)-(65) and fed back;
+    P is not changed by it. Where ``delay`` is compensated, a row measures p - d v + d^2/2 a - d^3/6 j, d the age of
+    the frame at the tick. Each arm is measured by the name nearest to the estimate (see branches), heading by the
+    nearest turn, so neither jumps. A joint unseen for ``coast_s`` has its derivatives damped and its covariance
+    growing; unseen for ``memory_s`` it is lost and starts anew from its next valid row. All is finite from the first
+    valid row on: joints not yet seen stand at a neutral posture with a large standard deviation. How far the body is
+    from its model, and for how long a limb has not been seen, is kept beside the filter and changes nothing in it.
+
+    Args:
+        state: From ``start`` or the previous call. It is not changed.
+        ticks_ns: (n,) instants, after those of the previous call.
+        measurements: Rows in order of arrival, none after ``ticks_ns[-1]`` and none given before.
+        settings: See FusionSettings.
+        limits: Bounds for the saturation.
+
+    Returns:
+        The filter after the last tick, the states (n ticks; NaN before the first valid row), and counts of events:
+        ``outlier_points_<camera>``, ``superseded_frames_<camera>`` (a newer frame had come), ``joints_reacquired``,
+        ``ticks_saturated``. The bits of the states do not depend on how ticks are cut into calls.
+    """
+    after, states, counts, _ = _fuse(state, ticks_ns, measurements, settings, limits, traced=False)
+    return after, states, counts
+
+
+def fuse_traced(
+    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: FusionSettings, limits: LimitSet
+) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
+    """``fuse``, and the covariances that ``smooth`` needs (1.5 kB a tick)."""
+    return _fuse(state, ticks_ns, measurements, settings, limits, traced=True)
+
+
+def process_noise(settings: FusionSettings, j: int, dt: float, damping: float) -> Floats:
+    """Diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds."""
+    sigma = _sigma(settings)[j]
+    return np.array([process_variance(a, dt, damping, sigma, _REST_STD[j]) for a in range(4)])
+
+
+def _sigma(settings: FusionSettings) -> Floats:
+    return np.array((settings.sigma_position, settings.sigma_angle))[_KIND]
+
+
+def _fuse(
+    state: FusionState,
+    ticks_ns: Ints,
+    measurements: Measurements,
+    settings: FusionSettings,
+    limits: LimitSet,
+    *,
+    traced: bool,
+) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
+    after = Filter._make([array.copy() for array in state])
+    track = _track(len(ticks_ns), len(measurements.cameras), traced=traced)
+    run(np.array(ticks_ns), _frames(measurements), after, _rules(settings, limits), track)
+    p, v, a, j, p_std, v_std = track.motion
+    lengths, lengths_std = track.lengths
+    states = HumanStates(
+        t_ns=ticks_ns,
+        p=p,
+        v=v,
+        a=a,
+        j=j,
+        p_std=p_std,
+        v_std=v_std,
+        lengths_m=lengths,
+        lengths_std_m=lengths_std,
+        valid=track.valid,
+        residual_m=track.residual,
+        unseen_s=track.unseen,
+        cameras=measurements.cameras,
+    )
+    counts = Counter({"joints_reacquired": int(track.reacquired[0]), "ticks_saturated": int(track.saturated[0])})
+    for c, camera in enumerate(measurements.cameras):
+        counts[f"outlier_points_{camera}"] = int(track.outliers[c])
+        counts[f"superseded_frames_{camera}"] = int(track.superseded[c])
+    return after, states, counts, Trace(cov=track.cov, damping=track.damping)
+
+
+def _frames(measurements: Measurements) -> Frames:
+    return Frames(
+        capture_ns=np.array(measurements.capture_ns),
+        arrival_ns=np.array(measurements.arrival_ns),
+        camera=np.array(measurements.camera),
+        z=np.concatenate((measurements.angles, measurements.lengths_m), axis=1),
+        z_var=np.concatenate((measurements.angles_std, measurements.lengths_std_m), axis=1) ** 2,
+        points=np.array(measurements.points_m),
+        confidence=np.array(measurements.confidence),
+    )
+
+
+def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
+    return Rules(
+        sigma=_sigma(settings),
+        reuse=settings.stale == "reuse",
+        compensate=settings.delay == "compensate",
+        delay_max_s=settings.delay_max_s,
+        confidence_min=settings.confidence_min,
+        outlier_m=settings.outlier_m,
+        bone_m=settings.bone_m,
+        memory_ns=round(settings.memory_s * 1e9),
+        bone_memory_ns=round(settings.bone_memory_s * 1e9),
+        coast_ns=round(settings.coast_s * 1e9),
+        residual_quantile=settings.residual_quantile,
+        residual_memory_s=settings.residual_memory_s,
+        spread_memory_s=settings.spread_memory_s,
+        spread_least=settings.spread_least,
+        spread_most=settings.spread_most,
+        rest_s=0.3 * settings.coast_s,
+        rest_std=_REST_STD,
+        p_min=limits.p_min,
+        p_max=limits.p_max,
+        v_min=limits.v_min,
+        v_max=limits.v_max,
+        a_min=limits.a_min,
+        a_max=limits.a_max,
+        coupled=limits.coupled,
+    )
+
+
+def _track(n: int, cameras: int, *, traced: bool) -> Track:
+    rows = n if traced else 0
+    return Track(
+        motion=np.full((6, n, 12), np.nan),
+        lengths=np.full((2, n, len(LENGTHS)), np.nan),
+        valid=np.zeros((n, cameras), dtype=np.bool_),
+        residual=np.full((n, len(BODY)), np.nan),
+        unseen=np.full((n, len(LIMBS)), np.inf),
+        cov=np.full((rows, 12, 4, 4), np.nan),
+        damping=np.ones((rows, 12)),
+        outliers=np.zeros(cameras, dtype=np.int64),
+        superseded=np.zeros(cameras, dtype=np.int64),
+        reacquired=np.zeros(1, dtype=np.int64),
+        saturated=np.zeros(1, dtype=np.int64),
+    )
+
+
+#: Derivatives are smoothed in units of this time, where the four states have about the same size [s].
+_UNIT_S = 0.05
+
+
+def smooth(states: HumanStates, trace: Trace, settings: FusionSettings) -> HumanStates:
+    """Every tick given all measurements of the run, by filterpy's smoother joint by joint.
+
+    The arms are followed under one name through the run (see branches) and keep it: a smoothed angle does not jump.
+    Lengths are constants, so the last estimate is the best for all ticks. About 0.5 ms a tick; memory 1.5 kB a tick
+    for the trace and as much again for one joint at a time.
+
+    Args:
+        states: Of one whole run.
+        trace: Of the same ticks, from ``fuse_traced``.
+        settings: Those of the run.
+
+    Returns:
+        The smoothed states; rows before the first measurement stay NaN.
+    """
+    live = np.flatnonzero(np.isfinite(states.p[:, 0]))
+    if len(live) < 2:
+        return states
+    first = live[0]
+    dt = np.diff(states.t_ns[first:], prepend=states.t_ns[first]) * 1e-9
+    mean, cov = _one_name(states, first), trace.cov[first:]
+    smoothed, std = mean.copy(), np.empty((*mean.shape[:2], 2))
+    for j in range(mean.shape[1]):
+        smoothed[:, j], std[:, j] = _smooth_joint(mean[:, j], cov[:, j], dt, trace.damping[first:, j], settings, j)
+    return replace(
+        states,
+        p=_put(states.p, first, smoothed[:, :, 0]),
+        v=_put(states.v, first, smoothed[:, :, 1]),
+        a=_put(states.a, first, smoothed[:, :, 2]),
+        j=_put(states.j, first, smoothed[:, :, 3]),
+        p_std=_put(states.p_std, first, std[:, :, 0]),
+        v_std=_put(states.v_std, first, std[:, :, 1]),
+        lengths_m=_put(states.lengths_m, first, states.lengths_m[-1]),
+        lengths_std_m=_put(states.lengths_std_m, first, states.lengths_std_m[-1]),
+    )
+
+
+def _smooth_joint(
+    mean: Floats, cov: Floats, dt: Floats, damping: Floats, settings: FusionSettings, j: int
+) -> tuple[Floats, Floats]:
+    """Smoothed mean (n, 4) and standard deviations of p and v (n, 2) of one joint."""
+    scale = _UNIT_S ** np.arange(4.0)
+    Fs, Qs = np.zeros_like(cov), np.zeros_like(cov)
+    for k in range(1, len(dt)):
+        Fs[k] = _transition(dt[k], damping[k])
+        Qs[k] = np.diag(process_noise(settings, j, dt[k], damping[k]))
+    both = scale[:, None] * scale
+    x, P, _, _ = KalmanFilter(4, 1).rts_smoother(
+        mean * scale, cov * both, list(Fs * (scale[:, None] / scale)), list(Qs * both)
+    )
+    return x / scale, np.sqrt(np.stack([P[:, k, k] for k in range(2)], axis=1)) / scale[:2]
+
+
+def _transition(dt: float, damping: float) -> Floats:
+    """F of Eq. (43) for one joint, (4, 4), its derivatives damped."""
+    F = np.eye(4) + np.eye(4, k=1) * dt + np.eye(4, k=2) * dt**2 / 2.0 + np.eye(4, k=3) * dt**3 / 6.0
+    F[1:] *= damping
+    return F
+
+
+def _one_name(states: HumanStates, first: int) -> Floats:
+    """Means (n, 12, 4) with each posture by the name nearest to the one before."""
+    mean = np.stack([states.p, states.v, states.a, states.j], axis=2)[first:]
+    for k in range(1, len(mean)):
+        p = nearest(mean[k : k + 1, :, 0], mean[k - 1 : k, :, 0])[0]
+        mirrored = np.abs(np.sin(0.5 * (p - mean[k, :, 0]))) > 0.5  # alpha_1 moved by pi, not by a turn or not at all
+        for first_of_arm in (4, 8):
+            if mirrored[first_of_arm]:
+                mean[k, first_of_arm + 1] *= -1.0
+        mean[k, :, 0] = p
+    return mean
+
+
+def _put(whole: Floats, first: int, tail: Floats) -> Floats:
+    changed = whole.copy()
+    changed[first:] = tail
+    return changed

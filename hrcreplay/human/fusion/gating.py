@@ -1,0 +1,125 @@
+"""What of a camera's frame the filter may use, 4.1.2: by confidence, and by the predicted skeleton."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, ROWS
+from hrcreplay.human.fusion.kalman import Filter, Rules, Track, ago, delay
+from hrcreplay.human.model import ARM_POINTS, HEAD, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
+from hrcreplay.records import LENGTHS, POINTS, Bools, Floats
+
+#: An angle known no better than this is not observed: a circle cannot tell [rad].
+_BLIND_STD = 1.0
+#: The points that the model predicts and a camera may get wrong.
+_TESTED = np.flatnonzero(DEPENDS.any(axis=0))
+_FAR_ENDS = (
+    (),
+    (PELVIS,),
+    (HEAD,),
+    (ARM_POINTS[0][0], ARM_POINTS[1][0]),
+    (ARM_POINTS[1][1],),
+    (ARM_POINTS[0][1],),
+    (ARM_POINTS[1][2],),
+    (ARM_POINTS[0][2],),
+)
+#: (6, 20) the body points that place a limb of LIMBS: what its rows are computed from, however it is turned.
+_PLACING = DEPENDS[[3, 3, RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2]]
+_PLACING[0, HEAD] = True
+#: (8, 20) the points that may be wrong where a length is: the far end of its bone, both shoulders of their line. How
+#: high the pelvis is may change.
+_ENDS = np.zeros((len(LENGTHS), len(POINTS)), dtype=np.bool_)
+for _length, _point in enumerate(_FAR_ENDS):
+    _ENDS[_length, list(_point)] = True
+_STEP = 1e-5
+#: How wrong a length is that starts anew, standard deviation [m].
+_UNKNOWN_M = 0.1
+
+
+@njit(cache=True)
+def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
+    """Which rows of a new frame are valid, 4.1.2, and which limbs it shows whole."""
+    trusted = np.ones(len(filter_.point_ns), dtype=np.bool_)
+    if filter_.started[0]:
+        trusted = _agreeing(filter_, c, now, rules) & _whole(filter_, c, now, rules)
+        track.outliers[c] += len(trusted) - np.sum(trusted)
+    confidence, points = filter_.confidence[c], filter_.points[c]
+    for row in range(ROWS):
+        product = 1.0
+        agrees = np.isfinite(filter_.z[c, row])
+        for k in range(len(trusted)):
+            if DEPENDS[row, k]:
+                product *= confidence[k] if np.isfinite(points[k, 0]) else confidence[NECK]
+                agrees = agrees and trusted[k]
+        blind = 2 <= row < 12 and filter_.z_var[c, row] > _BLIND_STD**2
+        filter_.valid[c, row] = agrees and not blind and product >= rules.confidence_min
+    for point in _TESTED:
+        if trusted[point] and confidence[point] >= rules.confidence_min and np.isfinite(points[point, 0]):
+            filter_.point_ns[point] = now
+    for limb in range(len(_PLACING)):
+        product, agrees = 1.0, True
+        for k in range(len(trusted)):
+            if _PLACING[limb, k]:
+                product *= confidence[k]
+                agrees = agrees and trusted[k] and np.isfinite(points[k, 0])
+        filter_.shows[c, limb] = agrees and product >= rules.confidence_min
+
+
+@njit(cache=True)
+def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
+    """The points of a frame (20,) near enough to the a-priori skeleton; a lost point agrees with anything.
+
+    Near is within ``outlier_m`` widened by three standard deviations of the prediction, each joint's carried through
+    the forward kinematics.
+    """
+    d = delay(filter_, c, now, rules)
+    p, lengths = ago(filter_.mean, d), filter_.lengths
+    expected, moved = np.empty_like(filter_.points[c]), np.empty_like(filter_.points[c])
+    skeleton_row(p, lengths, expected)
+    variance = np.zeros(len(expected))
+    for j in range(12):
+        p[j] += _STEP
+        skeleton_row(p, lengths, moved)
+        p[j] -= _STEP
+        for k in _TESTED:
+            variance[k] += distance(moved[k], expected[k]) ** 2 / _STEP**2 * filter_.cov[j, 0, 0]
+    for k in _TESTED:
+        variance[k] += filter_.lengths_var[0]
+        if k != PELVIS:
+            variance[k] += filter_.lengths_var[1] + filter_.lengths_var[2 if k == HEAD else 3]
+            variance[k] += 0.0 if k == HEAD else filter_.lengths_var[4:].sum()
+    agreeing = np.ones(len(expected), dtype=np.bool_)
+    for k in _TESTED:
+        lost = now - filter_.point_ns[k] > rules.memory_ns
+        if not lost and np.isfinite(filter_.points[c, k, 0]):
+            gate = rules.outlier_m + 3.0 * np.sqrt(variance[k])
+            agreeing[k] = distance(filter_.points[c, k], expected[k]) <= gate
+    return agreeing
+
+
+@njit(cache=True)
+def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
+    """The points of a frame (20,) that are not at the far end of a bone of another length than the person's.
+
+    Bones do not change, so a marker that jumps is told from a limb that moves. A length that no camera has seen right
+    for long was learnt wrong: it starts anew.
+    """
+    whole = np.ones(len(filter_.point_ns), dtype=np.bool_)
+    for k in range(1, len(filter_.lengths)):
+        apart = abs(filter_.z[c, 12 + k] - filter_.lengths[k])
+        if not np.isfinite(apart):
+            continue
+        if filter_.bone_ns[k] >= 0 and now - filter_.bone_ns[k] > rules.bone_memory_ns:
+            filter_.lengths_var[k] = _UNKNOWN_M**2
+        if apart <= rules.bone_m + 3.0 * np.sqrt(filter_.lengths_var[k]):
+            filter_.bone_ns[k] = now
+        else:
+            whole &= ~_ENDS[k]
+    return whole
+
+
+@njit(cache=True)
+def distance(a: Floats, b: Floats) -> float:
+    """Between two points (3,) [m]."""
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)

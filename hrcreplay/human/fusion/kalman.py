@@ -1,0 +1,205 @@
+"""The arrays that the kernels of the fusion share.
+
+The Kalman filter of one joint: four states p, v, a, j, Eq. (42)-(57).
+
+How uncertain the fused state truly is: the variances that the filter tells, times what innovations say of them.
+
+P of Eq. (49) follows from the sigmas alone, which must do for the liveliest motion and the worst camera. To multiply
+R and G by one number leaves every gain, and so the estimate, as it is, and multiplies P: the variance of unit weight of
+the calculus of observations. Each joint has its own, from its innovations squared over their variance: the mean of the
+last few, held at its highest and forgotten slowly. At rest it is small; when a joint sets off, the first innovations
+raise it at once, and it outlasts the motion.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.records import Bools, Floats, Ints
+
+
+class Filter(NamedTuple):
+    """All that one tick hands to the next."""
+
+    tick_ns: Ints  #: (1,) the last tick
+    started: Bools  #: (1,) whether there is a person
+    mean: Floats  #: (12, 4) p, v, a, j
+    cov: Floats  #: (12, 4, 4)
+    lengths: Floats  #: (8,)
+    lengths_var: Floats  #: (8,)
+    row_ns: Ints  #: (20,) tick at which a row (12 angles, 8 lengths) was last valid
+    acquired_ns: Ints  #: (20,) tick at which a row started anew
+    point_ns: Ints  #: (20,) tick at which a body point last agreed with the filter
+    bone_ns: Ints  #: (8,) tick at which a camera last saw a length that agreed with the filter
+    capture_ns: Ints  #: (c,) of the frame held for each camera
+    uses: Ints  #: (c,) ticks that frame was used in; -1 without one
+    z: Floats  #: (c, 20) its rows
+    z_var: Floats  #: (c, 20) sigma_z^2
+    points: Floats  #: (c, 20, 3)
+    confidence: Floats  #: (c, 20)
+    valid: Bools  #: (c, 20) which of its rows are used
+    shows: Bools  #: (c, 6) which limbs it shows with all that carries them
+    residuals: Floats  #: (7, BINS) weights of the residuals of each limb of BODY by their size
+    weight: Floats  #: (7,) of all of them
+    samples: Ints  #: (7,) residuals so far
+    sampled_ns: Ints  #: (7,) tick of the last
+    residual: Floats  #: (7,) their quantile [m]
+    surprise: Floats  #: (12,) running mean of each joint's innovations squared over their variance
+    spread: Floats  #: (12,) highest of it lately: the factor on the variances that are told
+
+
+class Frames(NamedTuple):
+    """Frames in order of arrival."""
+
+    capture_ns: Ints
+    arrival_ns: Ints
+    camera: Ints
+    z: Floats
+    z_var: Floats
+    points: Floats
+    confidence: Floats
+
+
+class Rules(NamedTuple):
+    """Settings and limits as the kernels need them."""
+
+    sigma: Floats  #: (12, 4) of Eq. (44)
+    reuse: bool
+    compensate: bool
+    delay_max_s: float
+    confidence_min: float
+    outlier_m: float
+    bone_m: float
+    memory_ns: int
+    bone_memory_ns: int
+    coast_ns: int
+    residual_quantile: float
+    residual_memory_s: float
+    spread_memory_s: float
+    spread_least: float
+    spread_most: float
+    rest_s: float
+    rest_std: Floats  #: (12, 3) of v, a, j of a joint nobody has seen for long
+    p_min: Floats
+    p_max: Floats
+    v_min: Floats
+    v_max: Floats
+    a_min: Floats
+    a_max: Floats
+    coupled: bool
+
+
+class Track(NamedTuple):
+    """What the ticks leave behind; rows before the start stay as they are."""
+
+    motion: Floats  #: (6, n, 12) p, v, a, j, and the deviations of p and v with the factor of ``spread``
+    lengths: Floats  #: (2, n, 8) and their deviations
+    valid: Bools  #: (n, c)
+    residual: Floats  #: (n, 7)
+    unseen: Floats  #: (n, 6)
+    cov: Floats  #: (n or 0, 12, 4, 4)
+    damping: Floats  #: (n or 0, 12) of the derivatives, on the way to the tick
+    outliers: Ints  #: (c,)
+    superseded: Ints  #: (c,)
+    reacquired: Ints  #: (1,)
+    saturated: Ints  #: (1,)
+
+
+@njit(cache=True)
+def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
+    """Age of the frame held for a camera [s]; 0 where delays are ignored."""
+    if not rules.compensate:
+        return 0.0
+    return max(0.0, min((now - filter_.capture_ns[c]) * 1e-9, rules.delay_max_s))
+
+
+@njit(cache=True)
+def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> None:
+    """Eq. (48), (49) over dt seconds, mean (4,) and P (4, 4) in place.
+
+    F is upper triangular, so that each row is done before the rows it needs change. With a damping below 1 the
+    derivatives also forget: towards rest, give or take ``rest_std`` (3,).
+    """
+    taylor = (1.0, dt, dt**2 / 2.0, dt**3 / 6.0)  # F of Eq. (43)
+    for a in range(4):
+        kept = damping if a > 0 else 1.0
+        mean[a] = kept * _ahead(taylor, mean, a)
+        for b in range(4):
+            P[a, b] = kept * _ahead(taylor, P[:, b], a)
+    for a in range(4):
+        for b in range(a, 4):
+            P[a, b] = (damping if b > 0 else 1.0) * _ahead(taylor, P[a], b)
+            P[b, a] = P[a, b]
+    for a in range(4):
+        P[a, a] += process_variance(a, dt, damping, sigma, rest_std)
+
+
+@njit(cache=True)
+def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> float:
+    """Row a of F times x (4,)."""
+    total = x[a]
+    for k in range(a + 1, 4):
+        total += taylor[k - a] * x[k]
+    return total
+
+
+@njit(cache=True)
+def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
+    """The Kalman update of one joint by one scalar row; returns the innovation squared over its variance.
+
+    A row whose innovation has no variance, or none that a number can hold, tells nothing: it changes nothing.
+    """
+    Ph = np.empty(4)
+    for a in range(4):
+        Ph[a] = dot(P[a], h)
+    S = dot(h, Ph) + R
+    innovation = z - dot(h, mean)
+    if not (0.0 < S < np.inf and np.isfinite(innovation)):
+        return 0.0
+    for a in range(4):
+        mean[a] += Ph[a] / S * innovation
+        for b in range(4):
+            P[a, b] -= Ph[a] * Ph[b] / S
+    return innovation**2 / S
+
+
+@njit(cache=True)
+def process_variance(a: int, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> float:
+    """Entry a of the diagonal of G of Eq. (44), corrected; with a damping, also of what is forgotten."""
+    remainder = (dt**4 / 24.0, dt**3 / 6.0, dt**2 / 2.0, dt)
+    forgotten = (1.0 - damping**2) * rest_std[a - 1] ** 2 if a > 0 else 0.0
+    return sigma[a] ** 2 * remainder[a] + forgotten
+
+
+@njit(cache=True)
+def ago(mean: Floats, d: float) -> Floats:
+    """Where the joints (12,) were d seconds before, by the Taylor polynomial of Eq. (43)."""
+    return mean[:, 0] - d * mean[:, 1] + d**2 / 2.0 * mean[:, 2] - d**3 / 6.0 * mean[:, 3]
+
+
+@njit(cache=True)
+def dot(a: Floats, b: Floats) -> float:
+    """The scalar product of (4,) and (4,)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+
+
+#: Weight of the newest innovation in the running mean.
+_NEWEST = 0.25
+
+
+@njit(cache=True)
+def enter(filter_: Filter, j: int, squared: float, now: int, rules: Rules) -> None:
+    """Takes an innovation of joint j in, squared over its variance; ``row_ns`` still tells of the one before."""
+    filter_.surprise[j] += _NEWEST * (squared - filter_.surprise[j])
+    kept = np.exp(-(now - filter_.row_ns[j]) * 1e-9 / rules.spread_memory_s)
+    filter_.spread[j] = max(kept * filter_.spread[j], filter_.surprise[j])
+
+
+@njit(cache=True)
+def factor(filter_: Filter, j: int, rules: Rules) -> float:
+    """On the variances of joint j; at least 1 while it coasts, for nothing is known of a joint that is not seen."""
+    least = 1.0 if filter_.tick_ns[0] - filter_.row_ns[j] > rules.coast_ns else rules.spread_least
+    return max(least, min(filter_.spread[j], rules.spread_most))

@@ -1,0 +1,236 @@
+"""One tick of Alg. 3 on plain arrays. The filter of (42)-(57) is 12 filters of four states and 8 of one.
+
+Bounds on the fused state, Eq. (62)-(65).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.fusion.gating import judge
+from hrcreplay.human.fusion.inverse_kinematics import ROWS
+from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, correct, delay, dot, enter, factor, predict
+from hrcreplay.human.fusion.model_residual import observe, unseen
+from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row, nearest_arm, wrap
+from hrcreplay.records import Floats, Ints
+
+#: A name of an arm is kept until the other is better by this [rad].
+_NAME_MARGIN = np.radians(20.0)
+
+
+@njit(cache=True)
+def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Track) -> None:
+    """Runs the ticks, changing the filter in place. Frames must have arrived by the last tick."""
+    damping = np.ones(12)
+    seen = 0
+    for k in range(len(ticks_ns)):
+        now = ticks_ns[k]
+        dt = (now - filter_.tick_ns[0]) * 1e-9 if filter_.started[0] else 0.0
+        if filter_.started[0]:
+            _predict(filter_, now, rules, damping)
+        seen = _collect(frames, seen, now, filter_, track)
+        fresh = filter_.uses == 0
+        for c in range(len(fresh)):
+            if fresh[c]:
+                judge(filter_, c, now, rules, track)
+        for c in range(len(fresh)):
+            again = rules.reuse and filter_.uses[c] > 0 and now - filter_.capture_ns[c] <= rules.memory_ns
+            if fresh[c] or again:
+                track.valid[k, c] = _update(filter_, c, now, rules, track)
+        filter_.tick_ns[0] = now
+        if filter_.started[0]:
+            _rename(filter_)
+            if saturate(filter_.mean, dt, rules):
+                track.saturated[0] += 1
+            observe(filter_, fresh, now, rules)
+            _leave(filter_, k, rules, track, damping)
+
+
+@njit(cache=True)
+def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
+    """The a-priori estimate. A joint unseen for longer than ``coast_ns`` comes to rest: no jerk can be followed far."""
+    dt = (now - filter_.tick_ns[0]) * 1e-9
+    for j in range(12):
+        damping[j] = np.exp(-dt / rules.rest_s) if now - filter_.row_ns[j] > rules.coast_ns else 1.0
+        predict(filter_.mean[j], filter_.cov[j], dt, damping[j], rules.sigma[j], rules.rest_std[j])
+
+
+@njit(cache=True)
+def _collect(frames: Frames, seen: int, now: int, filter_: Filter, track: Track) -> int:
+    """Holds the newest frame of each camera that has arrived; returns how many frames have been seen."""
+    while seen < len(frames.arrival_ns) and frames.arrival_ns[seen] <= now:
+        c = frames.camera[seen]
+        waiting = filter_.uses[c] == 0
+        late = filter_.uses[c] >= 0 and frames.capture_ns[seen] < filter_.capture_ns[c]
+        if waiting or late:
+            track.superseded[c] += 1
+        if not late:
+            filter_.capture_ns[c] = frames.capture_ns[seen]
+            filter_.uses[c] = 0
+            filter_.z[c] = frames.z[seen]
+            filter_.z_var[c] = frames.z_var[seen]
+            filter_.points[c] = frames.points[seen]
+            filter_.confidence[c] = frames.confidence[seen]
+        seen += 1
+    return seen
+
+
+@njit(cache=True)
+def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bool:
+    """Eq. (52)-(57) with the valid rows of one camera's frame, row after row; whether there was one.
+
+    One scalar row at a time is exact because R is diagonal. R of a frame used for the n-th time is n sigma_z^2.
+    """
+    filter_.uses[c] += 1
+    if not filter_.valid[c].any():
+        return False
+    if not filter_.started[0]:
+        _start(filter_, c)
+    d = delay(filter_, c, now, rules)
+    h = np.array([1.0, -d, d**2 / 2.0, -(d**3) / 6.0])
+    z = _named(filter_, c, h)
+    for row in range(ROWS):
+        if not filter_.valid[c, row]:
+            continue
+        R = filter_.uses[c] * filter_.z_var[c, row]
+        if row >= 12:
+            both = filter_.lengths_var[row - 12] + R
+            if both > 0.0:  # else the length is known exactly, and so is the row
+                gain = filter_.lengths_var[row - 12] / both
+                filter_.lengths[row - 12] += gain * (z[row] - filter_.lengths[row - 12])
+                filter_.lengths_var[row - 12] *= 1.0 - gain
+        elif now - filter_.row_ns[row] > rules.memory_ns:
+            _acquire(filter_, row, z[row], R, rules.rest_std[row])
+            filter_.acquired_ns[row] = now
+            track.reacquired[0] += filter_.row_ns[row] >= 0  # the first time is no loss
+        else:
+            squared = correct(filter_.mean[row], filter_.cov[row], h, z[row], R)
+            enter(filter_, row, squared, now, rules)
+        if filter_.uses[c] == 1:
+            filter_.row_ns[row] = now
+    return True
+
+
+@njit(cache=True)
+def _named(filter_: Filter, c: int, h: Floats) -> Floats:
+    """The rows (20,) of a camera's frame by the names, and the turn of the heading, nearest to the estimate."""
+    z = filter_.z[c].copy()
+    expected, variance = np.empty(12), np.empty(12)
+    for j in range(12):
+        if not filter_.valid[c, j]:
+            z[j] = np.nan
+        expected[j] = dot(h, filter_.mean[j])
+        variance[j] = filter_.z_var[c, j]
+        for a in range(4):
+            variance[j] += h[a] * dot(filter_.cov[j, a], h)
+    z[2] = expected[2] + wrap(z[2] - expected[2])
+    for first in (RIGHT_ARM, LEFT_ARM):
+        arm = slice(first, first + 4)
+        nearest_arm(z[arm], expected[arm], variance[arm])
+    return z
+
+
+@njit(cache=True)
+def _start(filter_: Filter, c: int) -> None:
+    """The person appears: the base under what is seen, until the pelvis is."""
+    filter_.started[0] = True
+    for axis in range(2):
+        filter_.mean[axis, 0] = np.nanmean(filter_.points[c, :, axis])
+
+
+@njit(cache=True)
+def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> None:
+    """A joint seen for the first time, or for the first time after it was lost: nothing old is carried over."""
+    filter_.mean[j] = 0.0
+    filter_.mean[j, 0] = z
+    filter_.surprise[j], filter_.spread[j] = 1.0, 1.0
+    filter_.cov[j] = 0.0
+    filter_.cov[j, 0, 0] = R
+    for k in range(3):
+        filter_.cov[j, k + 1, k + 1] = rest_std[k] ** 2
+
+
+@njit(cache=True)
+def _rename(filter_: Filter) -> None:
+    """Keeps each arm near its canonical name. The same posture: alpha_2 is mirrored, P is what it was."""
+    for first in (RIGHT_ARM, LEFT_ARM):
+        arm = filter_.mean[first : first + 4, 0].copy()
+        if canonical_arm(arm, _NAME_MARGIN):
+            filter_.mean[first + 1] *= -1.0
+        filter_.mean[first : first + 4, 0] = arm
+
+
+@njit(cache=True)
+def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats) -> None:
+    for j in range(12):
+        for a in range(4):
+            track.motion[a, k, j] = filter_.mean[j, a]
+        for a in range(2):
+            track.motion[4 + a, k, j] = np.sqrt(factor(filter_, j, rules) * filter_.cov[j, a, a])
+    track.lengths[0, k] = filter_.lengths
+    track.lengths[1, k] = np.sqrt(filter_.lengths_var)
+    track.residual[k] = filter_.residual
+    unseen(filter_, track.unseen[k])
+    if len(track.cov) > 0:
+        track.cov[k] = filter_.cov
+        track.damping[k] = damping
+
+
+@njit(cache=True)
+def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
+    """Eq. (62)-(65) on the state of all joints (12, 4), then the same for the accelerations, in place.
+
+    The filter goes on from the saturated state; P is not changed by it. x and y are bounded along and across the
+    body, Eq. (33), and turned back, Eq. (32). A joint's velocity may not carry it over its position bound within dt,
+    its acceleration not over its velocity bound; without a dt yet (0) only the plain bounds hold.
+
+    Returns:
+        Whether anything had to give.
+    """
+    low, high = np.empty(12), np.empty(12)
+    before = mean[:, :3].copy()
+    p = mean[:, 0].copy()
+    clamp_row(p, rules.p_min, rules.p_max, rules.coupled, low, high)
+    mean[:, 0] = p
+    low[:2], high[:2] = -np.inf, np.inf  # bounds of x and y are the world's, those of their velocities the body's
+    v = _into_body(mean[:, 1], p[2])
+    v_out = _clip(v, p, low, high, rules.v_min, rules.v_max, dt)
+    a = _into_body(mean[:, 2], p[2])
+    a_out = _clip(a, v_out, rules.v_min, rules.v_max, rules.a_min, rules.a_max, dt)
+    _write(mean[:, 1], v, v_out, p[2])
+    _write(mean[:, 2], a, a_out, p[2])
+    return bool((before != mean[:, :3]).any())
+
+
+@njit(cache=True)
+def _clip(
+    rate: Floats, value: Floats, low: Floats, high: Floats, rate_low: Floats, rate_high: Floats, dt: float
+) -> Floats:
+    """Eq. (63)-(65): the rates (12,) within their bounds and those that keep the value within its own for dt."""
+    clipped = np.empty(12)
+    for j in range(12):
+        least, most = rate_low[j], rate_high[j]
+        if dt > 0.0:
+            least = min(max(least, (low[j] - value[j]) / dt), most)
+            most = max(min(most, (high[j] - value[j]) / dt), least)
+        clipped[j] = max(least, min(rate[j], most))
+    return clipped
+
+
+@njit(cache=True)
+def _into_body(world: Floats, theta: float) -> Floats:
+    """Eq. (33): the first two of (12,) forward and to the left."""
+    body = world.copy()
+    c, s = np.cos(theta), np.sin(theta)
+    body[0], body[1] = c * world[0] + s * world[1], -s * world[0] + c * world[1]
+    return body
+
+
+@njit(cache=True)
+def _write(world: Floats, body: Floats, clipped: Floats, theta: float) -> None:
+    """Eq. (32): writes back only what was clipped, so that the rest keeps its bits."""
+    world[2:] = clipped[2:]
+    if body[0] != clipped[0] or body[1] != clipped[1]:
+        c, s = np.cos(theta), np.sin(theta)
+        world[0], world[1] = c * clipped[0] - s * clipped[1], s * clipped[0] + c * clipped[1]

@@ -1,0 +1,141 @@
+"""How far people are from their model, limb by limb, and for how long a limb has not been seen.
+
+People bend sideways, twist and lift their shoulders; twelve joints do not (ERRATA, 'The human model'). A sample of a
+limb's residual is the largest distance of its measured points from those of the fused model at the frame's capture
+time, where the delay is compensated. It is taken after the tick's update and saturation, so it is about the state that
+is handed on, from frames that show the limb and all that carries it with enough confidence and without an outlier.
+
+Legs have no joints in the model. Theirs is the largest distance from the line between the floor and the fused pelvis of
+the hips, knees, ankles and feet that the frame shows, if it shows the pelvis and at least one point below the hips. The
+distance from a convex set is convex, so a bone between two points is no further off than the worse of them.
+
+The running quantile is that of all samples so far, each with the weight exp(-age / memory); a limb out of sight does
+not age for longer than it takes to be lost, so that what is known of a person outlives an occlusion. Samples are kept
+by the millimetre and rounded up.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.fusion.gating import distance
+from hrcreplay.human.fusion.kalman import Filter, Rules, ago, delay
+from hrcreplay.human.model import ARM_POINTS, HEAD, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
+from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
+
+#: No point of a leg is further from the pelvis: toes of a tall man's straight leg. What is further is no leg [m].
+REACH_M = 1.2
+_BIN_M = 0.001
+#: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person's arm.
+BINS = round(REACH_M / _BIN_M)
+#: Fewer samples say nothing of a quantile.
+LEAST = 20
+
+(_SHOULDER_R, _ELBOW_R, _WRIST_R), (_SHOULDER_L, _ELBOW_L, _WRIST_L) = ARM_POINTS
+#: Points of each of LIMBS, the first repeated where there are fewer. The neck, the middle of the shoulders, is never
+#: further off than the worse of them.
+_ENDS = np.array(
+    [
+        [HEAD, HEAD, HEAD],
+        [PELVIS, _SHOULDER_R, _SHOULDER_L],
+        [_SHOULDER_R, _ELBOW_R, _ELBOW_R],
+        [_ELBOW_R, _WRIST_R, _WRIST_R],
+        [_SHOULDER_L, _ELBOW_L, _ELBOW_L],
+        [_ELBOW_L, _WRIST_L, _WRIST_L],
+    ]
+)
+#: First of the two joints of each arm's limb.
+_FIRST = np.array([RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2])
+_LEGS = BODY.index("LEGS")
+_HIPS = np.array([POINTS.index(f"hip_{side}") for side in "rl"])
+_BELOW = np.array([POINTS.index(f"{part}_{side}") for part in ("knee", "ankle", "foot") for side in "rl"])
+
+
+@njit(cache=True)
+def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
+    """Takes the samples of the cameras' new frames in, and the quantiles of those limbs anew."""
+    model = np.empty_like(filter_.points[0])
+    for c in np.flatnonzero(fresh):
+        skeleton_row(ago(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths, model)
+        for limb in np.flatnonzero(filter_.shows[c]):
+            if _settled(filter_, limb, now, rules):
+                sample = 0.0
+                for k in _ENDS[limb]:
+                    sample = max(sample, distance(filter_.points[c, k], model[k]))
+                _enter(filter_, limb, now, sample, rules)
+        if filter_.valid[c, :2].all() and _settled(filter_, _LEGS, now, rules):
+            below = _farthest(filter_, c, _BELOW, model[PELVIS], rules)
+            if below >= 0.0:
+                sample = max(below, _farthest(filter_, c, _HIPS, model[PELVIS], rules))
+                _enter(filter_, _LEGS, now, sample, rules)
+    for limb in np.flatnonzero(filter_.sampled_ns == now):
+        if filter_.samples[limb] >= LEAST:
+            larger = (1.0 - rules.residual_quantile) * filter_.weight[limb]
+            filter_.residual[limb] = _exceeded_by(filter_.residuals[limb], larger)
+
+
+@njit(cache=True)
+def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rules) -> float:
+    """Largest distance of some points of the legs from the line below the pelvis (3,) [m]; -1 where none is shown."""
+    farthest = -1.0
+    for k in points:
+        point = filter_.points[c, k]
+        if filter_.confidence[c, k] >= rules.confidence_min and distance(point, pelvis) <= REACH_M:
+            beyond = point[2] - max(0.0, min(point[2], pelvis[2]))
+            off = np.sqrt((point[0] - pelvis[0]) ** 2 + (point[1] - pelvis[1]) ** 2 + beyond**2)
+            farthest = max(farthest, off)
+    return farthest
+
+
+@njit(cache=True)
+def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
+    """Whether no joint that carries the limb has started anew within the memory: the filter must find it first."""
+    newest = filter_.acquired_ns[: 2 if limb == _LEGS else 4].max()
+    if 2 <= limb < _LEGS:
+        first = _FIRST[limb - 2]
+        newest = max(newest, filter_.acquired_ns[first - first % 4 : first + 2].max())
+    return now - newest > rules.memory_ns
+
+
+@njit(cache=True)
+def unseen(filter_: Filter, seconds: Floats) -> None:
+    """Writes how long ago the last valid row of each limb's own joints came, (6,) [s].
+
+    Head and thorax have been seen when all four joints of the torso have. Of the two joints of a part of an arm one is
+    enough: the other goes blind where it does not matter (alpha_3 when the elbow is straight).
+    """
+    now = filter_.tick_ns[0]
+    seconds[:2] = _since(now, filter_.row_ns[:4].min())
+    for i in range(len(_FIRST)):
+        seconds[2 + i] = _since(now, filter_.row_ns[_FIRST[i] : _FIRST[i] + 2].max())
+
+
+@njit(cache=True)
+def _since(now: int, then: int) -> float:
+    return (now - then) * 1e-9 if then >= 0 else np.inf
+
+
+@njit(cache=True)
+def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) -> None:
+    """Lets the earlier samples of a limb age, and adds one of weight 1; one that is no distance is none."""
+    if not sample >= 0.0:
+        return
+    age = min(now - filter_.sampled_ns[limb], rules.memory_ns) * 1e-9
+    kept = np.exp(-age / rules.residual_memory_s)
+    filter_.residuals[limb] *= kept
+    filter_.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf is no whole number
+    filter_.weight[limb] = kept * filter_.weight[limb] + 1.0
+    filter_.samples[limb] += 1
+    filter_.sampled_ns[limb] = now
+
+
+@njit(cache=True)
+def _exceeded_by(weights: Floats, larger: float) -> float:
+    """The least upper end of a bin with samples of at most this weight above it [m]."""
+    above = 0.0
+    bin_ = BINS
+    while bin_ > 1 and above + weights[bin_ - 1] <= larger:
+        bin_ -= 1
+        above += weights[bin_]
+    return bin_ * _BIN_M

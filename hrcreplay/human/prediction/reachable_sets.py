@@ -1,0 +1,185 @@
+"""What every joint can reach within the horizon: Eq. (18)-(30), corrected, and Alg. 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.human.model import SHOWN_BY, LimitSet, alpha_2_bounds, alpha_3_bounds
+from hrcreplay.human.prediction.sound_reach import STANDARD, Margins, enclose
+from hrcreplay.records import Bools, Floats, HumanStates, Ints, Table
+
+#: Ways to predict, in the order of their codes in the kernels: the two of the literature, and what encloses.
+PRINTED = ("paper", "positions")
+METHODS = (*PRINTED, "sound")
+PAPER, SOUND = METHODS.index("paper"), METHODS.index("sound")
+
+
+@dataclass(frozen=True)
+class Reach(Table):
+    """Reachable interval of every joint, a row a tick. It always holds the current posture, Eq. (40)."""
+
+    t_ns: Ints  #: (n,)
+    low: Floats  #: (n, 12) JOINTS [m, m, rad...]; NaN where the state is
+    high: Floats  #: (n, 12)
+
+
+def reachable(
+    states: HumanStates, limits: LimitSet, horizon_s: float, method: str, margins: Margins = STANDARD
+) -> Reach:
+    """Reachable sets within the horizon, Eq. (36), (38), (39), joint by joint.
+
+    ``paper``: Eq. (20)-(30), corrected, for walking and Alg. 1 for the other joints: from positions, velocities and
+    bounds on velocity and acceleration. ``positions``: the older way of [26], from positions and velocity bounds.
+    Both hold the angles within their limits, with (34b), (34c) taken over the reachable interval of what they depend
+    on; a posture that is itself outside stays included. An arm joint that nobody ever measured may be anywhere within
+    its limits, whatever the method. ``sound``: every motion under the limits from every likely
+    state, at all times until the horizon and the latency are over; x and y are those of a polygon, see ``stroll``.
+
+    Args:
+        states: The fused person.
+        limits: Bounds.
+        horizon_s: Braking time T_s of the robot [s].
+        method: One of METHODS.
+        margins: What ``sound`` adds; the printed methods add nothing.
+
+    Raises:
+        SettingsError: There is no such method.
+    """
+    code = code_of(method)
+    if code == SOUND:
+        low, high = enclose(states, bounds_of(limits), limits.coupled, horizon_s, margins)
+        return Reach(states.t_ns, low, high)
+    low, high = np.empty_like(states.p), np.empty_like(states.p)
+    p, v = np.ascontiguousarray(states.p), np.ascontiguousarray(states.v)
+    _reach_rows(p, v, never_measured(states), bounds_of(limits), limits.coupled, horizon_s, code, low, high)
+    return Reach(states.t_ns, low, high)
+
+
+def never_measured(states: HumanStates) -> Bools:
+    """(n, 12) joints of which no camera has shown anything yet: the filter only has a guess of them."""
+    return np.ascontiguousarray(np.isinf(states.unseen_s)[:, SHOWN_BY])
+
+
+def code_of(method: str) -> int:
+    """The number by which the kernels know a method of METHODS.
+
+    Raises:
+        SettingsError: There is no such method.
+    """
+    if method not in METHODS:
+        raise SettingsError(f"occupancy.method: found {method!r}; choose one of {', '.join(METHODS)}")
+    return METHODS.index(method)
+
+
+def bounds_of(limits: LimitSet) -> Floats:
+    """(6, 12): p_min, p_max, v_min, v_max, a_min, a_max, as the kernels take them."""
+    return np.stack([limits.p_min, limits.p_max, limits.v_min, limits.v_max, limits.a_min, limits.a_max])
+
+
+@njit(cache=True)
+def _reach_rows(
+    p: Floats,
+    v: Floats,
+    never: Bools,
+    bounds: Floats,
+    coupled: bool,
+    horizon: float,
+    method: int,
+    low: Floats,
+    high: Floats,
+) -> None:
+    for i in range(len(p)):
+        reach_row(p[i], v[i], never[i], bounds, coupled, horizon, method, low[i], high[i])
+
+
+@njit(cache=True)
+def reach_row(
+    p: Floats,
+    v: Floats,
+    never: Bools,
+    bounds: Floats,
+    coupled: bool,
+    horizon: float,
+    method: int,
+    low: Floats,
+    high: Floats,
+) -> None:
+    """Writes the reachable interval of every joint from p, v (12,) into low, high (12,); ``never`` was it measured."""
+    _walk(p, v, bounds, horizon, method, low, high)
+    for j in range(3, 12):
+        if method == PAPER:
+            low[j], high[j] = _joint(p[j], v[j], bounds[2:, j], horizon)
+        else:
+            low[j], high[j] = p[j] + bounds[2, j] * horizon, p[j] + bounds[3, j] * horizon
+        least, most = bounds[0, j], bounds[1, j]
+        if coupled and j in (5, 9):
+            least, most = alpha_2_bounds(low[j - 1], high[j - 1])
+        elif coupled and j in (6, 10):
+            least, most = alpha_3_bounds(low[j - 2], high[j - 2], low[j - 1], high[j - 1])
+        if never[j]:
+            low[j], high[j] = least, most
+        elif not np.isnan(low[j] + high[j]):
+            low[j], high[j] = max(least, min(low[j], most)), max(least, min(high[j], most))
+        _include(p, j, low, high)
+
+
+@njit(cache=True)
+def _include(p: Floats, j: int, low: Floats, high: Floats) -> None:
+    """Eq. (40), the ends sorted first; an interval with a NaN anywhere is NaN at both ends."""
+    if np.isnan(p[j] + low[j] + high[j]):
+        low[j], high[j] = np.nan, np.nan
+    else:
+        low[j], high[j] = min(p[j], low[j], high[j]), max(p[j], low[j], high[j])
+
+
+@njit(cache=True)
+def _joint(p: float, v: float, bounds: Floats, horizon: float) -> tuple[float, float]:
+    """Alg. 1 for one joint; its bounds are v_min, v_max, a_min, a_max."""
+    return _farthest(p, v, bounds[0], bounds[2], horizon), _farthest(p, v, bounds[1], bounds[3], horizon)
+
+
+@njit(cache=True)
+def _farthest(p: float, v: float, v_bound: float, a_bound: float, horizon: float) -> float:
+    """Where a joint gets that accelerates at its bound until it reaches its velocity bound at T*."""
+    t_star = max(0.0, min((v_bound - v) / a_bound, horizon))  # an estimate over the bound has T* < 0
+    if t_star == horizon:
+        return p + v * horizon + 0.5 * a_bound * horizon**2
+    return p + v * t_star + 0.5 * a_bound * t_star**2 + v_bound * (horizon - t_star)
+
+
+@njit(cache=True)
+def _walk(p: Floats, v: Floats, bounds: Floats, horizon: float, method: int, low: Floats, high: Floats) -> None:
+    """Eq. (18)-(30), corrected: x, y and heading.
+
+    The bounds of x and y are those of v and v_perp, so the velocity is turned into the body frame, Eq. (33), and the
+    displacements back, Eq. (32). beta = omega T_s; (27), (28) take the lateral acceleration; the two displacements
+    add up as intervals, whatever the signs of cos(theta) and sin(theta).
+    """
+    c, s = np.cos(p[2]), np.sin(p[2])
+    least, most = bounds[2, :3].copy(), bounds[3, :3].copy()
+    if method == PAPER:
+        body = (c * v[0] + s * v[1], c * v[1] - s * v[0], v[2])
+        for k in range(3):
+            gain = bounds[5, k] * horizon
+            most[k] = min(body[k] + gain, most[k])
+            if k > 0:  # the print lets a walker stop at once: its v^min is the bound, whatever the acceleration
+                least[k] = max(body[k] + bounds[4, k] * horizon, least[k])
+    ahead = (least[0] * horizon, most[0] * horizon)
+    left = (least[1] * horizon, most[1] * horizon)
+    low[0], high[0] = _sum(p[0], c, ahead, -s, left)
+    low[1], high[1] = _sum(p[1], s, ahead, c, left)
+    low[2], high[2] = p[2] + least[2] * horizon, p[2] + most[2] * horizon
+    for k in range(3):
+        _include(p, k, low, high)
+
+
+@njit(cache=True)
+def _sum(start: float, f: float, a: tuple[float, float], g: float, b: tuple[float, float]) -> tuple[float, float]:
+    """Interval start + f a + g b."""
+    low = start + min(f * a[0], f * a[1]) + min(g * b[0], g * b[1])
+    high = start + max(f * a[0], f * a[1]) + max(g * b[0], g * b[1])
+    return low, high

@@ -1,0 +1,149 @@
+"""What a person can reach under ``sound``: intervals of all joints, and a polygon of pelvis positions.
+
+What ``sound`` adds to the model's motions so that real people stay inside too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.model import SHOWN_BY
+from hrcreplay.human.prediction.joint_reach import Stops, interval, stops
+from hrcreplay.human.prediction.walking_reach import SIDES, body_velocity, corners_of, turned, walked
+from hrcreplay.records import Floats, HumanStates
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Margins of ``occupancy.method = "sound"``. ``paper`` and ``positions`` know none of them."""
+
+    sigmas: float = 3.0  #: states within so many standard deviations of the estimate are enclosed, joint by joint
+    latency_s: float = 0.0  #: from the newest capture to the robot's reaction; the horizon is longer by it [s]
+    hand_m: float = 0.19  #: length of the hand, which goes on where the forearm ends [m]
+    legs_radius_m: float = 0.20  #: least of the lower body, around the line from the floor to the pelvis [m]
+    residual: bool = True  #: whether the body's distance from the model is added to the radii
+    residual_m: float = 0.10  #: that distance as long as it is not known: of most people, ERRATA 'The human model' [m]
+    memory_s: float = 0.5  #: a limb unseen for longer grows to what it could have reached since [s]
+    legs: bool = True  #: whether there is a lower body
+
+
+STANDARD = Margins()
+
+
+Range = tuple[float, float]
+
+
+class Likely(NamedTuple):
+    """Where people may be at the tick, a row each: a box around the estimate, and what nobody has seen for long."""
+
+    p: Floats  #: (n, 12)
+    v: Floats  #: (n, 12)
+    p_off: Floats  #: (n, 12) largest error of p
+    v_off: Floats  #: (n, 12) largest error of v
+    unseen_s: Floats  #: (n, 12) for how long a joint has not been seen, 0 within its memory [s]
+
+
+def likely(states: HumanStates, margins: Margins) -> Likely:
+    """The states that ``sound`` starts from."""
+    unseen = np.where(states.unseen_s > margins.memory_s, states.unseen_s, 0.0)[:, SHOWN_BY]
+    off = (margins.sigmas * states.p_std, margins.sigmas * states.v_std)
+    return Likely(*(np.ascontiguousarray(a) for a in (states.p, states.v, *off, unseen)))
+
+
+@njit(cache=True)
+def enclose_row(
+    i: int,
+    at: Likely,
+    bounds: Floats,
+    coupled: bool,
+    horizon: float,
+    memory: float,
+    low: Floats,
+    high: Floats,
+    corners: Floats,
+) -> None:
+    """Writes the intervals (12,) of row i, and the corners (SIDES, 2) of the polygon around the pelvis [m].
+
+    A joint unseen for longer than its memory may since have had any velocity within the bounds; its horizon starts
+    when it was last seen. Its estimate has coasted from there, for at most the memory.
+    """
+    _walk(i, at, bounds, horizon, memory, low, high, corners)
+    for j in range(3, 12):
+        limit = stops(j, bounds, coupled, low, high)
+        if at.unseen_s[i, j] == np.inf:
+            low[j], high[j] = limit[0], limit[3]
+        else:
+            low[j], high[j] = _joint(i, j, at, bounds, limit, horizon, memory)
+
+
+@njit(cache=True)
+def _joint(i: int, j: int, at: Likely, bounds: Floats, limit: Stops, horizon: float, memory: float) -> Range:
+    p, off, unseen = at.p[i, j], at.p_off[i, j], at.unseen_s[i, j]
+    if np.isnan(p + off + at.v[i, j] + at.v_off[i, j]):
+        return np.nan, np.nan
+    if unseen > 0.0:
+        drift = memory * max(-bounds[2, j], bounds[3, j])
+        span = unseen + horizon
+        low, high = p - off - drift + bounds[2, j] * span, p + off + drift + bounds[3, j] * span
+        return min(p, max(low, limit[0])), max(p, min(high, limit[3]))
+    v, v_off = at.v[i, j], at.v_off[i, j]
+    return interval((p - off, p + off), (v - v_off, v + v_off), bounds[2:, j], limit, horizon)
+
+
+@njit(cache=True)
+def _walk(
+    i: int,
+    at: Likely,
+    bounds: Floats,
+    horizon: float,
+    memory: float,
+    low: Floats,
+    high: Floats,
+    corners: Floats,
+) -> None:
+    p, off, v, v_off = at.p[i, :3], at.p_off[i, :3], at.v[i, :3], at.v_off[i, :3]
+    low[:3], high[:3], corners[:] = np.nan, np.nan, np.nan
+    span = horizon + at.unseen_s[i, :3].max()
+    if not np.isfinite(p.sum() + off.sum() + v.sum() + v_off.sum() + span):
+        return
+    heading = (p[2] - off[2], p[2] + off[2])
+    ahead, left = body_velocity(v, v_off, heading)
+    velocity = (ahead, left, (v[2] - v_off[2], v[2] + v_off[2]))
+    drift = 0.0
+    if span > horizon:
+        turn = memory * max(-bounds[2, 2], bounds[3, 2])
+        heading = (heading[0] - turn, heading[1] + turn)
+        velocity = ((bounds[2, 0], bounds[3, 0]), (bounds[2, 1], bounds[3, 1]), (bounds[2, 2], bounds[3, 2]))
+        drift = memory * np.hypot(max(-bounds[2, 0], bounds[3, 0]), max(-bounds[2, 1], bounds[3, 1]))
+    far = np.empty(SIDES)
+    for side in range(SIDES):
+        phi = p[2] + 2.0 * np.pi * side / SIDES
+        c, s = np.cos(phi), np.sin(phi)
+        far[side] = c * p[0] + s * p[1] + abs(c) * off[0] + abs(s) * off[1] + drift
+    walked(heading, velocity, bounds, span, far)
+    corners_of(far, p[2], corners)
+    for k in range(2):
+        low[k], high[k] = corners[:, k].min(), corners[:, k].max()
+    low[2], high[2] = turned(heading, velocity[2], bounds, span)
+
+
+def enclose(
+    states: HumanStates, bounds: Floats, coupled: bool, horizon_s: float, margins: Margins
+) -> tuple[Floats, Floats]:
+    """Reachable intervals of all rows, low and high (n, 12), under the bounds of ``reach.bounds_of``."""
+    low, high = np.empty_like(states.p), np.empty_like(states.p)
+    _enclose_rows(likely(states, margins), bounds, coupled, horizon_s + margins.latency_s, margins.memory_s, low, high)
+    return low, high
+
+
+@njit(cache=True)
+def _enclose_rows(
+    at: Likely, bounds: Floats, coupled: bool, horizon: float, memory: float, low: Floats, high: Floats
+) -> None:
+    corners = np.empty((SIDES, 2))
+    for i in range(len(at.p)):
+        enclose_row(i, at, bounds, coupled, horizon, memory, low[i], high[i], corners)

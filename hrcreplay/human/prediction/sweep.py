@@ -1,0 +1,332 @@
+"""The last sweeps of Alg. 2, heading and place, in one: only copies that can be corners of the result.
+
+All copies of a point are at its height. A copy is no corner of the result when it lies between another copy and a
+point of its own set, that is: when the point can take a small step away from where the other copy is, and stay inside.
+The steps are proven on the surface around the set, so nothing is dropped that is not inside the hull of the rest.
+
+Which rotations carry a limb: from its end points to the human base.
+
+Swept volumes of point sets, one degree of freedom at a time: the two strategies of Alg. 2.
+
+Every sweep maps the whole set by a few fixed linear maps. So the hull of a swept set is the swept hull: points that
+are not corners of the hull may be dropped before any sweep without changing what comes out at the end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.geometry.hull_reduction import NX, NY, POINT, A, B, C, Surface, is_inside
+from hrcreplay.records import Floats
+
+_X, _Y, _Z = 0, 1, 2
+
+
+@njit(cache=True)
+def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tuple[Floats, Floats]:
+    """A limb's end points in the frame of its first rotation, and the rotations from there to the human base.
+
+    A row of the chain is: axis, smallest and largest angle [rad], then the origin of its frame in the next (3,) [m].
+    What follows is walking. The thorax also spans the shoulder line, whose midpoint is the neck.
+    """
+    pelvis_height, torso, head, half_shoulder = lengths[0], lengths[1], lengths[2], lengths[3]
+    turn_rho = (_Y, low[3], high[3], 0.0, 0.0, pelvis_height)
+    if limb == 0:
+        points = np.array([[0.0, 0.0, torso], [0.0, 0.0, torso + head]])
+        return points, np.array([turn_rho])
+    if limb == 1:
+        points = np.array([[0.0, 0.0, 0.0], [0.0, -half_shoulder, torso], [0.0, half_shoulder, torso]])
+        return points, np.array([turn_rho])
+    left = limb >= 4
+    side = 1.0 if left else -1.0
+    upper, forearm = (lengths[4], lengths[6]) if left else (lengths[5], lengths[7])
+    a1 = 8 if left else 4  # first joint of the arm
+    a2, a3, a4 = a1 + 1, a1 + 2, a1 + 3
+    turn_2 = (_Y, -high[a2], -low[a2], 0.0, 0.0, 0.0)
+    turn_1 = (
+        _X,
+        min(side * low[a1], side * high[a1]),
+        max(side * low[a1], side * high[a1]),
+        0.0,
+        side * half_shoulder,
+        torso,
+    )
+    if limb in (2, 4):
+        points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -upper]])
+        return points, np.array([turn_2, turn_1, turn_rho])
+    turn_4 = (_Y, low[a4] - np.pi, high[a4] - np.pi, 0.0, 0.0, 0.0)
+    turn_3 = (_Z, min(side * low[a3], side * high[a3]), max(side * low[a3], side * high[a3]), 0.0, 0.0, -upper)
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -forearm]])
+    return points, np.array([turn_4, turn_3, turn_2, turn_1, turn_rho])
+
+
+#: Largest angle that one triangle spans [rad]: its apex is then at most 15.5 % of the radius off the arc.
+TRIANGLE_RAD = np.pi / 3.0
+#: Most points that a rotation makes of one: both ends and an apex for each of six triangles.
+MOST_COPIES = 8
+
+
+@njit(cache=True)
+def sweep_lin(points: Floats, count: int, axis: int, low: float, high: float, swept: Floats) -> int:
+    """Translational sweep along a coordinate axis, Fig. 7.
+
+    Args:
+        points: (m, 3), of which the first ``count`` are swept [m].
+        count: Number of points.
+        axis: 0, 1, 2 for x, y, z.
+        low: Smallest displacement [m].
+        high: Largest displacement [m]; equal to ``low`` it moves the points and adds none.
+        swept: (>= 2 count, 3) receives the points, whose hull is the swept volume [m].
+
+    Returns:
+        Number of points written.
+    """
+    copies = 1 if low == high else 2
+    for i in range(count):
+        for copy in range(copies):
+            for k in range(3):
+                swept[copies * i + copy, k] = points[i, k]
+            swept[copies * i + copy, axis] += high if copy else low
+    return copies * count
+
+
+@njit(cache=True)
+def sweep_rot(
+    points: Floats, count: int, axis: int, low: float, high: float, swept: Floats, widest: float = TRIANGLE_RAD
+) -> int:
+    """Rotational sweep about a coordinate axis through the origin, Fig. 8: arcs inside triangles.
+
+    An arc is cut into equal pieces of at most ``widest``; each lies in the triangle of its ends and the point where
+    their tangents meet. A cut lies on the tangent that its two triangles share, between their apexes, so only the
+    arc's ends and the apexes are corners. A whole turn is the polygon around the circle.
+
+    Args:
+        points: (m, 3), of which the first ``count`` are swept [m].
+        count: Number of points.
+        axis: 0, 1, 2 for x, y, z.
+        low: Smallest angle [rad].
+        high: Largest angle [rad]; equal to ``low`` it turns the points and adds none.
+        swept: (>= copies(low, high, widest) count, 3) receives the points, whose hull contains every arc [m].
+        widest: Largest angle of a triangle [rad].
+
+    Returns:
+        Number of points written.
+    """
+    most = copies(low, high, widest)
+    cosines, sines = np.empty(most), np.empty(most)
+    made = turns(low, high, cosines, sines, widest)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    n = 0
+    for row in range(count):
+        u, v = points[row, i], points[row, j]
+        for copy in range(1 if u == 0.0 and v == 0.0 else made):
+            swept[n, axis] = points[row, axis]
+            swept[n, i] = cosines[copy] * u - sines[copy] * v
+            swept[n, j] = sines[copy] * u + cosines[copy] * v
+            n += 1
+    return n
+
+
+@njit(cache=True)
+def copies(low: float, high: float, widest: float = TRIANGLE_RAD) -> int:
+    """Most points that a rotation makes of one."""
+    return 1 if low == high else 2 + int(np.ceil(min(high - low, 2.0 * np.pi) / widest))
+
+
+@njit(cache=True)
+def turns(low: float, high: float, cosines: Floats, sines: Floats, widest: float = TRIANGLE_RAD) -> int:
+    """The maps of a rotational sweep: rotations, for an apex stretched by 1 / cos(half the piece).
+
+    Writes the first columns (cos, sin) of their matrices, and returns how many there are.
+    """
+    if low == high:
+        cosines[0], sines[0] = np.cos(low), np.sin(low)
+        return 1
+    width = min(high - low, 2.0 * np.pi)
+    pieces = int(np.ceil(width / widest))
+    half = 0.5 * width / pieces
+    for piece in range(pieces):
+        middle = low + (2 * piece + 1) * half
+        cosines[piece], sines[piece] = np.cos(middle) / np.cos(half), np.sin(middle) / np.cos(half)
+    if width == 2.0 * np.pi:
+        return pieces
+    cosines[pieces], sines[pieces] = np.cos(low), np.sin(low)
+    cosines[pieces + 1], sines[pieces + 1] = np.cos(high), np.sin(high)
+    return pieces + 2
+
+
+#: Directions in the plane: EMPTY, POINTED (within less than half a turn) or ALL_ROUND (they can cancel), and the
+#: clockwise most and counterclockwise most of pointed ones as unit vectors.
+Cone = tuple[int, float, float, float, float]
+EMPTY, POINTED, ALL_ROUND = 0, 1, 2
+
+#: How far a step goes [m], and how far it keeps off the edge of the directions that lead inside [rad].
+_STEP_M, _OFF_EDGE = 1e-6, 1e-3
+#: Directions that differ by less are the same [rad].
+_SAME = 1e-12
+
+
+@njit(cache=True)
+def sweep_walk(
+    points: Floats,
+    count: int,
+    faces: int,
+    work: Surface,
+    heading: tuple[float, float],
+    floor: Floats,
+    swept: Floats,
+    widest: float = TRIANGLE_RAD,
+) -> int:
+    """Rotational sweep about the z axis, then a translational one over a polygon.
+
+    Args:
+        points: (m, 3), of which the first ``count`` are what ``keep_corners`` kept, in the human base frame [m].
+        count: Number of points.
+        faces: Number of triangles around them; with none, only copies inside the others of a point are left out.
+        work: The surface, as ``keep_corners`` left it.
+        heading: Smallest and largest heading [rad].
+        floor: (k, 6) places of the human base: x, y, and the vectors there from the two neighbouring corners of the
+            polygon, zero where there is none [m].
+        swept: (>= copies(*heading, widest) k count, 3) receives the points, world [m].
+        widest: Largest angle of a triangle [rad].
+
+    Returns:
+        Number of points written.
+    """
+    most = copies(heading[0], heading[1], widest)
+    cosines, sines = np.empty(most), np.empty(most)
+    made = turns(heading[0], heading[1], cosines, sines, widest)
+    steps = _steps_inside(points, count, faces, work)
+    sides = _directions(floor)
+    n = 0
+    for i in range(count):
+        x, y = points[i, 0], points[i, 1]
+        for copy in range(1 if x == 0.0 and y == 0.0 else made):
+            c, s = cosines[copy], sines[copy]
+            away = _away_from_turned(x, y, copy, made, cosines, sines)
+            for k in (0, 2):
+                away = _widen(away, s * steps[i, k + 1] - c * steps[i, k], -s * steps[i, k] - c * steps[i, k + 1])
+            for k in range(len(floor)):
+                if _is_between(away, k, sides):
+                    continue
+                swept[n, 0] = c * x - s * y + floor[k, 0]
+                swept[n, 1] = s * x + c * y + floor[k, 1]
+                swept[n, 2] = points[i, 2]
+                n += 1
+    return n
+
+
+@njit(cache=True)
+def _directions(floor: Floats) -> Floats:
+    """(k, 4) the two vectors of each place as unit vectors; zero ones stay."""
+    sides = np.zeros((len(floor), 4))
+    for k in range(len(floor)):
+        for j in (0, 2):
+            x, y = floor[k, 2 + j], floor[k, 3 + j]
+            length = np.sqrt(x * x + y * y)
+            if length > 0.0:
+                sides[k, j], sides[k, j + 1] = x / length, y / length
+    return sides
+
+
+@njit(cache=True)
+def _is_between(away: Cone, k: int, sides: Floats) -> bool:
+    """Whether a copy is no corner at a place, given the directions to it from its set and from its turned copies."""
+    if away[0] == ALL_ROUND:
+        return True
+    for j in (0, 2):
+        x, y = sides[k, j], sides[k, j + 1]
+        if x != 0.0 or y != 0.0:
+            away = _widen_to(away, x, y)
+    return away[0] == ALL_ROUND
+
+
+@njit(cache=True)
+def box(low: Floats, high: Floats) -> Floats:
+    """The floor of ``sweep_walk`` for x and y in intervals of their own; an empty interval has one end."""
+    wide, deep = 1 + (low[0] < high[0]), 1 + (low[1] < high[1])
+    floor = np.zeros((wide * deep, 6))
+    for right in range(wide):
+        for far in range(deep):
+            place = floor[deep * right + far]
+            place[0], place[1] = high[0] if right else low[0], high[1] if far else low[1]
+            place[2] = (2 * right - 1) * (high[0] - low[0])
+            place[5] = (2 * far - 1) * (high[1] - low[1])
+    return floor
+
+
+@njit(cache=True)
+def polygon(corners: Floats) -> Floats:
+    """The floor of ``sweep_walk`` for the hull of corners (k, 2) in order around it [m]."""
+    floor = np.empty((len(corners), 6))
+    for i in range(len(corners)):
+        before, after = corners[i - 1], corners[(i + 1) % len(corners)]
+        floor[i, 0], floor[i, 1] = corners[i, 0], corners[i, 1]
+        floor[i, 2], floor[i, 3] = corners[i, 0] - before[0], corners[i, 1] - before[1]
+        floor[i, 4], floor[i, 5] = corners[i, 0] - after[0], corners[i, 1] - after[1]
+    return floor
+
+
+@njit(cache=True)
+def _away_from_turned(x: float, y: float, copy: int, made: int, cosines: Floats, sines: Floats) -> Cone:
+    """Directions from the other turned copies of a point to this one."""
+    away = (EMPTY, 0.0, 0.0, 0.0, 0.0)
+    if x == 0.0 and y == 0.0:
+        return away
+    for other in range(made):
+        if other != copy:
+            c, s = cosines[copy] - cosines[other], sines[copy] - sines[other]
+            away = _widen(away, c * x - s * y, s * x + c * y)
+    return away
+
+
+@njit(cache=True)
+def _widen(cone: Cone, x: float, y: float) -> Cone:
+    """The cone with another direction in it; a zero vector is none."""
+    length = np.sqrt(x * x + y * y)
+    if cone[0] == ALL_ROUND or length == 0.0:
+        return cone
+    return _widen_to(cone, x / length, y / length)
+
+
+@njit(cache=True)
+def _widen_to(cone: Cone, x: float, y: float) -> Cone:
+    """The cone with a unit vector in it."""
+    kind, ax, ay, bx, by = cone
+    if kind == ALL_ROUND:
+        return cone
+    if kind == EMPTY:
+        return POINTED, x, y, x, y
+    from_a, to_b = ax * y - ay * x, x * by - y * bx
+    if from_a < -_SAME and to_b < -_SAME:
+        return ALL_ROUND, 0.0, 0.0, 0.0, 0.0
+    if from_a < 0.0 <= to_b:
+        return POINTED, x, y, bx, by
+    if to_b < 0.0 <= from_a:
+        return POINTED, ax, ay, x, y
+    return cone
+
+
+@njit(cache=True)
+def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floats:
+    """(count, 4) two level directions (x, y, x, y), from which on and between which a small step leads inside.
+
+    They are next to the edges of what the triangles at a corner allow, and zero where they allow or prove none.
+    """
+    normals = [(EMPTY, 0.0, 0.0, 0.0, 0.0) for _ in range(count)]
+    for f in range(faces):
+        for k in (A, B, C):
+            i = work.faces[POINT, work.faces[k, f]]
+            normals[i] = _widen(normals[i], work.planes[NX, f], work.planes[NY, f])
+    steps = np.zeros((count, 4))
+    for i in range(count):
+        kind, ax, ay, bx, by = normals[i]
+        if kind != POINTED:
+            continue
+        for k, x, y in ((0, -by, bx), (2, ay, -ax)):  # at right angles to the outermost normals
+            x, y = x - _OFF_EDGE * (ax + bx), y - _OFF_EDGE * (ay + by)
+            px, py = points[i, 0] + _STEP_M * x, points[i, 1] + _STEP_M * y
+            if is_inside(px, py, points[i, 2], faces, work.planes):
+                steps[i, k], steps[i, k + 1] = x, y
+    return steps

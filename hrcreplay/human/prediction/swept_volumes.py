@@ -1,0 +1,387 @@
+"""Swept volumes that enclose: every motion of model (25) with the stops (34), over all times, from all likely states.
+
+Why no motion leaves them, step by step:
+
+1. States. Each joint's position and velocity are within ``sigmas`` deviations of the estimate, whatever their
+   correlation: a box around it. World velocities are turned into the body's frame over all headings of the box.
+2. Joints. Heading, torso and arm joints stay in the intervals of ``excursion`` at all times; stops that depend on
+   other joints are taken over the intervals of those.
+3. Walking. The pelvis stays in the convex polygon of ``stroll`` at all times.
+4. Limbs. A limb at any instant is a chain of rotations, each by an angle of its interval, then a displacement of the
+   polygon. Sweeping a convex set by all angles of a joint and by all displacements, each regardless of the others,
+   holds all combinations, among them those that occur. A swept set is kept as points whose hull holds it: rotations
+   are linear, so the hull of the swept points holds the swept hull. Arcs are in triangles with their apexes outside,
+   and points are only dropped where they are proven to be inside the rest (``sweep``, ``walk``, ``corners``). Where
+   that leaves too many, the polytope of ``outer`` takes their place, which holds them all. It may be cut back to the
+   ball that no point of the limb can leave, because a direction's number may be any that is not below the truth.
+5. Lengths. A limb is drawn as long as it may be: its far end goes out along a line through the near one. An unknown
+   length further up the chain displaces the limb by no more than its error, which is added to the radius.
+6. Rounding. The steps are exact in real numbers; in floating point they are off by less than 1e-12 m for people within
+   a kilometre of the origin. Radii are larger by ``ROUNDING_M``. That is no tolerance for motions outside.
+
+The lower body is the line from the floor to the pelvis with its own radius, walking along: that of people who stand, or
+as far out as cameras have seen hips, knees and feet lately (``residual``).
+
+The space that the person can reach within the horizon, limb by limb: Alg. 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
+from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
+from hrcreplay.human.model import LimitSet
+from hrcreplay.human.prediction.reachable_sets import SOUND, bounds_of, code_of, never_measured, reach_row
+from hrcreplay.human.prediction.sound_reach import STANDARD, Likely, Margins, enclose_row, likely
+from hrcreplay.human.prediction.sweep import (
+    MOST_COPIES,
+    TRIANGLE_RAD,
+    box,
+    copies,
+    kinematic_chain,
+    polygon,
+    sweep_rot,
+    sweep_walk,
+)
+from hrcreplay.human.prediction.walking_reach import SIDES
+from hrcreplay.records import BODY, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes
+
+#: A larger set is reduced before the next rotation: below, it costs less to carry all points along.
+_WORTH_REDUCING = 50
+#: A larger result is reduced once more: walking leaves few points too many unless the person can turn far.
+_TOO_MANY = 256
+
+
+@dataclass(frozen=True)
+class Radii:
+    """Radii of the balls that give the limbs their thickness, Eq. (41). Defaults: Table 2 [m]."""
+
+    head: float = 0.12
+    thorax: float = 0.15
+    upper_arm: float = 0.07
+    lower_arm: float = 0.07
+
+    def of_limbs(self) -> Floats:
+        """(6,) in the order of LIMBS [m]."""
+        upper, lower = self.upper_arm, self.lower_arm
+        return np.array([self.head, self.thorax, upper, lower, upper, lower])
+
+
+def predict(
+    states: HumanStates,
+    limits: LimitSet,
+    *,
+    horizon_s: float,
+    radii: Radii,
+    method: str,
+    margins: Margins = STANDARD,
+) -> SweptVolumes:
+    """Swept volumes of all limbs from the reachable sets of the joints: Alg. 2, or what encloses them all (``sound``).
+
+    Args:
+        states: The fused person; a row gives the same bits alone and among others.
+        limits: Bounds on the joints.
+        horizon_s: Braking time T_s of the robot [s].
+        radii: Table 2.
+        method: One of ``reach.METHODS``.
+        margins: What ``sound`` adds; the printed methods add nothing.
+
+    Returns:
+        Points whose convex hulls are those of Alg. 2: every corner of a hull is among them, and few others. For
+        ``sound``, points whose hulls enclose all motions; with ``margins.legs`` the last limb is ``LEGS``. A limb whose
+        state or lengths are NaN has one NaN vertex.
+
+    Raises:
+        SettingsError: There is no such method.
+    """
+    code, radius = code_of(method), radii.of_limbs()
+    if code == SOUND:
+        vertices, offsets = sweep_sound(states, bounds_of(limits), limits.coupled, horizon_s, margins)
+        limbs = BODY if margins.legs else LIMBS
+        return SweptVolumes(states.t_ns, offsets, vertices, sound_radii(states, radius, margins), limbs, method)
+    vertices, offsets = _predict_rows(
+        np.ascontiguousarray(states.p),
+        np.ascontiguousarray(states.v),
+        never_measured(states),
+        np.ascontiguousarray(states.lengths_m),
+        bounds_of(limits),
+        limits.coupled,
+        horizon_s,
+        code,
+        surface(),
+    )
+    return SweptVolumes(states.t_ns, offsets, vertices, np.tile(radius, (len(states), 1)), LIMBS, method)
+
+
+@njit(cache=True)
+def _predict_rows(
+    p: Floats,
+    v: Floats,
+    never: Bools,
+    lengths: Floats,
+    bounds: Floats,
+    coupled: bool,
+    horizon: float,
+    method: int,
+    work: Surface,
+) -> tuple[Floats, Ints]:
+    limbs = 6
+    offsets = np.zeros(len(p) * limbs + 1, np.int64)
+    vertices = np.empty((len(p) * 256 + 256, 3))
+    low, high = np.empty(12), np.empty(12)
+    n = 0
+    for i in range(len(p)):
+        reach_row(p[i], v[i], never[i], bounds, coupled, horizon, method, low, high)
+        for limb in range(limbs):
+            swept, count = _sweep_limb(limb, low, high, lengths[i], work)
+            if n + count > len(vertices):
+                roomier = np.empty((2 * (n + count), 3))
+                roomier[:n] = vertices[:n]
+                vertices = roomier
+            vertices[n : n + count] = swept[:count]
+            n += count
+            offsets[i * limbs + limb + 1] = n
+    return vertices[:n].copy(), offsets
+
+
+@njit(cache=True)
+def _sweep_limb(limb: int, low: Floats, high: Floats, lengths: Floats, work: Surface) -> tuple[Floats, int]:
+    """Alg. 2 for one limb, given the reachable intervals (12,) and the lengths (8,)."""
+    points, chain = kinematic_chain(limb, low, high, lengths)
+    if not np.isfinite(points.sum() + chain.sum() + low[:3].sum() + high[:3].sum()):
+        return np.full((1, 3), np.nan), 1
+    count, faces = len(points), 0
+    for k, step in enumerate(chain):
+        swept = np.empty((MOST_COPIES * count, 3))
+        count = sweep_rot(points, count, int(step[0]), step[1], step[2], swept)
+        points = swept
+        for i in range(count):
+            for axis in range(3):
+                points[i, axis] += step[3 + axis]
+        if count > _WORTH_REDUCING or k == len(chain) - 1:
+            count, faces = keep_corners(points, count, work)
+    swept = np.empty((4 * MOST_COPIES * count, 3))
+    count = sweep_walk(points, count, faces, work, (low[2], high[2]), box(low, high), swept)
+    if count > _TOO_MANY:
+        count, faces = keep_corners(swept, count, work)
+    return swept, count
+
+
+#: Added to every radius: more than all rounding on the way [m].
+ROUNDING_M = 1e-9
+#: More points than a rotation or walking may make: the polytope around them is made instead.
+MOST_COPIED = 2000
+#: Beyond this many, walking makes triangles of 60 degrees.
+MOST_FINE = 700
+#: Only smaller sets are reduced to their corners: the time goes with the square.
+MOST_REDUCED = 256
+#: Largest angle of a triangle around an arc: its apex is then at most 3.6 % of the radius off [rad].
+FINE_RAD = np.pi / 6.0
+#: More corners than this at the end are replaced by the polytope around them.
+MOST_CORNERS = 256
+#: A larger set is reduced before the next rotation.
+_MANY_CORNERS = 40
+#: From the middle of a leg, where cameras put its points, to the skin: a thigh 0.5 m around [m].
+THIGH_M = 0.08
+_HEAD, _THORAX, _LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
+
+
+def sweep_sound(
+    states: HumanStates, bounds: Floats, coupled: bool, horizon_s: float, margins: Margins
+) -> tuple[Floats, Ints]:
+    """Vertices (m, 3) of all ticks and limbs [m], and the offsets of ``SweptVolumes``.
+
+    Args:
+        states: The fused person.
+        bounds: (6, 12) of ``reach.bounds_of``.
+        coupled: Whether (34b), (34c) hold.
+        horizon_s: Braking time T_s of the robot [s].
+        margins: What is added to the model.
+    """
+    return _sweep_rows(
+        likely(states, margins),
+        np.ascontiguousarray(states.lengths_m),
+        np.ascontiguousarray(margins.sigmas * states.lengths_std_m),
+        bounds,
+        coupled,
+        horizon_s + margins.latency_s,
+        margins.memory_s,
+        margins.hand_m,
+        len(LIMBS) + margins.legs,
+        surface(),
+    )
+
+
+def sound_radii(states: HumanStates, limbs_m: Floats, margins: Margins) -> Floats:
+    """(n, limbs) radii: of the limb (6,) [m], of what an unknown length up the chain displaces, and the residual.
+
+    A residual that is not known yet (NaN) is taken to be ``margins.residual_m``. The lower body has the thorax's, which
+    tells how far the pelvis is from where it stands upright: who squats has the knees where the hips were. That of the
+    legs is how far their middles were from the line below the pelvis; where it and a thigh are more, they are the
+    radius. Legs that were close when they were last seen make it no smaller: a table may hide that they are not now.
+    """
+    found = np.empty((len(states), len(LIMBS) + margins.legs))
+    unknown_m = margins.residual_m if margins.residual else np.nan
+    _radii_rows(
+        margins.sigmas * states.lengths_std_m, states.residual_m, limbs_m, margins.legs_radius_m, unknown_m, found
+    )
+    return found
+
+
+@njit(cache=True)
+def _radii_rows(off: Floats, residual: Floats, limbs: Floats, legs: float, unknown: float, found: Floats) -> None:
+    """Writes the radii; without the residual where ``unknown``, what stands for one not known yet, is NaN."""
+    for i in range(len(off)):
+        pelvis = off[i, 0]
+        shoulder = pelvis + np.hypot(off[i, 1], off[i, 3])
+        displaced = (pelvis, pelvis, shoulder, shoulder + off[i, 5], shoulder, shoulder + off[i, 4])
+        for limb in range(found.shape[1]):
+            base = legs + ROUNDING_M if limb == _LEGS else limbs[limb] + displaced[limb] + ROUNDING_M
+            of = _THORAX if limb == _LEGS else limb
+            further = unknown if np.isnan(residual[i, of]) else residual[i, of]
+            found[i, limb] = base if np.isnan(unknown) else base + further
+        if len(found[i]) > _LEGS and not np.isnan(unknown):  # no less than where they were seen
+            found[i, _LEGS] = np.fmax(found[i, _LEGS], residual[i, _LEGS] + (THIGH_M + ROUNDING_M))
+
+
+@njit(cache=True)
+def _sweep_rows(
+    at: Likely,
+    lengths: Floats,
+    lengths_off: Floats,
+    bounds: Floats,
+    coupled: bool,
+    horizon: float,
+    memory: float,
+    hand: float,
+    limbs: int,
+    work: Surface,
+) -> tuple[Floats, Ints]:
+    offsets = np.zeros(len(at.p) * limbs + 1, np.int64)
+    vertices = np.empty((len(at.p) * limbs * 80 + 80, 3))
+    low, high, corners = np.empty(12), np.empty(12), np.empty((SIDES, 2))
+    n = 0
+    for i in range(len(at.p)):
+        enclose_row(i, at, bounds, coupled, horizon, memory, low, high, corners)
+        for limb in range(limbs):
+            if limb == _LEGS:
+                swept, count = _legs(corners, lengths[i, 0] + lengths_off[i, 0])
+            else:
+                swept, count = _limb(limb, low, high, corners, lengths[i], lengths_off[i], hand, work)
+            if n + count > len(vertices):
+                roomier = np.empty((2 * (n + count), 3))
+                roomier[:n] = vertices[:n]
+                vertices = roomier
+            vertices[n : n + count] = swept[:count]
+            n += count
+            offsets[i * limbs + limb + 1] = n
+    return vertices[:n].copy(), offsets
+
+
+@njit(cache=True)
+def _legs(corners: Floats, height: float) -> tuple[Floats, int]:
+    """From the floor to the highest pelvis, wherever it walks."""
+    if not np.isfinite(corners.sum() + height):
+        return np.full((1, 3), np.nan), 1
+    swept = np.zeros((2 * SIDES, 3))
+    swept[:SIDES, :2], swept[SIDES:, :2], swept[SIDES:, 2] = corners, corners, height
+    return swept, len(swept)
+
+
+@njit(cache=True)
+def _limb(
+    limb: int, low: Floats, high: Floats, corners: Floats, lengths: Floats, off: Floats, hand: float, work: Surface
+) -> tuple[Floats, int]:
+    """Points around all that a limb reaches; a NaN vertex where the state or the lengths are NaN."""
+    ends, chain = kinematic_chain(limb, low, high, lengths)
+    ends = _longest(limb, ends, off, hand)
+    if not np.isfinite(ends.sum() + chain.sum() + corners.sum() + low[2] + high[2]):
+        return np.full((1, 3), np.nan), 1
+    points, count, faces = _turn_all(ends, chain, work)
+    fine = count * copies(low[2], high[2], FINE_RAD) * SIDES <= MOST_FINE
+    widest = FINE_RAD if fine else TRIANGLE_RAD
+    room = count * copies(low[2], high[2], widest) * SIDES
+    if count <= MOST_REDUCED and room <= MOST_COPIED:
+        swept = np.empty((room, 3))
+        many = sweep_walk(points, count, faces, work, (low[2], high[2]), polygon(corners), swept, widest)
+        if many > MOST_CORNERS:
+            many, _ = keep_corners(swept, many, work)
+        if many <= MOST_CORNERS:
+            return swept, many
+    return _walk(points, count, low[2], high[2], corners)
+
+
+@njit(cache=True)
+def _turn_all(ends: Floats, chain: Floats, work: Surface) -> tuple[Floats, int, int]:
+    """Points around what the rotations of a chain make of a limb's ends, how many, and triangles around them."""
+    points, count, faces = ends, len(ends), 0
+    radius = 0.0  # of the ball around the frame's origin that holds the limb
+    for end in ends:
+        radius = max(radius, np.sqrt(end[0] ** 2 + end[1] ** 2 + end[2] ** 2))
+    for k, step in enumerate(chain):
+        axis, low, high = int(step[0]), step[1], step[2]
+        room = count * copies(low, high, FINE_RAD)
+        if room <= MOST_COPIED:
+            swept = np.empty((room, 3))
+            count = sweep_rot(points, count, axis, low, high, swept, FINE_RAD)
+        else:
+            swept = np.empty((CORNERS, 3))
+            count = _turn(points, count, axis, low, high, radius, swept)
+        points = swept
+        for i in range(count):
+            for j in range(3):
+                points[i, j] += step[3 + j]
+        faces = 0
+        if room <= MOST_REDUCED and (count > _MANY_CORNERS or k == len(chain) - 1):
+            count, faces = keep_corners(points, count, work)
+        radius += np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+    return points, count, faces
+
+
+@njit(cache=True)
+def _longest(limb: int, ends: Floats, off: Floats, hand: float) -> Floats:
+    """The limb's end points, drawn out to where lengths up to ``off`` (8,) longer or shorter may put them [m]."""
+    if limb == _HEAD:
+        ends[0, 2] -= off[1]
+        ends[1, 2] += off[1] + off[2]
+        return ends
+    if limb == _THORAX:
+        if off[1] == 0.0 and off[3] == 0.0:
+            return ends
+        wide = np.concatenate((ends, ends[1:]))
+        for i in range(1, 5):
+            wide[i, 1] += off[3] if wide[i, 1] > 0.0 else -off[3]
+            wide[i, 2] += off[1] if i > 2 else -off[1]
+        return wide
+    left = limb >= 4
+    if limb in (2, 4):
+        ends[1, 2] -= off[4] if left else off[5]
+    else:
+        ends[1, 2] -= hand + (off[6] if left else off[7])
+    return ends
+
+
+@njit(cache=True)
+def _turn(points: Floats, count: int, axis: int, low: float, high: float, radius: float, swept: Floats) -> int:
+    far = np.full(len(DIRECTIONS), -np.inf)
+    reach_turning(points, count, axis, low, high, far)
+    for d in range(len(far)):
+        far[d] = min(far[d], radius)
+    return around(far, swept)
+
+
+@njit(cache=True)
+def _walk(points: Floats, count: int, low: float, high: float, corners: Floats) -> tuple[Floats, int]:
+    far = np.full(len(DIRECTIONS), -np.inf)
+    reach_turning(points, count, 2, low, high, far)
+    for d in range(len(far)):
+        there = -np.inf
+        for k in range(SIDES):
+            there = max(there, DIRECTIONS[d, 0] * corners[k, 0] + DIRECTIONS[d, 1] * corners[k, 1])
+        far[d] += there
+    swept = np.empty((CORNERS, 3))
+    return swept, around(far, swept)

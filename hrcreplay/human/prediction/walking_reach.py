@@ -1,0 +1,147 @@
+"""Where model (25) can walk: a polygon around all displacements, over all headings, velocities and times.
+
+The displacement at time t along u(phi) is the integral of u . Rz(theta) (v, v_perp). At every instant theta, v and
+v_perp are in intervals of their own, so the integral is at most that of
+
+    F(tau) = max over theta, v, v_perp in their intervals at tau of u . Rz(theta) (v, v_perp).
+
+Time is cut where a velocity profile bends and in between. In a piece theta is taken from its interval at the piece's
+end, which holds all earlier ones; the ends of the velocity intervals are then linear in tau, and F, the largest of
+linear functions of them, is convex: the trapezoid is never below its integral. So is that of max(0, F), which bounds
+what an instant inside the piece can gain.
+
+Neighbouring sides of the polygon meet in its corners. A direction between theirs is a sum of both with weights >= 0,
+so no displacement is further along it than the corner: the hull of the corners encloses them, whatever the sides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.prediction.joint_reach import fastest, rise, saturation_s
+from hrcreplay.records import Floats
+
+#: Sides of the polygon; the first looks ahead.
+SIDES = 8
+#: Equal pieces of the horizon, beside the cuts where profiles bend.
+_PIECES = 4
+
+Range = tuple[float, float]
+
+
+@njit(cache=True)
+def turned_range(x: float, y: float, low: float, high: float) -> Range:
+    """Range of x cos(phi) + y sin(phi) for phi in [low, high]."""
+    middle, half = 0.5 * (low + high), min(0.5 * (high - low), np.pi)
+    c, s = np.cos(middle), np.sin(middle)
+    along, across, radius = c * x + s * y, c * y - s * x, np.sqrt(x * x + y * y)
+    cos_half, sin_half = np.cos(half), np.sin(half)
+    ends = along * cos_half, abs(across) * sin_half
+    most = radius if along >= cos_half * radius else ends[0] + ends[1]
+    least = -radius if -along >= cos_half * radius else ends[0] - ends[1]
+    return least, most
+
+
+@njit(cache=True)
+def body_velocity(v: Floats, spread: Floats, heading: Range) -> tuple[Range, Range]:
+    """Ranges of v and v_perp, Eq. (33), for a velocity in v +- spread (2,), world, and any heading in the range."""
+    forward = turned_range(v[0], v[1], heading[0], heading[1])
+    left = turned_range(v[1], -v[0], heading[0], heading[1])
+    cosine = turned_range(1.0, 0.0, heading[0], heading[1])
+    sine = turned_range(0.0, 1.0, heading[0], heading[1])
+    c, s = max(-cosine[0], cosine[1]), max(-sine[0], sine[1])
+    ahead, aside = c * spread[0] + s * spread[1], s * spread[0] + c * spread[1]
+    return (forward[0] - ahead, forward[1] + ahead), (left[0] - aside, left[1] + aside)
+
+
+@njit(cache=True)
+def walked(heading: Range, velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float, far: Floats) -> None:
+    """Adds to far (SIDES,) how far the pelvis gets along each side's direction at any time in [0, horizon] [m].
+
+    Args:
+        heading: Initial headings [rad].
+        velocity: Initial v, v_perp and omega [m/s, m/s, rad/s].
+        bounds: (6, 12) of ``reach.bounds_of``.
+        horizon: [s].
+        far: Receives the sums.
+    """
+    cuts = _cuts(velocity, bounds, horizon)
+    total, largest = np.zeros(SIDES), np.zeros(SIDES)
+    middle = 0.5 * (heading[0] + heading[1])
+    box = _box(velocity, bounds, 0.0)
+    for i in range(len(cuts) - 1):
+        step, later = cuts[i + 1] - cuts[i], _box(velocity, bounds, cuts[i + 1])
+        turn = _turn(velocity[2], bounds, cuts[i + 1])
+        low, high = heading[0] - turn[0] - middle, heading[1] + turn[1] - middle
+        for side in range(SIDES):
+            phi = 2.0 * np.pi * side / SIDES
+            before, after = _farthest(box, phi - high, phi - low), _farthest(later, phi - high, phi - low)
+            gain = 0.5 * step * (max(before, 0.0) + max(after, 0.0))
+            largest[side] = max(largest[side], total[side] + gain)
+            total[side] += 0.5 * step * (before + after)
+        box = later
+    for side in range(SIDES):
+        far[side] += largest[side]
+
+
+@njit(cache=True)
+def _turn(omega: Range, bounds: Floats, t: float) -> Range:
+    """How far the heading can turn to the right and to the left at any time until t [rad]."""
+    least, most, brake, gain = bounds[2, 2], bounds[3, 2], bounds[4, 2], bounds[5, 2]
+    return rise(-omega[0], -least, -brake, -gain, t), rise(omega[1], most, gain, brake, t)
+
+
+@njit(cache=True)
+def turned(heading: Range, omega: Range, bounds: Floats, horizon: float) -> Range:
+    """All headings at any time in [0, horizon] [rad]."""
+    turn = _turn(omega, bounds, horizon)
+    return heading[0] - turn[0], heading[1] + turn[1]
+
+
+@njit(cache=True)
+def _cuts(velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float) -> Floats:
+    cuts = np.empty(_PIECES + 5)
+    for i in range(_PIECES + 1):
+        cuts[i] = horizon * i / _PIECES
+    for k in range(2):
+        least, most, brake, gain = bounds[2, k], bounds[3, k], bounds[4, k], bounds[5, k]
+        v = velocity[k]
+        cuts[_PIECES + 1 + 2 * k] = min(horizon, saturation_s(v[1], most, gain, brake))
+        cuts[_PIECES + 2 + 2 * k] = min(horizon, saturation_s(-v[0], -least, -brake, -gain))
+    cuts.sort()
+    return cuts
+
+
+@njit(cache=True)
+def _box(velocity: tuple[Range, Range, Range], bounds: Floats, t: float) -> tuple[Range, Range]:
+    """Intervals of v and v_perp at time t."""
+    ahead, left = velocity[0], velocity[1]
+    return _speeds(ahead, bounds, 0, t), _speeds(left, bounds, 1, t)
+
+
+@njit(cache=True)
+def _speeds(v: Range, bounds: Floats, k: int, t: float) -> Range:
+    least, most, brake, gain = bounds[2, k], bounds[3, k], bounds[4, k], bounds[5, k]
+    return -fastest(-v[0], -least, -brake, -gain, t), fastest(v[1], most, gain, brake, t)
+
+
+@njit(cache=True)
+def _farthest(box: tuple[Range, Range], low: float, high: float) -> float:
+    """F: largest v cos(psi) + v_perp sin(psi) over the box and psi in [low, high]; at a corner, for it is convex."""
+    largest = -np.inf
+    for v in box[0]:
+        for v_perp in box[1]:
+            largest = max(largest, turned_range(v, v_perp, low, high)[1])
+    return largest
+
+
+@njit(cache=True)
+def corners_of(far: Floats, ahead: float, corners: Floats) -> None:
+    """Writes into corners (SIDES, 2) where the polygon's neighbouring sides meet; ``ahead``: its first direction."""
+    step = 2.0 * np.pi / SIDES
+    for i in range(SIDES):
+        after = (i + 1) % SIDES
+        a, b = ahead + step * i, ahead + step * (i + 1)
+        corners[i, 0] = (far[i] * np.sin(b) - far[after] * np.sin(a)) / np.sin(step)
+        corners[i, 1] = (far[after] * np.cos(a) - far[i] * np.cos(b)) / np.sin(step)

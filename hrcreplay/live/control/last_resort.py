@@ -1,0 +1,155 @@
+"""What answers the robot when control itself has crashed: it brakes from what was sent last, and needs nothing else.
+
+Neither pilot nor stages, session or codec are used: whichever of them failed, the robot is told to stop. Numbers are in
+degrees as they go over the link.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from hrcreplay.egm import motion_link_pb2 as messages
+from hrcreplay.egm.link import Received
+from hrcreplay.live.control import watchdog
+from hrcreplay.live.control.loop import FAREWELLS, Loop
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import Answer, MotionRow, Signal
+from hrcreplay.robot.control.control_step import BRAKING
+
+#: A robot that says nothing for so many waits of the link has stopped listening; it stops by itself.
+_SILENCES = 25
+
+_COUNTER = 2**32
+
+
+@dataclass
+class Brake:
+    """Each axis as fast as it can, Eq. (67), from the last reply on; positions stay within limits."""
+
+    ddq_max: Sequence[float]  #: [deg/s^2]
+    q_min: Sequence[float]  #: [deg]
+    q_max: Sequence[float]  #: [deg]
+    cycle_s: float
+    tracking: float  #: a robot further than this from what it was told begins anew where it is [deg]
+    q: list[float]  #: told last [deg]
+    dq: list[float]  #: told last [deg/s]
+    seqno: int  #: of the last reply
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the robot has been told to stand."""
+        return not any(self.dq)
+
+    def hear(self, measured: Sequence[float]) -> None:
+        """Takes where the robot says it is [deg]."""
+        if max(abs(m - q) for m, q in zip(measured, self.q, strict=True)) > self.tracking:
+            self.q, self.dq = list(measured), [0.0] * len(measured)
+
+    def step(self, tm_ms: int) -> bytes:
+        """The reply of one cycle, with our own stamp [ms]."""
+        for axis, (q, dq) in enumerate(zip(self.q, self.dq, strict=True)):
+            slower = math.copysign(max(0.0, abs(dq) - self.ddq_max[axis] * self.cycle_s), dq)
+            there = q + 0.5 * self.cycle_s * (dq + slower)
+            held = min(max(there, min(self.q_min[axis], q)), max(self.q_max[axis], q))
+            self.q[axis], self.dq[axis] = held, slower if held == there else 0.0
+        self.seqno = (self.seqno + 1) % _COUNTER
+        message = messages.SensorMessage()
+        message.header.seqno, message.header.tm = self.seqno, tm_ms % _COUNTER
+        message.header.mtype = messages.TYPE_CORRECTION
+        message.planned.joints.joints.extend(self.q)
+        message.speed_reference.joints.joints.extend(self.dq)
+        return bytes(message.SerializeToString())
+
+
+def bring_to_rest(loop: Loop, why: str) -> None:
+    """Answers the robot until it stands. Does nothing where nothing was sent: then it has not been moved.
+
+    Where not even the link can be read, the replies go at the robot's pace to where its packets last came from.
+
+    Args:
+        loop: That crashed.
+        why: What the record is to say of it.
+    """
+    with suppress(Exception):
+        if loop.pilot.stop != watchdog.FAULT:
+            loop.pilot.stop = watchdog.FAULT
+            loop.pilot.stops.append((loop.now_ns(), watchdog.FAULT))
+        loop.recorder.send(codec.event(loop.now_ns(), {"what": "crash", "text": why}))
+    brake, sender = _brake(loop), loop.sender
+    if brake is None or sender is None:
+        return
+    standing = silences = 0
+    received = loop.pending
+    while standing < FAREWELLS and silences < _SILENCES:
+        try:
+            received = received or loop.link.newest()
+        except Exception:  # whatever it is
+            time.sleep(brake.cycle_s)
+        else:
+            if received is None:
+                silences += 1
+                continue
+        sender = received.sender if received is not None else sender
+        measured = None if received is None else _measured(received.data)
+        if received is None or measured is not None:
+            if measured is not None:
+                brake.hear(measured)
+            before = list(brake.q), list(brake.dq)
+            data = brake.step(loop.now_ns() // 1_000_000)
+            with suppress(Exception):
+                loop.link.answer(data, sender)
+            with suppress(Exception):  # the record is worth less than the stop
+                _record(loop, received, measured, before, brake, data)
+            standing = standing + 1 if brake.at_rest else 0
+        received = None
+
+
+def _brake(loop: Loop) -> Brake | None:
+    if loop.sent is None:
+        return None
+    told = messages.SensorMessage.FromString(loop.sent)
+    robot, setup = loop.pilot.setup.robot, loop.pilot.setup
+    ddq_max, q_min, q_max = (np.degrees(bound).tolist() for bound in (robot.ddq_max, robot.q_min, robot.q_max))
+    q, dq = list(told.planned.joints.joints), list(told.speed_reference.joints.joints)
+    tracking = math.degrees(setup.bounds.tracking_rad)
+    return Brake(ddq_max, q_min, q_max, setup.plan.dt_s, tracking, q, dq, told.header.seqno)
+
+
+def _measured(data: bytes) -> list[float] | None:
+    """Where the robot is [deg]; None of a datagram that does not say it."""
+    try:
+        joints = list(messages.RobotMessage.FromString(data).feed_back.joints.joints)
+    except DecodeError:
+        return None
+    return joints if len(joints) == 6 and all(map(math.isfinite, joints)) else None
+
+
+def _record(
+    loop: Loop,
+    received: Received | None,
+    measured: list[float] | None,
+    before: tuple[list[float], list[float]],
+    brake: Brake,
+    data: bytes,
+) -> None:
+    """A row of the motion like any other; what only the stages know is missing in it."""
+    t_ns = loop.now_ns() if received is None else received.t_ns + loop.anchor_ns
+    datagrams = () if received is None else (*received.older, received.data)
+    for datagram in datagrams:
+        loop.recorder.send(codec.robot(t_ns, datagram))
+    q, dq = (np.radians(numbers) for numbers in before)
+    u = (np.radians(brake.dq) - dq) / brake.cycle_s
+    where = np.full(len(q), np.nan) if measured is None else np.radians(measured)
+    unknown = np.full(3, np.nan)
+    row = MotionRow(where, q, dq, u, unknown, unknown, np.full(4, np.nan))
+    phase = codec.HOLDING if brake.at_rest else codec.STOPPING
+    answer = Answer(t_ns, 0, data, phase, BRAKING, watchdog.FAULT, -1, -1, row)
+    loop.recorder.send(codec.answer(answer, Signal.NONE, len(datagrams), 0))
+    loop.recorder.send(codec.reply(t_ns, data, sent=True))

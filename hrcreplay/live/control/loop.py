@@ -1,0 +1,209 @@
+"""The control loop: a packet, an answer, a look; everything else is told to others and waited for by nobody.
+
+A look that lasts into the next packet makes its answer late. The look after that answer is left out, so that the one
+after it is on time again: what the robot keeps clear of is then a cycle older (`live.reaction_s` has room for that).
+
+Percentiles of many short times in little memory.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hrcreplay.egm.link import Address, Link, Received
+from hrcreplay.live.control.pilot import Pilot
+from hrcreplay.live.control.watchdog import REFUSED
+from hrcreplay.live.processes import Helper
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import Answer, Signal, TickEvent
+
+_BIN_NS = 5_000
+_BINS = 20_000  # up to 0.1 s; the last one holds all that took longer
+
+
+class Durations:
+    """A histogram in steps of 5 us."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(_BINS, dtype=np.int64)
+
+    def add(self, duration_ns: int) -> None:
+        """One more."""
+        self._counts[min(max(duration_ns, 0) // _BIN_NS, _BINS - 1)] += 1
+
+    def quantiles_us(self, *shares: float) -> list[float] | None:
+        """Upper ends of the steps in which these shares of all lie; None where there is nothing [us]."""
+        total = np.cumsum(self._counts)
+        if not total[-1]:
+            return None
+        places = np.searchsorted(total, np.ceil(np.array(shares) * total[-1]))
+        return [float((place + 1) * _BIN_NS / 1e3) for place in places]
+
+
+#: Signals after which the session ends as soon as the robot stands. A process that is gone does not come back.
+ENDING = (
+    Signal.INTERRUPT
+    | Signal.TERMINATE
+    | Signal.DURATION
+    | Signal.PERSON_ENDED
+    | Signal.PERSON_DEAD
+    | Signal.RECORDER_DEAD
+    | Signal.SCREEN_DEAD
+)
+
+#: Answers at speed 0 before we leave: a robot keeps obeying the last one.
+FAREWELLS = 5
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """What the loop itself watches; see sections_live.Live."""
+
+    duration_s: float  #: inf: until it is stopped
+    sending: bool
+    person_late_s: float
+    overrun_s: float
+    keep_recorder: bool
+    store_every_s: float  #: between two looks whose volumes are recorded whole
+
+
+@dataclass
+class Loop:
+    """One session's loop. ``now_ns`` is the session's clock."""
+
+    pilot: Pilot
+    link: Link
+    person: Helper
+    recorder: Helper
+    settings: LoopSettings
+    anchor_ns: int
+    start_ns: int
+    screen: Helper | None = None
+    caught: Signal = Signal.NONE  #: by the handlers of the operating system's signals
+    signals: Signal = Signal.NONE  #: of the latest turn
+    notes: list[str] = field(default_factory=list)
+    took: Durations = field(default_factory=Durations)
+    answers: int = 0
+    skipped: int = 0  #: looks left out
+    robot: str | None = None
+    last: Answer | None = None
+    sent: bytes | None = None  #: the latest reply that went to the robot
+    sender: Address | None = None  #: where the robot's packets come from
+    pending: Received | None = None  #: what is not answered yet
+    stored: bytes | None = None  #: the latest swept volumes that were recorded whole
+    _bodies: list[bytes] = field(default_factory=list)
+    _beat_ns: int = 0
+    _late: bool = False
+    _skipped: bool = False
+    _ended: bool = False
+    _stored_ns: int = 0
+
+    def now_ns(self) -> int:
+        """The session's clock: monotonic, beginning at the time of day."""
+        return time.monotonic_ns() + self.anchor_ns
+
+    def begin(self) -> None:
+        """Tells the human side to start."""
+        self.link.clear()
+        self._beat_ns = self.now_ns()
+        self.person.send(b"G" + self.start_ns.to_bytes(8, "little"))
+
+    def turn(self) -> bool:
+        """One turn; False when the session is over."""
+        received = self.pending = self.link.newest()
+        signals = self.signals = self._signals()
+        if received is None:
+            t_ns = self.now_ns()
+            self.pilot.silence(t_ns, signals)
+            self.recorder.send(codec.silence(t_ns, signals))
+        else:
+            self._answer(received, signals)
+        self._skipped = received is not None and received.waited and not self._skipped
+        if self._skipped:
+            self.skipped += 1
+            self.pilot.prepare()
+        else:
+            self._look()
+        return not self._over(signals)
+
+    def _answer(self, received: Received, signals: Signal) -> None:
+        event = TickEvent(received.t_ns + self.anchor_ns, (*received.older, received.data), signals)
+        answer = self.pilot.answer(event)
+        if answer.datagram is not None and self.settings.sending:
+            self.link.answer(answer.datagram, received.sender)
+            self.sent, self.sender = answer.datagram, received.sender
+        self.pending = None
+        took_ns = self.now_ns() - event.t_ns
+        self._late = took_ns > self.settings.overrun_s * 1e9
+        self.robot = "{}:{}".format(*received.sender)
+        for datagram in event.datagrams:
+            self.recorder.send(codec.robot(event.t_ns, datagram))
+        self.recorder.send(codec.answer(answer, signals, len(event.datagrams), took_ns // 1000))
+        if answer.datagram is not None:
+            self.answers += 1
+            self.took.add(took_ns)
+            self.recorder.send(codec.reply(event.t_ns, answer.datagram, sent=self.settings.sending))
+        self.last = answer
+
+    def _look(self) -> None:
+        skeletons = self._hear_person()
+        t_ns = self.now_ns()
+        sight = self.pilot.look(t_ns, skeletons)
+        for skeleton in skeletons:
+            self.recorder.send(codec.frame(t_ns, skeleton))
+        if sight is None:
+            self.recorder.send(codec.event(t_ns, {"what": "blind"}))
+            return
+        self.recorder.send(codec.look(sight.states, sight.volumes, len(skeletons)))
+        if t_ns - self._stored_ns >= self.settings.store_every_s * 1e9:
+            self._stored_ns = t_ns
+            self.stored = codec.whole(sight.volumes)
+            self.recorder.send(self.stored)
+
+    def _hear_person(self) -> list[bytes]:
+        skeletons = []
+        for message in self.person.messages():
+            self._beat_ns = self.now_ns()
+            kind = message[:1]
+            if kind in (b"f", b"F"):
+                self._bodies.append(message[1:])
+                if kind == b"F":  # the last body of its frame: half a frame could be somebody else's
+                    skeletons += self._bodies
+                    self._bodies = []
+            elif kind == b"N":
+                self.note(message[1:].decode(errors="replace"))
+            elif kind == b"Z":
+                self._ended = True
+        return skeletons
+
+    def note(self, text: str) -> None:
+        """Something worth telling and recording."""
+        self.notes.append(text)
+        self.recorder.send(codec.event(self.now_ns(), {"what": "note", "text": text}))
+
+    def _signals(self) -> Signal:
+        now_ns, found = self.now_ns(), self.caught
+        if now_ns - self.start_ns >= self.settings.duration_s * 1e9:
+            found |= Signal.DURATION
+        if self._ended:
+            found |= Signal.PERSON_ENDED
+        elif not self.person.alive:
+            found |= Signal.PERSON_DEAD
+        elif now_ns - self._beat_ns > self.settings.person_late_s * 1e9:
+            found |= Signal.PERSON_LATE
+        if self.settings.keep_recorder and not self.recorder.notice():
+            found |= Signal.RECORDER_DEAD
+        if self.screen is not None and self.screen.crashed():
+            found |= Signal.SCREEN_DEAD
+        if self._late:
+            found |= Signal.OVERRUN
+        return found
+
+    def _over(self, signals: Signal) -> bool:
+        if self.pilot.stop in REFUSED:
+            return True
+        ending = bool(signals & ENDING) or self.pilot.fault is not None
+        return ending and (self.pilot.standing >= FAREWELLS or not self.pilot.connected)

@@ -1,0 +1,100 @@
+"""A live robot's next step: along the way to its programme, along the programme, or to a stop. Nothing is changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hrcreplay.live.control.watchdog import Bounds
+from hrcreplay.records import Floats
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step
+from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.programme.path import approach
+from hrcreplay.robot.programme.reference import Reference
+from hrcreplay.run.followers import QpFollower, ScalingFollower
+
+Follower = QpFollower | ScalingFollower
+
+
+@dataclass(frozen=True)
+class Setup:
+    """All that a session depends on beside what it hears."""
+
+    robot: RobotModel
+    programme: Reference
+    plan: PlanSettings
+    follow: Callable[[Reference, float], Follower]  #: a robot at a programmed time of a path
+    waypoint_m: float  #: the approach is over when the TCP is this close to its end [m]
+    approach_speed: float  #: share of the axes' top speeds on the way to the programme
+    bounds: Bounds
+    memory_s: float  #: a person unseen for longer counts as unknown [s]
+    sending: bool  #: False in shadow mode: the robot does not follow
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Where a robot has got, as far as it was told."""
+
+    state: RobotState
+    programme_s: float  #: of the programme
+    follower: Follower | None = None  #: None: it stands, or brakes
+    arrived: bool = False  #: whether it follows the programme, not the way to it
+
+
+class Said(NamedTuple):
+    """One tick's decision before it is encoded, and where it leads."""
+
+    reference_m: Floats
+    reference_speed: float
+    step: Step
+    after: Course
+
+
+def set_out(setup: Setup, course: Course) -> Course:
+    """From where the robot stands to where its programme has got."""
+    goal = setup.programme.sample(course.programme_s).q
+    follower = setup.follow(approach(setup.robot, course.state.q, goal, setup.approach_speed), 0.0)
+    follower.state = course.state
+    return replace(course, follower=follower, arrived=False)
+
+
+def follow(setup: Setup, course: Course, around: Obstacles) -> Said:
+    """One tick along the path."""
+    if course.follower is None:
+        raise ValueError("follow: the robot has not set out")
+    follower = copy(course.follower)
+    tick = follower.step(around)
+    after = replace(course, state=tick.step.next, follower=follower)
+    if course.arrived:
+        after = replace(after, programme_s=tick.programme_s)
+    elif _at_the_end(setup, follower):
+        follower = setup.follow(setup.programme, course.programme_s)
+        follower.state = tick.step.next
+        after = replace(after, follower=follower, arrived=True)
+    return Said(tick.point.T_world_tcp[:3, 3], float(np.linalg.norm(tick.point.twist[:3])), tick.step, after)
+
+
+def _at_the_end(setup: Setup, follower: Follower) -> bool:
+    """Whether the approach has come to its end."""
+    along_s = follower.s_s if isinstance(follower, QpFollower) else follower.along.s_s
+    if along_s < follower.reference.duration_s:
+        return False
+    goal = follower.reference.sample(along_s).T_world_tcp[:3, 3]
+    pose = setup.robot.pose(follower.state.q, follower.state.dq)
+    return float(np.linalg.norm(pose.T_world_tcp[:3, 3] - goal)) <= setup.waypoint_m
+
+
+def brake(setup: Setup, course: Course, around: Obstacles) -> Said:
+    """Eq. (67): each axis as fast as it can; a robot that stands stays."""
+    robot, plan, state = setup.robot, setup.plan, course.state
+    with np.errstate(all="ignore"):
+        seen = control_step.observe(robot, state, around, plan.clearance_m)
+    step = seen.step(state, control_step.braked(state, robot.ddq_max, plan.dt_s), plan.dt_s, control_step.BRAKING)
+    point = setup.programme.sample(course.programme_s)
+    return Said(point.T_world_tcp[:3, 3], 0.0, step, Course(step.next, course.programme_s))

@@ -1,0 +1,80 @@
+"""The person of a live session: skeletons in, swept volumes out, a look at a time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from hrcreplay.human.fusion import fuse
+from hrcreplay.live.record.codec import Sight
+from hrcreplay.logs import skeleton_pb2
+from hrcreplay.logs.clean import Cleaner, PersonMemory
+from hrcreplay.logs.decoders import points_of
+from hrcreplay.logs.messages import Row, Undecodable
+from hrcreplay.records import CameraFrames
+from hrcreplay.robot.control.separation import obstacles
+from hrcreplay.run.stages import NS, Eyes, Foresight, nothing
+
+
+class Observer:
+    """Stages 1 and 2, fed with what has come since the look before."""
+
+    def __init__(self, eyes: Eyes, foresight: Foresight, cameras: tuple[str, ...], gap_s: float) -> None:
+        self._eyes = eyes
+        self._foresight = foresight
+        self._cameras = cameras
+        self._nothing = nothing(cameras)
+        self._fusion = fuse.start(cameras)
+        self._memory = PersonMemory()
+        self.counts: Counter[str] = Counter()
+        self._cleaner = Cleaner(cameras, gap_s, self.counts)
+        self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
+
+    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Sight:
+        """What is known of the person at ``t_ns``, which must be later than that of the look before.
+
+        Args:
+            t_ns: By the session's clock; the arrival of all that this look takes.
+            skeletons: Serialised Skeleton messages. What cannot be read is counted and left out.
+        """
+        frames = self._frames(t_ns, skeletons)
+        measured = self._nothing
+        if frames is not None:
+            self._memory, measured, found = self._eyes.measure(frames, self._memory)
+            self.counts.update(found)
+            for camera, capture_ns in zip(measured.camera.tolist(), measured.capture_ns.tolist(), strict=True):
+                self.newest_ns[self._cameras[camera]] = capture_ns
+        ticks = np.array([t_ns])
+        self._fusion, states, events = fuse.fuse(self._fusion, ticks, measured, self._eyes.filter, self._eyes.limits)
+        self.counts.update(events)
+        volumes = self._foresight.volumes(states)
+        return Sight(t_ns, states, volumes, obstacles(volumes, 0))
+
+    def age_s(self, t_ns: int) -> float:
+        """How old the newest frame of the person is; inf before the first [s]."""
+        return (t_ns - max(self.newest_ns.values())) / NS if self.newest_ns else float("inf")
+
+    def _frames(self, t_ns: int, skeletons: Sequence[bytes]) -> CameraFrames | None:
+        for data in skeletons:
+            try:
+                row = _row(data)
+            except (DecodeError, Undecodable):
+                self.counts["skeletons_unreadable"] += 1
+                continue
+            if row.camera not in self._cameras:
+                self.counts["skeletons_of_unknown_cameras"] += 1
+                continue
+            # a camera whose clock is ahead has seen nothing of the future
+            self._cleaner.add(row._replace(capture_ns=min(row.capture_ns or t_ns, t_ns)), t_ns)
+        return self._cleaner.rest()
+
+
+def _row(data: bytes) -> Row:
+    skeleton = skeleton_pb2.Skeleton.FromString(data)
+    points = points_of(skeleton.points, skeleton.camera)
+    if len(skeleton.confidence) != len(points):
+        raise Undecodable(f"{skeleton.camera}: {len(skeleton.confidence)} confidences")
+    return Row(skeleton.capture_ns, skeleton.camera, skeleton.body, points, np.array(skeleton.confidence, np.float64))

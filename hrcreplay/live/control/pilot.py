@@ -1,0 +1,234 @@
+"""What the robot is told in a live session. Pure: the same events in the same order give the same bits."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from hrcreplay.egm.codec import AXES, BadPacket, RobotPacket, decode_robot, encode_correction
+from hrcreplay.egm.session import Heard, Session
+from hrcreplay.live.control import watchdog
+from hrcreplay.live.control.motion import Course, Said, Setup, brake, follow, set_out
+from hrcreplay.live.control.perception import Observer
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import Answer, MotionRow, Sight, Signal, TickEvent
+from hrcreplay.records import Floats
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.separation import Obstacles
+
+#: What is kept clear of before the first look: nothing is known, so the robot stands.
+_UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=False)
+_STILL = np.zeros(AXES)
+
+
+class Pilot:
+    """Answers the robot's packets: waits, approaches, follows its programme, brakes by Eq. (67) and holds.
+
+    Between two answers ``look`` brings in what the cameras saw. The robot moves only while the watchdog has no reason
+    against it; one that appears is kept until the session ends, or, where ``resume`` is set, until it has been gone
+    for ``resume_s``. From standing to moving there is but one way: from where the robot stands, at approach speed.
+
+    The step of the next answer follows from what was told and seen last, so a look ends with it, and an answer has only
+    to decide whether it is taken. Where there is no time for a look, ``prepare`` makes the step without one.
+    """
+
+    def __init__(self, setup: Setup, observer: Observer, session: Session) -> None:
+        self.setup = setup
+        self.observer = observer
+        self._session = session
+        self.sight: Sight | None = None
+        self.phase = codec.WAITING
+        self.stop = ""  #: why the robot was stopped; empty while it may move
+        self.stops: list[tuple[int, str]] = []  #: every stop: instant [ns] and reason
+        self.waiting = ""  #: why it does not start
+        self.fault: Exception | None = None  #: a bug that stopped it; to be raised once it stands
+        self.standing = 0  #: answers since it stands
+        self._course: Course | None = None  # None: no robot is there
+        self._ready: tuple[Course, Said] | None = None
+        self._programme_s = 0.0  # of the robot that was there last
+        self._heard_ns: int | None = None
+        self._clear_ns: int | None = None
+        self._behind_ns: int | None = None  # since when every event has packets of several cycles: we are too slow
+
+    @property
+    def connected(self) -> bool:
+        """Whether a robot is being answered."""
+        return self._course is not None
+
+    def counts(self) -> Counter[str]:
+        """What was found of the person's frames and the robot's packets so far."""
+        return self.observer.counts + Counter({f"robot {what}": n for what, n in self._session.counts.items()})
+
+    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Sight | None:
+        """Stages 1 and 2 up to ``t_ns`` [ns, session clock]; None where they failed, which stops the robot."""
+        self._ready = None
+        try:
+            self.sight = self.observer.look(t_ns, skeletons)
+            if self._course is not None:
+                self._ready = self._course, self._step(self._course)
+        except Exception as error:  # whatever it is, the robot must go on being answered
+            self.fault = self.fault or error
+            self.sight = self.sight if self.sight is not None and self.sight.t_ns == t_ns else None
+        return self.sight
+
+    def prepare(self) -> None:
+        """Makes the step of the next answer beside what was seen last; changes nothing that is said."""
+        if self._course is not None:
+            with suppress(Exception):  # the answer fails in the same way, and says so
+                self._ready = self._course, self._step(self._course)
+
+    def silence(self, t_ns: int, signals: Signal) -> None:
+        """Nothing came from the robot within the time-out."""
+        self._hear_nothing(t_ns)
+        why = watchdog.of_signals(signals)
+        if why and not self.stop:
+            self._stop(t_ns, why)
+
+    def answer(self, event: TickEvent) -> Answer:
+        """The reply to what the robot sent, and why it is that one."""
+        self._hear_nothing(event.t_ns)  # also where the packet that ends a silence comes before its time-out is seen
+        packets = [_decoded(data) for data in event.datagrams]
+        cycles = {packet.clock_ns for packet in packets if packet is not None}
+        self._behind_ns = (self._behind_ns or event.t_ns) if len(cycles) > 1 else None
+        heard, packet = self._session.hear_all(packets, event.t_ns)
+        look_ns = self.sight.t_ns if self.sight is not None else 0
+        if packet is None:
+            self._refuse(event.t_ns, heard)
+            return Answer(event.t_ns, look_ns, None, self.phase, control_step.BRAKING, self.stop, -1, -1, None)
+        measured = packet.q[:AXES]
+        self._heard_ns = event.t_ns
+        if heard.fresh or self._course is None:
+            self._begin(measured)
+        self._judge(event, heard, measured)
+        before = self._course
+        assert before is not None  # noqa: S101 - for the type checker
+        said = self._say(before)
+        phase = self.phase
+        reply = self._session.reply(said.step.next.q, said.step.next.dq, event.t_ns)
+        told = RobotState(reply.q, reply.dq)  # which is an echo while the robot may not move
+        self._course = replace(said.after, state=told)
+        self._programme_s = said.after.programme_s
+        self._settle()
+        step, row = said.step, _row(measured, before, said)
+        reason = (self.stop or self.waiting) if said.after.follower is None else control_step.REASONS[step.reason]
+        return Answer(
+            event.t_ns, look_ns, encode_correction(reply), phase, step.status, reason, step.limb, step.link, row
+        )
+
+    def _settle(self) -> None:
+        """The phase after an answer that left the robot standing, or not."""
+        moving = self._course is not None and bool(np.any(self._course.state.dq))
+        self.standing = 0 if moving else self.standing + 1
+        if self.phase == codec.ECHO:
+            self.phase = codec.HOLDING if self.stop else codec.WAITING
+        elif self.phase == codec.STOPPING and not moving:
+            self.phase = codec.HOLDING
+        elif self.phase == codec.APPROACH and self._course is not None and self._course.arrived:
+            self.phase = codec.FOLLOWING
+
+    def _refuse(self, t_ns: int, heard: Heard) -> None:
+        """Nothing to answer: a robot that must not be moved at all, or nothing of worth."""
+        if heard.reason in watchdog.REFUSED and not self.stop:
+            self._stop(t_ns, heard.reason)
+            self._course, self.phase = None, codec.HOLDING
+        self._hear_nothing(t_ns)
+
+    def _hear_nothing(self, t_ns: int) -> None:
+        """Whether the robot has been gone for too long: it has stopped listening, so it begins anew where it stands."""
+        if self._heard_ns is None or t_ns - self._heard_ns <= self.setup.bounds.silent_s * 1e9:
+            return
+        if self.phase in (codec.APPROACH, codec.FOLLOWING, codec.STOPPING):
+            self._stop(t_ns, watchdog.SILENT)
+        self._course, self._heard_ns = None, None
+        self.phase = codec.HOLDING if self.stop else codec.WAITING
+
+    def _begin(self, measured: Floats) -> None:
+        """A new session of the robot: whatever was commanded before, it is where it is."""
+        self._course = Course(RobotState(measured, _STILL), self._programme_s)
+        self.phase = codec.ECHO
+
+    def _judge(self, event: TickEvent, heard: Heard, measured: Floats) -> None:
+        """What the watchdog says, and the phase that follows from it."""
+        why = self._why(event, heard, measured)
+        if self.phase in (codec.APPROACH, codec.FOLLOWING):
+            if why:
+                self._stop(event.t_ns, why)
+            return
+        if self.phase == codec.HOLDING and self.setup.bounds.resume:
+            self._clear_ns = None if why else (self._clear_ns or event.t_ns)
+            if self._clear_ns is not None and event.t_ns - self._clear_ns >= self.setup.bounds.resume_s * 1e9:
+                self.stop, self.phase = "", codec.WAITING
+            elif why and why not in watchdog.ENDINGS:
+                self.stop = why  # what holds it now
+        self.waiting = why if self.phase == codec.WAITING else ""
+        if self.phase == codec.WAITING and not why and self._course is not None:
+            self._course, self.phase = set_out(self.setup, self._course), codec.APPROACH
+
+    def _why(self, event: TickEvent, heard: Heard, measured: Floats) -> str:
+        """The reason not to move, or none."""
+        if self.fault is not None:
+            return watchdog.FAULT
+        why = watchdog.of_signals(event.signals) or watchdog.of_robot(heard)
+        behind_ns = 0 if self._behind_ns is None else event.t_ns - self._behind_ns
+        if not why and behind_ns > self.setup.bounds.overrun_s * 1e9:
+            why = watchdog.OVERRUN
+        if not why:
+            why = watchdog.of_person(self.sight, self.observer.age_s(event.t_ns), self.setup.bounds)
+        if not why and self.setup.sending and self._course is not None and self.phase != codec.ECHO:
+            why = watchdog.of_tracking(measured, self._course.state.q, self.setup.bounds)
+        return why
+
+    def _stop(self, t_ns: int, why: str) -> None:
+        self.stop, self.phase, self._clear_ns = why, codec.STOPPING, None
+        self.stops.append((t_ns, why))
+        if self._course is not None:
+            self._course = replace(self._course, follower=None)
+
+    def _say(self, course: Course) -> Said:
+        """The tick's step: the one that is ready, if it is still the one to take."""
+        if self._ready is not None and self._ready[0] is course:
+            said = self._ready[1]
+        else:
+            try:
+                said = self._step(course)
+            except Exception as error:  # whatever it is, the robot must brake
+                self.fault = self.fault or error
+                return self._give_up(course, watchdog.FAULT)
+        finite = math.isfinite(said.step.next.q.sum() + said.step.next.dq.sum())
+        return said if finite else self._give_up(course, watchdog.NOT_FINITE)
+
+    def _give_up(self, course: Course, why: str) -> Said:
+        """The stop of a robot whose step cannot be taken; once, however often it fails while the robot brakes."""
+        if not self.stop or self.phase in (codec.APPROACH, codec.FOLLOWING):
+            self._stop(self._heard_ns or 0, why)
+        return brake(self.setup, course, _UNSEEN)
+
+    def _step(self, course: Course) -> Said:
+        return (brake if course.follower is None else follow)(self.setup, course, self._around())
+
+    def _around(self) -> Obstacles:
+        """What to keep clear of; unknown where nobody has been seen for too long."""
+        if self.sight is None:
+            return _UNSEEN
+        seen = self.observer.age_s(self.sight.t_ns) <= self.setup.memory_s
+        return self.sight.around if seen else replace(self.sight.around, known=False)
+
+
+def _decoded(data: bytes) -> RobotPacket | None:
+    try:
+        return decode_robot(data)
+    except BadPacket:
+        return None
+
+
+def _row(measured: Floats, before: Course, said: Said) -> MotionRow:
+    pose, state = said.step.pose, before.state
+    speed = float(np.linalg.norm(pose.J_tcp[:3] @ state.dq))
+    rest = np.array([speed, said.reference_speed, said.after.programme_s, said.step.distance_m])
+    return MotionRow(measured, state.q, state.dq, said.step.u, said.reference_m, pose.T_world_tcp[:3, 3], rest)

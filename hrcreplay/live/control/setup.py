@@ -1,0 +1,262 @@
+"""From a job to a session's pilot, by way of a table that the record keeps: what it says is enough to begin again.
+
+Every kernel compiled and every library loaded before the robot waits for an answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from hrcreplay import __version__
+from hrcreplay.calibration.cell import Cell
+from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_robot
+from hrcreplay.egm.session import Session
+from hrcreplay.errors import SettingsError
+from hrcreplay.human.model import LimitSet, skeleton
+from hrcreplay.live.control import watchdog
+from hrcreplay.live.control.motion import Follower, Setup
+from hrcreplay.live.control.perception import Observer
+from hrcreplay.live.control.pilot import Pilot
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import Signal, TickEvent
+from hrcreplay.logs import skeleton_pb2
+from hrcreplay.logs.reader import open_log
+from hrcreplay.logs.tracks import Header, JointTrack
+from hrcreplay.records import Floats
+from hrcreplay.robot.programme.reference import Reference
+from hrcreplay.run import build
+from hrcreplay.run.build import log_options
+from hrcreplay.run.job import Job, resolve, unlogged
+from hrcreplay.settings.load import Settings, load_settings
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What stands for a log where there is none yet: see build.Source."""
+
+    header: Header
+
+    def joints(self) -> Iterator[JointTrack]:
+        """None: a live robot is told where to go by a task."""
+        return iter(())
+
+
+def live_job(
+    human: Path | None, config: Path | None, overrides: tuple[str, ...], cell_file: Path | None
+) -> tuple[Job, Header]:
+    """Settings and cameras of a session.
+
+    Args:
+        human: Recording of the person; None: the cameras are those of live.zenoh.keys, their poses the cell's.
+        config: Settings file.
+        overrides: ``section.key=value``.
+        cell_file: Poses of cameras and robot.
+
+    Raises:
+        SettingsError: A setting or the cell cannot be used, or there is no camera.
+        LogError: The recording cannot be read.
+    """
+    span: dict[str, Any] = {"start_s": None, "end_s": None}
+    if human is not None:
+        job = resolve("live", human, config=config, overrides=overrides, cell_file=cell_file, **span)
+        return job, open_log(job.log, log_options(job.settings)).header
+    settings = load_settings(config, overrides)
+    cameras = tuple(sorted(settings.live.zenoh.keys))
+    if not cameras:
+        raise SettingsError("live.zenoh.keys: no camera; name one there, or play a recording with --human LOG")
+    where = Path("live.zenoh")
+    job = unlogged("live", where, settings, cell_file)
+    return job, _header(where, cameras, {}, None, None)
+
+
+def _header(
+    path: Path,
+    cameras: tuple[str, ...],
+    T_world_camera: dict[str, Floats],
+    T_world_base: Floats | None,
+    task: dict[str, Any] | None,
+) -> Header:
+    return Header(
+        path=path,
+        kind="hrcreplay",
+        cameras=cameras,
+        T_world_camera=T_world_camera,
+        task=task,
+        start_ns=0,
+        end_ns=0,
+        T_world_base=T_world_base,
+        has_truth=False,
+        joint_names=(),
+    )
+
+
+def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
+    """All that the session's decisions depend on beside what it hears, as JSON.
+
+    Raises:
+        SettingsError: There is no task, or it is not known where the robot stands.
+        LogError: The pose of a camera is not known.
+    """
+    task = job.task or header.task
+    if task is None:
+        raise SettingsError(
+            f"{header.path}: no task; a live robot needs one: name a task file with --set plan.task=FILE"
+        )
+    known, scene = job.meta(), Scene(header)
+    T_world_base, eyes = build.standing(job, scene), build.eyes(job, scene)
+    robot = build.robot(job, T_world_base)
+    if robot.nv != AXES:
+        raise SettingsError(f"robot.urdf: {robot.name} has {robot.nv} axes; live drives robots of {AXES} over EGM")
+    volumes = Observer(eyes, build.foresight(job), header.cameras, job.settings.logs.gap_s).look(0, ()).volumes
+    return {
+        "hrcreplay": __version__,
+        "settings": known["settings"],
+        "versions": known["versions"],
+        "limits": known["limits"],
+        "cell": known["cell"],
+        "cameras": {name: T.tolist() for name, T in zip(header.cameras, eyes.T_world_camera, strict=True)},
+        "T_world_base": T_world_base.tolist(),
+        "task": task,
+        "sending": sending,
+        "limbs": list(volumes.limbs),
+        "method": volumes.method,
+        "links": [segment.name for segment in robot.segments],
+    }
+
+
+def build_pilot(start: dict[str, Any]) -> Pilot:
+    """The pilot of a session at its start.
+
+    Raises:
+        SettingsError: A setting of the table cannot be used.
+    """
+    job = job_of(start, Path("live session"), "")
+    poses = {name: np.array(T) for name, T in start["cameras"].items()}
+    header = _header(job.log, tuple(start["cameras"]), poses, np.array(start["T_world_base"]), job.task)
+    scene = Scene(header)
+    setup = _setup(job, scene, sending=start["sending"])
+    observer = Observer(build.eyes(job, scene), build.foresight(job), header.cameras, job.settings.logs.gap_s)
+    robot, live = setup.robot, job.settings.live
+    session = Session(
+        robot.q_min, robot.q_max, robot.dq_max, utilization_max=live.utilization_max, silence_s=live.silent_s
+    )
+    return Pilot(setup, observer, session)
+
+
+def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
+    """What a session depended on, by its start table.
+
+    Raises:
+        SettingsError: Its settings are not those of this version.
+    """
+    try:
+        settings = Settings.model_validate(start["settings"])
+    except ValidationError as error:
+        raise SettingsError(
+            f"{log}: recorded by {start.get('hrcreplay')}, whose settings are not ours: {error}"
+        ) from error
+    return Job(
+        command="live",
+        log=log,
+        log_sha256=log_sha256,
+        settings=settings,
+        cell=None if start["cell"] is None else Cell.from_dict(start["cell"]),
+        task=start["task"],
+        start_s=None,
+        end_s=None,
+        tracking=_limits(start["limits"]["tracking"]),
+        prediction=_limits(start["limits"]["prediction"]),
+        earlier=None,
+    )
+
+
+def _setup(job: Job, scene: Scene, *, sending: bool) -> Setup:
+    live, plan = job.settings.live, job.settings.plan
+    robot = build.robot(job, build.standing(job, scene))
+    programme, _ = build.reference(job, scene, robot)
+    settings = build.plan_settings(job, live.cycle_s)
+
+    def follow(path: Reference, s_s: float) -> Follower:
+        return build.follow(job, plan.method, robot, path, settings, s_s)
+
+    bounds = watchdog.Bounds(
+        fresh_s=live.fresh_s,
+        uncertain_m=live.uncertain_m,
+        uncertain_rad=live.uncertain_rad,
+        tracking_rad=live.tracking_rad,
+        silent_s=live.silent_s,
+        overrun_s=live.overrun_s,
+        resume=live.resume,
+        resume_s=live.resume_s,
+    )
+    return Setup(
+        robot=robot,
+        programme=programme,
+        plan=settings,
+        follow=follow,
+        waypoint_m=plan.waypoint_m,
+        approach_speed=live.approach_speed,
+        bounds=bounds,
+        memory_s=job.settings.fusion.memory_s,
+        sending=sending,
+    )
+
+
+def _limits(table: dict[str, Any]) -> LimitSet:
+    """A limit set from run.json's form of it, in which null stands for no bound."""
+    return LimitSet(**{name: _bounds(name, value) for name, value in table.items()})
+
+
+def _bounds(name: str, value: Any) -> Any:
+    if not isinstance(value, list):
+        return value
+    none = -np.inf if name.endswith("_min") else np.inf
+    return np.array([none if number is None else number for number in value])
+
+
+_TICKS = 400
+_TICK_NS = 4_032_000
+_FRAME_EVERY = 8
+
+#: Lengths of somebody, in the order of LENGTHS [m].
+_LENGTHS_M = np.array([[0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
+
+
+def warm(start: dict[str, Any]) -> None:
+    """Runs a session of a second and a half with somebody who walks up to the robot."""
+    pilot = build_pilot({**start, "sending": False})
+    camera, T = next(iter(start["cameras"].items()))
+    to_camera = np.linalg.inv(np.array(T))
+    base = np.array(start["T_world_base"])[:3, 3]
+    q = pilot.setup.programme.q0
+    for tick in range(_TICKS):
+        t_ns = 10**18 + tick * _TICK_NS
+        packet = RobotPacket(tick, tick * 4, t_ns, q, q, Motors.ON, Mci.RUNNING, Rapid.RUNNING, False, 0.0)
+        event = TickEvent(t_ns, (encode_robot(packet),), Signal.NONE)
+        answer = pilot.answer(event)
+        codec.answer(answer, Signal.NONE, 1, 0)
+        away_m = 2.0 - 1.6 * tick / _TICKS
+        seen = [] if tick % _FRAME_EVERY else [_seen(camera, to_camera, base + np.array([away_m, 0.0, 0.0]), t_ns)]
+        sight = pilot.look(t_ns + 1_000_000, seen)
+        if pilot.fault is not None:
+            raise pilot.fault
+        if sight is not None:
+            codec.look(sight.states, sight.volumes, len(seen))
+            codec.whole(sight.volumes)
+
+
+def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int) -> bytes:
+    """Somebody at a place, arms half bent."""
+    joints = np.array([[place_m[0], place_m[1], np.pi, 0.1, 0.1, 0.5, 0.0, 1.8, 0.1, 0.5, 0.0, 1.8]])
+    points = skeleton(joints, _LENGTHS_M)[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
+    message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=1)
+    message.points.extend(points.ravel().tolist())
+    message.confidence.extend(np.isfinite(points[:, 0]).astype(float).tolist())
+    data: bytes = message.SerializeToString()
+    return data

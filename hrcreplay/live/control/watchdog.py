@@ -1,0 +1,85 @@
+"""The watchdog: everything that must stop a live robot, by name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hrcreplay.egm.session import Heard
+from hrcreplay.live.record.codec import Sight, Signal
+from hrcreplay.records import Floats
+
+#: What ends a session as it should; every other reason ends it as a stop.
+SESSION_OVER, RECORDING_OVER = "session over", "recording of the person over"
+
+INTERRUPTED, TERMINATED = "Ctrl-C", "SIGTERM"
+PERSON_DEAD, PERSON_LATE = "human side dead", "human side late"
+RECORDER_DEAD, SCREEN_DEAD = "recorder dead", "screen dead"
+OVERRUN, SILENT = "tick overrun", "robot silent"
+NO_FRAME, UNCERTAIN, NOT_FINITE, TRACKING = "no fresh frame", "state uncertain", "not finite", "tracking error"
+FAULT = "internal error"
+
+#: What ends a session whose robot may have been stopped for another reason.
+ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
+
+#: Robots that are not answered at all.
+REFUSED = ("radians", "axes")
+
+#: Reasons by signal, the most telling first.
+SIGNALS = {
+    Signal.INTERRUPT: INTERRUPTED,
+    Signal.TERMINATE: TERMINATED,
+    Signal.DURATION: SESSION_OVER,
+    Signal.PERSON_ENDED: RECORDING_OVER,
+    Signal.PERSON_DEAD: PERSON_DEAD,
+    Signal.PERSON_LATE: PERSON_LATE,
+    Signal.RECORDER_DEAD: RECORDER_DEAD,
+    Signal.SCREEN_DEAD: SCREEN_DEAD,
+    Signal.OVERRUN: OVERRUN,
+}
+
+_BASE = 4  #: x, y, heading and bend: the joints that carry the whole person
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Settings of the watchdog; see sections_live.Live."""
+
+    fresh_s: float
+    uncertain_m: float
+    uncertain_rad: float
+    tracking_rad: float
+    silent_s: float
+    overrun_s: float
+    resume: bool
+    resume_s: float
+
+
+def of_signals(signals: Signal) -> str:
+    """The reason that the loop itself has found, or none."""
+    return next((reason for signal, reason in SIGNALS.items() if signal in signals), "")
+
+
+def of_robot(heard: Heard) -> str:
+    """The reason that lies with the robot, or none."""
+    if heard.reason:
+        return heard.reason
+    return "" if heard.allowed else "robot not ready"
+
+
+def of_person(sight: Sight | None, age_s: float, bounds: Bounds) -> str:
+    """The reason that lies with what is known of the person, or none."""
+    if sight is None or not age_s <= bounds.fresh_s:
+        return NO_FRAME
+    std = sight.states.p_std[0, :_BASE]
+    if not math.isfinite(sight.states.p.sum() + sight.states.v.sum()):
+        return NOT_FINITE
+    sure = max(std[0], std[1]) <= bounds.uncertain_m and max(std[2], std[3]) <= bounds.uncertain_rad
+    return "" if sure else UNCERTAIN
+
+
+def of_tracking(measured: Floats, commanded: Floats, bounds: Bounds) -> str:
+    """The reason that the robot is not where it was told to be, or none; both (6,) [rad]."""
+    return "" if np.abs(measured - commanded).max() <= bounds.tracking_rad else TRACKING

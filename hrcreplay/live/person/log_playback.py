@@ -1,0 +1,211 @@
+"""A recording as the person of a live session: its frames at their own pace, read ahead so that none is late."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from queue import Empty, Queue
+from threading import Thread
+from typing import Any, NamedTuple
+
+from hrcreplay.logs import skeleton_pb2 as pb
+from hrcreplay.logs.decoders import GenericDecoder
+from hrcreplay.logs.reader import Log, LogOptions, open_log
+from hrcreplay.records import CameraFrames
+
+_SEAM_NS = 40_000_000  # between the end of a recording and its repetition: about one frame
+_AHEAD = 16  # chunks of at most a second each that wait decoded
+_RETRY_NS = 1_000_000  # when reading has fallen behind
+
+Message = tuple[bytes, bytes]  #: kind and payload
+
+
+class Frame(NamedTuple):
+    """A body in a frame, still in the recording's time."""
+
+    arrival_ns: int
+    skeleton: Any  #: hrcreplay.Skeleton
+
+
+class Opened(NamedTuple):
+    """What is known before the first frame."""
+
+    cameras: tuple[str, ...]
+    start_ns: int
+    end_ns: int
+
+
+class Note(NamedTuple):
+    """Something to tell the user, when reading has come to it."""
+
+    text: str
+
+
+Item = Opened | Note | list[Frame] | Exception | None  #: None: nothing will follow
+
+
+def passes(log: Log, *, repeat: bool) -> Iterator[Item]:
+    """All that a recording gives: its span, its frames chunk by chunk, again and again with ``repeat``, remarks."""
+    header = log.header
+    yield Opened(header.cameras, header.start_ns, header.end_ns)
+    newest: dict[str, int] = {}  # last capture of each camera in the passes before
+    later_ns = 0
+    while True:
+        captured = dict(newest)
+        for table in log.frames():
+            frames = [frame for frame in frames_of(table, later_ns) if _rises(frame, newest)]
+            for frame in frames:
+                camera = frame.skeleton.camera
+                captured[camera] = max(captured.get(camera, frame.skeleton.capture_ns), frame.skeleton.capture_ns)
+            yield frames
+        if not later_ns:
+            yield from (Note(f"recording: {text}") for text in log.notes)
+        if not repeat or not captured:
+            yield None
+            return
+        newest = captured
+        later_ns += header.end_ns - header.start_ns + _SEAM_NS
+        yield Note("recording starts again")
+
+
+def _rises(frame: Frame, newest: dict[str, int]) -> bool:
+    """Whether a frame is captured after the pass before; delays of the first frames may differ from the last."""
+    before = newest.get(frame.skeleton.camera)
+    return before is None or frame.skeleton.capture_ns > before
+
+
+def frames_of(table: CameraFrames, later_ns: int = 0) -> Iterator[Frame]:
+    """The rows of a table as messages, arrival and capture put off by ``later_ns``."""
+    points = table.points_m.reshape(len(table), -1)
+    for i in range(len(table)):
+        skeleton = pb.Skeleton(
+            capture_ns=int(table.capture_ns[i]) + later_ns,
+            camera=table.cameras[table.camera[i]],
+            body=int(table.body[i]),
+            points=points[i].tolist(),
+            confidence=table.confidence[i].tolist(),
+        )
+        yield Frame(int(table.arrival_ns[i]) + later_ns, skeleton)
+
+
+def same(one: Frame, two: Frame) -> bool:
+    """Whether two bodies stood in one frame. The shift to session time comes when the first of them is sent."""
+    return (one.skeleton.camera, one.skeleton.capture_ns) == (two.skeleton.camera, two.skeleton.capture_ns)
+
+
+def ready(cameras: tuple[str, ...]) -> Message:
+    """The note that tells control that frames can come, and from whom."""
+    return b"N", b"ready " + json.dumps({"cameras": list(cameras)}).encode()
+
+
+class Playback:
+    """Hands out a recording's messages when they are due. A thread reads ahead; ``due`` never waits for it."""
+
+    def __init__(self, reading: Callable[[], Iterator[Item]]) -> None:
+        self._queue: Queue[Item] = Queue(_AHEAD)
+        self._waiting: deque[Frame | Note] = deque()
+        self._opened: Opened | None = None
+        self._shift_ns: int | None = None  # from the recording's time to session time, once that is known
+        self._end_ns = 0  # in the recording's time
+        self._exhausted = self._ended = self._behind = False
+        Thread(target=self._read, args=(reading,), name="reading ahead", daemon=True).start()
+
+    def _read(self, reading: Callable[[], Iterator[Item]]) -> None:
+        try:
+            for item in reading():
+                self._queue.put(item)
+        except Exception as error:  # raised again where the process can tell of it
+            self._queue.put(error)
+
+    def go(self, start_ns: int) -> None:
+        """Lets the recording's first instant be ``start_ns`` of session time."""
+        if self._opened is None:
+            raise RuntimeError("go before ready")
+        self._shift_ns = start_ns - self._opened.start_ns
+
+    def due(self, now_ns: int) -> Iterator[Message]:
+        """The messages whose time has come.
+
+        Raises:
+            LogError: The recording cannot be read, or no further.
+        """
+        if self._opened is None:
+            yield from self._open()
+        if self._shift_ns is None:
+            return
+        while self._fill():
+            head = self._waiting[0]
+            if isinstance(head, Frame) and head.arrival_ns + self._shift_ns > now_ns:
+                return
+            self._waiting.popleft()
+            if isinstance(head, Note):
+                yield b"N", head.text.encode()
+            else:
+                more = self._waiting and isinstance(self._waiting[0], Frame) and same(head, self._waiting[0])
+                head.skeleton.capture_ns += self._shift_ns
+                yield b"f" if more else b"F", head.skeleton.SerializeToString()
+        if not self._exhausted and not self._behind:
+            self._behind = True
+            yield b"N", b"recording: reading is slower than its pace; frames come late"
+        if self._exhausted and not self._ended and now_ns >= self._end_ns + self._shift_ns:
+            self._ended = True
+            yield b"N", b"recording ended"
+            yield b"Z", b""
+
+    def next_ns(self, now_ns: int) -> int | None:
+        """When the next message is due, in session time; None where nothing is to come or nothing is known yet."""
+        if self._shift_ns is None or self._ended:
+            return None
+        if self._waiting:
+            head = self._waiting[0]
+            return head.arrival_ns + self._shift_ns if isinstance(head, Frame) else now_ns
+        return self._end_ns + self._shift_ns if self._exhausted else now_ns + _RETRY_NS
+
+    def _open(self) -> Iterator[Message]:
+        try:
+            opened = self._take()
+        except Empty:
+            return
+        if isinstance(opened, Opened):
+            self._opened = opened
+            self._end_ns = opened.end_ns
+            yield ready(opened.cameras)
+
+    def _fill(self) -> bool:
+        """Whether a message waits, taking what has been read where none does."""
+        while not self._waiting and not self._exhausted:
+            try:
+                item = self._take()
+            except Empty:
+                return False
+            if isinstance(item, list):
+                self._waiting.extend(item)
+                self._end_ns = max([self._end_ns, *(frame.arrival_ns for frame in item)])
+            elif isinstance(item, Note):
+                self._waiting.append(item)
+            elif item is None:
+                self._exhausted = True
+        return bool(self._waiting)
+
+    def _take(self) -> Item:
+        item = self._queue.get_nowait()
+        if isinstance(item, Exception):
+            raise item
+        return item
+
+
+def play(path: Path, options: dict[str, Any], *, repeat: bool) -> Playback:
+    """Plays a log of any kind.
+
+    Args:
+        path: The log.
+        options: ``topics`` and ``decoders`` as in the settings' section ``logs``; may be empty.
+        repeat: Whether it starts again at its end.
+    """
+    chosen = LogOptions(
+        topics=tuple(options.get("topics", ())),
+        decoders=tuple(GenericDecoder(**described) for described in options.get("decoders", ())),
+    )
+    return Playback(lambda: passes(open_log(path, chosen), repeat=repeat))

@@ -1,0 +1,307 @@
+"""The processes beside the control loop, and the sockets to them. Nothing here waits for any of them.
+
+What a crash of one of a session's processes leaves in the run folder: a file with its traceback.
+
+The first line of ``crash_<part>.txt`` says which part failed, with what exception and where; that line is also what the
+user is told and what run.json has. A part may be a process that ended without a word.
+
+A helper process's end of its socket to the control loop: whole messages, and nobody ever waits for the other.
+
+How each process beside control runs: ``python -m hrcreplay.live.processes FOLDER PART MODULE arguments``.
+
+Whatever ends it that nobody foresaw is kept with its traceback in the run folder, not on the user's terminal; control
+sees the process gone, brakes the robot and tells of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import runpy
+import select
+import socket
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from signal import Signals
+from typing import NoReturn
+
+import hrcreplay
+
+#: The parts of a session. The first three processes are helpers of control.
+PERSON, RECORDER, SCREEN, CONTROL, FOLDER = "human side", "recorder", "screen", "control", "run folder"
+
+#: What the names of the files begin with.
+PREFIX = "crash_"
+
+_PACKAGE = Path(hrcreplay.__file__).parent
+
+
+def said_of(error: BaseException) -> str:
+    """An exception in one line: its kind, its message, and where in our code it arose."""
+    message = " ".join(str(error).split())
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [frame for frame in frames if Path(frame.filename).is_relative_to(_PACKAGE)]
+    name = type(error).__name__ + (f": {message}" if message else "")
+    for frame in (ours or frames)[-1:]:
+        path = Path(frame.filename)
+        where = path.relative_to(_PACKAGE.parent).as_posix() if ours else path.name
+        return f"{name} ({where}:{frame.lineno}, in {frame.name})"
+    return name
+
+
+def end_of(code: int) -> str:
+    """How a process ended that left nothing else: killed, or by an exit code."""
+    if code >= 0:
+        return f"ended with exit code {code}"
+    with suppress(ValueError):
+        return f"killed by {Signals(-code).name}"
+    return f"killed by signal {-code}"
+
+
+def write(folder: Path, part: str, error: BaseException | str) -> str:
+    """Keeps a crash; one of the same part that came first stays first.
+
+    Returns:
+        What to say of it, as ``read`` gives it.
+    """
+    said = f"{part}: {error if isinstance(error, str) else said_of(error)}"
+    trace = "" if isinstance(error, str) else "".join(traceback.format_exception(error))
+    try:
+        with _file(folder, part).open("a") as file:
+            file.write(f"{said}\n\n{trace}")
+    except OSError:
+        sys.stderr.write(f"{said}\n{trace}")  # better there than nowhere
+        sys.stderr.flush()
+    return said
+
+
+def read(folder: Path) -> list[str]:
+    """What there is to say of the crashes that a session's folder holds, a line each."""
+    lines = []
+    for path in sorted(folder.glob(f"{PREFIX}*.txt")):
+        text = path.read_text(errors="replace").splitlines()
+        lines.append(text[0] if text else path.name)
+    return lines
+
+
+def left(folder: Path, part: str) -> bool:
+    """Whether a part has left a file."""
+    return _file(folder, part).exists()
+
+
+def _file(folder: Path, part: str) -> Path:
+    return folder / f"{PREFIX}{part.replace(' ', '_')}.txt"
+
+
+_LARGEST = 1 << 20  # no message is larger; one that is would be cut, never split
+
+
+class ControlGoneError(Exception):
+    """The control process closed its end, or is dead: the helper has nothing left to do."""
+
+
+class Channel:
+    """SOCK_SEQPACKET socket inherited from the control process; the first byte of a message is its kind."""
+
+    def __init__(self, fd: int) -> None:
+        self._socket = socket.socket(fileno=fd)
+        self._socket.setblocking(False)
+        self.dropped = 0  #: messages that control's full socket did not take
+
+    def send(self, kind: bytes, payload: bytes = b"") -> bool:
+        """Sends a message, or drops and counts it where control does not read; tells which.
+
+        Raises:
+            ControlGoneError: Nobody is at the other end.
+        """
+        try:
+            self._socket.send(kind + payload)
+        except (BlockingIOError, InterruptedError):
+            self.dropped += 1
+            return False
+        except (BrokenPipeError, ConnectionResetError) as error:
+            raise ControlGoneError from error
+        return True
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """The next message, None where none comes in time.
+
+        Raises:
+            ControlGoneError: Nobody is at the other end.
+        """
+        readable, _, _ = select.select([self._socket], [], [], max(0.0, timeout_s))  # unlike poll, finer than 1 ms
+        if not readable:
+            return None
+        try:
+            data = self._socket.recv(_LARGEST)
+        except BlockingIOError:
+            return None
+        except ConnectionResetError as error:
+            raise ControlGoneError from error
+        if not data:
+            raise ControlGoneError
+        return data
+
+
+#: Module through which every helper starts; see process.py.
+ENTRY = "hrcreplay.live.processes"
+
+_LARGEST = 1 << 20  #: no message is larger
+_BUFFER = 4 << 20  #: of messages under way: seconds of them
+_AT_ONCE = 256  #: messages taken at once, so that a flood does not hold up the loop
+
+
+class Helper:
+    """A process of ours, with a socket whose far end it holds."""
+
+    def __init__(
+        self, part: str, module: str, arguments: Sequence[str], folder: Path, told: tuple[int, ...] = ()
+    ) -> None:
+        """Starts ``module --fd N arguments`` in a session of its own: Ctrl-C is for control alone.
+
+        Args:
+            part: Which part of the session it is, of crash.py.
+            module: Module to run.
+            arguments: Of it, beside the socket.
+            folder: Where it leaves its traceback if it crashes.
+            told: Exit codes beside 0 of a process that has told why it ends: no crash.
+        """
+        self.part = part
+        self._folder = folder
+        self._told = (0, *told)
+        near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        for end in (near, far):
+            _enlarge(end)
+        near.setblocking(False)
+        self._socket = near
+        self.alive = True
+        self.dropped = 0  #: messages that it did not take
+        with far:
+            self.process = subprocess.Popen(  # noqa: S603 - our own modules
+                [sys.executable, "-m", ENTRY, str(folder), part, module, "--fd", str(far.fileno()), *arguments],
+                pass_fds=(far.fileno(),),
+                start_new_session=True,
+                stdin=subprocess.DEVNULL,
+            )
+
+    def send(self, message: bytes) -> None:
+        """Hands a message over, or drops and counts it."""
+        if not self.alive:
+            self.dropped += 1
+            return
+        try:
+            self._socket.send(message)
+        except (BlockingIOError, InterruptedError):
+            self.dropped += 1
+        except OSError as error:
+            self.dropped += 1
+            if isinstance(error, ConnectionError):
+                self.alive = False
+
+    def messages(self) -> Iterator[bytes]:
+        """What it has said since."""
+        for _ in range(_AT_ONCE):
+            try:
+                message = self._socket.recv(_LARGEST)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError:
+                message = b""
+            if not message:
+                self.alive = False
+                return
+            yield message
+
+    def notice(self) -> bool:
+        """Whether it is still there, for one that never says anything."""
+        if self.alive:
+            for _ in self.messages():
+                pass
+        return self.alive
+
+    def crashed(self) -> bool:
+        """Whether it has ended as nobody foresaw; no for one that lives, or is about to end."""
+        return not self.alive and self.process.poll() not in (None, *self._told)
+
+    def dismiss(self, patience_s: float) -> int | None:
+        """Closes the socket, which ends the process; its exit code, None where it had to be killed.
+
+        A process that crashed has left a file in the run folder; of one that could not, this leaves it.
+        """
+        self._socket.close()
+        self.alive = False
+        try:
+            code = self.process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            return None
+        if self.crashed() and not left(self._folder, self.part):
+            write(self._folder, self.part, end_of(code))
+        return code
+
+
+def _enlarge(end: socket.socket) -> None:
+    """As large a buffer as we are permitted."""
+    forced = getattr(socket, "SO_SNDBUFFORCE", 32)
+    with contextlib.suppress(OSError):
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+    with contextlib.suppress(OSError):
+        end.setsockopt(socket.SOL_SOCKET, forced, _BUFFER)
+
+
+def take_precedence() -> list[str]:
+    """Asks the system to run this process before others and to keep it in memory; returns what was refused."""
+    import ctypes
+
+    refused = []
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+    except (OSError, AttributeError):
+        refused.append("real-time priority")
+    lock_current_and_future = 3
+    try:
+        if ctypes.CDLL(None, use_errno=True).mlockall(lock_current_and_future):
+            refused.append("locked memory")
+    except (OSError, AttributeError):
+        refused.append("locked memory")
+    return refused
+
+
+def step_back() -> None:
+    """Ends what ``take_precedence`` asked for."""
+    import ctypes
+
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).munlockall()
+
+
+#: Exit code of a process that crashed, as sysexits.h has it for internal errors.
+CRASHED = 70
+
+
+def main() -> None:
+    """Runs a module as ``python -m`` does."""
+    folder, part, module, *arguments = sys.argv[1:]
+
+    def die(error: BaseException) -> NoReturn:
+        write(Path(folder), part, error)
+        os._exit(CRASHED)  # other threads may wait for one that is gone
+
+    threading.excepthook = lambda raised: die(raised.exc_value or SystemError("a thread ended without a reason"))
+    sys.argv = [module, *arguments]
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except Exception as error:  # whatever it is
+        die(error)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,293 @@
+"""The record of a live session as messages: what control tells the recorder, and what the log holds.
+
+The first byte is the kind, the next eight the session's clock [ns]; numbers are little-endian. Whatever decides a tick
+is in here, so the log alone is enough to run the session again (see verify).
+
+======  ==========================================================================================================
+``R``   a datagram of the robot, as it came
+``C``   our reply, as it went (or would have gone: in shadow mode ``sent`` is 0)
+``F``   a skeleton that a look took: the serialised Skeleton message; the clock is that of the look, its arrival
+``L``   a look: state of the person, digests of the swept volumes
+``V``   the swept volumes of some looks, whole
+``A``   an answer: signals in, decision out
+``S``   nothing came from the robot within the time-out
+``E``   JSON: the settings at the start, remarks, the end
+======  ==========================================================================================================
+
+What goes into one tick of a live session, and what comes out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Any
+
+import numpy as np
+
+from hrcreplay.egm.codec import AXES
+from hrcreplay.records import Floats, HumanStates, SweptVolumes
+from hrcreplay.robot.control.separation import Obstacles
+
+#: Where a session is: nobody may move yet, the first answers, on the way to the programme, the programme itself,
+#: braking for a reason of the watchdog, standing because of one.
+PHASES = ("waiting", "echo", "approach", "following", "stopping", "holding")
+WAITING, ECHO, APPROACH, FOLLOWING, STOPPING, HOLDING = range(len(PHASES))
+
+
+class Signal(IntFlag):
+    """What the loop found outside the stages and tells the pilot with an event. Part of the record."""
+
+    NONE = 0
+    INTERRUPT = 1  #: Ctrl-C
+    TERMINATE = 2  #: SIGTERM
+    DURATION = 4  #: the session's time is over
+    PERSON_DEAD = 8  #: the human side's process has ended
+    PERSON_LATE = 16  #: the human side gave no sign of life for too long
+    PERSON_ENDED = 32  #: the recording of the person is over
+    RECORDER_DEAD = 64  #: the recorder's process has ended
+    OVERRUN = 128  #: the answer before this one came too late
+    SCREEN_DEAD = 256  #: the screen's process has crashed
+
+
+@dataclass(frozen=True, slots=True)
+class TickEvent:
+    """One wake-up of the control loop by the robot."""
+
+    t_ns: int  #: session clock when the first of the datagrams was taken
+    datagrams: tuple[bytes, ...]  #: all that lay in the queue, in order of arrival
+    signals: Signal
+
+
+@dataclass(frozen=True, slots=True)
+class MotionRow:
+    """What the robot was told in one answer. Angles in rad, positions in the world in m."""
+
+    q_measured: Floats  #: (6,) where it said it was
+    q: Floats  #: (6,) commanded position at the tick
+    dq: Floats  #: (6,) commanded velocity at the tick
+    u: Floats  #: (6,) acceleration applied from the tick on
+    ref_m: Floats  #: (3,) programmed TCP position
+    tcp_m: Floats  #: (3,) TCP position at ``q``
+    rest: Floats  #: (4,) TCP speed, reference's speed [m/s], programmed time [s], separation [m]
+
+    def flat(self) -> Floats:
+        """(34,) all numbers one after another."""
+        return np.concatenate((self.q_measured, self.q, self.dq, self.u, self.ref_m, self.tcp_m, self.rest))
+
+    @classmethod
+    def of(cls, flat: Floats) -> MotionRow:
+        """The inverse of ``flat``."""
+        return cls(*np.split(flat, np.cumsum(WIDTHS)[:-1]))
+
+
+#: Of the fields of a MotionRow.
+WIDTHS = (AXES, AXES, AXES, AXES, 3, 3, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the pilot decided on an event."""
+
+    t_ns: int  #: of the event
+    look_ns: int  #: of the look whose volumes it kept clear of
+    datagram: bytes | None  #: reply to the robot; None where none is due
+    phase: int  #: index into PHASES
+    status: int  #: index into records.STATUSES
+    reason: str  #: why it braked: of the controller or of the watchdog; empty where it did not
+    limb: int  #: of the nearest pair, index into the volumes' limbs; -1 without one
+    link: int  #: of the nearest pair; -1 without one
+    row: MotionRow | None  #: None where no reply was due
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What is known of the person after a look."""
+
+    t_ns: int
+    states: HumanStates  #: one row
+    volumes: SweptVolumes  #: one row
+    around: Obstacles
+
+
+ROBOT, REPLY, FRAME, LOOK, VOLUMES, ANSWER, SILENCE, EVENT = (b"R", b"C", b"F", b"L", b"V", b"A", b"S", b"E")
+
+_HEAD = struct.Struct("<cq")
+_REPLY = struct.Struct("<cqB")
+_LOOK = struct.Struct("<cqHHHH")
+_VOLUMES = struct.Struct("<cqHI")
+_ANSWER = struct.Struct("<cqqIIBBhhH")
+_SILENCE = struct.Struct("<cqI")
+_DIGEST = 8
+
+
+def kind(message: bytes) -> bytes:
+    """Which message it is."""
+    return message[:1]
+
+
+def clock_ns(message: bytes) -> int:
+    """When it was, by the session's clock."""
+    return int(_HEAD.unpack_from(message)[1])
+
+
+def body(message: bytes) -> bytes:
+    """What follows kind and clock: the datagram, the skeleton."""
+    return message[_HEAD.size :]
+
+
+def robot(t_ns: int, datagram: bytes) -> bytes:
+    """A datagram that came."""
+    return _HEAD.pack(ROBOT, t_ns) + datagram
+
+
+def frame(t_ns: int, skeleton: bytes) -> bytes:
+    """A skeleton, by the look that took it."""
+    return _HEAD.pack(FRAME, t_ns) + skeleton
+
+
+def reply(t_ns: int, datagram: bytes, *, sent: bool) -> bytes:
+    """A datagram that went, or would have gone."""
+    return _REPLY.pack(REPLY, t_ns, sent) + datagram
+
+
+def read_reply(message: bytes) -> tuple[bool, bytes]:
+    """Whether it was sent, and the datagram."""
+    return bool(_REPLY.unpack_from(message)[2]), message[_REPLY.size :]
+
+
+def event(t_ns: int, what: dict[str, Any]) -> bytes:
+    """Something worth telling."""
+    return _HEAD.pack(EVENT, t_ns) + json.dumps(what, sort_keys=True, allow_nan=False).encode()
+
+
+def read_event(message: bytes) -> dict[str, Any]:
+    """What there was to tell."""
+    found: dict[str, Any] = json.loads(body(message))
+    return found
+
+
+def silence(t_ns: int, signals: Signal) -> bytes:
+    """The robot said nothing."""
+    return _SILENCE.pack(SILENCE, t_ns, signals)
+
+
+def read_silence(message: bytes) -> Signal:
+    """What else was the matter then."""
+    return Signal(_SILENCE.unpack_from(message)[2])
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """A look as the record has it."""
+
+    t_ns: int
+    skeletons: int  #: taken by it: the FRAME messages right before it
+    state: Floats  #: all numbers of the state's row, in the order of the record's fields
+    valid: bytes  #: a byte a camera
+    digests: tuple[bytes, ...]  #: of vertices and radius, a limb each
+
+
+def look(states: HumanStates, volumes: SweptVolumes, skeletons: int) -> bytes:
+    """A look that took so many skeletons."""
+    state = flat(states)
+    digests = [digest(volumes, limb) for limb in range(len(volumes.limbs))]
+    valid = states.valid[0].tobytes()
+    head = _LOOK.pack(LOOK, int(states.t_ns[0]), skeletons, len(state), len(valid), len(digests))
+    return b"".join([head, state.tobytes(), valid, *digests])
+
+
+def read_look(message: bytes) -> Look:
+    """A look as it was recorded."""
+    _, t_ns, skeletons, numbers, cameras, limbs = _LOOK.unpack_from(message)
+    at = _LOOK.size
+    state = np.frombuffer(message, "<f8", numbers, at)
+    at += 8 * numbers
+    valid = message[at : at + cameras]
+    at += cameras
+    digests = tuple(message[at + _DIGEST * i : at + _DIGEST * (i + 1)] for i in range(limbs))
+    return Look(t_ns, skeletons, state, valid, digests)
+
+
+def flat(states: HumanStates) -> Floats:
+    """The numbers of one row of states, field after field."""
+    found = vars(states).values()
+    return np.concatenate([value[0] for value in found if isinstance(value, np.ndarray) and value.dtype == np.float64])
+
+
+def digest(volumes: SweptVolumes, limb: int) -> bytes:
+    """What stands for one limb's volume of a single tick."""
+    what = hashlib.blake2b(volumes.vertices(0, limb).data, digest_size=_DIGEST)
+    what.update(volumes.radius_m[0, limb].tobytes())
+    return what.digest()
+
+
+def whole(volumes: SweptVolumes) -> bytes:
+    """The swept volumes of one look."""
+    head = _VOLUMES.pack(VOLUMES, int(volumes.t_ns[0]), len(volumes.limbs), len(volumes.vertices_m))
+    return b"".join([head, volumes.offsets.tobytes(), volumes.radius_m.tobytes(), volumes.vertices_m.tobytes()])
+
+
+def read_whole(message: bytes, limbs: tuple[str, ...], method: str) -> SweptVolumes:
+    """The swept volumes as they were recorded; their limbs' names and method are known from the session's start."""
+    _, t_ns, count, vertices = _VOLUMES.unpack_from(message)
+    at = _VOLUMES.size
+    offsets = np.frombuffer(message, "<i8", count + 1, at)
+    at += 8 * (count + 1)
+    radius = np.frombuffer(message, "<f8", count, at)[None]
+    at += 8 * count
+    points = np.frombuffer(message, "<f8", 3 * vertices, at).reshape(-1, 3)
+    return SweptVolumes(np.array([t_ns]), offsets, points, radius, limbs, method)
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """An answer as the record has it; its reply is the REPLY message right after it, where one was due."""
+
+    t_ns: int
+    look_ns: int
+    took_us: int  #: from the datagram's arrival to the reply's departure; not part of what must come out the same
+    signals: Signal
+    phase: int
+    status: int
+    reason: str
+    limb: int
+    link: int
+    datagrams: int  #: the ROBOT messages right before it
+    row: Floats | None  #: (34,) of a MotionRow
+
+
+def answer(found: Answer, signals: Signal, datagrams: int, took_us: int) -> bytes:
+    """A decision."""
+    numbers = b"" if found.row is None else found.row.flat().tobytes()
+    head = _ANSWER.pack(
+        ANSWER,
+        found.t_ns,
+        found.look_ns,
+        took_us,
+        signals,
+        found.phase,
+        found.status,
+        found.limb,
+        found.link,
+        datagrams,
+    )
+    return b"".join([head, bytes([len(numbers) // 8]), numbers, found.reason.encode()])
+
+
+def read_answer(message: bytes) -> Answered:
+    """A decision as it was recorded."""
+    _, t_ns, look_ns, took_us, signals, phase, status, limb, link, datagrams = _ANSWER.unpack_from(message)
+    at = _ANSWER.size
+    numbers = message[at]
+    row = np.frombuffer(message, "<f8", numbers, at + 1) if numbers else None
+    reason = message[at + 1 + 8 * numbers :].decode()
+    return Answered(t_ns, look_ns, took_us, Signal(signals), phase, status, reason, limb, link, datagrams, row)
+
+
+def motion_row(answered: Answered) -> MotionRow | None:
+    """The numbers of an answer by name."""
+    return None if answered.row is None else MotionRow.of(answered.row)

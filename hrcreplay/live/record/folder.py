@@ -1,0 +1,240 @@
+"""The messages of a session's record as the tables of a run folder.
+
+The run folder of a live session: a place for its log at the start, and all the rest from that log at the end.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from dataclasses import dataclass, field, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from hrcreplay.egm.codec import AXES
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.live import processes
+from hrcreplay.live.control.setup import job_of
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import PHASES, MotionRow
+from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.logs.clean import PersonMemory
+from hrcreplay.logs.reader import open_log
+from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Motion
+from hrcreplay.run import build
+from hrcreplay.run.build import log_options
+from hrcreplay.run.job import Job
+from hrcreplay.run.report import write_report
+from hrcreplay.run.stages import store as store_volumes
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import RunWriter, TableWriter
+from hrcreplay.store.tables import Columns, measurement_columns, motion_columns, state_columns
+
+_BATCH = TableWriter.ROWS
+
+
+@dataclass
+class SessionTables:
+    """Writes state, occupancy and motion of the messages it is given; counts them, and keeps what was remarked."""
+
+    run: RunWriter
+    cameras: tuple[str, ...]
+    links: tuple[str, ...]
+    limbs: tuple[str, ...]  #: that have a swept volume
+    method: str  #: of the swept volumes
+    counts: Counter[str] = field(default_factory=Counter)
+    took_us: list[int] = field(default_factory=list)  #: of every reply
+    events: list[dict[str, Any]] = field(default_factory=list)  #: beside the start
+    _looks: list[codec.Look] = field(default_factory=list)
+    _answers: list[codec.Answered] = field(default_factory=list)
+
+    def add(self, message: bytes) -> None:
+        """Takes a message of the record."""
+        kind = codec.kind(message)
+        self.counts[_COUNTED[kind]] += 1
+        if kind == codec.LOOK:
+            self._looks.append(codec.read_look(message))
+        elif kind == codec.VOLUMES:
+            store_volumes(codec.read_whole(message, self.limbs, self.method), np.zeros(1, np.int64), self.run)
+        elif kind == codec.ANSWER:
+            self._answered(codec.read_answer(message))
+        elif kind == codec.EVENT:
+            self.events.append(codec.read_event(message))
+        if max(len(self._looks), len(self._answers)) >= _BATCH:
+            self.flush()
+
+    def flush(self) -> None:
+        """Writes what waits."""
+        if self._looks:
+            self.run.table("state", state_columns(_states(self._looks, self.cameras, self.run.partial)))
+        if self._answers:
+            self.run.table("motion", _motion(self._answers, self.limbs, self.links))
+        self._looks, self._answers = [], []
+
+    def _answered(self, answered: codec.Answered) -> None:
+        if answered.row is not None:  # else there was no packet to answer
+            self._answers.append(answered)
+            self.took_us.append(answered.took_us)
+
+    def timing(self) -> dict[str, Any]:
+        """From a packet's arrival to the departure of its reply, as timing.json has it."""
+        took = np.array(self.took_us, dtype=np.float64)
+        if not len(took):
+            return {}
+        shares = {"median_us": 0.5, "p99_us": 0.99, "p99_9_us": 0.999, "max_us": 1.0}
+        found = {name: float(np.quantile(took, share)) for name, share in shares.items()}
+        return {"reply": {"ticks": len(took), **found, "real_time_factor": None}}
+
+
+_COUNTED = {
+    codec.ROBOT: "robot_packets",
+    codec.REPLY: "replies",
+    codec.FRAME: "skeletons",
+    codec.LOOK: "looks",
+    codec.VOLUMES: "looks_with_volumes",
+    codec.ANSWER: "answers",
+    codec.SILENCE: "silences",
+    codec.EVENT: "events",
+}
+
+
+def _states(looks: list[codec.Look], cameras: tuple[str, ...], where: Path) -> HumanStates:
+    numbers = np.array([look.state for look in looks])
+    widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), 12)
+    widths |= {"lengths_m": 8, "lengths_std_m": 8, "residual_m": len(BODY), "unseen_s": len(LIMBS)}
+    ends = np.cumsum(list(widths.values()))
+    if numbers.shape[1] != ends[-1]:
+        raise LogError(
+            f"{where}: found {numbers.shape[1]} numbers a look where this version has {ends[-1]}; "
+            "would be right: the version of hrcreplay that recorded the session"
+        )
+    parts = np.split(numbers, ends[:-1], axis=1)
+    return HumanStates(
+        t_ns=np.array([look.t_ns for look in looks]),
+        **dict(zip(widths, parts, strict=True)),
+        valid=np.array([np.frombuffer(look.valid, dtype=bool) for look in looks]),
+        cameras=cameras,
+    )
+
+
+def _motion(answers: list[codec.Answered], limbs: tuple[str, ...], links: tuple[str, ...]) -> Columns:
+    rows = [row for answered in answers if (row := codec.motion_row(answered)) is not None]
+    column: dict[str, Floats] = {f.name: np.array([getattr(row, f.name) for row in rows]) for f in fields(MotionRow)}
+    rest = dict(zip(("tcp_speed", "ref_speed", "programme_s", "distance_m"), column["rest"].T, strict=True))
+    reasons = ("", *sorted({answered.reason for answered in answers} - {""}))
+    motion = Motion(
+        t_ns=np.array([answered.t_ns for answered in answers]),
+        **{name: column[name] for name in ("q", "dq", "u", "ref_m", "tcp_m")},
+        **rest,
+        limb=np.array([answered.limb for answered in answers]),
+        link=np.array([answered.link for answered in answers]),
+        status=np.array([answered.status for answered in answers]),
+        reason=np.array([reasons.index(answered.reason) for answered in answers]),
+        limbs=limbs,
+        links=links,
+        reasons=reasons,
+    )
+    measured = {f"q_measured{i + 1}": np.ascontiguousarray(column["q_measured"][:, i]) for i in range(AXES)}
+    phases = pa.array([PHASES[answered.phase] for answered in answers], type=pa.string())
+    return {**motion_columns(motion), **measured, "phase": phases}
+
+
+LOG = "log.mcap"
+_PARTIAL = ".partial"
+
+
+def begin(out: Path) -> Path:
+    """Makes the folder that a session's log goes to; it gets its own name from ``finish``.
+
+    Raises:
+        SettingsError: The folder exists, or cannot be made.
+    """
+    return RunWriter(out).__enter__().partial  # and never left: whatever comes of the session, its record stays
+
+
+def finish(partial: Path) -> Path:
+    """Makes the run folder of a session that has ended or was killed.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        SettingsError: No such session, or the run folder is there already.
+        LogError: The record cannot be read, or lacks the session's start.
+    """
+    if partial.suffix != _PARTIAL or not (partial / LOG).is_file():
+        raise SettingsError(f"{partial}: no session to be finished; those end in {_PARTIAL} and hold {LOG}")
+    writer = RunWriter(partial.with_name(partial.name.removesuffix(_PARTIAL)))
+    if writer.folder.exists():
+        raise SettingsError(f"{writer.folder}: exists already; move it away, then finish {partial}")
+    tape = Tape(partial / LOG)
+    start = tape.start()
+    job = job_of(start, writer.folder / LOG, run_folder.sha256(partial / LOG))
+    cameras, links, limbs = (tuple(start[name]) for name in ("cameras", "links", "limbs"))
+    tables = SessionTables(writer, cameras, links, limbs, start["method"])
+    for message in tape.messages():
+        tables.add(message)
+    tables.flush()
+    _measure(job, writer)
+    writer.close_tables()
+    crashes = processes.read(partial)
+    meta = _meta(job, start, tables, tape, crashes)
+    write_report(job, writer, meta)
+    writer.timing.update(tables.timing())
+    writer.finish(meta, complete=not crashes)
+    return writer.folder
+
+
+def leave(partial: Path, crashes: list[str]) -> None:
+    """Leaves of a session that no run folder can be made of its log and its crashes, and says so in run.json."""
+    for path in sorted(partial.iterdir()):
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != LOG and not path.name.startswith(processes.PREFIX):
+            path.unlink()
+    (partial / "run.json").write_text(run_folder.to_json(_crashed(crashes) | {"command": "live", "complete": False}))
+
+
+def _crashed(crashes: list[str]) -> dict[str, Any]:
+    """What run.json has of crashes."""
+    return {"crashes": crashes, "reason": crashes[0]} if crashes else {}
+
+
+def _measure(job: Job, writer: RunWriter) -> None:
+    """The table of measurements: what each frame says by itself."""
+    log = open_log(writer.partial / LOG, log_options(job.settings), skeletons=False)
+    eyes, memory = build.eyes(job, log), PersonMemory()
+    for frames in log.frames():
+        memory, measured, _ = eyes.measure(frames, memory)
+        writer.table("measurements", measurement_columns(measured))
+
+
+def _meta(job: Job, start: dict[str, Any], tables: SessionTables, tape: Tape, crashes: list[str]) -> dict[str, Any]:
+    """run.json of the session."""
+    end: dict[str, Any] = next((event for event in tables.events if event.get("what") == "end"), {})
+    notes = [str(event["text"]) for event in tables.events if event.get("what") == "note"]
+    notes += [f"{LOG}: {flaw}" for flaw in tape.flaws]
+    notes += [f"not complete: {line}" for line in crashes]
+    if not end and not crashes:
+        notes.append("the session was killed: its record has no end")
+    counts = {name.replace(" ", "_"): int(count) for name, count in end.get("counts", {}).items()}
+    counts |= dict(tables.counts) | {"messages_dropped": int(end.get("dropped", 0))}
+    counts |= {"looks_skipped": int(end.get("looks_skipped", 0))}
+    return {
+        **job.meta(),
+        "versions": start["versions"],
+        "inputs": [{"path": LOG, "sha256": job.log_sha256}],  # beside it, wherever the folder is moved to
+        "stages": {},  # a replay of the log has ticks of its own: it takes nothing over
+        "T_world_base": start["T_world_base"],
+        "sending": start["sending"],
+        "created": f"{datetime.fromtimestamp(tape.first_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "stops": end.get("stops", []),
+        "reason": end.get("reason"),
+        "counts": dict(sorted(counts.items())),
+        "notes": notes,
+        **_crashed(crashes),
+    }

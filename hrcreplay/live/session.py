@@ -1,0 +1,287 @@
+"""`hrcreplay live`: the processes of a session, its loop, and what it leaves behind."""
+
+from __future__ import annotations
+
+import gc
+import json
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from hrcreplay.egm.link import Link
+from hrcreplay.errors import HrcReplayError, LiveStopped, LogError, SettingsError
+from hrcreplay.live import processes
+from hrcreplay.live.control import watchdog
+from hrcreplay.live.control.last_resort import bring_to_rest
+from hrcreplay.live.control.loop import ENDING, Loop, LoopSettings
+from hrcreplay.live.control.pilot import Pilot
+from hrcreplay.live.control.setup import build_pilot, live_job, start_table, warm
+from hrcreplay.live.processes import Helper, step_back, take_precedence
+from hrcreplay.live.record import codec, folder
+from hrcreplay.live.record.codec import Signal
+from hrcreplay.live.view.status_publisher import Teller
+from hrcreplay.settings.load import Settings
+
+#: Longest wait for a packet before the loop looks after everything else [s].
+WAIT_S = 0.02
+
+#: Longest wait for the recording to be opened, and for the record to be finished [s].
+PATIENCE_S = 60.0
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line of `hrcreplay live`."""
+
+    human: Path | None  #: recording of the person; None: Zenoh
+    repeat: bool
+    port: int | None
+    duration_s: float
+    out: Path
+    send: bool
+    json_lines: bool
+    foxglove: int | None
+    config: Path | None
+    overrides: tuple[str, ...]
+    cell: Path | None
+
+
+def run(request: Request) -> Path:
+    """A whole session.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        SettingsError: A setting, the cell, the task, the port or the output folder cannot be used.
+        LogError: The recording of the person cannot be read.
+        LiveStopped: The session ended by a stop reason, or a part of it crashed; then its record is not complete.
+    """
+    partial = folder.begin(request.out)
+    try:
+        with ExitStack() as stack:
+            prepared = _prepare(request, stack)
+            loop, crashes = _conduct(request, prepared, partial)
+    except _CrashedError:
+        raise _broken_off(partial, processes.read(partial)) from None
+    except (HrcReplayError, KeyboardInterrupt, SystemExit):
+        if not (partial / folder.LOG).exists():
+            shutil.rmtree(partial, ignore_errors=True)  # there is nothing in it
+        raise
+    except Exception as error:  # whatever it is
+        raise _broken_off(partial, [processes.write(partial, processes.CONTROL, error)]) from None
+    done = _finish(partial, crashes)
+    _verdict(loop, done, crashes)
+    return done
+
+
+def _finish(partial: Path, crashes: list[str]) -> Path:
+    """The run folder of a session that is over."""
+    try:
+        return folder.finish(partial)
+    except KeyboardInterrupt:
+        again = f"hrcreplay verify {partial} --finish"
+        raise LiveStopped(
+            f"interrupted while its run folder was made; the record is whole, go on with: {again}"
+        ) from None
+    except HrcReplayError:
+        if not crashes:
+            raise
+        raise _broken_off(partial, crashes) from None
+    except Exception as error:  # whatever it is
+        raise _broken_off(partial, [*crashes, processes.write(partial, processes.FOLDER, error)]) from None
+
+
+def _broken_off(partial: Path, crashes: list[str]) -> LiveStopped:
+    """What to say of a session that no run folder can be made of; what there is of it says the same."""
+    folder.leave(partial, crashes)
+    return LiveStopped(f"{crashes[0]}; not complete: what there is of the record, and the traceback, is in {partial}")
+
+
+class _CrashedError(Exception):
+    """A helper crashed before the session began; its file says how."""
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A session before its processes start."""
+
+    settings: Settings
+    start: dict[str, Any]
+    pilot: Pilot
+    link: Link
+
+
+def _prepare(request: Request, stack: ExitStack) -> _Prepared:
+    """Settings, pilot, port; every kernel compiled."""
+    job, header = live_job(request.human, request.config, request.overrides, request.cell)
+    port = job.settings.live.port if request.port is None else request.port
+    start = start_table(job, header, sending=request.send)
+    pilot = build_pilot(start)
+    link = stack.enter_context(closing(Link("", port, WAIT_S)))
+    warm(start)
+    return _Prepared(job.settings, start, pilot, link)
+
+
+def _conduct(request: Request, prepared: _Prepared, partial: Path) -> tuple[Loop, list[str]]:
+    """The loop with the processes around it; the loop, which is over, and what is to be said of crashes."""
+    settings = prepared.settings
+    anchor_ns = time.time_ns() - time.monotonic_ns()
+    to_record = ["--path", str(partial / folder.LOG)]
+    recorder = Helper(processes.RECORDER, "hrcreplay.live.record.recorder", to_record, partial)
+    person_arguments = _person_arguments(request, settings, anchor_ns)
+    person = Helper(processes.PERSON, "hrcreplay.live.person.source", person_arguments, partial, told=(2, 3))
+    screen = Helper(processes.SCREEN, "hrcreplay.live.view.screen", _screen_arguments(request), partial)
+    begun = False
+    try:
+        _await_person(person, request.human)
+        begun, start_ns = True, time.monotonic_ns() + anchor_ns
+        parts = prepared.pilot, prepared.link, person, recorder
+        loop = Loop(*parts, _loop_settings(request, settings), anchor_ns, start_ns, screen)
+        recorder.send(codec.event(loop.start_ns, {"what": "start", **prepared.start}))
+        crashes = _fly(loop, prepared.start, partial, real_time=settings.live.real_time, in_3d=bool(request.foxglove))
+    finally:
+        screen.dismiss(2.0)
+        person.dismiss(2.0)
+        if recorder.dismiss(PATIENCE_S) is None:
+            processes.write(partial, processes.RECORDER, f"did not finish within {PATIENCE_S:g} s")
+        if not begun:
+            (partial / folder.LOG).unlink(missing_ok=True)  # there is nothing in it
+    return loop, list(dict.fromkeys([*crashes, *processes.read(partial)]))
+
+
+def _fly(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, in_3d: bool) -> list[str]:
+    """The loop, alone with the robot: no garbage collector, no waiting for anybody. Returns its crashes."""
+    found: list[Exception] = []
+    with _signals(loop):
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        try:
+            for refused in take_precedence() if real_time else ():
+                loop.note(f"the system refuses {refused}")
+            teller = Teller(loop, start, in_3d=in_3d)
+            loop.begin()
+            while loop.turn():
+                teller.tell()
+        except Exception as error:  # whatever it is, the robot is braked first
+            found.append(error)
+            bring_to_rest(loop, processes.said_of(error))
+        finally:
+            step_back()
+            gc.enable()
+            gc.unfreeze()
+        try:
+            loop.recorder.send(codec.event(loop.now_ns(), {"what": "end", **outcome(loop)}))
+            teller.tell(last=True)
+        except Exception as error:  # whatever it is
+            found.append(error)
+    if loop.pilot.fault is not None:
+        found.insert(0, loop.pilot.fault)
+    return [processes.write(partial, processes.CONTROL, error) for error in found]
+
+
+def outcome(loop: Loop) -> dict[str, Any]:
+    """What there is to say of a session at its end, as JSON."""
+    return {
+        "stops": [{"t_ns": t_ns, "reason": reason} for t_ns, reason in loop.pilot.stops],
+        "reason": _reason(loop),
+        "waiting": loop.pilot.waiting,
+        "answers": loop.answers,
+        "looks_skipped": loop.skipped,
+        "dropped": loop.recorder.dropped,
+        "counts": {name: int(count) for name, count in sorted(loop.pilot.counts().items())},
+    }
+
+
+def _reason(loop: Loop) -> str:
+    return loop.pilot.stop or watchdog.of_signals(loop.caught | (loop.signals & ENDING))
+
+
+def _verdict(loop: Loop, done: Path, crashes: list[str]) -> None:
+    if crashes:
+        braked = "braked; " if loop.pilot.stops else ""
+        raise LiveStopped(f"{crashes[0]}; {braked}the record, not complete, and the traceback are in {done}")
+    reason = _reason(loop)
+    if reason and reason not in (watchdog.SESSION_OVER, watchdog.RECORDING_OVER):
+        at = next((t_ns for t_ns, why in loop.pilot.stops if why == reason), None)
+        when = "" if at is None else f" after {(at - loop.start_ns) / 1e9:.1f} s"
+        last_words = [note.removeprefix("failed ") for note in loop.notes if note.startswith("failed ")]
+        why = f" ({last_words[-1]})" if reason == watchdog.PERSON_DEAD and last_words else ""
+        raise LiveStopped(f"stopped by: {reason}{why}{when}; the record is in {done}")
+
+
+@contextmanager
+def _signals(loop: Loop) -> Iterator[None]:
+    """Ctrl-C and SIGTERM become signals of the loop: the robot brakes before anything ends."""
+    meaning = {signal.SIGINT: Signal.INTERRUPT, signal.SIGTERM: Signal.TERMINATE}
+
+    def catch(number: int, _frame: FrameType | None) -> None:
+        loop.caught |= meaning[signal.Signals(number)]
+
+    before = {number: signal.signal(number, catch) for number in meaning}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _await_person(person: Helper, human: Path | None) -> None:
+    """Waits until the human side is ready.
+
+    Raises:
+        LogError: The recording cannot be read.
+        SettingsError: Zenoh cannot be opened.
+    """
+    kind = SettingsError if human is None else LogError
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline and person.alive:
+        for message in person.messages():
+            text = message[1:].decode(errors="replace")
+            if message[:1] == b"N" and text.startswith("failed "):
+                raise kind(text.removeprefix("failed "))
+            if message[:1] == b"N" and text.startswith("ready"):
+                return
+        time.sleep(0.01)
+    if not person.alive:
+        raise _CrashedError
+    raise kind(f"{human or 'live.zenoh'}: the human side did not get ready within {PATIENCE_S:g} s")
+
+
+def _loop_settings(request: Request, settings: Settings) -> LoopSettings:
+    live, store_hz = settings.live, settings.occupancy.store_hz
+    return LoopSettings(
+        duration_s=request.duration_s,
+        sending=request.send,
+        person_late_s=live.person_late_s,
+        overrun_s=live.overrun_s,
+        keep_recorder=live.keep_recorder,
+        store_every_s=0.0 if store_hz == "all" else 1.0 / store_hz,
+    )
+
+
+def _person_arguments(request: Request, settings: Settings, anchor_ns: int) -> list[str]:
+    table = settings.model_dump(mode="json")
+    common = ["--anchor", str(anchor_ns), "--options", json.dumps(table["logs"])]
+    if request.human is None:
+        return [*common, "--zenoh", json.dumps(table["live"]["zenoh"])]
+    return [*common, "--log", str(request.human), *(["--repeat"] if request.repeat else [])]
+
+
+def _screen_arguments(request: Request) -> list[str]:
+    arguments = ["--json"] if request.json_lines else []
+    return arguments + ([] if request.foxglove is None else ["--foxglove", str(request.foxglove)])
+
+
+def default_out(human: Path | None) -> Path:
+    """Where a session is left when nobody says where."""
+    name = "zenoh" if human is None else human.stem
+    return Path("reports") / name / f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-live"

@@ -1,0 +1,286 @@
+"""Skeletons as openni_tracker publishes them: transforms camera -> left_elbow_1 on /tf, one message a joint.
+
+Skeletons of our own log.
+
+Skeletons as the Azure Kinect ROS driver publishes them: visualization_msgs/MarkerArray, a marker a joint.
+
+Skeletons of a message type that settings describe.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from hrcreplay.errors import LogError
+from hrcreplay.logs.messages import (
+    AZURE_INDEX,
+    AZURE_JOINTS,
+    OPENNI_JOINTS,
+    OPENNI_POINTS,
+    Message,
+    Row,
+    Undecodable,
+    blank,
+    camera_of,
+    stamp_ns,
+)
+from hrcreplay.records import POINTS, Floats
+
+
+class OwnDecoder:
+    """Topic /camera/<name>/skeleton of our own log."""
+
+    notes: ClassVar[tuple[str, ...]] = ()
+    always_heard: ClassVar[bool] = False
+
+    def __init__(self, topic: str, camera: str) -> None:
+        self.topic = topic
+        self.cameras = (camera,)
+
+    def fresh(self) -> OwnDecoder:
+        """Itself: it remembers nothing."""
+        return self
+
+    def rows(self, message: Message) -> list[Row]:
+        """The one row of a message."""
+        skeleton = message.read()
+        confidence = np.array(skeleton.confidence, dtype=np.float64)
+        if len(confidence) != len(POINTS):
+            raise Undecodable(f"{self.topic}: a skeleton of {len(confidence)} confidences; {len(POINTS)} are right")
+        points = points_of(skeleton.points, self.topic)
+        return [Row(skeleton.capture_ns, self.cameras[0], skeleton.body, points, confidence)]
+
+
+def points_of(values: Any, topic: str) -> Floats:
+    """(20, 3) points from the packed values of a message."""
+    if len(values) != 3 * len(POINTS):
+        raise Undecodable(f"{topic}: a body of {len(values)} numbers; {3 * len(POINTS)} are right")
+    return np.array(values, dtype=np.float64).reshape(len(POINTS), 3)
+
+
+MARKER_TYPE = "visualization_msgs/MarkerArray"
+_IDS_A_BODY = 100
+_LEAST_MARKERS = 8
+_GONE = (2, 3)  # actions DELETE and DELETEALL
+
+
+class MarkerDecoder:
+    """A MarkerArray topic; marker.id = body * 100 + joint, positions in metres in the camera's frame.
+
+    The markers carry no confidence: it is 1 for every point. The camera is named after the topic.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = ("markers carry no confidence: 1 for every point",)
+    always_heard: ClassVar[bool] = True
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+        self.cameras = (camera_of(topic),)
+
+    def fresh(self) -> MarkerDecoder:
+        """Itself: it remembers nothing."""
+        return self
+
+    def rows(self, message: Message) -> list[Row]:
+        """A row a body; none for an empty or a clearing array."""
+        rows = []
+        for body, markers in sorted(_bodies(message.read()).items()):
+            points, confidence = blank()
+            for joint, marker in markers.items():
+                if joint in AZURE_INDEX:
+                    at = marker.pose.position
+                    points[AZURE_INDEX[joint]] = at.x, at.y, at.z
+                    confidence[AZURE_INDEX[joint]] = 1.0
+            stamp = stamp_ns(next(iter(markers.values())).header.stamp, self.topic)
+            rows.append(Row(stamp or None, self.cameras[0], body, points, confidence, stamp_zero=not stamp))
+        return rows
+
+
+def is_skeleton(array: Any) -> bool:
+    """Whether the markers of an array look like a body's joints: any other node publishes markers too."""
+    return any(len(markers) >= _LEAST_MARKERS for markers in _bodies(array).values())
+
+
+def _bodies(array: Any) -> dict[int, dict[int, Any]]:
+    bodies: dict[int, dict[int, Any]] = {}
+    for marker in array.markers:
+        body, joint = divmod(marker.id, _IDS_A_BODY)
+        if marker.action not in _GONE and body >= 0 and joint < len(AZURE_JOINTS):
+            bodies.setdefault(body, {})[joint] = marker
+    return bodies
+
+
+TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+_FRAME_NS = 15_000_000  # half a period of 30 Hz: openni_tracker stamps every joint by itself, some ms apart
+_LEAST_JOINTS = 6
+_NAMES = "|".join(sorted(OPENNI_JOINTS))
+_CHILD = re.compile(rf"/?({_NAMES})_(\d+)")
+_JOINT_BYTES = re.compile(rf"(?:{_NAMES})_\d".encode())
+_PAIR_BYTES = re.compile(rf"([!-~]+)\0{{0,4}}[\x01-\xff]\0\0\0(/?(?:{_NAMES})_\d+)".encode())
+_WHERE = {joint: [POINTS.index(p) for p, named in OPENNI_POINTS.items() if named == joint] for joint in OPENNI_JOINTS}
+
+
+@dataclass
+class _Person:
+    """A person's joints of the frame being assembled."""
+
+    known: set[str] = field(default_factory=set)  #: joints ever seen of the person
+    joints: dict[str, Floats] = field(default_factory=dict)
+    first_ns: int = 0
+
+
+class TfDecoder:
+    """A tf topic. The camera is the parent frame, the body the number at the end of the child's name.
+
+    A person's transforms make one frame; it is complete, and arrives, with the last of the joints that this person
+    has had so far, or, where one of them stays away, when the next frame begins: a joint comes again or the stamp
+    moves by more than 15 ms. The capture is the first transform's stamp. Left and right are taken as named. OpenNI has
+    no pelvis: it is the middle of the hips.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = (
+        "openni has no wrist and no pelvis: the hand and the middle of the hips stand for them",
+    )
+    always_heard: ClassVar[bool] = False
+
+    def __init__(self, topic: str, cameras: tuple[str, ...]) -> None:
+        self.topic = topic
+        self.cameras = cameras
+        self._people: dict[tuple[str, int], _Person] = defaultdict(_Person)
+
+    def fresh(self) -> TfDecoder:
+        """A decoder that has seen nobody yet."""
+        return TfDecoder(self.topic, self.cameras)
+
+    def rows(self, message: Message) -> list[Row]:
+        """The frames that this message completes."""
+        rows: list[Row] = []
+        if not _JOINT_BYTES.search(message.data):
+            return rows
+        for transform in message.read().transforms:
+            child = _CHILD.fullmatch(transform.child_frame_id)
+            camera = camera_of(transform.header.frame_id)
+            if not child or camera not in self.cameras:
+                continue
+            joint, body = child[1], int(child[2])
+            capture_ns = stamp_ns(transform.header.stamp, self.topic)
+            person = self._people[(camera, body)]
+            if person.joints and (joint in person.joints or abs(capture_ns - person.first_ns) > _FRAME_NS):
+                rows.append(_finish(person, camera, body))
+            if not person.joints:
+                person.first_ns = capture_ns
+            at = transform.transform.translation
+            person.joints[joint] = np.array([at.x, at.y, at.z])
+            if person.joints.keys() >= (person.known if len(person.known) >= _LEAST_JOINTS else OPENNI_JOINTS):
+                rows.append(_finish(person, camera, body))
+        return rows
+
+
+def _finish(person: _Person, camera: str, body: int) -> Row:
+    person.known.update(person.joints)
+    points, confidence = blank()
+    for joint, at in person.joints.items():
+        points[_WHERE[joint]] = at
+        confidence[_WHERE[joint]] = 1.0
+    left, right = person.joints.get("left_hip"), person.joints.get("right_hip")
+    if left is not None and right is not None:
+        points[POINTS.index("pelvis")] = (left + right) / 2.0
+        confidence[POINTS.index("pelvis")] = 1.0
+    person.joints = {}
+    return Row(person.first_ns or None, camera, body, points, confidence, stamp_zero=not person.first_ns)
+
+
+def find_cameras(messages: Iterable[Message]) -> tuple[str, ...]:
+    """Frames under which people are tracked, in order of appearance.
+
+    The whole topic is gone through, as a camera may start late, but only messages with a pair of frames not met
+    before are decoded.
+    """
+    met: set[tuple[bytes, bytes]] = set()
+    joints: dict[str, set[str]] = defaultdict(set)
+    for message in messages:
+        if not _JOINT_BYTES.search(message.data):
+            continue
+        pairs = set(_PAIR_BYTES.findall(message.data))
+        if pairs and pairs <= met:
+            continue
+        met |= pairs
+        for transform in message.read().transforms:
+            child = _CHILD.fullmatch(transform.child_frame_id)
+            if child:
+                joints[camera_of(transform.header.frame_id)].add(child[1])
+    return tuple(camera for camera, names in joints.items() if len(names) >= _LEAST_JOINTS)
+
+
+_METRES = {"m": 1.0, "mm": 1e-3}
+
+
+@dataclass(frozen=True)
+class GenericDecoder:
+    """How to read skeletons from a message type the package does not know; one body, called 0."""
+
+    topic: str
+    camera: str
+    points: str  #: path to the array of points, fields joined by dots; its elements have x, y, z
+    index: Mapping[str, int]  #: body point -> element
+    unit: str = "m"  #: "m" or "mm"
+    stamp: str | None = "header.stamp"  #: path to the capture time; None: the arrival time is used
+    confidence: str | None = None  #: path to an array of confidences in [0, 1]; None: 1 for every finite point
+
+    notes: ClassVar[tuple[str, ...]] = ()
+    always_heard: ClassVar[bool] = True
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The one sensor."""
+        return (self.camera,)
+
+    def fresh(self) -> GenericDecoder:
+        """Itself: it remembers nothing."""
+        return self
+
+    def rows(self, message: Message) -> list[Row]:
+        """The one row of a message; none where the array is empty."""
+        content = message.read()
+        where = f"{self.topic} ({message.topic.type})"
+        elements = _array(content, self.points, where)
+        trust = None if self.confidence is None else _array(content, self.confidence, where)
+        if not len(elements):
+            return []
+        points, confidence = blank()
+        scale = _METRES[self.unit]
+        for name, element in self.index.items():
+            if not 0 <= element < len(elements):
+                continue  # a shorter array has no such point
+            at, i = elements[element], POINTS.index(name)
+            try:
+                points[i] = scale * at.x, scale * at.y, scale * at.z
+            except AttributeError as error:
+                raise LogError(
+                    f"{where}: elements of {self.points!r} have no x, y, z; name an array of points"
+                ) from error
+            confidence[i] = 1.0 if trust is None else float(trust[element]) if element < len(trust) else 0.0
+        stamp = None if self.stamp is None else stamp_ns(_field(content, self.stamp, where), where)
+        return [Row(stamp or None, self.camera, 0, points, confidence, stamp_zero=stamp == 0)]
+
+
+def _array(content: Any, path: str, where: str) -> Any:
+    found = _field(content, path, where)
+    if isinstance(found, str) or not hasattr(found, "__len__"):
+        raise LogError(f"{where}: {path!r} is no array but {found!r}; name an array")
+    return found
+
+
+def _field(content: Any, path: str, where: str) -> Any:
+    for name in path.split("."):
+        if not hasattr(content, name):
+            known = ", ".join(f for f in getattr(content, "__dataclass_fields__", ()) if not f.startswith("__"))
+            raise LogError(f"{where}: has no field {path!r}; {name!r} is not among {known or 'its fields'}")
+        content = getattr(content, name)
+    return content

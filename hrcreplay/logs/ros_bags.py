@@ -1,0 +1,345 @@
+"""ROS 1 bags without an index, or with a broken one: read by going through their chunks once.
+
+Layout: http://wiki.ros.org/Bags/Format/2.0
+
+ROS messages from their bytes, without ROS: by the definitions in the log, else by those of the known releases.
+
+ROS 1 bags and the sqlite3 files of ROS 2 bags, through rosbags.
+"""
+
+from __future__ import annotations
+
+import bz2
+import struct
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
+from io import BytesIO
+from pathlib import Path
+from typing import IO, Any
+
+import lz4.frame  # type: ignore[import-untyped]
+from rosbags import rosbag1, rosbag2
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.base import TypesysError
+from rosbags.typesys.store import Typestore
+from zstandard import ZstdDecompressor, ZstdError
+
+from hrcreplay.errors import LogError
+from hrcreplay.logs.messages import Damage, Message, Part, Stream, Topic, Undecodable, in_order
+
+_IDL_RULE = "=" * 80 + "\n"
+_ROS1 = (Stores.ROS1_NOETIC,)
+_ROS2 = (Stores.LATEST, Stores.ROS2_HUMBLE, Stores.ROS2_GALACTIC, Stores.ROS2_FOXY)  # by what differs in their messages
+_FAILURES = (SerdeError, TypesysError, KeyError, ValueError, AssertionError)
+
+
+def plain(msgtype: str) -> str:
+    """The name of a type without the "msg" that ROS 2 puts in the middle."""
+    return msgtype.replace("/msg/", "/")
+
+
+def parser(where: str, msgtype: str, definition: str, form: str, *, cdr: bool) -> Callable[[bytes], Any]:
+    """A function from the bytes of a message to its fields.
+
+    Args:
+        where: Start of error messages: file and topic.
+        msgtype: Name of the type, of ROS 1 or ROS 2.
+        definition: Text of the type's definition in the log; "" where there is none.
+        form: "msg" or "idl".
+        cdr: Whether the bytes are CDR (ROS 2); else they are ROS 1's.
+
+    Returns:
+        The function. It settles on the first definition that fits its first message and raises Undecodable for a
+        message that fits none.
+    """
+    name = _full(msgtype)
+    chosen: list[Typestore] = []
+
+    def read(store: Typestore, data: bytes) -> Any:
+        return store.deserialize_cdr(data, name) if cdr else store.deserialize_ros1(data, name)
+
+    def parse(data: bytes) -> Any:
+        problem = "its type is not defined in the log"
+        for store in chosen or _stores(name, definition, form, _ROS2 if cdr else _ROS1):
+            try:
+                message = read(store, data)
+            except _FAILURES as error:
+                problem = str(error)
+                continue
+            if not chosen:
+                chosen.append(store)
+            return message
+        raise Undecodable(f"{where}: a message of type {plain(msgtype)} cannot be decoded: {problem}")
+
+    return parse
+
+
+def _stores(name: str, definition: str, form: str, releases: tuple[Stores, ...]) -> Iterator[Typestore]:
+    if definition:
+        store = get_typestore(Stores.EMPTY)
+        try:
+            store.register(_types(name, definition, form))
+            yield store
+        except _FAILURES:
+            pass  # some recorders stored definitions without their parts; a release may know the type
+    for release in releases:
+        store = _release(release)
+        if name in store.fielddefs:
+            yield store
+
+
+@cache
+def _release(release: Stores) -> Typestore:
+    """The types of a release, which take a while to build."""
+    return get_typestore(release)
+
+
+def _types(name: str, definition: str, form: str) -> Any:
+    if form == "msg":
+        return get_types_from_msg(definition, name)
+    types: dict[str, Any] = {}
+    for part in definition.split(_IDL_RULE) if definition.startswith(_IDL_RULE) else [definition]:
+        text = part.partition("\n")[2] if part.startswith("IDL: ") else part
+        if text.strip():
+            types.update(get_types_from_idl(text))
+    return types
+
+
+def _full(msgtype: str) -> str:
+    package, _, rest = msgtype.partition("/")
+    return msgtype if "/" in rest else f"{package}/msg/{rest}"
+
+
+MAGIC = b"#ROSBAG V2.0\n"
+_MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
+_DECOMPRESS: dict[bytes, Callable[[bytes], bytes]] = {
+    b"none": bytes,
+    b"bz2": bz2.decompress,
+    b"lz4": lz4.frame.decompress,
+}
+_BROKEN_CHUNK = (struct.error, OSError, RuntimeError, ValueError, KeyError, EOFError)
+
+Fields = dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    start_ns: int
+    end_ns: int
+    offset: int
+
+
+class RecoveredBag:
+    """A ROS 1 bag whose index is missing or broken.
+
+    Raises:
+        LogError: No whole message is in it.
+    """
+
+    profile = "ros1"
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        damage = Damage()
+        damage.notes.append("the bag has no usable index: it was read once more to make one (rosbag reindex mends it)")
+        damage.defects["unindexed"] = 1
+        self._chunks: list[_Chunk] = []
+        connections: dict[int, tuple[str, Fields]] = {}
+        counts: Counter[int] = Counter()
+        with path.open("rb") as file:
+            whole = self._scan(file, connections, counts)
+        if not self._chunks:
+            raise LogError(f"{path}: the log holds no messages that are whole; copy the bag again")
+        self.start_ns = min(chunk.start_ns for chunk in self._chunks)
+        self.end_ns = max(chunk.end_ns for chunk in self._chunks)
+        if not whole:
+            damage.ends_at(self.end_ns, self.start_ns)
+        self.defects, self.notes = damage.defects, damage.notes
+        self._topics = {
+            number: _topic(path, name, fields, counts[number]) for number, (name, fields) in sorted(connections.items())
+        }
+        self.topics = tuple(self._topics.values())
+
+    def messages(self, names: Collection[str], start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
+        """Messages on these topics with start <= arrival < end, in order of arrival."""
+        wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
+        with self._path.open("rb") as file:
+            for message in in_order(
+                Part(chunk.start_ns, partial(self._chunk, file, chunk, wanted))
+                for chunk in self._chunks
+                if (start_ns is None or chunk.end_ns >= start_ns) and (end_ns is None or chunk.start_ns < end_ns)
+            ):
+                after_start = start_ns is None or message.arrival_ns >= start_ns
+                if after_start and (end_ns is None or message.arrival_ns < end_ns):
+                    yield message
+
+    def _scan(self, file: IO[bytes], connections: dict[int, tuple[str, Fields]], counts: Counter[int]) -> bool:
+        """Finds chunks and connections; whether the file ends with a whole record."""
+        file.seek(len(MAGIC))
+        offset = file.tell()
+        try:
+            while (fields := _fields(file)) is not None:
+                (length,) = struct.unpack("<L", file.read(4))
+                data = file.read(length)
+                if fields["op"][0] == _CHUNK:
+                    self._add(offset, _DECOMPRESS[fields["compression"]](data), connections, counts)
+                if len(data) < length:
+                    return False
+                if fields["op"][0] == _CONNECTION:
+                    _connect(fields, data, connections)
+                offset = file.tell()
+        except _BROKEN_CHUNK:
+            return False
+        return True
+
+    def _add(self, offset: int, data: bytes, connections: dict[int, tuple[str, Fields]], counts: Counter[int]) -> None:
+        times = []
+        for fields, content in _inner(data):
+            if fields["op"][0] == _CONNECTION:
+                _connect(fields, content, connections)
+            elif fields["op"][0] == _MESSAGE:
+                times.append(_time_ns(fields))
+                counts[_number(fields)] += 1
+        if times:
+            self._chunks.append(_Chunk(min(times), max(times), offset))
+
+    def _chunk(self, file: IO[bytes], chunk: _Chunk, wanted: dict[int, Topic]) -> Iterator[Message]:
+        file.seek(chunk.offset)
+        header = _fields(file) or {}
+        data = file.read(struct.unpack("<L", file.read(4))[0])
+        messages = [
+            Message(_time_ns(fields), wanted[_number(fields)], content)
+            for fields, content in _inner(_DECOMPRESS[header["compression"]](data))
+            if fields["op"][0] == _MESSAGE and _number(fields) in wanted
+        ]
+        messages.sort(key=lambda message: message.arrival_ns)
+        yield from messages
+
+
+def _fields(file: IO[bytes]) -> Fields | None:
+    """The header of the next record; None at the end of the file."""
+    prefix = file.read(4)
+    if not prefix:
+        return None
+    (length,) = struct.unpack("<L", prefix)
+    data = file.read(length)
+    if len(data) < length:
+        raise EOFError
+    fields: Fields = {}
+    at = 0
+    while at < length:
+        (size,) = struct.unpack_from("<L", data, at)
+        name, _, value = data[at + 4 : at + 4 + size].partition(b"=")
+        fields[name.decode()] = value
+        at += 4 + size
+    return fields
+
+
+def _inner(data: bytes) -> Iterator[tuple[Fields, bytes]]:
+    """Whole records of a chunk; the last chunk of a bag that breaks off may itself break off."""
+    file = BytesIO(data)
+    try:
+        while (fields := _fields(file)) is not None:
+            (length,) = struct.unpack("<L", file.read(4))
+            content = file.read(length)
+            if len(content) < length:
+                return
+            yield fields, content
+    except (struct.error, EOFError):
+        return
+
+
+def _number(fields: Fields) -> int:
+    return int.from_bytes(fields["conn"], "little")
+
+
+def _time_ns(fields: Fields) -> int:
+    seconds, nanoseconds = struct.unpack("<LL", fields["time"])
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def _connect(fields: Fields, data: bytes, connections: dict[int, tuple[str, Fields]]) -> None:
+    described = _fields(BytesIO(struct.pack("<L", len(data)) + data)) or {}
+    connections[_number(fields)] = (fields["topic"].decode(), described)
+
+
+def _topic(path: Path, name: str, fields: Fields, count: int) -> Topic:
+    msgtype = fields["type"].decode()
+    definition = fields["message_definition"].decode(errors="replace")
+    parse = parser(f"{path}: {name}", msgtype, definition, "msg", cdr=False)
+    return Topic(name, plain(msgtype), count, parse)
+
+
+_NO_INDEX = (rosbag1.ReaderError, AssertionError, struct.error, ValueError, IndexError)
+_BROKEN = (*_NO_INDEX, rosbag2.ReaderError, ZstdError, RuntimeError, OSError)  # the last two: lz4's, bz2's
+
+
+def open_bag(path: Path) -> Stream:
+    """A ROS 1 bag, by its index or, where that is missing or broken, without it.
+
+    Raises:
+        LogError: It holds no whole message.
+    """
+    try:
+        return RosStream(path, rosbag1.Reader, cdr=False)
+    except _NO_INDEX:
+        return RecoveredBag(path)
+
+
+def open_db3(path: Path, *, zstd_messages: bool = False) -> Stream:
+    """A sqlite3 file of a ROS 2 bag, by itself; ``zstd_messages`` where each message is compressed.
+
+    Raises:
+        LogError: It is no such file.
+    """
+    try:
+        stream = RosStream(path, rosbag2.Reader, cdr=True, zstd_messages=zstd_messages)
+    except rosbag2.ReaderError as error:
+        raise LogError(f"{path}: cannot be read as a ROS 2 bag ({error}); record or copy it again") from error
+    journal = path.with_name(f"{path.name}-wal")
+    if journal.exists() and journal.stat().st_size:
+        stream.notes.append(f"{journal.name} beside the file holds messages not yet in it; they are left out")
+    return stream
+
+
+class RosStream:
+    """A file that rosbags reads."""
+
+    def __init__(self, path: Path, reader: Callable[[Path], Any], *, cdr: bool, zstd_messages: bool = False) -> None:
+        self._path = path
+        self._reader = reader
+        self._unpack: Callable[[bytes], bytes] = ZstdDecompressor().decompress if zstd_messages else bytes
+        self.profile = "ros2" if cdr else "ros1"
+        self.defects: Counter[str] = Counter()
+        self.notes: list[str] = []
+        with reader(path) as opened:
+            connections: list[Connection] = list(opened.connections)
+            self.start_ns, self.end_ns = opened.start_time, opened.end_time - 1
+        self._topics: dict[tuple[str, str], Topic] = {}
+        for c in connections:
+            key = (c.topic, c.msgtype)
+            count = c.msgcount + (self._topics[key].count if key in self._topics else 0)
+            self._topics[key] = Topic(c.topic, plain(c.msgtype), count, _parser(path, c, cdr=cdr))
+        self.topics = tuple(self._topics.values())
+
+    def messages(self, names: Collection[str], start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
+        """Messages on these topics with start <= arrival < end, in order of arrival."""
+        try:
+            with self._reader(self._path) as opened:
+                wanted = [c for c in opened.connections if c.topic in names]
+                if not wanted:
+                    return
+                for c, arrival_ns, data in opened.messages(wanted, start_ns, end_ns):
+                    yield Message(arrival_ns, self._topics[(c.topic, c.msgtype)], self._unpack(data))
+        except _BROKEN as error:
+            found = str(error) or type(error).__name__  # struct and zlib say what they found, EOFError does not
+            raise LogError(f"{self._path}: broken in the middle ({found}); copy it again") from error
+
+
+def _parser(path: Path, connection: Connection, *, cdr: bool) -> Callable[[bytes], Any]:
+    form = "idl" if connection.msgdef.format == MessageDefinitionFormat.IDL else "msg"
+    return parser(f"{path}: {connection.topic}", connection.msgtype, connection.msgdef.data, form, cdr=cdr)

@@ -1,0 +1,304 @@
+"""Errors of the cameras and of the fused state against ground truth.
+
+Metrics of the data that went in, and of the volumes that came out of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from hrcreplay.records import JOINTS, LIMBS, Bools, Floats, Ints
+from hrcreplay.report.metrics import (
+    ANGLES,
+    IS_ANGLE,
+    MetricTable,
+    central_differences,
+    columns,
+    difference,
+    durations_s,
+    interpolate,
+    stretches,
+    times,
+)
+from hrcreplay.store.run_folder import Run
+
+
+def cameras(run: Run) -> list[str]:
+    """Names of the run's cameras, sorted."""
+    found: set[str] = set()
+    if run.measurements is not None:
+        found |= set(run.measurements["camera"].astype(str))
+    if run.state is not None:
+        found |= {name.removeprefix("valid_") for name in run.state.columns if name.startswith("valid_")}
+    return sorted(found)
+
+
+def add_quality(metrics: MetricTable, run: Run, gap_s: float) -> None:
+    """Frames, rates and gaps of each camera, what the filter could use of them, and every counter of the reader."""
+    _add_span(metrics, run)
+    for camera in cameras(run):
+        _add_frames(metrics, run.measurements, camera, gap_s)
+        _add_validity(metrics, run.state, camera, gap_s)
+    if run.state is not None:
+        _add_coverage(metrics, run.state)
+    for name, count in run.counts.items():
+        metrics.add(f"count_{name}", int(count), "1", f"data quality counter '{name.replace('_', ' ')}'")
+
+
+def _add_span(metrics: MetricTable, run: Run) -> None:
+    table = run.state if run.state is not None else run.motion
+    t_ns = times(table) if table is not None else np.zeros(0, dtype=np.int64)
+    reason = "no stage with ticks was run"
+    span = (int(t_ns[-1]) - int(t_ns[0])) * 1e-9 if len(t_ns) else None
+    metrics.add("span_s", span, "s", "from the first tick to the last", reason=reason)
+    metrics.add("ticks", len(t_ns) or None, "1", "ticks of the filter and the controller", reason=reason)
+
+
+def _add_frames(metrics: MetricTable, measurements: pd.DataFrame | None, camera: str, gap_s: float) -> None:
+    reason = "the run has no table of measurements"
+    frames = rate = gaps = longest = None
+    if measurements is not None:
+        capture = np.sort(times(measurements[measurements["camera"] == camera], "capture_ns"))
+        steps = np.diff(capture) * 1e-9
+        frames = len(capture)
+        rate = 1.0 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else None
+        gaps = int((steps > gap_s).sum())
+        longest = float(steps.max()) if len(steps) else None
+        reason = "fewer than two frames"
+    name = f"camera_{camera}"
+    metrics.add(f"{name}_frames", frames, "1", f"frames of {camera} that hold the person", reason=reason)
+    metrics.add(f"{name}_rate_hz", rate, "Hz", f"1 / median time between captures of {camera}", reason=reason)
+    metrics.add(f"{name}_gaps", gaps, "1", f"times between captures of {camera} over {gap_s:g} s", reason=reason)
+    metrics.add(f"{name}_gap_max_s", longest, "s", f"longest time between captures of {camera}", reason=reason)
+
+
+def _add_validity(metrics: MetricTable, state: pd.DataFrame | None, camera: str, gap_s: float) -> None:
+    used = recent = None
+    if state is not None and f"valid_{camera}" in state:
+        valid = state[f"valid_{camera}"].to_numpy(dtype=bool)
+        used = float(valid.mean()) if len(valid) else None
+        recent = float((seconds_since(state, valid) <= gap_s).mean()) if len(valid) else None
+    metrics.add(
+        f"camera_{camera}_valid_share",
+        used,
+        "1",
+        f"share of ticks whose update used a row of {camera}; a camera slower than the filter cannot reach 1",
+        reason="not fused",
+    )
+    metrics.add(
+        f"camera_{camera}_available_share",
+        recent,
+        "1",
+        f"share of ticks at most {gap_s:g} s after a tick whose update used a row of {camera}",
+        reason="not fused",
+    )
+
+
+def seconds_since(state: pd.DataFrame, valid: Bools) -> Floats:
+    """(n,) time since the last valid tick, 0 at one [s]; infinite before the first."""
+    t_ns = times(state)
+    last = np.maximum.accumulate(np.where(valid, np.arange(len(valid)), -1))
+    return np.where(last < 0, np.inf, (t_ns - t_ns[np.maximum(last, 0)]) * 1e-9)
+
+
+def _add_coverage(metrics: MetricTable, state: pd.DataFrame) -> None:
+    names = [name for name in state.columns if name.startswith("valid_")]
+    any_valid: Bools = np.asarray(state[names].to_numpy(dtype=bool).any(axis=1))
+    t_ns = times(state)
+    runs = stretches(~any_valid)
+    ends = (t_ns + np.round(durations_s(t_ns) * 1e9)).astype(np.int64)
+    longest = max(((ends[last - 1] - t_ns[first]) * 1e-9 for first, last in runs), default=0.0)
+    metrics.add("ticks_without_camera", int((~any_valid).sum()), "1", "ticks whose update used no camera at all")
+    metrics.add(
+        "longest_without_camera_s",
+        float(longest) if len(t_ns) else None,
+        "s",
+        "longest stretch of ticks whose updates used no camera at all, the time before the first frame included",
+    )
+    p = columns(state)
+    finite: Bools = np.asarray(np.isfinite(p).all(axis=1))
+    lost = ~finite
+    lost[: int(np.argmax(finite)) if finite.any() else len(lost)] = False
+    metrics.add("ticks_before_first_state", int((~finite).sum() - lost.sum()), "1", "ticks before the first full state")
+    metrics.add("ticks_state_lost", int(lost.sum()), "1", "ticks after the first full state without a finite one")
+
+
+def add_occupancy(metrics: MetricTable, occupancy: pd.DataFrame | None) -> None:
+    """Mean swept volume per method and limb, and of all limbs of a tick together."""
+    if occupancy is None:
+        metrics.add("occupancy_ticks", None, "1", "ticks with stored swept volumes", reason="not predicted")
+        return
+    metrics.add("occupancy_ticks", int(occupancy["t_ns"].nunique()), "1", "ticks with stored swept volumes")
+    for method, rows in occupancy.groupby("method", sort=True):
+        for limb in (*LIMBS, *sorted(set(rows["limb"]) - set(LIMBS))):
+            volume = rows.loc[rows["limb"] == limb, "volume_m3"].to_numpy(dtype=float)
+            volume = volume[np.isfinite(volume)]
+            metrics.add(
+                f"occupancy_{method}_{limb}_m3",
+                float(volume.mean()) if len(volume) else None,
+                "m^3",
+                f"mean swept volume of {limb} over the stored ticks, method '{method}', limb radius included",
+            )
+        total = (
+            rows[rows["limb"].isin(LIMBS)].groupby("t_ns", sort=True)["volume_m3"].sum(min_count=len(LIMBS)).dropna()
+        )
+        metrics.add(
+            f"occupancy_{method}_sum_m3",
+            float(total.mean()) if len(total) else None,
+            "m^3",
+            f"mean over the stored ticks of the six limbs' swept volumes added up (overlaps count twice), '{method}'",
+        )
+
+
+NO_TRUTH = "the log has no ground truth"
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Estimate minus truth of one source, a row a tick or a frame; NaN where one of the two is missing."""
+
+    t_ns: Ints  #: (n,) when the position errors hold [ns]
+    position: Floats  #: (n, 12) [m, m, rad...]
+    velocity_t_ns: Ints  #: (k,) when the velocity errors hold [ns]
+    velocity: Floats  #: (k, 12) [m/s, m/s, rad/s...]
+
+
+def errors(run: Run, gap_s: float) -> dict[str, Errors]:
+    """Errors of ``fused`` at the ticks and of each camera at its captures; empty without ground truth.
+
+    The fused state is compared with the truth interpolated at the tick. A camera's raw angles are compared with the
+    truth at the capture; their differences between consecutive captures over the time between, with the truth's
+    velocity half-way between the two, which is the kindest instant for a difference. Pairs further apart than
+    ``gap_s`` are left out. The truth's velocity is its central difference.
+    """
+    if run.truth is None or len(run.truth) < 3:
+        return {}
+    truth_ns, truth = times(run.truth), columns(run.truth)
+    rate = central_differences(truth_ns, truth)
+    found: dict[str, Errors] = {}
+    if run.state is not None:
+        t_ns = times(run.state)
+        found["fused"] = Errors(
+            t_ns,
+            difference(columns(run.state), interpolate(truth_ns, truth, t_ns, angles=True)),
+            t_ns,
+            columns(run.state, "_vel") - interpolate(truth_ns, rate, t_ns, angles=False),
+        )
+    if run.measurements is not None:
+        for camera in cameras(run):
+            rows = run.measurements[run.measurements["camera"] == camera].sort_values("capture_ns", kind="stable")
+            at_ns, raw = times(rows, "capture_ns"), columns(rows)
+            step_ns = np.diff(at_ns)
+            kept = (step_ns > 0) & (step_ns * 1e-9 <= gap_s)
+            middle_ns = (at_ns[:-1] + step_ns // 2)[kept]
+            raw_rate = difference(raw[1:], raw[:-1])[kept] / (step_ns[kept] * 1e-9)[:, None]
+            found[camera] = Errors(
+                at_ns,
+                difference(raw, interpolate(truth_ns, truth, at_ns, angles=True)),
+                middle_ns,
+                raw_rate - interpolate(truth_ns, rate, middle_ns, angles=False),
+            )
+    return found
+
+
+def rmse(error: Floats) -> float | None:
+    """Root mean square of the finite entries; None without any."""
+    finite = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
+
+
+def median(error: Floats) -> float | None:
+    """Median of the absolute finite entries; None without any."""
+    finite = np.abs(error[np.isfinite(error)])
+    return float(np.median(finite)) if len(finite) else None
+
+
+def add_fusion(metrics: MetricTable, run: Run, gap_s: float) -> None:
+    """RMSE and median error per joint and pooled, and the fused state's share of the better camera's RMSE."""
+    found = errors(run, gap_s)
+    sources = ["fused", *cameras(run)]
+    for source in sources:
+        _add_source(metrics, source, found.get(source), "no such rows" if found else NO_TRUTH)
+    for kind, unit in (("angle", "rad"), ("velocity", "rad/s")):
+        _add_ratio(metrics, found, kind, unit)
+        _add_seen(metrics, run, found, kind, unit, gap_s)
+
+
+def _add_source(metrics: MetricTable, source: str, error: Errors | None, reason: str) -> None:
+    fused = source == "fused"
+    name = "fusion" if fused else f"camera_{source}"
+    if fused:
+        what = {"": "fused {} at the tick", "velocity_": "fused velocity of {} at the tick"}
+    else:
+        what = {
+            "": f"raw {{}} of {source} at the capture",
+            "velocity_": f"raw {{}} of {source} differenced between consecutive captures, half-way between them",
+        }
+    for kind, text in what.items():
+        values = None if error is None else (error.velocity if kind else error.position)
+        per_s = "/s" if kind else ""
+        for joint in JOINTS:
+            column = None if values is None else values[:, JOINTS.index(joint)]
+            unit = ("rad" if joint in ANGLES else "m") + per_s
+            meaning = f"RMSE of the {text.format(joint)} against ground truth, samples that both have"
+            metrics.add(
+                f"{name}_{kind}rmse_{joint}", None if column is None else rmse(column), unit, meaning, reason=reason
+            )
+        pooled = None if values is None else values[:, IS_ANGLE]
+        label = f"{name}_{kind or 'angle_'}"
+        scope = f"the {text.format('angles')} against ground truth, pooled over all samples of the 10 angles"
+        metrics.add(
+            f"{label}rmse", None if pooled is None else rmse(pooled), f"rad{per_s}", f"RMSE of {scope}", reason=reason
+        )
+        metrics.add(
+            f"{label}median",
+            None if pooled is None else median(pooled),
+            f"rad{per_s}",
+            f"median absolute error of {scope}",
+            reason=reason,
+        )
+
+
+def _add_ratio(metrics: MetricTable, found: dict[str, Errors], kind: str, unit: str) -> None:
+    pooled = {
+        source: value
+        for source, error in found.items()
+        if (value := rmse((error.position if kind == "angle" else error.velocity)[:, IS_ANGLE])) is not None
+    }
+    fused = pooled.pop("fused", None)
+    reason = "needs a fused state, a camera and ground truth"
+    better = min(sorted(pooled), key=lambda name: pooled[name]) if pooled else None
+    raw = "raw angles" if kind == "angle" else "differenced raw angles"
+    metrics.add(
+        f"fusion_{kind}_better_camera", better, "name", f"camera with the smaller pooled RMSE of {raw}", reason=reason
+    )
+    ratio = fused / pooled[better] if fused is not None and better is not None and pooled[better] > 0 else None
+    metrics.add(
+        f"fusion_{kind}_rmse_ratio",
+        ratio,
+        "1",
+        f"pooled RMSE [{unit}] of the fused state over all ticks / that of the better camera's {raw} over its frames",
+        reason=reason,
+    )
+
+
+def _add_seen(metrics: MetricTable, run: Run, found: dict[str, Errors], kind: str, unit: str, gap_s: float) -> None:
+    """The same where cameras can be compared: they have no errors while they do not see the person, the filter has."""
+    value = None
+    if run.state is not None and "fused" in found:
+        names = [name for name in run.state.columns if name.startswith("valid_")]
+        valid = np.asarray(run.state[names].to_numpy(dtype=bool).any(axis=1))
+        seen = seconds_since(run.state, valid) <= gap_s
+        error = found["fused"].position if kind == "angle" else found["fused"].velocity
+        value = rmse(error[seen][:, IS_ANGLE])
+    what = "angles" if kind == "angle" else "angular velocities"
+    metrics.add(
+        f"fusion_seen_{kind}_rmse",
+        value,
+        unit,
+        f"RMSE of the fused {what}, the 10 angles pooled, at ticks at most {gap_s:g} s after one that used a camera",
+        reason="needs a fused state and ground truth",
+    )

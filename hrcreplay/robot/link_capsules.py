@@ -1,0 +1,261 @@
+"""Capsules around the collision shapes of a URDF's links.
+
+Shapes are read here and not by pinocchio's geometry model: its parser knows no <capsule>, and a shape that it cannot
+read is left out with a line on the terminal and no error. It reads the meshes (see ``model``).
+
+Link segments: the capsules that stand for a robot's links.
+
+The smallest capsule around a set of points.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numba import njit
+from scipy.optimize import minimize
+from scipy.spatial import ConvexHull, QhullError
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.geometry.vectors import from_rpy
+from hrcreplay.records import Floats
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A capsule around one link. Both ends are fixed on the same body, as the derivation of Eq. (5) needs."""
+
+    name: str
+    body: str  #: URDF link or joint whose frame the ends are given in
+    start_m: Vector  #: first end in the body's frame [m]
+    end_m: Vector  #: second end in the body's frame [m]
+    radius_m: float
+    shape_m3: float = math.nan  #: volume of the collision shape's convex hull inside it; NaN where it was given [m^3]
+
+    @property
+    def volume_m3(self) -> float:
+        """Volume of the capsule [m^3]."""
+        return capsule_m3(math.dist(self.start_m, self.end_m), self.radius_m)
+
+
+#: Ends are rounded to 0.1 mm and the radius up to it: the last bits of the search rarely reach an output.
+_DECIMALS = 4
+
+
+def fit(points_m: Floats) -> tuple[Floats, Floats, float]:
+    """A capsule of small volume that encloses points.
+
+    Nelder and Mead's simplex over the axis' direction, its place and the radius, from each principal axis of the
+    points; the ends follow, as near to each other as the points allow. The radius is last, and encloses every point.
+
+    Args:
+        points_m: (n, 3) [m].
+
+    Returns:
+        Both ends (3,) and the radius [m].
+    """
+    corners, centre = _corners(points_m), np.asarray(points_m).mean(axis=0)
+    axes = np.linalg.eigh((corners - centre).T @ (corners - centre))[1].T
+    size = float(np.linalg.norm(np.ptp(corners, axis=0))) or 1.0
+    shapes = [(corners, centre, np.roll(axes, -first, axis=0), size) for first in range(3)]
+    simplex = 0.15 * np.vstack([np.zeros(5), np.eye(5)])
+    coarse = [_search(shape, simplex, 200) for shape in shapes]
+    best = min(range(3), key=lambda i: float(coarse[i].fun))
+    fine = _search(shapes[best], coarse[best].x + 0.3 * simplex, 400)  # the first simplex may have gone flat
+    line, low, high, _ = _on_axis(fine.x, *shapes[best])
+    start, end = line[0] + low * line[1], line[0] + high * line[1]
+    start, end = np.round(start, _DECIMALS), np.round(end, _DECIMALS)
+    steps = math.floor(float(distance_m(corners, start, end).max()) * 10**_DECIMALS) + 1
+    return start, end, steps / 10**_DECIMALS
+
+
+def distance_m(points_m: Floats, start_m: Floats, end_m: Floats) -> Floats:
+    """(n,) distance of (n, 3) points from a segment [m]."""
+    along = end_m - start_m
+    share = np.clip((points_m - start_m) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(points_m - start_m - share[:, None] * along, axis=1))
+
+
+def capsule_m3(length_m: float, radius_m: float) -> float:
+    """Volume of a capsule whose axis is ``length_m`` long [m^3]."""
+    return math.pi * radius_m**2 * (length_m + 4.0 / 3.0 * radius_m)
+
+
+def hull_m3(points_m: Floats) -> float:
+    """Volume of the convex hull of (n, 3) points; 0 where they lie in a plane [m^3]."""
+    try:
+        return float(ConvexHull(points_m).volume)
+    except (QhullError, ValueError):
+        return 0.0
+
+
+def _corners(points_m: Floats) -> Floats:
+    """The vertices of the hull, which the capsule encloses with all the others; of flat sets the points themselves."""
+    points = np.unique(points_m, axis=0)
+    try:
+        return points[np.sort(ConvexHull(points).vertices)]
+    except (QhullError, ValueError):
+        return points
+
+
+def _search(shape: tuple[Floats, Floats, Floats, float], simplex: Floats, iterations: int) -> Any:
+    options = {"initial_simplex": simplex, "xatol": 1e-5, "fatol": 0.0, "maxiter": iterations, "maxfev": 2 * iterations}
+    return minimize(_volume, simplex[0], shape, "Nelder-Mead", options=options)
+
+
+def _volume(x: Floats, corners: Floats, centre: Floats, frame: Floats, size: float) -> float:
+    """Volume over the cube of the points' size, so that large and small shapes stop alike."""
+    _, low, high, radius = _on_axis(x, corners, centre, frame, size)
+    return capsule_m3(high - low, radius) / size**3
+
+
+@njit(cache=True)
+def _on_axis(
+    x: Floats, corners: Floats, centre: Floats, frame: Floats, size: float
+) -> tuple[Floats, float, float, float]:
+    """The shortest capsule on one axis: direction x[0:2], place x[2:4], radius least where x[4] is zero.
+
+    Returns:
+        Origin and direction of the axis (2, 3), where on it the capsule's ends are, and its radius.
+    """
+    line = np.empty((2, 3))
+    line[0] = centre + size * (x[2] * frame[1] + x[3] * frame[2])
+    line[1] = frame[0] + x[0] * frame[1] + x[1] * frame[2]
+    line[1] /= math.sqrt((line[1] * line[1]).sum())
+    count = len(corners)
+    along, off2 = np.empty(count), np.empty(count)
+    (ox, oy, oz), (ax, ay, az) = line
+    for i in range(count):
+        dx, dy, dz = corners[i, 0] - ox, corners[i, 1] - oy, corners[i, 2] - oz
+        along[i] = dx * ax + dy * ay + dz * az
+        off2[i] = max(dx * dx + dy * dy + dz * dz - along[i] * along[i], 0.0)
+    radius2 = off2.max() * (1.0 + x[4] * x[4])
+    low, high = math.inf, -math.inf
+    for i in range(count):
+        half = math.sqrt(radius2 - off2[i])  # a ball centred within this of the corner's foot holds the corner
+        low, high = min(low, along[i] + half), max(high, along[i] - half)
+    if low > high:  # one ball is enough
+        low = high = 0.5 * (low + high)
+    return line, low, high, math.sqrt(radius2)
+
+
+KINDS = ("box", "capsule", "cylinder", "mesh", "sphere")
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One collision shape of a link."""
+
+    name: str  #: of the link; numbered where the link has several
+    link: str
+    collision: ET.Element
+    geometry: ET.Element  #: <box>, <capsule>, <cylinder>, <mesh> or <sphere>
+
+    @property
+    def mesh(self) -> str | None:
+        """The file that a mesh names."""
+        return self.geometry.get("filename", "") if self.geometry.tag == "mesh" else None
+
+
+def shapes(links: Sequence[ET.Element]) -> tuple[Shape, ...]:
+    """The collision shapes of links."""
+    found = []
+    for link in links:
+        name = str(link.get("name"))
+        collisions = link.findall("collision")
+        for number, collision in enumerate(collisions, start=1):
+            holder = collision.find("geometry")
+            geometry = next(iter(holder), None) if holder is not None else None
+            shape = ET.Element("nothing") if geometry is None else geometry
+            found.append(Shape(name if len(collisions) == 1 else f"{name}_{number}", name, collision, shape))
+    return tuple(found)
+
+
+def capsules(found: Sequence[Shape], vertices_m: Mapping[str, Floats]) -> tuple[Segment, ...]:
+    """A capsule around every shape, named after it.
+
+    Args:
+        found: Collision shapes.
+        vertices_m: Name of each mesh among them -> (n, 3) its vertices in the link's frame [m].
+
+    Raises:
+        SettingsError: There is none, or one of a kind that URDF does not have, or one without a size.
+    """
+    if not found:
+        raise SettingsError("robot: no moving link of the URDF has a collision shape; give its capsules in robot.links")
+    return tuple(
+        _around(shape, vertices_m[shape.name]) if shape.mesh is not None else _primitive(shape) for shape in found
+    )
+
+
+def _around(shape: Shape, points_m: Floats) -> Segment:
+    """The capsule around the convex hull of points in the link's frame."""
+    if not len(points_m) or not np.isfinite(points_m).all():
+        raise SettingsError(f"robot: the {shape.geometry.tag} of link {shape.link!r} has no size; check its vertices")
+    start, end, radius = fit(points_m)
+    return _segment(shape, start, end, radius, hull_m3(points_m))
+
+
+def _primitive(shape: Shape) -> Segment:
+    kind, half = shape.geometry.tag, np.zeros(3)
+    if kind not in KINDS:
+        raise SettingsError(
+            f"robot: the collision shape of link {shape.link!r} is {kind}; capsules are derived from "
+            f"{', '.join(KINDS)}, so give robot.links"
+        )
+    if kind == "box":
+        sides = _floats(shape.geometry.get("size"))
+        if not (np.isfinite(sides).all() and (sides > 0).all()):
+            raise _no_size(shape)
+        corners = itertools.product(*zip(-sides / 2, sides / 2, strict=True))
+        return _around(shape, _placed(shape, np.array(list(corners))))
+    radius = _measure(shape.geometry, "radius")
+    half[2] = 0.0 if kind == "sphere" else _measure(shape.geometry, "length") / 2
+    if not (math.isfinite(radius) and radius > 0 and 0 <= half[2] < math.inf):
+        raise _no_size(shape)
+    inside = math.pi * radius**2 * 2 * half[2] if kind == "cylinder" else capsule_m3(2 * half[2], radius)
+    start, end = _placed(shape, np.array([-half, half]))
+    return _segment(shape, start, end, radius, inside)
+
+
+def _no_size(shape: Shape) -> SettingsError:
+    return SettingsError(
+        f"robot: the {shape.geometry.tag} of link {shape.link!r} has no size; give its measures in metres"
+    )
+
+
+def _segment(shape: Shape, start: Floats, end: Floats, radius: float, inside_m3: float) -> Segment:
+    ends = [(float(x), float(y), float(z)) for x, y, z in (start, end)]
+    return Segment(shape.name, shape.link, ends[0], ends[1], radius, inside_m3)
+
+
+def _placed(shape: Shape, points: Floats) -> Floats:
+    """(n, 3) points of the shape in the link's frame [m]."""
+    origin = shape.collision.find("origin")
+    turn = from_rpy(_floats(None if origin is None else origin.get("rpy")))
+    return np.asarray(points @ turn.T + _floats(None if origin is None else origin.get("xyz")))
+
+
+def _measure(geometry: ET.Element, key: str) -> float:
+    try:
+        return float(geometry.get(key, "nan"))
+    except ValueError:
+        return math.nan
+
+
+def _floats(text: str | None) -> Floats:
+    try:
+        values = np.array([float(part) for part in text.split()] if text else [0.0, 0.0, 0.0])
+    except ValueError as error:
+        raise SettingsError(f"robot: {text!r} are no numbers; three are needed") from error
+    if values.shape != (3,):
+        raise SettingsError(f"robot: {text!r} are {len(values)} numbers; three are needed")
+    return values

@@ -1,0 +1,1 @@
+"""What the robot would do if nobody were there: tasks, paths, references, inverse kinematics."""

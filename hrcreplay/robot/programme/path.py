@@ -1,0 +1,369 @@
+"""Where references come from: a programmed task, or joint positions that a log recorded.
+
+One move from standstill to standstill on a regular time grid, within the limits of the axes and of the TCP.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from ruckig import InputParameter, Result, Ruckig, Trajectory
+from scipy.signal import savgol_filter
+
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.geometry.vectors import from_quaternion, from_rpy, from_vector, to_vector
+from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.programme.inverse_kinematics import Missed, descend, solve
+from hrcreplay.robot.programme.reference import STEP_S, Reference
+from hrcreplay.robot.programme.task import Task, Waypoint
+
+#: Limits rise to their full acceleration in this time: jerk limit = acceleration limit / RAMP_S [s].
+RAMP_S = 0.1
+
+#: On a straight line the TCP turns by at most this for a metre, ABB's 2 pi rad/s for 2.5 m/s [rad/m].
+TURN_RAD_PER_M = 2 * math.pi / 2.5
+
+#: A line that must be slower by more than this for the axes' sake passes a singular posture.
+_SLOWEST = 20.0
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast a move may be."""
+
+    dq_max: Floats  #: (nv,) [rad/s]
+    ddq_max: Floats  #: (nv,) [rad/s^2]
+    tcp_speed: float  #: [m/s]
+    tcp_acceleration: float  #: along straight lines [m/s^2]
+    step_s: float  #: time grid [s]
+
+
+@dataclass(frozen=True)
+class Track:
+    """Joint positions and velocities on the time grid, first and last at rest."""
+
+    q: Floats  #: (n, nv) [rad]
+    dq: Floats  #: (n, nv) [rad/s]
+
+
+def joint_move(model: RobotModel, start: Floats, end: Floats, pace: Pace) -> Track:
+    """Every axis at the same share of its way, so that all start and stop together.
+
+    Args:
+        model: The robot.
+        start: (nv,) [rad].
+        end: (nv,) [rad].
+        pace: Limits of axes and TCP.
+    """
+    way = end - start
+    if not np.any(way):
+        return Track(start[None], np.zeros_like(start)[None])
+    with np.errstate(divide="ignore"):
+        speed, acceleration = (float((limit / np.abs(way)).min()) for limit in (pace.dq_max, pace.ddq_max))
+
+    def along(share: Floats, rate: Floats) -> Track:
+        return Track(start + np.outer(share, way), np.outer(rate, way))
+
+    return _paced(model, pace, along, 1.0, speed, acceleration, "")
+
+
+def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pace, where: str) -> Track:
+    """The TCP on a straight line, turning evenly about one axis.
+
+    Args:
+        model: The robot.
+        start: (nv,) [rad].
+        T_world_end: (4, 4) pose of the TCP to reach, world frame [m].
+        pace: Limits of axes and TCP.
+        where: What messages begin with.
+
+    Raises:
+        SettingsError: The line leaves the arm's range or passes a singular posture.
+    """
+    T_start = model.pose(start, np.zeros(model.nv)).T_world_tcp
+    way_m = T_world_end[:3, 3] - T_start[:3, 3]
+    turn_rad = to_vector(T_world_end[:3, :3] @ T_start[:3, :3].T)
+    length = max(float(np.linalg.norm(way_m)), float(np.linalg.norm(turn_rad)) / TURN_RAD_PER_M)
+    if length < 1e-9:
+        return Track(start[None], np.zeros_like(start)[None])
+    twist_per_m = np.concatenate([way_m, turn_rad]) / length
+
+    def along(s_m: Floats, rate: Floats) -> Track:
+        q, dq = np.empty((len(s_m), model.nv)), np.zeros((len(s_m), model.nv))
+        now = start
+        T = np.eye(4)
+        for i, s in enumerate(s_m):
+            T[:3, 3] = T_start[:3, 3] + s / length * way_m
+            T[:3, :3] = from_vector(s / length * turn_rad) @ T_start[:3, :3]
+            now, error = descend(model, T, now)
+            if np.abs(error).max() > 1e-6:
+                raise SettingsError(
+                    f"{where}: the straight line to it leaves the arm's range after {s:.3f} m of {length:.3f} m; "
+                    'use move = "joint" or start from another posture'
+                )
+            q[i] = now
+            dq[i] = np.linalg.pinv(model.pose(now, np.zeros(model.nv)).J_tcp, rcond=1e-9) @ twist_per_m * rate[i]
+        return Track(q, dq)
+
+    return _paced(model, pace, along, length, pace.tcp_speed, pace.tcp_acceleration, where)
+
+
+def _paced(
+    model: RobotModel,
+    pace: Pace,
+    along: Callable[[Floats, Floats], Track],
+    length: float,
+    speed: float,
+    acceleration: float,
+    where: str,
+) -> Track:
+    """A path run by a jerk-limited profile as fast as the axes and the TCP allow.
+
+    The profile's own speed and acceleration are lowered by what its axes exceed. Where that does not help against an
+    acceleration, it stems from the path's curvature, which only less speed can mend.
+    """
+    slowest, softest, before = speed / _SLOWEST, acceleration / _SLOWEST**2, math.inf
+    while True:
+        track = along(*_profile(length, speed, acceleration, pace.step_s))
+        faster, harder = _excess(model, track, pace)
+        if max(faster, harder) <= 1.0 + 1e-9:
+            return track
+        curved = math.sqrt(harder) if harder > max(1.0, 0.9 * before) else 1.0
+        speed /= max(1.0, faster) * curved * 1.0001
+        acceleration /= max(1.0, harder) * 1.0001
+        before = harder
+        if where and (speed < slowest or acceleration < softest):
+            raise SettingsError(
+                f"{where}: on the straight line to it an axis would have to be {_SLOWEST:.0f} times as fast as it is; "
+                'the arm passes a singular posture: use move = "joint" or start from another posture'
+            )
+
+
+def _profile(length: float, speed: float, acceleration: float, step_s: float) -> tuple[Floats, Floats]:
+    """Position and speed along a path on the time grid, stretched to a whole number of its steps."""
+    task = InputParameter(1)
+    task.current_position, task.target_position = [0.0], [length]
+    task.max_velocity, task.max_acceleration, task.max_jerk = [speed], [acceleration], [acceleration / RAMP_S]
+    fastest = Trajectory(1)
+    result = Ruckig(1).calculate(task, fastest)
+    if result != Result.Working:
+        raise RuntimeError(f"ruckig: {result} for {length} m or rad at {speed}, {acceleration}")
+    steps = max(1, math.ceil(fastest.duration / step_s))
+    stretch = steps * step_s / fastest.duration
+    states = [fastest.at_time(fastest.duration * i / steps) for i in range(steps + 1)]
+    s, ds = (np.array([state[order][0] for state in states]) for order in (0, 1))
+    s[0], s[-1], ds[0], ds[-1] = 0.0, length, 0.0, 0.0
+    return np.clip(s, 0.0, length), ds / stretch
+
+
+def _excess(model: RobotModel, track: Track, pace: Pace) -> tuple[float, float]:
+    """By which factors the path's speed and its acceleration exceed what axes and TCP allow."""
+    way, first, last = np.diff(track.q, axis=0) / pace.step_s, track.dq[:-1], track.dq[1:]
+    speeds = np.concatenate([track.dq, 1.5 * way - 0.25 * (first + last)])  # of the cubics between grid points
+    accelerations = np.concatenate([6 * way - 4 * first - 2 * last, 2 * first + 4 * last - 6 * way]) / pace.step_s
+    tcp = [np.linalg.norm(model.pose(q, dq).J_tcp[:3] @ dq) for q, dq in zip(track.q, track.dq, strict=True)]
+    return (
+        max(float((np.abs(speeds) / pace.dq_max).max()), float(max(tcp)) / pace.tcp_speed),
+        float((np.abs(accelerations) / pace.ddq_max).max()),
+    )
+
+
+#: A recorded track is smoothed by cubics over this long [s].
+_SMOOTH_S = 0.1
+
+#: A recorded position may be this far outside the range: encoders are noisy where an axis rests on its stop [rad].
+_NOISE_RAD = 0.01
+
+
+def programmed(task: Task, model: RobotModel, where: str = "task") -> Reference:
+    """The path of a task, time-parametrised within the limits of the axes.
+
+    Args:
+        task: The waypoints.
+        model: The robot; the task's poses are in its base frame.
+        where: What messages begin with.
+
+    Raises:
+        SettingsError: A waypoint is out of reach or range, or a straight line cannot be followed; names the waypoint.
+    """
+    start = _joints(model, task, 0, np.clip(np.zeros(model.nv), model.q_min, model.q_max), where)
+    tracks = [_stand(start, task.waypoints[0].dwell_s)]
+    arrivals_s, end = [0.0], 0
+    for index in range(1, len(task.waypoints)):
+        tracks.append(_move(model, task, index, tracks[-1].q[-1], where))
+        arrivals_s.append(_steps(tracks) * STEP_S)
+        tracks.append(_stand(tracks[-1].q[-1], task.waypoints[index].dwell_s))
+        end = _steps(tracks)
+    if task.repeat or task.cycles > 1:
+        tracks.append(_move(model, task, 0, tracks[-1].q[-1], where, start))
+    if _steps(tracks) == 0:
+        raise SettingsError(f"{where}: every waypoint is where the robot starts; at least one must differ")
+    return Reference(
+        model=model,
+        q=np.concatenate([start[None], *(track.q[1:] for track in tracks)]),
+        dq=np.concatenate([np.zeros((1, model.nv)), *(track.dq[1:] for track in tracks)]),
+        end=end,
+        cycles=math.inf if task.repeat else float(task.cycles),
+        waypoints_s=tuple(arrivals_s),
+    )
+
+
+def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
+    """The path of a recorded joint track, smoothed by cubics over 0.1 s on a regular time grid.
+
+    Programmed time 0 is ``t_ns[0]``. Gaps are bridged on straight lines. Positions and velocities are held against the
+    robot's limits; accelerations are not, since the controller follows only as fast as its own allow.
+
+    Args:
+        t_ns: (n,) instants, in any order; of rows with the same instant the first counts.
+        q: (n, nv) [rad]; rows that are not finite are left out.
+        model: The robot that is to follow.
+
+    Raises:
+        LogError: Another number of axes, too few rows, or a position or speed that the robot does not have.
+    """
+    if q.ndim != 2 or q.shape[1] != model.nv:
+        raise LogError(f"joint track: found {q.shape[-1]} joints; {model.name} has {model.nv} axes")
+    whole = np.isfinite(q).all(axis=1)
+    instants, first = np.unique(t_ns[whole], return_index=True)
+    if len(instants) < 2:
+        raise LogError(f"joint track: found {len(instants)} instants with finite positions; a path needs two")
+    rows = q[whole][first]
+    endless = np.isinf(model.q_max)
+    rows[:, endless] = np.unwrap(rows[:, endless], axis=0)
+    _check(model, instants - t_ns[0], rows, "position", "rad", model.q_min - _NOISE_RAD, model.q_max + _NOISE_RAD)
+    seconds = (instants - instants[0]) * 1e-9
+    grid = np.arange(max(2, math.ceil(seconds[-1] / STEP_S) + 1)) * STEP_S
+    even = np.column_stack([np.interp(grid, seconds, rows[:, axis]) for axis in range(model.nv)])
+    window = min(2 * round(_SMOOTH_S / STEP_S / 2) + 1, 2 * ((len(grid) - 1) // 2) + 1)
+    order = min(3, window - 1)
+    smooth = np.clip(savgol_filter(even, window, order, axis=0), model.q_min, model.q_max)
+    dq = (
+        savgol_filter(even, window, order, deriv=1, delta=STEP_S, axis=0)
+        if order
+        else np.gradient(even, STEP_S, axis=0)
+    )
+    _check(model, grid * 1e9, dq, "speed", "rad/s", -model.dq_max, model.dq_max)
+    return Reference(model, smooth, dq, end=len(grid) - 1, cycles=1.0, waypoints_s=())
+
+
+def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Reference:
+    """The way from where a robot stands to where a path begins, all axes together, with the least jerk.
+
+    In closed form, since a live robot waits for it: of the quintic 10 r^3 - 15 r^4 + 6 r^5 the largest velocity is
+    15/8 and the largest acceleration 10/sqrt(3).
+
+    Args:
+        model: The robot.
+        start: (nv,) [rad].
+        goal: (nv,) [rad].
+        speed: Share of the axes' top speeds and accelerations, in (0, 1].
+    """
+    way = goal - start
+    for_speed_s = (15 / 8 * np.abs(way) / (speed * model.dq_max)).max()
+    for_acceleration_s = math.sqrt((10 / math.sqrt(3) * np.abs(way) / (speed * model.ddq_max)).max())
+    end = max(1, math.ceil(max(for_speed_s, for_acceleration_s) / STEP_S))
+    r = np.arange(end + 1) / end
+    share, rate = r**3 * (10 - 15 * r + 6 * r**2), 30 * r**2 * (1 - r) ** 2 / (end * STEP_S)
+    q, dq = start + np.outer(share, way), np.outer(rate, way)
+    return Reference(model, q, dq, end=end, cycles=1.0, waypoints_s=(end * STEP_S,))
+
+
+def _check(
+    model: RobotModel, t_ns: Ints | Floats, rows: Floats, what: str, unit: str, low: Floats, high: Floats
+) -> None:
+    over = np.argwhere((rows < low) | (rows > high))
+    if len(over):
+        row, axis = over[0]
+        raise LogError(
+            f"joint track: {model.joint_names[axis]} has {what} {rows[row, axis]:.3f} {unit} "
+            f"after {t_ns[row] * 1e-9:.3f} s; {model.name} allows {low[axis]:.3f} to {high[axis]:.3f}"
+        )
+
+
+def _steps(tracks: list[Track]) -> int:
+    return sum(len(track.q) - 1 for track in tracks)
+
+
+def _stand(q: Floats, dwell_s: float) -> Track:
+    rows = np.repeat(q[None], round(dwell_s / STEP_S) + 1, axis=0)
+    return Track(rows, np.zeros_like(rows))
+
+
+def _move(model: RobotModel, task: Task, index: int, now: Floats, where: str, goal: Floats | None = None) -> Track:
+    """The move to a waypoint, and for the way back to the first, to the joint positions it started with."""
+    waypoint = task.waypoints[index]
+    at = f"{where}: {task.label(index)}"
+    pace = Pace(
+        dq_max=task.speed * model.dq_max,
+        ddq_max=task.acceleration * model.ddq_max,
+        tcp_speed=min(task.tcp_speed_m_per_s, waypoint.tcp_speed_m_per_s or math.inf),
+        tcp_acceleration=task.tcp_acceleration_m_per_s2,
+        step_s=STEP_S,
+    )
+    if goal is None and (waypoint.move == "joint" or waypoint.position_m is None):
+        goal = _joints(model, task, index, now, where)
+    if goal is not None and waypoint.move == "joint":
+        return joint_move(model, now, goal, pace)
+    T_end = _target(model, waypoint, at) if goal is None else model.pose(goal, np.zeros(model.nv)).T_world_tcp
+    track = linear_move(model, now, T_end, pace, at)
+    if goal is not None and np.abs(track.q[-1] - goal).max() > 1e-6:
+        axis = int(np.argmax(np.abs(track.q[-1] - goal)))
+        raise SettingsError(
+            f"{at}: the straight line to it ends with axis {axis + 1} at {math.degrees(track.q[-1, axis]):.1f} deg "
+            f'and not at {math.degrees(goal[axis]):.1f} deg; use move = "joint"'
+        )
+    return track
+
+
+def _joints(model: RobotModel, task: Task, index: int, near: Floats, where: str) -> Floats:
+    """Joint positions of a waypoint, those nearest to ``near`` where it gives a pose."""
+    waypoint = task.waypoints[index]
+    at = f"{where}: {task.label(index)}"
+    if waypoint.position_m is not None:
+        return _reached(model, _target(model, waypoint, at), near, at)
+    degrees = waypoint.joints_deg
+    q = np.array(waypoint.joints_rad if degrees is None else np.radians(degrees), dtype=float)
+    if q.shape != model.q_min.shape:
+        raise SettingsError(f"{at}: found {len(q)} joints; {model.name} has {model.nv} axes")
+    for axis in np.flatnonzero((q < model.q_min - 1e-9) | (q > model.q_max + 1e-9)):
+        raise SettingsError(
+            f"{at}: found axis {axis + 1} at {math.degrees(q[axis]):.1f} deg; its range is "
+            f"{math.degrees(model.q_min[axis]):.1f} to {math.degrees(model.q_max[axis]):.1f} deg"
+        )
+    return np.clip(q, model.q_min, model.q_max)
+
+
+def _target(model: RobotModel, waypoint: Waypoint, at: str) -> Floats:
+    """(4, 4) pose of the TCP that a waypoint gives, world frame."""
+    T_base_tcp = np.eye(4)
+    T_base_tcp[:3, 3] = waypoint.position_m
+    if waypoint.rpy_deg is not None:
+        T_base_tcp[:3, :3] = from_rpy(np.radians(waypoint.rpy_deg))
+    else:
+        T_base_tcp[:3, :3] = from_quaternion(np.array(waypoint.quaternion_wxyz, dtype=float))
+    T_world_tcp = model.T_world_base @ T_base_tcp
+    distance_m = float(np.linalg.norm(T_world_tcp[:3, 3] - model.shoulder_m))
+    if distance_m > model.reach_m:
+        raise SettingsError(
+            f"{at}: out of reach, {distance_m:.3f} m from the first axis; "
+            f"the TCP of {model.name} reaches {model.reach_m:.3f} m"
+        )
+    return T_world_tcp
+
+
+def _reached(model: RobotModel, T_world_tcp: Floats, near: Floats, at: str) -> Floats:
+    solution = solve(model, T_world_tcp, near)
+    if isinstance(solution, Missed):
+        distance_m = float(np.linalg.norm(T_world_tcp[:3, 3] - model.shoulder_m))
+        raise SettingsError(
+            f"{at}: no joint position within the limits reaches it; the nearest misses it by "
+            f"{solution.position_m * 1e3:.0f} mm and {math.degrees(solution.angle_rad):.0f} deg. "
+            f"It is {distance_m:.3f} m from the first axis and the TCP of {model.name} reaches {model.reach_m:.3f} m; "
+            "move it or turn it"
+        )
+    return solution

@@ -1,0 +1,1 @@
+"""Offline runs: a job, its stages, the followers of a programme, the run folder."""

@@ -1,0 +1,235 @@
+"""From settings, cell and log to what the stages take. The rooms never see a settings model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+
+from hrcreplay.calibration.cell import Cell
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.geometry.vectors import from_rpy
+from hrcreplay.human.fusion.fuse import FusionSettings
+from hrcreplay.human.fusion.inverse_kinematics import PointNoise
+from hrcreplay.human.prediction.sound_reach import Margins
+from hrcreplay.human.prediction.swept_volumes import Radii
+from hrcreplay.logs.decoders import GenericDecoder
+from hrcreplay.logs.reader import LogOptions
+from hrcreplay.logs.tracks import Header, JointTrack
+from hrcreplay.records import Floats
+from hrcreplay.robot.control.control_step import PlanSettings
+from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
+from hrcreplay.robot.programme.path import programmed, recorded
+from hrcreplay.robot.programme.reference import Leash, Reference
+from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.run.followers import Planner, QpFollower, ScalingFollower
+from hrcreplay.run.job import Job, UrdfFiles, read_urdf
+from hrcreplay.run.stages import Eyes, Foresight
+from hrcreplay.settings.load import Settings
+
+
+def log_options(settings: Settings) -> LogOptions:
+    """How to read a log."""
+    return LogOptions(
+        topics=settings.logs.topics,
+        decoders=tuple(GenericDecoder(**decoder.model_dump()) for decoder in settings.logs.decoders),
+        joints_topic=settings.logs.joints_topic,
+        gap_s=settings.logs.gap_s,
+    )
+
+
+class Source(Protocol):
+    """A log, or what stands for one in a live session."""
+
+    @property
+    def header(self) -> Header:
+        """Cameras, task and robot base as far as they are known."""
+
+    def joints(self) -> Iterator[JointTrack]:
+        """The recorded joints, where there are any."""
+
+
+def eyes(job: Job, log: Source) -> Eyes:
+    """Stage 1. A pose of the cell file wins over the log's.
+
+    Raises:
+        LogError: A camera's pose is known to neither.
+    """
+    cell = job.cell or Cell()
+    poses = {**log.header.T_world_camera, **cell.T_world_camera}
+    for camera in log.header.cameras:
+        if camera not in poses:
+            raise LogError(
+                f"{log.header.path}: the pose of camera {camera} is not known; "
+                f"find it with: hrcreplay calibrate {log.header.path} --out cell.toml, then give --cell cell.toml"
+            )
+    unknown = sorted(set(cell.T_world_camera) - set(log.header.cameras))
+    if unknown:
+        raise SettingsError(
+            f"cell: camera {unknown[0]} is not in the log; its cameras are {', '.join(log.header.cameras)}"
+        )
+    offsets_s = [cell.clock_offset_s.get(camera, 0.0) for camera in log.header.cameras]
+    fusion, logs = job.settings.fusion, job.settings.logs
+    return Eyes(
+        T_world_camera=np.array([poses[camera] for camera in log.header.cameras]),
+        clock_offset_ns=np.round(np.array(offsets_s) * 1e9).astype(np.int64),
+        noise=PointNoise(std_m=fusion.point_std_m, depth_std_per_m=fusion.point_std_per_m),
+        filter=FusionSettings(**fusion.model_dump(exclude={"rate_hz", "point_std_m", "point_std_per_m"})),
+        limits=job.tracking,
+        person_jump_m=logs.person_jump_m,
+        person_memory_s=logs.person_memory_s,
+    )
+
+
+def foresight(job: Job) -> Foresight:
+    """Stage 2. Beside a real robot the volumes reach further, by the time until it obeys."""
+    occupancy = job.settings.occupancy
+    radii = Radii(
+        head=occupancy.radius_head_m,
+        thorax=occupancy.radius_thorax_m,
+        upper_arm=occupancy.radius_upper_arm_m,
+        lower_arm=occupancy.radius_lower_arm_m,
+    )
+    reaction_s = job.settings.live.reaction_s if job.command == "live" else 0.0
+    margins = Margins(
+        sigmas=occupancy.sigmas,
+        latency_s=occupancy.latency_s + reaction_s,
+        hand_m=occupancy.hand_m,
+        legs_radius_m=occupancy.legs_radius_m,
+        residual=occupancy.residual,
+        residual_m=occupancy.residual_unknown_m,
+        memory_s=job.settings.fusion.memory_s,
+        legs=occupancy.legs,
+    )
+    return Foresight(job.prediction, occupancy.stop_s, radii, margins, occupancy.method)
+
+
+def base(job: Job, log: Source) -> Floats | None:
+    """(4, 4) the robot's base in the world: of the cell file, else of the log."""
+    if job.cell is not None and job.cell.T_world_base is not None:
+        return job.cell.T_world_base
+    return log.header.T_world_base
+
+
+def robot(job: Job, T_world_base: Floats) -> RobotModel:
+    """The manipulator on its base.
+
+    Raises:
+        SettingsError: The URDF or a robot setting cannot be used.
+    """
+    settings, stop_s, files = job.settings.robot, job.settings.occupancy.stop_s, read_urdf(job.settings.robot)
+    T_tool_tcp = np.eye(4)
+    T_tool_tcp[:3, :3] = from_rpy(np.radians(settings.tcp_offset.rpy_deg))
+    T_tool_tcp[:3, 3] = settings.tcp_offset.position_m
+    if files is None:
+        other = [key for key in ("links", "tcp_frame", "base_frame", "packages") if getattr(settings, key)]
+        if other:
+            raise SettingsError(f"robot.{other[0]}: found {other[0]} for the IRB 140; it goes with a robot.urdf")
+        return irb140(
+            T_world_base,
+            stop_s=stop_s,
+            tool_m=settings.tool_m,
+            T_tool_tcp=T_tool_tcp,
+            acceleration=settings.acceleration,
+        )
+    segments = tuple(
+        Segment(name=link.name, body=link.body, start_m=link.start_m, end_m=link.end_m, radius_m=link.radius_m)
+        for link in settings.links
+    )
+    return from_urdf(
+        files.text,
+        T_world_base,
+        stop_s=stop_s,
+        tcp_frame=settings.tcp_frame,
+        base_frame=settings.base_frame,
+        tool_m=settings.tool_m,
+        T_tool_tcp=T_tool_tcp,
+        segments=segments or _capsules(files, settings.tcp_frame, settings.base_frame),
+        acceleration=settings.acceleration,
+    )
+
+
+@lru_cache(maxsize=4)  # a run makes its robot several times; a file that changes has another digest
+def _capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -> tuple[Segment, ...]:
+    """The link capsules that a URDF's collision shapes give."""
+    meshes = dict(files.meshes)
+    model = from_urdf(files.text, np.eye(4), stop_s=1.0, tcp_frame=tcp_frame, base_frame=base_frame, meshes=meshes)
+    return model.segments
+
+
+def reference(job: Job, log: Source, model: RobotModel) -> tuple[Reference, int | None]:
+    """The programmed path: of the task file, else of the log's task, else the log's joint track.
+
+    Returns:
+        The path, and the instant at which it starts where the log says [ns].
+
+    Raises:
+        SettingsError: The task cannot be used, or there is none.
+        LogError: The joint track does not fit the robot.
+    """
+    own = (log.header.task, f"{log.header.path}: task")
+    table, where = (job.task, str(job.settings.plan.task)) if job.task else own
+    if table is not None:
+        return programmed(parse_task(table, where), model, where), None
+    track = list(log.joints())
+    if not track:
+        raise SettingsError(
+            f"{log.header.path}: no task and no joint track; name a task file with --set plan.task=FILE.toml"
+        )
+    whole = JointTrack.join(track)
+    return recorded(whole.t_ns, whole.q, model), int(whole.t_ns.min())
+
+
+def planners(job: Job, log: Source, start_ns: int) -> dict[str, Planner]:
+    """Stage 3: the chosen method and its baselines, each with a robot of its own."""
+    plan, model = job.settings.plan, robot(job, standing(job, log))
+    path, begin_ns = reference(job, log, model)
+    settings = plan_settings(job, 1.0 / job.settings.fusion.rate_hz)
+    s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
+
+    def planner(name: str) -> Planner:
+        follower = follow(job, name, model, path, settings, s_s)
+        return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
+
+    return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
+
+
+def standing(job: Job, log: Source) -> Floats:
+    """(4, 4) where the robot stands.
+
+    Raises:
+        SettingsError: Neither the cell nor the log knows.
+    """
+    T_world_base = base(job, log)
+    if T_world_base is None:
+        raise SettingsError(
+            f"{log.header.path}: where the robot stands is not known; give a --cell file with T_world_base"
+        )
+    return T_world_base
+
+
+def plan_settings(job: Job, dt_s: float) -> PlanSettings:
+    """Section 5 for ticks of ``dt_s`` [s]."""
+    plan = job.settings.plan
+    return PlanSettings(
+        dt_s=dt_s,
+        stop_s=job.settings.occupancy.stop_s,
+        clearance_m=plan.clearance_m,
+        q_p=plan.q_p,
+        q_v=plan.q_v,
+        path_gain_per_s=plan.path_gain_per_s,
+        tcp_speed_max=plan.tcp_speed_max,
+        tcp_acceleration_max=plan.tcp_acceleration_max,
+    )
+
+
+def follow(
+    job: Job, method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float
+) -> QpFollower | ScalingFollower:
+    """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on."""
+    if method == "scaling":
+        return ScalingFollower(model, path, settings, s_s)
+    plan = job.settings.plan
+    return QpFollower(model, path, settings, Leash(plan.reference, plan.leash_m, plan.waypoint_m), s_s)

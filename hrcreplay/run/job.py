@@ -1,0 +1,274 @@
+"""What a run depends on: log, settings, cell, span.
+
+The files behind ``robot.urdf``: the URDF itself and the meshes of its links, wherever its packages are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tomllib
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from hrcreplay import __version__
+from hrcreplay.calibration.cell import Cell, load_cell
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.human.model import LimitSet
+from hrcreplay.limits import load_limits
+from hrcreplay.robot.urdf import describe
+from hrcreplay.settings.load import Settings, as_overrides, load_settings
+from hrcreplay.settings.sections import Robot
+from hrcreplay.store import run_folder
+
+
+@dataclass(frozen=True)
+class UrdfFiles:
+    """A URDF's text, and where its meshes are."""
+
+    text: str
+    meshes: tuple[tuple[str, str], ...]  #: file that a collision mesh names, and its path
+    inputs: tuple[tuple[str, str], ...]  #: path and SHA-256 of each file that was read, the URDF first
+
+
+def read_urdf(robot: Robot) -> UrdfFiles | None:
+    """The files of the robot that the settings name; none for the IRB 140.
+
+    Meshes are looked for only where link capsules are derived from them.
+
+    Raises:
+        SettingsError: The URDF or one of its meshes is not there or cannot be read.
+    """
+    path = robot.urdf
+    if path is None:
+        return None
+    if not path.is_file():
+        raise SettingsError(f"robot.urdf: {path} is not a file; name a URDF, or leave it out for the IRB 140")
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"robot.urdf: {path} is not text ({error.reason}); name a URDF") from error
+    meshes: dict[str, str] = {}
+    if not robot.links:
+        for shape in describe(text, robot.tcp_frame, robot.base_frame).shapes:
+            if shape.mesh is not None and shape.mesh not in meshes:
+                meshes[shape.mesh] = str(_find(shape.mesh, shape.link, path, robot.packages))
+    files = [path, *(Path(mesh) for mesh in meshes.values())]
+    return UrdfFiles(text, tuple(meshes.items()), tuple((str(file), run_folder.sha256(file)) for file in files))
+
+
+def _find(name: str, link: str, urdf: Path, packages: tuple[Path, ...]) -> Path:
+    """The file that a URDF calls ``package://PACKAGE/...``, or by its path."""
+    scheme, _, rest = name.partition("://") if "://" in name else ("", "", name)
+    if scheme in ("", "file"):
+        path = urdf.parent / rest  # an absolute path stays one
+        if path.is_file():
+            return path
+        raise SettingsError(f"robot.urdf: {urdf}: the mesh {name} of link {link!r} is not at {path}")
+    package, _, inside = rest.partition("/")
+    roots = [*packages, *urdf.resolve().parents, *_ros_path()]
+    for root in roots:
+        for path in (root / rest, root / inside):
+            if path.is_file() and (path == root / rest or root.name == package):
+                return path
+    raise SettingsError(
+        f"robot.urdf: {urdf}: the mesh {name} of link {link!r} is not in {_listed(packages)} "
+        f"(robot.packages), nor beside the URDF, nor in {_listed(_ros_path())} (ROS_PACKAGE_PATH); name the directory "
+        f"that holds {package!r} in robot.packages, or give robot.links"
+    )
+
+
+def _ros_path() -> list[Path]:
+    """Where ROS looks for packages."""
+    ros1 = os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)
+    ros2 = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    return [Path(root) for root in ros1 if root] + [Path(root) / "share" for root in ros2 if root]
+
+
+def _listed(roots: tuple[Path, ...] | list[Path]) -> str:
+    return ", ".join(str(root) for root in roots) or "nothing"
+
+
+STAGES = ("fuse", "predict", "plan")
+
+#: What each stage leaves behind.
+TABLES = {
+    "fuse": ("measurements.parquet", "state.parquet", "truth.parquet"),
+    "predict": ("occupancy.parquet",),
+    "plan": ("motion.parquet", "motion_*.parquet"),
+}
+
+#: What a run must tell of itself, so that its log can be replayed as it was.
+_NEEDED = ("inputs", "settings", "cell", "task", "span_s")
+
+#: Packages whose version can change a result.
+PACKAGES = ("coal", "filterpy", "mcap", "numba", "numpy", "pin", "proxsuite", "rosbags", "ruckig", "scipy")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One command on one log, resolved."""
+
+    command: str
+    log: Path
+    log_sha256: str
+    settings: Settings
+    cell: Cell | None
+    task: dict[str, Any] | None
+    start_s: float | None
+    end_s: float | None
+    tracking: LimitSet
+    prediction: LimitSet
+    earlier: Path | None  #: run folder given instead of a log
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages that the command runs."""
+        return STAGES[: STAGES.index(self.command) + 1] if self.command in STAGES else STAGES
+
+    def arguments(self, *, smooth: bool) -> list[str]:
+        """A command line that makes the same run again, wherever the settings came from: names without folders.
+
+        ``CELL.toml`` stands for the cell file, whose content is the run's ``cell``.
+        """
+        span = (("--start", self.start_s), ("--end", self.end_s))
+        return [
+            *(self.command, self.log.name),
+            *(part for name, at_s in span if at_s is not None for part in (name, f"{at_s:.12g}")),
+            *(("--cell", "CELL.toml") if self.cell is not None else ()),
+            *(("--smooth",) if smooth else ()),
+            *(part for setting in as_overrides(self.settings) for part in ("--set", setting)),
+        ]
+
+    def meta(self) -> dict[str, Any]:
+        """The part of run.json that is known before the first frame is read."""
+        return {
+            "command": self.command,
+            "versions": versions(),
+            "inputs": [{"path": str(self.log), "sha256": self.log_sha256}, *_urdf_inputs(self.settings)],
+            "settings": self.settings.model_dump(mode="json"),
+            "cell": None if self.cell is None else self.cell.to_dict(),
+            "task": self.task,
+            "span_s": [self.start_s, self.end_s],
+            "limits": {"tracking": plain_limits(self.tracking), "prediction": plain_limits(self.prediction)},
+        }
+
+
+def versions() -> dict[str, str]:
+    """Our version and those of PACKAGES."""
+    return {"hrcreplay": __version__, **{name: metadata.version(name) for name in PACKAGES}}
+
+
+def resolve(
+    command: str,
+    source: Path,
+    *,
+    config: Path | None,
+    overrides: tuple[str, ...],
+    cell_file: Path | None,
+    start_s: float | None,
+    end_s: float | None,
+) -> Job:
+    """The job that a command line asks for.
+
+    Settings of a run folder are those of the run unless a settings file or ``--set`` says otherwise.
+
+    Raises:
+        SettingsError: A setting, the cell, a limit set or the run folder cannot be used.
+        LogError: There is nothing at that path.
+    """
+    if not source.exists():
+        raise LogError(f"{source}: nothing is there; give a log or a run folder")
+    earlier = run_folder.read_meta(source) if run_folder.is_run(source) else None
+    if earlier is not None and (missing := [key for key in _NEEDED if key not in earlier]):
+        raise LogError(f"{source}: its run.json lacks {missing[0]}, so another version made it; give the log itself")
+    base = earlier["settings"] if earlier is not None else {}
+    settings = load_settings(config, overrides, base)
+    cell = load_cell(cell_file) if cell_file is not None else None
+    if earlier is not None:
+        cell = cell or (Cell.from_dict(earlier["cell"]) if earlier["cell"] else None)
+        start_s = earlier["span_s"][0] if start_s is None else start_s
+        end_s = earlier["span_s"][1] if end_s is None else end_s
+    log = source
+    if earlier is not None:  # a live session's log lies in its folder, wherever that is by now
+        named = Path(earlier["inputs"][0]["path"])
+        log = source / named if (source / named).exists() else named
+    return Job(
+        command=command,
+        log=log,
+        log_sha256=_digest(log, earlier),
+        settings=settings,
+        cell=cell,
+        task=_task(settings, earlier),
+        start_s=start_s,
+        end_s=end_s,
+        tracking=load_limits(settings.limits.tracking),
+        prediction=load_limits(settings.limits.prediction),
+        earlier=source if earlier is not None else None,
+    )
+
+
+def unlogged(command: str, where: Path, settings: Settings, cell_file: Path | None) -> Job:
+    """The job of a command that has no log yet; ``where`` is what messages call it.
+
+    Raises:
+        SettingsError: The cell, the task or a limit set cannot be used.
+    """
+    return Job(
+        command=command,
+        log=where,
+        log_sha256="",
+        settings=settings,
+        cell=load_cell(cell_file) if cell_file is not None else None,
+        task=_task(settings, None),
+        start_s=None,
+        end_s=None,
+        tracking=load_limits(settings.limits.tracking),
+        prediction=load_limits(settings.limits.prediction),
+        earlier=None,
+    )
+
+
+def _digest(log: Path, earlier: dict[str, Any] | None) -> str:
+    if log.exists():
+        return run_folder.sha256(log)
+    if earlier is None:
+        raise LogError(f"{log}: nothing is there; give a log or a run folder")
+    return str(earlier["inputs"][0]["sha256"])
+
+
+def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The task of the task file, else of the earlier run; the log's own is read with the log."""
+    path = settings.plan.task
+    if path is None:
+        return earlier["task"] if earlier is not None else None
+    try:
+        return tomllib.loads(path.read_text())
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror}); plan.task names a TOML file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: not TOML ({error})") from error
+
+
+def urdf_digest(settings: Settings) -> str | None:
+    """Of the robot's URDF and the meshes that its link capsules come from; None for the IRB 140."""
+    digests = [file["sha256"] for file in _urdf_inputs(settings)]
+    return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else None
+
+
+def _urdf_inputs(settings: Settings) -> list[dict[str, str]]:
+    files = read_urdf(settings.robot)
+    return [] if files is None else [{"path": path, "sha256": digest} for path, digest in files.inputs]
+
+
+def plain_limits(limits: LimitSet) -> dict[str, Any]:
+    """JSON form of a limit set; no bound is null."""
+
+    def plain(value: Any) -> Any:
+        if not hasattr(value, "tolist"):
+            return value
+        return [number if abs(number) != float("inf") else None for number in value.tolist()]
+
+    return {name: plain(value) for name, value in asdict(limits).items()}

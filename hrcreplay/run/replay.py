@@ -1,0 +1,312 @@
+"""Offline driver: log -> stages -> run folder.
+
+Which stages of an earlier run come out the same, by digests of all that the result of each stage depends on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from fnmatch import fnmatch
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.logs.reader import Log, open_log
+from hrcreplay.records import HumanStates, Ints
+from hrcreplay.report import limbs, tables
+from hrcreplay.report.story import flaws
+from hrcreplay.run import build, stages
+from hrcreplay.run.build import Source, log_options
+from hrcreplay.run.job import TABLES, Job, plain_limits, resolve, urdf_digest, versions
+from hrcreplay.run.report import write_report
+from hrcreplay.run.stages import NS, Bar, Sink, say
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import Run, RunWriter, Stopwatch
+from hrcreplay.store.tables import lacks, read_states
+
+REPORTS = Path("reports")
+
+
+def run(
+    command: str,
+    source: Path,
+    *,
+    out: Path | None = None,
+    config: Path | None = None,
+    overrides: tuple[str, ...] = (),
+    cell_file: Path | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    smooth: bool = False,
+    chunk_ticks: int = 250,
+) -> Path:
+    """Runs the stages up to that of ``command`` on a log or an earlier run.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        SettingsError: A setting, the cell, the task or the output folder cannot be used.
+        LogError: The log cannot be read, or lacks what a stage needs.
+    """
+    began = datetime.now(UTC)
+    job = resolve(
+        command, source, config=config, overrides=overrides, cell_file=cell_file, start_s=start_s, end_s=end_s
+    )
+    known = job.meta()
+    with RunWriter(out or _folder(job, began)) as writer:
+        log = open_log(job.log, log_options(job.settings))
+        ticks_ns = _ticks(job, log)
+        parts = dependencies(job, log, ticks_ns)
+        reused = _take_over(job, parts, writer, smooth=smooth)
+        last = [stage for stage in job.stages if stage not in reused][-1:]
+        with Bar(last[0] if last else "", len(ticks_ns)) as bar:
+            sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
+            found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth)
+        base = build.base(job, log)
+        writer.close_tables()
+        notes = [*found["notes"], *_unmeasured(writer.partial, known, found["notes"])]
+        if "plan" in job.stages:
+            robot = build.robot(job, build.standing(job, log))
+            notes += tables.remarks(robot)
+            found["robot"] = tables.summary(robot)
+        found["notes"] = list(dict.fromkeys(notes))
+        for line in flaws(found["counts"], found["notes"]):
+            say(line)
+        meta = {
+            **known,
+            **found,
+            "arguments": job.arguments(smooth=smooth),
+            "depends_on": parts,
+            "stages": stage_digests(job, parts),
+            "T_world_base": None if base is None else base.tolist(),
+            "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
+        }
+        if command == "report":
+            with sink.watch.stage("report", len(ticks_ns)):
+                write_report(job, writer, meta)
+        writer.timing.update(sink.watch.summary(1.0 / job.settings.fusion.rate_hz))
+        writer.finish(meta)
+        return writer.folder
+
+
+def run_stages(
+    job: Job, log: Log, ticks_ns: Ints, size: int, sink: Sink, reused: tuple[str, ...], *, smooth: bool
+) -> dict[str, Any]:
+    """All stages of the job in one pass, without those whose tables were taken over.
+
+    Returns:
+        ``counts`` and ``notes`` about the data, for run.json, and ``found_by``: those of each stage that reads the log.
+    """
+    todo = [stage for stage in job.stages if stage not in reused]
+    states: Iterable[HumanStates]
+    if "fuse" in todo:
+        stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
+        states = stages.fused(log, ticks_ns, size, build.eyes(job, log), sink, smooth=smooth)
+    else:
+        states = read_states(sink.run.partial / "state.parquet", size)
+    flow: Iterable[Any] = states
+    if "predict" in todo or "plan" in todo:
+        people = stages.predicted(states, build.foresight(job), _store_every(job), sink, keep="predict" in todo)
+        flow = people
+        if "plan" in todo:
+            flow = stages.planned(people, build.planners(job, log, int(ticks_ns[0])), sink)
+    if todo:
+        for _ in flow:
+            pass
+    return _findings(job, log, sink, reused)
+
+
+def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str]:
+    """Remarks on limbs that were not measured, from the tables of the first stage."""
+
+    def table(name: str) -> Any:
+        path = folder / f"{name}.parquet"
+        return pq.read_table(path, columns=list(limbs.COLUMNS[name])).to_pandas() if path.exists() else None
+
+    return limbs.remarks(Run(folder, meta, state=table("state"), measurements=table("measurements")), told)
+
+
+def _findings(job: Job, log: Log, sink: Sink, reused: tuple[str, ...]) -> dict[str, Any]:
+    """What the stages found in the log; of a stage taken over, what the earlier run found.
+
+    Damage to the files that only this run met is told all the same.
+    """
+    joints = log.joint_defects
+    found: dict[str, tuple[Counter[str], list[str]]] = {
+        "fuse": (log.defects - joints + sink.counts, [*log.notes, *sink.notes["fuse"]]),
+        "plan": (joints, sink.notes["plan"]),
+    }
+    by_stage: dict[str, Any] = {}
+    for stage, (counts, notes) in found.items():
+        if stage in reused and job.earlier is not None:
+            theirs = run_folder.read_meta(job.earlier)["found_by"][stage]
+            counts = Counter[str](theirs["counts"]) | counts
+            notes = [*theirs["notes"], *notes]
+        if stage in job.stages:
+            by_stage[stage] = {"counts": _plain(counts), "notes": list(dict.fromkeys(notes))}
+    total = sum((Counter(part["counts"]) for part in by_stage.values()), Counter[str]())
+    told = [note for part in by_stage.values() for note in part["notes"]]
+    return {"counts": _plain(total), "notes": told, "found_by": by_stage}
+
+
+def _take_over(job: Job, parts: Mapping[str, str], writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
+    """Copies the tables of the earlier run's stages that would come out the same, and says which those are."""
+    if job.earlier is None:
+        return ()
+    stale = stale_stages(job, parts)
+    if smooth:
+        stale.setdefault("fuse", f"{job.earlier} holds no covariances to smooth with")
+    reused = tuple(stage for stage in job.stages if stage not in stale)
+    for stage in job.stages:
+        names = [name for pattern in TABLES[stage] for name in sorted(p.name for p in job.earlier.glob(pattern))]
+        if stage in reused:
+            for name in names:
+                writer.copy(name, job.earlier)
+            say(f"{stage}: taken over from {job.earlier}")
+        elif names:
+            say(f"{stage}: {stale[stage]}; computed again")
+    return reused
+
+
+def _ticks(job: Job, log: Log) -> Ints:
+    first, last = log.header.start_ns, log.header.end_ns
+    if first == last:
+        raise LogError(f"{job.log}: holds a single instant; would be right: two frames or more")
+    start_ns = first + round((job.start_s or 0.0) * NS)
+    end_ns = last if job.end_s is None else min(last, first + round(job.end_s * NS))
+    if not first <= start_ns < end_ns:
+        option = f"--start {job.start_s:g}" if job.start_s is not None else f"--end {job.end_s or 0:g}"
+        raise SettingsError(f"{option}: nothing of the log is left; it lasts {(last - first) / NS:.1f} s")
+    return stages.tick_times(start_ns, end_ns, job.settings.fusion.rate_hz)
+
+
+def _store_every(job: Job) -> float:
+    store_hz = job.settings.occupancy.store_hz
+    return 1.0 if store_hz == "all" else max(1.0, job.settings.fusion.rate_hz / store_hz)
+
+
+def _plain(counts: Counter[str]) -> dict[str, int]:
+    return {name: int(count) for name, count in sorted((+counts).items())}
+
+
+def _folder(job: Job, began: datetime) -> Path:
+    return REPORTS / job.log.stem / f"{began:%Y%m%dT%H%M%SZ}-{job.command}"
+
+
+def demo_log() -> Path:
+    """The log that ships with the package; in a checkout, that of datasets/."""
+    shipped = Path(str(resources.files("hrcreplay"))) / "data" / "demo.mcap"
+    return shipped if shipped.exists() else Path(__file__).parents[2] / "datasets" / "demo.mcap"
+
+
+#: What the fused person depends on, and the volumes; each stage works on what those before it hand on.
+_PERSON = ("versions", "log", "ticks", "cameras", "settings logs", "settings fusion", "limits.tracking")
+_VOLUMES = (*_PERSON, "settings occupancy", "limits.prediction")
+#: Stage -> the parts that its tables, counts and notes depend on. The plan takes the volumes of every tick: how many
+#: of them are stored changes nothing for it.
+PARTS = {
+    "fuse": (*_PERSON, "logs.gap_s"),
+    "predict": (*_VOLUMES, "occupancy.store_hz"),
+    "plan": (*_VOLUMES, "base", "programme", "settings robot", "settings plan"),
+}
+
+
+def dependencies(job: Job, log: Source, ticks_ns: Ints) -> dict[str, str]:
+    """Digest of every part that a stage of the job depends on.
+
+    A section of the settings counts whole, so that a new setting cannot be forgotten, but for the keys that stand here
+    by themselves: a file counts by its content, ``joints_topic`` as the programme, for want of a task.
+
+    Args:
+        job: What was asked for.
+        log: Where the job's cell and task say nothing, the log's own hold.
+        ticks_ns: (n,) of the run [ns].
+
+    Raises:
+        SettingsError: The cell or the URDF cannot be used.
+        LogError: The pose of a camera is not known.
+    """
+    settings = job.settings.model_dump(mode="json")
+    eyes = build.eyes(job, log)
+    found: dict[str, Any] = {
+        "versions": versions(),
+        "log": job.log_sha256,
+        "ticks": [int(ticks_ns[0]), int(ticks_ns[-1]), len(ticks_ns)],
+        "cameras": [log.header.cameras, eyes.T_world_camera.tolist(), eyes.clock_offset_ns.tolist()],
+        "settings logs": _without(settings["logs"], "joints_topic", "gap_s"),
+        "logs.gap_s": settings["logs"]["gap_s"],
+        "settings fusion": settings["fusion"],
+        "limits.tracking": _without(plain_limits(job.tracking), "name"),
+        "settings occupancy": _without(settings["occupancy"], "store_hz"),
+        "occupancy.store_hz": settings["occupancy"]["store_hz"],
+        "limits.prediction": _without(plain_limits(job.prediction), "name"),
+    }
+    if "plan" in job.stages:
+        base = build.base(job, log)
+        found |= {
+            "base": None if base is None else base.tolist(),
+            "programme": job.task or log.header.task or {"joints_topic": settings["logs"]["joints_topic"]},
+            "settings robot": [_without(settings["robot"], "urdf", "packages"), urdf_digest(job.settings)],
+            "settings plan": _without(settings["plan"], "task"),
+        }
+    return {name: _digest(part) for name, part in found.items()}
+
+
+def stage_digests(job: Job, found: Mapping[str, str]) -> dict[str, str]:
+    """Digest of all that the result of each stage of the job depends on, from those of ``parts``."""
+    return {stage: _digest([found[name] for name in PARTS[stage]]) for stage in job.stages}
+
+
+def stale_stages(job: Job, found: Mapping[str, str]) -> dict[str, str]:
+    """Stage -> why the earlier run's result is not the one that this job would make.
+
+    A table that is damaged or of an earlier version speaks against the stages after its own, too.
+    """
+    if job.earlier is None:
+        return {}
+    meta, mine = run_folder.read_meta(job.earlier), stage_digests(job, found)
+    why: dict[str, str] = {}
+    damage = None
+    for stage in job.stages:
+        damage = damage or _damage(job.earlier, stage, meta["outputs"])
+        if meta.get("stages", {}).get(stage) != mine[stage]:
+            why[stage] = _difference(stage, found, meta, job.earlier)
+        elif damage is not None:
+            why[stage] = damage
+    return why
+
+
+def _difference(stage: str, found: Mapping[str, str], meta: Mapping[str, Any], earlier: Path) -> str:
+    theirs = meta.get("depends_on", {})
+    different = [name for name in PARTS[stage] if theirs.get(name) != found[name]]
+    if not theirs or not different:  # of a live session, or of an earlier version
+        return f"{earlier} does not say what its tables depend on"
+    return f"{', '.join(different)} {'is' if len(different) == 1 else 'are'} not as in {earlier}"
+
+
+def _damage(folder: Path, stage: str, outputs: Mapping[str, str]) -> str | None:
+    """What keeps an earlier run's tables of a stage from being taken for ours."""
+    for name in sorted(name for name in outputs if any(fnmatch(name, pattern) for pattern in TABLES[stage])):
+        path = folder / name
+        if not path.exists() or run_folder.sha256(path) != outputs[name]:
+            return f"{path} is not as its run left it"
+        if missing := lacks(path):
+            return f"{path} is of an earlier version, without {missing[0]}"
+    return None
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def _without(table: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    return {name: value for name, value in table.items() if name not in keys}

@@ -1,0 +1,141 @@
+"""The report of a run: metrics first, then what only reads them.
+
+Everything that metrics.json holds, from a run's tables alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.report import figures, page, tables
+from hrcreplay.report.figures_human import Instant
+from hrcreplay.report.figures_robot import LinkPose
+from hrcreplay.report.limbs import add_limbs
+from hrcreplay.report.metrics import Metric, MetricTable
+from hrcreplay.report.metrics_data import add_fusion, add_occupancy, add_quality
+from hrcreplay.report.metrics_plan import add_plan
+from hrcreplay.report.story import lines
+from hrcreplay.run import build
+from hrcreplay.run.job import Job
+from hrcreplay.run.stages import Foresight
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import Run, RunWriter
+from hrcreplay.store.tables import read_states
+
+
+def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
+    """Leaves metrics.json, the figures and report.html beside the tables that have just been written."""
+    near = _bounds(job.settings.model_dump())
+    run = run_folder.read(writer.partial, meta)
+    found = compute(run, **near)
+    writer.text("metrics.json", run_folder.to_json(found))
+    foresight = build.foresight(job)
+    radii = {name.replace("_", " "): radius for name, radius in asdict(foresight.radii).items()}
+    if foresight.method == "sound" and foresight.margins.legs:
+        radii["legs, of sound"] = foresight.margins.legs_radius_m
+    folder = writer.partial / "figures"
+    robot = _links(job, foresight, run)
+    figures.draw_all(run, folder, found, **near, volumes=_instants(foresight, run), robot=robot)
+    shown = [
+        tables.limit_table(job.prediction, use="prediction"),
+        tables.limit_table(job.tracking, use="tracking"),
+        tables.radius_table(radii),
+    ]
+    writer.text("report.html", page.render(run, found, folder, shown))
+
+
+def summary(folder: Path) -> list[str]:
+    """The main figures of a run, a line a stage."""
+    run = run_folder.read(folder)
+    return lines(run, compute(run, **_bounds(run.meta["settings"])))
+
+
+def _bounds(settings: Mapping[str, Any]) -> dict[str, float]:
+    """What the metrics ask of the settings."""
+    return {
+        "near_m": settings["report"]["near_m"],
+        "stationary_m_per_s": settings["report"]["stationary_m_per_s"],
+        "gap_s": settings["logs"]["gap_s"],
+    }
+
+
+def _instants(foresight: Foresight, run: Run) -> list[Instant]:
+    """The swept volumes by the paper's two methods and the run's own at the instants that Fig. 17 shows."""
+    wanted = figures.instants(run)
+    if not len(wanted):
+        return []
+    states = _states(run, wanted)
+    methods = dict.fromkeys(("paper", "positions", foresight.method))
+    by_method = {method: foresight.volumes(states, method) for method in methods}
+
+    return [
+        (int(t), {method: _hulls(volumes, row) for method, volumes in by_method.items()})
+        for row, t in enumerate(states.t_ns)
+    ]
+
+
+def _links(job: Job, foresight: Foresight, run: Run) -> LinkPose | None:
+    """The robot's capsules and the swept volumes at the tick of the smallest separation."""
+    if run.motion is None or not len(run.motion) or run.T_world_base is None:
+        return None
+    robot = build.robot(job, run.T_world_base)
+    row = run.motion.iloc[figures.nearest_tick(run.motion)]
+    q = row[[f"q{axis}" for axis in range(1, robot.nv + 1)]].to_numpy(dtype=float)
+    if not np.isfinite(q).all():
+        return None
+    states = _states(run, np.array([row["t_ns"]]))
+    hulls = _hulls(foresight.volumes(states), 0) if len(states) else {}
+    return LinkPose(
+        t_ns=int(row["t_ns"]),
+        distance_m=float(row["distance_m"]),
+        bodies=tuple(segment.body for segment in robot.segments),
+        ends_m=robot.pose(q, np.zeros(robot.nv)).ends_m,
+        radius_m=np.array([segment.radius_m for segment in robot.segments]),
+        volumes={limb: (points, radius) for limb, (points, radius) in hulls.items() if np.isfinite(points).all()},
+    )
+
+
+def _states(run: Run, wanted_ns: Ints) -> HumanStates:
+    """The fused person at some ticks."""
+    batches = read_states(run.folder / "state.parquet", 4096)
+    return HumanStates.join([batch.rows(np.isin(batch.t_ns, wanted_ns)) for batch in batches])
+
+
+def _hulls(volumes: SweptVolumes, row: int) -> dict[str, tuple[Floats, float]]:
+    return {limb: (volumes.vertices(row, i), float(volumes.radius_m[row, i])) for i, limb in enumerate(volumes.limbs)}
+
+
+def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float = 0.2) -> dict[str, Metric]:
+    """Metrics of a run: name -> value, unit, meaning; null with a reason where one does not apply, never 0.
+
+    Args:
+        run: The run's tables; those of stages that were not run are None.
+        near_m: The stationary share counts ticks with a separation of at most this [m].
+        stationary_m_per_s: A TCP slower than this stands [m/s].
+        gap_s: A camera silent for longer has a gap [s].
+
+    Returns:
+        Sorted by name, plain Python values, finite numbers only.
+    """
+    plan = run.meta.get("settings", {}).get("plan", {})
+    metrics = MetricTable()
+    add_quality(metrics, run, gap_s)
+    add_limbs(metrics, run)
+    add_occupancy(metrics, run.occupancy)
+    add_fusion(metrics, run, gap_s)
+    add_plan(
+        metrics,
+        run.motion,
+        run.baselines,
+        method=str(plan.get("method", "qp")),
+        near_m=near_m,
+        stationary_m_per_s=stationary_m_per_s,
+        leash_m=float(plan.get("leash_m", 0.25)),
+    )
+    return metrics.sorted()

@@ -1,0 +1,310 @@
+"""The three stages as generators over batches of ticks: each hands its rows on and writes what it leaves behind.
+
+What a person at a terminal sees of a run; a pipe sees nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from hrcreplay.errors import LogError
+from hrcreplay.geometry import convex_hull
+from hrcreplay.human.fusion import fuse, inverse_kinematics
+from hrcreplay.human.fusion import fuse as smoother
+from hrcreplay.human.model import LimitSet
+from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.human.prediction.sound_reach import Margins
+from hrcreplay.logs.clean import PersonMemory, pick
+from hrcreplay.logs.plausibility import Stand
+from hrcreplay.logs.reader import Log
+from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.run.followers import Beside, Planner
+from hrcreplay.store.run_folder import RunWriter, Stopwatch
+from hrcreplay.store.tables import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
+
+NS = 1_000_000_000
+#: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
+_LOST = ("points_", "person_frames_without", "frames_repeated", "frames_out_of_order")
+
+#: Of a session; a longer log has an arrival of another clock among its messages [s].
+LONGEST_S = 24 * 3600
+
+
+@dataclass
+class Sink:
+    """Where the stages leave their rows, and what they count on the way."""
+
+    run: RunWriter
+    watch: Stopwatch
+    progress: Callable[[str, int], None]  #: stage, ticks done
+    counts: Counter[str] = field(default_factory=Counter)
+    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> what is odd
+
+
+@dataclass(frozen=True)
+class Eyes:
+    """What the first stage needs to know of cameras and person."""
+
+    T_world_camera: Floats  #: (c, 4, 4)
+    clock_offset_ns: Ints  #: (c,) camera's clock minus the reference camera's
+    noise: inverse_kinematics.PointNoise
+    filter: fuse.FusionSettings
+    limits: LimitSet
+    person_jump_m: float
+    person_memory_s: float
+
+    def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
+        """What the frames say of the person, by the clock of the reference camera; see ``person.pick``."""
+        memory, mine, found = pick(frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s)
+        mine = replace(mine, capture_ns=mine.capture_ns - self.clock_offset_ns[mine.camera])
+        return memory, inverse_kinematics.measure(mine, self.T_world_camera, self.noise), found
+
+
+@dataclass(frozen=True)
+class Foresight:
+    """What the second stage needs beside the person."""
+
+    limits: LimitSet
+    horizon_s: float
+    radii: swept_volumes.Radii
+    margins: Margins
+    method: str
+
+    def volumes(self, states: HumanStates, method: str | None = None) -> SweptVolumes:
+        """Swept volumes of every tick, by this or another method."""
+        return swept_volumes.predict(
+            states,
+            self.limits,
+            horizon_s=self.horizon_s,
+            radii=self.radii,
+            method=method or self.method,
+            margins=self.margins,
+        )
+
+
+def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
+    """(n,) tick times: from the first instant on, at the filter's rate, none after the last [ns].
+
+    Raises:
+        LogError: So long a span is no session, but a message with an arrival that cannot be.
+    """
+    if end_ns - start_ns > LONGEST_S * NS:
+        raise LogError(
+            f"arrivals: the log goes on for {(end_ns - start_ns) / (3600 * NS):.0f} h from its first message to its "
+            f"last; would be right: at most {LONGEST_S // 3600} h, as a span with --start and --end"
+        )
+    count = int((end_ns - start_ns) * rate_hz / NS) + 1
+    ticks: Ints = start_ns + np.round(np.arange(count) * (NS / rate_hz)).astype(np.int64)
+    return ticks[ticks <= end_ns]
+
+
+def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterator[tuple[Ints, CameraFrames | None]]:
+    """Ticks by the batch, each with the frames that arrived up to its last tick and not before."""
+    waiting: list[CameraFrames] = []
+    arrived_ns = -1
+    for first in range(0, len(ticks_ns), size):
+        ticks = ticks_ns[first : first + size]
+        while arrived_ns <= ticks[-1] and (chunk := next(frames, None)) is not None:
+            waiting.append(chunk)
+            arrived_ns = int(chunk.arrival_ns[-1])
+        due = None
+        if waiting:
+            table = CameraFrames.join(waiting)
+            count = int(np.searchsorted(table.arrival_ns, ticks[-1], side="right"))
+            due = table.rows(slice(0, count)) if count else None
+            waiting = [table.rows(slice(count, None))] if count < len(table) else []
+        yield ticks, due
+
+
+def fused(
+    log: Log, ticks_ns: Ints, size: int, eyes: Eyes, sink: Sink, *, smooth: bool = False
+) -> Iterator[HumanStates]:
+    """Stage 1: camera frames to the fused person; leaves measurements and state, and ``smooth`` where asked.
+
+    Raises:
+        LogError: At the end: what the log shows is certainly no person, or nobody was ever seen.
+    """
+    state = fuse.start(log.header.cameras)
+    memory = PersonMemory()
+    frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
+    passed: list[tuple[HumanStates, fuse.Trace]] = []
+    stands = [Stand() for _ in log.header.cameras]
+    ever = False
+    for ticks, seen in batches(frames, ticks_ns, size):
+        measured = nothing(log.header.cameras)
+        if seen is not None:
+            with sink.watch.stage("angles", len(ticks)):
+                memory, measured, found = eyes.measure(seen, memory)
+            sink.counts.update(found)
+            sink.run.table("measurements", measurement_columns(measured))
+            for stand, c in zip(stands, range(len(stands)), strict=True):
+                stand.add(measured.points_m[measured.camera == c])
+        with sink.watch.stage("fuse", len(ticks)):
+            if smooth:
+                state, states, events, trace = fuse.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
+                passed.append((states, trace))
+            else:
+                state, states, events = fuse.fuse(state, ticks, measured, eyes.filter, eyes.limits)
+        sink.counts.update(events)
+        ever = ever or bool(states.valid.any())
+        sink.run.table("state", state_columns(states))
+        sink.progress("fuse", len(ticks))
+        yield states
+    log.check()
+    if not ever:
+        raise _nobody(log, sink.counts)
+    sink.notes["fuse"].extend(_oddities(log, stands))
+    if smooth:
+        whole = HumanStates.join([states for states, _ in passed])
+        traces = [trace for _, trace in passed]
+        trace = fuse.Trace(
+            cov=np.concatenate([trace.cov for trace in traces]),
+            damping=np.concatenate([trace.damping for trace in traces]),
+        )
+        sink.run.table("smooth", state_columns(smoother.smooth(whole, trace, eyes.filter)))
+
+
+def _nobody(log: Log, found: Counter[str]) -> LogError:
+    """What to tell of a log in which nobody was ever seen: what there was, and what would be right."""
+    rows = sum(log.defects[f"frames_{camera}"] for camera in log.header.cameras)
+    text = (
+        f"{log.header.path}: nobody was ever seen: {rows} bodies in the frames of {', '.join(log.header.cameras)} hold "
+        f"{log.points_seen} points with a place and a confidence"
+    )
+    why = [f"{name} {count}" for name, count in sorted((log.defects + found).items()) if name.startswith(_LOST)]
+    text += f" ({', '.join(why)})" if why else ""
+    return LogError(
+        f"{text}; would be right: a person's pelvis, shoulders and arms, confidence at least fusion.confidence_min. "
+        "Look at it with hrcreplay info"
+    )
+
+
+def _oddities(log: Log, stands: list[Stand]) -> Iterator[str]:
+    """What is odd about how the person stands in the world."""
+    for camera, stand in zip(log.header.cameras, stands, strict=True):
+        remark = stand.remark(camera)
+        if remark is not None:
+            yield remark
+
+
+def nothing(cameras: tuple[str, ...]) -> Measurements:
+    """No frame of any camera."""
+    return Measurements(
+        capture_ns=np.zeros(0, np.int64),
+        arrival_ns=np.zeros(0, np.int64),
+        camera=np.zeros(0, np.int64),
+        angles=np.zeros((0, 12)),
+        angles_std=np.zeros((0, 12)),
+        lengths_m=np.zeros((0, 8)),
+        lengths_std_m=np.zeros((0, 8)),
+        points_m=np.zeros((0, 20, 3)),
+        confidence=np.zeros((0, 20)),
+        cameras=cameras,
+    )
+
+
+def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
+    """Leaves the closed-form joints of the log's noise-free skeleton, where it has one."""
+    for truth in log.truth():
+        within = truth.rows((truth.t_ns >= start_ns) & (truth.t_ns <= end_ns))
+        if len(within):
+            sink.run.table("truth", truth_columns(within.t_ns, *inverse_kinematics.inverse(within.points_m)))
+
+
+def predicted(
+    states: Iterable[HumanStates], foresight: Foresight, store_every: float, sink: Sink, *, keep: bool
+) -> Iterator[tuple[HumanStates, SweptVolumes]]:
+    """Stage 2: the swept volumes of every tick; where ``keep``, leaves those of one tick in ``store_every``."""
+    done = 0
+    for batch in states:
+        with sink.watch.stage("predict", len(batch)):
+            volumes = foresight.volumes(batch)
+        if keep:
+            number = np.arange(done, done + len(batch))
+            stored = np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
+            with sink.watch.stage("hulls", len(stored)):
+                store(volumes, stored, sink.run)
+        done += len(batch)
+        sink.progress("predict", len(batch))
+        yield batch, volumes
+
+
+def store(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
+    """Hull vertices and size of some ticks' volumes; a tick without a person leaves none."""
+    t_ns: list[int] = []
+    limbs: list[str] = []
+    radii: list[float] = []
+    sizes: list[float] = []
+    hulls: list[Floats] = []
+    for tick in ticks.tolist():
+        for i, limb in enumerate(volumes.limbs):
+            vertices = volumes.vertices(tick, i)
+            if np.isnan(vertices).any():
+                continue
+            corners, faces = convex_hull.hull(vertices)
+            radius = float(volumes.radius_m[tick, i])
+            t_ns.append(int(volumes.t_ns[tick]))
+            limbs.append(limb)
+            radii.append(radius)
+            sizes.append(convex_hull.sphere_swept_volume_m3(corners, radius, faces))
+            hulls.append(corners)
+    if t_ns:
+        run.table("occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls))
+
+
+def planned(
+    people: Iterable[tuple[HumanStates, SweptVolumes]], planners: dict[str, Planner], sink: Sink
+) -> Iterator[None]:
+    """Stage 3: what the robot would have done by each method; leaves a motion for each."""
+    beside = Beside(next(iter(planners.values())).dt_s)
+    for states, volumes in people:
+        for name, planner in planners.items():
+            with sink.watch.stage(f"plan {name}", len(volumes)):
+                motion = planner.follow(states, volumes)
+            sink.run.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
+            if planner.chosen:
+                beside.add(states, motion)
+        sink.progress("plan", len(volumes))
+        yield
+    remark = beside.remark()
+    if remark is not None:
+        sink.notes["plan"].append(remark)
+
+
+def say(text: str) -> None:
+    """A line for the user beside the result, on standard error."""
+    sys.stderr.write(f"hrcreplay: {text}\n")
+
+
+class Bar:
+    """A bar over the ticks of a run's last stage."""
+
+    def __init__(self, stage: str, ticks: int) -> None:
+        self._stage = stage
+        console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
+        self._bar = Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal)
+        self._task: TaskID = self._bar.add_task(stage, total=ticks)
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def advance(self, stage: str, ticks: int) -> None:
+        """So many ticks of a stage are done."""
+        if stage == self._stage:
+            self._bar.advance(self._task, ticks)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()

@@ -1,0 +1,1 @@
+"""All settings, each defined once with its unit and default. Defaults < file < command line."""

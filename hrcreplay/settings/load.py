@@ -1,0 +1,117 @@
+"""All settings, by section, and where they come from.
+
+Precedence: defaults < settings file (TOML) < command line (``--set section.key=value``).
+Rooms below never see these models: the drivers hand them plain values.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path, PurePath
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.settings.sections import Fusion, Limits, Live, Logs, Occupancy, Plan, Report, Robot, Section
+
+#: Words that TOML takes for something else than a text.
+_WORDS = frozenset({"true", "false", "inf", "nan"})
+
+
+class Settings(Section):
+    """Everything a run depends on beside the log and the cell."""
+
+    logs: Logs = Logs()
+    fusion: Fusion = Fusion()
+    limits: Limits = Limits()
+    occupancy: Occupancy = Occupancy()
+    robot: Robot = Robot()
+    plan: Plan = Plan()
+    report: Report = Report()
+    live: Live = Live()
+
+
+def load_settings(
+    path: Path | None = None, overrides: tuple[str, ...] = (), base: dict[str, Any] | None = None
+) -> Settings:
+    """Settings from a TOML file and ``section.key=value`` overrides, over those of an earlier run (``base``).
+
+    Raises:
+        SettingsError: The file cannot be read, or a key or value is not known.
+    """
+    table: dict[str, Any] = {name: dict(section) for name, section in (base or {}).items()}
+    where = "settings"
+    if path is not None:
+        where = str(path)
+        try:
+            for name, section in tomllib.loads(path.read_text()).items():
+                table[name] = table.get(name, {}) | section if isinstance(section, dict) else section
+        except OSError as error:
+            raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a TOML file") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise SettingsError(f"{path}: not TOML ({error})") from error
+    for override in overrides:
+        _override(table, override)
+    try:
+        return Settings.model_validate(table)
+    except ValidationError as error:
+        raise SettingsError(f"{where}: {_first_problem(error)}") from error
+
+
+def as_overrides(settings: Settings) -> tuple[str, ...]:
+    """The settings that are not the defaults, as ``section.key=value``; files by their names, without folders."""
+    found = []
+    for name in sorted(Settings.model_fields):
+        section, usual = getattr(settings, name), getattr(Settings(), name)
+        for key in sorted(type(section).model_fields):
+            value = getattr(section, key)
+            if value != getattr(usual, key) and value is not None:
+                found.append(f"{name}.{key}={_toml(value)}")
+    return tuple(found)
+
+
+def _toml(value: Any, *, inside: bool = False) -> str:
+    """A value as ``--set`` takes it: TOML, or a plain word."""
+    if isinstance(value, BaseModel):
+        value = value.model_dump(exclude_none=True)
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(key)} = {_toml(part, inside=True)}" for key, part in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml(part, inside=True) for part in value) + "]"
+    if isinstance(value, PurePath) or (isinstance(value, str) and value.endswith(".toml")):
+        value = PurePath(value).name
+    plain = isinstance(value, str) and re.fullmatch(r"[A-Za-z_][\w.-]*", value) and value not in _WORDS
+    return str(value) if plain and not inside else json.dumps(value)
+
+
+def _override(table: dict[str, Any], text: str) -> None:
+    key, equals, value = text.partition("=")
+    parts = key.strip().split(".")
+    if not equals or len(parts) != 2:
+        raise SettingsError(f"--set {text}: not of the form section.key=value; e.g. --set fusion.rate_hz=100")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    section = table.setdefault(parts[0], {})
+    if not isinstance(section, dict):
+        raise SettingsError(f"--set {text}: {parts[0]} is not a section of the settings file")
+    section[parts[1]] = parsed
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    loc = [str(part) for part in problem["loc"]]
+    if problem["type"] == "extra_forbidden":
+        known = Settings.model_fields if len(loc) == 1 else _section_keys(loc[0])
+        return f"unknown setting {'.'.join(loc)!r}; known here: {', '.join(known)}"
+    return f"{'.'.join(loc)}: found {problem['input']!r}; {problem['msg'][0].lower()}{problem['msg'][1:]}"
+
+
+def _section_keys(name: str) -> list[str]:
+    field = Settings.model_fields.get(name)
+    section = field.annotation if field else None
+    return list(section.model_fields) if isinstance(section, type) and issubclass(section, BaseModel) else []

@@ -1,0 +1,313 @@
+"""Sections of the settings, one pydantic model each. Defaults are the paper's where it gives one.
+
+Sections of the settings that only a live session has.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hrcreplay.records import POINTS
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Sigmas = tuple[NotNegative, NotNegative, NotNegative, NotNegative]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class Section(BaseModel):
+    """A group of settings: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class Decoder(Section):
+    """How to read skeletons from a message type the package does not know."""
+
+    topic: str
+    """Topic of the messages."""
+    camera: str
+    """Name that the sensor gets."""
+    points: str
+    """Path to the array of points inside the message, fields joined by dots; its elements have x, y, z."""
+    index: dict[str, int]
+    """Which element is which body point: body point -> index."""
+    unit: Literal["m", "mm"] = "m"
+    """Unit of the points."""
+    stamp: str | None = "header.stamp"
+    """Path to the capture time; none: the arrival time is used."""
+    confidence: str | None = None
+    """Path to an array of confidences in [0, 1], one a point; none: every finite point has confidence 1."""
+
+    def model_post_init(self, _context: Any) -> None:
+        """Refuses body points that are not in POINTS."""
+        unknown = sorted(set(self.index) - set(POINTS))
+        if unknown:
+            raise ValueError(f"unknown body point {unknown[0]!r}; known are {', '.join(POINTS)}")
+
+
+class Logs(Section):
+    """Reading logs."""
+
+    topics: tuple[str, ...] = ()
+    """Skeleton topics to read; none: all that a decoder knows."""
+    decoders: tuple[Decoder, ...] = ()
+    """Decoders for message types the package does not know."""
+    joints_topic: str | None = None
+    """Topic of the robot's joint states; none: the first sensor_msgs/JointState or our own."""
+    person_jump_m: Positive = 0.8
+    """A body further than this from where the person was last seen is somebody else [m]."""
+    person_memory_s: Positive = 2.0
+    """After this long without the person, the nearest body becomes the person [s]."""
+    gap_s: Positive = 0.2
+    """A camera silent for longer has a gap [s]."""
+
+
+class Fusion(Section):
+    """Section 4: the Kalman filter."""
+
+    rate_hz: Positive = 250.0
+    """Ticks a second of the filter and the controller [Hz]."""
+    stale: Literal["skip", "reuse"] = "skip"
+    """Between two frames: skip the camera's rows, or re-use them with the sawtooth covariance of 4.1.1."""
+    delay: Literal["compensate", "ignore"] = "compensate"
+    """Relate a frame to the state at its capture time, or take it for the state at the tick."""
+    confidence_min: Share = 0.2
+    """An angle is used when the product of the confidences of its points is at least this."""
+    outlier_m: Positive = 0.20
+    """A point further than this from the predicted skeleton is an outlier [m]."""
+    bone_m: Positive = 0.10
+    """So is one at the end of a bone that is longer or shorter than the person's by more [m]."""
+    bone_memory_s: Positive = 5.0
+    """Unless no camera has seen that bone right for so long [s]."""
+    point_std_m: Positive = 0.02
+    """Standard deviation of a skeleton point at full confidence [m]."""
+    point_std_per_m: NotNegative = 0.0
+    """Its growth with the distance from the camera [m/m]."""
+    sigma_position: Sigmas = (300.0, 100.0, 5.0, 1.0)
+    """Sigmas of Eq. (44) for x and y: p, v, a, j [m/s^2, m/s^2.5, m/s^3, m/s^3.5]."""
+    sigma_angle: Sigmas = (1500.0, 600.0, 10.0, 1.0)
+    """The same for the angles [rad]."""
+    coast_s: Positive = 0.12
+    """A joint without a valid row for longer comes to rest [s]."""
+    delay_max_s: Positive = 0.25
+    """An older frame counts as this old [s]."""
+    residual_quantile: Share = 0.95
+    """Of how far each limb's measured points were from the model's: the quantile that is tracked."""
+    residual_memory_s: Positive = 20.0
+    """A distance seen this long ago counts 1/e of a new one [s]."""
+    spread_memory_s: Positive = 1.0
+    """The reported deviations follow the surprises of measurements; a surprise falls to 1/e in this time [s]."""
+    memory_s: Positive = 0.5
+    """Without a valid row for longer than this the person counts as lost [s]."""
+
+
+class Limits(Section):
+    """Named limit sets (paper, human, people) or paths of TOML files."""
+
+    tracking: str = "human"
+    """Bounds the filter's state, Eq. (62)-(65)."""
+    prediction: str = "people"
+    """Bounds the reachable sets, Alg. 1. people: fitted on recordings; the README says why it is the default."""
+
+
+class Occupancy(Section):
+    """Section 3: what the person can reach."""
+
+    method: Literal["paper", "positions", "sound"] = "sound"
+    """sound: encloses every motion of the model under the limits; paper: Eq. (20)-(30) and Alg. 1, 2 as printed;
+    positions: from positions and velocity bounds alone [26]."""
+    stop_s: Positive = 0.377
+    """Worst-case braking time T_s of the robot, Eq. (70) [s]."""
+    store_hz: Positive | Literal["all"] = 25.0
+    """Ticks a second whose volumes are stored, or "all" [Hz]."""
+    radius_head_m: NotNegative = 0.12
+    """Table 2 [m]."""
+    radius_thorax_m: NotNegative = 0.15
+    """Table 2 [m]."""
+    radius_upper_arm_m: NotNegative = 0.07
+    """Table 2 [m]."""
+    radius_lower_arm_m: NotNegative = 0.07
+    """Table 2 [m]."""
+
+    sigmas: NotNegative = 1.0
+    """sound: states within so many standard deviations of the estimate are enclosed, all joints off at once."""
+    latency_s: NotNegative = 0.0
+    """sound: from the newest capture to the robot's reaction; the horizon is longer by it [s]."""
+    hand_m: NotNegative = 0.19
+    """sound: length of the hand beyond the wrist [m]."""
+    legs_radius_m: Positive = 0.20
+    """sound: least radius of the lower body around the line from the floor to the pelvis; legs seen further off, as of
+    who sits or squats, make it larger [m]."""
+    legs: bool = True
+    """sound: whether there is a lower body."""
+    residual: bool = True
+    """sound: whether the measured body's distance from the model is added to the radii."""
+    residual_unknown_m: NotNegative = 0.10
+    """sound: that distance until enough of it has been seen [m]."""
+
+
+class LinkSettings(Section):
+    """One link segment of a robot."""
+
+    name: str
+    """Name in outputs."""
+    body: str
+    """Body (URDF link or joint frame) that both ends are fixed on."""
+    start_m: tuple[float, float, float]
+    """First end in that body's frame [m]."""
+    end_m: tuple[float, float, float]
+    """Second end in that body's frame [m]."""
+    radius_m: Positive
+    """Radius of the capsule [m]."""
+
+
+class Offset(Section):
+    """A pose seen from another frame."""
+
+    position_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """Its origin [m]."""
+    rpy_deg: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """Its orientation, Rz(yaw) Ry(pitch) Rx(roll) [deg]."""
+
+
+class Robot(Section):
+    """The manipulator. Default: ABB IRB 140."""
+
+    urdf: Path | None = None
+    """Another robot's URDF; none: the IRB 140. Joints that do not lie between base and tool are locked at zero."""
+    packages: tuple[Path, ...] = ()
+    """Directories of the packages whose meshes that URDF names (package://); searched before the directories at and
+    above the URDF, and those of ROS_PACKAGE_PATH."""
+    base_frame: str | None = None
+    """Frame of that URDF that stands on T_world_base; none: its root."""
+    tcp_frame: str | None = None
+    """Frame of that URDF that carries the tool; none: the last one that revolute joints move."""
+    tool_m: NotNegative = 0.10
+    """TCP beyond the flange, along its z axis [m]."""
+    tcp_offset: Offset = Offset()
+    """TCP from there, for a tool that is not straight."""
+    links: tuple[LinkSettings, ...] = ()
+    """Link segments; none: the IRB 140's, or derived from the URDF's collision shapes, meshes among them."""
+    acceleration: tuple[Positive, ...] = ()
+    """Joint acceleration limits [rad/s^2]; none: top speed / T_s of every axis."""
+
+
+class Plan(Section):
+    """Section 5: the trajectory generator."""
+
+    method: Literal["qp", "scaling"] = "qp"
+    """qp: Eq. (66); scaling: the largest factor on the programmed speed that meets the same constraints [24]."""
+    baselines: tuple[Literal["qp", "scaling"], ...] = ("scaling",)
+    """Methods run beside it on the same volumes, for comparison."""
+    task: Path | None = None
+    """Task file (TOML); none: the one inside the log, else the joint track inside the log."""
+    reference: Literal["time", "path"] = "path"
+    """time: the reference runs with the clock; path: only as far as the robot has followed."""
+    leash_m: Positive = 0.25
+    """path: the reference waits when the TCP is this far away [m]."""
+    waypoint_m: Positive = 0.02
+    """path: the reference leaves a waypoint when the TCP has come this close [m]."""
+    q_p: tuple[NotNegative, NotNegative] = (0.10, 0.10)
+    """Eq. (71): weights of the position error, translation and orientation."""
+    q_v: tuple[NotNegative, NotNegative] = (1.0, 1.0)
+    """Eq. (72): weights of the velocity error, translation and orientation."""
+    path_gain_per_s: NotNegative = 5.0
+    """Position error fed into the reference velocity [1/s]; 0 as printed: no error decays, so use reference "time"."""
+    clearance_m: NotNegative = 0.0
+    """Clearance beyond limb radius + link radius [m]."""
+    tcp_speed_max: Positive = 2.5
+    """Eq. (66g), each axis of the world [m/s]; the rotation's bound is 2 pi rad/s for each 2.5 m/s."""
+    tcp_acceleration_max: Positive = 25.0
+    """Eq. (66h), corrected, each axis of the world [m/s^2]."""
+
+
+class Report(Section):
+    """What is computed and drawn."""
+
+    near_m: Positive = 0.50
+    """The stationary share counts ticks with a separation of at most this [m]."""
+    stationary_m_per_s: Positive = 0.001
+    """A TCP slower than this stands [m/s]."""
+
+
+class ZenohKey(Section):
+    """The Zenoh keys of one camera."""
+
+    key: str
+    """Key expression: 0/kinect/skeleton/** of rmw_zenoh, kinect/skeleton of the DDS bridge."""
+    payload: Literal["hrcreplay", "cdr"] = "hrcreplay"
+    """Our own message, or the CDR of a ROS 2 system."""
+    type: str | None = None
+    """cdr: message type; none: as the keys of rmw_zenoh tell."""
+    definition: str = ""
+    """cdr: text of the type's .msg, where no release of ROS 2 has it."""
+    points: str | None = None
+    """cdr: path to the points in a type without a decoder of its own, as in logs.decoders."""
+    index: dict[str, int] = Field(default_factory=dict)
+    """cdr: which element is which body point."""
+    unit: Literal["m", "mm"] = "m"
+    """cdr: unit of the points."""
+    stamp: str | None = "header.stamp"
+    """cdr: path to the capture time."""
+    confidence: str | None = None
+    """cdr: path to an array of confidences."""
+
+
+class Zenoh(Section):
+    """Live skeletons over Zenoh."""
+
+    mode: Literal["peer", "client"] = "peer"
+    """How we take part."""
+    connect: tuple[str, ...] = ()
+    """Endpoints to connect to, as tcp/192.168.0.1:7447."""
+    listen: tuple[str, ...] = ()
+    """Endpoints to listen on."""
+    scouting: bool = False
+    """Whether to look for others by multicast."""
+    keys: dict[str, ZenohKey] = Field(default_factory=dict)
+    """Camera -> where its skeletons are."""
+
+
+class Live(Section):
+    """The live session: EGM link, watchdog, person."""
+
+    port: Annotated[int, Field(ge=0, le=65535)] = 6510
+    """UDP port at which the robot's packets arrive."""
+    cycle_s: Positive = 0.004032
+    """The robot's cycle: every answer moves the reference by this much time [s]."""
+    reaction_s: NotNegative = 0.05
+    """From a look at the person to the robot's obedience: up to two cycles until it is used, an answer's delay, a cycle
+    and the robot's own lag. The swept volumes of method sound reach this much further than T_s [s]."""
+    approach_speed: Annotated[float, Field(gt=0, le=1)] = 0.1
+    """Share of the axes' top speeds on the way from where the robot stands to its programme."""
+    resume: bool = False
+    """Whether motion goes on by itself once the reason of a stop is gone."""
+    resume_s: Positive = 1.0
+    """How long it must be gone before that [s]."""
+    fresh_s: Positive = 0.3
+    """No frame of the person for longer stops the robot [s]."""
+    uncertain_m: Positive = 0.2
+    """A larger standard deviation of the person's position stops the robot [m]."""
+    uncertain_rad: Positive = 0.8
+    """The same for heading and bend of the trunk [rad]."""
+    person_late_s: Positive = 0.2
+    """The human side's process without a sign of life for longer stops the robot [s]."""
+    overrun_s: Positive = 0.02
+    """An answer later than this stops the robot [s]."""
+    silent_s: Positive = 0.1
+    """A robot that sends nothing for longer counts as gone [s]."""
+    tracking_rad: Positive = 0.2
+    """A robot further than this from its reference stops [rad]."""
+    utilization_max: Positive = 100.0
+    """A robot above this cannot follow, and stops [%]."""
+    keep_recorder: bool = True
+    """Whether the robot stops when nobody records any more."""
+    real_time: bool = True
+    """Whether to ask the system to run the control loop before all else and to keep it in memory."""
+    zenoh: Zenoh = Zenoh()
+    """Where live skeletons come from when no recording is played."""

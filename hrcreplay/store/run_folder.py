@@ -1,0 +1,299 @@
+"""A run folder: what a command leaves behind, and how it is read back.
+
+Written whole or not at all: everything goes to ``<folder>.partial`` first, which takes its final name with the last
+write. Tables are parquet without times or paths in them, so the same log and settings give the same bytes.
+
+Text files that appear whole or not at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.records import Floats
+
+#: The outputs that may differ between two runs on the same log and settings.
+NOT_DETERMINISTIC = frozenset({"run.json", "timing.json"})
+
+
+def sha256(path: Path) -> str:
+    """Hex digest of a file; of a folder, the digest of its files' names and digests in sorted order."""
+    if path.is_dir():
+        digest = hashlib.sha256()
+        for part in sorted(p for p in path.rglob("*") if p.is_file()):
+            digest.update(f"{part.relative_to(path).as_posix()}\0{sha256(part)}\n".encode())
+        return digest.hexdigest()
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def to_json(value: Any) -> str:
+    """JSON text with sorted keys; a number that is not finite is a bug here and raises ValueError."""
+    return json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
+
+
+class TableWriter:
+    """A parquet file written chunk by chunk in row groups of a fixed size, whatever the size of the chunks."""
+
+    ROWS = 4096
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._writer: pq.ParquetWriter | None = None
+        self._waiting: list[pa.Table] = []
+
+    def write(self, columns: Mapping[str, Any]) -> None:
+        """Appends rows given as columns: numpy arrays or arrow arrays."""
+        self._waiting.append(pa.table({name: _one_nan(column) for name, column in columns.items()}))
+        while sum(len(table) for table in self._waiting) >= self.ROWS:
+            table = pa.concat_tables(self._waiting).combine_chunks()
+            self._flush(table.slice(0, self.ROWS))
+            self._waiting = [table.slice(self.ROWS)]
+
+    def _flush(self, table: pa.Table) -> None:
+        if self._writer is None:
+            self._writer = pq.ParquetWriter(self._path, table.schema, compression="zstd")
+        self._writer.write_table(table.combine_chunks())
+
+    def close(self) -> None:
+        """Writes what still waits. A table that never got a row leaves no file."""
+        rest = [table for table in self._waiting if len(table)]
+        if rest or (self._waiting and self._writer is None):
+            self._flush(pa.concat_tables(rest or self._waiting[:1]))
+        if self._writer is not None:
+            self._writer.close()
+
+
+def _one_nan(column: Any) -> Any:
+    """The column with one NaN for all: which of the many bit patterns arises depends on the machine."""
+    if isinstance(column, np.ndarray) and column.dtype == np.float64:
+        return np.where(np.isnan(column), np.nan, column)
+    return column
+
+
+@dataclass
+class RunWriter:
+    """Makes a run folder. Use as a context manager: a failure removes all that was written.
+
+    Raises:
+        SettingsError: The folder exists, or cannot be made.
+    """
+
+    folder: Path
+    tables: dict[str, TableWriter] = field(default_factory=dict)
+    timing: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def partial(self) -> Path:
+        """Where the run is written until it is complete."""
+        return self.folder.with_name(self.folder.name + ".partial")
+
+    def __enter__(self) -> Self:
+        if self.folder.exists():
+            raise SettingsError(f"{self.folder}: exists already; name another folder with --out, or remove it")
+        if self.partial.exists():
+            raise SettingsError(
+                f"{self.partial}: left by a run that is under way or was killed; remove it or name another --out"
+            )
+        try:
+            self.partial.mkdir(parents=True)
+        except OSError as error:
+            raise SettingsError(f"{self.folder}: cannot be made ({error.strerror}); name another --out") from error
+        self.text("run.json", to_json({"complete": False}))
+        return self
+
+    def table(self, name: str, columns: Mapping[str, Any]) -> None:
+        """Appends rows to ``<name>.parquet``."""
+        if name not in self.tables:
+            self.tables[name] = TableWriter(self.partial / f"{name}.parquet")
+        self.tables[name].write(columns)
+
+    def close_tables(self) -> None:
+        """Completes the tables, so that they can be read from ``partial``."""
+        for table in self.tables.values():
+            table.close()
+        self.tables.clear()
+
+    def copy(self, name: str, source: Path) -> None:
+        """Takes a file over from another run, byte for byte."""
+        shutil.copyfile(source / name, self.partial / name)
+
+    def text(self, name: str, text: str) -> None:
+        """Writes a text file."""
+        path = self.partial / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+
+    def finish(self, meta: Mapping[str, Any], *, complete: bool = True) -> None:
+        """Writes run.json with the digest of every output and gives the folder its name.
+
+        Args:
+            meta: All else that run.json has.
+            complete: No for a session that broke off, whatever could be made of its record.
+        """
+        self.close_tables()
+        self.text("timing.json", to_json(self.timing))
+        names = sorted(p.relative_to(self.partial).as_posix() for p in self.partial.rglob("*") if p.is_file())
+        outputs = {name: sha256(self.partial / name) for name in names if name not in NOT_DETERMINISTIC}
+        self.text("run.json", to_json({**meta, "outputs": outputs, "complete": complete}))
+        self.partial.rename(self.folder)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            for table in self.tables.values():
+                table.close()
+        finally:
+            if self.partial.exists():
+                shutil.rmtree(self.partial)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder's tables; None where the stage was not run."""
+
+    folder: Path
+    meta: dict[str, Any]
+    state: pd.DataFrame | None = None
+    measurements: pd.DataFrame | None = None
+    truth: pd.DataFrame | None = None
+    occupancy: pd.DataFrame | None = None
+    motion: pd.DataFrame | None = None
+    baselines: dict[str, pd.DataFrame] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def T_world_base(self) -> Floats | None:
+        """(4, 4) robot base in the world, where the run knew it."""
+        found = self.meta.get("T_world_base")
+        return None if found is None else np.asarray(found, dtype=float)
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder was left by an earlier command."""
+    return (path / "run.json").is_file()
+
+
+def read_meta(folder: Path, *, broken_off: bool = False) -> dict[str, Any]:
+    """run.json of a complete run.
+
+    Args:
+        folder: Of the run.
+        broken_off: Whether a live session that crashed will do as well.
+
+    Raises:
+        SettingsError: Not a run folder, or the run did not end.
+    """
+    try:
+        meta: dict[str, Any] = json.loads((folder / "run.json").read_text())
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"{folder}: no run folder (run.json is missing or broken)") from error
+    if not meta.get("complete") and meta.get("crashes"):
+        if broken_off:
+            return meta
+        raise SettingsError(
+            f"{folder}: a live session that broke off ({meta['crashes'][0]}); give its log: {folder / 'log.mcap'}"
+        )
+    if not meta.get("complete"):
+        raise SettingsError(f"{folder}: the run did not end (complete is false); run it again")
+    return meta
+
+
+def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
+    """The tables of a run folder, or of a run under way when its ``meta`` is given."""
+    meta = read_meta(folder) if meta is None else meta
+
+    def table(name: str) -> pd.DataFrame | None:
+        path = folder / f"{name}.parquet"
+        return pq.read_table(path).to_pandas() if path.exists() else None
+
+    baselines = sorted(p.stem.removeprefix("motion_") for p in folder.glob("motion_*.parquet"))
+    return Run(
+        folder=folder,
+        meta=meta,
+        state=table("state"),
+        measurements=table("measurements"),
+        truth=table("truth"),
+        occupancy=table("occupancy"),
+        motion=table("motion"),
+        baselines={name: found for name in baselines if (found := table(f"motion_{name}")) is not None},
+        counts=meta.get("counts", {}),
+        notes=tuple(meta.get("notes", ())),
+    )
+
+
+class Stopwatch:
+    """Time spent per stage, for timing.json: per call, spread over the ticks that the call served."""
+
+    def __init__(self, clock_ns: Callable[[], int]) -> None:
+        self._clock_ns = clock_ns
+        self._calls: dict[str, list[tuple[int, int]]] = {}
+
+    @contextmanager
+    def stage(self, name: str, ticks: int) -> Iterator[None]:
+        """Books the time that the block takes on a stage, and on so many of its ticks."""
+        start = self._clock_ns()
+        yield
+        self._calls.setdefault(name, []).append((ticks, self._clock_ns() - start))
+
+    def summary(self, period_s: float) -> dict[str, Any]:
+        """Per stage: ticks; median, p99, p99.9 and max time a tick [us]; how much faster than real time."""
+        out = {}
+        for stage, calls in self._calls.items():
+            ticks = np.array([n for n, _ in calls if n])
+            each_us = np.array([ns / n / 1e3 for n, ns in calls if n])
+            if not len(ticks):
+                continue
+            spread = np.repeat(each_us, ticks)
+            total_s = float((ticks * each_us).sum()) / 1e6
+            out[stage] = {
+                "ticks": int(ticks.sum()),
+                "median_us": float(np.median(spread)),
+                "p99_us": float(np.quantile(spread, 0.99)),
+                "p99_9_us": float(np.quantile(spread, 0.999)),
+                "max_us": float(spread.max()),
+                "real_time_factor": float(ticks.sum()) * period_s / total_s if total_s else None,
+            }
+        return out
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Writes a new file beside its place and gives it its name when it is complete.
+
+    Raises:
+        SettingsError: The file exists, or its folder cannot be written.
+    """
+    if path.exists():
+        raise SettingsError(f"{path}: exists already; name another file, or remove it")
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be written ({error.strerror}); name a folder that can") from error
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)  # mkstemp's 0600 would hide the file from colleagues
+        temporary.rename(path)
+    finally:
+        temporary.unlink(missing_ok=True)
