@@ -11,8 +11,8 @@ import pytest
 from hrcreplay import limits
 from hrcreplay.run import replay
 from tests.audit.standing import frames, log_of_one_who_does_not_stir, standing
+from tests.cli.test_app import Run, run
 from tests.logs import own
-from tests.test_cli import Run, run
 
 __all__ = ["run"]  # the fixture
 

@@ -21,8 +21,8 @@ from hrcreplay.live.record.log_reader import Tape
 from hrcreplay.live.verify import verify
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.robot.model import irb140
+from tests.live.person.test_zenoh import free_endpoint
 from tests.live.sessions import PATIENT, Session, Twin, free_port
-from tests.live.test_zenoh import free_endpoint
 from tests.live.zenoh_worker import MARKERS, OWN, POSES
 
 FRESH_S = 0.5

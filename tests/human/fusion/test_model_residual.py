@@ -20,7 +20,7 @@ from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats, HumanStates, 
 from hrcreplay.store.tables import read_states, state_columns
 from tests.human.bent import RATE_HZ, WIDE, bent, fused, measured, ticks, used_frames
 
-DEMO = Path(__file__).parents[2] / "datasets" / "demo.mcap"
+DEMO = Path(__file__).parents[3] / "datasets" / "demo.mcap"
 POINTS_OF = {
     "HD": ("head",),
     "THX": ("pelvis", "shoulder_l", "shoulder_r"),

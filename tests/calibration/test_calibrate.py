@@ -204,7 +204,7 @@ def test_what_cannot_be_calibrated_is_told(tmp_path: Path) -> None:
 
 
 def test_a_log_that_does_not_show_where_up_is_says_so() -> None:
-    demo = open_log(Path(__file__).parents[1] / "datasets" / "demo.mcap")
+    demo = open_log(Path(__file__).parents[2] / "datasets" / "demo.mcap")
     with pytest.raises(LogError, match=r"give the reference camera's height above it \(--height\) and up"):
         calibrate(demo, jump_m=0.8, memory_s=2.0)
 

@@ -17,7 +17,7 @@ from hrcreplay.run import replay
 from hrcreplay.run.job import read_urdf
 from hrcreplay.settings.sections import Robot
 from hrcreplay.store import run_folder
-from tests.arms import ARMS, Arm
+from tests.run.arms import ARMS, Arm
 
 COLLADA = "{http://www.collada.org/2005/11/COLLADASchema}"
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hrcreplay.geometry.segment_hull_distance import distances
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.separation import axis_distance
-from tests.robot.exact import exact_distance
+from tests.geometry.exact import exact_distance
 
 PAIRS = 10_000
 
