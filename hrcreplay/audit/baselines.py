@@ -9,7 +9,6 @@ import numpy as np
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import ARM_POINTS, HEAD, NECK, PELVIS, skeleton
-from hrcreplay.human.prediction.swept_volumes import Radii
 from hrcreplay.records import LIMBS, Floats, HumanStates, SweptVolumes
 
 PEERS = ("constant_velocity", "v2_a50", "iso_13855")
@@ -22,7 +21,7 @@ _APPROACH = np.array([1.6, 1.6, 2.0, 2.0, 2.0, 2.0])
 _STEP_S = 1e-4
 
 
-def predict(states: HumanStates, *, horizon_s: float, radii: Radii, hand_m: float, method: str) -> SweptVolumes:
+def predict(states: HumanStates, *, horizon_s: float, radii_m: Floats, hand_m: float, method: str) -> SweptVolumes:
     """Swept volumes of a peer: the hull of what each limb's ends can reach, as the limb lies between them.
 
     ``constant_velocity``: the limb now and after the horizon, its ends moving on as they do.
@@ -35,7 +34,7 @@ def predict(states: HumanStates, *, horizon_s: float, radii: Radii, hand_m: floa
     Args:
         states: The fused person.
         horizon_s: Braking time T_s of the robot [s].
-        radii: Table 2.
+        radii_m: (6,) radii of LIMBS, Table 2 [m].
         hand_m: The lower arm reaches this far beyond the wrist [m].
         method: One of PEERS.
 
@@ -62,7 +61,7 @@ def predict(states: HumanStates, *, horizon_s: float, radii: Radii, hand_m: floa
     counts = np.tile([part.shape[1] for part in sets], len(states))
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     vertices = np.concatenate(sets, axis=1).reshape(-1, 3)
-    radius = np.tile(radii.of_limbs() + grown, (len(states), 1))
+    radius = np.tile(radii_m + grown, (len(states), 1))
     return SweptVolumes(states.t_ns, offsets, vertices, radius, LIMBS, method)
 
 

@@ -27,10 +27,11 @@ from hrcreplay.audit.metrics import (
 from hrcreplay.audit.recording import TRUTH
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.prediction import reachable_sets
+from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.records import LIMBS
 from hrcreplay.run import build
 from hrcreplay.run.job import Job, resolve
-from hrcreplay.run.stages import say
+from hrcreplay.run.stages import Foresight, say
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
@@ -121,8 +122,8 @@ def _alike(jobs: Sequence[Job]) -> None:
     for what, values in (
         ("occupancy.stop_s and latency_s", [standstill_s(one) for one in foresights]),
         ("occupancy.method", [one.method for one in foresights]),
-        ("occupancy.radius_*", [one.radii.of_limbs().tolist() for one in foresights]),
-        ("the margins of occupancy", [one.margins for one in foresights]),
+        ("occupancy.radius_*", [limb_radii(one.occupancy).tolist() for one in foresights]),
+        ("the margins of occupancy", [_margins(one) for one in foresights]),
     ):
         for job, value in zip(jobs, values, strict=True):
             if value != values[0]:
@@ -181,9 +182,16 @@ def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
     }
 
 
+def _margins(foresight: Foresight) -> tuple[Any, ...]:
+    """What ``sound`` adds to the model."""
+    occupancy = foresight.occupancy
+    names = ("sigmas", "latency_s", "hand_m", "legs_radius_m", "legs", "residual", "residual_unknown_m")
+    return (*(getattr(occupancy, name) for name in names), foresight.memory_s)
+
+
 def _methods(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
-    radii = build.foresight(audits[0].job).radii
-    body = dict(zip(LIMBS, radii.of_limbs().tolist(), strict=True))
+    radii = limb_radii(build.foresight(audits[0].job).occupancy)
+    body = dict(zip(LIMBS, radii.tolist(), strict=True))
     return {method: method_figures([audit.outcomes[method] for audit in audits], drawn, body) for method in methods()}
 
 

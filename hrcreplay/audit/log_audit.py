@@ -19,6 +19,7 @@ from hrcreplay.errors import LogError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.human.prediction.reachable_sets import Reach
+from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report.metrics import difference
@@ -48,7 +49,7 @@ _SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
 
 def standstill_s(foresight: Foresight) -> float:
     """How long the person must stay in what was predicted: until the robot has reacted and braked [s]."""
-    return foresight.horizon_s + foresight.margins.latency_s
+    return foresight.horizon_s + foresight.occupancy.latency_s
 
 
 @dataclass(frozen=True)
@@ -224,8 +225,8 @@ def volumes(foresight: Foresight, window: Window, method: str) -> SweptVolumes:
         return baselines.predict(
             window.states,
             horizon_s=standstill_s(foresight),
-            radii=foresight.radii,
-            hand_m=foresight.margins.hand_m,
+            radii_m=limb_radii(foresight.occupancy),
+            hand_m=foresight.occupancy.hand_m,
             method=method,
         )
     return foresight.volumes(window.states, method)
@@ -281,9 +282,7 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
                 curve[method] = _curve(foresight, future, method, outcomes[method], progress)
     joints = {}
     for method in reachable_sets.METHODS:
-        interval = reachable_sets.reachable(
-            future.states, foresight.limits, foresight.horizon_s, method, foresight.margins
-        )
+        interval = foresight.by(method).reachable(future.states)
         joints[method] = joints_inside(recording, future.states, interval, horizon_s)
     notes = (*log.notes, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))
     return LogAudit(job, name, recording, outcomes, joints, curve, future.points(), notes)

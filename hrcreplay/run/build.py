@@ -11,10 +11,6 @@ import numpy as np
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.geometry.vectors import from_rpy
-from hrcreplay.human.fusion.fuse import FusionSettings
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise
-from hrcreplay.human.prediction.sound_reach import Margins
-from hrcreplay.human.prediction.swept_volumes import Radii
 from hrcreplay.logs.decoders import GenericDecoder
 from hrcreplay.logs.reader import LogOptions
 from hrcreplay.logs.tracks import Header, JointTrack
@@ -22,7 +18,7 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.programme.path import programmed, recorded
-from hrcreplay.robot.programme.reference import Leash, Reference
+from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.robot.programme.task import parse_task
 from hrcreplay.run.followers import Planner, QpFollower, ScalingFollower
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
@@ -71,12 +67,11 @@ def eyes(job: Job, log: Source) -> Eyes:
             f"cell: camera {unknown[0]} is not in the log; its cameras are {', '.join(log.header.cameras)}"
         )
     offsets_s = [cell.clock_offset_s.get(camera, 0.0) for camera in log.header.cameras]
-    fusion, logs = job.settings.fusion, job.settings.logs
+    logs = job.settings.logs
     return Eyes(
         T_world_camera=np.array([poses[camera] for camera in log.header.cameras]),
         clock_offset_ns=np.round(np.array(offsets_s) * 1e9).astype(np.int64),
-        noise=PointNoise(std_m=fusion.point_std_m, depth_std_per_m=fusion.point_std_per_m),
-        filter=FusionSettings(**fusion.model_dump(exclude={"rate_hz", "point_std_m", "point_std_per_m"})),
+        filter=job.settings.fusion,
         limits=job.tracking,
         person_jump_m=logs.person_jump_m,
         person_memory_s=logs.person_memory_s,
@@ -86,24 +81,9 @@ def eyes(job: Job, log: Source) -> Eyes:
 def foresight(job: Job) -> Foresight:
     """Stage 2. Beside a real robot the volumes reach further, by the time until it obeys."""
     occupancy = job.settings.occupancy
-    radii = Radii(
-        head=occupancy.radius_head_m,
-        thorax=occupancy.radius_thorax_m,
-        upper_arm=occupancy.radius_upper_arm_m,
-        lower_arm=occupancy.radius_lower_arm_m,
-    )
-    reaction_s = job.settings.live.reaction_s if job.command == "live" else 0.0
-    margins = Margins(
-        sigmas=occupancy.sigmas,
-        latency_s=occupancy.latency_s + reaction_s,
-        hand_m=occupancy.hand_m,
-        legs_radius_m=occupancy.legs_radius_m,
-        residual=occupancy.residual,
-        residual_m=occupancy.residual_unknown_m,
-        memory_s=job.settings.fusion.memory_s,
-        legs=occupancy.legs,
-    )
-    return Foresight(job.prediction, occupancy.stop_s, radii, margins, occupancy.method)
+    if job.command == "live":
+        occupancy = occupancy.model_copy(update={"latency_s": occupancy.latency_s + job.settings.live.reaction_s})
+    return Foresight(job.prediction, occupancy, job.settings.fusion.memory_s)
 
 
 def base(job: Job, log: Source) -> Floats | None:
@@ -190,7 +170,7 @@ def planners(job: Job, log: Source, start_ns: int) -> dict[str, Planner]:
     s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
 
     def planner(name: str) -> Planner:
-        follower = follow(job, name, model, path, settings, s_s)
+        follower = follow(name, model, path, settings, s_s)
         return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
@@ -212,24 +192,13 @@ def standing(job: Job, log: Source) -> Floats:
 
 def plan_settings(job: Job, dt_s: float) -> PlanSettings:
     """Section 5 for ticks of ``dt_s`` [s]."""
-    plan = job.settings.plan
-    return PlanSettings(
-        dt_s=dt_s,
-        stop_s=job.settings.occupancy.stop_s,
-        clearance_m=plan.clearance_m,
-        q_p=plan.q_p,
-        q_v=plan.q_v,
-        path_gain_per_s=plan.path_gain_per_s,
-        tcp_speed_max=plan.tcp_speed_max,
-        tcp_acceleration_max=plan.tcp_acceleration_max,
-    )
+    return PlanSettings(job.settings.plan, dt_s=dt_s, stop_s=job.settings.occupancy.stop_s)
 
 
 def follow(
-    job: Job, method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float
+    method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float
 ) -> QpFollower | ScalingFollower:
     """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on."""
     if method == "scaling":
         return ScalingFollower(model, path, settings, s_s)
-    plan = job.settings.plan
-    return QpFollower(model, path, settings, Leash(plan.reference, plan.leash_m, plan.waypoint_m), s_s)
+    return QpFollower(model, path, settings, s_s)

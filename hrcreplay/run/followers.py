@@ -13,7 +13,7 @@ from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step
 from hrcreplay.robot.control.scaling_controller import PathState
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.reference import Leash, Reference, ReferencePoint, advance
+from hrcreplay.robot.programme.reference import Reference, ReferencePoint, advance
 
 _FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
 
@@ -34,7 +34,6 @@ class QpFollower:
     robot: RobotModel
     reference: Reference
     settings: PlanSettings
-    leash: Leash
     s_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -46,7 +45,7 @@ class QpFollower:
         state, point, now_s = self.state, self.point, self.s_s
         tcp_m = self.robot.pose(state.q, state.dq).T_world_tcp[:3, 3]
         error_m = float(np.linalg.norm(tcp_m - point.T_world_tcp[:3, 3]))
-        self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.leash)
+        self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
         step = qp_controller.step(
             self.robot, state, self.point.T_world_tcp, rate * self.point.twist, volumes, self.settings

@@ -6,7 +6,6 @@ Everything that metrics.json holds, from a run's tables alone.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +35,11 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
     found = compute(run, **near)
     writer.text("metrics.json", run_folder.to_json(found))
     foresight = build.foresight(job)
-    radii = {name.replace("_", " "): radius for name, radius in asdict(foresight.radii).items()}
-    if foresight.method == "sound" and foresight.margins.legs:
-        radii["legs, of sound"] = foresight.margins.legs_radius_m
+    occupancy = foresight.occupancy
+    parts = ("head", "thorax", "upper_arm", "lower_arm")
+    radii = {part.replace("_", " "): getattr(occupancy, f"radius_{part}_m") for part in parts}
+    if foresight.method == "sound" and occupancy.legs:
+        radii["legs, of sound"] = occupancy.legs_radius_m
     folder = writer.partial / "figures"
     robot = _links(job, foresight, run)
     figures.draw_all(run, folder, found, **near, volumes=_instants(foresight, run), robot=robot)

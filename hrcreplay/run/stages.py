@@ -21,13 +21,13 @@ from hrcreplay.geometry import convex_hull
 from hrcreplay.human.fusion import fuse, inverse_kinematics
 from hrcreplay.human.fusion import fuse as smoother
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.human.prediction.sound_reach import Margins
+from hrcreplay.human.prediction import reachable_sets, swept_volumes
 from hrcreplay.logs.clean import PersonMemory, pick
 from hrcreplay.logs.plausibility import Stand
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.run.followers import Beside, Planner
+from hrcreplay.settings.sections import Fusion, Occupancy
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 from hrcreplay.store.tables import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 
@@ -56,8 +56,7 @@ class Eyes:
 
     T_world_camera: Floats  #: (c, 4, 4)
     clock_offset_ns: Ints  #: (c,) camera's clock minus the reference camera's
-    noise: inverse_kinematics.PointNoise
-    filter: fuse.FusionSettings
+    filter: Fusion
     limits: LimitSet
     person_jump_m: float
     person_memory_s: float
@@ -66,7 +65,7 @@ class Eyes:
         """What the frames say of the person, by the clock of the reference camera; see ``person.pick``."""
         memory, mine, found = pick(frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s)
         mine = replace(mine, capture_ns=mine.capture_ns - self.clock_offset_ns[mine.camera])
-        return memory, inverse_kinematics.measure(mine, self.T_world_camera, self.noise), found
+        return memory, inverse_kinematics.measure(mine, self.T_world_camera, self.filter), found
 
 
 @dataclass(frozen=True)
@@ -74,20 +73,35 @@ class Foresight:
     """What the second stage needs beside the person."""
 
     limits: LimitSet
-    horizon_s: float
-    radii: swept_volumes.Radii
-    margins: Margins
-    method: str
+    occupancy: Occupancy
+    memory_s: float  #: how long the filter goes on without a measurement [s]
+
+    @property
+    def horizon_s(self) -> float:
+        """Braking time T_s of the robot [s]."""
+        return self.occupancy.stop_s
+
+    @property
+    def method(self) -> str:
+        """How the volumes are predicted."""
+        return self.occupancy.method
+
+    def by(self, method: str) -> Foresight:
+        """The same by another method."""
+        return replace(self, occupancy=self.occupancy.model_copy(update={"method": method}))
+
+    def reachable(self, states: HumanStates) -> reachable_sets.Reach:
+        """Reachable interval of every joint at every tick."""
+        return reachable_sets.reachable(
+            states, self.limits, self.occupancy, horizon_s=self.horizon_s, memory_s=self.memory_s
+        )
 
     def volumes(self, states: HumanStates, method: str | None = None) -> SweptVolumes:
         """Swept volumes of every tick, by this or another method."""
+        if method is not None:
+            return self.by(method).volumes(states)
         return swept_volumes.predict(
-            states,
-            self.limits,
-            horizon_s=self.horizon_s,
-            radii=self.radii,
-            method=method or self.method,
-            margins=self.margins,
+            states, self.limits, self.occupancy, horizon_s=self.horizon_s, memory_s=self.memory_s
         )
 
 

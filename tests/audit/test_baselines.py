@@ -11,12 +11,13 @@ from hrcreplay.audit import baselines
 from hrcreplay.audit.containment import Solid
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
-from hrcreplay.human.prediction.swept_volumes import Radii
+from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, SweptVolumes
+from hrcreplay.settings.sections import Occupancy
 from tests.human.people import random_states, states
 
-RADII, HAND_M, HORIZON_S = Radii(), 0.19, 0.377
+RADII_M, HAND_M, HORIZON_S = limb_radii(Occupancy()), 0.19, 0.377
 AXES = {
     "HD": ("neck", "head"),
     "THX": ("pelvis", "shoulder_r", "shoulder_l"),
@@ -34,7 +35,7 @@ def _axes(people: HumanStates, limb: str, later_s: float = 0.0) -> Floats:
 
 
 def _predict(people: HumanStates, method: str, horizon_s: float = HORIZON_S) -> SweptVolumes:
-    return baselines.predict(people, horizon_s=horizon_s, radii=RADII, hand_m=HAND_M, method=method)
+    return baselines.predict(people, horizon_s=horizon_s, radii_m=RADII_M, hand_m=HAND_M, method=method)
 
 
 def _solid(volumes: SweptVolumes, tick: int, limb: str) -> Solid:
@@ -67,7 +68,7 @@ def test_v2_a50_holds_every_motion_with_its_speed_and_acceleration(horizon_s: fl
     tightest = np.inf
     for tick in range(len(people)):
         for i, limb in enumerate(LIMBS):
-            radius = RADII.of_limbs()[i]
+            radius = RADII_M[i]
             solid = _solid(volumes, tick, limb)
             velocity = (_axes(people, limb, 1e-6) - _axes(people, limb, -1e-6))[tick] / 2e-6
             for k, start in enumerate(_axes(people, limb)[tick]):
@@ -98,15 +99,13 @@ def test_constant_velocity_holds_ends_that_go_on_as_they_do() -> None:
             solid = _solid(volumes, tick, limb)
             track = now[tick] + velocity[tick] * np.linspace(0.0, HORIZON_S, 20)[:, None, None]
             assert solid.distances_m(track.reshape(-1, 3)).max() < 1e-6
-            assert solid.radius_m == pytest.approx(RADII.of_limbs()[LIMBS.index(limb)])
+            assert solid.radius_m == pytest.approx(RADII_M[LIMBS.index(limb)])
 
 
 def test_iso_13855_is_the_limb_with_its_approach_speed_around() -> None:
     people = random_states(load_limits("paper"), 3, seed=8)
     volumes = _predict(people, "iso_13855")
-    np.testing.assert_allclose(
-        volumes.radius_m[0] - RADII.of_limbs(), np.array([1.6, 1.6, 2.0, 2.0, 2.0, 2.0]) * HORIZON_S
-    )
+    np.testing.assert_allclose(volumes.radius_m[0] - RADII_M, np.array([1.6, 1.6, 2.0, 2.0, 2.0, 2.0]) * HORIZON_S)
     length = people.lengths_m[0, 5]
     r = 0.07 + 2.0 * HORIZON_S
     capsule = np.pi * r**2 * length + 4.0 / 3.0 * np.pi * r**3

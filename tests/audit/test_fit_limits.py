@@ -10,10 +10,10 @@ import pytest
 from hrcreplay.audit import fit_limits
 from hrcreplay.audit.fit_limits import Futures
 from hrcreplay.errors import LogError
-from hrcreplay.human.prediction.reachable_sets import reachable
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, HumanStates, Ints
 from tests.human.people import random_states, states
+from tests.human.predictions import reachable
 
 PAPER, HUMAN = load_limits("paper"), load_limits("human")
 T_S, STEP_S = 0.377, 0.004

@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from hrcreplay.audit import driver, recording
-from hrcreplay.human.fusion.fuse import FusionSettings
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import POINTS, Bools, Floats, Measurements
 from hrcreplay.run.stages import Eyes
+from hrcreplay.settings.sections import Fusion
 from tests.audit.standing import frames, standing
 from tests.human.people import states
 
@@ -41,8 +40,7 @@ def _eyes() -> Eyes:
     return Eyes(
         T_world_camera=np.eye(4)[None],
         clock_offset_ns=np.zeros(1, np.int64),
-        noise=PointNoise(),
-        filter=FusionSettings(),
+        filter=Fusion(),
         limits=load_limits("human"),
         person_jump_m=0.8,
         person_memory_s=2.0,

@@ -12,11 +12,12 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.linalg import block_diag
 
-from hrcreplay.human.fusion.fuse import FusionSettings, fuse, start
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
+from hrcreplay.human.fusion.fuse import fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import CameraFrames, Ints, Measurements
+from hrcreplay.settings.sections import Fusion
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
 
 SECONDS = 4.0
@@ -33,7 +34,7 @@ def frames() -> CameraFrames:
 
 
 def measured() -> Measurements:
-    m = measure(frames(), T_WORLD_CAMERA, PointNoise())
+    m = measure(frames(), T_WORLD_CAMERA, Fusion())
     return m.rows(m.arrival_ns <= TICKS[-1])
 
 
@@ -58,8 +59,8 @@ def dense_us_per_tick(measurements: Measurements, ticks: Ints) -> float:
 
 def test_fuse_a_recording(benchmark: Any) -> None:
     measurements = measured()
-    fuse(start(CAMERAS), TICKS, measurements, FusionSettings(), LIMITS)
-    benchmark(lambda: fuse(start(CAMERAS), TICKS, measurements, FusionSettings(), LIMITS))
+    fuse(start(CAMERAS), TICKS, measurements, Fusion(), LIMITS)
+    benchmark(lambda: fuse(start(CAMERAS), TICKS, measurements, Fusion(), LIMITS))
     ours, theirs = benchmark.stats.stats.median / len(TICKS) * 1e6, dense_us_per_tick(measurements, TICKS[:250])
     benchmark.extra_info |= {"us_per_tick": ours, "filterpy_us_per_tick": theirs, "times_faster": theirs / ours}
     assert theirs > 2.0 * ours
@@ -68,12 +69,12 @@ def test_fuse_a_recording(benchmark: Any) -> None:
 def test_fuse_one_tick(benchmark: Any) -> None:
     """A live tick: a table of one row, with everything Python does around it."""
     measurements = measured()
-    state, _, _ = fuse(start(CAMERAS), TICKS[:-1], measurements, FusionSettings(), LIMITS)
+    state, _, _ = fuse(start(CAMERAS), TICKS[:-1], measurements, Fusion(), LIMITS)
     none = measurements.rows(slice(0, 0))
-    benchmark(lambda: fuse(state, TICKS[-1:], none, FusionSettings(), LIMITS))
+    benchmark(lambda: fuse(state, TICKS[-1:], none, Fusion(), LIMITS))
 
 
 def test_measure_one_frame(benchmark: Any) -> None:
     one = frames().rows(slice(0, 1))
-    measure(one, T_WORLD_CAMERA, PointNoise())
-    benchmark(lambda: measure(one, T_WORLD_CAMERA, PointNoise()))
+    measure(one, T_WORLD_CAMERA, Fusion())
+    benchmark(lambda: measure(one, T_WORLD_CAMERA, Fusion()))

@@ -7,11 +7,10 @@ from typing import Any
 import pytest
 from scipy.spatial import ConvexHull
 
-from hrcreplay.human.prediction.reachable_sets import reachable
-from hrcreplay.human.prediction.swept_volumes import Radii, predict
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS
 from tests.human.people import random_states, raw_cloud
+from tests.human.predictions import predict, reachable
 
 T, PAPER = 0.377, load_limits("paper")
 PEOPLE = random_states(PAPER, 50, 0)
@@ -19,8 +18,8 @@ PEOPLE = random_states(PAPER, 50, 0)
 
 @pytest.mark.benchmark(group="swept volumes of 50 ticks")
 def test_ours(benchmark: Any) -> None:
-    predict(PEOPLE, PAPER, horizon_s=T, radii=Radii(), method="paper")
-    volumes = benchmark(predict, PEOPLE, PAPER, horizon_s=T, radii=Radii(), method="paper")
+    predict(PEOPLE, PAPER, horizon_s=T, method="paper")
+    volumes = benchmark(predict, PEOPLE, PAPER, horizon_s=T, method="paper")
     benchmark.extra_info["points a limb"] = len(volumes.vertices_m) / len(volumes) / len(LIMBS)
     assert len(volumes) == 50
 
@@ -38,5 +37,5 @@ def test_qhull_on_the_raw_points(benchmark: Any) -> None:
 @pytest.mark.benchmark(group="swept volumes of one live tick")
 def test_live(benchmark: Any) -> None:
     tick = PEOPLE.rows(slice(0, 1))
-    volumes = benchmark(predict, tick, PAPER, horizon_s=T, radii=Radii(), method="paper")
+    volumes = benchmark(predict, tick, PAPER, horizon_s=T, method="paper")
     assert len(volumes) == 1

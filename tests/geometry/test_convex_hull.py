@@ -6,10 +6,10 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.geometry.convex_hull import hull, sphere_swept_volume_m3
-from hrcreplay.human.prediction.swept_volumes import Radii, predict
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, Ints
 from tests.human.people import random_states
+from tests.human.predictions import predict
 
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], dtype=float)
 TRIANGLE = np.array([[0, 0, 0], [3, 0, 0], [0, 4, 0]], dtype=float)
@@ -174,7 +174,7 @@ def test_the_surface_is_closed_even_with_slivers() -> None:
     """Volumes of a very short horizon are full of nearly equal points; Qhull's slivers have no normal to trust."""
     rng = np.random.default_rng(3)
     limits = load_limits("paper")
-    volumes = predict(random_states(limits, 5, 56), limits, horizon_s=1e-5, radii=Radii(), method="paper")
+    volumes = predict(random_states(limits, 5, 56), limits, horizon_s=1e-5, method="paper")
     clouds = [volumes.vertices(i, k) for i in range(5) for k in range(6)]
     clouds += [tilted(rng.integers(0, 3, (40, 3)).astype(float)) for _ in range(20)]
     for points in clouds:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.fusion.fuse import FusionSettings, fuse, start
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
+from hrcreplay.human.fusion.fuse import fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.limits import load_limits
 from hrcreplay.records import POINTS, CameraFrames, HumanStates, Ints, Measurements
+from hrcreplay.settings.sections import Fusion
 
 WIDE = load_limits("human")
 CAMERAS = ("left", "right")
@@ -47,11 +48,11 @@ def bent(seconds: float) -> CameraFrames:
 
 
 def measured(frames: CameraFrames) -> Measurements:
-    return measure(frames, np.tile(np.eye(4), (2, 1, 1)), PointNoise(0.01))
+    return measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01))
 
 
-def fused(m: Measurements, t_ns: Ints, settings: FusionSettings | None = None) -> HumanStates:
-    return fuse(start(m.cameras), t_ns, m.rows(m.arrival_ns <= t_ns[-1]), settings or FusionSettings(), WIDE)[1]
+def fused(m: Measurements, t_ns: Ints, settings: Fusion | None = None) -> HumanStates:
+    return fuse(start(m.cameras), t_ns, m.rows(m.arrival_ns <= t_ns[-1]), settings or Fusion(), WIDE)[1]
 
 
 def used_frames(m: Measurements, t_ns: Ints) -> list[tuple[int, int]]:

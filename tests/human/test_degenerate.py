@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from hrcreplay.geometry.convex_hull import hull
 from hrcreplay.human.fusion import fuse
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise, inverse, measure
+from hrcreplay.human.fusion.inverse_kinematics import inverse, measure
 from hrcreplay.human.model import LimitSet, skeleton
-from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.human.prediction.sound_reach import STANDARD
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, CameraFrames, Floats, HumanStates
+from hrcreplay.settings.sections import Fusion, Occupancy
 from tests.human import sightings
+from tests.human.predictions import predict
 
 LIMITS: LimitSet = load_limits("people")
 PERIOD_NS = 40_000_000
@@ -85,9 +85,9 @@ def frames(points: Floats, confidence: Floats) -> CameraFrames:
     )
 
 
-def followed(seen: CameraFrames, rules: fuse.FusionSettings) -> HumanStates:
+def followed(seen: CameraFrames, rules: Fusion) -> HumanStates:
     ticks = np.arange(0, int(seen.arrival_ns[-1]) + TICK_NS, TICK_NS)
-    measured = measure(seen, np.stack([np.eye(4)] * 2), PointNoise())
+    measured = measure(seen, np.stack([np.eye(4)] * 2), Fusion())
     return fuse.fuse(fuse.start(sightings.CAMERAS), ticks, measured, rules, LIMITS)[1]
 
 
@@ -105,11 +105,9 @@ def test_no_skeleton_breaks_the_kernels(seed: int, value: float, reuse: bool) ->
     confidence = np.where(np.isfinite(points[..., 0]), 1.0, 0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # overflow: the numbers ask for it
-        states = followed(frames(points, confidence), fuse.FusionSettings(stale="reuse" if reuse else "skip"))
+        states = followed(frames(points, confidence), Fusion(stale="reuse" if reuse else "skip"))
         for method in ("sound", "paper", "positions"):
-            volumes = swept_volumes.predict(
-                states, LIMITS, horizon_s=0.4, radii=swept_volumes.Radii(), method=method, margins=STANDARD
-            )
+            volumes = predict(states, LIMITS, horizon_s=0.4, method=method, margins=Occupancy(sigmas=3.0))
             for tick in (20, len(states) - 1):
                 for limb in range(len(volumes.limbs)):
                     if np.isfinite(vertices := volumes.vertices(tick, limb)).all() and abs(vertices).max() < 1e6:

@@ -16,11 +16,12 @@ from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step,
 from hrcreplay.robot.control.qp_controller import Problem, problem, step
 from hrcreplay.robot.control.separation import Obstacles, Separation, obstacles
 from hrcreplay.robot.model import RobotModel, RobotPose, irb140
+from hrcreplay.settings.sections import Plan
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
 
 STOP_S, DT_S = 0.377, 0.004
-SETTINGS = PlanSettings(dt_s=DT_S, stop_s=STOP_S)
+SETTINGS = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)
 HOME = np.deg2rad([10.0, 20.0, -20.0, 0.0, 60.0, 0.0])
 
 

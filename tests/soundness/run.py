@@ -5,15 +5,15 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.human.prediction.sound_reach import Margins
-from hrcreplay.human.prediction.swept_volumes import Radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.settings.sections import Occupancy
+from tests.human.predictions import MEMORY_S
 from tests.soundness.facets import distance_m, facets_of
 from tests.soundness.joint import bounds_of
 from tests.soundness.kinematics import CORNERS, POINTS
@@ -45,19 +45,21 @@ class Plan:
             raise ValueError(f"motions_a_state: found {self.motions_a_state}; take a multiple of {BLOCK}")
 
     @property
-    def margins(self) -> Margins:
-        """Those of the volumes, without what is the same on both sides: the thickness of limbs, and the residual.
+    def occupancy(self) -> Occupancy:
+        """That of the volumes, without what is the same on both sides: the thickness of limbs, and the residual.
 
         A body that is off the model by no more than the residual is inside a volume with that ball around it wherever
         the model is inside the volume without: so the model is held against the latter.
         """
-        bare = Margins(legs_radius_m=0.0, residual=False)
-        return replace(bare, sigmas=self.sigmas, latency_s=self.latency_s, hand_m=self.hand_m)
+        limbs = ("head", "thorax", "upper_arm", "lower_arm")
+        return Occupancy(
+            method=self.method, residual=False, sigmas=self.sigmas, latency_s=self.latency_s, hand_m=self.hand_m
+        ).model_copy(update={f"radius_{limb}_m": 0.0 for limb in limbs} | {"legs_radius_m": 0.0})
 
     @property
     def coasted_s(self) -> float:
         """For how long the filter went on without measurements: at most for its memory."""
-        return self.margins.memory_s if self.unseen_s > self.margins.memory_s else 0.0
+        return MEMORY_S if self.unseen_s > MEMORY_S else 0.0
 
 
 @dataclass
@@ -99,12 +101,7 @@ def corners_of(limbs: tuple[str, ...]) -> Corners:
 def predict(states: HumanStates, plan: Plan) -> SweptVolumes:
     """The volumes under test. Limbs have no thickness, so their radii are what the method adds for other reasons."""
     return swept_volumes.predict(
-        states,
-        load_limits(plan.limits),
-        horizon_s=plan.horizon_s,
-        radii=Radii(0.0, 0.0, 0.0, 0.0),
-        method=plan.method,
-        margins=plan.margins,
+        states, load_limits(plan.limits), plan.occupancy, horizon_s=plan.horizon_s, memory_s=MEMORY_S
     )
 
 

@@ -113,9 +113,9 @@ def test_the_command_samples_what_predict_does_by_default(method: str, capsys: p
     foresight = build.foresight(unlogged("predict", Path(), settings, None))
     assert (found["method"], found["limits"]) == (method, foresight.limits.name)
     assert found["horizon_s"] == foresight.horizon_s
-    assert found["latency_s"] == foresight.margins.latency_s
-    assert found["sigmas"] == (foresight.margins.sigmas if sound else 0.0)  # the print knows no margins
-    assert found["hand_m"] == (foresight.margins.hand_m if sound else 0.0)
+    assert found["latency_s"] == foresight.occupancy.latency_s
+    assert found["sigmas"] == (foresight.occupancy.sigmas if sound else 0.0)  # the print knows no margins
+    assert found["hand_m"] == (foresight.occupancy.hand_m if sound else 0.0)
     plan = Plan(method, "people", 0, sigmas=found["sigmas"], hand_m=found["hand_m"])
     result = run(plan, 2000, processes=1)
     assert (found["samples"], found["states"]) == (2000, 2)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -17,6 +16,7 @@ from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
 from hrcreplay.human.model import LimitSet, nearest
 from hrcreplay.records import BODY, JOINTS, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
+from hrcreplay.settings.sections import Fusion
 
 ROWS = len(JOINTS) + len(LENGTHS)
 _NEVER_NS = -(2**62)
@@ -32,42 +32,6 @@ _REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10)
 _KIND = np.repeat((0, 1), (2, 10))
 
 FusionState = Filter
-Sigmas = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class FusionSettings:
-    """Settings of the filter.
-
-    The sigmas and ``coast_s`` are those with the least error against ground truth over a sweep on a recording with
-    two cameras of 25 and 30 Hz, 1-3 cm of noise and occlusions: the velocity's sigma dominates, since people reach and
-    rest, and a polynomial with a lively jerk overshoots at both ends. Ignoring delays has the smaller error there
-    while people stand, compensating them while they move; what matters for safety is the latter.
-    """
-
-    stale: Literal["skip", "reuse"] = "skip"  #: use a frame once, or at every tick until the next, R growing (4.1.1)
-    delay: Literal["compensate", "ignore"] = "compensate"  #: relate a frame to its capture time, or to the tick
-    delay_max_s: float = 0.25  #: an older frame counts as this old [s]
-    confidence_min: float = 0.2  #: least product of the confidences of the points an angle is computed from
-    outlier_m: float = 0.20  #: a point further than this from the predicted skeleton is an outlier [m]
-    bone_m: float = 0.10  #: and one at the end of a bone that is longer or shorter than the person's by more [m]
-    bone_memory_s: float = 5.0  #: unless no camera has seen that bone right for so long [s]
-    sigma_position: Sigmas = (
-        300.0,
-        100.0,
-        5.0,
-        1.0,
-    )  #: of x and y in Eq. (44): p, v, a, j [m/s^2, /s^2.5, /s^3, /s^3.5]
-    sigma_angle: Sigmas = (1500.0, 600.0, 10.0, 1.0)  #: of the angles in Eq. (44) [rad, likewise]
-    coast_s: float = 0.12  #: a joint without a valid row for longer comes to rest [s]
-    memory_s: float = (
-        0.5  #: a joint or point without a valid row for longer is lost: the next one is taken as it is [s]
-    )
-    residual_quantile: float = 0.95  #: of how far each limb's points were from the model's (see residual)
-    residual_memory_s: float = 20.0  #: one seen this long ago counts 1/e of a new one [s]
-    spread_memory_s: float = 1.0  #: the factor on the variances falls to 1/e in this time (see surprise) [s]
-    spread_least: float = 0.01  #: smallest factor on the variances
-    spread_most: float = 4.0  #: largest one
 
 
 @dataclass(frozen=True)
@@ -115,7 +79,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
 
 
 def fuse(
-    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: FusionSettings, limits: LimitSet
+    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: Fusion, limits: LimitSet
 ) -> tuple[FusionState, HumanStates, Counter[str]]:
     """Alg. 3: one tick after another, each with the frames that arrived in (previous tick, tick].
 
@@ -132,7 +96,7 @@ def fuse(
         state: From ``start`` or the previous call. It is not changed.
         ticks_ns: (n,) instants, after those of the previous call.
         measurements: Rows in order of arrival, none after ``ticks_ns[-1]`` and none given before.
-        settings: See FusionSettings.
+        settings: Of the filter.
         limits: Bounds for the saturation.
 
     Returns:
@@ -145,19 +109,19 @@ def fuse(
 
 
 def fuse_traced(
-    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: FusionSettings, limits: LimitSet
+    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: Fusion, limits: LimitSet
 ) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
     """``fuse``, and the covariances that ``smooth`` needs (1.5 kB a tick)."""
     return _fuse(state, ticks_ns, measurements, settings, limits, traced=True)
 
 
-def process_noise(settings: FusionSettings, j: int, dt: float, damping: float) -> Floats:
+def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats:
     """Diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds."""
     sigma = _sigma(settings)[j]
     return np.array([process_variance(a, dt, damping, sigma, _REST_STD[j]) for a in range(4)])
 
 
-def _sigma(settings: FusionSettings) -> Floats:
+def _sigma(settings: Fusion) -> Floats:
     return np.array((settings.sigma_position, settings.sigma_angle))[_KIND]
 
 
@@ -165,7 +129,7 @@ def _fuse(
     state: FusionState,
     ticks_ns: Ints,
     measurements: Measurements,
-    settings: FusionSettings,
+    settings: Fusion,
     limits: LimitSet,
     *,
     traced: bool,
@@ -209,7 +173,7 @@ def _frames(measurements: Measurements) -> Frames:
     )
 
 
-def _rules(settings: FusionSettings, limits: LimitSet) -> Rules:
+def _rules(settings: Fusion, limits: LimitSet) -> Rules:
     return Rules(
         sigma=_sigma(settings),
         reuse=settings.stale == "reuse",
@@ -259,7 +223,7 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
 _UNIT_S = 0.05
 
 
-def smooth(states: HumanStates, trace: Trace, settings: FusionSettings) -> HumanStates:
+def smooth(states: HumanStates, trace: Trace, settings: Fusion) -> HumanStates:
     """Every tick given all measurements of the run, by filterpy's smoother joint by joint.
 
     The arms are followed under one name through the run (see branches) and keep it: a smoothed angle does not jump.
@@ -297,7 +261,7 @@ def smooth(states: HumanStates, trace: Trace, settings: FusionSettings) -> Human
 
 
 def _smooth_joint(
-    mean: Floats, cov: Floats, dt: Floats, damping: Floats, settings: FusionSettings, j: int
+    mean: Floats, cov: Floats, dt: Floats, damping: Floats, settings: Fusion, j: int
 ) -> tuple[Floats, Floats]:
     """Smoothed mean (n, 4) and standard deviations of p and v (n, 2) of one joint."""
     scale = _UNIT_S ** np.arange(4.0)

@@ -7,8 +7,6 @@ seen from the side, each arm from its own two bones in the torso's frame. Length
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 
@@ -25,6 +23,7 @@ from hrcreplay.human.model import (
     wrap,
 )
 from hrcreplay.records import LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements
+from hrcreplay.settings.sections import Fusion
 
 ROWS = 12 + len(LENGTHS)
 _SHOULDER_R, _SHOULDER_L = ARM_POINTS[0][0], ARM_POINTS[1][0]
@@ -58,14 +57,6 @@ for _row, _points in enumerate(_points_of_rows()):
     DEPENDS[_row, list(_points)] = True
 
 
-@dataclass(frozen=True)
-class PointNoise:
-    """Noise of a skeleton point, the same in all directions: (std_m + depth_std_per_m * range) / confidence."""
-
-    std_m: float = 0.02  #: at full confidence [m]
-    depth_std_per_m: float = 0.0  #: growth with the distance from the camera [m/m]
-
-
 def inverse(points_m: Floats) -> tuple[Floats, Floats]:
     """Joint angles and limb lengths of skeletons, the inverse of ``model.skeleton``.
 
@@ -83,22 +74,23 @@ def inverse(points_m: Floats) -> tuple[Floats, Floats]:
     return rows[:, :12].copy(), rows[:, 12:].copy()
 
 
-def measure(frames: CameraFrames, T_world_camera: Floats, noise: PointNoise) -> Measurements:
+def measure(frames: CameraFrames, T_world_camera: Floats, settings: Fusion) -> Measurements:
     """What the closed-form inverse kinematics makes of camera frames.
 
     Args:
         frames: Skeletons in their camera's frame, one body each.
         T_world_camera: (c, 4, 4) pose of each camera in the world.
-        noise: Standard deviation of a point; carried through the inverse kinematics by its Jacobian, diagonal only,
+        settings: Noise of a skeleton point, the same in all directions: (``point_std_m`` + ``point_std_per_m`` * range)
+            / confidence, which is carried through the inverse kinematics by its Jacobian, diagonal only,
             Eq. (47). Towards a singular posture it grows without bound (a straight elbow says nothing of alpha_3,
             an arm pointing forward nothing of alpha_1, a vertical shoulder line nothing of heading).
     """
     n = len(frames)
     points = np.empty((n, len(POINTS), 3))
     rows, variances = np.full((n, ROWS), np.nan), np.full((n, ROWS), np.nan)
-    settings = np.array([noise.std_m, noise.depth_std_per_m])
+    noise = np.array([settings.point_std_m, settings.point_std_per_m])
     _measure_rows(
-        frames.camera, frames.points_m, frames.confidence, np.array(T_world_camera), settings, points, rows, variances
+        frames.camera, frames.points_m, frames.confidence, np.array(T_world_camera), noise, points, rows, variances
     )
     std = np.sqrt(variances)
     return Measurements(

@@ -9,8 +9,9 @@ from numba import njit
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import SHOWN_BY, LimitSet, alpha_2_bounds, alpha_3_bounds
-from hrcreplay.human.prediction.sound_reach import STANDARD, Margins, enclose
+from hrcreplay.human.prediction.sound_reach import enclose, likely
 from hrcreplay.records import Bools, Floats, HumanStates, Ints, Table
+from hrcreplay.settings.sections import Occupancy
 
 #: Ways to predict, in the order of their codes in the kernels: the two of the literature, and what encloses.
 PRINTED = ("paper", "positions")
@@ -28,7 +29,7 @@ class Reach(Table):
 
 
 def reachable(
-    states: HumanStates, limits: LimitSet, horizon_s: float, method: str, margins: Margins = STANDARD
+    states: HumanStates, limits: LimitSet, occupancy: Occupancy, *, horizon_s: float, memory_s: float
 ) -> Reach:
     """Reachable sets within the horizon, Eq. (36), (38), (39), joint by joint.
 
@@ -42,16 +43,17 @@ def reachable(
     Args:
         states: The fused person.
         limits: Bounds.
+        occupancy: Method, one of METHODS, and what ``sound`` adds; the printed methods add nothing.
         horizon_s: Braking time T_s of the robot [s].
-        method: One of METHODS.
-        margins: What ``sound`` adds; the printed methods add nothing.
+        memory_s: How long the filter goes on without a measurement [s].
 
     Raises:
         SettingsError: There is no such method.
     """
-    code = code_of(method)
+    code = code_of(occupancy.method)
     if code == SOUND:
-        low, high = enclose(states, bounds_of(limits), limits.coupled, horizon_s, margins)
+        at, span_s = likely(states, occupancy, memory_s), horizon_s + occupancy.latency_s
+        low, high = enclose(at, bounds_of(limits), limits.coupled, span_s, memory_s)
         return Reach(states.t_ns, low, high)
     low, high = np.empty_like(states.p), np.empty_like(states.p)
     p, v = np.ascontiguousarray(states.p), np.ascontiguousarray(states.v)

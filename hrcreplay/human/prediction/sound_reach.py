@@ -5,7 +5,6 @@ What ``sound`` adds to the model's motions so that real people stay inside too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,24 +14,7 @@ from hrcreplay.human.model import SHOWN_BY
 from hrcreplay.human.prediction.joint_reach import Stops, interval, stops
 from hrcreplay.human.prediction.walking_reach import SIDES, body_velocity, corners_of, turned, walked
 from hrcreplay.records import Floats, HumanStates
-
-
-@dataclass(frozen=True)
-class Margins:
-    """Margins of ``occupancy.method = "sound"``. ``paper`` and ``positions`` know none of them."""
-
-    sigmas: float = 3.0  #: states within so many standard deviations of the estimate are enclosed, joint by joint
-    latency_s: float = 0.0  #: from the newest capture to the robot's reaction; the horizon is longer by it [s]
-    hand_m: float = 0.19  #: length of the hand, which goes on where the forearm ends [m]
-    legs_radius_m: float = 0.20  #: least of the lower body, around the line from the floor to the pelvis [m]
-    residual: bool = True  #: whether the body's distance from the model is added to the radii
-    residual_m: float = 0.10  #: that distance as long as it is not known: of most people, ERRATA 'The human model' [m]
-    memory_s: float = 0.5  #: a limb unseen for longer grows to what it could have reached since [s]
-    legs: bool = True  #: whether there is a lower body
-
-
-STANDARD = Margins()
-
+from hrcreplay.settings.sections import Occupancy
 
 Range = tuple[float, float]
 
@@ -47,10 +29,10 @@ class Likely(NamedTuple):
     unseen_s: Floats  #: (n, 12) for how long a joint has not been seen, 0 within its memory [s]
 
 
-def likely(states: HumanStates, margins: Margins) -> Likely:
-    """The states that ``sound`` starts from."""
-    unseen = np.where(states.unseen_s > margins.memory_s, states.unseen_s, 0.0)[:, SHOWN_BY]
-    off = (margins.sigmas * states.p_std, margins.sigmas * states.v_std)
+def likely(states: HumanStates, occupancy: Occupancy, memory_s: float) -> Likely:
+    """The states that ``sound`` starts from; a limb unseen for longer than ``memory_s`` [s] may have moved since."""
+    unseen = np.where(states.unseen_s > memory_s, states.unseen_s, 0.0)[:, SHOWN_BY]
+    off = (occupancy.sigmas * states.p_std, occupancy.sigmas * states.v_std)
     return Likely(*(np.ascontiguousarray(a) for a in (states.p, states.v, *off, unseen)))
 
 
@@ -131,12 +113,21 @@ def _walk(
     low[2], high[2] = turned(heading, velocity[2], bounds, span)
 
 
-def enclose(
-    states: HumanStates, bounds: Floats, coupled: bool, horizon_s: float, margins: Margins
-) -> tuple[Floats, Floats]:
-    """Reachable intervals of all rows, low and high (n, 12), under the bounds of ``reach.bounds_of``."""
-    low, high = np.empty_like(states.p), np.empty_like(states.p)
-    _enclose_rows(likely(states, margins), bounds, coupled, horizon_s + margins.latency_s, margins.memory_s, low, high)
+def enclose(at: Likely, bounds: Floats, coupled: bool, span_s: float, memory_s: float) -> tuple[Floats, Floats]:
+    """Reachable intervals of all rows.
+
+    Args:
+        at: Where people may be.
+        bounds: (6, 12) of ``reachable_sets.bounds_of``.
+        coupled: Whether (34b), (34c) hold.
+        span_s: Horizon and latency [s].
+        memory_s: How long the filter goes on without a measurement [s].
+
+    Returns:
+        Lower and upper ends, (n, 12) each [m, m, rad...].
+    """
+    low, high = np.empty_like(at.p), np.empty_like(at.p)
+    _enclose_rows(at, bounds, coupled, span_s, memory_s, low, high)
     return low, high
 
 

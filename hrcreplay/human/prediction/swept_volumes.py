@@ -27,8 +27,6 @@ The space that the person can reach within the horizon, limb by limb: Alg. 2.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 
@@ -36,7 +34,7 @@ from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_tu
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction.reachable_sets import SOUND, bounds_of, code_of, never_measured, reach_row
-from hrcreplay.human.prediction.sound_reach import STANDARD, Likely, Margins, enclose_row, likely
+from hrcreplay.human.prediction.sound_reach import Likely, enclose_row, likely
 from hrcreplay.human.prediction.sweep import (
     MOST_COPIES,
     TRIANGLE_RAD,
@@ -49,6 +47,7 @@ from hrcreplay.human.prediction.sweep import (
 )
 from hrcreplay.human.prediction.walking_reach import SIDES
 from hrcreplay.records import BODY, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.settings.sections import Occupancy
 
 #: A larger set is reduced before the next rotation: below, it costs less to carry all points along.
 _WORTH_REDUCING = 50
@@ -56,53 +55,44 @@ _WORTH_REDUCING = 50
 _TOO_MANY = 256
 
 
-@dataclass(frozen=True)
-class Radii:
-    """Radii of the balls that give the limbs their thickness, Eq. (41). Defaults: Table 2 [m]."""
-
-    head: float = 0.12
-    thorax: float = 0.15
-    upper_arm: float = 0.07
-    lower_arm: float = 0.07
-
-    def of_limbs(self) -> Floats:
-        """(6,) in the order of LIMBS [m]."""
-        upper, lower = self.upper_arm, self.lower_arm
-        return np.array([self.head, self.thorax, upper, lower, upper, lower])
+def limb_radii(occupancy: Occupancy) -> Floats:
+    """(6,) radii of the balls that give the limbs their thickness, Eq. (41), Table 2, in the order of LIMBS [m]."""
+    upper, lower = occupancy.radius_upper_arm_m, occupancy.radius_lower_arm_m
+    return np.array([occupancy.radius_head_m, occupancy.radius_thorax_m, upper, lower, upper, lower])
 
 
 def predict(
     states: HumanStates,
     limits: LimitSet,
+    occupancy: Occupancy,
     *,
     horizon_s: float,
-    radii: Radii,
-    method: str,
-    margins: Margins = STANDARD,
+    memory_s: float,
 ) -> SweptVolumes:
     """Swept volumes of all limbs from the reachable sets of the joints: Alg. 2, or what encloses them all (``sound``).
 
     Args:
         states: The fused person; a row gives the same bits alone and among others.
         limits: Bounds on the joints.
+        occupancy: Method, radii of Table 2, and what ``sound`` adds; the printed methods add nothing.
         horizon_s: Braking time T_s of the robot [s].
-        radii: Table 2.
-        method: One of ``reach.METHODS``.
-        margins: What ``sound`` adds; the printed methods add nothing.
+        memory_s: How long the filter goes on without a measurement [s].
 
     Returns:
         Points whose convex hulls are those of Alg. 2: every corner of a hull is among them, and few others. For
-        ``sound``, points whose hulls enclose all motions; with ``margins.legs`` the last limb is ``LEGS``. A limb whose
-        state or lengths are NaN has one NaN vertex.
+        ``sound``, points whose hulls enclose all motions; with ``occupancy.legs`` the last limb is ``LEGS``. A limb
+        whose state or lengths are NaN has one NaN vertex.
 
     Raises:
         SettingsError: There is no such method.
     """
-    code, radius = code_of(method), radii.of_limbs()
+    code, radius = code_of(occupancy.method), limb_radii(occupancy)
     if code == SOUND:
-        vertices, offsets = sweep_sound(states, bounds_of(limits), limits.coupled, horizon_s, margins)
-        limbs = BODY if margins.legs else LIMBS
-        return SweptVolumes(states.t_ns, offsets, vertices, sound_radii(states, radius, margins), limbs, method)
+        vertices, offsets = sweep_sound(states, limits, occupancy, horizon_s + occupancy.latency_s, memory_s)
+        limbs = BODY if occupancy.legs else LIMBS
+        return SweptVolumes(
+            states.t_ns, offsets, vertices, sound_radii(states, radius, occupancy), limbs, occupancy.method
+        )
     vertices, offsets = _predict_rows(
         np.ascontiguousarray(states.p),
         np.ascontiguousarray(states.v),
@@ -114,7 +104,7 @@ def predict(
         code,
         surface(),
     )
-    return SweptVolumes(states.t_ns, offsets, vertices, np.tile(radius, (len(states), 1)), LIMBS, method)
+    return SweptVolumes(states.t_ns, offsets, vertices, np.tile(radius, (len(states), 1)), LIMBS, occupancy.method)
 
 
 @njit(cache=True)
@@ -191,43 +181,43 @@ _HEAD, _THORAX, _LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
 
 
 def sweep_sound(
-    states: HumanStates, bounds: Floats, coupled: bool, horizon_s: float, margins: Margins
+    states: HumanStates, limits: LimitSet, occupancy: Occupancy, span_s: float, memory_s: float
 ) -> tuple[Floats, Ints]:
     """Vertices (m, 3) of all ticks and limbs [m], and the offsets of ``SweptVolumes``.
 
     Args:
         states: The fused person.
-        bounds: (6, 12) of ``reach.bounds_of``.
-        coupled: Whether (34b), (34c) hold.
-        horizon_s: Braking time T_s of the robot [s].
-        margins: What is added to the model.
+        limits: Bounds on the joints.
+        occupancy: What is added to the model.
+        span_s: Horizon and latency [s].
+        memory_s: How long the filter goes on without a measurement [s].
     """
     return _sweep_rows(
-        likely(states, margins),
+        likely(states, occupancy, memory_s),
         np.ascontiguousarray(states.lengths_m),
-        np.ascontiguousarray(margins.sigmas * states.lengths_std_m),
-        bounds,
-        coupled,
-        horizon_s + margins.latency_s,
-        margins.memory_s,
-        margins.hand_m,
-        len(LIMBS) + margins.legs,
+        np.ascontiguousarray(occupancy.sigmas * states.lengths_std_m),
+        bounds_of(limits),
+        limits.coupled,
+        span_s,
+        memory_s,
+        occupancy.hand_m,
+        len(LIMBS) + occupancy.legs,
         surface(),
     )
 
 
-def sound_radii(states: HumanStates, limbs_m: Floats, margins: Margins) -> Floats:
+def sound_radii(states: HumanStates, limbs_m: Floats, occupancy: Occupancy) -> Floats:
     """(n, limbs) radii: of the limb (6,) [m], of what an unknown length up the chain displaces, and the residual.
 
-    A residual that is not known yet (NaN) is taken to be ``margins.residual_m``. The lower body has the thorax's, which
+    A residual that is not known yet (NaN) is taken to be ``residual_unknown_m``. The lower body has the thorax's, which
     tells how far the pelvis is from where it stands upright: who squats has the knees where the hips were. That of the
     legs is how far their middles were from the line below the pelvis; where it and a thigh are more, they are the
     radius. Legs that were close when they were last seen make it no smaller: a table may hide that they are not now.
     """
-    found = np.empty((len(states), len(LIMBS) + margins.legs))
-    unknown_m = margins.residual_m if margins.residual else np.nan
+    found = np.empty((len(states), len(LIMBS) + occupancy.legs))
+    unknown_m = occupancy.residual_unknown_m if occupancy.residual else np.nan
     _radii_rows(
-        margins.sigmas * states.lengths_std_m, states.residual_m, limbs_m, margins.legs_radius_m, unknown_m, found
+        occupancy.sigmas * states.lengths_std_m, states.residual_m, limbs_m, occupancy.legs_radius_m, unknown_m, found
     )
     return found
 

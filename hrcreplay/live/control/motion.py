@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.live.control.watchdog import Bounds
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step
@@ -18,6 +17,7 @@ from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.path import approach
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.run.followers import QpFollower, ScalingFollower
+from hrcreplay.settings.sections import Live
 
 Follower = QpFollower | ScalingFollower
 
@@ -32,7 +32,7 @@ class Setup:
     follow: Callable[[Reference, float], Follower]  #: a robot at a programmed time of a path
     waypoint_m: float  #: the approach is over when the TCP is this close to its end [m]
     approach_speed: float  #: share of the axes' top speeds on the way to the programme
-    bounds: Bounds
+    bounds: Live
     memory_s: float  #: a person unseen for longer counts as unknown [s]
     sending: bool  #: False in shadow mode: the robot does not follow
 
@@ -94,7 +94,7 @@ def brake(setup: Setup, course: Course, around: Obstacles) -> Said:
     """Eq. (67): each axis as fast as it can; a robot that stands stays."""
     robot, plan, state = setup.robot, setup.plan, course.state
     with np.errstate(all="ignore"):
-        seen = control_step.observe(robot, state, around, plan.clearance_m)
+        seen = control_step.observe(robot, state, around, plan.plan.clearance_m)
     step = seen.step(state, control_step.braked(state, robot.ddq_max, plan.dt_s), plan.dt_s, control_step.BRAKING)
     point = setup.programme.sample(course.programme_s)
     return Said(point.T_world_tcp[:3, 3], 0.0, step, Course(step.next, course.programme_s))

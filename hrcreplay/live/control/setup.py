@@ -19,7 +19,6 @@ from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_ro
 from hrcreplay.egm.session import Session
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet, skeleton
-from hrcreplay.live.control import watchdog
 from hrcreplay.live.control.motion import Follower, Setup
 from hrcreplay.live.control.perception import Observer
 from hrcreplay.live.control.pilot import Pilot
@@ -183,18 +182,8 @@ def _setup(job: Job, scene: Scene, *, sending: bool) -> Setup:
     settings = build.plan_settings(job, live.cycle_s)
 
     def follow(path: Reference, s_s: float) -> Follower:
-        return build.follow(job, plan.method, robot, path, settings, s_s)
+        return build.follow(plan.method, robot, path, settings, s_s)
 
-    bounds = watchdog.Bounds(
-        fresh_s=live.fresh_s,
-        uncertain_m=live.uncertain_m,
-        uncertain_rad=live.uncertain_rad,
-        tracking_rad=live.tracking_rad,
-        silent_s=live.silent_s,
-        overrun_s=live.overrun_s,
-        resume=live.resume,
-        resume_s=live.resume_s,
-    )
     return Setup(
         robot=robot,
         programme=programme,
@@ -202,7 +191,7 @@ def _setup(job: Job, scene: Scene, *, sending: bool) -> Setup:
         follow=follow,
         waypoint_m=plan.waypoint_m,
         approach_speed=live.approach_speed,
-        bounds=bounds,
+        bounds=live,
         memory_s=job.settings.fusion.memory_s,
         sending=sending,
     )

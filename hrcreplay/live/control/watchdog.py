@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from hrcreplay.egm.session import Heard
 from hrcreplay.live.record.codec import Sight, Signal
 from hrcreplay.records import Floats
+from hrcreplay.settings.sections import Live
 
 #: What ends a session as it should; every other reason ends it as a stop.
 SESSION_OVER, RECORDING_OVER = "session over", "recording of the person over"
@@ -43,20 +43,6 @@ SIGNALS = {
 _BASE = 4  #: x, y, heading and bend: the joints that carry the whole person
 
 
-@dataclass(frozen=True, slots=True)
-class Bounds:
-    """Settings of the watchdog; see sections_live.Live."""
-
-    fresh_s: float
-    uncertain_m: float
-    uncertain_rad: float
-    tracking_rad: float
-    silent_s: float
-    overrun_s: float
-    resume: bool
-    resume_s: float
-
-
 def of_signals(signals: Signal) -> str:
     """The reason that the loop itself has found, or none."""
     return next((reason for signal, reason in SIGNALS.items() if signal in signals), "")
@@ -69,7 +55,7 @@ def of_robot(heard: Heard) -> str:
     return "" if heard.allowed else "robot not ready"
 
 
-def of_person(sight: Sight | None, age_s: float, bounds: Bounds) -> str:
+def of_person(sight: Sight | None, age_s: float, bounds: Live) -> str:
     """The reason that lies with what is known of the person, or none."""
     if sight is None or not age_s <= bounds.fresh_s:
         return NO_FRAME
@@ -80,6 +66,6 @@ def of_person(sight: Sight | None, age_s: float, bounds: Bounds) -> str:
     return "" if sure else UNCERTAIN
 
 
-def of_tracking(measured: Floats, commanded: Floats, bounds: Bounds) -> str:
+def of_tracking(measured: Floats, commanded: Floats, bounds: Live) -> str:
     """The reason that the robot is not where it was told to be, or none; both (6,) [rad]."""
     return "" if np.abs(measured - commanded).max() <= bounds.tracking_rad else TRACKING

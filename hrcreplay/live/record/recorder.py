@@ -86,7 +86,8 @@ class SessionWriter:
         cameras: dict[str, Any] = start.get("cameras", {})
         self._cameras = frozenset(name for name in cameras if "/" not in name)  # of a topic's name
         latched: list[tuple[str, Any]] = [
-            (own.camera_info_topic(name), pb.Camera(camera=name, T_world_camera=_flat(pose))) for name, pose in cameras.items()
+            (own.camera_info_topic(name), pb.Camera(camera=name, T_world_camera=_flat(pose)))
+            for name, pose in cameras.items()
         ]
         if start.get("task") is not None:
             latched.append((own.TASK, pb.Task(json=json.dumps(start["task"], sort_keys=True))))

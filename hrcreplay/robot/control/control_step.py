@@ -13,6 +13,7 @@ import numpy as np
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.separation import Obstacles, Separation, separation
 from hrcreplay.robot.model import RobotModel, RobotPose
+from hrcreplay.settings.sections import Plan
 
 #: Why a robot braked. The first stands for ticks in which it did not.
 REASONS = ("", "no human state", "no solution", "separation failed", "not finite")
@@ -32,16 +33,11 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """Section 5 without the robot. Weights are (translation, rotation)."""
+    """Section 5 without the robot."""
 
+    plan: Plan
     dt_s: float  #: length of a tick [s]
     stop_s: float  #: T_s of Eq. (70) [s]
-    clearance_m: float = 0.0  #: beyond limb radius + link radius [m]
-    q_p: tuple[float, float] = (0.10, 0.10)  #: Eq. (71) [1/s^2 of the velocity's weight]
-    q_v: tuple[float, float] = (1.0, 1.0)  #: Eq. (72)
-    path_gain_per_s: float = 5.0  #: position error fed into the reference velocity; 0 as printed [1/s]
-    tcp_speed_max: float = 2.5  #: Eq. (66g), each axis of the world [m/s]; 2 pi rad/s for each 2.5 m/s
-    tcp_acceleration_max: float = 25.0  #: Eq. (66h), corrected [m/s^2]; rotation in the same proportion
 
 
 @dataclass(frozen=True, slots=True)

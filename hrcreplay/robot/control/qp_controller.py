@@ -220,13 +220,15 @@ def problem(
         dJdq,
         state.dq,
         twist_ref,
-        settings.q_p,
-        settings.q_v,
-        settings.path_gain_per_s,
+        settings.plan.q_p,
+        settings.plan.q_v,
+        settings.plan.path_gain_per_s,
         dt_s,
     )
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
-    J_low, J_high = cartesian_bounds(J, dJdq, state.dq, settings.tcp_speed_max, settings.tcp_acceleration_max, dt_s)
+    J_low, J_high = cartesian_bounds(
+        J, dJdq, state.dq, settings.plan.tcp_speed_max, settings.plan.tcp_acceleration_max, dt_s
+    )
     rows = tick_rows(pose, obstacles, pairs.room_m2(), settings.stop_s)
     return Problem(H, g, Limits(low, high, J, J_low, J_high), rows)
 
@@ -283,7 +285,7 @@ def step(
         settings: Weights and limits.
     """
     with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
-        sight = observe(robot, state, obstacles, settings.clearance_m)
+        sight = observe(robot, state, obstacles, settings.plan.clearance_m)
         reason = sight.reason
         if sight.pairs is not None:
             task = problem(robot, state, sight.pose, T_world_ref, twist_ref, obstacles, sight.pairs, settings)

@@ -69,7 +69,7 @@ def step(
     with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
         now = reference.sample(state.s_s)
         axes = RobotState(now.q, state.rate * now.dq)
-        sight = observe(robot, axes, obstacles, settings.clearance_m)
+        sight = observe(robot, axes, obstacles, settings.plan.clearance_m)
         if sight.reason == control_step.NOT_FINITE:
             stand = np.zeros(robot.nv)
             held = sight.step(RobotState(now.q, stand), stand, settings.dt_s, control_step.BRAKING, sight.reason)
@@ -127,7 +127,7 @@ def _fastest(
     dt_s, gain, pose = settings.dt_s, robot.ddq_max * settings.dt_s, sight.pose
     low, high = np.maximum(-robot.dq_max, axes.dq - gain), np.minimum(robot.dq_max, axes.dq + gain)
     J_low, J_high = cartesian_bounds(
-        pose.J_tcp, pose.dJdq_tcp, axes.dq, settings.tcp_speed_max, settings.tcp_acceleration_max, dt_s
+        pose.J_tcp, pose.dJdq_tcp, axes.dq, settings.plan.tcp_speed_max, settings.plan.tcp_acceleration_max, dt_s
     )
     slowed = False
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numba import njit
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel
+from hrcreplay.settings.sections import Plan
 
 #: Time grid that a reference is computed on once; between its points it is a cubic [s].
 STEP_S = 0.004
@@ -94,16 +94,7 @@ def _cubic(
     return q, dq, (2 * b + share * 6 * a) / step_s**2
 
 
-@dataclass(frozen=True, slots=True)
-class Leash:
-    """How far a robot may fall behind its reference before the reference waits (``path``), or never (``time``)."""
-
-    mode: Literal["time", "path"] = "path"
-    length_m: float = 0.25  #: the reference stands when the TCP is this far away [m]
-    waypoint_m: float = 0.02  #: and does not leave a waypoint before the TCP is this close to it [m]
-
-
-def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, leash: Leash) -> tuple[float, float]:
+def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, plan: Plan) -> tuple[float, float]:
     """Programmed time after one tick, and the rate at which it ran.
 
     ``time`` runs with the clock: a robot that was held back then faces a reference that ran away.
@@ -116,18 +107,18 @@ def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, l
         s_s: Programmed time [s].
         dt_s: Length of the tick [s].
         tcp_error_m: Distance from the TCP to the reference at ``s_s`` [m].
-        leash: When to wait.
+        plan: When the reference waits.
 
     Returns:
         Programmed time at the next tick [s] and the rate in [0, 1]: the reference's velocity is ``rate * twist``.
     """
-    if leash.mode == "time":
+    if plan.reference == "time":
         return s_s + dt_s, 1.0
-    slack = 2.0 - 2.0 * tcp_error_m / leash.length_m  # 1 at half the leash, 0 where it is taut
+    slack = 2.0 - 2.0 * tcp_error_m / plan.leash_m  # 1 at half the leash, 0 where it is taut
     if not slack > 0.0:
         return s_s, 0.0
     rate = 1.0 if slack >= 1.0 else slack * slack * (3.0 - 2.0 * slack)
     ahead_s = s_s + rate * dt_s
-    if not tcp_error_m <= leash.waypoint_m:
+    if not tcp_error_m <= plan.waypoint_m:
         ahead_s = min(ahead_s, reference.next_waypoint(s_s))
     return ahead_s, (ahead_s - s_s) / dt_s

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -8,11 +7,12 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from scipy.linalg import block_diag
 
-from hrcreplay.human.fusion.fuse import FusionSettings, FusionState, fuse, start
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
+from hrcreplay.human.fusion.fuse import FusionState, fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, POINTS, HumanStates
+from hrcreplay.settings.sections import Fusion
 from tests.human.filtered import FREE, PLAIN, WIDE, fused, standing, ticks, until
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, random_measurements
 
@@ -20,7 +20,7 @@ from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, random
 class Dense:
     """The filter of (42)-(57) over all 56 states by filterpy, rows switched off in H."""
 
-    def __init__(self, state: FusionState, settings: FusionSettings) -> None:
+    def __init__(self, state: FusionState, settings: Fusion) -> None:
         self.settings = settings
         self.filter = KalmanFilter(56, 1)
         self.filter.x = np.concatenate([state.mean.T.ravel(), state.lengths])[:, None]
@@ -83,7 +83,7 @@ def rows_of_points() -> list[list[int]]:
 @pytest.mark.parametrize("stale", ["skip", "reuse"])
 @pytest.mark.parametrize("delay", ["compensate", "ignore"])
 def test_it_is_the_dense_filter_over_the_whole_state(stale: Any, delay: Any) -> None:
-    settings = replace(PLAIN, stale=stale, delay=delay, delay_max_s=10.0)
+    settings = PLAIN.model_copy(update={"stale": stale, "delay": delay, "delay_max_s": 10.0})
     m = random_measurements(150, seed=1)
     t = np.sort(np.random.default_rng(2).choice(ticks(2.0), 300, replace=False))
     first = int(np.searchsorted(t, m.arrival_ns[20]))
@@ -122,7 +122,7 @@ def test_it_is_the_dense_filter_over_the_whole_state(stale: Any, delay: Any) -> 
 
 @pytest.mark.parametrize("stale", ["skip", "reuse"])
 def test_one_tick_at_a_time_gives_the_same_bits_as_all_at_once(stale: Any) -> None:
-    settings, m, t = FusionSettings(stale=stale), random_measurements(120, seed=3, missing=0.5), ticks(1.5)
+    settings, m, t = Fusion(stale=stale), random_measurements(120, seed=3, missing=0.5), ticks(1.5)
     _, whole, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), settings, WIDE)
     for size in (1, 7):
         state, parts, total, last = start(CAMERAS), [], type(counts)(), -1
@@ -140,7 +140,7 @@ def test_one_tick_at_a_time_gives_the_same_bits_as_all_at_once(stale: Any) -> No
 
 def test_no_tick_uses_a_frame_that_was_still_on_the_wire() -> None:
     m = standing(0.5)
-    states = fused(m, ticks(0.5), FusionSettings())
+    states = fused(m, ticks(0.5), Fusion())
     assert not states.valid[states.t_ns < m.arrival_ns[0]].any()
     assert np.isnan(states.p[states.t_ns < m.arrival_ns[0]]).all()
     assert np.isfinite(states.p[states.t_ns >= m.arrival_ns[0]]).all()
@@ -152,7 +152,7 @@ def test_no_tick_uses_a_frame_that_was_still_on_the_wire() -> None:
 def test_it_settles_on_a_person_who_stands_still_with_either_kind_of_delay() -> None:
     delay: Literal["compensate", "ignore"]
     for delay in ("compensate", "ignore"):
-        states = fused(standing(2.0), ticks(2.0), FusionSettings(delay=delay))
+        states = fused(standing(2.0), ticks(2.0), Fusion(delay=delay))
         np.testing.assert_allclose(states.p[-1], NEUTRAL, atol=2e-3)
         np.testing.assert_allclose(states.v[-1], 0.0, atol=2e-2)
         np.testing.assert_allclose(states.lengths_m[-1], LENGTHS_M, atol=2e-3)
@@ -164,11 +164,11 @@ def test_a_compensated_delay_does_not_lag() -> None:
     p = np.tile(NEUTRAL, (len(capture), 1))
     p[:, 2] += 1.0 * capture * 1e-9
     frames = frames_of(skeleton(p, np.tile(LENGTHS_M, (len(p), 1))), capture * 0, capture, 40_000_000)
-    m = measure(frames, np.tile(np.eye(4), (2, 1, 1)), PointNoise(0.01))
+    m = measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01))
     t = ticks(2.9)
     lags: tuple[tuple[Literal["compensate", "ignore"], float], ...] = (("compensate", 0.0), ("ignore", 0.04))
     for delay, lag in lags:
-        states = fused(m, t, FusionSettings(delay=delay))
+        states = fused(m, t, Fusion(delay=delay))
         late = NEUTRAL[2] + t[-100:] * 1e-9 - states.p[-100:, 2]
         np.testing.assert_allclose(late.mean(), lag, atol=0.012)
 
@@ -178,7 +178,7 @@ def test_heading_is_unwrapped_through_a_whole_turn() -> None:
     p = np.tile(NEUTRAL, (len(capture), 1))
     p[:, 2] += 2.0 * capture * 1e-9
     frames = frames_of(skeleton(p, np.tile(LENGTHS_M, (len(p), 1))), capture * 0, capture)
-    states = fused(measure(frames, np.tile(np.eye(4), (2, 1, 1)), PointNoise(0.01)), ticks(5.9), FusionSettings())
+    states = fused(measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01)), ticks(5.9), Fusion())
     heading = states.p[250:, 2]
     assert np.abs(np.diff(heading)).max() < 0.1
     np.testing.assert_allclose(heading, NEUTRAL[2] + 2.0 * states.t_ns[250:] * 1e-9, atol=0.1)
@@ -192,10 +192,10 @@ def test_an_arm_crossing_the_chest_is_followed_although_its_angles_change_name()
     p[:, 9] = np.radians(55.0)
     capture = (seconds * 1e9).astype(np.int64)
     points = skeleton(p, np.tile(LENGTHS_M, (len(p), 1)))
-    m = measure(frames_of(points, capture * 0, capture), np.tile(np.eye(4), (2, 1, 1)), PointNoise(0.01))
+    m = measure(frames_of(points, capture * 0, capture), np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01))
     assert np.abs(np.diff(m.angles[:, 8])).max() > 3.0
     t = capture[40:]
-    states = fused(m, t, FusionSettings())
+    states = fused(m, t, Fusion())
     again = skeleton(states.p, states.lengths_m)
     hands = [POINTS.index("elbow_l"), POINTS.index("wrist_l")]
     assert np.linalg.norm(again - points[40:], axis=-1)[10:, hands].max() < 0.03
@@ -205,7 +205,7 @@ def test_an_arm_crossing_the_chest_is_followed_although_its_angles_change_name()
 def test_frames_that_a_newer_one_overtook_are_counted() -> None:
     m = standing(1.0, cameras=(0,))
     t = ticks(1.0, rate_hz=10.0)
-    _, _, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), FusionSettings(), WIDE)
+    _, _, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), Fusion(), WIDE)
     used = len(np.unique(np.searchsorted(t, until(m, int(t[-1])).arrival_ns)))
     assert counts["superseded_frames_left"] == len(until(m, int(t[-1]))) - used
 
@@ -220,10 +220,10 @@ def test_the_state_obeys_the_limits_in_the_body_frame() -> None:
     p[:, 1] += 2.0 * seconds * np.sin(0.7)
     p[:, 9] += 1.5 * np.sin(4.0 * seconds)
     frames = frames_of(skeleton(p, np.tile(LENGTHS_M, (len(p), 1))), capture * 0, capture)
-    m = measure(frames, np.tile(np.eye(4), (2, 1, 1)), PointNoise(0.01))
+    m = measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01))
     t = ticks(2.9)
     limits = load_limits("paper")
-    _, states, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), FusionSettings(), limits)
+    _, states, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), Fusion(), limits)
     assert counts["ticks_saturated"] > 100
     for rate, low, high in ((states.v, limits.v_min, limits.v_max), (states.a, limits.a_min, limits.a_max)):
         body = rate.copy()
@@ -251,6 +251,6 @@ def test_a_saturated_state_keeps_its_covariance() -> None:
 def test_the_given_state_is_not_changed() -> None:
     state, m, t = start(CAMERAS), standing(0.3), ticks(0.3)
     before = [array.copy() for array in state]
-    fuse(state, t, until(m, int(t[-1])), FusionSettings(), WIDE)
+    fuse(state, t, until(m, int(t[-1])), Fusion(), WIDE)
     for array, kept in zip(state, before, strict=True):
         np.testing.assert_array_equal(array, kept)

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from hrcreplay.human.fusion.fuse import FusionSettings, fuse, start
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
+from hrcreplay.human.fusion.fuse import fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.records import POINTS, Measurements
+from hrcreplay.settings.sections import Fusion
 from tests.human.filtered import WIDE, fused, standing, ticks, until
 from tests.human.sightings import CAMERAS, NEUTRAL, frames_of, random_measurements
 
@@ -19,9 +20,9 @@ def test_an_outlier_is_kept_out_and_counted() -> None:
     wrist, k = POINTS.index("wrist_l"), int(np.flatnonzero(m.camera == 0)[30])
     points[k, wrist] += [0.5, 0.0, 0.3]
     frames = frames_of(points, m.camera, m.capture_ns, 20_000_000)
-    bad = measure(frames, np.tile(np.eye(4), (2, 1, 1)), PointNoise(0.01))
+    bad = measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01))
     t = ticks(2.0)
-    _, states, counts = fuse(start(CAMERAS), t, until(bad, int(t[-1])), FusionSettings(), WIDE)
+    _, states, counts = fuse(start(CAMERAS), t, until(bad, int(t[-1])), Fusion(), WIDE)
     assert counts["outlier_points_left"] == 1
     assert counts["outlier_points_right"] == 0
     after = states.t_ns >= m.arrival_ns[k]
@@ -37,8 +38,8 @@ def test_swapped_sides_are_outliers() -> None:
         pair = [POINTS.index(f"{name}_{side}") for side in "lr"]
         points[k, pair] = points[k, pair[::-1]]
     frames = frames_of(points, m.camera, m.capture_ns, 20_000_000)
-    bad = measure(frames, np.tile(np.eye(4), (2, 1, 1)), PointNoise(0.01))
-    states = fused(bad, ticks(2.0), FusionSettings())
+    bad = measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01))
+    states = fused(bad, ticks(2.0), Fusion())
     np.testing.assert_allclose(states.p[-200:], np.tile(NEUTRAL, (200, 1)), atol=5e-3)
 
 
@@ -47,7 +48,7 @@ def test_a_person_who_jumped_is_taken_up_again_after_the_memory_and_not_before()
     moved[:2] += 1.5
     m = Measurements.join([standing(1.0), standing(3.0, moved, start_s=1.0)])
     t = ticks(3.0)
-    _, states, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), FusionSettings(memory_s=0.5), WIDE)
+    _, states, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), Fusion(memory_s=0.5), WIDE)
     seconds = t * 1e-9
     np.testing.assert_allclose(states.p[seconds < 1.45][-50:, :2], np.tile(NEUTRAL[:2], (50, 1)), atol=0.05)
     np.testing.assert_allclose(states.p[-1], moved, atol=5e-3)
@@ -57,7 +58,7 @@ def test_a_person_who_jumped_is_taken_up_again_after_the_memory_and_not_before()
 def test_a_person_lost_for_long_comes_to_rest_and_stays_finite() -> None:
     m = random_measurements(100, seed=5, missing=0.0, noise=0.2)
     t = ticks(1.5 + 600.0, rate_hz=50.0)
-    states = fused(m, t, FusionSettings())
+    states = fused(m, t, Fusion())
     live = states.t_ns >= m.arrival_ns[0]
     for name in ("p", "v", "a", "j", "p_std", "v_std", "lengths_m"):
         assert np.isfinite(getattr(states, name)[live]).all()
@@ -71,7 +72,7 @@ def test_joints_nobody_has_seen_stand_at_a_neutral_posture_with_a_large_std() ->
     m = standing(1.0)
     angles, stds = m.angles.copy(), m.angles_std.copy()
     angles[:, 4:8], stds[:, 4:8] = np.nan, np.nan
-    states = fused(replace(m, angles=angles, angles_std=stds), ticks(1.0), FusionSettings())
+    states = fused(replace(m, angles=angles, angles_std=stds), ticks(1.0), Fusion())
     live = states.t_ns >= m.arrival_ns[0]
     assert np.isfinite(states.p[live]).all()
     assert (states.p_std[live][:, 4:8] > 0.5).all()

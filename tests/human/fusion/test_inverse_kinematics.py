@@ -6,13 +6,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, PointNoise, inverse, inverse_jacobian, measure
+from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, inverse, inverse_jacobian, measure
 from hrcreplay.human.model import canonical, nearest, skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, POINTS, Bools, Floats
+from hrcreplay.settings.sections import Fusion
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, lengths, postures
 
-NOISE = PointNoise(0.02)
+NOISE = Fusion(point_std_m=0.02)
 AT = {name: k for k, name in enumerate(POINTS)}
 
 
@@ -23,7 +24,7 @@ def person(**joints: float) -> Floats:
     return p
 
 
-def stds(p: Floats, confidence: float = 1.0, noise: PointNoise = NOISE) -> Floats:
+def stds(p: Floats, confidence: float = 1.0, noise: Fusion = NOISE) -> Floats:
     frames = frames_of(skeleton(p[None], LENGTHS_M[None]), np.zeros(1, np.int64), np.zeros(1, np.int64))
     frames = type(frames)(**{**vars(frames), "confidence": frames.confidence * confidence})
     return measure(frames, np.tile(np.eye(4), (2, 1, 1)), noise).angles_std[0]
@@ -119,7 +120,7 @@ def test_the_noise_is_that_of_sampled_points() -> None:
     measured = measure(
         frames_of(points, np.zeros(1, np.int64), np.zeros(1, np.int64)),
         np.tile(np.eye(4), (2, 1, 1)),
-        PointNoise(0.004),
+        Fusion(point_std_m=0.004),
     )
     np.testing.assert_allclose(measured.angles_std[0], found.std(axis=0), rtol=0.03)
     np.testing.assert_allclose(measured.lengths_std_m[0], found_pi.std(axis=0), rtol=0.03)
@@ -127,9 +128,9 @@ def test_the_noise_is_that_of_sampled_points() -> None:
 
 def test_noise_grows_with_the_range_and_as_confidence_falls() -> None:
     np.testing.assert_allclose(
-        stds(NEUTRAL, 0.5, PointNoise(1e-4)), 2.0 * stds(NEUTRAL, 1.0, PointNoise(1e-4)), rtol=1e-3
+        stds(NEUTRAL, 0.5, Fusion(point_std_m=1e-4)), 2.0 * stds(NEUTRAL, 1.0, Fusion(point_std_m=1e-4)), rtol=1e-3
     )
-    assert (stds(NEUTRAL, noise=PointNoise(0.02, 0.01)) > stds(NEUTRAL)).all()
+    assert (stds(NEUTRAL, noise=Fusion(point_std_m=0.02, point_std_per_m=0.01)) > stds(NEUTRAL)).all()
 
 
 def test_cameras_see_the_same_person_in_one_world() -> None:

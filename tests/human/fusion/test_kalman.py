@@ -7,18 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hrcreplay.human.fusion.fuse import FusionSettings, fuse_traced, start
 from hrcreplay.human.fusion.fuse import fuse as fuse_all
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
+from hrcreplay.human.fusion.fuse import fuse_traced, start
+from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements
+from hrcreplay.settings.sections import Fusion
 
 HUMAN = load_limits("human")
 POSE = np.array([0.2, 0.1, 0.3, 0.1, 0.4, 0.6, 0.1, 1.7, 0.4, 0.6, 0.1, 1.7])
 LENGTHS_M = np.array([0.94, 0.5, 0.2, 0.18, 0.3, 0.3, 0.26, 0.26])
 RATE_HZ, FRAMES_HZ = 250, 50
-FREE = FusionSettings(spread_least=1.0, spread_most=1.0)
+FREE = Fusion(spread_least=1.0, spread_most=1.0)
 
 
 def ticks(seconds: float) -> Ints:
@@ -42,19 +43,19 @@ def frames_of(p: Floats, noise_m: float = 0.0, lengths_m: Floats = LENGTHS_M) ->
 
 
 def measured(frames: CameraFrames, std_m: float = 0.02) -> Measurements:
-    return measure(frames, np.eye(4)[None], PointNoise(std_m))
+    return measure(frames, np.eye(4)[None], Fusion(point_std_m=std_m))
 
 
-def factors(m: Measurements, t: Ints, settings: FusionSettings | None = None) -> Floats:
+def factors(m: Measurements, t: Ints, settings: Fusion | None = None) -> Floats:
     """(n, 12) what the variances of v that are told are, over those of P."""
-    _, states, _, trace = fuse_traced(start(("one",)), t, m, settings or FusionSettings(), HUMAN)
+    _, states, _, trace = fuse_traced(start(("one",)), t, m, settings or Fusion(), HUMAN)
     return np.asarray(states.v_std**2 / trace.cov[:, :, 1, 1])
 
 
 def test_the_estimate_is_the_same_whatever_is_told_of_it() -> None:
     sway = POSE + 0.3 * np.sin(np.arange(150) / 8.0)[:, None] * (np.arange(12) >= 4)
     m = measured(frames_of(sway, 0.01))
-    told, plain = (fuse_all(start(("one",)), ticks(2.9), m, s, HUMAN)[1] for s in (FusionSettings(), FREE))
+    told, plain = (fuse_all(start(("one",)), ticks(2.9), m, s, HUMAN)[1] for s in (Fusion(), FREE))
     for name in ("p", "v", "a", "j", "lengths_m", "residual_m"):
         np.testing.assert_array_equal(getattr(told, name), getattr(plain, name))
     assert np.nanmax(np.abs(told.v_std / plain.v_std - 1.0)) > 0.3
@@ -96,9 +97,7 @@ def test_a_marker_that_jumps_off_the_bone_is_no_measurement() -> None:
     points = frames.points_m.copy()
     points[100:300, POINTS.index("wrist_l")] = wrist[100:300] + 0.7 * (wrist - elbow)[100:300]  # within 0.2 m
     t = ticks(7.9)
-    _, states, counts = fuse_all(
-        start(("one",)), t, measured(replace(frames, points_m=points)), FusionSettings(), HUMAN
-    )
+    _, states, counts = fuse_all(start(("one",)), t, measured(replace(frames, points_m=points)), Fusion(), HUMAN)
     assert counts["outlier_points_one"] == 200
     forearm = LENGTHS.index("pi_forearm_l")
     assert states.lengths_m[-1, forearm] == pytest.approx(0.26, abs=2e-3)
@@ -111,9 +110,7 @@ def test_a_length_that_was_learnt_wrong_is_learnt_anew() -> None:
     short[LENGTHS.index("pi_forearm_l")] = 0.08
     frames, wrong = frames_of(np.tile(POSE, (700, 1))), frames_of(np.tile(POSE, (700, 1)), lengths_m=short)
     points = np.concatenate([wrong.points_m[:100], frames.points_m[100:]])
-    _, states, _ = fuse_all(
-        start(("one",)), ticks(13.9), measured(replace(frames, points_m=points)), FusionSettings(), HUMAN
-    )
+    _, states, _ = fuse_all(start(("one",)), ticks(13.9), measured(replace(frames, points_m=points)), Fusion(), HUMAN)
     forearm = states.lengths_m[:, LENGTHS.index("pi_forearm_l")]
     assert forearm[round(6.5 * RATE_HZ)] == pytest.approx(0.08, abs=0.02)
     assert forearm[-1] == pytest.approx(0.26, abs=0.02)

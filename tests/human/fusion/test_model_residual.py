@@ -10,13 +10,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from hrcreplay.human.fusion.fuse import FusionSettings, fuse, start
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise, inverse, measure
+from hrcreplay.human.fusion.fuse import fuse, start
+from hrcreplay.human.fusion.inverse_kinematics import inverse, measure
 from hrcreplay.human.fusion.model_residual import LEAST
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.clean import PersonMemory, pick
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats, HumanStates, Ints, Measurements
+from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.tables import read_states, state_columns
 from tests.human.bent import RATE_HZ, WIDE, bent, fused, measured, ticks, used_frames
 
@@ -42,7 +43,7 @@ def demo() -> tuple[Measurements, Ints]:
     poses, memory, parts = np.array([log.header.T_world_camera[c] for c in log.header.cameras]), PersonMemory(), []
     for chunk in log.frames():
         memory, mine, _ = pick(chunk, memory, poses, 0.8, 2.0)
-        parts.append(measure(mine, poses, PointNoise()))
+        parts.append(measure(mine, poses, Fusion()))
     m = Measurements.join(parts)
     first = int(m.arrival_ns[0]) - 100_000_000
     return m, first + ticks((m.arrival_ns[-1] - first) * 1e-9)
@@ -61,7 +62,7 @@ def found_s(states: HumanStates, limb: int) -> float:
     return float(states.t_ns[max(fell)] * 1e-9)
 
 
-def plain_residual(m: Measurements, states: HumanStates, settings: FusionSettings) -> Floats:
+def plain_residual(m: Measurements, states: HumanStates, settings: Fusion) -> Floats:
     """(n, 6) without a gate for outliers: every sample kept, the quantile exact."""
     found = np.full((len(states), 6), np.nan)
     frames = used_frames(m, states.t_ns)
@@ -95,7 +96,7 @@ def test_it_is_the_weighted_quantile_of_all_samples(
 ) -> None:
     m, t = demo[0], demo[1][: 25 * RATE_HZ]
     m = m.rows(m.arrival_ns <= t[-1])
-    settings = FusionSettings(outlier_m=1e6, bone_m=1e6, residual_quantile=quantile, residual_memory_s=memory_s)
+    settings = Fusion(outlier_m=1e6, bone_m=1e6, residual_quantile=quantile, residual_memory_s=memory_s)
     states = fused(m, t, settings)
     expected = plain_residual(m, states, settings)
     residual = states.residual_m[:, : len(LIMBS)]
@@ -114,7 +115,7 @@ def test_chunks_of_any_size_give_the_same_bits(demo: tuple[Measurements, Ints]) 
         state, parts, last = start(m.cameras), [], -1
         for chunk in (t[i : i + size] for i in range(0, len(t), size)):
             mine = m.rows((m.arrival_ns > last) & (m.arrival_ns <= chunk[-1]))
-            state, part, _ = fuse(state, chunk, mine, FusionSettings(), WIDE)
+            state, part, _ = fuse(state, chunk, mine, Fusion(), WIDE)
             parts.append(part)
             last = int(chunk[-1])
         joined = HumanStates.join(parts)
@@ -214,13 +215,13 @@ def test_an_outlier_is_no_sample() -> None:
     gross = measured(replace(frames, points_m=points))
     clean = fused(measured(frames), ticks(3.0)).residual_m[-1]
     np.testing.assert_allclose(fused(gross, ticks(3.0)).residual_m[-1], clean, atol=1.1e-3)
-    no_gate = fused(gross, ticks(3.0), FusionSettings(outlier_m=1e6, bone_m=1e6)).residual_m[-1]
+    no_gate = fused(gross, ticks(3.0), Fusion(outlier_m=1e6, bone_m=1e6)).residual_m[-1]
     assert no_gate[LIMBS.index("LLA")] > 0.3
 
 
 def test_what_was_learnt_outlives_an_occlusion_and_fades_while_the_limb_is_seen() -> None:
     """Bent for 2 s, out of sight for 20 s, then like the model: the old samples lose weight only from then on."""
-    settings = FusionSettings(residual_memory_s=2.0)
+    settings = Fusion(residual_memory_s=2.0)
     first, later = bent(2.0), bent(10.0)
     straight = skeleton(*inverse(first.points_m[:1]))
     later = replace(

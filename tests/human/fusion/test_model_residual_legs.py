@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hrcreplay.human.fusion.fuse import FusionSettings
 from hrcreplay.human.fusion.model_residual import LEAST
 from hrcreplay.records import BODY, LIMBS, POINTS, CameraFrames, Floats, HumanStates, Measurements
+from hrcreplay.settings.sections import Fusion
 from tests.human.bent import RATE_HZ, bent, fused, measured, ticks, used_frames
 
 Legs = dict[str, tuple[float, float, float]]
@@ -48,7 +48,7 @@ def off_the_line(points_m: Floats, pelvis_m: Floats) -> Floats:
     return nearest
 
 
-def plain_samples(m: Measurements, states: HumanStates, settings: FusionSettings) -> list[tuple[int, float]]:
+def plain_samples(m: Measurements, states: HumanStates, settings: Fusion) -> list[tuple[int, float]]:
     """(tick, sample) of every frame that shows pelvis and a leg, later than half a second after the pelvis was found.
 
     It is found with the first frame that shows it, and with the first after more than half a second without one.
@@ -74,7 +74,7 @@ def plain_samples(m: Measurements, states: HumanStates, settings: FusionSettings
     return samples
 
 
-def plain_residual(m: Measurements, states: HumanStates, settings: FusionSettings) -> Floats:
+def plain_residual(m: Measurements, states: HumanStates, settings: Fusion) -> Floats:
     """(n,): all samples kept, each forgotten by its age, a pause counting half a second; the quantile exact."""
     found = np.full(len(states), np.nan)
     samples = plain_samples(m, states, settings)
@@ -115,7 +115,7 @@ def lived() -> CameraFrames:
 @pytest.mark.parametrize(("quantile", "memory_s"), [(0.95, 20.0), (0.6, 1.0)])
 def test_it_is_the_weighted_quantile_of_all_samples(quantile: float, memory_s: float) -> None:
     m = measured(lived())
-    settings = FusionSettings(outlier_m=1e6, bone_m=1e6, residual_quantile=quantile, residual_memory_s=memory_s)
+    settings = Fusion(outlier_m=1e6, bone_m=1e6, residual_quantile=quantile, residual_memory_s=memory_s)
     states = fused(m, ticks(9.0), settings)
     expected = plain_residual(m, states, settings)
     residual = states.residual_m[:, LEGS]

@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hrcreplay.human.fusion.fuse import FusionSettings, fuse, fuse_traced, smooth, start
-from hrcreplay.human.fusion.inverse_kinematics import PointNoise, measure
+from hrcreplay.human.fusion.fuse import fuse, fuse_traced, smooth, start
+from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats
+from hrcreplay.settings.sections import Fusion
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
 
 LIMITS = load_limits("human")
@@ -26,7 +27,7 @@ def moving(seconds: NDArray[np.floating[Any]]) -> Floats:
 
 def test_it_is_the_least_squares_estimate_given_all_measurements() -> None:
     """One joint, written as one linear system over all ticks: prior, motions and measurements weighed by variance."""
-    settings = FusionSettings(
+    settings = Fusion(
         delay="ignore",
         outlier_m=1e6,
         bone_m=1e6,
@@ -38,7 +39,9 @@ def test_it_is_the_least_squares_estimate_given_all_measurements() -> None:
     rng = np.random.default_rng(1)
     capture = np.arange(0, 400_000_000, 20_000_000)
     points = skeleton(moving(capture * 1e-9), np.tile(LENGTHS_M, (len(capture), 1)))
-    m = measure(frames_of(points + rng.normal(0, 0.01, points.shape), capture * 0, capture), T, PointNoise(0.01))
+    m = measure(
+        frames_of(points + rng.normal(0, 0.01, points.shape), capture * 0, capture), T, Fusion(point_std_m=0.01)
+    )
     t = np.arange(0, 400_000_000, 10_000_000)
     _, states, _, trace = fuse_traced(start(CAMERAS), t, m.rows(m.arrival_ns <= t[-1]), settings, LIMITS)
     smoothed = smooth(states, trace, settings)
@@ -72,8 +75,8 @@ def test_it_is_nearer_to_the_truth_than_the_filter_and_surer() -> None:
     points = skeleton(moving(capture * 1e-9), np.tile(LENGTHS_M, (len(capture), 1)))
     frames = frames_of(points + rng.normal(0, 0.015, points.shape), capture * 0, capture, 30_000_000)
     t = np.arange(0, 4_000_000_000, 10_000_000)
-    settings = FusionSettings(spread_least=1.0, spread_most=1.0)
-    m = measure(frames, T, PointNoise(0.015))
+    settings = Fusion(spread_least=1.0, spread_most=1.0)
+    m = measure(frames, T, Fusion(point_std_m=0.015))
     _, states, _, trace = fuse_traced(start(CAMERAS), t, m.rows(m.arrival_ns <= t[-1]), settings, LIMITS)
     smoothed = smooth(states, trace, settings)
     truth = moving(t * 1e-9)
@@ -93,8 +96,8 @@ def test_it_follows_an_arm_that_changes_its_name() -> None:
     p[:, 8], p[:, 9] = np.radians(20.0 - 80.0 * np.clip((seconds - 1.0) / 2.0, 0.0, 1.0)), np.radians(55.0)
     capture = np.round(seconds * 1e9).astype(np.int64)
     points = skeleton(p, np.tile(LENGTHS_M, (len(p), 1)))
-    m = measure(frames_of(points, capture * 0, capture), T, PointNoise(0.01))
-    settings = FusionSettings()
+    m = measure(frames_of(points, capture * 0, capture), T, Fusion(point_std_m=0.01))
+    settings = Fusion()
     _, states, _, trace = fuse_traced(start(CAMERAS), capture, m, settings, LIMITS)
     assert np.abs(np.diff(states.p[:, 8])).max() > 3.0
     smoothed = smooth(states, trace, settings)
@@ -105,8 +108,8 @@ def test_it_follows_an_arm_that_changes_its_name() -> None:
 def test_without_anybody_there_is_nothing_to_smooth() -> None:
     t = np.arange(0, 50_000_000, 10_000_000)
     points = skeleton(NEUTRAL[None], LENGTHS_M[None])
-    none = measure(frames_of(points, np.zeros(1, np.int64), np.zeros(1, np.int64)), T, PointNoise())
+    none = measure(frames_of(points, np.zeros(1, np.int64), np.zeros(1, np.int64)), T, Fusion())
     none = replace(none).rows(slice(0, 0))
-    _, states, _, trace = fuse_traced(start(CAMERAS), t, none, FusionSettings(), LIMITS)
-    assert np.isnan(smooth(states, trace, FusionSettings()).p).all()
-    assert np.isnan(fuse(start(CAMERAS), t, none, FusionSettings(), LIMITS)[1].p).all()
+    _, states, _, trace = fuse_traced(start(CAMERAS), t, none, Fusion(), LIMITS)
+    assert np.isnan(smooth(states, trace, Fusion()).p).all()
+    assert np.isnan(fuse(start(CAMERAS), t, none, Fusion(), LIMITS)[1].p).all()

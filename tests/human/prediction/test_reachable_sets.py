@@ -7,10 +7,11 @@ import pytest
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.prediction.reachable_sets import PRINTED, reachable
+from hrcreplay.human.prediction.reachable_sets import PRINTED
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, Floats
 from tests.human.people import random_states, states
+from tests.human.predictions import reachable
 
 T = 0.377
 PAPER = load_limits("paper")

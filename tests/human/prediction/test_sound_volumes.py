@@ -12,21 +12,21 @@ from scipy.spatial.transform import Rotation
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning, sphere_swept_volume_m3
 from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds, skeleton
 from hrcreplay.human.prediction.joint_reach import rise
-from hrcreplay.human.prediction.reachable_sets import reachable
-from hrcreplay.human.prediction.sound_reach import Margins
-from hrcreplay.human.prediction.swept_volumes import Radii, predict
+from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
+from hrcreplay.settings.sections import Occupancy
 from tests.human.people import limb_points, random_states, states
+from tests.human.predictions import predict, reachable
 
 T = 0.377
 PAPER, HUMAN = load_limits("paper"), load_limits("human")
-BARE = Margins(sigmas=0.0, hand_m=0.0, legs=False)
+BARE = Occupancy(sigmas=0.0, hand_m=0.0, legs=False)
 STEPS = 40
 
 
-def volumes(people: HumanStates, limits: LimitSet = PAPER, margins: Margins = BARE) -> SweptVolumes:
-    return predict(people, limits, horizon_s=T, radii=Radii(), method="sound", margins=margins)
+def volumes(people: HumanStates, limits: LimitSet = PAPER, margins: Occupancy = BARE) -> SweptVolumes:
+    return predict(people, limits, horizon_s=T, method="sound", margins=margins)
 
 
 def uncertain(people: HumanStates, p_std: float, v_std: float, lengths_std_m: float) -> HumanStates:
@@ -82,14 +82,14 @@ def motions(
     return seen
 
 
-def worst(people: HumanStates, limits: LimitSet, margins: Margins, seed: int, count: int = 120) -> tuple[float, str]:
+def worst(people: HumanStates, limits: LimitSet, margins: Occupancy, seed: int, count: int = 120) -> tuple[float, str]:
     """How far any sampled motion is out of its volume [m], and which."""
     rng = np.random.default_rng(seed)
     swept = volumes(people, limits, margins)
     k, largest, where = margins.sigmas, -np.inf, ""
     for i in range(len(people)):
         solids = [ConvexHull(swept.vertices(i, limb)).equations for limb in range(len(LIMBS))]
-        room = swept.radius_m[i] - np.append(Radii().of_limbs(), np.zeros(len(swept.limbs) - 6))
+        room = swept.radius_m[i] - np.append(limb_radii(Occupancy()), np.zeros(len(swept.limbs) - 6))
         for sharp in (True, False):
             side = rng.choice([-1.0, 1.0], (3, 12)) if sharp else rng.uniform(-1, 1, (3, 12))
             p, v = people.p[i] + k * people.p_std[i] * side[0], people.v[i] + k * people.v_std[i] * side[1]
@@ -111,7 +111,7 @@ def worst(people: HumanStates, limits: LimitSet, margins: Margins, seed: int, co
 @pytest.mark.parametrize("std", [0.0, 0.1], ids=["known", "uncertain"])
 def test_no_motion_leaves(limits: LimitSet, std: float) -> None:
     people = uncertain(random_states(limits, 40, 3), 0.5 * std, std, 0.05 * std)
-    margins = BARE if std == 0.0 else Margins(sigmas=2.0, legs=False)
+    margins = BARE if std == 0.0 else Occupancy(sigmas=2.0, legs=False)
     out, where = worst(people, limits, margins, 1)
     assert out <= 0.0, where
 
@@ -119,7 +119,7 @@ def test_no_motion_leaves(limits: LimitSet, std: float) -> None:
 def test_paper_lets_motions_out_that_sound_holds() -> None:
     """The motions drawn here have teeth: the same ones leave the volumes of ``paper``."""
     people, rng = random_states(PAPER, 40, 3), np.random.default_rng(1)
-    printed = predict(people, PAPER, horizon_s=T, radii=Radii(), method="paper")
+    printed = predict(people, PAPER, horizon_s=T, method="paper")
     out = np.full(len(LIMBS), -np.inf)
     for i in range(len(people)):
         c, s = np.cos(people.p[i, 2]), np.sin(people.p[i, 2])
@@ -138,7 +138,7 @@ def test_it_is_hardly_larger_than_paper() -> None:
     people = random_states(PAPER, 60, 15)
     totals = []
     for method in ("paper", "sound"):
-        swept = predict(people, PAPER, horizon_s=T, radii=Radii(), method=method, margins=BARE)
+        swept = predict(people, PAPER, horizon_s=T, method=method, margins=BARE)
         totals.append(
             [
                 sum(sphere_swept_volume_m3(swept.vertices(i, k), swept.radius_m[i, k]) for k in range(len(LIMBS)))
@@ -212,7 +212,7 @@ def test_a_polytope_holds_every_turned_point() -> None:
 
 def test_unknown_lengths_are_in_the_volumes() -> None:
     people = uncertain(random_states(PAPER, 30, 9), 0.0, 0.0, 0.01)
-    margins = Margins(sigmas=3.0, legs=False)
+    margins = Occupancy(sigmas=3.0, legs=False)
     out, where = worst(people, PAPER, margins, 5)
     assert out <= 0.0, where
     assert volumes(people, PAPER, margins).radius_m[0, LIMBS.index("HD")] == pytest.approx(0.12 + 0.03)
@@ -256,12 +256,12 @@ def test_residual_hand_and_legs() -> None:
     people = random_states(PAPER, 2, 13)
     residual = np.array([[np.nan] * 7, [*[0.05] * 6, np.nan]])
     people = dataclasses.replace(people, residual_m=residual)
-    swept = volumes(people, PAPER, Margins(sigmas=0.0))
+    swept = volumes(people, PAPER, Occupancy(sigmas=0.0))
     assert swept.limbs == (*LIMBS, "LEGS")
     assert swept.radius_m[:, -1] == pytest.approx([0.20 + 0.10, 0.20 + 0.05])  # not known yet: that of most people
     assert swept.radius_m[0, :-1] - swept.radius_m[1, :-1] == pytest.approx(0.05)
-    assert volumes(people, PAPER, dataclasses.replace(BARE, residual=False)).radius_m[1] == pytest.approx(
-        Radii().of_limbs()
+    assert volumes(people, PAPER, BARE.model_copy(update={"residual": False})).radius_m[1] == pytest.approx(
+        limb_radii(Occupancy())
     )
     legs = swept.vertices(0, len(LIMBS))
     assert (legs[:, 2].min(), legs[:, 2].max()) == (0.0, people.lengths_m[0, 0])
@@ -277,18 +277,18 @@ def test_legs_are_as_wide_as_they_were_seen() -> None:
     residual = np.full((len(seen_m), 7), 0.02)
     residual[:, 1], residual[:, 6] = thorax_m, seen_m
     people = dataclasses.replace(people, residual_m=residual)
-    swept = volumes(people, PAPER, dataclasses.replace(BARE, legs=True))
+    swept = volumes(people, PAPER, BARE.model_copy(update={"legs": True}))
     assert swept.radius_m[:, 6] == pytest.approx([0.27, 0.27, 0.27, 0.33, 0.53, 0.53])
-    wide = dataclasses.replace(BARE, legs=True, legs_radius_m=0.3)
+    wide = BARE.model_copy(update={"legs": True, "legs_radius_m": 0.3})
     assert volumes(people, PAPER, wide).radius_m[:, 6] == pytest.approx([0.37, 0.37, 0.37, 0.37, 0.53, 0.60])
-    deaf = dataclasses.replace(BARE, legs=True, residual=False)
+    deaf = BARE.model_copy(update={"legs": True, "residual": False})
     assert volumes(people, PAPER, deaf).radius_m[:, 6] == pytest.approx(0.20)
     assert volumes(people).radius_m == pytest.approx(swept.radius_m[:, :6])  # no lower body, and no other limb's radius
 
 
 def test_one_tick_has_the_bits_of_many() -> None:
     people = uncertain(random_states(HUMAN, 20, 16), 0.05, 0.3, 0.004)
-    whole = volumes(people, HUMAN, Margins())
-    alone = [volumes(people.rows(slice(i, i + 1)), HUMAN, Margins()) for i in range(len(people))]
+    whole = volumes(people, HUMAN, Occupancy(sigmas=3.0))
+    alone = [volumes(people.rows(slice(i, i + 1)), HUMAN, Occupancy(sigmas=3.0)) for i in range(len(people))]
     assert np.concatenate([tick.vertices_m for tick in alone]).tobytes() == whole.vertices_m.tobytes()
     assert len(volumes(people.rows(slice(0, 0)))) == 0

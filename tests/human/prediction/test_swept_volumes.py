@@ -9,12 +9,14 @@ from scipy.spatial import ConvexHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.convex_hull import sphere_swept_volume_m3
 from hrcreplay.human.model import LimitSet, clamp, skeleton
-from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.human.prediction.reachable_sets import METHODS, PRINTED, reachable
-from hrcreplay.human.prediction.swept_volumes import Radii
+from hrcreplay.human.prediction.reachable_sets import METHODS, PRINTED
+from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
+from hrcreplay.settings.sections import Occupancy
+from tests.human import predictions
 from tests.human.people import LENGTHS_M, directions, limb_points, random_states, raw_cloud, states
+from tests.human.predictions import reachable
 
 T = 0.377
 PAPER, HUMAN = load_limits("paper"), load_limits("human")
@@ -22,7 +24,7 @@ ALONG = directions(1500, 1)
 
 
 def predict(people: HumanStates, limits: LimitSet = PAPER, method: str = "paper", horizon_s: float = T) -> SweptVolumes:
-    return swept_volumes.predict(people, limits, horizon_s=horizon_s, radii=Radii(), method=method)
+    return predictions.predict(people, limits, horizon_s=horizon_s, method=method)
 
 
 def support(points: Floats) -> Floats:
@@ -88,7 +90,7 @@ def test_every_posture_in_the_reachable_sets_is_inside(method: str) -> None:
 def test_the_older_method_needs_more_room() -> None:
     """Fig. 17."""
     people = random_states(PAPER, 60, 15)
-    radii = Radii().of_limbs()
+    radii = limb_radii(Occupancy())
     paper, positions = (
         np.array(
             [

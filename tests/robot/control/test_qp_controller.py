@@ -11,6 +11,7 @@ from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.control.qp_controller import Solution, Unsolved, pose_error, solve, step
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.settings.sections import Plan
 from tests.robot.checker import links, violation
 from tests.robot.distances import by_coal
 from tests.robot.people import person, volumes
@@ -121,7 +122,7 @@ def test_as_printed_a_position_error_does_not_decay(robot: RobotModel) -> None:
     for gain in (0.0, 5.0):
         state = RobotState(HOME, np.zeros(6))
         for _ in range(500):
-            state = step(robot, state, T, np.zeros(6), nobody, replace(SETTINGS, path_gain_per_s=gain)).next
+            state = step(robot, state, T, np.zeros(6), nobody, replace(SETTINGS, plan=Plan(path_gain_per_s=gain))).next
         left[gain] = T[0, 3] - robot.pose(state.q, state.dq).T_world_tcp[0, 3]
     assert left[0.0] > 0.0099
     assert abs(left[5.0]) < 1e-5

@@ -17,12 +17,13 @@ from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.programme.path import programmed
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.settings.sections import Plan
 from tests.robot.checker import violation
 from tests.robot.distances import by_coal
 from tests.robot.people import person, volumes
 
 STOP_S, DT_S = 0.377, 0.004
-SETTINGS = PlanSettings(dt_s=DT_S, stop_s=STOP_S)
+SETTINGS = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)
 
 
 def base() -> Floats:
@@ -137,7 +138,7 @@ def test_without_a_known_person_it_brakes_along_the_path_until_it_stands(
 
 def test_a_tcp_limit_scales_the_speed(robot: RobotModel, reference: Reference) -> None:
     nobody = obstacles(volumes([np.full((1, 3), 50.0)]), 0)
-    slow, state, fastest = replace(SETTINGS, tcp_speed_max=0.2), PathState(0.0, 0.0), 0.0
+    slow, state, fastest = replace(SETTINGS, plan=Plan(tcp_speed_max=0.2)), PathState(0.0, 0.0), 0.0
     for _ in range(400):
         made, state = step(robot, reference, state, nobody, slow)
         fastest = max(fastest, np.abs(made.pose.J_tcp @ made.next.dq)[:3].max())

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from hrcreplay.robot.programme.reference import Leash, Reference, advance
+from hrcreplay.robot.programme.reference import Reference, advance
+from hrcreplay.settings.sections import Plan
 from tests.robot.tasks import pick_and_place, robot
 
 __all__ = ["pick_and_place", "robot"]  # fixtures
 
 
 def test_time_runs_with_the_clock(pick_and_place: Reference) -> None:
-    assert advance(pick_and_place, 1.0, 0.004, 9.0, Leash("time")) == (1.004, 1.0)
+    assert advance(pick_and_place, 1.0, 0.004, 9.0, Plan(reference="time")) == (1.004, 1.0)
 
 
 def test_path_waits_on_a_taut_leash_and_never_turns_back(pick_and_place: Reference) -> None:
-    leash = Leash("path", length_m=0.05, waypoint_m=0.05)
+    leash = Plan(reference="path", leash_m=0.05, waypoint_m=0.05)
     errors = np.linspace(0, 0.08, 400)
     steps = [advance(pick_and_place, 1.0, 0.004, e, leash) for e in errors]
     rates = np.array([rate for _, rate in steps])
@@ -33,7 +34,7 @@ def test_path_waits_on_a_taut_leash_and_never_turns_back(pick_and_place: Referen
 
 def test_a_held_robot_is_waited_for_and_skips_no_waypoint(pick_and_place: Reference) -> None:
     """The robot stands for two seconds in the middle of a move, then evades by 12 cm, and goes on from there."""
-    tick, leash = 0.004, Leash("path", length_m=0.25, waypoint_m=0.01)
+    tick, leash = 0.004, Plan(reference="path", leash_m=0.25, waypoint_m=0.01)
     s, tcp = 0.0, pick_and_place.sample(0.0).T_world_tcp[:3, 3]
     passed, evaded = [], 0.0
     for k in range(4500):
@@ -43,7 +44,7 @@ def test_a_held_robot_is_waited_for_and_skips_no_waypoint(pick_and_place: Refere
         if not 100 <= k < 600:
             tcp = tcp + min(1.0, 1.2 * tick / max(way, 1e-12)) * (goal - tcp)
         error = float(np.linalg.norm(target - tcp))
-        assert error < leash.length_m + 2.2 * tick
+        assert error < leash.leash_m + 2.2 * tick
         s_next, rate = advance(pick_and_place, s, tick, error, leash)
         assert s <= s_next <= s + tick
         passed += [error for arrival in pick_and_place.waypoints_s if s <= arrival < s_next]

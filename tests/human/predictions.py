@@ -1,0 +1,34 @@
+"""Predictions by a method's name, with the defaults of the settings beside."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hrcreplay.human.model import LimitSet
+from hrcreplay.human.prediction import reachable_sets, swept_volumes
+from hrcreplay.human.prediction.reachable_sets import Reach
+from hrcreplay.records import HumanStates, SweptVolumes
+from hrcreplay.settings.sections import Fusion, Occupancy
+
+MEMORY_S = Fusion().memory_s
+
+
+def margins(**changes: Any) -> Occupancy:
+    """Settings whose estimates are wide: 3 standard deviations, unless another number is given."""
+    return Occupancy(**({"sigmas": 3.0} | changes))
+
+
+def predict(
+    people: HumanStates, limits: LimitSet, *, horizon_s: float, method: str, margins: Occupancy | None = None
+) -> SweptVolumes:
+    """See swept_volumes.predict."""
+    occupancy = (margins or Occupancy()).model_copy(update={"method": method})
+    return swept_volumes.predict(people, limits, occupancy, horizon_s=horizon_s, memory_s=MEMORY_S)
+
+
+def reachable(
+    people: HumanStates, limits: LimitSet, horizon_s: float, method: str, margins: Occupancy | None = None
+) -> Reach:
+    """See reachable_sets.reachable."""
+    occupancy = (margins or Occupancy()).model_copy(update={"method": method})
+    return reachable_sets.reachable(people, limits, occupancy, horizon_s=horizon_s, memory_s=MEMORY_S)
