@@ -1,5 +1,7 @@
 """Sections of the settings, one pydantic model each. Defaults are the paper's where it gives one.
 
+Where an equation is called corrected, docs/paper.md says how.
+
 Sections of the settings that only a live session has.
 """
 
