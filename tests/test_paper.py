@@ -30,13 +30,15 @@ Label = tuple[str, str]
 
 
 def equations(listed: str) -> set[Label]:
-    """The equations of a list like ``(12), (14)-(16)``; an end of a range with parts brings them all."""
+    """The equations of a list like ``(12), (14)-(16)``; an equation with parts at a range's end brings them all."""
     found = set()
     for first, last in re.findall(r"\((\w+)\)(?:-\((\w+)\))?", listed):
-        start, end = EQUATIONS.index(first), EQUATIONS.index(last or first)
-        assert start <= end, f"({first})-({last})"
-        if last.isdigit() and int(last) in PARTS:
-            end += len(PARTS[int(last)])
+        if not last or last not in EQUATIONS or first not in EQUATIONS:
+            found |= {("Eq.", label) for label in (first, last) if label}
+            continue
+        start, end = EQUATIONS.index(first), EQUATIONS.index(last)
+        assert start < end, f"({first})-({last})"
+        end += len(PARTS.get(int(last), "")) if last.isdigit() else 0
         found |= {("Eq.", label) for label in EQUATIONS[start : end + 1]}
     return found
 
