@@ -35,11 +35,11 @@ _DEGREE = np.pi / 180.0
 
 @dataclass(frozen=True)
 class LimitSet:
-    """Bounds on the joints of Eq. (37), (12,) each, [m, m, rad...] and their derivatives.
+    """Bounds on the joints of Eq. (37), as in Table 1, (12,) each, [m, m, rad...] and their derivatives.
 
     The velocity and acceleration bounds of x and y bound v (forward) and v_perp (to the left) in the body frame,
-    Eq. (25), (26). Heading has no position bound (+-inf). Where ``coupled``, alpha_2 and alpha_3 obey (34b), (34c)
-    and their own entries in ``p_min``/``p_max`` only enclose them.
+    Eq. (18), (25), (26). Heading has no position bound (+-inf). Where ``coupled``, alpha_2 and alpha_3 obey
+    Eq. (34b), (34c) and their own entries in ``p_min``/``p_max`` only enclose them.
     """
 
     name: str
@@ -161,7 +161,7 @@ def _clamp_rows(p: Floats, p_min: Floats, p_max: Floats, coupled: bool) -> None:
 
 @njit(cache=True)
 def clamp_row(p: Floats, p_min: Floats, p_max: Floats, coupled: bool, low: Floats, high: Floats) -> None:
-    """Clamps one posture (12,) in place and writes the bounds that held for it into low, high (12,)."""
+    """Eq. (62) for one posture (12,) in place; writes the bounds that held for it into low, high (12,)."""
     for j in range(12):
         low[j], high[j] = p_min[j], p_max[j]
         if j == 2:  # Table 1's +-pi is a wrap, not a stop

@@ -23,6 +23,8 @@ _COUPLED = ("ar2", "ar3", "al2", "al3")
 def load_limits(name_or_path: str | Path) -> LimitSet:
     """A limit set that ships with the package, by its name, or one of the user's, by the path of its TOML file.
 
+    ``paper`` is Table 1.
+
     Args:
         name_or_path: ``paper``, ``human``, ``people`` or a file like theirs: ``coupled`` and a table ``joints`` with
             a row ``{ position = [low, high], velocity = [...], acceleration = [...] }`` for each of JOINTS
@@ -141,7 +143,7 @@ def _pair(value: Any, where: str) -> tuple[float, float]:
 
 
 def _enclose(bounds: Floats) -> None:
-    """Writes what (34b), (34c) allow at most as the position bounds of alpha_2 and alpha_3 into (12, 3, 2)."""
+    """Writes what Eq. (34b), (34c) allow at most as the position bounds of alpha_2 and alpha_3 into (12, 3, 2)."""
     for first in (JOINTS.index("ar1"), JOINTS.index("al1")):
         bounds[first + 1, 0] = alpha_2_bounds(*bounds[first, 0])
         bounds[first + 2, 0] = alpha_3_bounds(*bounds[first, 0], *bounds[first + 1, 0])

@@ -31,7 +31,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Segment:
-    """A capsule around one link. Both ends are fixed on the same body, as the derivation of Eq. (5) needs."""
+    """A capsule around one link, whose axis is that of Eq. (4). Both ends are on one body, as Eq. (5) needs."""
 
     name: str
     body: str  #: URDF link or joint whose frame the ends are given in

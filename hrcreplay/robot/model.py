@@ -64,7 +64,9 @@ class RobotModel:
         return len(self.joint_names)
 
     def pose(self, q: Floats, dq: Floats) -> RobotPose:
-        """Forward kinematics, Jacobians and Jdot dq of Eq. (66b) at one instant.
+        """Forward kinematics, Jacobians and Jdot dq of Eq. (66b), corrected, and Eq. (66c) at one instant.
+
+        The print has two dots on J in Eq. (66b); one is right: docs/paper.md.
 
         Args:
             q: (nv,) [rad].
@@ -114,7 +116,8 @@ def _jacobians(
         J_tcp[3:, j] = J[3:, j]
         twist += J_tcp[:, j] * dq[j]
         dJdq += dJ[:, j] * dq[j]
-    # acceleration of the TCP itself from the spatial one: d/dt (v_O + w x p) = a_O + dw x p + w x v_p
+    # Jdot dq of Eq. (66b), (66c): acceleration of the TCP itself from the spatial one,
+    # d/dt (v_O + w x p) = a_O + dw x p + w x v_p
     dJdq[:3] += _cross(dJdq[3:], tcp) + _cross(twist[3:], twist[:3])
     return J_tcp, dJdq, J_points
 

@@ -1,6 +1,7 @@
 """Every setting, with its unit and its default, in sections. Defaults are the paper's where it gives one.
 
-The stages take these sections as they are; only the drivers load them from files.
+The stages take these sections as they are; only the drivers load them from files. Where an equation is called
+corrected, docs/paper.md says how.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Fusion of several cameras into one moving person, Alg. 3.
+"""Fusion of several cameras into one moving person, Alg. 3; corrections to the paper: docs/paper.md.
 
 Offline reference: the fused person once more, knowing what came after (Rauch, Tung, Striebel).
 """
@@ -83,11 +83,11 @@ def fuse(
 ) -> tuple[FusionState, HumanStates, Counter[str]]:
     """Alg. 3: one tick after another, each with the frames that arrived in (previous tick, tick].
 
-    The filter is that of (42)-(57) with (44) corrected: per joint p, v, a, j under Eq. (43), per length a constant;
-    rows that are not valid are switched off in H. After each tick the state is saturated by (62)-(65) and fed back;
-    P is not changed by it. Where ``delay`` is compensated, a row measures p - d v + d^2/2 a - d^3/6 j, d the age of
-    the frame at the tick. Each arm is measured by the name nearest to the estimate (see branches), heading by the
-    nearest turn, so neither jumps. A joint unseen for ``coast_s`` has its derivatives damped and its covariance
+    The filter is that of Eq. (42)-(57) with Eq. (44) corrected: per joint p, v, a, j under Eq. (43), per length a
+    constant; rows that are not valid are switched off in H. After each tick the state is saturated by Eq. (62)-(65)
+    and fed back; P is not changed by it. Where ``delay`` is compensated, a row measures p - d v + d^2/2 a - d^3/6 j,
+    d the age of the frame at the tick. Each arm is measured by the name nearest to the estimate (see branches), heading
+    by the nearest turn, so neither jumps. A joint unseen for ``coast_s`` has its derivatives damped and its covariance
     growing; unseen for ``memory_s`` it is lost and starts anew from its next valid row. All is finite from the first
     valid row on: joints not yet seen stand at a neutral posture with a large standard deviation. How far the body is
     from its model, and for how long a limb has not been seen, is kept beside the filter and changes nothing in it.

@@ -39,7 +39,7 @@ _UNKNOWN_M = 0.1
 
 @njit(cache=True)
 def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
-    """Which rows of a new frame are valid, 4.1.2, and which limbs it shows whole."""
+    """Which rows of a new frame are valid, 4.1.2 and Eq. (58), and which limbs it shows whole."""
     trusted = np.ones(len(filter_.point_ns), dtype=np.bool_)
     if filter_.started[0]:
         trusted = _agreeing(filter_, c, now, rules) & _whole(filter_, c, now, rules)

@@ -144,7 +144,7 @@ def _measure_rows(
 
 @njit(cache=True)
 def _variances_row(points: Floats, point_variance: Floats, variances: Floats) -> None:
-    """Variance of every row by the Jacobian's squares; second order makes it outgrow what a circle can tell."""
+    """Eq. (47), variance of every row by the Jacobian's squares; second order: it outgrows what a circle can tell."""
     J = inverse_jacobian(points)
     for row in range(ROWS):
         variance = 0.0

@@ -1,6 +1,6 @@
 """The arrays that the kernels of the fusion share.
 
-The Kalman filter of one joint: four states p, v, a, j, Eq. (42)-(57).
+The Kalman filter of one joint: four states p, v, a, j, Eq. (42)-(57); corrections: docs/paper.md.
 
 How uncertain the fused state truly is: the variances that the filter tells, times what innovations say of them.
 
@@ -118,12 +118,13 @@ def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
 
 @njit(cache=True)
 def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> None:
-    """Eq. (48), (49) over dt seconds, mean (4,) and P (4, 4) in place.
+    """Eq. (42), (48), (49) over dt seconds, mean (4,) and P (4, 4) in place.
 
+    x, y and heading are joints like the others, with world velocities of their own: the linear model of Eq. (31).
     F is upper triangular, so that each row is done before the rows it needs change. With a damping below 1 the
     derivatives also forget: towards rest, give or take ``rest_std`` (3,).
     """
-    taylor = (1.0, dt, dt**2 / 2.0, dt**3 / 6.0)  # F of Eq. (43)
+    taylor = (1.0, dt, dt**2 / 2.0, dt**3 / 6.0)  # F of Eq. (43), corrected: s is p, v, a, j
     for a in range(4):
         kept = damping if a > 0 else 1.0
         mean[a] = kept * _ahead(taylor, mean, a)
@@ -148,21 +149,21 @@ def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> floa
 
 @njit(cache=True)
 def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
-    """The Kalman update of one joint by one scalar row; returns the innovation squared over its variance.
+    """Eq. (52)-(57) for one joint and one scalar row; returns the innovation squared over its variance.
 
     A row whose innovation has no variance, or none that a number can hold, tells nothing: it changes nothing.
     """
     Ph = np.empty(4)
     for a in range(4):
         Ph[a] = dot(P[a], h)
-    S = dot(h, Ph) + R
-    innovation = z - dot(h, mean)
+    S = dot(h, Ph) + R  # Eq. (53): K = Ph / S
+    innovation = z - dot(h, mean)  # Eq. (52)
     if not (0.0 < S < np.inf and np.isfinite(innovation)):
         return 0.0
     for a in range(4):
-        mean[a] += Ph[a] / S * innovation
+        mean[a] += Ph[a] / S * innovation  # Eq. (54), (56)
         for b in range(4):
-            P[a, b] -= Ph[a] * Ph[b] / S
+            P[a, b] -= Ph[a] * Ph[b] / S  # Eq. (55), corrected: (I - K H) P; Eq. (57)
     return innovation**2 / S
 
 

@@ -1,4 +1,4 @@
-"""One tick of Alg. 3 on plain arrays. The filter of (42)-(57) is 12 filters of four states and 8 of one.
+"""One tick of Alg. 3 on plain arrays. The filter of Eq. (42)-(57) is 12 filters of four states and 8 of one.
 
 Bounds on the fused state, Eq. (62)-(65).
 """
@@ -21,7 +21,10 @@ _NAME_MARGIN = np.radians(20.0)
 
 @njit(cache=True)
 def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Track) -> None:
-    """Runs the ticks, changing the filter in place. Frames must have arrived by the last tick."""
+    """Alg. 3 over the ticks, changing the filter in place. Frames must have arrived by the last tick.
+
+    Without a valid row the a-priori estimate stays as it is, Eq. (50), (51).
+    """
     damping = np.ones(12)
     seen = 0
     for k in range(len(ticks_ns)):
@@ -49,7 +52,10 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
 
 @njit(cache=True)
 def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
-    """The a-priori estimate. A joint unseen for longer than ``coast_ns`` comes to rest: no jerk can be followed far."""
+    """The a-priori estimate, Eq. (48), (49).
+
+    A joint unseen for longer than ``coast_ns`` comes to rest: no jerk can be followed far.
+    """
     dt = (now - filter_.tick_ns[0]) * 1e-9
     for j in range(12):
         damping[j] = np.exp(-dt / rules.rest_s) if now - filter_.row_ns[j] > rules.coast_ns else 1.0
@@ -80,7 +86,9 @@ def _collect(frames: Frames, seen: int, now: int, filter_: Filter, track: Track)
 def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bool:
     """Eq. (52)-(57) with the valid rows of one camera's frame, row after row; whether there was one.
 
-    One scalar row at a time is exact because R is diagonal. R of a frame used for the n-th time is n sigma_z^2.
+    One scalar row at a time is exact because R of Eq. (47) is diagonal. R of a frame used for the n-th time is
+    n sigma_z^2 (4.1.1). A row of H of Eq. (45), (46) is ``h``: the identity's where d = 0, else Eq. (43) backwards.
+    A row that is not valid is left out, which is Eq. (58), corrected: docs/paper.md.
     """
     filter_.uses[c] += 1
     if not filter_.valid[c].any():
@@ -181,6 +189,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
 def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
     """Eq. (62)-(65) on the state of all joints (12, 4), then the same for the accelerations, in place.
 
+    That is Eq. (61), the solution of Eq. (59a), (59b), (60) for bounds that do not depend on each other.
     The filter goes on from the saturated state; P is not changed by it. x and y are bounded along and across the
     body, Eq. (33), and turned back, Eq. (32). A joint's velocity may not carry it over its position bound within dt,
     its acceleration not over its velocity bound; without a dt yet (0) only the plain bounds hold.

@@ -67,7 +67,7 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
     """Where the stops of joint j can be while the joints that they depend on are in [low, high].
 
     A stop outside of all of them holds always; one inside of all may be where the joint is stopped. The coupled ones,
-    (34b) and (34c), are monotonic or bilinear: their extremes are at the corners.
+    Eq. (34b), (34c), are monotonic or bilinear: their extremes are at the corners.
     """
     if not coupled or j not in (5, 6, 9, 10):
         return bounds[0, j], bounds[0, j], bounds[1, j], bounds[1, j]
@@ -89,7 +89,7 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
 def interval(
     p: tuple[float, float], v: tuple[float, float], speed: Floats, limit: Stops, horizon: float
 ) -> tuple[float, float]:
-    """What a joint between stops can reach at any time in [0, horizon].
+    """What a joint between stops can reach at any time in [0, horizon]; stands for Alg. 1 under ``sound``.
 
     A stop takes the velocity into it away at once: from there the joint starts again from rest. A state that may be
     beyond a stop brakes outward and then stays; a stop takes nothing away from what the state itself encloses.

@@ -1,4 +1,4 @@
-"""What every joint can reach within the horizon: Eq. (18)-(30), corrected, and Alg. 1."""
+"""What every joint can reach within the horizon: Eq. (18)-(30), corrected, and Alg. 1; see docs/paper.md."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PAPER, SOUND = METHODS.index("paper"), METHODS.index("sound")
 
 @dataclass(frozen=True)
 class Reach(Table):
-    """Reachable interval of every joint, a row a tick. It always holds the current posture, Eq. (40)."""
+    """Reachable interval of every joint, a row a tick, Eq. (36), (38), (39). The current posture is in it, Eq. (40)."""
 
     t_ns: Ints  #: (n,)
     low: Floats  #: (n, 12) JOINTS [m, m, rad...]; NaN where the state is
@@ -35,10 +35,10 @@ def reachable(
 
     ``paper``: Eq. (20)-(30), corrected, for walking and Alg. 1 for the other joints: from positions, velocities and
     bounds on velocity and acceleration. ``positions``: the older way of [26], from positions and velocity bounds.
-    Both hold the angles within their limits, with (34b), (34c) taken over the reachable interval of what they depend
-    on; a posture that is itself outside stays included. An arm joint that nobody ever measured may be anywhere within
-    its limits, whatever the method. ``sound``: every motion under the limits from every likely
-    state, at all times until the horizon and the latency are over; x and y are those of a polygon, see ``stroll``.
+    Both hold the angles within their limits, with Eq. (34b), (34c) taken over the reachable interval of what they
+    depend on; a posture that is itself outside stays included. An arm joint that nobody ever measured may be
+    anywhere within its limits, whatever the method. ``sound``: every motion under the limits from every likely state,
+    at all times until the horizon and the latency are over; x and y are those of a polygon, see ``stroll``.
 
     Args:
         states: The fused person.
@@ -110,7 +110,10 @@ def reach_row(
     low: Floats,
     high: Floats,
 ) -> None:
-    """Writes the reachable interval of every joint from p, v (12,) into low, high (12,); ``never`` was it measured."""
+    """Writes the reachable interval of every joint from p, v (12,) into low, high (12,); ``never`` was it measured.
+
+    Alg. 1 and its clipping to Eq. (34), (35); walking is Eq. (18)-(30).
+    """
     _walk(p, v, bounds, horizon, method, low, high)
     for j in range(3, 12):
         if method == PAPER:
@@ -140,13 +143,13 @@ def _include(p: Floats, j: int, low: Floats, high: Floats) -> None:
 
 @njit(cache=True)
 def _joint(p: float, v: float, bounds: Floats, horizon: float) -> tuple[float, float]:
-    """Alg. 1 for one joint; its bounds are v_min, v_max, a_min, a_max."""
+    """Alg. 1, corrected, for one joint; its bounds are v_min, v_max, a_min, a_max."""
     return _farthest(p, v, bounds[0], bounds[2], horizon), _farthest(p, v, bounds[1], bounds[3], horizon)
 
 
 @njit(cache=True)
 def _farthest(p: float, v: float, v_bound: float, a_bound: float, horizon: float) -> float:
-    """Where a joint gets that accelerates at its bound until it reaches its velocity bound at T*."""
+    """Where a joint gets that accelerates at its bound until it reaches its velocity bound at T* of Alg. 1."""
     t_star = max(0.0, min((v_bound - v) / a_bound, horizon))  # an estimate over the bound has T* < 0
     if t_star == horizon:
         return p + v * horizon + 0.5 * a_bound * horizon**2
@@ -166,15 +169,15 @@ def _walk(p: Floats, v: Floats, bounds: Floats, horizon: float, method: int, low
     if method == PAPER:
         body = (c * v[0] + s * v[1], c * v[1] - s * v[0], v[2])
         for k in range(3):
-            gain = bounds[5, k] * horizon
+            gain = bounds[5, k] * horizon  # Eq. (27), (28), corrected: k = 1 is the lateral acceleration
             most[k] = min(body[k] + gain, most[k])
             if k > 0:  # the print lets a walker stop at once: its v^min is the bound, whatever the acceleration
                 least[k] = max(body[k] + bounds[4, k] * horizon, least[k])
     ahead = (least[0] * horizon, most[0] * horizon)
     left = (least[1] * horizon, most[1] * horizon)
-    low[0], high[0] = _sum(p[0], c, ahead, -s, left)
-    low[1], high[1] = _sum(p[1], s, ahead, c, left)
-    low[2], high[2] = p[2] + least[2] * horizon, p[2] + most[2] * horizon
+    low[0], high[0] = _sum(p[0], c, ahead, -s, left)  # Eq. (22), (29)
+    low[1], high[1] = _sum(p[1], s, ahead, c, left)  # Eq. (23), (30)
+    low[2], high[2] = p[2] + least[2] * horizon, p[2] + most[2] * horizon  # Eq. (20), (21), corrected, (24)
     for k in range(3):
         _include(p, k, low, high)
 

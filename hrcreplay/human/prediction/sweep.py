@@ -25,7 +25,7 @@ _X, _Y, _Z = 0, 1, 2
 
 @njit(cache=True)
 def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tuple[Floats, Floats]:
-    """A limb's end points in the frame of its first rotation, and the rotations from there to the human base.
+    """A limb's end points in the frame of its first rotation, and the rotations from there to the human base, Alg. 2.
 
     A row of the chain is: axis, smallest and largest angle [rad], then the origin of its frame in the next (3,) [m].
     What follows is walking. The thorax also spans the shoulder line, whose midpoint is the neck.
@@ -61,7 +61,8 @@ def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tu
     return points, np.array([turn_4, turn_3, turn_2, turn_1, turn_rho])
 
 
-#: Largest angle that one triangle spans [rad]: its apex is then at most 15.5 % of the radius off the arc.
+#: Largest angle that one triangle spans [rad], Alg. 2, corrected (docs/paper.md): its apex is then at most 15.5 % of
+#: the radius off the arc.
 TRIANGLE_RAD = np.pi / 3.0
 #: Most points that a rotation makes of one: both ends and an apex for each of six triangles.
 MOST_COPIES = 8
@@ -95,7 +96,7 @@ def sweep_lin(points: Floats, count: int, axis: int, low: float, high: float, sw
 def sweep_rot(
     points: Floats, count: int, axis: int, low: float, high: float, swept: Floats, widest: float = TRIANGLE_RAD
 ) -> int:
-    """Rotational sweep about a coordinate axis through the origin, Fig. 8: arcs inside triangles.
+    """Rotational sweep about a coordinate axis through the origin, Fig. 8 and Alg. 2: arcs inside triangles.
 
     An arc is cut into equal pieces of at most ``widest``; each lies in the triangle of its ends and the point where
     their tangents meet. A cut lies on the tangent that its two triangles share, between their apexes, so only the
@@ -178,7 +179,7 @@ def sweep_walk(
     swept: Floats,
     widest: float = TRIANGLE_RAD,
 ) -> int:
-    """Rotational sweep about the z axis, then a translational one over a polygon.
+    """Rotational sweep about the z axis, then a translational one over a polygon, Fig. 7: the end of Alg. 2.
 
     Args:
         points: (m, 3), of which the first ``count`` are what ``keep_corners`` kept, in the human base frame [m].

@@ -1,4 +1,4 @@
-"""Swept volumes that enclose: every motion of model (25) with the stops (34), over all times, from all likely states.
+"""Swept volumes that enclose every motion of Eq. (25) with the stops of Eq. (34), at all times, from all likely states.
 
 Why no motion leaves them, step by step:
 
@@ -286,7 +286,7 @@ def _legs(corners: Floats, height: float) -> tuple[Floats, int]:
 def _limb(
     limb: int, low: Floats, high: Floats, corners: Floats, lengths: Floats, off: Floats, hand: float, work: Surface
 ) -> tuple[Floats, int]:
-    """Points around all that a limb reaches; a NaN vertex where the state or the lengths are NaN."""
+    """Points around all that a limb reaches, in place of Alg. 2; a NaN vertex where state or lengths are NaN."""
     ends, chain = kinematic_chain(limb, low, high, lengths)
     ends = _longest(limb, ends, off, hand)
     if not np.isfinite(ends.sum() + chain.sum() + corners.sum() + low[2] + high[2]):

@@ -1,4 +1,4 @@
-"""Where model (25) can walk: a polygon around all displacements, over all headings, velocities and times.
+"""Where the model of Eq. (25) can walk: a polygon around all displacements, over all headings, velocities and times.
 
 The displacement at time t along u(phi) is the integral of u . Rz(theta) (v, v_perp). At every instant theta, v and
 v_perp are in intervals of their own, so the integral is at most that of
@@ -58,6 +58,8 @@ def body_velocity(v: Floats, spread: Floats, heading: Range) -> tuple[Range, Ran
 @njit(cache=True)
 def walked(heading: Range, velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float, far: Floats) -> None:
     """Adds to far (SIDES,) how far the pelvis gets along each side's direction at any time in [0, horizon] [m].
+
+    Stands for Eq. (20)-(30), whose box does not hold all motions of Eq. (25): docs/paper.md.
 
     Args:
         heading: Initial headings [rad].

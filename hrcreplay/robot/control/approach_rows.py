@@ -1,4 +1,4 @@
-"""Speed limits on the robot's links from the swept volumes, Eq. (12)-(16).
+"""Speed limits on the robot's links from the swept volumes, Eq. (12)-(16); corrections: docs/paper.md.
 
 The minimiser of Eq. (66) over all rows, found with few of them.
 """
@@ -72,8 +72,8 @@ class Approach(NamedTuple):
     vertices_m: Floats  #: (m, 3) of all limbs [m]
     offsets: Ints  #: (l + 1,) where each limb's vertices begin
     boxes_m: Floats  #: (l, 2, 3) around each limb's vertices [m]
-    room_m2: Floats  #: (s, l) right-hand side for every pair of link and limb [m^2]
-    stop_s: float  #: T_s [s]
+    room_m2: Floats  #: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2]
+    stop_s: float  #: T_s of Eq. (70) [s]
 
 
 def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, stop_s: float) -> Approach:
@@ -84,10 +84,11 @@ def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, stop_s: fl
 
 @njit(cache=True)
 def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, Floats, Floats]:
-    """The row of Eq. (16) that a velocity breaks most, for every pair and either end of the link.
+    """The row of Eq. (16) that a velocity breaks most, for every pair and either end of the link; Eq. (66i), corrected.
 
     The rows are linear in the vertex, so the worst vertex is the one furthest along the end's velocity: one pass
-    over the vertices checks them all, without any row being written down.
+    over the vertices checks them all, without any row being written down. For a vertex r and an end's velocity v,
+    Eq. (15), (16) times the joint velocity is T_s (r @ v + rest), and rest does not depend on r.
 
     Args:
         rows: Of the tick.
@@ -104,9 +105,9 @@ def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, 
     A, values = np.empty((len(which), len(dq_next))), np.empty(len(which))
     n = 0
     for s in range(links):
-        for end in range(2):
+        for end in range(2):  # Eq. (7)-(9), (11): linear along the link, so s = 0 and s = 1 bound all points between
             v = _times(J_ends[s, end], dq_next)
-            rest = -dot3(ends[s, 0], v)
+            rest = -dot3(ends[s, 0], v)  # Eq. (15): E_1 @ dq
             if end == 1:
                 rest -= dot3(ends[s, 1] - ends[s, 0], _times(J_ends[s, 0], dq_next))
             for k in range(limbs):
@@ -118,7 +119,7 @@ def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, 
                     along = dot3(vertices[i], v)
                     if along > top:
                         best, top = i, along
-                value = stop_s * (top + rest)
+                value = stop_s * (top + rest)  # Eq. (66i), corrected: T_s belongs here
                 if value > bound:
                     which[n] = s, k, end, best
                     A[n] = stop_s * _row(ends[s], J_ends[s], vertices[best], end)
@@ -129,7 +130,7 @@ def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, 
 
 @njit(cache=True)
 def _row(ends: Floats, J_ends: Floats, vertex: Floats, end: int) -> Floats:
-    """(nv,) one row of Eq. (12), without T_s."""
+    """(nv,) one row of E of Eq. (12), without T_s."""
     row = np.zeros(J_ends.shape[2])
     for j in range(len(row)):
         for i in range(3):

@@ -1,4 +1,4 @@
-"""What goes into one tick of a controller, and what comes out.
+"""What goes into one tick of a controller, and what comes out. Corrections to the paper: docs/paper.md.
 
 What a controller sees in one tick before it decides: how near the people are, or why that is not known.
 """
@@ -114,6 +114,8 @@ class Sight:
 
 def observe(robot: RobotModel, state: RobotState, obstacles: Obstacles, clearance_m: float) -> Sight:
     """Pose of the robot and nearest pair of link and limb.
+
+    The clearance of Eq. (1), (2) of a pair is the limb's radius, Eq. (41), plus the link's, plus ``clearance_m``.
 
     Args:
         robot: The manipulator.

@@ -1,4 +1,6 @@
-"""The trajectory generator: QP (66), or else the stop (67). The only module that imports proxsuite.
+"""The trajectory generator: Eq. (66), or else the stop of Eq. (67). The only module that imports proxsuite.
+
+What is corrected in the printed equations, and why: docs/paper.md.
 
 Limits of the axes and of the TCP, Eq. (66d)-(66h), as bounds on the joint velocity of the next tick.
 
@@ -113,7 +115,7 @@ def cartesian_bounds(
             now += J[i, j] * dq[j]
         drift = dt_s * dJdq[i]
         change = dt_s * unit * acceleration_max
-        low[i] = max(-unit * speed_max, now - change) - drift
+        low[i] = max(-unit * speed_max, now - change) - drift  # Eq. (66g), (66h)
         high[i] = min(unit * speed_max, now + change) - drift
     return low, high
 
@@ -142,7 +144,9 @@ def tracking_cost(
     path_gain_per_s: float,
     dt_s: float,
 ) -> tuple[Floats, Floats]:
-    """Eq. (66a) as ``w @ H @ w / 2 + g @ w`` (and a constant, and a factor of 2) of the next joint velocity w.
+    """Eq. (66a), corrected, as ``w @ H @ w / 2 + g @ w`` (and a constant, and a factor of 2) of the next velocity w.
+
+    The variable is w = dq + dt u instead of the acceleration u, so Eq. (66b), (66c) are linear in w.
 
     With the printed weights a position error changes the velocity by dt q_p / q_v of it, that is, it never decays; so
     ``path_gain_per_s`` times the error at this tick is taken off the reference velocity.
@@ -170,7 +174,7 @@ def tracking_cost(
             speed += J[i, j] * dq[j]
         wanted = twist_ref[i] - path_gain_per_s * (error[i] + dt_s * twist_ref[i])
         rest_v = dt_s * dJdq[i] - wanted  # Eq. (66c): J w + rest_v
-        rest_p = error[i] + 0.5 * dt_s * (speed + dt_s * dJdq[i])  # Eq. (66b): dt/2 J w + rest_p
+        rest_p = error[i] + 0.5 * dt_s * (speed + dt_s * dJdq[i])  # Eq. (66b), corrected: dt/2 J w + rest_p
         curvature = weight_v + 0.25 * dt_s**2 * weight_p
         slope = weight_v * rest_v + 0.5 * dt_s * weight_p * rest_p
         for j in range(nv):

@@ -1,5 +1,7 @@
 """Distances between the robot's links and the swept volumes. The only module that imports coal.
 
+The right-hand side of the safety constraints is corrected as docs/paper.md says.
+
 The swept volumes of one tick, as every controller of that tick uses them.
 """
 
@@ -79,7 +81,7 @@ class Separation:
     clearance_m: Floats  #: (s, l) Delta of Eq. (2) [m]
 
     def room_m2(self) -> Floats:
-        """(s, l) right-hand side of Eq. (14), corrected: max(0, distance - clearance)^2 [m^2]."""
+        """(s, l) right-hand side of Eq. (14), corrected: max(0, distance - clearance)^2, Eq. (6), (10) [m^2]."""
         return np.maximum(0.0, self.distance_m - self.clearance_m) ** 2
 
     def nearest(self) -> tuple[float, int, int]:
