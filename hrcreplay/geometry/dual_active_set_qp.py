@@ -24,13 +24,6 @@ DEPENDENT = 1e-18
 STEPS = 200
 
 
-@njit(cache=True, error_model="numpy")
-def minimiser(H: Floats, g: Floats) -> Floats:
-    """(n,) minimiser of ``w @ H @ w / 2 + g @ w`` for a positive definite H; NaN where H is not."""
-    L = _cholesky(H)
-    return _backward(L, _forward(L, -g))
-
-
 class Working(NamedTuple):
     """A problem being solved: in the metric of the cost, ``y = L.T @ w``, H is the identity and rows have length 1."""
 
@@ -94,25 +87,6 @@ def settle(work: Working, rows: int, count: int) -> int:
 def solution(work: Working, rows: int) -> tuple[Floats, Floats]:
     """``w`` (n,) and the rows' multipliers ``z``: where it has settled ``H @ w + g + A.T @ z = 0``, ``z >= 0``."""
     return _backward(work.L, work.y), work.z[:rows] / work.norms[:rows]
-
-
-@njit(cache=True, error_model="numpy")
-def active_set(H: Floats, g: Floats, A: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Minimiser of ``w @ H @ w / 2 + g @ w`` where ``A @ w <= high``, and the rows' multipliers; NaN without one.
-
-    Args:
-        H: (n, n) positive definite.
-        g: (n,).
-        A: (m, n).
-        high: (m,); inf where a row has no bound.
-    """
-    m = len(high)
-    work = working(H, g, m)
-    for i in range(m):
-        add(work, i, A[i], 1.0, high[i])
-    if settle(work, m, 0) < 0:
-        return np.full(len(g), np.nan), np.full(m, np.nan)
-    return solution(work, m)
 
 
 @njit(cache=True)

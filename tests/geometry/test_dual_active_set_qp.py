@@ -4,8 +4,8 @@ import daqp
 import numpy as np
 import pytest
 
-from hrcreplay.geometry.dual_active_set_qp import active_set, minimiser
 from hrcreplay.records import Floats
+from tests.geometry.quadratic import active_set, minimiser
 
 
 def random_problem(rng: np.random.Generator, rows: int, flat: float) -> tuple[Floats, Floats, Floats, Floats]:

@@ -11,7 +11,6 @@ import pytest
 
 from hrcreplay.geometry.vectors import from_vector
 from hrcreplay.records import Floats, SweptVolumes
-from hrcreplay.robot.control.approach_rows import approach_rows, link_segment
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, observe
 from hrcreplay.robot.control.qp_controller import Problem, problem, step
 from hrcreplay.robot.control.separation import Obstacles, Separation, obstacles
@@ -19,6 +18,7 @@ from hrcreplay.robot.model import RobotModel, RobotPose, irb140
 from hrcreplay.settings.sections import Plan
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
+from tests.robot.plain_rows import approach_rows, link_segment
 
 STOP_S, DT_S = 0.377, 0.004
 SETTINGS = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)

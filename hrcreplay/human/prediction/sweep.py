@@ -69,30 +69,6 @@ MOST_COPIES = 8
 
 
 @njit(cache=True)
-def sweep_lin(points: Floats, count: int, axis: int, low: float, high: float, swept: Floats) -> int:
-    """Translational sweep along a coordinate axis, Fig. 7.
-
-    Args:
-        points: (m, 3), of which the first ``count`` are swept [m].
-        count: Number of points.
-        axis: 0, 1, 2 for x, y, z.
-        low: Smallest displacement [m].
-        high: Largest displacement [m]; equal to ``low`` it moves the points and adds none.
-        swept: (>= 2 count, 3) receives the points, whose hull is the swept volume [m].
-
-    Returns:
-        Number of points written.
-    """
-    copies = 1 if low == high else 2
-    for i in range(count):
-        for copy in range(copies):
-            for k in range(3):
-                swept[copies * i + copy, k] = points[i, k]
-            swept[copies * i + copy, axis] += high if copy else low
-    return copies * count
-
-
-@njit(cache=True)
 def sweep_rot(
     points: Floats, count: int, axis: int, low: float, high: float, swept: Floats, widest: float = TRIANGLE_RAD
 ) -> int:

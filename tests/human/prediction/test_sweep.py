@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.prediction.sweep import MOST_COPIES, sweep_lin, sweep_rot
+from hrcreplay.human.prediction.sweep import MOST_COPIES, sweep_rot
 from hrcreplay.records import Floats
 
 POINT = np.array([[0.4, -0.3, 0.7]])
@@ -14,16 +14,6 @@ POINT = np.array([[0.4, -0.3, 0.7]])
 def turned(points: Floats, axis: int, low: float, high: float) -> Floats:
     swept = np.empty((MOST_COPIES * len(points), 3))
     return swept[: sweep_rot(points, len(points), axis, low, high, swept)]
-
-
-def moved(points: Floats, axis: int, low: float, high: float) -> Floats:
-    swept = np.empty((2 * len(points), 3))
-    return swept[: sweep_lin(points, len(points), axis, low, high, swept)]
-
-
-def test_a_translation_by_hand() -> None:
-    assert moved(POINT, 1, -1.0, 2.0).tolist() == [[0.4, -1.3, 0.7], [0.4, 1.7, 0.7]]
-    assert moved(POINT, 2, 0.5, 0.5).tolist() == [[0.4, -0.3, 1.2]]
 
 
 def test_a_quarter_turn_by_hand() -> None:

@@ -6,13 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.approach_rows import approach_rows, link_segment, tick_rows, worst_rows
+from hrcreplay.robot.control.approach_rows import tick_rows, worst_rows
 from hrcreplay.robot.control.control_step import RobotState, braked, integrate
 from hrcreplay.robot.control.qp_controller import RAD_PER_M, cartesian_bounds, joint_bounds
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel, irb140
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
+from tests.robot.plain_rows import approach_rows, link_segment
 
 STOP_S, DT_S = 0.377, 0.004
 

@@ -9,7 +9,6 @@ import pytest
 
 from hrcreplay.records import Floats, SweptVolumes
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.approach_rows import approach_rows, link_segment
 from hrcreplay.robot.control.control_step import PlanSettings, Step
 from hrcreplay.robot.control.scaling_controller import PathState, rates, step
 from hrcreplay.robot.control.separation import obstacles
@@ -21,6 +20,7 @@ from hrcreplay.settings.sections import Plan
 from tests.robot.checker import violation
 from tests.robot.distances import by_coal
 from tests.robot.people import person, volumes
+from tests.robot.plain_rows import approach_rows, link_segment
 
 STOP_S, DT_S = 0.377, 0.004
 SETTINGS = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)

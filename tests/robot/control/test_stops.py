@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay.geometry.dual_active_set_qp import minimiser
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step, qp_controller
 from hrcreplay.robot.control.approach_rows import SOLVED, Optimum, optimum
@@ -15,6 +14,7 @@ from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.control.qp_controller import Solution, Unsolved, solve, step
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel
+from tests.geometry.quadratic import minimiser
 from tests.robot.people import volumes
 from tests.robot.swinging import DT_S, HOME, SETTINGS, moving, random_tick, robot, swing
 

@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hrcreplay.geometry.dual_active_set_qp import minimiser
 from hrcreplay.geometry.vectors import from_vector
 from hrcreplay.robot.control.qp_controller import pose_error, tracking_cost
 from hrcreplay.robot.model import irb140
+from tests.geometry.quadratic import minimiser
 
 DT_S = 0.004
 
