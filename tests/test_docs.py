@@ -141,7 +141,7 @@ def test_the_program_shown_is_the_one_in_the_file() -> None:
 
 
 def test_every_stop_reason_is_in_the_table() -> None:
-    heard = session.Heard(answer=True, fresh=False, allowed=False, reason="", ended=False, lost=0)
+    heard = session.PacketStatus(answer=True, fresh=False, allowed=False, reason="", ended=False, lost=0)
     constants = {value for name, value in vars(watchdog).items() if name.isupper() and isinstance(value, str)}
     reasons = {*constants, *watchdog.SIGNALS.values(), *watchdog.REFUSED, *session.STOPS, watchdog.of_robot(heard)}
     table = rows(section(7), "| reason |")

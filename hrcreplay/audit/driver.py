@@ -30,7 +30,7 @@ from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.records import LIMBS
 from hrcreplay.run import build
 from hrcreplay.run.job import Job, resolve
-from hrcreplay.run.stages import say
+from hrcreplay.run.stages import print_note
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
@@ -84,7 +84,7 @@ def run(
         found = figures(audits)
         for log in found["logs"]:
             for note in log["notes"]:
-                say(f"{log['log']}: {note}")
+                print_note(f"{log['log']}: {note}")
         _write_escapes(found, writer)
         writer.close_tables()
         writer.text("audit.json", run_folder.to_json(found))
@@ -97,7 +97,7 @@ def run(
         writer.timing.update(watch.summary(1.0 / AUDIT_HZ))
         writer.finish(meta)
         for line in _summary(found):
-            say(line)
+            print_note(line)
         return writer.folder
 
 
@@ -117,7 +117,7 @@ def _summary(found: dict[str, Any]) -> list[str]:
 
 def _alike(jobs: Sequence[Job]) -> None:
     """Refuses logs whose ticks cannot be counted together."""
-    foresights = [build.foresight(job) for job in jobs]
+    foresights = [build.prediction_stage(job) for job in jobs]
     for what, values in (
         ("occupancy.stop_s and latency_s", [standstill_s(one) for one in foresights]),
         ("occupancy.method", [one.method for one in foresights]),
@@ -134,7 +134,7 @@ def _alike(jobs: Sequence[Job]) -> None:
 
 def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
     """All that audit.json holds."""
-    foresight = build.foresight(audits[0].job)
+    foresight = build.prediction_stage(audits[0].job)
     horizon_s = standstill_s(foresight)
     lengths = [len(audit.outcomes[methods()[0]]) for audit in audits]
     block = block_ticks(horizon_s, AUDIT_HZ, max(lengths))
@@ -182,7 +182,7 @@ def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
 
 
 def _methods(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
-    radii = build.foresight(audits[0].job).radii
+    radii = build.prediction_stage(audits[0].job).radii
     body = dict(zip(LIMBS, radii.of_limbs().tolist(), strict=True))
     return {method: method_figures([audit.outcomes[method] for audit in audits], drawn, body) for method in methods()}
 
@@ -196,7 +196,7 @@ def _joints(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
 
 
 def _curves(audits: Sequence[LogAudit]) -> dict[str, Any]:
-    horizon_s = standstill_s(build.foresight(audits[0].job))
+    horizon_s = standstill_s(build.prediction_stage(audits[0].job))
 
     def point(method: str, factor: float) -> dict[str, Any]:
         outcomes = [audit.curve[method][factor] for audit in audits]

@@ -28,7 +28,7 @@ from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
 from hrcreplay.run import build
 from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job, resolve
-from hrcreplay.run.stages import NS, Bar, Foresight, tick_times
+from hrcreplay.run.stages import NS, PredictionStage, ProgressBar, tick_times
 
 
 def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) -> list[str]:
@@ -92,7 +92,7 @@ _SMALLEST, _HALVINGS = 0.6, 4
 class Held:
     """One log's person in parts: to fit on, and held back."""
 
-    foresight: Foresight
+    foresight: PredictionStage
     training: Window
     held_back: Window
 
@@ -112,7 +112,7 @@ def unchecked(people: Sequence[Held]) -> list[str]:
     return limbs + points
 
 
-def stayed(foresight: Foresight, future: Window, limits: LimitSet) -> Floats:
+def stayed(foresight: PredictionStage, future: Window, limits: LimitSet) -> Floats:
     """(n,) whether all limbs that were seen stayed in their volumes until the horizon: 1, 0, or NaN where none was."""
     volumes = replace(foresight, limits=limits).volumes(future.states)
     worst = hold(volumes, future, np.zeros(len(future.states), dtype=bool)).worst_m()
@@ -242,7 +242,7 @@ def _refuse(logs: Sequence[Path], out: Path, coverage: float, held_back: float, 
 
 
 def _horizon_s(jobs: Sequence[Job]) -> float:
-    horizons = {build.foresight(job).horizon_s for job in jobs}
+    horizons = {build.prediction_stage(job).horizon_s for job in jobs}
     if len(horizons) > 1:
         raise SettingsError(f"occupancy.stop_s: found {sorted(horizons)} s; all logs need one horizon, set it")
     return horizons.pop()
@@ -262,8 +262,8 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
     rate_hz = job.settings.fusion.rate_hz
     ticks_ns = tick_times(begin_ns, end_ns, rate_hz)
     stage = f"reading {job.log.name}"
-    with Bar(stage, len(ticks_ns)) as bar:
-        recording = record(log, ticks_ns, build.eyes(job, log), lambda n: bar.advance(stage, n))
+    with ProgressBar(stage, len(ticks_ns)) as bar:
+        recording = record(log, ticks_ns, build.fusion_stage(job, log), lambda n: bar.advance(stage, n))
     states, joints = recording.states, recording.joints
     if recording.source != TRUTH:
         joints = fit_limits.believed(joints, states.unseen_s, SEEN_S)
@@ -290,7 +290,7 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
 
 
 def _limbs(job: Job, recording: Recording, cut_ns: int) -> Held:
-    foresight, states = build.foresight(job), recording.states
+    foresight, states = build.prediction_stage(job), recording.states
     horizon_s = standstill_s(foresight)
     horizon_ns = round(horizon_s * NS)
     ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / TIGHTEN_HZ)))

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.containment import Solid, union_volume_m3
+from hrcreplay.audit.containment import InflatedHull, union_volume_m3
 from hrcreplay.audit.metrics import Outcome
 from hrcreplay.audit.recording import Recording, record
 from hrcreplay.errors import LogError
@@ -25,7 +25,7 @@ from hrcreplay.report.metrics import difference
 from hrcreplay.run import build
 from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job
-from hrcreplay.run.stages import NS, Bar, Foresight, tick_times
+from hrcreplay.run.stages import NS, PredictionStage, ProgressBar, tick_times
 from hrcreplay.store.run_folder import Stopwatch
 
 #: Recorded points of a limb. The first two, its ends, must have been seen near the end of the horizon, or the limb is
@@ -46,7 +46,7 @@ _COUNT = 1024
 _SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
 
 
-def standstill_s(foresight: Foresight) -> float:
+def standstill_s(foresight: PredictionStage) -> float:
     """How long the person must stay in what was predicted: until the robot has reacted and braked [s]."""
     return foresight.horizon_s + foresight.margins.latency_s
 
@@ -128,7 +128,7 @@ def hold(volumes: SweptVolumes, future: Window, counted: Bools, first_sample: in
             vertices = volumes.vertices(i, k)
             if np.isnan(vertices).any():
                 continue
-            solid = Solid.around(vertices, float(volumes.radius_m[i, k]))
+            solid = InflatedHull.around(vertices, float(volumes.radius_m[i, k]))
             size[i, k] = solid.volume_m3()
             solids.append(solid)
             if checked[i, k]:
@@ -142,7 +142,7 @@ def hold(volumes: SweptVolumes, future: Window, counted: Bools, first_sample: in
     return Outcome(volumes.t_ns, beyond, radius, size, union, union_std, upper, upper_std, limbs)
 
 
-def _farthest(solid: Solid, future: Window, tick: int, limb: str) -> float:
+def _farthest(solid: InflatedHull, future: Window, tick: int, limb: str) -> float:
     """How far the recorded points of a limb, some of them seen, get from a hull [m]."""
     points = future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
     return float(np.nanmax(solid.distances_m(points)))
@@ -218,7 +218,7 @@ def factors(method: str) -> tuple[float, ...]:
     return _FACTORS.get(method, _STANDARD_FACTORS)
 
 
-def volumes(foresight: Foresight, window: Window, method: str) -> SweptVolumes:
+def volumes(foresight: PredictionStage, window: Window, method: str) -> SweptVolumes:
     """Swept volumes by any method, ours or a peer's."""
     if method in baselines.PEERS:
         return baselines.predict(
@@ -245,7 +245,7 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         LogError: The log cannot be read, is shorter than the horizon, or shows nobody.
     """
     log = open_log(job.log, log_options(job.settings))
-    foresight = build.foresight(job)
+    foresight = build.prediction_stage(job)
     horizon_s = standstill_s(foresight)
     first_ns, last_ns = log.header.start_ns, log.header.end_ns
     begin_ns = first_ns + round((job.start_s or 0.0) * NS)
@@ -256,8 +256,8 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
             f"{horizon_s:g} s"
         )
     ticks_ns = tick_times(begin_ns, end_ns, job.settings.fusion.rate_hz)
-    with Bar(f"reading {name}", len(ticks_ns)) as bar, watch.stage("record", len(ticks_ns)):
-        recording = record(log, ticks_ns, build.eyes(job, log), lambda n: bar.advance(f"reading {name}", n))
+    with ProgressBar(f"reading {name}", len(ticks_ns)) as bar, watch.stage("record", len(ticks_ns)):
+        recording = record(log, ticks_ns, build.fusion_stage(job, log), lambda n: bar.advance(f"reading {name}", n))
     rows = _audited(recording, job.settings.fusion.rate_hz, horizon_s)
     if not len(rows):
         raise LogError(f"{job.log}: nobody was seen for longer than the horizon of {horizon_s:g} s")
@@ -266,7 +266,7 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
     stage = f"auditing {name}"
     more = sum(len(factors(method)) - 1 for method in reachable_sets.METHODS)
     work = len(rows) * len(methods()) + more * len(rows[::EVERY])
-    with Bar(stage, work) as bar:
+    with ProgressBar(stage, work) as bar:
         progress = partial(bar.advance, stage)
         for method in methods():
             with watch.stage(f"audit {method}", len(rows)):
@@ -300,7 +300,7 @@ def _audited(recording: Recording, rate_hz: float, horizon_s: float) -> Ints:
 
 
 def _hold(
-    foresight: Foresight, future: Window, method: str, union_every: int, progress: Callable[[int], None]
+    foresight: PredictionStage, future: Window, method: str, union_every: int, progress: Callable[[int], None]
 ) -> Outcome:
     n = len(future.states)
     parts = []
@@ -313,7 +313,7 @@ def _hold(
 
 
 def _curve(
-    foresight: Foresight, future: Window, method: str, standard: Outcome, progress: Callable[[int], None]
+    foresight: PredictionStage, future: Window, method: str, standard: Outcome, progress: Callable[[int], None]
 ) -> dict[float, Outcome]:
     """The method under scaled limits, at fewer ticks; factor 1 is its ``standard`` outcome with all ticks."""
     some = future.rows(np.arange(0, len(future.states), EVERY))

@@ -15,7 +15,7 @@ from hrcreplay.audit.figures import METHODS, in_order
 from hrcreplay.audit.metrics import checked_cameras, checked_scope, checked_table, text, unchecked_notes, volume_at
 from hrcreplay.records import JOINTS, LIMBS
 from hrcreplay.report.metrics import Metric
-from hrcreplay.report.page import PageFigure, Part
+from hrcreplay.report.page import PageFigure, PageSection
 from hrcreplay.report.story import Answer, Card
 from hrcreplay.report.tables import PageTable, text_of
 
@@ -123,7 +123,7 @@ def _named(methods: Sequence[str]) -> tuple[str, ...]:
     return tuple(METHODS.get(method, method) for method in methods)
 
 
-def _coverage(found: Mapping[str, Any], folder: Path) -> Part:
+def _coverage(found: Mapping[str, Any], folder: Path) -> PageSection:
     methods = in_order(found["total"]["methods"])
     rows = [(log["log"], log) for log in found["logs"]]
     if len(rows) > 1:
@@ -146,7 +146,7 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> Part:
     if len(found["logs"]) > 1:
         way += " The total counts every tick once: a long log weighs more than a short one."
     error = max(found["total"]["methods"][m]["all"]["union_counting_error"] or 0.0 for m in methods)
-    return Part(
+    return PageSection(
         "coverage",
         "Coverage",
         "Did the recorded person stay in what was predicted, and how much room did the prediction take?",
@@ -193,7 +193,7 @@ def _equal(found: Mapping[str, Any]) -> str:
     return f"{at}, the lower body left out, of its volume: {', '.join(parts)}."
 
 
-def _limbs(found: Mapping[str, Any], folder: Path) -> Part:
+def _limbs(found: Mapping[str, Any], folder: Path) -> PageSection:
     methods = in_order(found["total"]["methods"])
     figures = found["total"]["methods"]
     limbs = [limb for limb in (*LIMBS, "LEGS") if any(limb in figures[m] for m in methods)]
@@ -207,7 +207,7 @@ def _limbs(found: Mapping[str, Any], folder: Path) -> Part:
         return PageTable(title, ("limb", *_named(methods)), tuple(body), note)
 
     deepest = [(limb, *(_millimetres(figures[m].get(limb, {}).get("escape_max_m")) for m in methods)) for limb in limbs]
-    return Part(
+    return PageSection(
         "limbs",
         "Limbs",
         "Each limb in its own volume. A dash: the method has no volume for it, or nobody left it.",
@@ -230,7 +230,7 @@ def _millimetres(value: float | None) -> str:
     return "\u2013" if value is None else f"{1e3 * value:.0f}"
 
 
-def _joints(found: Mapping[str, Any], folder: Path) -> Part:
+def _joints(found: Mapping[str, Any], folder: Path) -> PageSection:
     tables = found["total"]["joints"]
     methods = in_order(tables)
     body = []
@@ -241,10 +241,10 @@ def _joints(found: Mapping[str, Any], folder: Path) -> Part:
     table = PageTable(
         "Ticks with the joint in its reachable interval [%]", ("joint", "moved", *_named(methods)), tuple(body)
     )
-    return Part("joints", "Joints", "Which bound fails.", (_figure(folder, "audit_joints"),), (table,))
+    return PageSection("joints", "Joints", "Which bound fails.", (_figure(folder, "audit_joints"),), (table,))
 
 
-def _data(found: Mapping[str, Any]) -> Part:
+def _data(found: Mapping[str, Any]) -> PageSection:
     tables = []
     for log in found["logs"]:
         rows = [(f"limits of the prediction: {log['limits']}",), *((note,) for note in log["notes"])]
@@ -253,7 +253,7 @@ def _data(found: Mapping[str, Any]) -> Part:
         counts = tuple((name.replace("_", " "), str(count)) for name, count in log["counts"].items())
         tables.append(PageTable(f"{log['log']}: what was counted on the way", ("", "count"), counts))
         tables += [_escapes(log, method) for method in found["own_methods"]]
-    return Part(
+    return PageSection(
         "data",
         "Logs and escapes",
         "What each log was held against, what was thrown out, and when somebody left a volume.",

@@ -14,7 +14,7 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import LENGTHS, POINTS, Bools, Floats, HumanStates, Ints, Measurements
-from hrcreplay.run.stages import Eyes, batches
+from hrcreplay.run.stages import FusionStage, batches
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
 
@@ -55,7 +55,7 @@ class Recording:
     counts: dict[str, int]
 
 
-def record(log: Log, ticks_ns: Ints, eyes: Eyes, progress: Callable[[int], None]) -> Recording:
+def record(log: Log, ticks_ns: Ints, eyes: FusionStage, progress: Callable[[int], None]) -> Recording:
     """Reads the span of ``ticks_ns``.
 
     The recorded future is the ground truth where the log has it. Else the points of the cameras, at their capture
@@ -91,7 +91,7 @@ Stretch = tuple[Measurements, HumanStates, fuse.Trace]
 
 
 def _fuse(
-    log: Log, ticks_ns: Ints, eyes: Eyes, counts: Counter[str], progress: Callable[[int], None]
+    log: Log, ticks_ns: Ints, eyes: FusionStage, counts: Counter[str], progress: Callable[[int], None]
 ) -> Iterator[Stretch]:
     """Stage 1 from the first stretch on in which a camera saw somebody."""
     state, memory = fuse.start(log.header.cameras), PersonMemory()
@@ -113,7 +113,7 @@ def _fuse(
         raise LogError(f"{log.header.path}: no camera saw anybody; an audit needs a person")
 
 
-def _smoothed(stretches: Iterator[Stretch], eyes: Eyes) -> tuple[HumanStates, Measurements, HumanStates]:
+def _smoothed(stretches: Iterator[Stretch], eyes: FusionStage) -> tuple[HumanStates, Measurements, HumanStates]:
     """The states, the measurements and the smoothed states of all stretches."""
     seen, passed, best = [], [], []
     held: tuple[HumanStates, fuse.Trace] | None = None
@@ -139,7 +139,7 @@ def _smoothed(stretches: Iterator[Stretch], eyes: Eyes) -> tuple[HumanStates, Me
     return HumanStates.join(passed), Measurements.join(seen), HumanStates.join(best)
 
 
-def _believed(seen: Measurements, best: HumanStates, eyes: Eyes) -> tuple[Floats, Counter[str]]:
+def _believed(seen: Measurements, best: HumanStates, eyes: FusionStage) -> tuple[Floats, Counter[str]]:
     """The measured points (m, 20, 3) that are believed, and how many per camera are not, by why.
 
     A missing point and one of confidence 0 were not seen. One that the camera trusts too little, that hangs from such a

@@ -10,7 +10,7 @@ import numpy as np
 
 from hrcreplay.calibration.cell import Cell, Residual
 from hrcreplay.calibration.floor import LEVEL_VIEW, Floor, find_floor, floor_frame, up_direction
-from hrcreplay.calibration.registration import Registration, Track, disagreement, register, transform
+from hrcreplay.calibration.registration import Registration, SkeletonTrack, disagreement, register, transform
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.clean import PersonMemory, pick
 from hrcreplay.logs.reader import Log
@@ -106,7 +106,7 @@ def survey(
     return Survey(cell, whereabouts(cell, tracks, cameras[root]))
 
 
-def whereabouts(cell: Cell, tracks: list[Track], root: str) -> tuple[str, ...]:
+def whereabouts(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tuple[str, ...]:
     """Where the person stood in the cell's world and which way its axes point: what a robot's base is placed by."""
     looks_along = abs(cell.T_world_camera[root][2, 2]) <= LEVEL_VIEW
     x = f"x points where {root} looks, along the floor" if looks_along else f"x points along {root}'s own x"
@@ -128,7 +128,7 @@ def whereabouts(cell: Cell, tracks: list[Track], root: str) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def collect(log: Log, jump_m: float, memory_s: float) -> list[Track]:
+def collect(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTrack]:
     """The person as each camera saw it; of a long log, evenly spaced windows."""
     cameras = log.header.cameras
     alone = np.full((len(cameras), 4, 4), np.nan)  # poses are what is sought: continuity in each camera's own frame
@@ -153,11 +153,11 @@ def _in_window(frames: CameraFrames, start_ns: int, end_ns: int) -> np.ndarray[t
     return np.asarray((frames.arrival_ns - start_ns) % every_ns < window_ns)
 
 
-def _track(table: CameraFrames, camera: int) -> Track:
+def _track(table: CameraFrames, camera: int) -> SkeletonTrack:
     mine = table.rows(table.camera == camera)
     _, first = np.unique(mine.capture_ns, return_index=True)  # in order of capture, a frame that came twice once
     mine = mine.rows(first.astype(np.int64))
-    return Track(mine.capture_ns, mine.points_m, mine.confidence)
+    return SkeletonTrack(mine.capture_ns, mine.points_m, mine.confidence)
 
 
 def _root(cameras: tuple[str, ...], reference: str | None, log: Log) -> int:
@@ -179,7 +179,7 @@ def _direction(up: Sequence[float] | None) -> Floats | None:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def _together(a: Track, b: Track) -> int:
+def _together(a: SkeletonTrack, b: SkeletonTrack) -> int:
     """Frames of a that have one of b close by."""
     if not len(a) or not len(b):
         return 0
@@ -189,7 +189,7 @@ def _together(a: Track, b: Track) -> int:
     return int((nearest <= _TOGETHER_S * 1e9).sum())
 
 
-def _tree(tracks: list[Track], root: int) -> list[Pair]:
+def _tree(tracks: list[SkeletonTrack], root: int) -> list[Pair]:
     """Pairs that tie every camera to the root, those with most frames together first (Prim)."""
     tied: list[int] = [root]
     ties: list[Pair] = []
@@ -202,7 +202,7 @@ def _tree(tracks: list[Track], root: int) -> list[Pair]:
         tied.append(best.b)
 
 
-def _tie(tracks: list[Track], pair: Pair, known: Registration, search_s: float, log: Log) -> Registration:
+def _tie(tracks: list[SkeletonTrack], pair: Pair, known: Registration, search_s: float, log: Log) -> Registration:
     """How camera b stands to the root, by way of camera a."""
     a, b = (tracks[i] for i in pair)
     names = " and ".join(log.header.cameras[i] for i in pair)
@@ -237,7 +237,9 @@ def _doubts(residuals: tuple[Residual, ...]) -> Iterator[str]:
             )
 
 
-def _residuals(cameras: tuple[str, ...], tracks: list[Track], found: dict[int, Registration]) -> tuple[Residual, ...]:
+def _residuals(
+    cameras: tuple[str, ...], tracks: list[SkeletonTrack], found: dict[int, Registration]
+) -> tuple[Residual, ...]:
     rests = []
     for a in range(len(cameras)):
         for b in range(a + 1, len(cameras)):
@@ -251,7 +253,7 @@ def _residuals(cameras: tuple[str, ...], tracks: list[Track], found: dict[int, R
 
 
 def _floor(
-    tracks: list[Track],
+    tracks: list[SkeletonTrack],
     found: dict[int, Registration],
     root: int,
     up: Floats | None,
@@ -262,7 +264,7 @@ def _floor(
     order = [root, *(i for i in found if i != root)]
     for i in order:
         T = found[i].T_a_b
-        track = Track(tracks[i].t_ns, transform(T, tracks[i].points_m), tracks[i].confidence)
+        track = SkeletonTrack(tracks[i].t_ns, transform(T, tracks[i].points_m), tracks[i].confidence)
         floor = find_floor(track, up)
         if floor is not None and np.isfinite([*floor.up, floor.height_m]).all():
             return floor if height_m is None else replace(floor, height_m=height_m)

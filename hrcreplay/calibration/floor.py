@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hrcreplay.calibration.registration import Track, rigid
+from hrcreplay.calibration.registration import SkeletonTrack, rigid
 from hrcreplay.records import POINTS, Bools, Floats
 
 _SOLE_M = 0.03  # foot point above the floor, Winter's foot with a shoe's sole
@@ -32,7 +32,7 @@ class Floor:
     tilt_std_rad: float  #: how well ``up`` is known, standard deviation [rad]
 
 
-def up_direction(track: Track) -> tuple[Floats, float] | None:
+def up_direction(track: SkeletonTrack) -> tuple[Floats, float] | None:
     """Where up is, by how the person holds the body.
 
     Returns:
@@ -55,7 +55,7 @@ def up_direction(track: Track) -> tuple[Floats, float] | None:
     return None
 
 
-def find_floor(track: Track, up: Floats | None = None) -> Floor | None:
+def find_floor(track: SkeletonTrack, up: Floats | None = None) -> Floor | None:
     """The plane under the feet.
 
     Ankles and feet that rest lie on two planes of one direction; the posture says which direction is likely, the more
@@ -109,7 +109,7 @@ def floor_frame(floor: Floor) -> Floats:
     return rigid(np.stack([x, np.cross(floor.up, x), floor.up]), np.array([0.0, 0.0, floor.height_m]))
 
 
-def _point(track: Track, name: str) -> Floats:
+def _point(track: SkeletonTrack, name: str) -> Floats:
     i = POINTS.index(name)
     return np.where((track.confidence[:, i] > 0)[:, None], track.points_m[:, i], np.nan)
 
@@ -124,7 +124,7 @@ def _length(vectors: Floats) -> Floats:
     return np.asarray(np.linalg.norm(vectors, axis=-1))
 
 
-def _rows_for(track: Track, seconds: float) -> float:
+def _rows_for(track: SkeletonTrack, seconds: float) -> float:
     """Number of rows of this track that last so long."""
     return max(1.0, seconds * 1e9 / float(np.median(np.diff(track.t_ns)))) if len(track) > 1 else np.inf
 
@@ -138,7 +138,7 @@ def _middle(directions: Floats) -> Floats:
     return middle
 
 
-def _feet(track: Track) -> tuple[Floats, Bools]:
+def _feet(track: SkeletonTrack) -> tuple[Floats, Bools]:
     """(m, 3) ankles and feet that the sensor is sure of, and (m,) which are ankles."""
     places, kinds = [], []
     for name in ("ankle_l", "ankle_r", "foot_l", "foot_r"):

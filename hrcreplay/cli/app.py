@@ -162,7 +162,7 @@ def _summarize(folder: Path) -> None:
     from hrcreplay.run import report, stages
 
     for line in report.summary(folder):
-        stages.say(line)
+        stages.print_note(line)
 
 
 _stage("fuse", "Stage 1: merge the cameras' skeletons into one person (state.parquet).")

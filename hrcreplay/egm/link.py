@@ -39,7 +39,7 @@ class Received:
     waited: bool
 
 
-class Link:
+class EgmServer:
     """The server's end, from one thread.
 
     Once a robot has been answered, other senders are not heard until it has been silent for the time-out: two robots

@@ -36,7 +36,7 @@ REASONS: Final = (*REFUSALS, *STOPS)
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class PacketStatus:
     """What a packet means.
 
     Attributes:
@@ -57,7 +57,7 @@ class Heard:
     lost: int
 
 
-class Session:
+class EgmSession:
     """Conversations with one robot, one after the other.
 
     ``counts`` has the packets and sessions heard, those lost, and each refusal by its reason.
@@ -94,7 +94,7 @@ class Session:
         self._due = self._fresh = self._allowed = self._answered = self._ran = False
         self._strained = 0
 
-    def hear(self, packet: RobotPacket | None, t_ns: int) -> Heard:
+    def hear(self, packet: RobotPacket | None, t_ns: int) -> PacketStatus:
         """Take one datagram in order of arrival; None stands for one that is no packet."""
         if packet is None:
             return self._refuse("no packet")
@@ -114,13 +114,13 @@ class Session:
         self.counts["lost"] += lost
         return self._judge(packet, lost)
 
-    def hear_all(self, packets: Iterable[RobotPacket | None], t_ns: int) -> tuple[Heard, RobotPacket | None]:
+    def hear_all(self, packets: Iterable[RobotPacket | None], t_ns: int) -> tuple[PacketStatus, RobotPacket | None]:
         """Take a queue that built up, in order of arrival: one decision, and the packet to answer if there is one.
 
         The last datagram need not be that packet: it may be garbage, or overtaken by one before it.
         """
         newest, answered, lost, ended = None, None, 0, False
-        heard = Heard(answer=False, fresh=False, allowed=self._allowed, reason="no packet", ended=False, lost=0)
+        heard = PacketStatus(answer=False, fresh=False, allowed=self._allowed, reason="no packet", ended=False, lost=0)
         for packet in packets:
             heard = self.hear(packet, t_ns)
             lost, ended = lost + heard.lost, ended or heard.ended
@@ -183,12 +183,12 @@ class Session:
         self._answered = self._ran = False
         self._strained = 0
 
-    def _refuse(self, reason: str) -> Heard:
+    def _refuse(self, reason: str) -> PacketStatus:
         """Count a datagram that is not answered."""
         self.counts[reason] += 1
-        return Heard(answer=False, fresh=False, allowed=self._allowed, reason=reason, ended=False, lost=0)
+        return PacketStatus(answer=False, fresh=False, allowed=self._allowed, reason=reason, ended=False, lost=0)
 
-    def _judge(self, packet: RobotPacket, lost: int) -> Heard:
+    def _judge(self, packet: RobotPacket, lost: int) -> PacketStatus:
         """Whether the robot may be moved."""
         allowed = packet.motors == Motors.ON and packet.mci == Mci.RUNNING and packet.rapid != Rapid.STOPPED
         self._fresh = self._fresh or (allowed and not self._allowed)
@@ -200,7 +200,7 @@ class Session:
         if allowed and self._strained >= often:
             reason = "utilization"
         ended = packet.converged or (self._ran and packet.mci != Mci.RUNNING)
-        return Heard(answer=True, fresh=self._fresh, allowed=allowed, reason=reason, ended=ended, lost=lost)
+        return PacketStatus(answer=True, fresh=self._fresh, allowed=allowed, reason=reason, ended=ended, lost=lost)
 
     def _standing(self, packet: RobotPacket) -> str:
         """Why the robot may not move. EGM does not run before the first answer: that is no stop."""

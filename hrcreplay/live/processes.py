@@ -41,7 +41,7 @@ PREFIX = "crash_"
 _PACKAGE = Path(hrcreplay.__file__).parent
 
 
-def said_of(error: BaseException) -> str:
+def describe_exception(error: BaseException) -> str:
     """An exception in one line: its kind, its message, and where in our code it arose."""
     message = " ".join(str(error).split())
     frames = traceback.extract_tb(error.__traceback__)
@@ -54,7 +54,7 @@ def said_of(error: BaseException) -> str:
     return name
 
 
-def end_of(code: int) -> str:
+def describe_exit(code: int) -> str:
     """How a process ended that left nothing else: killed, or by an exit code."""
     if code >= 0:
         return f"ended with exit code {code}"
@@ -63,13 +63,13 @@ def end_of(code: int) -> str:
     return f"killed by signal {-code}"
 
 
-def write(folder: Path, part: str, error: BaseException | str) -> str:
+def write_crash(folder: Path, part: str, error: BaseException | str) -> str:
     """Keeps a crash; one of the same part that came first stays first.
 
     Returns:
-        What to say of it, as ``read`` gives it.
+        What to say of it, as ``read_crashes`` gives it.
     """
-    said = f"{part}: {error if isinstance(error, str) else said_of(error)}"
+    said = f"{part}: {error if isinstance(error, str) else describe_exception(error)}"
     trace = "" if isinstance(error, str) else "".join(traceback.format_exception(error))
     try:
         with _file(folder, part).open("a") as file:
@@ -80,7 +80,7 @@ def write(folder: Path, part: str, error: BaseException | str) -> str:
     return said
 
 
-def read(folder: Path) -> list[str]:
+def read_crashes(folder: Path) -> list[str]:
     """What there is to say of the crashes that a session's folder holds, a line each."""
     lines = []
     for path in sorted(folder.glob(f"{PREFIX}*.txt")):
@@ -89,7 +89,7 @@ def read(folder: Path) -> list[str]:
     return lines
 
 
-def left(folder: Path, part: str) -> bool:
+def has_crash_file(folder: Path, part: str) -> bool:
     """Whether a part has left a file."""
     return _file(folder, part).exists()
 
@@ -105,7 +105,7 @@ class ControlGoneError(Exception):
     """The control process closed its end, or is dead: the helper has nothing left to do."""
 
 
-class Channel:
+class ControlChannel:
     """SOCK_SEQPACKET socket inherited from the control process; the first byte of a message is its kind."""
 
     def __init__(self, fd: int) -> None:
@@ -156,7 +156,7 @@ _BUFFER = 4 << 20  #: of messages under way: seconds of them
 _AT_ONCE = 256  #: messages taken at once, so that a flood does not hold up the loop
 
 
-class Helper:
+class HelperProcess:
     """A process of ours, with a socket whose far end it holds."""
 
     def __init__(
@@ -241,8 +241,8 @@ class Helper:
             self.process.kill()
             self.process.wait()
             return None
-        if self.crashed() and not left(self._folder, self.part):
-            write(self._folder, self.part, end_of(code))
+        if self.crashed() and not has_crash_file(self._folder, self.part):
+            write_crash(self._folder, self.part, describe_exit(code))
         return code
 
 
@@ -255,7 +255,7 @@ def _enlarge(end: socket.socket) -> None:
         end.setsockopt(socket.SOL_SOCKET, forced, _BUFFER)
 
 
-def take_precedence() -> list[str]:
+def raise_priority() -> list[str]:
     """Asks the system to run this process before others and to keep it in memory; returns what was refused."""
     import ctypes
 
@@ -273,8 +273,8 @@ def take_precedence() -> list[str]:
     return refused
 
 
-def step_back() -> None:
-    """Ends what ``take_precedence`` asked for."""
+def restore_priority() -> None:
+    """Ends what ``raise_priority`` asked for."""
     import ctypes
 
     with contextlib.suppress(OSError, AttributeError):
@@ -292,7 +292,7 @@ def main() -> None:
     folder, part, module, *arguments = sys.argv[1:]
 
     def die(error: BaseException) -> NoReturn:
-        write(Path(folder), part, error)
+        write_crash(Path(folder), part, error)
         os._exit(CRASHED)  # other threads may wait for one that is gone
 
     threading.excepthook = lambda raised: die(raised.exc_value or SystemError("a thread ended without a reason"))

@@ -15,18 +15,18 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from hrcreplay.egm.link import Link
+from hrcreplay.egm.link import EgmServer
 from hrcreplay.errors import HrcReplayError, LiveStopped, LogError, SettingsError
 from hrcreplay.live import processes
 from hrcreplay.live.control import watchdog
 from hrcreplay.live.control.last_resort import bring_to_rest
 from hrcreplay.live.control.loop import ENDING, Loop, LoopSettings
-from hrcreplay.live.control.pilot import Pilot
-from hrcreplay.live.control.setup import build_pilot, live_job, start_table, warm
-from hrcreplay.live.processes import Helper, step_back, take_precedence
+from hrcreplay.live.control.pilot import SessionController
+from hrcreplay.live.control.setup import build_controller, compile_kernels, live_job, start_table
+from hrcreplay.live.processes import HelperProcess, raise_priority, restore_priority
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import Signal
-from hrcreplay.live.view.status_publisher import Teller
+from hrcreplay.live.view.status_publisher import StatusPublisher
 from hrcreplay.settings.load import Settings
 
 #: Longest wait for a packet before the loop looks after everything else [s].
@@ -70,13 +70,13 @@ def run(request: Request) -> Path:
             prepared = _prepare(request, stack)
             loop, crashes = _conduct(request, prepared, partial)
     except _CrashedError:
-        raise _broken_off(partial, processes.read(partial)) from None
+        raise _broken_off(partial, processes.read_crashes(partial)) from None
     except (HrcReplayError, KeyboardInterrupt, SystemExit):
         if not (partial / folder.LOG).exists():
             shutil.rmtree(partial, ignore_errors=True)  # there is nothing in it
         raise
     except Exception as error:  # whatever it is
-        raise _broken_off(partial, [processes.write(partial, processes.CONTROL, error)]) from None
+        raise _broken_off(partial, [processes.write_crash(partial, processes.CONTROL, error)]) from None
     done = _finish(partial, crashes)
     _verdict(loop, done, crashes)
     return done
@@ -96,7 +96,7 @@ def _finish(partial: Path, crashes: list[str]) -> Path:
             raise
         raise _broken_off(partial, crashes) from None
     except Exception as error:  # whatever it is
-        raise _broken_off(partial, [*crashes, processes.write(partial, processes.FOLDER, error)]) from None
+        raise _broken_off(partial, [*crashes, processes.write_crash(partial, processes.FOLDER, error)]) from None
 
 
 def _broken_off(partial: Path, crashes: list[str]) -> LiveStopped:
@@ -115,8 +115,8 @@ class _Prepared:
 
     settings: Settings
     start: dict[str, Any]
-    pilot: Pilot
-    link: Link
+    pilot: SessionController
+    link: EgmServer
 
 
 def _prepare(request: Request, stack: ExitStack) -> _Prepared:
@@ -124,9 +124,9 @@ def _prepare(request: Request, stack: ExitStack) -> _Prepared:
     job, header = live_job(request.human, request.config, request.overrides, request.cell)
     port = job.settings.live.port if request.port is None else request.port
     start = start_table(job, header, sending=request.send)
-    pilot = build_pilot(start)
-    link = stack.enter_context(closing(Link("", port, WAIT_S)))
-    warm(start)
+    pilot = build_controller(start)
+    link = stack.enter_context(closing(EgmServer("", port, WAIT_S)))
+    compile_kernels(start)
     return _Prepared(job.settings, start, pilot, link)
 
 
@@ -135,26 +135,26 @@ def _conduct(request: Request, prepared: _Prepared, partial: Path) -> tuple[Loop
     settings = prepared.settings
     anchor_ns = time.time_ns() - time.monotonic_ns()
     to_record = ["--path", str(partial / folder.LOG)]
-    recorder = Helper(processes.RECORDER, "hrcreplay.live.record.recorder", to_record, partial)
+    recorder = HelperProcess(processes.RECORDER, "hrcreplay.live.record.recorder", to_record, partial)
     person_arguments = _person_arguments(request, settings, anchor_ns)
-    person = Helper(processes.PERSON, "hrcreplay.live.person.source", person_arguments, partial, told=(2, 3))
-    screen = Helper(processes.SCREEN, "hrcreplay.live.view.screen", _screen_arguments(request), partial)
+    person = HelperProcess(processes.PERSON, "hrcreplay.live.person.source", person_arguments, partial, told=(2, 3))
+    screen = HelperProcess(processes.SCREEN, "hrcreplay.live.view.screen", _screen_arguments(request), partial)
     begun = False
     try:
         _await_person(person, request.human)
         begun, start_ns = True, time.monotonic_ns() + anchor_ns
         parts = prepared.pilot, prepared.link, person, recorder
         loop = Loop(*parts, _loop_settings(request, settings), anchor_ns, start_ns, screen)
-        recorder.send(codec.event(loop.start_ns, {"what": "start", **prepared.start}))
+        recorder.send(codec.encode_event(loop.start_ns, {"what": "start", **prepared.start}))
         crashes = _fly(loop, prepared.start, partial, real_time=settings.live.real_time, in_3d=bool(request.foxglove))
     finally:
         screen.dismiss(2.0)
         person.dismiss(2.0)
         if recorder.dismiss(PATIENCE_S) is None:
-            processes.write(partial, processes.RECORDER, f"did not finish within {PATIENCE_S:g} s")
+            processes.write_crash(partial, processes.RECORDER, f"did not finish within {PATIENCE_S:g} s")
         if not begun:
             (partial / folder.LOG).unlink(missing_ok=True)  # there is nothing in it
-    return loop, list(dict.fromkeys([*crashes, *processes.read(partial)]))
+    return loop, list(dict.fromkeys([*crashes, *processes.read_crashes(partial)]))
 
 
 def _fly(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, in_3d: bool) -> list[str]:
@@ -165,27 +165,27 @@ def _fly(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, i
         gc.freeze()
         gc.disable()
         try:
-            for refused in take_precedence() if real_time else ():
+            for refused in raise_priority() if real_time else ():
                 loop.note(f"the system refuses {refused}")
-            teller = Teller(loop, start, in_3d=in_3d)
+            teller = StatusPublisher(loop, start, in_3d=in_3d)
             loop.begin()
             while loop.turn():
                 teller.tell()
         except Exception as error:  # whatever it is, the robot is braked first
             found.append(error)
-            bring_to_rest(loop, processes.said_of(error))
+            bring_to_rest(loop, processes.describe_exception(error))
         finally:
-            step_back()
+            restore_priority()
             gc.enable()
             gc.unfreeze()
         try:
-            loop.recorder.send(codec.event(loop.now_ns(), {"what": "end", **outcome(loop)}))
+            loop.recorder.send(codec.encode_event(loop.now_ns(), {"what": "end", **outcome(loop)}))
             teller.tell(last=True)
         except Exception as error:  # whatever it is
             found.append(error)
     if loop.pilot.fault is not None:
         found.insert(0, loop.pilot.fault)
-    return [processes.write(partial, processes.CONTROL, error) for error in found]
+    return [processes.write_crash(partial, processes.CONTROL, error) for error in found]
 
 
 def outcome(loop: Loop) -> dict[str, Any]:
@@ -234,7 +234,7 @@ def _signals(loop: Loop) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _await_person(person: Helper, human: Path | None) -> None:
+def _await_person(person: HelperProcess, human: Path | None) -> None:
     """Waits until the human side is ready.
 
     Raises:

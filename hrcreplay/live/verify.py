@@ -20,8 +20,8 @@ from hrcreplay.egm.codec import AXES
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live.control import setup
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, Sight, Signal, TickEvent
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.records import STATUSES, Floats, SweptVolumes
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
@@ -136,23 +136,23 @@ class Verdict:
     lines: tuple[str, ...]
 
 
-class Pilot(Protocol):
+class DecisionMaker(Protocol):
     """What makes a session's decisions; see pilot.py."""
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Sight | None:
+    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
         """What is known of the person."""
 
-    def answer(self, event: TickEvent) -> Answer:
+    def answer(self, event: TickEvent) -> Decision:
         """What the robot is told."""
 
     def silence(self, t_ns: int, signals: Signal) -> None:
         """The robot said nothing."""
 
 
-Build = Callable[[dict[str, Any]], Pilot]
+Build = Callable[[dict[str, Any]], DecisionMaker]
 
 
-def verify(run: Path, build: Build = setup.build_pilot) -> Verdict:
+def verify(run: Path, build: Build = setup.build_controller) -> Verdict:
     """Runs a live session or a replay again from what its folder holds, and compares.
 
     Args:
@@ -170,8 +170,8 @@ def verify(run: Path, build: Build = setup.build_pilot) -> Verdict:
 
 
 def _session(run: Path, build: Build) -> Verdict:
-    tape = Tape(run / LOG)
-    again = Again(build(tape.start()))
+    tape = SessionLogReader(run / LOG)
+    again = SessionRecomputation(build(tape.start()))
     difference = None
     for message in tape.messages():
         if tape.flaws or again.crashed:
@@ -208,10 +208,10 @@ def _changed(run: Path) -> Iterator[str]:
             yield f"{path}: is not as the run left it"
 
 
-class Again:
+class SessionRecomputation:
     """A session once more: a fresh pilot is told what the record says, and must say what the record says."""
 
-    def __init__(self, pilot: Pilot) -> None:
+    def __init__(self, pilot: DecisionMaker) -> None:
         self.ticks = 0  #: answers so far
         self.looks = 0
         self.ended = False
@@ -222,7 +222,7 @@ class Again:
         self._frames: list[bytes] = []
         self._datagrams: list[bytes] = []
         self._reply: bytes | None = None  # due as the next message
-        self._sight: Sight | None = None
+        self._sight: Perception | None = None
         self._suspect = ""  # a limb whose volume is not that of the record; perhaps it is there whole
         self._take = {
             codec.ROBOT: self._robot,
@@ -242,7 +242,7 @@ class Again:
             self._start_ns = t_ns
         self._last_ns = t_ns
         found = None
-        if kind == codec.EVENT and (event := codec.read_event(message)).get("what") == "crash":
+        if kind == codec.EVENT and (event := codec.decode_event(message)).get("what") == "crash":
             self.crashed = str(event["text"])
             return None
         if self._reply is not None and kind != codec.REPLY:
@@ -267,10 +267,10 @@ class Again:
         self._frames.append(codec.body(message))
 
     def _silence(self, message: bytes) -> None:
-        self._pilot.silence(codec.clock_ns(message), codec.read_silence(message))
+        self._pilot.silence(codec.clock_ns(message), codec.decode_timeout(message))
 
     def _event(self, message: bytes) -> str | None:
-        what = codec.read_event(message).get("what")
+        what = codec.decode_event(message).get("what")
         self.ended = what == "end"
         if what != "blind":
             return None
@@ -280,22 +280,22 @@ class Again:
 
     def _look(self, message: bytes) -> str | None:
         frames, self._frames = self._frames, []
-        recorded = codec.read_look(message)
+        recorded = codec.decode_perception(message)
         if len(frames) != recorded.skeletons:
             return f"the record has {len(frames)} of the {recorded.skeletons} skeletons of this look"
         sight = self._sight = self._pilot.look(recorded.t_ns, frames)
         self.looks += 1
         if sight is None:
             return _both("look", "done", "failed")
-        if codec.look(sight.states, sight.volumes, len(frames)) == message:
+        if codec.encode_perception(sight.states, sight.volumes, len(frames)) == message:
             return None
         columns = state_columns(sight.states)
         cameras = [f"valid_{camera}" for camera in sight.states.cameras]
         names = [name for name in columns if name != "t_ns" and name not in cameras]
-        found = _first(names, recorded.state, codec.flat(sight.states))
+        found = _first(names, recorded.state, codec.state_numbers(sight.states))
         found = found or _first(cameras, list(recorded.valid), list(sight.states.valid[0].tobytes()))
         if found is None:
-            digests = [codec.digest(sight.volumes, limb) for limb in range(len(sight.volumes.limbs))]
+            digests = [codec.volume_digest(sight.volumes, limb) for limb in range(len(sight.volumes.limbs))]
             whole = [f"volume of {limb} (digest)" for limb in sight.volumes.limbs]
             self._suspect = _first(whole, [d.hex() for d in recorded.digests], [d.hex() for d in digests]) or ""
         return found
@@ -305,25 +305,25 @@ class Again:
         if self._sight is None:
             return _both("volumes", "some", "none")
         volumes = self._sight.volumes
-        if codec.whole(volumes) == message:
+        if codec.encode_volumes(volumes) == message:
             return suspect or None
-        return _volume(codec.read_whole(message, volumes.limbs, volumes.method), volumes) or suspect or None
+        return _volume(codec.decode_volumes(message, volumes.limbs, volumes.method), volumes) or suspect or None
 
     def _answer(self, message: bytes) -> str | None:
         datagrams, self._datagrams = tuple(self._datagrams), []
-        recorded = codec.read_answer(message)
+        recorded = codec.decode_decision(message)
         self.ticks += 1
         if len(datagrams) != recorded.datagrams:
             return f"the record has {len(datagrams)} of the {recorded.datagrams} packets of this tick"
         again = self._pilot.answer(TickEvent(recorded.t_ns, datagrams, recorded.signals))
         self._reply = again.datagram
-        said = codec.read_answer(codec.answer(again, recorded.signals, len(datagrams), recorded.took_us))
+        said = codec.decode_decision(codec.encode_decision(again, recorded.signals, len(datagrams), recorded.took_us))
         return _first(
             ("phase", "status", "reason", "look_ns", "limb", "link"), _decision(recorded), _decision(said)
         ) or (_first(_ROW, _numbers(recorded), _numbers(said)))
 
     def _replied(self, message: bytes) -> str | None:
-        _, recorded = codec.read_reply(message)
+        _, recorded = codec.decode_reply(message)
         again, self._reply = self._reply, None
         if again is None:
             return _both("reply", f"{len(recorded)} bytes", "none")
@@ -334,7 +334,7 @@ class Again:
         return _first([f"byte {i} of the reply" for i in range(len(again))], list(recorded), list(again))
 
 
-def _decision(found: codec.Answered) -> list[Any]:
+def _decision(found: codec.RecordedDecision) -> list[Any]:
     return [
         codec.PHASES[found.phase],
         STATUSES[found.status],
@@ -345,7 +345,7 @@ def _decision(found: codec.Answered) -> list[Any]:
     ]
 
 
-def _numbers(found: codec.Answered) -> Floats:
+def _numbers(found: codec.RecordedDecision) -> Floats:
     return np.empty(0) if found.row is None else found.row
 
 

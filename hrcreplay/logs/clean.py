@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.logs.messages import Row
+from hrcreplay.logs.messages import RawSkeleton
 from hrcreplay.records import POINTS, Bools, CameraFrames, Floats
 
 _TORSO = ("pelvis", "chest", "neck", "shoulder_l", "shoulder_r", "hip_l", "hip_r")
@@ -168,11 +168,11 @@ _A, _B = (np.array([POINTS.index(pair[end]) for pair in _PAIRS]) for end in (0, 
 class Mended(NamedTuple):
     """A row as it is handed on, and what had to be done to its points."""
 
-    row: Row
+    row: RawSkeleton
     flaws: tuple[tuple[str, int], ...]  #: name in DEFECTS -> points
 
 
-def mended(row: Row) -> Mended:
+def mended(row: RawSkeleton) -> Mended:
     """The row with all that is no point of a body made missing: NaN, with confidence 0.
 
     Of two ends of a bone in one place neither can be believed. A point of confidence 0 was said to be missing: it is
@@ -223,8 +223,10 @@ class Cleaner:
         self._gap_ns = round(gap_s * 1e9)
         self._defects = defects
         self._newest: dict[tuple[str, int], int] = {}
-        self._last: dict[tuple[str, int], tuple[Row, int]] = {}  # of each body: its last new skeleton, and its arrival
-        self._rows: list[tuple[int, int, Row]] = []
+        self._last: dict[
+            tuple[str, int], tuple[RawSkeleton, int]
+        ] = {}  # of each body: its last new skeleton, and its arrival
+        self._rows: list[tuple[int, int, RawSkeleton]] = []
         self.heard: dict[str, tuple[int, int]] = {}  #: camera -> first and last arrival
         self.seen: dict[str, Bools] = {}  #: camera -> (20,) points it ever gave a place and a confidence
         self.points: Counter[str] = Counter()  #: camera -> points with a place and a confidence
@@ -240,7 +242,7 @@ class Cleaner:
             self._defects[f"gaps_{camera}"] += 1
         self.heard[camera] = (first, arrival_ns)
 
-    def add(self, row: Row, arrival_ns: int) -> CameraFrames | None:
+    def add(self, row: RawSkeleton, arrival_ns: int) -> CameraFrames | None:
         """Takes a row; gives the chunk that ends before it, if one does."""
         self.hear(row.camera, arrival_ns)
         self._defects["frames_header_stamp_zero"] += row.stamp_zero
@@ -263,7 +265,7 @@ class Cleaner:
         self._rows.append((capture_ns, arrival_ns, whole))
         return chunk
 
-    def _captured(self, row: Row, arrival_ns: int) -> int:
+    def _captured(self, row: RawSkeleton, arrival_ns: int) -> int:
         """When the row was captured; its arrival where its stamp cannot be right."""
         if row.capture_ns is None:
             return arrival_ns
@@ -272,7 +274,7 @@ class Cleaner:
             return arrival_ns
         return row.capture_ns
 
-    def _repeats(self, row: Row, arrival_ns: int) -> bool:
+    def _repeats(self, row: RawSkeleton, arrival_ns: int) -> bool:
         """Whether the row shows the very skeleton of the one before it, which no sensor measures twice."""
         key = (row.camera, row.body)
         before = self._last.get(key)

@@ -24,7 +24,7 @@ from hrcreplay.logs.messages import (
     OPENNI_JOINTS,
     OPENNI_POINTS,
     Message,
-    Row,
+    RawSkeleton,
     Undecodable,
     blank,
     camera_of,
@@ -47,14 +47,14 @@ class OwnDecoder:
         """Itself: it remembers nothing."""
         return self
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """The one row of a message."""
         skeleton = message.read()
         confidence = np.array(skeleton.confidence, dtype=np.float64)
         if len(confidence) != len(POINTS):
             raise Undecodable(f"{self.topic}: a skeleton of {len(confidence)} confidences; {len(POINTS)} are right")
         points = points_of(skeleton.points, self.topic)
-        return [Row(skeleton.capture_ns, self.cameras[0], skeleton.body, points, confidence)]
+        return [RawSkeleton(skeleton.capture_ns, self.cameras[0], skeleton.body, points, confidence)]
 
 
 def points_of(values: Any, topic: str) -> Floats:
@@ -87,7 +87,7 @@ class MarkerDecoder:
         """Itself: it remembers nothing."""
         return self
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """A row a body; none for an empty or a clearing array."""
         rows = []
         for body, markers in sorted(_bodies(message.read()).items()):
@@ -98,7 +98,7 @@ class MarkerDecoder:
                     points[AZURE_INDEX[joint]] = at.x, at.y, at.z
                     confidence[AZURE_INDEX[joint]] = 1.0
             stamp = stamp_ns(next(iter(markers.values())).header.stamp, self.topic)
-            rows.append(Row(stamp or None, self.cameras[0], body, points, confidence, stamp_zero=not stamp))
+            rows.append(RawSkeleton(stamp or None, self.cameras[0], body, points, confidence, stamp_zero=not stamp))
         return rows
 
 
@@ -158,9 +158,9 @@ class TfDecoder:
         """A decoder that has seen nobody yet."""
         return TfDecoder(self.topic, self.cameras)
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """The frames that this message completes."""
-        rows: list[Row] = []
+        rows: list[RawSkeleton] = []
         if not _JOINT_BYTES.search(message.data):
             return rows
         for transform in message.read().transforms:
@@ -182,7 +182,7 @@ class TfDecoder:
         return rows
 
 
-def _finish(person: _Person, camera: str, body: int) -> Row:
+def _finish(person: _Person, camera: str, body: int) -> RawSkeleton:
     person.known.update(person.joints)
     points, confidence = blank()
     for joint, at in person.joints.items():
@@ -193,7 +193,7 @@ def _finish(person: _Person, camera: str, body: int) -> Row:
         points[POINTS.index("pelvis")] = (left + right) / 2.0
         confidence[POINTS.index("pelvis")] = 1.0
     person.joints = {}
-    return Row(person.first_ns or None, camera, body, points, confidence, stamp_zero=not person.first_ns)
+    return RawSkeleton(person.first_ns or None, camera, body, points, confidence, stamp_zero=not person.first_ns)
 
 
 def find_cameras(messages: Iterable[Message]) -> tuple[str, ...]:
@@ -245,7 +245,7 @@ class GenericDecoder:
         """Itself: it remembers nothing."""
         return self
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """The one row of a message; none where the array is empty."""
         content = message.read()
         where = f"{self.topic} ({message.topic.type})"
@@ -267,7 +267,7 @@ class GenericDecoder:
                 ) from error
             confidence[i] = 1.0 if trust is None else float(trust[element]) if element < len(trust) else 0.0
         stamp = None if self.stamp is None else stamp_ns(_field(content, self.stamp, where), where)
-        return [Row(stamp or None, self.camera, 0, points, confidence, stamp_zero=stamp == 0)]
+        return [RawSkeleton(stamp or None, self.camera, 0, points, confidence, stamp_zero=stamp == 0)]
 
 
 def _array(content: Any, path: str, where: str) -> Any:

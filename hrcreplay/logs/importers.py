@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.logs.text_rows import START_NS, Row, import_cameras, instant, lines, numbers, row, write_log
+from hrcreplay.logs.text_rows import START_NS, ImportedSkeleton, import_cameras, instant, lines, numbers, row, write_log
 from hrcreplay.records import POINTS, Floats
 
 #: K4ABT's joint confidence: none, low, medium, high. 'High' is reserved by the SDK; medium is the most it gives.
@@ -60,7 +60,7 @@ def import_azure(paths: Mapping[str, Path], out: Path) -> list[str]:
     return import_cameras(paths, out, _azure_rows)
 
 
-def _azure_rows(path: Path) -> Iterator[Row]:
+def _azure_rows(path: Path) -> Iterator[ImportedSkeleton]:
     stream = lines(path)
     where, header = next(stream)
     columns = header.lstrip("\ufeff").split(";")
@@ -95,7 +95,7 @@ def _places(where: str, columns: list[str]) -> int:
     return count
 
 
-def _row(where: str, text: str, before_ns: int, width: int, at: int, joints: dict[str, int]) -> Row:
+def _row(where: str, text: str, before_ns: int, width: int, at: int, joints: dict[str, int]) -> ImportedSkeleton:
     fields = text.split(";")
     values = numbers(where, fields, width)
     t_ns = instant(where, fields[0], 1000, before_ns)
@@ -137,7 +137,7 @@ def import_kinect2(paths: Mapping[str, Path], out: Path) -> list[str]:
     return import_cameras(paths, out, _kinect2_rows)
 
 
-def _kinect2_rows(path: Path) -> Iterator[Row]:
+def _kinect2_rows(path: Path) -> Iterator[ImportedSkeleton]:
     before_ns = 0
     for where, text in lines(path):
         fields = text.removesuffix(",").split(",")
@@ -271,7 +271,7 @@ def _t_ns(number: int, rate_hz: float) -> int:
     return START_NS + round(number / rate_hz * 1e9)
 
 
-def _kinect_rows(path: Path, rate_hz: float) -> Iterator[Row]:
+def _kinect_rows(path: Path, rate_hz: float) -> Iterator[ImportedSkeleton]:
     for number, table in enumerate(_tables(path, _KINECT_JOINTS)):
         points = table[:, :3].copy()
         points[(points == 0).all(axis=1)] = np.nan
@@ -306,7 +306,7 @@ def _pivots(path: Path) -> dict[str, Pivot]:
     return found
 
 
-def _optical_rows(path: Path, rate_hz: float, pivots: dict[str, Pivot]) -> Iterator[Row]:
+def _optical_rows(path: Path, rate_hz: float, pivots: dict[str, Pivot]) -> Iterator[ImportedSkeleton]:
     for number, (turns, positions) in enumerate(_poses(path)):
         points, trust = np.full((len(POINTS), 3), np.nan), np.ones(len(POINTS))
         for name, target in _ON_TARGET.items():

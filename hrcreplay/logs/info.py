@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hrcreplay.logs.plausibility import Stand
+from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats
 
@@ -99,7 +99,7 @@ def summarize(log: Log) -> Summary:
     """
     header = log.header
     tallies = [_Tally() for _ in header.cameras]
-    stands = {name: Stand() for name in header.cameras if name in header.T_world_camera}
+    stands = {name: BodyPosture() for name in header.cameras if name in header.T_world_camera}
     for frames in log.frames():
         _count(frames, tallies)
         for name, stand in stands.items():

@@ -24,7 +24,7 @@ from zstandard import ZstdError
 from hrcreplay.errors import LogError
 from hrcreplay.logs import ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.messages import Damage, Message, Part, Topic, Undecodable, in_order
+from hrcreplay.logs.messages import Damage, LazyChunk, Message, Topic, Undecodable, in_order
 
 MAGIC = b"\x89MCAP0\r\n"
 _RUN_BYTES = 1 << 20
@@ -98,7 +98,7 @@ class McapStream:
         wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
         with self._path.open("rb") as file:
             parts = [
-                Part(block.start_ns, partial(self._block, file, block, wanted, start_ns, end_ns))
+                LazyChunk(block.start_ns, partial(self._block, file, block, wanted, start_ns, end_ns))
                 for block in self._blocks
                 if (start_ns is None or block.end_ns >= start_ns)
                 and (end_ns is None or block.start_ns < end_ns)

@@ -52,7 +52,7 @@ class Message(NamedTuple):
         return self.topic.parse(self.data)
 
 
-class Stream(Protocol):
+class MessageStream(Protocol):
     """One file of a log."""
 
     topics: tuple[Topic, ...]
@@ -79,14 +79,14 @@ class Damage:
         self.notes.append(f"the file breaks off {(last_ns - start_ns) / 1e9:.3f} s after its first message")
 
 
-class Part(NamedTuple):
+class LazyChunk(NamedTuple):
     """A stretch of messages that is opened only when its time has come."""
 
     start_ns: int  #: no message in it is earlier
     open: Callable[[], Iterator[Message]]  #: the messages in order of arrival
 
 
-def in_order(parts: Iterable[Part]) -> Iterator[Message]:
+def in_order(parts: Iterable[LazyChunk]) -> Iterator[Message]:
     """Messages of all parts in order of arrival; parts that do not overlap are never open together.
 
     Messages of one arrival keep the order of their parts.
@@ -194,7 +194,7 @@ KINECT2_INDEX: Mapping[int, int] = {
 }
 
 
-class Row(NamedTuple):
+class RawSkeleton(NamedTuple):
     """One body in one frame, not yet cleaned."""
 
     capture_ns: int | None  #: None: the arrival is the best that is known
@@ -205,7 +205,7 @@ class Row(NamedTuple):
     stamp_zero: bool = False  #: whether the capture is missing because a ROS header's stamp is zero
 
 
-class Decoder(Protocol):
+class SkeletonDecoder(Protocol):
     """Reads the skeletons of one topic."""
 
     @property
@@ -224,10 +224,10 @@ class Decoder(Protocol):
     def always_heard(self) -> bool:
         """Whether a message without a body still tells that the camera (the only one) is alive."""
 
-    def fresh(self) -> Decoder:
+    def fresh(self) -> SkeletonDecoder:
         """The decoder at the start of a pass, with nothing remembered."""
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """The rows that are complete with this message. Raises Undecodable, LogError."""
 
 

@@ -44,7 +44,7 @@ _PELVIS_M = (0.0, 1.6)  # above the floor: of who sits on it, of who stands on a
 _UPRIGHT = np.cos(np.radians(60.0))
 
 
-class Shape:
+class BodyShape:
     """The bodies of one camera as they came, before anything is made missing."""
 
     def __init__(self) -> None:
@@ -161,7 +161,7 @@ def unmeasured(seen: Mapping[str, Bools]) -> Iterator[str]:
             )
 
 
-class Stand:
+class BodyPosture:
     """How the bodies of one camera stand in the world."""
 
     def __init__(self) -> None:

@@ -24,8 +24,8 @@ from hrcreplay.logs.decoders import (
     find_cameras,
     is_skeleton,
 )
-from hrcreplay.logs.messages import Decoder, Topic, Undecodable, listed
-from hrcreplay.logs.source import Source, open_source
+from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, listed
+from hrcreplay.logs.source import LogFiles, open_source
 from hrcreplay.logs.tracks import Header, JointTopic, JointTrack, Truth
 from hrcreplay.records import CameraFrames
 
@@ -34,7 +34,7 @@ _PEEK = 300  # markers: ten seconds of a sensor to show a body in
 _HOW = "Name one with --topic NAME, or a decoder for it in [logs.decoders] of the settings file."
 
 
-def choose(source: Source, names: tuple[str, ...], described: tuple[GenericDecoder, ...]) -> list[Decoder]:
+def choose(source: LogFiles, names: tuple[str, ...], described: tuple[GenericDecoder, ...]) -> list[SkeletonDecoder]:
     """The decoders of a log's skeleton topics.
 
     Args:
@@ -53,7 +53,7 @@ def choose(source: Source, names: tuple[str, ...], described: tuple[GenericDecod
         if name not in found:
             raise LogError(f"{source.path}: no topic {name}; found {listed(found.values())}")
     by_topic = {decoder.topic: decoder for decoder in described}
-    decoders: list[Decoder] = []
+    decoders: list[SkeletonDecoder] = []
     for topic in found.values():
         if names and topic.name not in names:
             continue
@@ -66,12 +66,12 @@ def choose(source: Source, names: tuple[str, ...], described: tuple[GenericDecod
     return decoders
 
 
-def none_found(source: Source) -> LogError:
+def none_found(source: LogFiles) -> LogError:
     """What to tell the user where no topic carries skeletons."""
     return LogError(f"{source.path}: no skeleton topic; found {listed(source.topics())}.\n{_HOW}")
 
 
-def _known(source: Source, topic: Topic, *, asked: bool) -> Decoder | None:
+def _known(source: LogFiles, topic: Topic, *, asked: bool) -> SkeletonDecoder | None:
     if not topic.count:
         return None
     if topic.type == _OWN:
@@ -85,7 +85,7 @@ def _known(source: Source, topic: Topic, *, asked: bool) -> Decoder | None:
     return None
 
 
-def _check_cameras(source: Source, decoders: list[Decoder]) -> None:
+def _check_cameras(source: LogFiles, decoders: list[SkeletonDecoder]) -> None:
     met: dict[str, str] = {}
     for decoder in decoders:
         for camera in decoder.cameras:
@@ -116,7 +116,7 @@ class LogOptions:
 class Log:
     """An open log. ``defects`` (names: clean.DEFECTS) and ``notes`` are about the latest pass over its frames."""
 
-    def __init__(self, source: Source, decoders: list[Decoder], options: LogOptions) -> None:
+    def __init__(self, source: LogFiles, decoders: list[SkeletonDecoder], options: LogOptions) -> None:
         self._source = source
         self._decoders = decoders
         self._options = options
@@ -163,7 +163,7 @@ class Log:
         decoders = {decoder.topic: decoder.fresh() for decoder in self._decoders}
         self._refusals, self.points_seen = [], 0
         cleaner = Cleaner(self.header.cameras, self._options.gap_s, self._reading)
-        shapes = {camera: plausibility.Shape() for camera in self.header.cameras}
+        shapes = {camera: plausibility.BodyShape() for camera in self.header.cameras}
         for message in self._source.messages(list(decoders), start_ns, end_ns):
             decoder = decoders[message.topic.name]
             try:
@@ -193,7 +193,7 @@ class Log:
         if self._refusals:
             raise LogError(f"{self.header.path}: {self._refusals[0]}")
 
-    def _judge(self, cleaner: Cleaner, shapes: dict[str, plausibility.Shape]) -> None:
+    def _judge(self, cleaner: Cleaner, shapes: dict[str, plausibility.BodyShape]) -> None:
         self.points_seen = cleaner.points.total()
         self.stature_m = {camera: shape.stature_m for camera, shape in shapes.items()}
         for camera, shape in shapes.items():
@@ -282,7 +282,7 @@ def open_log(path: Path, options: LogOptions = LogOptions(), *, skeletons: bool 
 
 
 def _header(
-    source: Source, decoders: list[Decoder], joints: JointTopic | None, truth: str | None, *, chosen: bool
+    source: LogFiles, decoders: list[SkeletonDecoder], joints: JointTopic | None, truth: str | None, *, chosen: bool
 ) -> Header:
     known = tracks.latched(source)
     seen = [camera for decoder in decoders for camera in decoder.cameras]

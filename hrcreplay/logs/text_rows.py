@@ -24,7 +24,7 @@ ARRIVAL_NOTE = "the files hold capture times only: arrival is taken as capture, 
 _CHUNK = 256  # rows written at once
 
 
-class Row(NamedTuple):
+class ImportedSkeleton(NamedTuple):
     """One body in one frame."""
 
     t_ns: int
@@ -101,16 +101,18 @@ def instant(where: str, text: str, unit_ns: int, before_ns: int) -> int:
     return t_ns
 
 
-def row(t_ns: int, body: int, found: Mapping[str, int] | list[int], points_m: Floats, confidence: Floats) -> Row:
+def row(
+    t_ns: int, body: int, found: Mapping[str, int] | list[int], points_m: Floats, confidence: Floats
+) -> ImportedSkeleton:
     """A row in the order of POINTS from a sensor's own joints; ``found`` tells where each stands."""
     index = [found[name] for name in POINTS] if isinstance(found, Mapping) else found
     points, trust = points_m[index], confidence[index]
     missing = ~np.isfinite(points).all(axis=1)
     points[missing], trust[missing] = np.nan, 0.0
-    return Row(t_ns, body, points, trust)
+    return ImportedSkeleton(t_ns, body, points, trust)
 
 
-def write_log(sources: Mapping[str, Iterator[Row]], out: Path) -> dict[str, tuple[int, int]]:
+def write_log(sources: Mapping[str, Iterator[ImportedSkeleton]], out: Path) -> dict[str, tuple[int, int]]:
     """Writes the rows of all cameras, merged by time, as our log; nothing is left behind when a source fails.
 
     Returns:
@@ -138,7 +140,9 @@ def write_log(sources: Mapping[str, Iterator[Row]], out: Path) -> dict[str, tupl
     return spans
 
 
-def import_cameras(paths: Mapping[str, Path], out: Path, read: Callable[[Path], Iterator[Row]]) -> list[str]:
+def import_cameras(
+    paths: Mapping[str, Path], out: Path, read: Callable[[Path], Iterator[ImportedSkeleton]]
+) -> list[str]:
     """Makes our log from one file a camera, whose times are those of the captures.
 
     Args:
@@ -168,12 +172,12 @@ def overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:
     ]
 
 
-def _numbered(index: int, stream: Iterator[Row]) -> Iterator[tuple[int, Row]]:
+def _numbered(index: int, stream: Iterator[ImportedSkeleton]) -> Iterator[tuple[int, ImportedSkeleton]]:
     return ((index, item) for item in stream)
 
 
-def _batches(merged: Iterable[tuple[int, Row]]) -> Iterator[list[tuple[int, Row]]]:
-    batch: list[tuple[int, Row]] = []
+def _batches(merged: Iterable[tuple[int, ImportedSkeleton]]) -> Iterator[list[tuple[int, ImportedSkeleton]]]:
+    batch: list[tuple[int, ImportedSkeleton]] = []
     for pair in merged:
         # The bodies of one frame stay together.
         if len(batch) >= _CHUNK and pair[1].t_ns != batch[-1][1].t_ns:
@@ -184,7 +188,7 @@ def _batches(merged: Iterable[tuple[int, Row]]) -> Iterator[list[tuple[int, Row]
         yield batch
 
 
-def _frames(batch: list[tuple[int, Row]], cameras: tuple[str, ...]) -> CameraFrames:
+def _frames(batch: list[tuple[int, ImportedSkeleton]], cameras: tuple[str, ...]) -> CameraFrames:
     t_ns = np.array([item.t_ns for _, item in batch], dtype=np.int64)
     return CameraFrames(
         capture_ns=t_ns,

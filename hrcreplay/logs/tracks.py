@@ -17,7 +17,7 @@ import numpy as np
 from hrcreplay.errors import LogError
 from hrcreplay.logs.decoders import points_of
 from hrcreplay.logs.messages import Message, Topic, Undecodable, listed, stamp_ns
-from hrcreplay.logs.source import Source
+from hrcreplay.logs.source import LogFiles
 from hrcreplay.records import Floats, Ints, Table
 
 
@@ -70,7 +70,7 @@ class Latched:
     T_world_base: Floats | None
 
 
-def latched(source: Source) -> Latched:
+def latched(source: LogFiles) -> Latched:
     """Reads what our own logs say once. Raises LogError where it is broken."""
     kinds = (_OWN_CAMERA, _OWN_TASK, _OWN_BASE)
     names = [topic.name for topic in source.topics() if topic.type in kinds]
@@ -122,7 +122,7 @@ class JointTopic:
     names: tuple[str, ...]
 
 
-def find_joints(source: Source, name: str | None) -> JointTopic | None:
+def find_joints(source: LogFiles, name: str | None) -> JointTopic | None:
     """The joint track: of the topic named, else of the first that carries one.
 
     Raises:
@@ -141,7 +141,7 @@ def find_joints(source: Source, name: str | None) -> JointTopic | None:
     return None
 
 
-def joints(source: Source, track: JointTopic, defects: Counter[str]) -> Iterator[JointTrack]:
+def joints(source: LogFiles, track: JointTopic, defects: Counter[str]) -> Iterator[JointTrack]:
     """The joint track in chunks of at most a second."""
     times: list[int] = []
     rows: list[list[float]] = []
@@ -176,12 +176,12 @@ def _joint_state(message: Message) -> tuple[int, dict[str, float]]:
     return t_ns, {str(name): float(q) for name, q in zip(content.name, content.position, strict=False)}
 
 
-def truth_topic(source: Source) -> str | None:
+def truth_topic(source: LogFiles) -> str | None:
     """The topic of the ground truth, where the log has one."""
     return next((topic.name for topic in source.topics() if topic.type == _OWN_TRUTH and topic.count), None)
 
 
-def truth(source: Source, topic: str) -> Iterator[Truth]:
+def truth(source: LogFiles, topic: str) -> Iterator[Truth]:
     """The ground truth in chunks of at most a second."""
     times: list[int] = []
     rows: list[Floats] = []

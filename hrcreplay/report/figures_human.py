@@ -19,7 +19,7 @@ from matplotlib.patches import Patch, Polygon
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import Solid, View, bones, outline, picture, view_from
+from hrcreplay.report.drawing import RenderedHull, View, bones, outline, picture, view_from
 from hrcreplay.report.metrics import ANGLES, Metric, broken, columns, envelope, seconds_from, stretches, times, wrap
 from hrcreplay.report.metrics_data import cameras, errors, seconds_since
 from hrcreplay.store.run_folder import Run
@@ -102,7 +102,7 @@ def _draw_person(
     centre: Floats,
     window: tuple[Floats, Floats],
 ) -> None:
-    solids = [Solid(vertices, radius, to_rgb(drawing.LIMBS[limb])) for limb, (vertices, radius) in limbs.items()]
+    solids = [RenderedHull(vertices, radius, to_rgb(drawing.LIMBS[limb])) for limb, (vertices, radius) in limbs.items()]
     low, high = window
     image = picture(solids, view, low + centre, high + centre, (high[1] - low[1]) / 320.0)
     image[..., 3] *= 0.78

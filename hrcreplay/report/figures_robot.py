@@ -18,7 +18,7 @@ from matplotlib.patches import Patch, Polygon
 
 from hrcreplay.records import STATUSES, Floats
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import Solid, View, outline, picture, view_from
+from hrcreplay.report.drawing import RenderedHull, View, outline, picture, view_from
 from hrcreplay.report.metrics import Metric, envelope, seconds_from, stretches, thin_path, times
 from hrcreplay.report.metrics_plan import numbers, path_feet, stationary, vectors
 
@@ -293,7 +293,7 @@ def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
     names = list(dict.fromkeys(pose.bodies))
     colours = {name: to_rgb(_COLOURS[i % len(_COLOURS)]) for i, name in enumerate(names)}
     solids = [
-        Solid(ends, float(radius), colours[body])
+        RenderedHull(ends, float(radius), colours[body])
         for body, ends, radius in zip(pose.bodies, pose.ends_m, pose.radius_m, strict=True)
     ]
     rows = -(-(len(names) + 1) // 4)
@@ -320,7 +320,7 @@ def _beside(pose: LinkPose, base_m: Floats) -> float:
     return float(np.arctan2(person[1] - base_m[1], person[0] - base_m[0]) - 0.5 * np.pi)
 
 
-def _draw(ax: Axes, view: View, solids: list[Solid], pose: LinkPose, base_m: Floats) -> None:
+def _draw(ax: Axes, view: View, solids: list[RenderedHull], pose: LinkPose, base_m: Floats) -> None:
     edges = [outline(solid.vertices_m, solid.radius_m, view) for solid in solids]
     corners = np.vstack([*edges, view.flat(base_m[None])])
     low, high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M

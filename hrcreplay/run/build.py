@@ -26,7 +26,7 @@ from hrcreplay.robot.programme.reference import Leash, Reference
 from hrcreplay.robot.programme.task import parse_task
 from hrcreplay.run.followers import Planner, QpFollower, ScalingFollower
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
-from hrcreplay.run.stages import Eyes, Foresight
+from hrcreplay.run.stages import FusionStage, PredictionStage
 from hrcreplay.settings.load import Settings
 
 
@@ -40,7 +40,7 @@ def log_options(settings: Settings) -> LogOptions:
     )
 
 
-class Source(Protocol):
+class LogLike(Protocol):
     """A log, or what stands for one in a live session."""
 
     @property
@@ -51,7 +51,7 @@ class Source(Protocol):
         """The recorded joints, where there are any."""
 
 
-def eyes(job: Job, log: Source) -> Eyes:
+def fusion_stage(job: Job, log: LogLike) -> FusionStage:
     """Stage 1. A pose of the cell file wins over the log's.
 
     Raises:
@@ -72,7 +72,7 @@ def eyes(job: Job, log: Source) -> Eyes:
         )
     offsets_s = [cell.clock_offset_s.get(camera, 0.0) for camera in log.header.cameras]
     fusion, logs = job.settings.fusion, job.settings.logs
-    return Eyes(
+    return FusionStage(
         T_world_camera=np.array([poses[camera] for camera in log.header.cameras]),
         clock_offset_ns=np.round(np.array(offsets_s) * 1e9).astype(np.int64),
         noise=PointNoise(std_m=fusion.point_std_m, depth_std_per_m=fusion.point_std_per_m),
@@ -83,7 +83,7 @@ def eyes(job: Job, log: Source) -> Eyes:
     )
 
 
-def foresight(job: Job) -> Foresight:
+def prediction_stage(job: Job) -> PredictionStage:
     """Stage 2. Beside a real robot the volumes reach further, by the time until it obeys."""
     occupancy = job.settings.occupancy
     radii = Radii(
@@ -103,10 +103,10 @@ def foresight(job: Job) -> Foresight:
         memory_s=job.settings.fusion.memory_s,
         legs=occupancy.legs,
     )
-    return Foresight(job.prediction, occupancy.stop_s, radii, margins, occupancy.method)
+    return PredictionStage(job.prediction, occupancy.stop_s, radii, margins, occupancy.method)
 
 
-def base(job: Job, log: Source) -> Floats | None:
+def base(job: Job, log: LogLike) -> Floats | None:
     """(4, 4) the robot's base in the world: of the cell file, else of the log."""
     if job.cell is not None and job.cell.T_world_base is not None:
         return job.cell.T_world_base
@@ -159,7 +159,7 @@ def _capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -
     return model.segments
 
 
-def reference(job: Job, log: Source, model: RobotModel) -> tuple[Reference, int | None]:
+def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int | None]:
     """The programmed path: of the task file, else of the log's task, else the log's joint track.
 
     Returns:
@@ -182,7 +182,7 @@ def reference(job: Job, log: Source, model: RobotModel) -> tuple[Reference, int 
     return recorded(whole.t_ns, whole.q, model), int(whole.t_ns.min())
 
 
-def planners(job: Job, log: Source, start_ns: int) -> dict[str, Planner]:
+def planners(job: Job, log: LogLike, start_ns: int) -> dict[str, Planner]:
     """Stage 3: the chosen method and its baselines, each with a robot of its own."""
     plan, model = job.settings.plan, robot(job, standing(job, log))
     path, begin_ns = reference(job, log, model)
@@ -196,7 +196,7 @@ def planners(job: Job, log: Source, start_ns: int) -> dict[str, Planner]:
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
 
 
-def standing(job: Job, log: Source) -> Floats:
+def standing(job: Job, log: LogLike) -> Floats:
     """(4, 4) where the robot stands.
 
     Raises:

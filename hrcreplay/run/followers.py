@@ -129,7 +129,7 @@ class Planner:
 
 
 @dataclass
-class Beside:
+class InitialOverlap:
     """Whether the robot stands in the person from the first: at every tick of the first second in which one is seen."""
 
     dt_s: float

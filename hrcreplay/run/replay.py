@@ -24,10 +24,10 @@ from hrcreplay.records import HumanStates, Ints
 from hrcreplay.report import limbs, tables
 from hrcreplay.report.story import flaws
 from hrcreplay.run import build, stages
-from hrcreplay.run.build import Source, log_options
+from hrcreplay.run.build import LogLike, log_options
 from hrcreplay.run.job import TABLES, Job, plain_limits, resolve, urdf_digest, versions
 from hrcreplay.run.report import write_report
-from hrcreplay.run.stages import NS, Bar, Sink, say
+from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter, Stopwatch
 from hrcreplay.store.tables import lacks, read_states
@@ -68,7 +68,7 @@ def run(
         parts = dependencies(job, log, ticks_ns)
         reused = _take_over(job, parts, writer, smooth=smooth)
         last = [stage for stage in job.stages if stage not in reused][-1:]
-        with Bar(last[0] if last else "", len(ticks_ns)) as bar:
+        with ProgressBar(last[0] if last else "", len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
             found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth)
         base = build.base(job, log)
@@ -80,7 +80,7 @@ def run(
             found["robot"] = tables.summary(robot)
         found["notes"] = list(dict.fromkeys(notes))
         for line in flaws(found["counts"], found["notes"]):
-            say(line)
+            print_note(line)
         meta = {
             **known,
             **found,
@@ -110,12 +110,12 @@ def run_stages(
     states: Iterable[HumanStates]
     if "fuse" in todo:
         stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
-        states = stages.fused(log, ticks_ns, size, build.eyes(job, log), sink, smooth=smooth)
+        states = stages.fused(log, ticks_ns, size, build.fusion_stage(job, log), sink, smooth=smooth)
     else:
         states = read_states(sink.run.partial / "state.parquet", size)
     flow: Iterable[Any] = states
     if "predict" in todo or "plan" in todo:
-        people = stages.predicted(states, build.foresight(job), _store_every(job), sink, keep="predict" in todo)
+        people = stages.predicted(states, build.prediction_stage(job), _store_every(job), sink, keep="predict" in todo)
         flow = people
         if "plan" in todo:
             flow = stages.planned(people, build.planners(job, log, int(ticks_ns[0])), sink)
@@ -171,9 +171,9 @@ def _take_over(job: Job, parts: Mapping[str, str], writer: RunWriter, *, smooth:
         if stage in reused:
             for name in names:
                 writer.copy(name, job.earlier)
-            say(f"{stage}: taken over from {job.earlier}")
+            print_note(f"{stage}: taken over from {job.earlier}")
         elif names:
-            say(f"{stage}: {stale[stage]}; computed again")
+            print_note(f"{stage}: {stale[stage]}; computed again")
     return reused
 
 
@@ -220,7 +220,7 @@ PARTS = {
 }
 
 
-def dependencies(job: Job, log: Source, ticks_ns: Ints) -> dict[str, str]:
+def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
     """Digest of every part that a stage of the job depends on.
 
     A section of the settings counts whole, so that a new setting cannot be forgotten, but for the keys that stand here
@@ -236,7 +236,7 @@ def dependencies(job: Job, log: Source, ticks_ns: Ints) -> dict[str, str]:
         LogError: The pose of a camera is not known.
     """
     settings = job.settings.model_dump(mode="json")
-    eyes = build.eyes(job, log)
+    eyes = build.fusion_stage(job, log)
     found: dict[str, Any] = {
         "versions": versions(),
         "log": job.log_sha256,

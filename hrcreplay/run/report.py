@@ -23,7 +23,7 @@ from hrcreplay.report.metrics_plan import add_plan
 from hrcreplay.report.story import lines
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
-from hrcreplay.run.stages import Foresight
+from hrcreplay.run.stages import PredictionStage
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
 from hrcreplay.store.tables import read_states
@@ -35,7 +35,7 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
     run = run_folder.read(writer.partial, meta)
     found = compute(run, **near)
     writer.text("metrics.json", run_folder.to_json(found))
-    foresight = build.foresight(job)
+    foresight = build.prediction_stage(job)
     radii = {name.replace("_", " "): radius for name, radius in asdict(foresight.radii).items()}
     if foresight.method == "sound" and foresight.margins.legs:
         radii["legs, of sound"] = foresight.margins.legs_radius_m
@@ -65,7 +65,7 @@ def _bounds(settings: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def _instants(foresight: Foresight, run: Run) -> list[Instant]:
+def _instants(foresight: PredictionStage, run: Run) -> list[Instant]:
     """The swept volumes by the paper's two methods and the run's own at the instants that Fig. 17 shows."""
     wanted = figures.instants(run)
     if not len(wanted):
@@ -80,7 +80,7 @@ def _instants(foresight: Foresight, run: Run) -> list[Instant]:
     ]
 
 
-def _links(job: Job, foresight: Foresight, run: Run) -> LinkPose | None:
+def _links(job: Job, foresight: PredictionStage, run: Run) -> LinkPose | None:
     """The robot's capsules and the swept volumes at the tick of the smallest separation."""
     if run.motion is None or not len(run.motion) or run.T_world_base is None:
         return None

@@ -24,10 +24,10 @@ from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.sound_reach import Margins
 from hrcreplay.logs.clean import PersonMemory, pick
-from hrcreplay.logs.plausibility import Stand
+from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
-from hrcreplay.run.followers import Beside, Planner
+from hrcreplay.run.followers import InitialOverlap, Planner
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 from hrcreplay.store.tables import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 
@@ -51,7 +51,7 @@ class Sink:
 
 
 @dataclass(frozen=True)
-class Eyes:
+class FusionStage:
     """What the first stage needs to know of cameras and person."""
 
     T_world_camera: Floats  #: (c, 4, 4)
@@ -70,7 +70,7 @@ class Eyes:
 
 
 @dataclass(frozen=True)
-class Foresight:
+class PredictionStage:
     """What the second stage needs beside the person."""
 
     limits: LimitSet
@@ -126,7 +126,7 @@ def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterat
 
 
 def fused(
-    log: Log, ticks_ns: Ints, size: int, eyes: Eyes, sink: Sink, *, smooth: bool = False
+    log: Log, ticks_ns: Ints, size: int, eyes: FusionStage, sink: Sink, *, smooth: bool = False
 ) -> Iterator[HumanStates]:
     """Stage 1: camera frames to the fused person; leaves measurements and state, and ``smooth`` where asked.
 
@@ -137,10 +137,10 @@ def fused(
     memory = PersonMemory()
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
     passed: list[tuple[HumanStates, fuse.Trace]] = []
-    stands = [Stand() for _ in log.header.cameras]
+    stands = [BodyPosture() for _ in log.header.cameras]
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
-        measured = nothing(log.header.cameras)
+        measured = no_frames(log.header.cameras)
         if seen is not None:
             with sink.watch.stage("angles", len(ticks)):
                 memory, measured, found = eyes.measure(seen, memory)
@@ -188,7 +188,7 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
     )
 
 
-def _oddities(log: Log, stands: list[Stand]) -> Iterator[str]:
+def _oddities(log: Log, stands: list[BodyPosture]) -> Iterator[str]:
     """What is odd about how the person stands in the world."""
     for camera, stand in zip(log.header.cameras, stands, strict=True):
         remark = stand.remark(camera)
@@ -196,7 +196,7 @@ def _oddities(log: Log, stands: list[Stand]) -> Iterator[str]:
             yield remark
 
 
-def nothing(cameras: tuple[str, ...]) -> Measurements:
+def no_frames(cameras: tuple[str, ...]) -> Measurements:
     """No frame of any camera."""
     return Measurements(
         capture_ns=np.zeros(0, np.int64),
@@ -221,7 +221,7 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
 
 
 def predicted(
-    states: Iterable[HumanStates], foresight: Foresight, store_every: float, sink: Sink, *, keep: bool
+    states: Iterable[HumanStates], foresight: PredictionStage, store_every: float, sink: Sink, *, keep: bool
 ) -> Iterator[tuple[HumanStates, SweptVolumes]]:
     """Stage 2: the swept volumes of every tick; where ``keep``, leaves those of one tick in ``store_every``."""
     done = 0
@@ -265,7 +265,7 @@ def planned(
     people: Iterable[tuple[HumanStates, SweptVolumes]], planners: dict[str, Planner], sink: Sink
 ) -> Iterator[None]:
     """Stage 3: what the robot would have done by each method; leaves a motion for each."""
-    beside = Beside(next(iter(planners.values())).dt_s)
+    beside = InitialOverlap(next(iter(planners.values())).dt_s)
     for states, volumes in people:
         for name, planner in planners.items():
             with sink.watch.stage(f"plan {name}", len(volumes)):
@@ -280,12 +280,12 @@ def planned(
         sink.notes["plan"].append(remark)
 
 
-def say(text: str) -> None:
+def print_note(text: str) -> None:
     """A line for the user beside the result, on standard error."""
     sys.stderr.write(f"hrcreplay: {text}\n")
 
 
-class Bar:
+class ProgressBar:
     """A bar over the ticks of a run's last stage."""
 
     def __init__(self, stage: str, ticks: int) -> None:

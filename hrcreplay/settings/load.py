@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.settings.sections import Fusion, Limits, Live, Logs, Occupancy, Plan, Report, Robot, Section
+from hrcreplay.settings.sections import Fusion, LimitNames, Live, Logs, Occupancy, Plan, Report, Robot, Section
 
 #: Words that TOML takes for something else than a text.
 _WORDS = frozenset({"true", "false", "inf", "nan"})
@@ -26,7 +26,7 @@ class Settings(Section):
 
     logs: Logs = Logs()
     fusion: Fusion = Fusion()
-    limits: Limits = Limits()
+    limits: LimitNames = LimitNames()
     occupancy: Occupancy = Occupancy()
     robot: Robot = Robot()
     plan: Plan = Plan()

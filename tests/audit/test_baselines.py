@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.containment import Solid
+from hrcreplay.audit.containment import InflatedHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.swept_volumes import Radii
@@ -37,9 +37,9 @@ def _predict(people: HumanStates, method: str, horizon_s: float = HORIZON_S) -> 
     return baselines.predict(people, horizon_s=horizon_s, radii=RADII, hand_m=HAND_M, method=method)
 
 
-def _solid(volumes: SweptVolumes, tick: int, limb: str) -> Solid:
+def _solid(volumes: SweptVolumes, tick: int, limb: str) -> InflatedHull:
     i = volumes.limbs.index(limb)
-    return Solid.around(volumes.vertices(tick, i), float(volumes.radius_m[tick, i]))
+    return InflatedHull.around(volumes.vertices(tick, i), float(volumes.radius_m[tick, i]))
 
 
 def _walk(start: Floats, v0: Floats, horizon_s: float, rng: np.random.Generator) -> Floats:

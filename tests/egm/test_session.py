@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay.egm.session import REASONS, Heard
+from hrcreplay.egm.session import REASONS, PacketStatus
 from tests.egm.talks import CYCLE_NS, T0_NS, ZERO, packet, session, talk
 
 
 def test_a_session_begins_once_and_each_packet_is_answered() -> None:
     heard = talk(session(), [0, 1, 2, 3])
-    assert heard[0] == Heard(answer=True, fresh=True, allowed=True, reason="", ended=False, lost=0)
-    assert heard[1:] == [Heard(answer=True, fresh=False, allowed=True, reason="", ended=False, lost=0)] * 3
+    assert heard[0] == PacketStatus(answer=True, fresh=True, allowed=True, reason="", ended=False, lost=0)
+    assert heard[1:] == [PacketStatus(answer=True, fresh=False, allowed=True, reason="", ended=False, lost=0)] * 3
 
 
 @pytest.mark.parametrize(
@@ -129,8 +129,8 @@ def test_a_robot_with_other_axes_is_refused() -> None:
 def test_what_is_no_packet_is_counted_and_changes_nothing() -> None:
     talking = session()
     talk(talking, [0, 1])
-    assert talking.hear(None, 2 * CYCLE_NS) == Heard(False, False, True, "no packet", False, 0)
-    assert talking.hear(packet(2), 2 * CYCLE_NS) == Heard(True, False, True, "", False, 0)
+    assert talking.hear(None, 2 * CYCLE_NS) == PacketStatus(False, False, True, "no packet", False, 0)
+    assert talking.hear(packet(2), 2 * CYCLE_NS) == PacketStatus(True, False, True, "", False, 0)
     assert talking.counts == {"packets": 3, "sessions": 1, "no packet": 1, "lost": 0}
 
 
@@ -146,6 +146,6 @@ def test_the_end_is_told() -> None:
     assert not talking.hear(packet(0, mci=2), 0).ended  # has not begun
     talking.reply(ZERO, ZERO, 0)
     assert not talking.hear(packet(1), CYCLE_NS).ended
-    assert talking.hear(packet(2, converged=True), 2 * CYCLE_NS) == Heard(True, True, True, "", True, 0)
+    assert talking.hear(packet(2, converged=True), 2 * CYCLE_NS) == PacketStatus(True, True, True, "", True, 0)
     assert talking.hear(packet(3, mci=2), 3 * CYCLE_NS).ended
     assert not talking.hear(packet(0), 4 * CYCLE_NS).ended

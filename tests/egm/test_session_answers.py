@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hrcreplay.egm.codec import RobotPacket
-from hrcreplay.egm.session import REASONS, Heard
+from hrcreplay.egm.session import REASONS, PacketStatus
 from tests.egm.talks import CYCLE_NS, DQ_MAX, Q_MAX, ZERO, packet, session, talk
 
 
@@ -115,7 +115,7 @@ def test_a_queue_gets_one_answer_to_its_newest_packet() -> None:
     lot = [packet(3), packet(2), None, packet(5), packet(5), packet(4), None]
     heard, newest = talking.hear_all(lot, 2 * CYCLE_NS)
     assert newest is lot[3]
-    assert heard == Heard(answer=True, fresh=False, allowed=True, reason="", ended=False, lost=2)
+    assert heard == PacketStatus(answer=True, fresh=False, allowed=True, reason="", ended=False, lost=2)
     assert talking.reply(ZERO, ZERO, 0).seqno == 2
     with pytest.raises(ValueError, match="no packet is waiting"):
         talking.reply(ZERO, ZERO, 0)

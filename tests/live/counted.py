@@ -12,7 +12,7 @@ from hrcreplay.egm.robot_double.faults import Datagram
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore
 from hrcreplay.live.control.loop import Loop, LoopSettings
-from hrcreplay.live.record.codec import Answer, Sight, TickEvent
+from hrcreplay.live.record.codec import Decision, Perception, TickEvent
 from tests.live.flights import BEGIN_NS, FRAME_NS, RESPONSE_NS, Flight, far_away
 
 ROBOT: Address = ("192.0.2.1", 6510)
@@ -123,7 +123,7 @@ class CountedLoop(Loop):
     clock: Clock = field(default_factory=Clock)
     work_ns: int = 300_000  #: from a packet to its answer
     look_ns: int = 0  #: what a look takes
-    seen: list[Answer] = field(default_factory=list)
+    seen: list[Decision] = field(default_factory=list)
 
     def now_ns(self) -> int:
         """The time counted."""
@@ -150,12 +150,12 @@ def counted(
     loop.work_ns, loop.look_ns = round(work_s * 1e9), round(look_s * 1e9)
     answer, look = flight.pilot.answer, flight.pilot.look
 
-    def works(event: TickEvent) -> Answer:
+    def works(event: TickEvent) -> Decision:
         clock.t_ns += loop.work_ns
         loop.seen.append(answer(event))
         return loop.seen[-1]
 
-    def looks(t_ns: int, skeletons: Sequence[bytes]) -> Sight | None:
+    def looks(t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
         sight = look(t_ns, skeletons)
         clock.t_ns += loop.look_ns
         return sight

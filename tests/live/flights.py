@@ -16,10 +16,10 @@ from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
 from hrcreplay.human.model import skeleton
-from hrcreplay.live.control.pilot import Pilot
-from hrcreplay.live.control.setup import build_pilot, live_job, start_table
+from hrcreplay.live.control.pilot import SessionController
+from hrcreplay.live.control.setup import build_controller, live_job, start_table
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import PHASES, Answer, MotionRow, Signal, TickEvent
+from hrcreplay.live.record.codec import PHASES, Decision, MotionRow, Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
 from hrcreplay.records import Floats, HumanStates
 from hrcreplay.robot.model import RobotModel
@@ -59,14 +59,14 @@ class Flight:
     twin: TwinSettings = field(default_factory=TwinSettings)
     signals: Callable[[float], Signal] = lambda _s: Signal.NONE
     messages: list[bytes] = field(default_factory=list)  #: what the recorder would get
-    answers: list[Answer] = field(default_factory=list)
-    heard: list[tuple[Answer, tuple[bytes, ...]]] = field(default_factory=list)  #: with what they answer
+    answers: list[Decision] = field(default_factory=list)
+    heard: list[tuple[Decision, tuple[bytes, ...]]] = field(default_factory=list)  #: with what they answer
     states: list[HumanStates] = field(default_factory=list)
     frames: list[tuple[int, bytes]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.start = start(*self.overrides)
-        self.pilot: Pilot = build_pilot(self.start)
+        self.pilot: SessionController = build_controller(self.start)
         self.core = TwinCore(self.twin, self.faults, self.seed)
         self._framed_ns = BEGIN_NS
         self._cycles = 0
@@ -90,14 +90,14 @@ class Flight:
             answer = self.pilot.answer(event)
             self.answers.append(answer)
             self.heard.append((answer, event.datagrams))
-            self.messages += [codec.robot(t_ns, datagram) for datagram in datagrams]
-            self.messages.append(codec.answer(answer, signals, len(datagrams), 0))
+            self.messages += [codec.encode_robot_packet(t_ns, datagram) for datagram in datagrams]
+            self.messages.append(codec.encode_decision(answer, signals, len(datagrams), 0))
             if answer.datagram is not None:
-                self.messages.append(codec.reply(t_ns, answer.datagram, sent=True))
+                self.messages.append(codec.encode_reply(t_ns, answer.datagram, sent=True))
                 yield answer.datagram
         else:
             self.pilot.silence(t_ns, signals)
-            self.messages.append(codec.silence(t_ns, signals))
+            self.messages.append(codec.encode_timeout(t_ns, signals))
         self._look(t_ns + 1)
 
     def _look(self, t_ns: int) -> None:
@@ -109,10 +109,10 @@ class Flight:
             self._framed_ns += FRAME_NS
         sight = self.pilot.look(t_ns, seen)
         self.frames += [(t_ns, data) for data in seen]
-        self.messages += [codec.frame(t_ns, data) for data in seen]
+        self.messages += [codec.encode_skeleton(t_ns, data) for data in seen]
         if sight is not None:
             self.states.append(sight.states)
-            self.messages.append(codec.look(sight.states, sight.volumes, len(seen)))
+            self.messages.append(codec.encode_perception(sight.states, sight.volumes, len(seen)))
 
     def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
         base = np.array(self.start["T_world_base"])[:3, 3]

@@ -16,15 +16,15 @@ import pytest
 from hrcreplay.cli import app
 from hrcreplay.egm.codec import Correction, decode_correction
 from hrcreplay.egm.link import Received
-from hrcreplay.egm.session import Session
+from hrcreplay.egm.session import EgmSession
 from hrcreplay.errors import LiveStopped
 from hrcreplay.live import processes, session
 from hrcreplay.live.control import last_resort, pilot, watchdog
 from hrcreplay.live.control.loop import FAREWELLS, Loop
 from hrcreplay.live.control.perception import Observer
-from hrcreplay.live.control.setup import build_pilot
+from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.record import codec, folder
-from hrcreplay.live.verify import Again
+from hrcreplay.live.verify import SessionRecomputation
 from hrcreplay.live.view import status_publisher
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import RobotState
@@ -41,8 +41,8 @@ PLACES: dict[str, tuple[Any, str]] = {
     "controller": (QpFollower, "step"),
     "every pose": (RobotModel, "pose"),
     "packets": (pilot, "decode_robot"),
-    "conversation": (Session, "hear_all"),
-    "reply": (Session, "reply"),
+    "conversation": (EgmSession, "hear_all"),
+    "reply": (EgmSession, "reply"),
     "encoding": (pilot, "encode_correction"),
     "watchdog": (watchdog, "of_person"),
     "age of the frames": (Observer, "age_s"),
@@ -50,7 +50,7 @@ PLACES: dict[str, tuple[Any, str]] = {
     "record of an answer": (codec, "answer"),
     "record of a packet": (codec, "robot"),
     "record of a look": (codec, "look"),
-    "status": (status_publisher.Teller, "_status"),
+    "status": (status_publisher.StatusPublisher, "_status"),
     "link": (Cable, "newest"),
 }
 MOVING_S = 0.45
@@ -121,7 +121,7 @@ def test_a_bug_is_one_line_and_a_traceback_in_the_folder(
     found = Sent(place, 0.0, tmp_path, monkeypatch)
     assert found.lines
     assert all(line.startswith("control: ZeroDivisionError: put there by a test (") for line in found.lines)
-    assert processes.read(tmp_path) == found.lines[:1]
+    assert processes.read_crashes(tmp_path) == found.lines[:1]
     text = (tmp_path / "crash_control.txt").read_text()
     assert text.startswith(f"{found.lines[0]}\n\nTraceback (most recent call last):\n")
     assert text.count("put there\nby a test") >= len(found.lines)
@@ -133,7 +133,7 @@ def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
     try:
         control_step.braked("nonsense", np.ones(6), 0.004)  # type: ignore[arg-type]
     except AttributeError as error:
-        said = processes.said_of(error)
+        said = processes.describe_exception(error)
     lines = Path(control_step.__file__).read_text().splitlines()
     number = next(i for i, line in enumerate(lines, 1) if "speed = np.abs(state.dq)" in line)
     place = f"hrcreplay/robot/control/control_step.py:{number}, in braked"
@@ -141,7 +141,7 @@ def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
 
 
 def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
-    brake = last_resort.Brake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7)
+    brake = last_resort.FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7)
     brake.hear([9.0] * 6)  # it lags
     assert brake.dq == [20.0] * 6
     brake.hear([11.0] * 6)
@@ -152,7 +152,9 @@ def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
 
 
 def test_a_brake_stays_within_the_joints_limits() -> None:
-    brake = last_resort.Brake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0)
+    brake = last_resort.FallbackBrake(
+        [360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0
+    )
     said = [decode_correction(brake.step(0)) for _ in range(20)]
     assert brake.at_rest
     np.testing.assert_allclose(np.degrees([reply.q[:5] for reply in said]).max(), 90.0)
@@ -185,14 +187,14 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
     monkeypatch.undo()
     messages: list[bytes] = found.loop.recorder.messages  # type: ignore[assignment]
     kinds = [codec.kind(message) for message in messages]
-    events = [codec.read_event(message) for message in messages if codec.kind(message) == codec.EVENT]
+    events = [codec.decode_event(message) for message in messages if codec.kind(message) == codec.EVENT]
     assert [event["what"] for event in events] == ["crash", "end"]
     assert events[1]["reason"] == watchdog.FAULT
-    again = Again(build_pilot(found.flight.start))
+    again = SessionRecomputation(build_controller(found.flight.start))
     crashed_at = next(i for i, message in enumerate(messages) if b'"crash"' in message)
     assert all(again.differs(message) is None for message in messages[: crashed_at + 1])
     assert again.crashed.startswith("ZeroDivisionError: put there by a test")
-    rows = [codec.motion_row(codec.read_answer(m)) for m in messages[crashed_at:] if codec.kind(m) == codec.ANSWER]
+    rows = [codec.motion_row(codec.decode_decision(m)) for m in messages[crashed_at:] if codec.kind(m) == codec.ANSWER]
     assert kinds[crashed_at:].count(codec.REPLY) == len(rows) > 50 + FAREWELLS
     assert rows[0] is not None
     assert rows[0].dq.any()
@@ -234,7 +236,7 @@ class Live:
         said, _, where = line.removeprefix("hrcreplay: ").partition("; ")
         assert self.code == 4
         assert where == f"not complete: what there is of the record, and the traceback, is in {self.partial}"
-        assert processes.read(self.partial) == [said]
+        assert processes.read_crashes(self.partial) == [said]
         assert said.startswith(f"{part}: ZeroDivisionError: put there by a test (")
         meta = json.loads((self.partial / "run.json").read_text())
         assert meta == {"command": "live", "complete": False, "reason": said, "crashes": [said]}

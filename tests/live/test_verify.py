@@ -13,7 +13,7 @@ import pytest
 from hrcreplay.egm.robot_double.faults import KINDS, Fault
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, Signal, TickEvent
+from hrcreplay.live.record.codec import Decision, Signal, TickEvent
 from hrcreplay.live.verify import Verdict, verify
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
@@ -62,7 +62,7 @@ class Drifting(made.Pilot):
 
     answers = 0
 
-    def answer(self, event: TickEvent) -> Answer:
+    def answer(self, event: TickEvent) -> Decision:
         self.answers += 1
         if self.answers == 20:
             self.q[2] += 1e-15
@@ -72,7 +72,7 @@ class Drifting(made.Pilot):
 def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messages: list[bytes]) -> None:
     verdict = _verdict(tmp_path, messages, Drifting)
     assert not verdict.identical
-    recorded = codec.read_answer(messages[_at(messages, codec.ANSWER, 19)]).row
+    recorded = codec.decode_decision(messages[_at(messages, codec.ANSWER, 19)]).row
     assert recorded is not None
     seconds = 20 * made.TICK_NS / 1e9
     q = float(recorded[2])  # of q_measured, which this pilot derives from q
@@ -105,7 +105,7 @@ def test_changed_numbers_are_named(
 
 def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[bytes]) -> None:
     at = _at(messages, codec.ANSWER, 58)
-    assert codec.read_answer(messages[at]).reason == "Ctrl-C"
+    assert codec.decode_decision(messages[at]).reason == "Ctrl-C"
     changed = list(messages)
     changed[at] = changed[at].replace(b"Ctrl-C", b"SIGINT")
     assert "tick 58 at" in (line := _verdict(tmp_path, changed).lines[0])
@@ -113,7 +113,7 @@ def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[
 
     changed = list(messages)
     changed[at + 1] = changed[at + 1][:-3] + bytes([changed[at + 1][-3] ^ 1]) + changed[at + 1][-2:]
-    reply = codec.read_reply(messages[at + 1])[1]
+    reply = codec.decode_reply(messages[at + 1])[1]
     value = reply[-3]
     assert (
         _verdict(tmp_path, changed)
@@ -166,7 +166,7 @@ def test_a_look_that_failed_fails_again(tmp_path: Path, messages: list[bytes]) -
             """A bug."""
 
     t_ns = made.START_NS + 10
-    record = [messages[0], codec.frame(t_ns, made.skeleton(0)), codec.event(t_ns, {"what": "blind"})]
+    record = [messages[0], codec.encode_skeleton(t_ns, made.skeleton(0)), codec.encode_event(t_ns, {"what": "blind"})]
     assert _verdict(tmp_path, record, Blind).identical
     assert "look: recorded 'failed'" in _verdict(tmp_path, record).lines[0]
 
@@ -266,6 +266,6 @@ def test_a_session_with_every_fault_is_identical(tmp_path: Path) -> None:
     assert len(flight.pilot.stops) >= 3
     run = tmp_path / "run.partial"
     run.mkdir()
-    made.record(run / "log.mcap", [codec.event(BEGIN_NS - 1, flight.start), *flight.messages], chunk=500)
+    made.record(run / "log.mcap", [codec.encode_event(BEGIN_NS - 1, flight.start), *flight.messages], chunk=500)
     verdict = verify(run)
     assert verdict.identical, verdict.lines

@@ -11,7 +11,7 @@ from hrcreplay.human.prediction.swept_volumes import Radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS
 from hrcreplay.run import replay, report
-from hrcreplay.run.stages import Foresight
+from hrcreplay.run.stages import PredictionStage
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
 
@@ -27,7 +27,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 def test_the_figure_of_volumes_holds_the_runs_own_method(sound: Run) -> None:
     radii = Radii(head=0.12, thorax=0.15, upper_arm=0.07, lower_arm=0.07)
-    foresight = Foresight(load_limits("paper"), 0.377, radii, Margins(), "sound")
+    foresight = PredictionStage(load_limits("paper"), 0.377, radii, Margins(), "sound")
     (_, methods), *others = report._instants(foresight, sound)
     assert len(others) == 3
     assert list(methods) == ["paper", "positions", "sound"]

@@ -209,7 +209,7 @@ def test_a_setting_makes_the_stages_stale_that_depend_on_it(
 
 def _handed(job: Job, log: Log) -> dict[str, str]:
     """What the first two stages are handed, however it came about, and how the third weighs."""
-    eyes, foresight = asdict(build.eyes(job, log)), asdict(build.foresight(job))
+    eyes, foresight = asdict(build.fusion_stage(job, log)), asdict(build.prediction_stage(job))
     for limits in (eyes["limits"], foresight["limits"]):
         del limits["name"]
     reading = asdict(log_options(job.settings))

@@ -110,7 +110,7 @@ def test_the_command_samples_what_predict_does_by_default(method: str, capsys: p
     found = json.loads(line)
     sound = method == "sound"
     settings = load_settings()
-    foresight = build.foresight(unlogged("predict", Path(), settings, None))
+    foresight = build.prediction_stage(unlogged("predict", Path(), settings, None))
     assert (found["method"], found["limits"]) == (method, foresight.limits.name)
     assert found["horizon_s"] == foresight.horizon_s
     assert found["latency_s"] == foresight.margins.latency_s

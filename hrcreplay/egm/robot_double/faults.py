@@ -24,7 +24,7 @@ class Datagram(NamedTuple):
     data: bytes
 
 
-class Channel:
+class FaultyChannel:
     """Faults of one direction, in the order in which they were given. Draws from its own generator alone."""
 
     def __init__(self, faults: Iterable[Fault], seed: Sequence[int]) -> None:

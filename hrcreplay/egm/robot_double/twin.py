@@ -28,7 +28,7 @@ from hrcreplay.egm.codec import (
     encode_robot,
     flange_pose,
 )
-from hrcreplay.egm.robot_double.faults import Channel, Datagram, Fault, lasts
+from hrcreplay.egm.robot_double.faults import Datagram, Fault, FaultyChannel, lasts
 from hrcreplay.egm.robot_double.servo import PERIOD_NS, Servo, ServoSettings
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats, Ints
@@ -198,8 +198,8 @@ class TwinCore:
         link = [fault for fault in faults if fault.of_link]
         self._robot_faults = [fault for fault in faults if not fault.of_link]
         self._happened: set[int] = set()
-        self._out = Channel((fault for fault in link if fault.direction != "in"), (seed, 0))
-        self._in = Channel((fault for fault in link if fault.direction != "out"), (seed, 1))
+        self._out = FaultyChannel((fault for fault in link if fault.direction != "in"), (seed, 0))
+        self._in = FaultyChannel((fault for fault in link if fault.direction != "out"), (seed, 1))
         self._coming: list[tuple[int, int, bytes]] = []
         self._coming_count = 0
         self._queue: deque[bytes] = deque()

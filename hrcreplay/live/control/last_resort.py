@@ -20,7 +20,7 @@ from hrcreplay.egm.link import Received
 from hrcreplay.live.control import watchdog
 from hrcreplay.live.control.loop import FAREWELLS, Loop
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, MotionRow, Signal
+from hrcreplay.live.record.codec import Decision, MotionRow, Signal
 from hrcreplay.robot.control.control_step import BRAKING
 
 #: A robot that says nothing for so many waits of the link has stopped listening; it stops by itself.
@@ -30,7 +30,7 @@ _COUNTER = 2**32
 
 
 @dataclass
-class Brake:
+class FallbackBrake:
     """Each axis as fast as it can, Eq. (67), from the last reply on; positions stay within limits."""
 
     ddq_max: Sequence[float]  #: [deg/s^2]
@@ -81,7 +81,7 @@ def bring_to_rest(loop: Loop, why: str) -> None:
         if loop.pilot.stop != watchdog.FAULT:
             loop.pilot.stop = watchdog.FAULT
             loop.pilot.stops.append((loop.now_ns(), watchdog.FAULT))
-        loop.recorder.send(codec.event(loop.now_ns(), {"what": "crash", "text": why}))
+        loop.recorder.send(codec.encode_event(loop.now_ns(), {"what": "crash", "text": why}))
     brake, sender = _brake(loop), loop.sender
     if brake is None or sender is None:
         return
@@ -111,7 +111,7 @@ def bring_to_rest(loop: Loop, why: str) -> None:
         received = None
 
 
-def _brake(loop: Loop) -> Brake | None:
+def _brake(loop: Loop) -> FallbackBrake | None:
     if loop.sent is None:
         return None
     told = messages.SensorMessage.FromString(loop.sent)
@@ -119,7 +119,7 @@ def _brake(loop: Loop) -> Brake | None:
     ddq_max, q_min, q_max = (np.degrees(bound).tolist() for bound in (robot.ddq_max, robot.q_min, robot.q_max))
     q, dq = list(told.planned.joints.joints), list(told.speed_reference.joints.joints)
     tracking = math.degrees(setup.bounds.tracking_rad)
-    return Brake(ddq_max, q_min, q_max, setup.plan.dt_s, tracking, q, dq, told.header.seqno)
+    return FallbackBrake(ddq_max, q_min, q_max, setup.plan.dt_s, tracking, q, dq, told.header.seqno)
 
 
 def _measured(data: bytes) -> list[float] | None:
@@ -136,20 +136,20 @@ def _record(
     received: Received | None,
     measured: list[float] | None,
     before: tuple[list[float], list[float]],
-    brake: Brake,
+    brake: FallbackBrake,
     data: bytes,
 ) -> None:
     """A row of the motion like any other; what only the stages know is missing in it."""
     t_ns = loop.now_ns() if received is None else received.t_ns + loop.anchor_ns
     datagrams = () if received is None else (*received.older, received.data)
     for datagram in datagrams:
-        loop.recorder.send(codec.robot(t_ns, datagram))
+        loop.recorder.send(codec.encode_robot_packet(t_ns, datagram))
     q, dq = (np.radians(numbers) for numbers in before)
     u = (np.radians(brake.dq) - dq) / brake.cycle_s
     where = np.full(len(q), np.nan) if measured is None else np.radians(measured)
     unknown = np.full(3, np.nan)
     row = MotionRow(where, q, dq, u, unknown, unknown, np.full(4, np.nan))
     phase = codec.HOLDING if brake.at_rest else codec.STOPPING
-    answer = Answer(t_ns, 0, data, phase, BRAKING, watchdog.FAULT, -1, -1, row)
-    loop.recorder.send(codec.answer(answer, Signal.NONE, len(datagrams), 0))
-    loop.recorder.send(codec.reply(t_ns, data, sent=True))
+    answer = Decision(t_ns, 0, data, phase, BRAKING, watchdog.FAULT, -1, -1, row)
+    loop.recorder.send(codec.encode_decision(answer, Signal.NONE, len(datagrams), 0))
+    loop.recorder.send(codec.encode_reply(t_ns, data, sent=True))

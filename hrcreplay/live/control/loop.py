@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hrcreplay.egm.link import Address, Link, Received
-from hrcreplay.live.control.pilot import Pilot
+from hrcreplay.egm.link import Address, EgmServer, Received
+from hrcreplay.live.control.pilot import SessionController
 from hrcreplay.live.control.watchdog import REFUSED
-from hrcreplay.live.processes import Helper
+from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, Signal, TickEvent
+from hrcreplay.live.record.codec import Decision, Signal, TickEvent
 
 _BIN_NS = 5_000
 _BINS = 20_000  # up to 0.1 s; the last one holds all that took longer
@@ -74,14 +74,14 @@ class LoopSettings:
 class Loop:
     """One session's loop. ``now_ns`` is the session's clock."""
 
-    pilot: Pilot
-    link: Link
-    person: Helper
-    recorder: Helper
+    pilot: SessionController
+    link: EgmServer
+    person: HelperProcess
+    recorder: HelperProcess
     settings: LoopSettings
     anchor_ns: int
     start_ns: int
-    screen: Helper | None = None
+    screen: HelperProcess | None = None
     caught: Signal = Signal.NONE  #: by the handlers of the operating system's signals
     signals: Signal = Signal.NONE  #: of the latest turn
     notes: list[str] = field(default_factory=list)
@@ -89,7 +89,7 @@ class Loop:
     answers: int = 0
     skipped: int = 0  #: looks left out
     robot: str | None = None
-    last: Answer | None = None
+    last: Decision | None = None
     sent: bytes | None = None  #: the latest reply that went to the robot
     sender: Address | None = None  #: where the robot's packets come from
     pending: Received | None = None  #: what is not answered yet
@@ -118,7 +118,7 @@ class Loop:
         if received is None:
             t_ns = self.now_ns()
             self.pilot.silence(t_ns, signals)
-            self.recorder.send(codec.silence(t_ns, signals))
+            self.recorder.send(codec.encode_timeout(t_ns, signals))
         else:
             self._answer(received, signals)
         self._skipped = received is not None and received.waited and not self._skipped
@@ -140,12 +140,12 @@ class Loop:
         self._late = took_ns > self.settings.overrun_s * 1e9
         self.robot = "{}:{}".format(*received.sender)
         for datagram in event.datagrams:
-            self.recorder.send(codec.robot(event.t_ns, datagram))
-        self.recorder.send(codec.answer(answer, signals, len(event.datagrams), took_ns // 1000))
+            self.recorder.send(codec.encode_robot_packet(event.t_ns, datagram))
+        self.recorder.send(codec.encode_decision(answer, signals, len(event.datagrams), took_ns // 1000))
         if answer.datagram is not None:
             self.answers += 1
             self.took.add(took_ns)
-            self.recorder.send(codec.reply(event.t_ns, answer.datagram, sent=self.settings.sending))
+            self.recorder.send(codec.encode_reply(event.t_ns, answer.datagram, sent=self.settings.sending))
         self.last = answer
 
     def _look(self) -> None:
@@ -153,14 +153,14 @@ class Loop:
         t_ns = self.now_ns()
         sight = self.pilot.look(t_ns, skeletons)
         for skeleton in skeletons:
-            self.recorder.send(codec.frame(t_ns, skeleton))
+            self.recorder.send(codec.encode_skeleton(t_ns, skeleton))
         if sight is None:
-            self.recorder.send(codec.event(t_ns, {"what": "blind"}))
+            self.recorder.send(codec.encode_event(t_ns, {"what": "blind"}))
             return
-        self.recorder.send(codec.look(sight.states, sight.volumes, len(skeletons)))
+        self.recorder.send(codec.encode_perception(sight.states, sight.volumes, len(skeletons)))
         if t_ns - self._stored_ns >= self.settings.store_every_s * 1e9:
             self._stored_ns = t_ns
-            self.stored = codec.whole(sight.volumes)
+            self.stored = codec.encode_volumes(sight.volumes)
             self.recorder.send(self.stored)
 
     def _hear_person(self) -> list[bytes]:
@@ -182,7 +182,7 @@ class Loop:
     def note(self, text: str) -> None:
         """Something worth telling and recording."""
         self.notes.append(text)
-        self.recorder.send(codec.event(self.now_ns(), {"what": "note", "text": text}))
+        self.recorder.send(codec.encode_event(self.now_ns(), {"what": "note", "text": text}))
 
     def _signals(self) -> Signal:
         now_ns, found = self.now_ns(), self.caught

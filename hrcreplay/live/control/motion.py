@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.live.control.watchdog import Bounds
+from hrcreplay.live.control.watchdog import WatchdogSettings
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step
@@ -23,7 +23,7 @@ Follower = QpFollower | ScalingFollower
 
 
 @dataclass(frozen=True)
-class Setup:
+class ControlSetup:
     """All that a session depends on beside what it hears."""
 
     robot: RobotModel
@@ -32,13 +32,13 @@ class Setup:
     follow: Callable[[Reference, float], Follower]  #: a robot at a programmed time of a path
     waypoint_m: float  #: the approach is over when the TCP is this close to its end [m]
     approach_speed: float  #: share of the axes' top speeds on the way to the programme
-    bounds: Bounds
+    bounds: WatchdogSettings
     memory_s: float  #: a person unseen for longer counts as unknown [s]
     sending: bool  #: False in shadow mode: the robot does not follow
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class MotionState:
     """Where a robot has got, as far as it was told."""
 
     state: RobotState
@@ -47,16 +47,16 @@ class Course:
     arrived: bool = False  #: whether it follows the programme, not the way to it
 
 
-class Said(NamedTuple):
+class MotionStep(NamedTuple):
     """One tick's decision before it is encoded, and where it leads."""
 
     reference_m: Floats
     reference_speed: float
     step: Step
-    after: Course
+    after: MotionState
 
 
-def set_out(setup: Setup, course: Course) -> Course:
+def start_approach(setup: ControlSetup, course: MotionState) -> MotionState:
     """From where the robot stands to where its programme has got."""
     goal = setup.programme.sample(course.programme_s).q
     follower = setup.follow(approach(setup.robot, course.state.q, goal, setup.approach_speed), 0.0)
@@ -64,7 +64,7 @@ def set_out(setup: Setup, course: Course) -> Course:
     return replace(course, follower=follower, arrived=False)
 
 
-def follow(setup: Setup, course: Course, around: Obstacles) -> Said:
+def follow(setup: ControlSetup, course: MotionState, around: Obstacles) -> MotionStep:
     """One tick along the path."""
     if course.follower is None:
         raise ValueError("follow: the robot has not set out")
@@ -77,10 +77,10 @@ def follow(setup: Setup, course: Course, around: Obstacles) -> Said:
         follower = setup.follow(setup.programme, course.programme_s)
         follower.state = tick.step.next
         after = replace(after, follower=follower, arrived=True)
-    return Said(tick.point.T_world_tcp[:3, 3], float(np.linalg.norm(tick.point.twist[:3])), tick.step, after)
+    return MotionStep(tick.point.T_world_tcp[:3, 3], float(np.linalg.norm(tick.point.twist[:3])), tick.step, after)
 
 
-def _at_the_end(setup: Setup, follower: Follower) -> bool:
+def _at_the_end(setup: ControlSetup, follower: Follower) -> bool:
     """Whether the approach has come to its end."""
     along_s = follower.s_s if isinstance(follower, QpFollower) else follower.along.s_s
     if along_s < follower.reference.duration_s:
@@ -90,11 +90,11 @@ def _at_the_end(setup: Setup, follower: Follower) -> bool:
     return float(np.linalg.norm(pose.T_world_tcp[:3, 3] - goal)) <= setup.waypoint_m
 
 
-def brake(setup: Setup, course: Course, around: Obstacles) -> Said:
+def brake(setup: ControlSetup, course: MotionState, around: Obstacles) -> MotionStep:
     """Eq. (67): each axis as fast as it can; a robot that stands stays."""
     robot, plan, state = setup.robot, setup.plan, course.state
     with np.errstate(all="ignore"):
         seen = control_step.observe(robot, state, around, plan.clearance_m)
     step = seen.step(state, control_step.braked(state, robot.ddq_max, plan.dt_s), plan.dt_s, control_step.BRAKING)
     point = setup.programme.sample(course.programme_s)
-    return Said(point.T_world_tcp[:3, 3], 0.0, step, Course(step.next, course.programme_s))
+    return MotionStep(point.T_world_tcp[:3, 3], 0.0, step, MotionState(step.next, course.programme_s))

@@ -9,31 +9,31 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from hrcreplay.human.fusion import fuse
-from hrcreplay.live.record.codec import Sight
+from hrcreplay.live.record.codec import Perception
 from hrcreplay.logs import skeleton_pb2
 from hrcreplay.logs.clean import Cleaner, PersonMemory
 from hrcreplay.logs.decoders import points_of
-from hrcreplay.logs.messages import Row, Undecodable
+from hrcreplay.logs.messages import RawSkeleton, Undecodable
 from hrcreplay.records import CameraFrames
 from hrcreplay.robot.control.separation import obstacles
-from hrcreplay.run.stages import NS, Eyes, Foresight, nothing
+from hrcreplay.run.stages import NS, FusionStage, PredictionStage, no_frames
 
 
 class Observer:
     """Stages 1 and 2, fed with what has come since the look before."""
 
-    def __init__(self, eyes: Eyes, foresight: Foresight, cameras: tuple[str, ...], gap_s: float) -> None:
+    def __init__(self, eyes: FusionStage, foresight: PredictionStage, cameras: tuple[str, ...], gap_s: float) -> None:
         self._eyes = eyes
         self._foresight = foresight
         self._cameras = cameras
-        self._nothing = nothing(cameras)
+        self._nothing = no_frames(cameras)
         self._fusion = fuse.start(cameras)
         self._memory = PersonMemory()
         self.counts: Counter[str] = Counter()
         self._cleaner = Cleaner(cameras, gap_s, self.counts)
         self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Sight:
+    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
         """What is known of the person at ``t_ns``, which must be later than that of the look before.
 
         Args:
@@ -51,7 +51,7 @@ class Observer:
         self._fusion, states, events = fuse.fuse(self._fusion, ticks, measured, self._eyes.filter, self._eyes.limits)
         self.counts.update(events)
         volumes = self._foresight.volumes(states)
-        return Sight(t_ns, states, volumes, obstacles(volumes, 0))
+        return Perception(t_ns, states, volumes, obstacles(volumes, 0))
 
     def age_s(self, t_ns: int) -> float:
         """How old the newest frame of the person is; inf before the first [s]."""
@@ -72,9 +72,11 @@ class Observer:
         return self._cleaner.rest()
 
 
-def _row(data: bytes) -> Row:
+def _row(data: bytes) -> RawSkeleton:
     skeleton = skeleton_pb2.Skeleton.FromString(data)
     points = points_of(skeleton.points, skeleton.camera)
     if len(skeleton.confidence) != len(points):
         raise Undecodable(f"{skeleton.camera}: {len(skeleton.confidence)} confidences")
-    return Row(skeleton.capture_ns, skeleton.camera, skeleton.body, points, np.array(skeleton.confidence, np.float64))
+    return RawSkeleton(
+        skeleton.capture_ns, skeleton.camera, skeleton.body, points, np.array(skeleton.confidence, np.float64)
+    )

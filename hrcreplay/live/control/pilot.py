@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 
 from hrcreplay.egm.codec import AXES, BadPacket, RobotPacket, decode_robot, encode_correction
-from hrcreplay.egm.session import Heard, Session
+from hrcreplay.egm.session import EgmSession, PacketStatus
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.motion import Course, Said, Setup, brake, follow, set_out
+from hrcreplay.live.control.motion import ControlSetup, MotionState, MotionStep, brake, follow, start_approach
 from hrcreplay.live.control.perception import Observer
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, MotionRow, Sight, Signal, TickEvent
+from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import RobotState
@@ -27,7 +27,7 @@ _UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.emp
 _STILL = np.zeros(AXES)
 
 
-class Pilot:
+class SessionController:
     """Answers the robot's packets: waits, approaches, follows its programme, brakes by Eq. (67) and holds.
 
     Between two answers ``look`` brings in what the cameras saw. The robot moves only while the watchdog has no reason
@@ -38,19 +38,19 @@ class Pilot:
     to decide whether it is taken. Where there is no time for a look, ``prepare`` makes the step without one.
     """
 
-    def __init__(self, setup: Setup, observer: Observer, session: Session) -> None:
+    def __init__(self, setup: ControlSetup, observer: Observer, session: EgmSession) -> None:
         self.setup = setup
         self.observer = observer
         self._session = session
-        self.sight: Sight | None = None
+        self.sight: Perception | None = None
         self.phase = codec.WAITING
         self.stop = ""  #: why the robot was stopped; empty while it may move
         self.stops: list[tuple[int, str]] = []  #: every stop: instant [ns] and reason
         self.waiting = ""  #: why it does not start
         self.fault: Exception | None = None  #: a bug that stopped it; to be raised once it stands
         self.standing = 0  #: answers since it stands
-        self._course: Course | None = None  # None: no robot is there
-        self._ready: tuple[Course, Said] | None = None
+        self._course: MotionState | None = None  # None: no robot is there
+        self._ready: tuple[MotionState, MotionStep] | None = None
         self._programme_s = 0.0  # of the robot that was there last
         self._heard_ns: int | None = None
         self._clear_ns: int | None = None
@@ -65,7 +65,7 @@ class Pilot:
         """What was found of the person's frames and the robot's packets so far."""
         return self.observer.counts + Counter({f"robot {what}": n for what, n in self._session.counts.items()})
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Sight | None:
+    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
         """Stages 1 and 2 up to ``t_ns`` [ns, session clock]; None where they failed, which stops the robot."""
         self._ready = None
         try:
@@ -90,7 +90,7 @@ class Pilot:
         if why and not self.stop:
             self._stop(t_ns, why)
 
-    def answer(self, event: TickEvent) -> Answer:
+    def answer(self, event: TickEvent) -> Decision:
         """The reply to what the robot sent, and why it is that one."""
         self._hear_nothing(event.t_ns)  # also where the packet that ends a silence comes before its time-out is seen
         packets = [_decoded(data) for data in event.datagrams]
@@ -100,7 +100,7 @@ class Pilot:
         look_ns = self.sight.t_ns if self.sight is not None else 0
         if packet is None:
             self._refuse(event.t_ns, heard)
-            return Answer(event.t_ns, look_ns, None, self.phase, control_step.BRAKING, self.stop, -1, -1, None)
+            return Decision(event.t_ns, look_ns, None, self.phase, control_step.BRAKING, self.stop, -1, -1, None)
         measured = packet.q[:AXES]
         self._heard_ns = event.t_ns
         if heard.fresh or self._course is None:
@@ -117,7 +117,7 @@ class Pilot:
         self._settle()
         step, row = said.step, _row(measured, before, said)
         reason = (self.stop or self.waiting) if said.after.follower is None else control_step.REASONS[step.reason]
-        return Answer(
+        return Decision(
             event.t_ns, look_ns, encode_correction(reply), phase, step.status, reason, step.limb, step.link, row
         )
 
@@ -132,7 +132,7 @@ class Pilot:
         elif self.phase == codec.APPROACH and self._course is not None and self._course.arrived:
             self.phase = codec.FOLLOWING
 
-    def _refuse(self, t_ns: int, heard: Heard) -> None:
+    def _refuse(self, t_ns: int, heard: PacketStatus) -> None:
         """Nothing to answer: a robot that must not be moved at all, or nothing of worth."""
         if heard.reason in watchdog.REFUSED and not self.stop:
             self._stop(t_ns, heard.reason)
@@ -150,10 +150,10 @@ class Pilot:
 
     def _begin(self, measured: Floats) -> None:
         """A new session of the robot: whatever was commanded before, it is where it is."""
-        self._course = Course(RobotState(measured, _STILL), self._programme_s)
+        self._course = MotionState(RobotState(measured, _STILL), self._programme_s)
         self.phase = codec.ECHO
 
-    def _judge(self, event: TickEvent, heard: Heard, measured: Floats) -> None:
+    def _judge(self, event: TickEvent, heard: PacketStatus, measured: Floats) -> None:
         """What the watchdog says, and the phase that follows from it."""
         why = self._why(event, heard, measured)
         if self.phase in (codec.APPROACH, codec.FOLLOWING):
@@ -168,9 +168,9 @@ class Pilot:
                 self.stop = why  # what holds it now
         self.waiting = why if self.phase == codec.WAITING else ""
         if self.phase == codec.WAITING and not why and self._course is not None:
-            self._course, self.phase = set_out(self.setup, self._course), codec.APPROACH
+            self._course, self.phase = start_approach(self.setup, self._course), codec.APPROACH
 
-    def _why(self, event: TickEvent, heard: Heard, measured: Floats) -> str:
+    def _why(self, event: TickEvent, heard: PacketStatus, measured: Floats) -> str:
         """The reason not to move, or none."""
         if self.fault is not None:
             return watchdog.FAULT
@@ -190,7 +190,7 @@ class Pilot:
         if self._course is not None:
             self._course = replace(self._course, follower=None)
 
-    def _say(self, course: Course) -> Said:
+    def _say(self, course: MotionState) -> MotionStep:
         """The tick's step: the one that is ready, if it is still the one to take."""
         if self._ready is not None and self._ready[0] is course:
             said = self._ready[1]
@@ -203,13 +203,13 @@ class Pilot:
         finite = math.isfinite(said.step.next.q.sum() + said.step.next.dq.sum())
         return said if finite else self._give_up(course, watchdog.NOT_FINITE)
 
-    def _give_up(self, course: Course, why: str) -> Said:
+    def _give_up(self, course: MotionState, why: str) -> MotionStep:
         """The stop of a robot whose step cannot be taken; once, however often it fails while the robot brakes."""
         if not self.stop or self.phase in (codec.APPROACH, codec.FOLLOWING):
             self._stop(self._heard_ns or 0, why)
         return brake(self.setup, course, _UNSEEN)
 
-    def _step(self, course: Course) -> Said:
+    def _step(self, course: MotionState) -> MotionStep:
         return (brake if course.follower is None else follow)(self.setup, course, self._around())
 
     def _around(self) -> Obstacles:
@@ -227,7 +227,7 @@ def _decoded(data: bytes) -> RobotPacket | None:
         return None
 
 
-def _row(measured: Floats, before: Course, said: Said) -> MotionRow:
+def _row(measured: Floats, before: MotionState, said: MotionStep) -> MotionRow:
     pose, state = said.step.pose, before.state
     speed = float(np.linalg.norm(pose.J_tcp[:3] @ state.dq))
     rest = np.array([speed, said.reference_speed, said.after.programme_s, said.step.distance_m])

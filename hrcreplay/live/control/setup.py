@@ -16,13 +16,13 @@ from pydantic import ValidationError
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_robot
-from hrcreplay.egm.session import Session
+from hrcreplay.egm.session import EgmSession
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet, skeleton
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.motion import Follower, Setup
+from hrcreplay.live.control.motion import ControlSetup, Follower
 from hrcreplay.live.control.perception import Observer
-from hrcreplay.live.control.pilot import Pilot
+from hrcreplay.live.control.pilot import SessionController
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
@@ -37,7 +37,7 @@ from hrcreplay.settings.load import Settings, load_settings
 
 
 @dataclass(frozen=True)
-class Scene:
+class HeaderOnlyLog:
     """What stands for a log where there is none yet: see build.Source."""
 
     header: Header
@@ -108,12 +108,12 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         raise SettingsError(
             f"{header.path}: no task; a live robot needs one: name a task file with --set plan.task=FILE"
         )
-    known, scene = job.meta(), Scene(header)
-    T_world_base, eyes = build.standing(job, scene), build.eyes(job, scene)
+    known, scene = job.meta(), HeaderOnlyLog(header)
+    T_world_base, eyes = build.standing(job, scene), build.fusion_stage(job, scene)
     robot = build.robot(job, T_world_base)
     if robot.nv != AXES:
         raise SettingsError(f"robot.urdf: {robot.name} has {robot.nv} axes; live drives robots of {AXES} over EGM")
-    volumes = Observer(eyes, build.foresight(job), header.cameras, job.settings.logs.gap_s).look(0, ()).volumes
+    volumes = Observer(eyes, build.prediction_stage(job), header.cameras, job.settings.logs.gap_s).look(0, ()).volumes
     return {
         "hrcreplay": __version__,
         "settings": known["settings"],
@@ -130,7 +130,7 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
     }
 
 
-def build_pilot(start: dict[str, Any]) -> Pilot:
+def build_controller(start: dict[str, Any]) -> SessionController:
     """The pilot of a session at its start.
 
     Raises:
@@ -139,14 +139,16 @@ def build_pilot(start: dict[str, Any]) -> Pilot:
     job = job_of(start, Path("live session"), "")
     poses = {name: np.array(T) for name, T in start["cameras"].items()}
     header = _header(job.log, tuple(start["cameras"]), poses, np.array(start["T_world_base"]), job.task)
-    scene = Scene(header)
+    scene = HeaderOnlyLog(header)
     setup = _setup(job, scene, sending=start["sending"])
-    observer = Observer(build.eyes(job, scene), build.foresight(job), header.cameras, job.settings.logs.gap_s)
+    observer = Observer(
+        build.fusion_stage(job, scene), build.prediction_stage(job), header.cameras, job.settings.logs.gap_s
+    )
     robot, live = setup.robot, job.settings.live
-    session = Session(
+    session = EgmSession(
         robot.q_min, robot.q_max, robot.dq_max, utilization_max=live.utilization_max, silence_s=live.silent_s
     )
-    return Pilot(setup, observer, session)
+    return SessionController(setup, observer, session)
 
 
 def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
@@ -176,7 +178,7 @@ def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
     )
 
 
-def _setup(job: Job, scene: Scene, *, sending: bool) -> Setup:
+def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
     live, plan = job.settings.live, job.settings.plan
     robot = build.robot(job, build.standing(job, scene))
     programme, _ = build.reference(job, scene, robot)
@@ -185,7 +187,7 @@ def _setup(job: Job, scene: Scene, *, sending: bool) -> Setup:
     def follow(path: Reference, s_s: float) -> Follower:
         return build.follow(job, plan.method, robot, path, settings, s_s)
 
-    bounds = watchdog.Bounds(
+    bounds = watchdog.WatchdogSettings(
         fresh_s=live.fresh_s,
         uncertain_m=live.uncertain_m,
         uncertain_rad=live.uncertain_rad,
@@ -195,7 +197,7 @@ def _setup(job: Job, scene: Scene, *, sending: bool) -> Setup:
         resume=live.resume,
         resume_s=live.resume_s,
     )
-    return Setup(
+    return ControlSetup(
         robot=robot,
         programme=programme,
         plan=settings,
@@ -228,9 +230,9 @@ _FRAME_EVERY = 8
 _LENGTHS_M = np.array([[0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
 
 
-def warm(start: dict[str, Any]) -> None:
+def compile_kernels(start: dict[str, Any]) -> None:
     """Runs a session of a second and a half with somebody who walks up to the robot."""
-    pilot = build_pilot({**start, "sending": False})
+    pilot = build_controller({**start, "sending": False})
     camera, T = next(iter(start["cameras"].items()))
     to_camera = np.linalg.inv(np.array(T))
     base = np.array(start["T_world_base"])[:3, 3]
@@ -240,15 +242,15 @@ def warm(start: dict[str, Any]) -> None:
         packet = RobotPacket(tick, tick * 4, t_ns, q, q, Motors.ON, Mci.RUNNING, Rapid.RUNNING, False, 0.0)
         event = TickEvent(t_ns, (encode_robot(packet),), Signal.NONE)
         answer = pilot.answer(event)
-        codec.answer(answer, Signal.NONE, 1, 0)
+        codec.encode_decision(answer, Signal.NONE, 1, 0)
         away_m = 2.0 - 1.6 * tick / _TICKS
         seen = [] if tick % _FRAME_EVERY else [_seen(camera, to_camera, base + np.array([away_m, 0.0, 0.0]), t_ns)]
         sight = pilot.look(t_ns + 1_000_000, seen)
         if pilot.fault is not None:
             raise pilot.fault
         if sight is not None:
-            codec.look(sight.states, sight.volumes, len(seen))
-            codec.whole(sight.volumes)
+            codec.encode_perception(sight.states, sight.volumes, len(seen))
+            codec.encode_volumes(sight.volumes)
 
 
 def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int) -> bytes:

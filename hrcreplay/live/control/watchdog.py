@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hrcreplay.egm.session import Heard
-from hrcreplay.live.record.codec import Sight, Signal
+from hrcreplay.egm.session import PacketStatus
+from hrcreplay.live.record.codec import Perception, Signal
 from hrcreplay.records import Floats
 
 #: What ends a session as it should; every other reason ends it as a stop.
@@ -44,7 +44,7 @@ _BASE = 4  #: x, y, heading and bend: the joints that carry the whole person
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
+class WatchdogSettings:
     """Settings of the watchdog; see sections_live.Live."""
 
     fresh_s: float
@@ -62,14 +62,14 @@ def of_signals(signals: Signal) -> str:
     return next((reason for signal, reason in SIGNALS.items() if signal in signals), "")
 
 
-def of_robot(heard: Heard) -> str:
+def of_robot(heard: PacketStatus) -> str:
     """The reason that lies with the robot, or none."""
     if heard.reason:
         return heard.reason
     return "" if heard.allowed else "robot not ready"
 
 
-def of_person(sight: Sight | None, age_s: float, bounds: Bounds) -> str:
+def of_person(sight: Perception | None, age_s: float, bounds: WatchdogSettings) -> str:
     """The reason that lies with what is known of the person, or none."""
     if sight is None or not age_s <= bounds.fresh_s:
         return NO_FRAME
@@ -80,6 +80,6 @@ def of_person(sight: Sight | None, age_s: float, bounds: Bounds) -> str:
     return "" if sure else UNCERTAIN
 
 
-def of_tracking(measured: Floats, commanded: Floats, bounds: Bounds) -> str:
+def of_tracking(measured: Floats, commanded: Floats, bounds: WatchdogSettings) -> str:
     """The reason that the robot is not where it was told to be, or none; both (6,) [rad]."""
     return "" if np.abs(measured - commanded).max() <= bounds.tracking_rad else TRACKING

@@ -23,14 +23,14 @@ from typing import NoReturn, Protocol
 from hrcreplay.errors import HrcReplayError
 from hrcreplay.live.person.log_playback import Message, play
 from hrcreplay.live.person.zenoh_source import ZenohSource
-from hrcreplay.live.processes import Channel, ControlGoneError
+from hrcreplay.live.processes import ControlChannel, ControlGoneError
 
 BEAT_NS = 20_000_000
 _NICE = -10  # where that is permitted: right after control, before recorder and screen
 _SWITCH_S = 0.0005  # a thread that decodes gives way to one whose time has come after this long
 
 
-class Source(Protocol):
+class SkeletonSource(Protocol):
     """Where skeletons come from."""
 
     def go(self, start_ns: int) -> None:
@@ -43,10 +43,10 @@ class Source(Protocol):
         """When the next message is due; None: not known, or woken otherwise."""
 
 
-class Pace:
+class SendSchedule:
     """What to send when: heartbeats at fixed instants, and what the source has due. Knows no clock and no socket."""
 
-    def __init__(self, source: Source, now_ns: int) -> None:
+    def __init__(self, source: SkeletonSource, now_ns: int) -> None:
         self._source = source
         self._beat_ns = now_ns
 
@@ -68,14 +68,14 @@ class Pace:
         return self._beat_ns if due_ns is None else min(self._beat_ns, due_ns)
 
 
-def run(channel: Channel, source: Source, anchor_ns: int) -> NoReturn:
+def run(channel: ControlChannel, source: SkeletonSource, anchor_ns: int) -> NoReturn:
     """Serves until control is gone.
 
     Raises:
         ControlGoneError: It is.
         HrcReplayError: The source cannot go on.
     """
-    pace = Pace(source, time.monotonic_ns() + anchor_ns)
+    pace = SendSchedule(source, time.monotonic_ns() + anchor_ns)
     told = 0
     while True:
         now_ns = time.monotonic_ns() + anchor_ns
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.setswitchinterval(_SWITCH_S)
     with suppress(PermissionError):
         os.nice(_NICE)
-    channel = Channel(given.fd)
+    channel = ControlChannel(given.fd)
     try:
         source = _source(given, channel)
         gc.freeze()
@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
 
 
-def _source(given: argparse.Namespace, channel: Channel) -> Source:
+def _source(given: argparse.Namespace, channel: ControlChannel) -> SkeletonSource:
     if given.log is not None:
         return play(given.log, given.options, repeat=given.repeat)
     return ZenohSource(given.zenoh, channel.send, lambda: time.monotonic_ns() + int(given.anchor))

@@ -24,7 +24,7 @@ from hrcreplay.logs import decoders, ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
 from hrcreplay.logs.decoders import GenericDecoder, MarkerDecoder, OwnDecoder, TfDecoder
-from hrcreplay.logs.messages import Decoder, Message, Row, Topic, Undecodable
+from hrcreplay.logs.messages import Message, RawSkeleton, SkeletonDecoder, Topic, Undecodable
 
 _OWN = "hrcreplay.Skeleton"
 _RMW_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")  # in the keys of rmw_zenoh: <domain>/<topic>/<type>/<hash>
@@ -50,14 +50,14 @@ class KeySettings:
     confidence: str | None = None
 
 
-class Stream:
+class CameraSubscription:
     """The keys of one camera: payloads in, cleaned skeletons out."""
 
     def __init__(self, camera: str, settings: KeySettings) -> None:
         self._camera = camera
         self._settings = settings
         self._where = f"live.zenoh.keys.{camera}"
-        self._readers: dict[str, tuple[Topic, Decoder]] = {}  # of each type
+        self._readers: dict[str, tuple[Topic, SkeletonDecoder]] = {}  # of each type
         self._defects: Counter[str] = Counter()
         self._cleaner = Cleaner((camera,), _GAP_S, self._defects)
         self._told: set[str] = set()
@@ -95,7 +95,7 @@ class Stream:
                 self._told.add(name)
                 yield self._note(f"{name}: {DEFECTS[name]}")
 
-    def _clocks(self, row: Row, now_ns: int) -> Iterator[Outgoing]:
+    def _clocks(self, row: RawSkeleton, now_ns: int) -> Iterator[Outgoing]:
         age_ns = 0 if row.capture_ns is None else now_ns - row.capture_ns
         if not -_AHEAD_NS < age_ns < _OLD_NS and "clocks" not in self._told:
             self._told.add("clocks")
@@ -103,7 +103,7 @@ class Stream:
             what = f"before; {kept}" if age_ns > 0 else "after; left out"
             yield self._note(f"captured {abs(age_ns) / 1e9:.3f} s {what}. Set the clocks of both computers")
 
-    def _rows(self, key: str, data: bytes, now_ns: int) -> list[Row]:
+    def _rows(self, key: str, data: bytes, now_ns: int) -> list[RawSkeleton]:
         topic, decoder = self._reader(key, self._type(key))
         rows = decoder.rows(Message(now_ns, topic, data))
         return [row._replace(camera=self._camera) if row.capture_ns else _unstamped(row, self._camera) for row in rows]
@@ -118,12 +118,12 @@ class Stream:
             raise LogError(f"key {key} does not tell its type; name it: type = 'package/msg/Name'")
         return f"{named[1]}/{named[2]}"
 
-    def _reader(self, key: str, msgtype: str) -> tuple[Topic, Decoder]:
+    def _reader(self, key: str, msgtype: str) -> tuple[Topic, SkeletonDecoder]:
         if msgtype not in self._readers:
             self._readers[msgtype] = self._new_reader(key, msgtype)
         return self._readers[msgtype]
 
-    def _new_reader(self, key: str, msgtype: str) -> tuple[Topic, Decoder]:
+    def _new_reader(self, key: str, msgtype: str) -> tuple[Topic, SkeletonDecoder]:
         given = self._settings
         if msgtype == _OWN:
             return Topic(key, msgtype, 1, _own), OwnDecoder(key, self._camera)
@@ -141,7 +141,7 @@ class Stream:
         return b"N", f"{self._where}: {text}".encode()
 
 
-def _unstamped(row: Row, camera: str) -> Row:
+def _unstamped(row: RawSkeleton, camera: str) -> RawSkeleton:
     return row._replace(camera=camera, capture_ns=None, stamp_zero=row.stamp_zero or row.capture_ns == 0)
 
 
@@ -190,7 +190,7 @@ class ZenohSource:
             session = open_session(self._settings)
             self._open.append(session)
             for name, given in keys.items():
-                stream = Stream(name, given)
+                stream = CameraSubscription(name, given)
                 stream.prepare()
                 self._open.append(_subscribe(session, name, given, self._taker(stream)))
             self._send(*ready(tuple(keys)))
@@ -199,7 +199,7 @@ class ZenohSource:
         except Exception as error:  # raised again where the process can tell of it
             self._failure = error
 
-    def _taker(self, stream: Stream) -> Callable[[Any], None]:
+    def _taker(self, stream: CameraSubscription) -> Callable[[Any], None]:
         def take(sample: Any) -> None:
             data = sample.payload.to_bytes()
             if not self._going or not data:  # a deletion has no payload

@@ -80,7 +80,7 @@ class MotionRow:
 
     @classmethod
     def of(cls, flat: Floats) -> MotionRow:
-        """The inverse of ``flat``."""
+        """The inverse of ``state_numbers``."""
         return cls(*np.split(flat, np.cumsum(WIDTHS)[:-1]))
 
 
@@ -89,7 +89,7 @@ WIDTHS = (AXES, AXES, AXES, AXES, 3, 3, 4)
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Decision:
     """What the pilot decided on an event."""
 
     t_ns: int  #: of the event
@@ -104,7 +104,7 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class Perception:
     """What is known of the person after a look."""
 
     t_ns: int
@@ -139,49 +139,49 @@ def body(message: bytes) -> bytes:
     return message[_HEAD.size :]
 
 
-def robot(t_ns: int, datagram: bytes) -> bytes:
+def encode_robot_packet(t_ns: int, datagram: bytes) -> bytes:
     """A datagram that came."""
     return _HEAD.pack(ROBOT, t_ns) + datagram
 
 
-def frame(t_ns: int, skeleton: bytes) -> bytes:
+def encode_skeleton(t_ns: int, skeleton: bytes) -> bytes:
     """A skeleton, by the look that took it."""
     return _HEAD.pack(FRAME, t_ns) + skeleton
 
 
-def reply(t_ns: int, datagram: bytes, *, sent: bool) -> bytes:
+def encode_reply(t_ns: int, datagram: bytes, *, sent: bool) -> bytes:
     """A datagram that went, or would have gone."""
     return _REPLY.pack(REPLY, t_ns, sent) + datagram
 
 
-def read_reply(message: bytes) -> tuple[bool, bytes]:
+def decode_reply(message: bytes) -> tuple[bool, bytes]:
     """Whether it was sent, and the datagram."""
     return bool(_REPLY.unpack_from(message)[2]), message[_REPLY.size :]
 
 
-def event(t_ns: int, what: dict[str, Any]) -> bytes:
+def encode_event(t_ns: int, what: dict[str, Any]) -> bytes:
     """Something worth telling."""
     return _HEAD.pack(EVENT, t_ns) + json.dumps(what, sort_keys=True, allow_nan=False).encode()
 
 
-def read_event(message: bytes) -> dict[str, Any]:
+def decode_event(message: bytes) -> dict[str, Any]:
     """What there was to tell."""
     found: dict[str, Any] = json.loads(body(message))
     return found
 
 
-def silence(t_ns: int, signals: Signal) -> bytes:
+def encode_timeout(t_ns: int, signals: Signal) -> bytes:
     """The robot said nothing."""
     return _SILENCE.pack(SILENCE, t_ns, signals)
 
 
-def read_silence(message: bytes) -> Signal:
+def decode_timeout(message: bytes) -> Signal:
     """What else was the matter then."""
     return Signal(_SILENCE.unpack_from(message)[2])
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class RecordedPerception:
     """A look as the record has it."""
 
     t_ns: int
@@ -191,16 +191,16 @@ class Look:
     digests: tuple[bytes, ...]  #: of vertices and radius, a limb each
 
 
-def look(states: HumanStates, volumes: SweptVolumes, skeletons: int) -> bytes:
+def encode_perception(states: HumanStates, volumes: SweptVolumes, skeletons: int) -> bytes:
     """A look that took so many skeletons."""
-    state = flat(states)
-    digests = [digest(volumes, limb) for limb in range(len(volumes.limbs))]
+    state = state_numbers(states)
+    digests = [volume_digest(volumes, limb) for limb in range(len(volumes.limbs))]
     valid = states.valid[0].tobytes()
     head = _LOOK.pack(LOOK, int(states.t_ns[0]), skeletons, len(state), len(valid), len(digests))
     return b"".join([head, state.tobytes(), valid, *digests])
 
 
-def read_look(message: bytes) -> Look:
+def decode_perception(message: bytes) -> RecordedPerception:
     """A look as it was recorded."""
     _, t_ns, skeletons, numbers, cameras, limbs = _LOOK.unpack_from(message)
     at = _LOOK.size
@@ -209,29 +209,29 @@ def read_look(message: bytes) -> Look:
     valid = message[at : at + cameras]
     at += cameras
     digests = tuple(message[at + _DIGEST * i : at + _DIGEST * (i + 1)] for i in range(limbs))
-    return Look(t_ns, skeletons, state, valid, digests)
+    return RecordedPerception(t_ns, skeletons, state, valid, digests)
 
 
-def flat(states: HumanStates) -> Floats:
+def state_numbers(states: HumanStates) -> Floats:
     """The numbers of one row of states, field after field."""
     found = vars(states).values()
     return np.concatenate([value[0] for value in found if isinstance(value, np.ndarray) and value.dtype == np.float64])
 
 
-def digest(volumes: SweptVolumes, limb: int) -> bytes:
+def volume_digest(volumes: SweptVolumes, limb: int) -> bytes:
     """What stands for one limb's volume of a single tick."""
     what = hashlib.blake2b(volumes.vertices(0, limb).data, digest_size=_DIGEST)
     what.update(volumes.radius_m[0, limb].tobytes())
     return what.digest()
 
 
-def whole(volumes: SweptVolumes) -> bytes:
+def encode_volumes(volumes: SweptVolumes) -> bytes:
     """The swept volumes of one look."""
     head = _VOLUMES.pack(VOLUMES, int(volumes.t_ns[0]), len(volumes.limbs), len(volumes.vertices_m))
     return b"".join([head, volumes.offsets.tobytes(), volumes.radius_m.tobytes(), volumes.vertices_m.tobytes()])
 
 
-def read_whole(message: bytes, limbs: tuple[str, ...], method: str) -> SweptVolumes:
+def decode_volumes(message: bytes, limbs: tuple[str, ...], method: str) -> SweptVolumes:
     """The swept volumes as they were recorded; their limbs' names and method are known from the session's start."""
     _, t_ns, count, vertices = _VOLUMES.unpack_from(message)
     at = _VOLUMES.size
@@ -244,7 +244,7 @@ def read_whole(message: bytes, limbs: tuple[str, ...], method: str) -> SweptVolu
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
+class RecordedDecision:
     """An answer as the record has it; its reply is the REPLY message right after it, where one was due."""
 
     t_ns: int
@@ -260,7 +260,7 @@ class Answered:
     row: Floats | None  #: (34,) of a MotionRow
 
 
-def answer(found: Answer, signals: Signal, datagrams: int, took_us: int) -> bytes:
+def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: int) -> bytes:
     """A decision."""
     numbers = b"" if found.row is None else found.row.flat().tobytes()
     head = _ANSWER.pack(
@@ -278,16 +278,16 @@ def answer(found: Answer, signals: Signal, datagrams: int, took_us: int) -> byte
     return b"".join([head, bytes([len(numbers) // 8]), numbers, found.reason.encode()])
 
 
-def read_answer(message: bytes) -> Answered:
+def decode_decision(message: bytes) -> RecordedDecision:
     """A decision as it was recorded."""
     _, t_ns, look_ns, took_us, signals, phase, status, limb, link, datagrams = _ANSWER.unpack_from(message)
     at = _ANSWER.size
     numbers = message[at]
     row = np.frombuffer(message, "<f8", numbers, at + 1) if numbers else None
     reason = message[at + 1 + 8 * numbers :].decode()
-    return Answered(t_ns, look_ns, took_us, Signal(signals), phase, status, reason, limb, link, datagrams, row)
+    return RecordedDecision(t_ns, look_ns, took_us, Signal(signals), phase, status, reason, limb, link, datagrams, row)
 
 
-def motion_row(answered: Answered) -> MotionRow | None:
+def motion_row(answered: RecordedDecision) -> MotionRow | None:
     """The numbers of an answer by name."""
     return None if answered.row is None else MotionRow.of(answered.row)

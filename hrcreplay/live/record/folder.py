@@ -21,7 +21,7 @@ from hrcreplay.live import processes
 from hrcreplay.live.control.setup import job_of
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, MotionRow
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Motion
@@ -49,21 +49,21 @@ class SessionTables:
     counts: Counter[str] = field(default_factory=Counter)
     took_us: list[int] = field(default_factory=list)  #: of every reply
     events: list[dict[str, Any]] = field(default_factory=list)  #: beside the start
-    _looks: list[codec.Look] = field(default_factory=list)
-    _answers: list[codec.Answered] = field(default_factory=list)
+    _looks: list[codec.RecordedPerception] = field(default_factory=list)
+    _answers: list[codec.RecordedDecision] = field(default_factory=list)
 
     def add(self, message: bytes) -> None:
         """Takes a message of the record."""
         kind = codec.kind(message)
         self.counts[_COUNTED[kind]] += 1
         if kind == codec.LOOK:
-            self._looks.append(codec.read_look(message))
+            self._looks.append(codec.decode_perception(message))
         elif kind == codec.VOLUMES:
-            store_volumes(codec.read_whole(message, self.limbs, self.method), np.zeros(1, np.int64), self.run)
+            store_volumes(codec.decode_volumes(message, self.limbs, self.method), np.zeros(1, np.int64), self.run)
         elif kind == codec.ANSWER:
-            self._answered(codec.read_answer(message))
+            self._answered(codec.decode_decision(message))
         elif kind == codec.EVENT:
-            self.events.append(codec.read_event(message))
+            self.events.append(codec.decode_event(message))
         if max(len(self._looks), len(self._answers)) >= _BATCH:
             self.flush()
 
@@ -75,7 +75,7 @@ class SessionTables:
             self.run.table("motion", _motion(self._answers, self.limbs, self.links))
         self._looks, self._answers = [], []
 
-    def _answered(self, answered: codec.Answered) -> None:
+    def _answered(self, answered: codec.RecordedDecision) -> None:
         if answered.row is not None:  # else there was no packet to answer
             self._answers.append(answered)
             self.took_us.append(answered.took_us)
@@ -102,7 +102,7 @@ _COUNTED = {
 }
 
 
-def _states(looks: list[codec.Look], cameras: tuple[str, ...], where: Path) -> HumanStates:
+def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], where: Path) -> HumanStates:
     numbers = np.array([look.state for look in looks])
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), 12)
     widths |= {"lengths_m": 8, "lengths_std_m": 8, "residual_m": len(BODY), "unseen_s": len(LIMBS)}
@@ -121,7 +121,7 @@ def _states(looks: list[codec.Look], cameras: tuple[str, ...], where: Path) -> H
     )
 
 
-def _motion(answers: list[codec.Answered], limbs: tuple[str, ...], links: tuple[str, ...]) -> Columns:
+def _motion(answers: list[codec.RecordedDecision], limbs: tuple[str, ...], links: tuple[str, ...]) -> Columns:
     rows = [row for answered in answers if (row := codec.motion_row(answered)) is not None]
     column: dict[str, Floats] = {f.name: np.array([getattr(row, f.name) for row in rows]) for f in fields(MotionRow)}
     rest = dict(zip(("tcp_speed", "ref_speed", "programme_s", "distance_m"), column["rest"].T, strict=True))
@@ -171,7 +171,7 @@ def finish(partial: Path) -> Path:
     writer = RunWriter(partial.with_name(partial.name.removesuffix(_PARTIAL)))
     if writer.folder.exists():
         raise SettingsError(f"{writer.folder}: exists already; move it away, then finish {partial}")
-    tape = Tape(partial / LOG)
+    tape = SessionLogReader(partial / LOG)
     start = tape.start()
     job = job_of(start, writer.folder / LOG, run_folder.sha256(partial / LOG))
     cameras, links, limbs = (tuple(start[name]) for name in ("cameras", "links", "limbs"))
@@ -181,7 +181,7 @@ def finish(partial: Path) -> Path:
     tables.flush()
     _measure(job, writer)
     writer.close_tables()
-    crashes = processes.read(partial)
+    crashes = processes.read_crashes(partial)
     meta = _meta(job, start, tables, tape, crashes)
     write_report(job, writer, meta)
     writer.timing.update(tables.timing())
@@ -207,13 +207,15 @@ def _crashed(crashes: list[str]) -> dict[str, Any]:
 def _measure(job: Job, writer: RunWriter) -> None:
     """The table of measurements: what each frame says by itself."""
     log = open_log(writer.partial / LOG, log_options(job.settings), skeletons=False)
-    eyes, memory = build.eyes(job, log), PersonMemory()
+    eyes, memory = build.fusion_stage(job, log), PersonMemory()
     for frames in log.frames():
         memory, measured, _ = eyes.measure(frames, memory)
         writer.table("measurements", measurement_columns(measured))
 
 
-def _meta(job: Job, start: dict[str, Any], tables: SessionTables, tape: Tape, crashes: list[str]) -> dict[str, Any]:
+def _meta(
+    job: Job, start: dict[str, Any], tables: SessionTables, tape: SessionLogReader, crashes: list[str]
+) -> dict[str, Any]:
     """run.json of the session."""
     end: dict[str, Any] = next((event for event in tables.events if event.get("what") == "end"), {})
     notes = [str(event["text"]) for event in tables.events if event.get("what") == "note"]

@@ -41,7 +41,7 @@ _LARGEST = 1 << 22  # of a message
 _TYPES = {topics.ROBOT: egm.RobotMessage, topics.SENT: egm.SensorMessage, topics.UNSENT: egm.SensorMessage}
 
 
-class SessionWriter:
+class SessionLogWriter:
     """The log of a session under way. Every message carries its number, so that a hole in the record shows."""
 
     def __init__(self, stream: IO[bytes]) -> None:
@@ -61,7 +61,7 @@ class SessionWriter:
             return
         self._write(topic, t_ns, t_ns, data, _TYPES.get(topic))
         if topic == topics.EVENT and not self._cameras:
-            self._latch(t_ns, codec.read_event(message))
+            self._latch(t_ns, codec.decode_event(message))
 
     def flush(self) -> None:
         """Closes the chunk and hands all to the system. Raises OSError."""
@@ -86,7 +86,8 @@ class SessionWriter:
         cameras: dict[str, Any] = start.get("cameras", {})
         self._cameras = frozenset(name for name in cameras if "/" not in name)  # of a topic's name
         latched: list[tuple[str, Any]] = [
-            (own.camera_info_topic(name), pb.Camera(camera=name, T_world_camera=_flat(pose))) for name, pose in cameras.items()
+            (own.camera_info_topic(name), pb.Camera(camera=name, T_world_camera=_flat(pose)))
+            for name, pose in cameras.items()
         ]
         if start.get("task") is not None:
             latched.append((own.TASK, pb.Task(json=json.dumps(start["task"], sort_keys=True))))
@@ -149,7 +150,7 @@ def record(control: socket.socket, path: Path) -> None:
     """
     inbox = Inbox(control)
     with path.open("xb") as stream:
-        writer = SessionWriter(stream)
+        writer = SessionLogWriter(stream)
         writer.flush()
         with suppress(BrokenPipeError):  # whoever is gone already may have left messages
             control.send(READY)

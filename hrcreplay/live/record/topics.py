@@ -32,7 +32,7 @@ def split(message: bytes) -> tuple[str, bytes]:
     """The topic of a message and what lies there; of a frame, the topic of those that belong to no camera."""
     kind = codec.kind(message)
     if kind == codec.REPLY:
-        sent, datagram = codec.read_reply(message)
+        sent, datagram = codec.decode_reply(message)
         return SENT if sent else UNSENT, datagram
     return STRAY if kind == codec.FRAME else _BY_KIND[kind], codec.body(message)
 
@@ -40,10 +40,10 @@ def split(message: bytes) -> tuple[str, bytes]:
 def join(topic: str, t_ns: int, data: bytes) -> bytes | None:
     """The message of the record that lies on a topic; None for what the log has beside the record."""
     if topic in (SENT, UNSENT):
-        return codec.reply(t_ns, data, sent=topic == SENT)
+        return codec.encode_reply(t_ns, data, sent=topic == SENT)
     if topic in _KINDS:
-        return _KINDS[topic] + codec.robot(t_ns, data)[1:]
+        return _KINDS[topic] + codec.encode_robot_packet(t_ns, data)[1:]
     parts = topic.split("/")
     if len(parts) == 4 and topic == messages.skeleton_topic(parts[2]):
-        return codec.frame(t_ns, data)
+        return codec.encode_skeleton(t_ns, data)
     return None

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.live.view.messages import Cast, Scene, Status, unpack
+from hrcreplay.live.view.messages import Scene, SceneNames, Status, unpack
 from hrcreplay.records import POINTS, Floats
 from hrcreplay.report.drawing import BONES
 
@@ -48,9 +48,9 @@ class FoxgloveStream:
         except (RuntimeError, OSError) as error:
             raise SettingsError(f"--foxglove {port}: {error}; name a port that is free") from error
         self.port = self._server.port
-        self._cast = Cast(limbs=[], links=[], radii_m=[])
+        self._cast = SceneNames(limbs=[], links=[], radii_m=[])
 
-    def cast(self, cast: Cast) -> None:
+    def cast(self, cast: SceneNames) -> None:
         """Takes what stays the same."""
         self._cast = cast
 

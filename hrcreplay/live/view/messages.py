@@ -62,7 +62,7 @@ class Status(TypedDict):
 _HEAD = struct.Struct("<qH")
 
 
-class Cast(TypedDict):
+class SceneNames(TypedDict):
     """What stays the same for a session."""
 
     limbs: list[str]  #: of the swept volumes
@@ -93,4 +93,4 @@ def unpack(data: bytes, limbs: tuple[str, ...]) -> Scene:
     at += points.nbytes
     ends = np.frombuffer(data, "<f8", 6 * segments, at).reshape(-1, 2, 3)
     at += ends.nbytes
-    return Scene(t_ns, points, ends, codec.read_whole(data[at:], limbs, ""))
+    return Scene(t_ns, points, ends, codec.decode_volumes(data[at:], limbs, ""))

@@ -23,7 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.live.processes import Channel, ControlGoneError
+from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.live.view.messages import CameraStatus, Status
 
 _COLOUR = {"tracking": "green", "limited": "yellow", "braking": "bold red"}
@@ -177,7 +177,7 @@ class Lines:
         self._write(line(status) + "\n")
 
 
-def serve(channel: Channel, show: Show, stream: FoxgloveStream | None) -> None:
+def serve(channel: ControlChannel, show: Show, stream: FoxgloveStream | None) -> None:
     """Shows what comes until control is gone; of what has piled up, the newest."""
     newest: dict[bytes, bytes] = {}
 
@@ -211,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="one JSON object a line instead of a panel")
     parser.add_argument("--foxglove", type=int, metavar="PORT", help="stream the scene to Foxglove on this port")
     given = parser.parse_args(arguments)
-    channel = Channel(given.fd)
+    channel = ControlChannel(given.fd)
     stream = _stream(given.foxglove)
     try:
         if given.json:

@@ -18,7 +18,7 @@ _EVERY_NS = 100_000_000
 _SECOND_NS = 1_000_000_000
 
 
-class Teller:
+class StatusPublisher:
     """Keeps the screen informed; costs the loop nothing between two tellings."""
 
     def __init__(self, loop: Loop, names: dict[str, Any], *, in_3d: bool) -> None:
@@ -31,7 +31,7 @@ class Teller:
         self._rates: dict[str, float] = {}
         if in_3d:
             radii = [segment.radius_m for segment in loop.pilot.setup.robot.segments]
-            cast = messages.Cast(limbs=names["limbs"], links=names["links"], radii_m=radii)
+            cast = messages.SceneNames(limbs=names["limbs"], links=names["links"], radii_m=radii)
             self._send(b"J" + json.dumps(cast).encode())
 
     def tell(self, *, last: bool = False) -> None:

@@ -3,12 +3,12 @@ from __future__ import annotations
 import pytest
 
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.motion import Course, Said
-from hrcreplay.live.control.setup import build_pilot
+from hrcreplay.live.control.motion import MotionState, MotionStep
+from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, TickEvent
+from hrcreplay.live.record.codec import Decision, TickEvent
 from hrcreplay.live.session import outcome
-from hrcreplay.live.verify import Again
+from hrcreplay.live.verify import SessionRecomputation
 from hrcreplay.run.followers import QpFollower
 from tests.live.counted import CountedLoop, counted
 from tests.live.flights import CYCLE_S, Flight
@@ -47,7 +47,7 @@ def test_looks_that_fit_are_all_taken() -> None:
 
 def test_a_session_with_looks_left_out_comes_out_the_same_again() -> None:
     loop = counted(flight := Flight(), look_s=0.0045).fly(SECONDS)
-    again = Again(build_pilot(flight.start))
+    again = SessionRecomputation(build_controller(flight.start))
     assert all(again.differs(message) is None for message in recorded(loop))
     assert again.ticks == loop.answers
 
@@ -78,11 +78,11 @@ def test_a_prepared_step_is_not_made_again_in_the_answer(monkeypatch: pytest.Mon
     loop = counted(flight, work_s=0.0042)
     step, answer, made, within = flight.pilot._step, flight.pilot.answer, [0], [0]
 
-    def counting(course: Course) -> Said:
+    def counting(course: MotionState) -> MotionStep:
         made[0] += 1
         return step(course)
 
-    def watching(event: TickEvent) -> Answer:
+    def watching(event: TickEvent) -> Decision:
         before = made[0]
         said = answer(event)
         within.append(made[0] - before)

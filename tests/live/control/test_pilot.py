@@ -13,7 +13,7 @@ from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.human.fusion import fuse
 from hrcreplay.live.control import watchdog
 from hrcreplay.live.control.perception import Observer
-from hrcreplay.live.control.setup import build_pilot
+from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.logs.clean import PersonMemory
@@ -181,7 +181,7 @@ def test_the_same_events_give_the_same_bytes() -> None:
 def test_looks_are_the_replay_tick_by_tick() -> None:
     """One fuse and one predict over all ticks give the bits that thousands of looks gave."""
     flight = Flight(walk=lambda s: (2.0 + 0.5 * np.sin(s), 0.3 * s)).fly(4.0)
-    pilot = build_pilot(start())
+    pilot = build_controller(start())
     observer: Observer = pilot.observer
     eyes, foresight = observer._eyes, observer._foresight
     ticks = np.array([int(states.t_ns[0]) for states in flight.states])

@@ -15,8 +15,8 @@ import pytest
 
 from hrcreplay.errors import LogError
 from hrcreplay.live.person.log_playback import Frame, Item, Note, Opened, Playback, passes, play
-from hrcreplay.live.person.source import BEAT_NS, Pace, run
-from hrcreplay.live.processes import Channel, ControlGoneError
+from hrcreplay.live.person.source import BEAT_NS, SendSchedule, run
+from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import CameraFrames
@@ -173,7 +173,7 @@ class Nothing:
 
 def test_heartbeats_keep_to_their_instants_and_missed_ones_are_not_made_up_for() -> None:
     source = Nothing()
-    pace = Pace(source, 0)
+    pace = SendSchedule(source, 0)
     assert list(pace.send(0)) == [(b"H", b"")]
     assert pace.next_ns(0) == BEAT_NS
     assert list(pace.send(BEAT_NS - 1)) == []
@@ -190,7 +190,7 @@ def test_heartbeats_keep_to_their_instants_and_missed_ones_are_not_made_up_for()
 
 def test_a_full_socket_drops_and_counts_and_a_closed_one_ends() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    channel = Channel(theirs.detach())
+    channel = ControlChannel(theirs.detach())
     assert channel.receive(0.0) is None
     taken = 0
     while channel.send(b"F", bytes(1000)):
@@ -209,7 +209,7 @@ def test_a_full_socket_drops_and_counts_and_a_closed_one_ends() -> None:
         channel.send(b"H")
 
 
-class Deaf(Channel):
+class Deaf(ControlChannel):
     """A channel to a control process that does not read for a while."""
 
     def __init__(self) -> None:

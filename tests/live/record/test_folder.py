@@ -28,7 +28,7 @@ class Stored(Flight):
         super()._look(t_ns)
         sight = self.pilot.sight
         if sight is not None and len(self.states) % 10 == 1:
-            self.messages.append(codec.whole(sight.volumes))
+            self.messages.append(codec.encode_volumes(sight.volumes))
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +46,13 @@ def messages(flight: Flight) -> list[bytes]:
     end = {"what": "end", "reason": "Ctrl-C", "counts": {"robot lost": 2}, "dropped": 0, "looks_skipped": 3}
     end |= {"stops": []}
     start = {"what": "start", **flight.start}
-    note = codec.event(BEGIN_NS + 2, {"what": "note", "text": "a remark"})
-    return [codec.event(BEGIN_NS - 1, start), *flight.messages, note, codec.event(BEGIN_NS + 4_000_000_000, end)]
+    note = codec.encode_event(BEGIN_NS + 2, {"what": "note", "text": "a remark"})
+    return [
+        codec.encode_event(BEGIN_NS - 1, start),
+        *flight.messages,
+        note,
+        codec.encode_event(BEGIN_NS + 4_000_000_000, end),
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +110,7 @@ def test_motions_are_those_of_the_session(run: Path, flight: Flight) -> None:
 
 def test_volumes_are_those_that_were_stored(run: Path, messages: list[bytes]) -> None:
     table = pd.read_parquet(run / "occupancy.parquet")
-    stored = [codec.read_whole(m, BODY, "") for m in messages if codec.kind(m) == codec.VOLUMES]
+    stored = [codec.decode_volumes(m, BODY, "") for m in messages if codec.kind(m) == codec.VOLUMES]
     known = [volumes for volumes in stored if np.isfinite(volumes.vertices_m).all()]
     assert sorted(set(table["t_ns"])) == [int(volumes.t_ns[0]) for volumes in known]
     last = table[table["t_ns"] == known[-1].t_ns[0]]
@@ -172,7 +177,7 @@ def test_a_record_of_another_version_is_left_as_it_is(tmp_path: Path, messages: 
     assert sight is not None
     other = replace(sight.states, residual_m=sight.states.residual_m[:, 1:])
     partial = folder.begin(tmp_path / "session")
-    made.record(partial / "log.mcap", [messages[0], codec.look(other, sight.volumes, 0)])
+    made.record(partial / "log.mcap", [messages[0], codec.encode_perception(other, sight.volumes, 0)])
     with pytest.raises(LogError, match=r"session.partial: found 100 numbers a look where this version has 101; would"):
         folder.finish(partial)
     assert (partial / "log.mcap").exists()

@@ -8,7 +8,7 @@ import pytest
 
 from hrcreplay.errors import LogError
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.logs.writer import LogWriter
 from tests.live import made
 from tests.logs import own
@@ -37,15 +37,15 @@ def _chunks(data: bytes | bytearray) -> list[int]:
     return found
 
 
-def _changed(path: Path, target: Path, data: bytes | bytearray) -> Tape:
+def _changed(path: Path, target: Path, data: bytes | bytearray) -> SessionLogReader:
     shutil.copyfile(path, target)
     target.write_bytes(data)
-    return Tape(target)
+    return SessionLogReader(target)
 
 
 def test_messages_come_back_in_order(finished: Path, unfinished: Path, messages: list[bytes]) -> None:
     for path in (finished, unfinished):
-        tape = Tape(path)
+        tape = SessionLogReader(path)
         assert list(tape.messages()) == messages
         assert tape.flaws == []
         assert tape.finished == (path is finished)
@@ -116,15 +116,15 @@ def test_a_file_that_breaks_off_is_read_to_its_last_whole_chunk(
 def test_what_is_no_session_says_so(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with pytest.raises(LogError, match="cannot be read"):
-        list(Tape(path).messages())
+        list(SessionLogReader(path).messages())
     path.write_bytes(b"")
     with pytest.raises(LogError, match="holds nothing"):
-        list(Tape(path).messages())
+        list(SessionLogReader(path).messages())
     path.write_bytes(b"something else")
     with pytest.raises(LogError, match="no log of a live session"):
-        list(Tape(path).messages())
+        list(SessionLogReader(path).messages())
     path.unlink()
     with LogWriter(path) as writer:
         writer.frames(own.frames(10))
     with pytest.raises(LogError, match="does not begin with the start"):
-        Tape(path).start()
+        SessionLogReader(path).start()
