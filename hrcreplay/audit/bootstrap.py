@@ -35,7 +35,7 @@ class Estimate:
     high: float
     samples: int  #: ticks behind it
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """JSON form; what is not known is null."""
         numbers = {"value": self.value, "low": self.low, "high": self.high}
         return {k: float(v) if np.isfinite(v) else None for k, v in numbers.items()} | {"samples": self.samples}

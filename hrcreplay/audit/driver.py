@@ -14,12 +14,12 @@ import pyarrow as pa
 from hrcreplay.audit import page
 from hrcreplay.audit.bootstrap import DRAWS, LEVEL, Resampling, block_ticks, resample
 from hrcreplay.audit.figures import draw_all
-from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, methods, standstill_s, travel
+from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, joint_travel, methods, standstill_s
 from hrcreplay.audit.metrics import (
     checked_scope,
     curve_point,
     escapes,
-    flat,
+    headline_metrics,
     joint_figures,
     method_figures,
     unchecked_notes,
@@ -81,7 +81,7 @@ def run(
         audits = [audit_log(job, name, watch) for job, name in zip(jobs, _names(jobs), strict=True)]
         for audit in audits:
             _write_rows(audit, writer)
-        found = figures(audits)
+        found = audit_results(audits)
         for log in found["logs"]:
             for note in log["notes"]:
                 print_note(f"{log['log']}: {note}")
@@ -91,7 +91,7 @@ def run(
         meta = _meta(jobs, began)
         folder = writer.partial / "figures"
         draw_all(found, folder)
-        metrics = flat(found)
+        metrics = headline_metrics(found)
         writer.text("metrics.json", run_folder.to_json(metrics))
         writer.text("report.html", page.render(found, metrics, meta, folder))
         writer.timing.update(watch.summary(1.0 / AUDIT_HZ))
@@ -132,10 +132,10 @@ def _alike(jobs: Sequence[Job]) -> None:
                 )
 
 
-def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
+def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
     """All that audit.json holds."""
-    foresight = build.prediction_stage(audits[0].job)
-    horizon_s = standstill_s(foresight)
+    prediction_stage = build.prediction_stage(audits[0].job)
+    horizon_s = standstill_s(prediction_stage)
     lengths = [len(audit.outcomes[methods()[0]]) for audit in audits]
     block = block_ticks(horizon_s, AUDIT_HZ, max(lengths))
     drawn = resample(lengths, block, horizon_s * AUDIT_HZ, SEED)
@@ -160,12 +160,12 @@ def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
                 "escapes": {method: escapes(outcome, start_ns) for method, outcome in audit.outcomes.items()},
             }
         )
-        logs[-1]["notes"] = [*audit.notes, *unchecked_notes(logs[-1], foresight.method)]
+        logs[-1]["notes"] = [*audit.notes, *unchecked_notes(logs[-1], prediction_stage.method)]
     return {
         "horizon_s": horizon_s,
         "audit_hz": AUDIT_HZ,
         "interval": {"level": LEVEL, "block_ticks": block, "draws": DRAWS, "seed": SEED},
-        "method": foresight.method,
+        "method": prediction_stage.method,
         "own_methods": list(reachable_sets.METHODS),
         "logs": logs,
         "total": {
@@ -188,7 +188,7 @@ def _methods(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
 
 
 def _joints(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
-    went = np.max([travel(audit.recording.joints) for audit in audits], axis=0)
+    went = np.max([joint_travel(audit.recording.joints) for audit in audits], axis=0)
     return {
         method: joint_figures(np.concatenate([audit.joints[method] for audit in audits]), went, drawn)
         for method in reachable_sets.METHODS

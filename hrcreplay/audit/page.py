@@ -12,7 +12,14 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from hrcreplay.audit.figures import METHODS, in_order
-from hrcreplay.audit.metrics import checked_cameras, checked_scope, checked_table, text, unchecked_notes, volume_at
+from hrcreplay.audit.metrics import (
+    checked_cameras,
+    checked_scope,
+    checked_table,
+    text_with_interval,
+    unchecked_notes,
+    volume_at,
+)
 from hrcreplay.records import JOINTS, LIMBS
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.page import PageFigure, PageSection
@@ -104,7 +111,7 @@ def _cards(found: Mapping[str, Any]) -> tuple[Card, ...]:
     for method in in_order(found["total"]["methods"]):
         whole = found["total"]["methods"][method]["all"]
         if whole["covered_share"]["value"] is not None:
-            room = text(whole["union_m3"], decimals=2)
+            room = text_with_interval(whole["union_m3"], decimals=2)
             value = f"{100 * whole['covered_share']['value']:.1f} %"
             cards.append(Card(value, METHODS.get(method, method), f"union {room} m\u00b3"))
     return tuple(cards)
@@ -133,7 +140,8 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> PageSection:
 
     def table(title: str, key: str, scale: float, decimals: int, note: str, limbs: str = "all") -> PageTable:
         body = tuple(
-            (name, *(text(part["methods"][m][limbs][key], scale, decimals) for m in methods)) for name, part in rows
+            (name, *(text_with_interval(part["methods"][m][limbs][key], scale, decimals) for m in methods))
+            for name, part in rows
         )
         return PageTable(title, ("log", *_named(methods)), body, note)
 
@@ -223,7 +231,7 @@ def _limbs(found: Mapping[str, Any], folder: Path) -> PageSection:
 
 
 def _cell(figure: Mapping[str, Any], scale: float, decimals: int) -> str:
-    return text(figure, scale, decimals) if figure["samples"] else "not checked"
+    return text_with_interval(figure, scale, decimals) if figure["samples"] else "not checked"
 
 
 def _millimetres(value: float | None) -> str:
@@ -237,7 +245,7 @@ def _joints(found: Mapping[str, Any], folder: Path) -> PageSection:
     for j, joint in enumerate(JOINTS):
         went = tables[methods[0]][joint]["travel"]
         moved = "\u2013" if went is None else f"{went:.2f} m" if j < 2 else f"{went * 57.29578:.0f}\u00b0"
-        body.append((joint, moved, *(text(tables[m][joint]["inside_share"], 100.0) for m in methods)))
+        body.append((joint, moved, *(text_with_interval(tables[m][joint]["inside_share"], 100.0) for m in methods)))
     table = PageTable(
         "Ticks with the joint in its reachable interval [%]", ("joint", "moved", *_named(methods)), tuple(body)
     )

@@ -12,7 +12,7 @@ from hrcreplay.calibration.cell import Cell, Residual
 from hrcreplay.calibration.floor import LEVEL_VIEW, Floor, find_floor, floor_frame, up_direction
 from hrcreplay.calibration.registration import Registration, SkeletonTrack, disagreement, register, transform
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.logs.clean import PersonMemory, pick
+from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import POINTS, CameraFrames, Floats
 
@@ -82,7 +82,7 @@ def survey(
     direction = _direction(up)
     if height_m is not None and not 0.0 <= height_m < np.inf:
         raise SettingsError(f"height: found {height_m:g}; would be right: metres above the floor, 0 or more")
-    tracks = collect(log, jump_m, memory_s)
+    tracks = collect_tracks(log, jump_m, memory_s)
     ties = _tree(tracks, root)
     found = {root: Registration(np.eye(4), 0.0)}
     for pair in ties:
@@ -103,10 +103,10 @@ def survey(
         residuals=residuals,
         notes=(*_notes(floor, cameras[root]), *_doubts(residuals)),
     )
-    return Survey(cell, whereabouts(cell, tracks, cameras[root]))
+    return Survey(cell, person_positions(cell, tracks, cameras[root]))
 
 
-def whereabouts(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tuple[str, ...]:
+def person_positions(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tuple[str, ...]:
     """Where the person stood in the cell's world and which way its axes point: what a robot's base is placed by."""
     looks_along = abs(cell.T_world_camera[root][2, 2]) <= LEVEL_VIEW
     x = f"x points where {root} looks, along the floor" if looks_along else f"x points along {root}'s own x"
@@ -128,14 +128,14 @@ def whereabouts(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tuple[str
     return tuple(lines)
 
 
-def collect(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTrack]:
+def collect_tracks(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTrack]:
     """The person as each camera saw it; of a long log, evenly spaced windows."""
     cameras = log.header.cameras
     alone = np.full((len(cameras), 4, 4), np.nan)  # poses are what is sought: continuity in each camera's own frame
     memory = PersonMemory()
     kept: list[CameraFrames] = []
     for frames in log.frames():
-        memory, mine, _ = pick(frames, memory, alone, jump_m, memory_s)
+        memory, mine, _ = select_person(frames, memory, alone, jump_m, memory_s)
         within = _in_window(mine, log.header.start_ns, log.header.end_ns)
         if len(rows := mine.rows(within)):
             kept.append(rows)

@@ -160,7 +160,7 @@ class HelperProcess:
     """A process of ours, with a socket whose far end it holds."""
 
     def __init__(
-        self, part: str, module: str, arguments: Sequence[str], folder: Path, told: tuple[int, ...] = ()
+        self, part: str, module: str, arguments: Sequence[str], folder: Path, expected: tuple[int, ...] = ()
     ) -> None:
         """Starts ``module --fd N arguments`` in a session of its own: Ctrl-C is for control alone.
 
@@ -169,11 +169,11 @@ class HelperProcess:
             module: Module to run.
             arguments: Of it, beside the socket.
             folder: Where it leaves its traceback if it crashes.
-            told: Exit codes beside 0 of a process that has told why it ends: no crash.
+            expected: Exit codes beside 0 of a process that has told why it ends: no crash.
         """
         self.part = part
         self._folder = folder
-        self._told = (0, *told)
+        self._told = (0, *expected)
         near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         for end in (near, far):
             _enlarge(end)
@@ -217,7 +217,7 @@ class HelperProcess:
                 return
             yield message
 
-    def notice(self) -> bool:
+    def check_alive(self) -> bool:
         """Whether it is still there, for one that never says anything."""
         if self.alive:
             for _ in self.messages():
@@ -228,7 +228,7 @@ class HelperProcess:
         """Whether it has ended as nobody foresaw; no for one that lives, or is about to end."""
         return not self.alive and self.process.poll() not in (None, *self._told)
 
-    def dismiss(self, patience_s: float) -> int | None:
+    def close(self, patience_s: float) -> int | None:
         """Closes the socket, which ends the process; its exit code, None where it had to be killed.
 
         A process that crashed has left a file in the run folder; of one that could not, this leaves it.

@@ -15,13 +15,13 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from hrcreplay.egm.link import EgmServer
+from hrcreplay.egm.udp_server import EgmServer
 from hrcreplay.errors import HrcReplayError, LiveStopped, LogError, SettingsError
 from hrcreplay.live import processes
 from hrcreplay.live.control import watchdog
 from hrcreplay.live.control.last_resort import bring_to_rest
 from hrcreplay.live.control.loop import ENDING, Loop, LoopSettings
-from hrcreplay.live.control.pilot import SessionController
+from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.control.setup import build_controller, compile_kernels, live_job, start_table
 from hrcreplay.live.processes import HelperProcess, raise_priority, restore_priority
 from hrcreplay.live.record import codec, folder
@@ -64,11 +64,11 @@ def run(request: Request) -> Path:
         LogError: The recording of the person cannot be read.
         LiveStopped: The session ended by a stop reason, or a part of it crashed; then its record is not complete.
     """
-    partial = folder.begin(request.out)
+    partial = folder.make_partial(request.out)
     try:
         with ExitStack() as stack:
             prepared = _prepare(request, stack)
-            loop, crashes = _conduct(request, prepared, partial)
+            loop, crashes = _run_processes(request, prepared, partial)
     except _CrashedError:
         raise _broken_off(partial, processes.read_crashes(partial)) from None
     except (HrcReplayError, KeyboardInterrupt, SystemExit):
@@ -101,7 +101,7 @@ def _finish(partial: Path, crashes: list[str]) -> Path:
 
 def _broken_off(partial: Path, crashes: list[str]) -> LiveStopped:
     """What to say of a session that no run folder can be made of; what there is of it says the same."""
-    folder.leave(partial, crashes)
+    folder.keep_incomplete(partial, crashes)
     return LiveStopped(f"{crashes[0]}; not complete: what there is of the record, and the traceback, is in {partial}")
 
 
@@ -115,7 +115,7 @@ class _Prepared:
 
     settings: Settings
     start: dict[str, Any]
-    pilot: SessionController
+    controller: SessionController
     link: EgmServer
 
 
@@ -124,40 +124,42 @@ def _prepare(request: Request, stack: ExitStack) -> _Prepared:
     job, header = live_job(request.human, request.config, request.overrides, request.cell)
     port = job.settings.live.port if request.port is None else request.port
     start = start_table(job, header, sending=request.send)
-    pilot = build_controller(start)
+    controller = build_controller(start)
     link = stack.enter_context(closing(EgmServer("", port, WAIT_S)))
     compile_kernels(start)
-    return _Prepared(job.settings, start, pilot, link)
+    return _Prepared(job.settings, start, controller, link)
 
 
-def _conduct(request: Request, prepared: _Prepared, partial: Path) -> tuple[Loop, list[str]]:
+def _run_processes(request: Request, prepared: _Prepared, partial: Path) -> tuple[Loop, list[str]]:
     """The loop with the processes around it; the loop, which is over, and what is to be said of crashes."""
     settings = prepared.settings
     anchor_ns = time.time_ns() - time.monotonic_ns()
     to_record = ["--path", str(partial / folder.LOG)]
     recorder = HelperProcess(processes.RECORDER, "hrcreplay.live.record.recorder", to_record, partial)
     person_arguments = _person_arguments(request, settings, anchor_ns)
-    person = HelperProcess(processes.PERSON, "hrcreplay.live.person.source", person_arguments, partial, told=(2, 3))
+    person = HelperProcess(processes.PERSON, "hrcreplay.live.person.source", person_arguments, partial, expected=(2, 3))
     screen = HelperProcess(processes.SCREEN, "hrcreplay.live.view.screen", _screen_arguments(request), partial)
     begun = False
     try:
         _await_person(person, request.human)
         begun, start_ns = True, time.monotonic_ns() + anchor_ns
-        parts = prepared.pilot, prepared.link, person, recorder
+        parts = prepared.controller, prepared.link, person, recorder
         loop = Loop(*parts, _loop_settings(request, settings), anchor_ns, start_ns, screen)
         recorder.send(codec.encode_event(loop.start_ns, {"what": "start", **prepared.start}))
-        crashes = _fly(loop, prepared.start, partial, real_time=settings.live.real_time, in_3d=bool(request.foxglove))
+        crashes = _run_loop(
+            loop, prepared.start, partial, real_time=settings.live.real_time, in_3d=bool(request.foxglove)
+        )
     finally:
-        screen.dismiss(2.0)
-        person.dismiss(2.0)
-        if recorder.dismiss(PATIENCE_S) is None:
+        screen.close(2.0)
+        person.close(2.0)
+        if recorder.close(PATIENCE_S) is None:
             processes.write_crash(partial, processes.RECORDER, f"did not finish within {PATIENCE_S:g} s")
         if not begun:
             (partial / folder.LOG).unlink(missing_ok=True)  # there is nothing in it
     return loop, list(dict.fromkeys([*crashes, *processes.read_crashes(partial)]))
 
 
-def _fly(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, in_3d: bool) -> list[str]:
+def _run_loop(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, in_3d: bool) -> list[str]:
     """The loop, alone with the robot: no garbage collector, no waiting for anybody. Returns its crashes."""
     found: list[Exception] = []
     with _signals(loop):
@@ -167,10 +169,10 @@ def _fly(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, i
         try:
             for refused in raise_priority() if real_time else ():
                 loop.note(f"the system refuses {refused}")
-            teller = StatusPublisher(loop, start, in_3d=in_3d)
+            publisher = StatusPublisher(loop, start, in_3d=in_3d)
             loop.begin()
-            while loop.turn():
-                teller.tell()
+            while loop.run_cycle():
+                publisher.publish()
         except Exception as error:  # whatever it is, the robot is braked first
             found.append(error)
             bring_to_rest(loop, processes.describe_exception(error))
@@ -180,38 +182,38 @@ def _fly(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, i
             gc.unfreeze()
         try:
             loop.recorder.send(codec.encode_event(loop.now_ns(), {"what": "end", **outcome(loop)}))
-            teller.tell(last=True)
+            publisher.publish(last=True)
         except Exception as error:  # whatever it is
             found.append(error)
-    if loop.pilot.fault is not None:
-        found.insert(0, loop.pilot.fault)
+    if loop.controller.fault is not None:
+        found.insert(0, loop.controller.fault)
     return [processes.write_crash(partial, processes.CONTROL, error) for error in found]
 
 
 def outcome(loop: Loop) -> dict[str, Any]:
     """What there is to say of a session at its end, as JSON."""
     return {
-        "stops": [{"t_ns": t_ns, "reason": reason} for t_ns, reason in loop.pilot.stops],
+        "stops": [{"t_ns": t_ns, "reason": reason} for t_ns, reason in loop.controller.stops],
         "reason": _reason(loop),
-        "waiting": loop.pilot.waiting,
+        "waiting": loop.controller.waiting,
         "answers": loop.answers,
         "looks_skipped": loop.skipped,
         "dropped": loop.recorder.dropped,
-        "counts": {name: int(count) for name, count in sorted(loop.pilot.counts().items())},
+        "counts": {name: int(count) for name, count in sorted(loop.controller.counts().items())},
     }
 
 
 def _reason(loop: Loop) -> str:
-    return loop.pilot.stop or watchdog.of_signals(loop.caught | (loop.signals & ENDING))
+    return loop.controller.stop or watchdog.of_signals(loop.caught | (loop.signals & ENDING))
 
 
 def _verdict(loop: Loop, done: Path, crashes: list[str]) -> None:
     if crashes:
-        braked = "braked; " if loop.pilot.stops else ""
+        braked = "braked; " if loop.controller.stops else ""
         raise LiveStopped(f"{crashes[0]}; {braked}the record, not complete, and the traceback are in {done}")
     reason = _reason(loop)
     if reason and reason not in (watchdog.SESSION_OVER, watchdog.RECORDING_OVER):
-        at = next((t_ns for t_ns, why in loop.pilot.stops if why == reason), None)
+        at = next((t_ns for t_ns, why in loop.controller.stops if why == reason), None)
         when = "" if at is None else f" after {(at - loop.start_ns) / 1e9:.1f} s"
         last_words = [note.removeprefix("failed ") for note in loop.notes if note.startswith("failed ")]
         why = f" ({last_words[-1]})" if reason == watchdog.PERSON_DEAD and last_words else ""

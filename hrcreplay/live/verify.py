@@ -25,7 +25,7 @@ from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.records import STATUSES, Floats, SweptVolumes
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
-from hrcreplay.store.tables import state_columns
+from hrcreplay.store.columns import state_columns
 
 COMMANDS = ("fuse", "predict", "plan", "report")
 _CONTEXT = ("versions", "limits", "task", "cell")  #: of run.json: what else may make a difference
@@ -139,7 +139,7 @@ class Verdict:
 class DecisionMaker(Protocol):
     """What makes a session's decisions; see pilot.py."""
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
         """What is known of the person."""
 
     def answer(self, event: TickEvent) -> Decision:
@@ -149,10 +149,10 @@ class DecisionMaker(Protocol):
         """The robot said nothing."""
 
 
-Build = Callable[[dict[str, Any]], DecisionMaker]
+ControllerFactory = Callable[[dict[str, Any]], DecisionMaker]
 
 
-def verify(run: Path, build: Build = setup.build_controller) -> Verdict:
+def verify(run: Path, build: ControllerFactory = setup.build_controller) -> Verdict:
     """Runs a live session or a replay again from what its folder holds, and compares.
 
     Args:
@@ -169,25 +169,25 @@ def verify(run: Path, build: Build = setup.build_controller) -> Verdict:
     return _session(run, build)
 
 
-def _session(run: Path, build: Build) -> Verdict:
-    tape = SessionLogReader(run / LOG)
-    again = SessionRecomputation(build(tape.start()))
+def _session(run: Path, build: ControllerFactory) -> Verdict:
+    log = SessionLogReader(run / LOG)
+    again = SessionRecomputation(build(log.start()))
     difference = None
-    for message in tape.messages():
-        if tape.flaws or again.crashed:
+    for message in log.messages():
+        if log.flaws or again.crashed:
             break
-        difference = again.differs(message)
+        difference = again.difference_at(message)
         if difference is not None:
             break
     else:
-        difference = again.owed()
-    lines = [f"{tape.path}: {flaw}" for flaw in tape.flaws]
+        difference = again.pending_difference()
+    lines = [f"{log.path}: {flaw}" for flaw in log.flaws]
     if difference is not None:
         lines.append(difference)
     lines += _changed(run)
     if lines:
         return Verdict(identical=False, lines=(*lines, f"identical until then: {again.ticks} ticks"))
-    end = "" if again.ended and tape.finished else "; the record breaks off: the session or its recorder was killed"
+    end = "" if again.ended and log.finished else "; the record breaks off: the session or its recorder was killed"
     end = f"; then control crashed: {again.crashed}" if again.crashed else end
     return Verdict(identical=True, lines=(f"identical: {again.ticks} ticks, {again.looks} looks{end}",))
 
@@ -211,31 +211,31 @@ def _changed(run: Path) -> Iterator[str]:
 class SessionRecomputation:
     """A session once more: a fresh pilot is told what the record says, and must say what the record says."""
 
-    def __init__(self, pilot: DecisionMaker) -> None:
+    def __init__(self, controller: DecisionMaker) -> None:
         self.ticks = 0  #: answers so far
         self.looks = 0
         self.ended = False
         self.crashed = ""  #: how control crashed, after which no pilot answered
-        self._pilot = pilot
+        self._pilot = controller
         self._start_ns: int | None = None
         self._last_ns = 0
         self._frames: list[bytes] = []
         self._datagrams: list[bytes] = []
         self._reply: bytes | None = None  # due as the next message
-        self._sight: Perception | None = None
+        self._perception: Perception | None = None
         self._suspect = ""  # a limb whose volume is not that of the record; perhaps it is there whole
         self._take = {
             codec.ROBOT: self._robot,
             codec.REPLY: self._replied,
-            codec.FRAME: self._frame,
-            codec.LOOK: self._look,
+            codec.SKELETON: self._frame,
+            codec.PERCEPTION: self._look,
             codec.VOLUMES: self._volumes,
-            codec.ANSWER: self._answer,
-            codec.SILENCE: self._silence,
+            codec.DECISION: self._answer,
+            codec.TIMEOUT: self._silence,
             codec.EVENT: self._event,
         }
 
-    def differs(self, message: bytes) -> str | None:
+    def difference_at(self, message: bytes) -> str | None:
         """The first thing about a message, or due before it, that is not the same again."""
         kind, t_ns = codec.kind(message), codec.clock_ns(message)
         if self._start_ns is None:
@@ -253,7 +253,7 @@ class SessionRecomputation:
             found = self._take[kind](message)
         return None if found is None else self._at(t_ns, found)
 
-    def owed(self) -> str | None:
+    def pending_difference(self) -> str | None:
         """What differs that the message after the last one would have shown."""
         return self._at(self._last_ns, self._suspect) if self._suspect else None
 
@@ -275,36 +275,36 @@ class SessionRecomputation:
         if what != "blind":
             return None
         frames, self._frames = self._frames, []
-        self._sight = self._pilot.look(codec.clock_ns(message), frames)
-        return None if self._sight is None else _both("look", "failed", "none of it")
+        self._perception = self._pilot.update_perception(codec.clock_ns(message), frames)
+        return None if self._perception is None else _both("look", "failed", "none of it")
 
     def _look(self, message: bytes) -> str | None:
         frames, self._frames = self._frames, []
         recorded = codec.decode_perception(message)
         if len(frames) != recorded.skeletons:
             return f"the record has {len(frames)} of the {recorded.skeletons} skeletons of this look"
-        sight = self._sight = self._pilot.look(recorded.t_ns, frames)
+        perception = self._perception = self._pilot.update_perception(recorded.t_ns, frames)
         self.looks += 1
-        if sight is None:
+        if perception is None:
             return _both("look", "done", "failed")
-        if codec.encode_perception(sight.states, sight.volumes, len(frames)) == message:
+        if codec.encode_perception(perception.states, perception.volumes, len(frames)) == message:
             return None
-        columns = state_columns(sight.states)
-        cameras = [f"valid_{camera}" for camera in sight.states.cameras]
+        columns = state_columns(perception.states)
+        cameras = [f"valid_{camera}" for camera in perception.states.cameras]
         names = [name for name in columns if name != "t_ns" and name not in cameras]
-        found = _first(names, recorded.state, codec.state_numbers(sight.states))
-        found = found or _first(cameras, list(recorded.valid), list(sight.states.valid[0].tobytes()))
+        found = _first(names, recorded.state, codec.state_numbers(perception.states))
+        found = found or _first(cameras, list(recorded.valid), list(perception.states.valid[0].tobytes()))
         if found is None:
-            digests = [codec.volume_digest(sight.volumes, limb) for limb in range(len(sight.volumes.limbs))]
-            whole = [f"volume of {limb} (digest)" for limb in sight.volumes.limbs]
+            digests = [codec.volume_digest(perception.volumes, limb) for limb in range(len(perception.volumes.limbs))]
+            whole = [f"volume of {limb} (digest)" for limb in perception.volumes.limbs]
             self._suspect = _first(whole, [d.hex() for d in recorded.digests], [d.hex() for d in digests]) or ""
         return found
 
     def _volumes(self, message: bytes) -> str | None:
         suspect, self._suspect = self._suspect, ""
-        if self._sight is None:
+        if self._perception is None:
             return _both("volumes", "some", "none")
-        volumes = self._sight.volumes
+        volumes = self._perception.volumes
         if codec.encode_volumes(volumes) == message:
             return suspect or None
         return _volume(codec.decode_volumes(message, volumes.limbs, volumes.method), volumes) or suspect or None

@@ -23,7 +23,7 @@ Place = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Sighting:
+class LastPosition:
     """Where and when the person was last seen."""
 
     position_m: Place
@@ -37,11 +37,11 @@ class PersonMemory:
     Cameras with known poses share the space "world"; every other camera is a space of its own.
     """
 
-    sightings: tuple[tuple[str, Sighting], ...] = ()  #: space -> last sighting
+    sightings: tuple[tuple[str, LastPosition], ...] = ()  #: space -> last sighting
     bodies: tuple[tuple[str, int], ...] = ()  #: camera -> body id of the person
 
 
-def pick(
+def select_person(
     frames: CameraFrames,
     memory: PersonMemory,
     T_world_camera: Floats,
@@ -85,7 +85,7 @@ def pick(
             continue
         keep[row] = True
         x, y, z = places_m[row]
-        sightings[space] = Sighting((x, y, z), now_ns)
+        sightings[space] = LastPosition((x, y, z), now_ns)
         body = int(frames.body[row])
         counts["person_id_switches"] += bodies.get(name, body) != body
         bodies[name] = body
@@ -165,14 +165,14 @@ _PAIRS = (
 _A, _B = (np.array([POINTS.index(pair[end]) for pair in _PAIRS]) for end in (0, 1))
 
 
-class Mended(NamedTuple):
+class CleanedSkeleton(NamedTuple):
     """A row as it is handed on, and what had to be done to its points."""
 
     row: RawSkeleton
     flaws: tuple[tuple[str, int], ...]  #: name in DEFECTS -> points
 
 
-def mended(row: RawSkeleton) -> Mended:
+def clean_skeleton(row: RawSkeleton) -> CleanedSkeleton:
     """The row with all that is no point of a body made missing: NaN, with confidence 0.
 
     Of two ends of a bone in one place neither can be believed. A point of confidence 0 was said to be missing: it is
@@ -195,7 +195,7 @@ def mended(row: RawSkeleton) -> Mended:
         "points_too_far": far & told,
         "points_coincident": together & told,
     }
-    return Mended(whole, tuple((name, int(which.sum())) for name, which in found.items() if which.any()))
+    return CleanedSkeleton(whole, tuple((name, int(which.sum())) for name, which in found.items() if which.any()))
 
 
 def _together(points: Floats) -> Bools:
@@ -207,7 +207,7 @@ def _together(points: Floats) -> Bools:
     return found
 
 
-class Repeats(NamedTuple):
+class RepeatedSkeleton(NamedTuple):
     """The longest time for which a camera gave one and the same skeleton."""
 
     seconds: float
@@ -227,24 +227,24 @@ class Cleaner:
             tuple[str, int], tuple[RawSkeleton, int]
         ] = {}  # of each body: its last new skeleton, and its arrival
         self._rows: list[tuple[int, int, RawSkeleton]] = []
-        self.heard: dict[str, tuple[int, int]] = {}  #: camera -> first and last arrival
+        self.arrivals: dict[str, tuple[int, int]] = {}  #: camera -> first and last arrival
         self.seen: dict[str, Bools] = {}  #: camera -> (20,) points it ever gave a place and a confidence
         self.points: Counter[str] = Counter()  #: camera -> points with a place and a confidence
         self.flaws: Counter[tuple[str, str]] = Counter()  #: (camera, name in DEFECTS) -> points or rows
-        self.frozen: dict[str, Repeats] = {}  #: camera -> its longest standstill
+        self.frozen: dict[str, RepeatedSkeleton] = {}  #: camera -> its longest standstill
         for name in (*_ALWAYS, *(f"{kind}_{camera}" for kind in ("frames", "gaps") for camera in cameras)):
             defects[name] += 0
 
-    def hear(self, camera: str, arrival_ns: int) -> None:
+    def note_arrival(self, camera: str, arrival_ns: int) -> None:
         """Notes that a camera is alive."""
-        first, last = self.heard.get(camera, (arrival_ns, arrival_ns))
+        first, last = self.arrivals.get(camera, (arrival_ns, arrival_ns))
         if arrival_ns - last > self._gap_ns:
             self._defects[f"gaps_{camera}"] += 1
-        self.heard[camera] = (first, arrival_ns)
+        self.arrivals[camera] = (first, arrival_ns)
 
     def add(self, row: RawSkeleton, arrival_ns: int) -> CameraFrames | None:
         """Takes a row; gives the chunk that ends before it, if one does."""
-        self.hear(row.camera, arrival_ns)
+        self.note_arrival(row.camera, arrival_ns)
         self._defects["frames_header_stamp_zero"] += row.stamp_zero
         capture_ns = self._captured(row, arrival_ns)
         newest_ns = self._newest.get((row.camera, row.body))
@@ -252,7 +252,7 @@ class Cleaner:
             self._defects["frames_duplicate" if capture_ns == newest_ns else "frames_out_of_order"] += 1
             return None
         self._newest[(row.camera, row.body)] = capture_ns
-        whole, flaws = mended(row)
+        whole, flaws = clean_skeleton(row)
         for name, count in flaws:
             self._flaw(row.camera, name, count)
         if self._repeats(whole, arrival_ns):
@@ -261,7 +261,7 @@ class Cleaner:
         self.seen[row.camera] = self.seen.get(row.camera, False) | known
         self.points[row.camera] += int(known.sum())
         self._defects[f"frames_{row.camera}"] += 1
-        chunk = self.rest() if self._rows and arrival_ns - self._rows[0][1] >= _CHUNK_NS else None
+        chunk = self.flush() if self._rows and arrival_ns - self._rows[0][1] >= _CHUNK_NS else None
         self._rows.append((capture_ns, arrival_ns, whole))
         return chunk
 
@@ -288,15 +288,15 @@ class Cleaner:
             return False
         self._flaw(row.camera, "frames_repeated", 1)
         lasted_s = (arrival_ns - before[1]) / 1e9
-        if lasted_s > self.frozen.get(row.camera, Repeats(0.0, 0)).seconds:
-            self.frozen[row.camera] = Repeats(lasted_s, before[1])
+        if lasted_s > self.frozen.get(row.camera, RepeatedSkeleton(0.0, 0)).seconds:
+            self.frozen[row.camera] = RepeatedSkeleton(lasted_s, before[1])
         return True
 
     def _flaw(self, camera: str, name: str, count: int) -> None:
         self._defects[name] += count
         self.flaws[(camera, name)] += count
 
-    def rest(self) -> CameraFrames | None:
+    def flush(self) -> CameraFrames | None:
         """What is not handed out yet."""
         rows, self._rows = self._rows, []
         if not rows:

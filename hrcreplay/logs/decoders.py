@@ -26,8 +26,8 @@ from hrcreplay.logs.messages import (
     Message,
     RawSkeleton,
     Undecodable,
-    blank,
     camera_of,
+    missing_body,
     stamp_ns,
 )
 from hrcreplay.records import POINTS, Floats
@@ -91,7 +91,7 @@ class MarkerDecoder:
         """A row a body; none for an empty or a clearing array."""
         rows = []
         for body, markers in sorted(_bodies(message.read()).items()):
-            points, confidence = blank()
+            points, confidence = missing_body()
             for joint, marker in markers.items():
                 if joint in AZURE_INDEX:
                     at = marker.pose.position
@@ -184,7 +184,7 @@ class TfDecoder:
 
 def _finish(person: _Person, camera: str, body: int) -> RawSkeleton:
     person.known.update(person.joints)
-    points, confidence = blank()
+    points, confidence = missing_body()
     for joint, at in person.joints.items():
         points[_WHERE[joint]] = at
         confidence[_WHERE[joint]] = 1.0
@@ -253,7 +253,7 @@ class GenericDecoder:
         trust = None if self.confidence is None else _array(content, self.confidence, where)
         if not len(elements):
             return []
-        points, confidence = blank()
+        points, confidence = missing_body()
         scale = _METRES[self.unit]
         for name, element in self.index.items():
             if not 0 <= element < len(elements):

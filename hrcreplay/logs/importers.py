@@ -23,7 +23,16 @@ from pathlib import Path
 import numpy as np
 
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.logs.text_rows import START_NS, ImportedSkeleton, import_cameras, instant, lines, numbers, row, write_log
+from hrcreplay.logs.text_rows import (
+    START_NS,
+    ImportedSkeleton,
+    import_cameras,
+    lines,
+    numbers,
+    skeleton_row,
+    time_stamp_ns,
+    write_log,
+)
 from hrcreplay.records import POINTS, Floats
 
 #: K4ABT's joint confidence: none, low, medium, high. 'High' is reserved by the SDK; medium is the most it gives.
@@ -98,14 +107,14 @@ def _places(where: str, columns: list[str]) -> int:
 def _row(where: str, text: str, before_ns: int, width: int, at: int, joints: dict[str, int]) -> ImportedSkeleton:
     fields = text.split(";")
     values = numbers(where, fields, width)
-    t_ns = instant(where, fields[0], 1000, before_ns)
+    t_ns = time_stamp_ns(where, fields[0], 1000, before_ns)
     table = values[2:].reshape(at, 4)
     confidence = table[:, 0].copy()
     for level in set(confidence.tolist()):
         if level not in _AZURE_CONFIDENCE:
             raise LogError(f"{where}: confidence: found {level:g}; would be right: 0, 1, 2 or 3")
         confidence[table[:, 0] == level] = _AZURE_CONFIDENCE[level]
-    return row(t_ns, int(values[1]), joints, table[:, 1:] * 1e-3, confidence)
+    return skeleton_row(t_ns, int(values[1]), joints, table[:, 1:] * 1e-3, confidence)
 
 
 #: Confidence of the tracking states 'not tracked', 'inferred' and 'tracked'.
@@ -142,13 +151,13 @@ def _kinect2_rows(path: Path) -> Iterator[ImportedSkeleton]:
     for where, text in lines(path):
         fields = text.removesuffix(",").split(",")
         values = numbers(where, fields, 1 + 4 * _COUNT)
-        before_ns = instant(where, fields[0], 100, before_ns)
+        before_ns = time_stamp_ns(where, fields[0], 100, before_ns)
         table = values[1:].reshape(_COUNT, 4)
         state = table[:, 3]
         wrong = ~np.isin(state, (0, 1, 2))
         if wrong.any():
             raise LogError(f"{where}: tracking state: found {state[wrong][0]:g}; would be right: 0, 1 or 2")
-        yield row(before_ns, 0, JOINTS, table[:, :3].copy(), _KINECT2_CONFIDENCE[state.astype(int)])
+        yield skeleton_row(before_ns, 0, JOINTS, table[:, :3].copy(), _KINECT2_CONFIDENCE[state.astype(int)])
 
 
 _PULL = 0.04  # skin movement (4 mm) over the usual distance of a target from the centre (0.1 m)
@@ -275,7 +284,7 @@ def _kinect_rows(path: Path, rate_hz: float) -> Iterator[ImportedSkeleton]:
     for number, table in enumerate(_tables(path, _KINECT_JOINTS)):
         points = table[:, :3].copy()
         points[(points == 0).all(axis=1)] = np.nan
-        yield row(_t_ns(number, rate_hz), 0, JOINTS, points, np.ones(_KINECT_JOINTS))
+        yield skeleton_row(_t_ns(number, rate_hz), 0, JOINTS, points, np.ones(_KINECT_JOINTS))
 
 
 def _tables(path: Path, count: int) -> Iterator[Floats]:
@@ -317,7 +326,7 @@ def _optical_rows(path: Path, rate_hz: float, pivots: dict[str, Pivot]) -> Itera
             points[POINTS.index(name)] = pivot.at(turns[a], positions[a], turns[b], positions[b])
         shoulders = points[[POINTS.index("shoulder_l"), POINTS.index("shoulder_r")]]
         points[POINTS.index("neck")] = shoulders.mean(axis=0)
-        yield row(_t_ns(number, rate_hz), 0, list(range(len(POINTS))), points, trust)
+        yield skeleton_row(_t_ns(number, rate_hz), 0, list(range(len(POINTS))), points, trust)
 
 
 __all__ = ["import_azure", "import_keraal", "import_kinect2"]

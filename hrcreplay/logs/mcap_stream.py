@@ -24,7 +24,7 @@ from zstandard import ZstdError
 from hrcreplay.errors import LogError
 from hrcreplay.logs import ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.messages import Damage, LazyChunk, Message, Topic, Undecodable, in_order
+from hrcreplay.logs.messages import Damage, LazyChunk, Message, Topic, Undecodable, merge_by_arrival
 
 MAGIC = b"\x89MCAP0\r\n"
 _RUN_BYTES = 1 << 20
@@ -104,7 +104,7 @@ class McapStream:
                 and (end_ns is None or block.start_ns < end_ns)
                 and (block.channels is None or not block.channels.isdisjoint(wanted))
             ]
-            yield from in_order(parts)
+            yield from merge_by_arrival(parts)
 
     def _block(
         self, file: IO[bytes], block: _Block, wanted: dict[int, Topic], start_ns: int | None, end_ns: int | None

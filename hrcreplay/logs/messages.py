@@ -35,7 +35,7 @@ class Topic:
     parse: Callable[[bytes], Any]  #: bytes of a message -> its fields; raises Undecodable
 
 
-def listed(found: Iterable[Topic]) -> str:
+def topic_list(found: Iterable[Topic]) -> str:
     """Topics and their types in one line."""
     return ", ".join(f"{topic.name} ({topic.type})" for topic in found) or "no topics at all"
 
@@ -86,7 +86,7 @@ class LazyChunk(NamedTuple):
     open: Callable[[], Iterator[Message]]  #: the messages in order of arrival
 
 
-def in_order(parts: Iterable[LazyChunk]) -> Iterator[Message]:
+def merge_by_arrival(parts: Iterable[LazyChunk]) -> Iterator[Message]:
     """Messages of all parts in order of arrival; parts that do not overlap are never open together.
 
     Messages of one arrival keep the order of their parts.
@@ -231,7 +231,7 @@ class SkeletonDecoder(Protocol):
         """The rows that are complete with this message. Raises Undecodable, LogError."""
 
 
-def blank() -> tuple[Floats, Floats]:
+def missing_body() -> tuple[Floats, Floats]:
     """Points and confidence of a body of which nothing is known."""
     return np.full((len(POINTS), 3), np.nan), np.zeros(len(POINTS))
 

@@ -132,7 +132,7 @@ def size_remark(camera: str, stature_m: float, mend: str) -> str | None:
     return f"{text}; are its points in metres? {mend}"
 
 
-def impossible(stature_m: float) -> bool:
+def impossible_size(stature_m: float) -> bool:
     """Whether nobody can be of that size."""
     return stature_m > _CERTAIN * PERSON_M[1] or stature_m < PERSON_M[0] / _CERTAIN
 
@@ -147,7 +147,7 @@ def side_remark(camera: str, side: float) -> str | None:
     )
 
 
-def unmeasured(seen: Mapping[str, Bools]) -> Iterator[str]:
+def unmeasured_limbs(seen: Mapping[str, Bools]) -> Iterator[str]:
     """The limbs that no camera ever placed, by the points (20,) that each ever gave."""
     ever = np.logical_or.reduce([np.zeros(len(POINTS), dtype=np.bool_), *seen.values()])
     if not ever.any():

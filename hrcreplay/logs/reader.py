@@ -24,8 +24,8 @@ from hrcreplay.logs.decoders import (
     find_cameras,
     is_skeleton,
 )
-from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, listed
-from hrcreplay.logs.source import LogFiles, open_source
+from hrcreplay.logs.log_files import LogFiles, open_source
+from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, topic_list
 from hrcreplay.logs.tracks import Header, JointTopic, JointTrack, Truth
 from hrcreplay.records import CameraFrames
 
@@ -34,7 +34,9 @@ _PEEK = 300  # markers: ten seconds of a sensor to show a body in
 _HOW = "Name one with --topic NAME, or a decoder for it in [logs.decoders] of the settings file."
 
 
-def choose(source: LogFiles, names: tuple[str, ...], described: tuple[GenericDecoder, ...]) -> list[SkeletonDecoder]:
+def choose_decoders(
+    source: LogFiles, names: tuple[str, ...], described: tuple[GenericDecoder, ...]
+) -> list[SkeletonDecoder]:
     """The decoders of a log's skeleton topics.
 
     Args:
@@ -51,7 +53,7 @@ def choose(source: LogFiles, names: tuple[str, ...], described: tuple[GenericDec
     found = {topic.name: topic for topic in source.topics()}
     for name in (*names, *(decoder.topic for decoder in described)):
         if name not in found:
-            raise LogError(f"{source.path}: no topic {name}; found {listed(found.values())}")
+            raise LogError(f"{source.path}: no topic {name}; found {topic_list(found.values())}")
     by_topic = {decoder.topic: decoder for decoder in described}
     decoders: list[SkeletonDecoder] = []
     for topic in found.values():
@@ -66,9 +68,9 @@ def choose(source: LogFiles, names: tuple[str, ...], described: tuple[GenericDec
     return decoders
 
 
-def none_found(source: LogFiles) -> LogError:
+def no_skeletons_message(source: LogFiles) -> LogError:
     """What to tell the user where no topic carries skeletons."""
-    return LogError(f"{source.path}: no skeleton topic; found {listed(source.topics())}.\n{_HOW}")
+    return LogError(f"{source.path}: no skeleton topic; found {topic_list(source.topics())}.\n{_HOW}")
 
 
 def _known(source: LogFiles, topic: Topic, *, asked: bool) -> SkeletonDecoder | None:
@@ -172,13 +174,13 @@ class Log:
                 self._reading["messages_undecodable"] += 1
                 continue
             if decoder.always_heard:
-                cleaner.hear(decoder.cameras[0], message.arrival_ns)
+                cleaner.note_arrival(decoder.cameras[0], message.arrival_ns)
             for row in rows:
                 shapes[row.camera].add(row.points_m)
                 chunk = cleaner.add(row, message.arrival_ns)
                 if chunk is not None:
                     yield chunk
-        chunk = cleaner.rest()
+        chunk = cleaner.flush()
         if chunk is not None:
             yield chunk
         self._remark(cleaner, start_ns, end_ns)
@@ -200,12 +202,12 @@ class Log:
             size = plausibility.size_remark(camera, shape.stature_m, self._unit_of(camera))
             if size is not None:
                 self._remarks.append(size)
-                if shape.certain and plausibility.impossible(shape.stature_m):
+                if shape.certain and plausibility.impossible_size(shape.stature_m):
                     self._refusals.append(size)
             side = plausibility.side_remark(camera, shape.side)
             if side is not None:
                 self._remarks.append(side)
-        self._remarks.extend(plausibility.unmeasured(cleaner.seen))
+        self._remarks.extend(plausibility.unmeasured_limbs(cleaner.seen))
 
     def _unit_of(self, camera: str) -> str:
         """Where the unit of a camera's points is set."""
@@ -232,10 +234,10 @@ class Log:
         begin = max(self.header.start_ns, start_ns or self.header.start_ns)
         end = min(self.header.end_ns, end_ns or self.header.end_ns)
         for camera in self.header.cameras:
-            if camera not in cleaner.heard:
+            if camera not in cleaner.arrivals:
                 self._remarks.append(f"camera {camera} is never heard")
                 continue
-            first, last = cleaner.heard[camera]
+            first, last = cleaner.arrivals[camera]
             if first - begin > _LATE_NS:
                 self._remarks.append(f"camera {camera} starts {(first - begin) / 1e9:.2f} s after the log")
             if end - last > _LATE_NS:
@@ -275,9 +277,9 @@ def open_log(path: Path, options: LogOptions = LogOptions(), *, skeletons: bool 
         LogError: It cannot be read, holds no messages, lacks a named topic, or has no skeletons.
     """
     source = open_source(path)
-    decoders = choose(source, options.topics, options.decoders)
+    decoders = choose_decoders(source, options.topics, options.decoders)
     if skeletons and not decoders:
-        raise none_found(source)
+        raise no_skeletons_message(source)
     return Log(source, decoders, options)
 
 

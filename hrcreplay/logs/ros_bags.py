@@ -29,7 +29,7 @@ from rosbags.typesys.store import Typestore
 from zstandard import ZstdDecompressor, ZstdError
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.messages import Damage, LazyChunk, Message, MessageStream, Topic, Undecodable, in_order
+from hrcreplay.logs.messages import Damage, LazyChunk, Message, MessageStream, Topic, Undecodable, merge_by_arrival
 
 _IDL_RULE = "=" * 80 + "\n"
 _ROS1 = (Stores.ROS1_NOETIC,)
@@ -168,7 +168,7 @@ class RecoveredBag:
         """Messages on these topics with start <= arrival < end, in order of arrival."""
         wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
         with self._path.open("rb") as file:
-            for message in in_order(
+            for message in merge_by_arrival(
                 LazyChunk(chunk.start_ns, partial(self._chunk, file, chunk, wanted))
                 for chunk in self._chunks
                 if (start_ns is None or chunk.end_ns >= start_ns) and (end_ns is None or chunk.start_ns < end_ns)

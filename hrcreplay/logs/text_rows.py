@@ -84,7 +84,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def instant(where: str, text: str, unit_ns: int, before_ns: int) -> int:
+def time_stamp_ns(where: str, text: str, unit_ns: int, before_ns: int) -> int:
     """A time stamp [ns], not negative, that must not be before ``before_ns``.
 
     Raises:
@@ -101,7 +101,7 @@ def instant(where: str, text: str, unit_ns: int, before_ns: int) -> int:
     return t_ns
 
 
-def row(
+def skeleton_row(
     t_ns: int, body: int, found: Mapping[str, int] | list[int], points_m: Floats, confidence: Floats
 ) -> ImportedSkeleton:
     """A row in the order of POINTS from a sensor's own joints; ``found`` tells where each stands."""

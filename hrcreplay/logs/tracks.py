@@ -16,8 +16,8 @@ import numpy as np
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs.decoders import points_of
-from hrcreplay.logs.messages import Message, Topic, Undecodable, listed, stamp_ns
-from hrcreplay.logs.source import LogFiles
+from hrcreplay.logs.log_files import LogFiles
+from hrcreplay.logs.messages import Message, Topic, Undecodable, stamp_ns, topic_list
 from hrcreplay.records import Floats, Ints, Table
 
 
@@ -132,7 +132,7 @@ def find_joints(source: LogFiles, name: str | None) -> JointTopic | None:
     if name is not None:
         found = [topic for topic in found if topic.name == name]
         if not found:
-            raise LogError(f"{source.path}: no joint states on {name}; found {listed(source.topics())}")
+            raise LogError(f"{source.path}: no joint states on {name}; found {topic_list(source.topics())}")
     for topic in found:
         for message in source.messages([topic.name]):
             _, q = _joint_state(message)

@@ -20,7 +20,17 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
 from hrcreplay.report import drawing
 from hrcreplay.report.drawing import RenderedHull, View, bones, outline, picture, view_from
-from hrcreplay.report.metrics import ANGLES, Metric, broken, columns, envelope, seconds_from, stretches, times, wrap
+from hrcreplay.report.metrics import (
+    ANGLES,
+    Metric,
+    break_at_gaps,
+    columns,
+    envelope,
+    seconds_from,
+    stretches,
+    times,
+    wrap,
+)
 from hrcreplay.report.metrics_data import cameras, errors, seconds_since
 from hrcreplay.store.run_folder import Run
 
@@ -151,7 +161,9 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
                 seconds = seconds_from(found[source].t_ns, t0_ns)
                 values = error_factor * found[source].position[:, JOINTS.index(joint)]
                 below.plot(
-                    *envelope(*broken(seconds, values, gap_s)), color=colour, lw=1.3 if source == "fused" else 0.7
+                    *envelope(*break_at_gaps(seconds, values, gap_s)),
+                    color=colour,
+                    lw=1.3 if source == "fused" else 0.7,
                 )
         below.set(title="Error against ground truth", ylabel=f"{error_unit}")
     rows[-1][0].set_xlabel("time [s]")
@@ -166,7 +178,7 @@ def _seen(run: Run, camera: str, joint: str, t0_ns: int, gap_s: float) -> tuple[
     rows = run.measurements[run.measurements["camera"] == camera].sort_values("capture_ns", kind="stable")
     seconds = seconds_from(times(rows, "capture_ns"), t0_ns)
     values = _beside_fused(run, joint, times(rows, "capture_ns"), rows[joint].to_numpy(dtype=float))
-    return broken(seconds, values, gap_s)
+    return break_at_gaps(seconds, values, gap_s)
 
 
 def _span(ax: Axes, run: Run, t0_ns: int) -> None:

@@ -88,7 +88,7 @@ def _never_measured(measurements: pd.DataFrame | None) -> frozenset[str]:
     return frozenset(joint for joint in JOINTS if not np.isfinite(measurements[joint].to_numpy(dtype=float)).any())
 
 
-def called(limbs: list[str]) -> str:
+def limb_names_text(limbs: list[str]) -> str:
     """Limbs as a reader calls them, with their abbreviations: "left lower arm (LLA) and head (HD)"."""
     names = [f"{NAMES[limb]} ({limb})" for limb in limbs]
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
@@ -121,11 +121,11 @@ def remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
                 "its volume holds all that its joints allow"
             )
     lines += [
-        f"the {called([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"
+        f"the {limb_names_text([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"
         for limb, share in mostly.items()
     ]
     for limb in LIMBS:
         joints = metrics[f"limb_{limb}_joints_unmeasured"]["value"]
         if joints is not None and limb not in never and limb != "HD":  # the head hangs on the trunk's joints
-            lines.append(f"the {called([limb])} was measured only in part: never its {joints}")
+            lines.append(f"the {limb_names_text([limb])} was measured only in part: never its {joints}")
     return lines

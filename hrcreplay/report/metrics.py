@@ -117,7 +117,7 @@ def durations_s(t_ns: Ints) -> Floats:
     return np.append(steps, np.median(steps))
 
 
-def broken(x: Floats, y: Floats, gap: float) -> tuple[Floats, Floats]:
+def break_at_gaps(x: Floats, y: Floats, gap: float) -> tuple[Floats, Floats]:
     """A line with a NaN put in wherever its abscissa leaps by more than ``gap``."""
     leaps = np.flatnonzero(np.diff(x) > gap) + 1
     return np.insert(x, leaps, x[leaps - 1]), np.insert(y, leaps, np.nan)

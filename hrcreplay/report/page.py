@@ -15,10 +15,10 @@ from markupsafe import Markup
 
 from hrcreplay.records import LIMBS
 from hrcreplay.report import story
-from hrcreplay.report.limbs import called
+from hrcreplay.report.limbs import limb_names_text
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
-from hrcreplay.report.story import flaws
+from hrcreplay.report.story import defect_notes
 from hrcreplay.report.tables import (
     CAMERA,
     CAPTIONS,
@@ -87,7 +87,7 @@ def render(
         inputs=inputs,
         versions=sorted(run.meta.get("versions", {}).items()),
         stages=sorted((run.meta.get("stages") or {}).items()),
-        flaws=flaws(run.counts, run.notes),
+        flaws=defect_notes(run.counts, run.notes),
         command=shlex.join(run.meta.get("arguments") or [str(run.meta.get("command", ""))]),
         not_claimed=NOT_CLAIMED,
         metrics=[
@@ -233,7 +233,7 @@ def _fusion_table(metrics: Mapping[str, Metric], seen: Sequence[str]) -> PageTab
 def _limbs(metrics: Mapping[str, Metric]) -> tuple[PageTable, ...]:
     shares, joints = ([metrics[f"limb_{limb}_{what}"] for limb in LIMBS] for what in _LIMB)
     rows = [
-        (called([limb]), percent(share), text_of(names))
+        (limb_names_text([limb]), percent(share), text_of(names))
         for limb, share, names in zip(LIMBS, shares, joints, strict=True)
     ]
     if shares[0]["value"] is None:

@@ -125,7 +125,7 @@ REASONS = {
 }
 
 
-def happened(reason: str) -> str:
+def reason_text(reason: str) -> str:
     """What happened at a tick with a reason to brake; of a reason without words, the record's own."""
     return REASONS.get(reason, f"the record says '{reason}'")
 

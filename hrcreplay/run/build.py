@@ -106,7 +106,7 @@ def prediction_stage(job: Job) -> PredictionStage:
     return PredictionStage(job.prediction, occupancy.stop_s, radii, margins, occupancy.method)
 
 
-def base(job: Job, log: LogLike) -> Floats | None:
+def known_robot_base(job: Job, log: LogLike) -> Floats | None:
     """(4, 4) the robot's base in the world: of the cell file, else of the log."""
     if job.cell is not None and job.cell.T_world_base is not None:
         return job.cell.T_world_base
@@ -184,25 +184,25 @@ def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int
 
 def planners(job: Job, log: LogLike, start_ns: int) -> dict[str, Planner]:
     """Stage 3: the chosen method and its baselines, each with a robot of its own."""
-    plan, model = job.settings.plan, robot(job, standing(job, log))
+    plan, model = job.settings.plan, robot(job, robot_base(job, log))
     path, begin_ns = reference(job, log, model)
     settings = plan_settings(job, 1.0 / job.settings.fusion.rate_hz)
     s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
 
     def planner(name: str) -> Planner:
-        follower = follow(job, name, model, path, settings, s_s)
+        follower = make_follower(job, name, model, path, settings, s_s)
         return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
 
 
-def standing(job: Job, log: LogLike) -> Floats:
+def robot_base(job: Job, log: LogLike) -> Floats:
     """(4, 4) where the robot stands.
 
     Raises:
         SettingsError: Neither the cell nor the log knows.
     """
-    T_world_base = base(job, log)
+    T_world_base = known_robot_base(job, log)
     if T_world_base is None:
         raise SettingsError(
             f"{log.header.path}: where the robot stands is not known; give a --cell file with T_world_base"
@@ -225,7 +225,7 @@ def plan_settings(job: Job, dt_s: float) -> PlanSettings:
     )
 
 
-def follow(
+def make_follower(
     job: Job, method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float
 ) -> QpFollower | ScalingFollower:
     """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on."""

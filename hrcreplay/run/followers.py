@@ -18,7 +18,7 @@ from hrcreplay.robot.programme.reference import Leash, Reference, ReferencePoint
 _FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
 
 
-class Tick(NamedTuple):
+class FollowerTick(NamedTuple):
     """What a method found at a tick, and what it decided."""
 
     state: RobotState
@@ -41,7 +41,7 @@ class QpFollower:
         self.point = self.reference.sample(self.s_s)
         self.state = RobotState(self.point.q, np.zeros(self.robot.nv))
 
-    def step(self, volumes: Obstacles) -> Tick:
+    def step(self, volumes: Obstacles) -> FollowerTick:
         """One tick of the trajectory generator."""
         state, point, now_s = self.state, self.point, self.s_s
         tcp_m = self.robot.pose(state.q, state.dq).T_world_tcp[:3, 3]
@@ -52,7 +52,7 @@ class QpFollower:
             self.robot, state, self.point.T_world_tcp, rate * self.point.twist, volumes, self.settings
         )
         self.state = step.next
-        return Tick(state, point, now_s, step)
+        return FollowerTick(state, point, now_s, step)
 
 
 @dataclass
@@ -68,13 +68,13 @@ class ScalingFollower:
         self.along = PathState(self.s_s, 0.0)
         self.state = RobotState(self.reference.sample(self.s_s).q, np.zeros(self.robot.nv))
 
-    def step(self, volumes: Obstacles) -> Tick:
+    def step(self, volumes: Obstacles) -> FollowerTick:
         """One tick of the baseline."""
         state, now_s = self.state, self.along.s_s
         point = self.reference.sample(now_s)
         step, self.along = scaling_controller.step(self.robot, self.reference, self.along, volumes, self.settings)
         self.state = step.next
-        return Tick(state, point, now_s, step)
+        return FollowerTick(state, point, now_s, step)
 
 
 @dataclass
@@ -119,7 +119,7 @@ class Planner:
             reasons=control_step.REASONS,
         )
 
-    def _tick(self, volumes: SweptVolumes, row: int, t_ns: int, seen: bool) -> Tick:
+    def _tick(self, volumes: SweptVolumes, row: int, t_ns: int, seen: bool) -> FollowerTick:
         if seen:
             self.seen_ns = t_ns
         around = obstacles(volumes, row)

@@ -210,7 +210,7 @@ def resolve(
     )
 
 
-def unlogged(command: str, where: Path, settings: Settings, cell_file: Path | None) -> Job:
+def job_without_log(command: str, where: Path, settings: Settings, cell_file: Path | None) -> Job:
     """The job of a command that has no log yet; ``where`` is what messages call it.
 
     Raises:

@@ -22,15 +22,15 @@ from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import HumanStates, Ints
 from hrcreplay.report import limbs, tables
-from hrcreplay.report.story import flaws
+from hrcreplay.report.story import defect_notes
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import LogLike, log_options
 from hrcreplay.run.job import TABLES, Job, plain_limits, resolve, urdf_digest, versions
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
 from hrcreplay.store import run_folder
+from hrcreplay.store.columns import lacks, read_states
 from hrcreplay.store.run_folder import Run, RunWriter, Stopwatch
-from hrcreplay.store.tables import lacks, read_states
 
 REPORTS = Path("reports")
 
@@ -71,15 +71,15 @@ def run(
         with ProgressBar(last[0] if last else "", len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
             found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth)
-        base = build.base(job, log)
+        base = build.known_robot_base(job, log)
         writer.close_tables()
         notes = [*found["notes"], *_unmeasured(writer.partial, known, found["notes"])]
         if "plan" in job.stages:
-            robot = build.robot(job, build.standing(job, log))
+            robot = build.robot(job, build.robot_base(job, log))
             notes += tables.remarks(robot)
             found["robot"] = tables.summary(robot)
         found["notes"] = list(dict.fromkeys(notes))
-        for line in flaws(found["counts"], found["notes"]):
+        for line in defect_notes(found["counts"], found["notes"]):
             print_note(line)
         meta = {
             **known,
@@ -236,12 +236,12 @@ def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
         LogError: The pose of a camera is not known.
     """
     settings = job.settings.model_dump(mode="json")
-    eyes = build.fusion_stage(job, log)
+    fusion_stage = build.fusion_stage(job, log)
     found: dict[str, Any] = {
         "versions": versions(),
         "log": job.log_sha256,
         "ticks": [int(ticks_ns[0]), int(ticks_ns[-1]), len(ticks_ns)],
-        "cameras": [log.header.cameras, eyes.T_world_camera.tolist(), eyes.clock_offset_ns.tolist()],
+        "cameras": [log.header.cameras, fusion_stage.T_world_camera.tolist(), fusion_stage.clock_offset_ns.tolist()],
         "settings logs": _without(settings["logs"], "joints_topic", "gap_s"),
         "logs.gap_s": settings["logs"]["gap_s"],
         "settings fusion": settings["fusion"],
@@ -251,7 +251,7 @@ def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
         "limits.prediction": _without(plain_limits(job.prediction), "name"),
     }
     if "plan" in job.stages:
-        base = build.base(job, log)
+        base = build.known_robot_base(job, log)
         found |= {
             "base": None if base is None else base.tolist(),
             "programme": job.task or log.header.task or {"joints_topic": settings["logs"]["joints_topic"]},
@@ -262,7 +262,7 @@ def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
 
 
 def stage_digests(job: Job, found: Mapping[str, str]) -> dict[str, str]:
-    """Digest of all that the result of each stage of the job depends on, from those of ``parts``."""
+    """Digest of all that the result of each stage of the job depends on, from those of ``dependencies``."""
     return {stage: _digest([found[name] for name in PARTS[stage]]) for stage in job.stages}
 
 

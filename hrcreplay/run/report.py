@@ -25,8 +25,8 @@ from hrcreplay.run import build
 from hrcreplay.run.job import Job
 from hrcreplay.run.stages import PredictionStage
 from hrcreplay.store import run_folder
+from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run, RunWriter
-from hrcreplay.store.tables import read_states
 
 
 def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
@@ -35,13 +35,13 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
     run = run_folder.read(writer.partial, meta)
     found = compute(run, **near)
     writer.text("metrics.json", run_folder.to_json(found))
-    foresight = build.prediction_stage(job)
-    radii = {name.replace("_", " "): radius for name, radius in asdict(foresight.radii).items()}
-    if foresight.method == "sound" and foresight.margins.legs:
-        radii["legs, of sound"] = foresight.margins.legs_radius_m
+    prediction_stage = build.prediction_stage(job)
+    radii = {name.replace("_", " "): radius for name, radius in asdict(prediction_stage.radii).items()}
+    if prediction_stage.method == "sound" and prediction_stage.margins.legs:
+        radii["legs, of sound"] = prediction_stage.margins.legs_radius_m
     folder = writer.partial / "figures"
-    robot = _links(job, foresight, run)
-    figures.draw_all(run, folder, found, **near, volumes=_instants(foresight, run), robot=robot)
+    robot = _links(job, prediction_stage, run)
+    figures.draw_all(run, folder, found, **near, volumes=_instants(prediction_stage, run), robot=robot)
     shown = [
         tables.limit_table(job.prediction, use="prediction"),
         tables.limit_table(job.tracking, use="tracking"),
@@ -65,14 +65,14 @@ def _bounds(settings: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def _instants(foresight: PredictionStage, run: Run) -> list[Instant]:
+def _instants(prediction_stage: PredictionStage, run: Run) -> list[Instant]:
     """The swept volumes by the paper's two methods and the run's own at the instants that Fig. 17 shows."""
     wanted = figures.instants(run)
     if not len(wanted):
         return []
     states = _states(run, wanted)
-    methods = dict.fromkeys(("paper", "positions", foresight.method))
-    by_method = {method: foresight.volumes(states, method) for method in methods}
+    methods = dict.fromkeys(("paper", "positions", prediction_stage.method))
+    by_method = {method: prediction_stage.volumes(states, method) for method in methods}
 
     return [
         (int(t), {method: _hulls(volumes, row) for method, volumes in by_method.items()})
@@ -80,7 +80,7 @@ def _instants(foresight: PredictionStage, run: Run) -> list[Instant]:
     ]
 
 
-def _links(job: Job, foresight: PredictionStage, run: Run) -> LinkPose | None:
+def _links(job: Job, prediction_stage: PredictionStage, run: Run) -> LinkPose | None:
     """The robot's capsules and the swept volumes at the tick of the smallest separation."""
     if run.motion is None or not len(run.motion) or run.T_world_base is None:
         return None
@@ -90,7 +90,7 @@ def _links(job: Job, foresight: PredictionStage, run: Run) -> LinkPose | None:
     if not np.isfinite(q).all():
         return None
     states = _states(run, np.array([row["t_ns"]]))
-    hulls = _hulls(foresight.volumes(states), 0) if len(states) else {}
+    hulls = _hulls(prediction_stage.volumes(states), 0) if len(states) else {}
     return LinkPose(
         t_ns=int(row["t_ns"]),
         distance_m=float(row["distance_m"]),

@@ -23,13 +23,13 @@ from hrcreplay.human.fusion import fuse as smoother
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.sound_reach import Margins
-from hrcreplay.logs.clean import PersonMemory, pick
+from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.run.followers import InitialOverlap, Planner
+from hrcreplay.store.columns import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
-from hrcreplay.store.tables import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 
 NS = 1_000_000_000
 #: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
@@ -64,7 +64,9 @@ class FusionStage:
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
         """What the frames say of the person, by the clock of the reference camera; see ``person.pick``."""
-        memory, mine, found = pick(frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s)
+        memory, mine, found = select_person(
+            frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
+        )
         mine = replace(mine, capture_ns=mine.capture_ns - self.clock_offset_ns[mine.camera])
         return memory, inverse_kinematics.measure(mine, self.T_world_camera, self.noise), found
 
@@ -126,7 +128,7 @@ def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterat
 
 
 def fused(
-    log: Log, ticks_ns: Ints, size: int, eyes: FusionStage, sink: Sink, *, smooth: bool = False
+    log: Log, ticks_ns: Ints, size: int, fusion_stage: FusionStage, sink: Sink, *, smooth: bool = False
 ) -> Iterator[HumanStates]:
     """Stage 1: camera frames to the fused person; leaves measurements and state, and ``smooth`` where asked.
 
@@ -143,17 +145,19 @@ def fused(
         measured = no_frames(log.header.cameras)
         if seen is not None:
             with sink.watch.stage("angles", len(ticks)):
-                memory, measured, found = eyes.measure(seen, memory)
+                memory, measured, found = fusion_stage.measure(seen, memory)
             sink.counts.update(found)
             sink.run.table("measurements", measurement_columns(measured))
             for stand, c in zip(stands, range(len(stands)), strict=True):
                 stand.add(measured.points_m[measured.camera == c])
         with sink.watch.stage("fuse", len(ticks)):
             if smooth:
-                state, states, events, trace = fuse.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
+                state, states, events, trace = fuse.fuse_traced(
+                    state, ticks, measured, fusion_stage.filter, fusion_stage.limits
+                )
                 passed.append((states, trace))
             else:
-                state, states, events = fuse.fuse(state, ticks, measured, eyes.filter, eyes.limits)
+                state, states, events = fuse.fuse(state, ticks, measured, fusion_stage.filter, fusion_stage.limits)
         sink.counts.update(events)
         ever = ever or bool(states.valid.any())
         sink.run.table("state", state_columns(states))
@@ -170,7 +174,7 @@ def fused(
             cov=np.concatenate([trace.cov for trace in traces]),
             damping=np.concatenate([trace.damping for trace in traces]),
         )
-        sink.run.table("smooth", state_columns(smoother.smooth(whole, trace, eyes.filter)))
+        sink.run.table("smooth", state_columns(smoother.smooth(whole, trace, fusion_stage.filter)))
 
 
 def _nobody(log: Log, found: Counter[str]) -> LogError:
@@ -221,24 +225,24 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
 
 
 def predicted(
-    states: Iterable[HumanStates], foresight: PredictionStage, store_every: float, sink: Sink, *, keep: bool
+    states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink, *, keep: bool
 ) -> Iterator[tuple[HumanStates, SweptVolumes]]:
     """Stage 2: the swept volumes of every tick; where ``keep``, leaves those of one tick in ``store_every``."""
     done = 0
     for batch in states:
         with sink.watch.stage("predict", len(batch)):
-            volumes = foresight.volumes(batch)
+            volumes = prediction_stage.volumes(batch)
         if keep:
             number = np.arange(done, done + len(batch))
             stored = np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
             with sink.watch.stage("hulls", len(stored)):
-                store(volumes, stored, sink.run)
+                store_volumes(volumes, stored, sink.run)
         done += len(batch)
         sink.progress("predict", len(batch))
         yield batch, volumes
 
 
-def store(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
+def store_volumes(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
     """Hull vertices and size of some ticks' volumes; a tick without a person leaves none."""
     t_ns: list[int] = []
     limbs: list[str] = []

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.calibration.calibrate import calibrate, collect, survey
+from hrcreplay.calibration.calibrate import calibrate, collect_tracks, survey
 from hrcreplay.calibration.registration import Disagreement, Registration, SkeletonTrack, rigid, transform
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.importers import import_azure, import_keraal, import_kinect2
@@ -112,7 +112,7 @@ def test_floor_of_one_camera(name: str, up_axis: int, sign: int, stature: float,
     log = open_log(tmp_path / "log.mcap")
     T = calibrate(log).T_world_camera["only"]
     assert sign * T[2, up_axis] > 0.95
-    (track,) = collect(log, 0.8, 2.0)
+    (track,) = collect_tracks(log, 0.8, 2.0)
     heads = transform(T, track.points_m)[:, 3, 2]
     assert np.nanpercentile(heads, 90) == pytest.approx(stature, abs=0.08)
     np.testing.assert_allclose(T[:2, 3], 0.0, atol=1e-12)
@@ -177,7 +177,7 @@ def test_a_second_person_does_not_disturb(tmp_path: Path) -> None:
 def test_a_long_log_is_looked_at_in_windows(tmp_path: Path) -> None:
     a = walker(20.0)
     hours = SkeletonTrack(a.t_ns * 200, a.points_m, a.confidence)  # 600 frames, 6.7 s apart: 67 minutes
-    (track,) = collect(_log(tmp_path / "log.mcap", {"a": hours}), 10.0, 2.0)
+    (track,) = collect_tracks(_log(tmp_path / "log.mcap", {"a": hours}), 10.0, 2.0)
     assert 60 <= len(track) <= 120
     assert track.t_ns[-1] - track.t_ns[0] > 0.95 * (hours.t_ns[-1] - hours.t_ns[0])
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.egm.codec import RobotPacket
-from hrcreplay.egm.session import EgmSession, PacketStatus
+from hrcreplay.egm.protocol import EgmSession, PacketStatus
 
 CYCLE_NS = 4_032_000
 T0_NS = 1_700_000_000_000_000_000
@@ -43,7 +43,7 @@ def talk(talking: EgmSession, seqnos: list[int], start: int = 0) -> list[PacketS
     """Hear and answer a packet a cycle."""
     heard = []
     for cycle, seqno in enumerate(seqnos, start):
-        heard.append(talking.hear(packet(seqno), cycle * CYCLE_NS))
+        heard.append(talking.classify(packet(seqno), cycle * CYCLE_NS))
         if heard[-1].answer:
             talking.reply(ZERO, ZERO, cycle * CYCLE_NS)
     return heard

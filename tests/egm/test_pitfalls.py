@@ -24,8 +24,8 @@ from hrcreplay.egm.codec import (
     encode_correction,
     encode_robot,
 )
-from hrcreplay.egm.link import EgmServer, Received
-from hrcreplay.egm.session import EgmSession, PacketStatus
+from hrcreplay.egm.protocol import EgmSession, PacketStatus
+from hrcreplay.egm.udp_server import EgmServer, Received
 from hrcreplay.records import Floats
 
 CYCLE_NS = 4_032_000
@@ -47,7 +47,7 @@ class Guide:
 
     def answer(self, datagrams: list[bytes], t_ns: int) -> Correction | None:
         """What the robot would read, if anything."""
-        heard, packet = self.session.hear_all(map(read, datagrams), t_ns)
+        heard, packet = self.session.classify_all(map(read, datagrams), t_ns)
         self.heard.append(heard)
         if packet is None:
             return None

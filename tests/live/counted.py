@@ -7,10 +7,10 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from hrcreplay.egm.link import Address, Received
 from hrcreplay.egm.robot_double.faults import Datagram
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore
+from hrcreplay.egm.udp_server import Address, Received
 from hrcreplay.live.control.loop import Loop, LoopSettings
 from hrcreplay.live.record.codec import Decision, Perception, TickEvent
 from tests.live.flights import BEGIN_NS, FRAME_NS, RESPONSE_NS, Flight, far_away
@@ -111,7 +111,7 @@ class Recorder:
         """Keeps it."""
         self.messages.append(message)
 
-    def notice(self) -> bool:
+    def check_alive(self) -> bool:
         """It is there."""
         return True
 
@@ -132,7 +132,7 @@ class CountedLoop(Loop):
     def fly(self, seconds: float = math.inf) -> CountedLoop:
         """Turns for so long, or until it is over."""
         end_ns = seconds * 1e9 + self.clock.t_ns
-        while self.clock.t_ns < end_ns and self.turn():
+        while self.clock.t_ns < end_ns and self.run_cycle():
             pass
         return self
 
@@ -146,9 +146,9 @@ def counted(
         duration_s, sending=True, person_late_s=9, overrun_s=0.02, keep_recorder=True, store_every_s=9
     )
     parts = Cable(flight.core, clock), Person(flight, clock), Recorder()
-    loop = CountedLoop(flight.pilot, *parts, settings, 0, clock.t_ns, clock=clock)  # type: ignore[arg-type]
+    loop = CountedLoop(flight.controller, *parts, settings, 0, clock.t_ns, clock=clock)  # type: ignore[arg-type]
     loop.work_ns, loop.look_ns = round(work_s * 1e9), round(look_s * 1e9)
-    answer, look = flight.pilot.answer, flight.pilot.look
+    answer, look = flight.controller.answer, flight.controller.update_perception
 
     def works(event: TickEvent) -> Decision:
         clock.t_ns += loop.work_ns
@@ -156,11 +156,11 @@ def counted(
         return loop.seen[-1]
 
     def looks(t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
-        sight = look(t_ns, skeletons)
+        perception = look(t_ns, skeletons)
         clock.t_ns += loop.look_ns
-        return sight
+        return perception
 
-    flight.pilot.answer = works  # type: ignore[method-assign]
-    flight.pilot.look = looks  # type: ignore[method-assign]
+    flight.controller.answer = works  # type: ignore[method-assign]
+    flight.controller.update_perception = looks  # type: ignore[method-assign]
     loop.begin()
     return loop

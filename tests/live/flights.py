@@ -16,7 +16,7 @@ from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
 from hrcreplay.human.model import skeleton
-from hrcreplay.live.control.pilot import SessionController
+from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.control.setup import build_controller, live_job, start_table
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Decision, MotionRow, Signal, TickEvent
@@ -66,14 +66,14 @@ class Flight:
 
     def __post_init__(self) -> None:
         self.start = start(*self.overrides)
-        self.pilot: SessionController = build_controller(self.start)
+        self.controller: SessionController = build_controller(self.start)
         self.core = TwinCore(self.twin, self.faults, self.seed)
         self._framed_ns = BEGIN_NS
         self._cycles = 0
 
     @property
     def robot(self) -> RobotModel:
-        return self.pilot.setup.robot
+        return self.controller.setup.robot
 
     def fly(self, seconds: float) -> Flight:
         """Goes on for so long."""
@@ -87,7 +87,7 @@ class Flight:
         signals = self.signals((t_ns - BEGIN_NS) * 1e-9)
         if datagrams:
             event = TickEvent(t_ns, tuple(datagrams), signals)
-            answer = self.pilot.answer(event)
+            answer = self.controller.answer(event)
             self.answers.append(answer)
             self.heard.append((answer, event.datagrams))
             self.messages += [codec.encode_robot_packet(t_ns, datagram) for datagram in datagrams]
@@ -96,23 +96,23 @@ class Flight:
                 self.messages.append(codec.encode_reply(t_ns, answer.datagram, sent=True))
                 yield answer.datagram
         else:
-            self.pilot.silence(t_ns, signals)
+            self.controller.silence(t_ns, signals)
             self.messages.append(codec.encode_timeout(t_ns, signals))
-        self._look(t_ns + 1)
+        self._update_perception(t_ns + 1)
 
-    def _look(self, t_ns: int) -> None:
+    def _update_perception(self, t_ns: int) -> None:
         seen = []
         while self._framed_ns <= t_ns:
             place = self.walk((self._framed_ns - BEGIN_NS) * 1e-9)
             if place is not None:
                 seen += [self._skeleton(camera, place, self._framed_ns) for camera in self.start["cameras"]]
             self._framed_ns += FRAME_NS
-        sight = self.pilot.look(t_ns, seen)
+        perception = self.controller.update_perception(t_ns, seen)
         self.frames += [(t_ns, data) for data in seen]
         self.messages += [codec.encode_skeleton(t_ns, data) for data in seen]
-        if sight is not None:
-            self.states.append(sight.states)
-            self.messages.append(codec.encode_perception(sight.states, sight.volumes, len(seen)))
+        if perception is not None:
+            self.states.append(perception.states)
+            self.messages.append(codec.encode_perception(perception.states, perception.volumes, len(seen)))
 
     def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
         base = np.array(self.start["T_world_base"])[:3, 3]

@@ -37,7 +37,7 @@ class Pilot:
         self.looked_ns = 0
         self.silences = 0
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
         """Every point of every skeleton moves the person."""
         for data in skeletons:
             self.p += self.gain * np.array(pb.Skeleton.FromString(data).points)[:12]
@@ -88,29 +88,29 @@ def datagram(number: int) -> bytes:
     return egm.RobotMessage(header=egm.Header(seqno=number, tm=4 * number)).SerializeToString()
 
 
-def session(ticks: int, *, pilot: Pilot | None = None) -> Iterator[bytes]:
+def session(ticks: int, *, controller: Pilot | None = None) -> Iterator[bytes]:
     """What control records: garbage and a skeleton of nobody among it, a silence, a Ctrl-C near the end."""
     yield codec.encode_event(START_NS, START)
-    pilot = pilot or Pilot(START)
+    controller = controller or Pilot(START)
     for k in range(ticks):
         t_ns = START_NS + (k + 1) * TICK_NS
         if k == ticks // 2:
             yield codec.encode_timeout(t_ns - 1000, Signal.PERSON_LATE)
-            pilot.silence(t_ns - 1000, Signal.PERSON_LATE)
+            controller.silence(t_ns - 1000, Signal.PERSON_LATE)
         datagrams = (b"\xff garbage", b"", datagram(k)) if k % 7 == 3 else (datagram(k),)
         signals = Signal.INTERRUPT if k == ticks - 2 else Signal(0)
         yield from (codec.encode_robot_packet(t_ns, data) for data in datagrams)
-        answer = pilot.answer(TickEvent(t_ns, datagrams, signals))
+        answer = controller.answer(TickEvent(t_ns, datagrams, signals))
         yield codec.encode_decision(answer, signals, len(datagrams), 300 + k % 50)
         if answer.datagram is not None:
             yield codec.encode_reply(t_ns, answer.datagram, sent=k > 2)
         skeletons = [skeleton(k, ("left", "right")[k % 2]), skeleton(k, "nobody's")] if k % 5 == 0 else []
         look_ns = t_ns + 500_000
         yield from (codec.encode_skeleton(look_ns, data) for data in skeletons)
-        sight = pilot.look(look_ns, skeletons)
-        yield codec.encode_perception(sight.states, sight.volumes, len(skeletons))
+        perception = controller.update_perception(look_ns, skeletons)
+        yield codec.encode_perception(perception.states, perception.volumes, len(skeletons))
         if k % 10 == 0:
-            yield codec.encode_volumes(sight.volumes)
+            yield codec.encode_volumes(perception.volumes)
     yield codec.encode_event(START_NS + (ticks + 2) * TICK_NS, {"what": "end", "reason": "Ctrl-C"})
 
 

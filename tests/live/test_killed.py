@@ -23,8 +23,8 @@ from tests.live.sessions import kill
 #: Session -> part and place of its bug.
 BUGS = {
     "recorder": "recorder/hrcreplay.live.record.topics:split",
-    "screen": "screen/hrcreplay.live.processes:Channel.receive",
-    "status": "control/hrcreplay.live.view.status_publisher:Teller._status",
+    "screen": "screen/hrcreplay.live.processes:ControlChannel.receive",
+    "status": "control/hrcreplay.live.view.status_publisher:StatusPublisher._status",
 }
 
 
@@ -143,7 +143,7 @@ def test_without_control_the_robot_stops_by_itself_and_is_echoed_by_the_next_ses
     rows = [
         codec.decode_decision(m)
         for m in SessionLogReader(one.session.partial / "log.mcap").messages()
-        if codec.kind(m) == codec.ANSWER
+        if codec.kind(m) == codec.DECISION
     ]
     assert rows[-1].phase in (APPROACH, FOLLOWING)
     assert not one.folder.exists()

@@ -72,7 +72,7 @@ class Drifting(made.Pilot):
 def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messages: list[bytes]) -> None:
     verdict = _verdict(tmp_path, messages, Drifting)
     assert not verdict.identical
-    recorded = codec.decode_decision(messages[_at(messages, codec.ANSWER, 19)]).row
+    recorded = codec.decode_decision(messages[_at(messages, codec.DECISION, 19)]).row
     assert recorded is not None
     seconds = 20 * made.TICK_NS / 1e9
     q = float(recorded[2])  # of q_measured, which this pilot derives from q
@@ -84,10 +84,10 @@ def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messa
 @pytest.mark.parametrize(
     ("kind", "number", "offset", "names"),
     [
-        (codec.LOOK, 7, struct.calcsize("<cqHHHH") + 8 * (12 + 3), "rho_vel: recorded "),
-        (codec.LOOK, 7, struct.calcsize("<cqHHHH") + 8 * 79, "pi_forearm_r: recorded "),
-        (codec.ANSWER, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 17, "dq6: recorded "),
-        (codec.ANSWER, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
+        (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * (12 + 3), "rho_vel: recorded "),
+        (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * 79, "pi_forearm_r: recorded "),
+        (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 17, "dq6: recorded "),
+        (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
         (codec.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
         (codec.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 5), "radius of LLA: recorded 1.1, again 0.1"),
     ],
@@ -104,7 +104,7 @@ def test_changed_numbers_are_named(
 
 
 def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[bytes]) -> None:
-    at = _at(messages, codec.ANSWER, 58)
+    at = _at(messages, codec.DECISION, 58)
     assert codec.decode_decision(messages[at]).reason == "Ctrl-C"
     changed = list(messages)
     changed[at] = changed[at].replace(b"Ctrl-C", b"SIGINT")
@@ -127,15 +127,17 @@ def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[
 
 
 def test_a_volume_that_is_not_stored_is_compared_by_digest(tmp_path: Path, messages: list[bytes]) -> None:
-    changed, at = list(messages), _at(messages, codec.LOOK, 7)
+    changed, at = list(messages), _at(messages, codec.PERCEPTION, 7)
     changed[at] = changed[at][:-1] + bytes([changed[at][-1] ^ 64])
     assert "s: volume of LLA (digest): recorded '" in _verdict(tmp_path, changed).lines[0]
-    at = _at(messages, codec.LOOK, -1)
+    at = _at(messages, codec.PERCEPTION, -1)
     changed = [*messages[:at], messages[at][:-1] + bytes([messages[at][-1] ^ 64])]
     assert "tick 59 at" in _verdict(tmp_path, changed).lines[0]  # nothing follows it
 
 
-@pytest.mark.parametrize(("kind", "number"), [(codec.ROBOT, 5), (codec.FRAME, 3), (codec.SILENCE, 0), (codec.EVENT, 0)])
+@pytest.mark.parametrize(
+    ("kind", "number"), [(codec.ROBOT, 5), (codec.SKELETON, 3), (codec.TIMEOUT, 0), (codec.EVENT, 0)]
+)
 def test_inputs_that_are_missing_or_changed_show(
     tmp_path: Path, messages: list[bytes], kind: bytes, number: int
 ) -> None:
@@ -146,7 +148,7 @@ def test_inputs_that_are_missing_or_changed_show(
         return
     verdict = _verdict(tmp_path, messages[:at] + messages[at + 1 :])
     assert not verdict.identical
-    if kind != codec.SILENCE:
+    if kind != codec.TIMEOUT:
         assert "s: the record has " in verdict.lines[0]
 
 
@@ -154,7 +156,7 @@ def test_any_nan_is_like_any_other(tmp_path: Path, messages: list[bytes]) -> Non
     changed = list(messages)
     quiet, other = struct.pack("<d", np.nan), b"\x01\0\0\0\0\0\xf8\xff"
     for i, message in enumerate(messages):
-        if codec.kind(message) == codec.LOOK:
+        if codec.kind(message) == codec.PERCEPTION:
             changed[i] = message.replace(quiet, other)
             assert changed[i] != message
     assert _verdict(tmp_path, changed).identical
@@ -162,7 +164,7 @@ def test_any_nan_is_like_any_other(tmp_path: Path, messages: list[bytes]) -> Non
 
 def test_a_look_that_failed_fails_again(tmp_path: Path, messages: list[bytes]) -> None:
     class Blind(made.Pilot):
-        def look(self, t_ns: int, skeletons: object) -> None:  # type: ignore[override]
+        def update_perception(self, t_ns: int, skeletons: object) -> None:  # type: ignore[override]
             """A bug."""
 
     t_ns = made.START_NS + 10
@@ -251,7 +253,7 @@ def test_a_replay_of_another_log_is_not_run(replayed: Path, tmp_path: Path) -> N
 
 
 def test_signals_are_part_of_what_is_told(tmp_path: Path, messages: list[bytes]) -> None:
-    changed, at = list(messages), _at(messages, codec.ANSWER, 30)
+    changed, at = list(messages), _at(messages, codec.DECISION, 30)
     offset = struct.calcsize("<cqqI")
     changed[at] = changed[at][:offset] + struct.pack("<I", Signal.INTERRUPT) + changed[at][offset + 4 :]
     assert "status: recorded 'tracking', again 'braking'" in _verdict(tmp_path, changed).lines[0]
@@ -263,7 +265,7 @@ def test_a_session_with_every_fault_is_identical(tmp_path: Path) -> None:
     )
     flight = Flight(overrides=("live.resume=true", "live.resume_s=0.05"), faults=faults)
     flight.fly(1.3 + 0.3 * len(KINDS))
-    assert len(flight.pilot.stops) >= 3
+    assert len(flight.controller.stops) >= 3
     run = tmp_path / "run.partial"
     run.mkdir()
     made.record(run / "log.mcap", [codec.encode_event(BEGIN_NS - 1, flight.start), *flight.messages], chunk=500)

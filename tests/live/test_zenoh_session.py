@@ -106,10 +106,10 @@ def moves_only_while_seen(log: Path, stop_s: float) -> None:
     captured = dict.fromkeys(POSES, 0)
     rows: list[codec.RecordedDecision] = []
     for message in SessionLogReader(log).messages():
-        if codec.kind(message) == codec.FRAME:
+        if codec.kind(message) == codec.SKELETON:
             skeleton = pb.Skeleton.FromString(codec.body(message))
             captured[skeleton.camera] = skeleton.capture_ns
-        elif codec.kind(message) == codec.ANSWER:
+        elif codec.kind(message) == codec.DECISION:
             rows.append(codec.decode_decision(message))
             if PHASES[rows[-1].phase] in MOVING:
                 assert rows[-1].t_ns - max(captured.values()) <= FRESH_S * 1e9

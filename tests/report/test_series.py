@@ -69,7 +69,7 @@ def test_envelope_leaves_short_lines_alone() -> None:
 
 
 def test_broken_lines_get_a_gap() -> None:
-    x, y = metrics.broken(np.array([0.0, 0.1, 5.0]), np.array([1.0, 2.0, 3.0]), 0.2)
+    x, y = metrics.break_at_gaps(np.array([0.0, 0.1, 5.0]), np.array([1.0, 2.0, 3.0]), 0.2)
     assert x.tolist() == [0.0, 0.1, 0.1, 5.0]
     assert np.isnan(y).tolist() == [False, False, True, False]
 

@@ -18,7 +18,7 @@ from hrcreplay.errors import LogError
 from hrcreplay.run import replay
 from hrcreplay.run.job import resolve
 from hrcreplay.store import run_folder
-from hrcreplay.store.tables import COLUMNS, lacks
+from hrcreplay.store.columns import COLUMNS, lacks
 
 #: What tables of the version before had not.
 NEW = {

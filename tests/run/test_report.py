@@ -27,8 +27,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 def test_the_figure_of_volumes_holds_the_runs_own_method(sound: Run) -> None:
     radii = Radii(head=0.12, thorax=0.15, upper_arm=0.07, lower_arm=0.07)
-    foresight = PredictionStage(load_limits("paper"), 0.377, radii, Margins(), "sound")
-    (_, methods), *others = report._instants(foresight, sound)
+    prediction_stage = PredictionStage(load_limits("paper"), 0.377, radii, Margins(), "sound")
+    (_, methods), *others = report._instants(prediction_stage, sound)
     assert len(others) == 3
     assert list(methods) == ["paper", "positions", "sound"]
     assert list(methods["paper"]) == list(LIMBS)

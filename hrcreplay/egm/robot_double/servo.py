@@ -87,7 +87,7 @@ class ServoSettings:
                 raise SettingsError(f"robot double: {name} is 0; a positive number would be right")
 
 
-class Servo:
+class ServoController:
     """The controller in a session: told one reference a cycle, or none, it moves the robot by one cycle.
 
     Attributes:

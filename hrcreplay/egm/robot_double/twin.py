@@ -29,7 +29,7 @@ from hrcreplay.egm.codec import (
     flange_pose,
 )
 from hrcreplay.egm.robot_double.faults import Datagram, Fault, FaultyChannel, lasts
-from hrcreplay.egm.robot_double.servo import PERIOD_NS, Servo, ServoSettings
+from hrcreplay.egm.robot_double.servo import PERIOD_NS, ServoController, ServoSettings
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats, Ints
 
@@ -92,7 +92,13 @@ class TwinRecord:
         self._arrivals.append((datagram.t_ns, session, told.seqno, told.q, told.dq))
 
     def cycled(
-        self, t_ns: int, session: int, packet: RobotPacket | None, servo: Servo, told: Correction | None, queued: int
+        self,
+        t_ns: int,
+        session: int,
+        packet: RobotPacket | None,
+        servo: ServoController,
+        told: Correction | None,
+        queued: int,
     ) -> None:
         """Notes a cycle after its step."""
         seqno = -1 if packet is None else packet.seqno
@@ -191,7 +197,7 @@ class TwinCore:
 
     def __init__(self, settings: TwinSettings, faults: Sequence[Fault] = (), seed: int = 0) -> None:
         self._settings = settings
-        self.servo = Servo(settings.servo, np.radians(settings.start_deg))
+        self.servo = ServoController(settings.servo, np.radians(settings.start_deg))
         self.record = TwinRecord()
         self.session = 1
         self.ends = [""]
@@ -219,7 +225,7 @@ class TwinCore:
         """
         self._catch_up(t_ns)
         since_s = (t_ns - (self._first_ns or 0)) * 1e-9
-        active = self._befall(t_ns, since_s)
+        active = self._apply_faults(t_ns, since_s)
         self._take_in(t_ns, since_s, arrived)
         packet = None if self._silent(t_ns, active) else self._packet(t_ns, active)
         departing = [] if packet is None else self._send(t_ns, since_s, packet)
@@ -243,7 +249,7 @@ class TwinCore:
                 self.servo.step(passed_ns, None)
         self._last_ns = t_ns
 
-    def _befall(self, t_ns: int, since_s: float) -> dict[str, Fault]:
+    def _apply_faults(self, t_ns: int, since_s: float) -> dict[str, Fault]:
         """Applies the faults of the robot. Returns those that are on, by kind."""
         active = {}
         for number, fault in enumerate(self._robot_faults):

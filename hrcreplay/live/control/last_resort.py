@@ -16,9 +16,9 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from hrcreplay.egm import motion_link_pb2 as messages
-from hrcreplay.egm.link import Received
+from hrcreplay.egm.udp_server import Received
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.loop import FAREWELLS, Loop
+from hrcreplay.live.control.loop import FINAL_ANSWERS, Loop
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Signal
 from hrcreplay.robot.control.control_step import BRAKING
@@ -47,7 +47,7 @@ class FallbackBrake:
         """Whether the robot has been told to stand."""
         return not any(self.dq)
 
-    def hear(self, measured: Sequence[float]) -> None:
+    def update_position(self, measured: Sequence[float]) -> None:
         """Takes where the robot says it is [deg]."""
         if max(abs(m - q) for m, q in zip(measured, self.q, strict=True)) > self.tracking:
             self.q, self.dq = list(measured), [0.0] * len(measured)
@@ -78,16 +78,16 @@ def bring_to_rest(loop: Loop, why: str) -> None:
         why: What the record is to say of it.
     """
     with suppress(Exception):
-        if loop.pilot.stop != watchdog.FAULT:
-            loop.pilot.stop = watchdog.FAULT
-            loop.pilot.stops.append((loop.now_ns(), watchdog.FAULT))
+        if loop.controller.stop != watchdog.FAULT:
+            loop.controller.stop = watchdog.FAULT
+            loop.controller.stops.append((loop.now_ns(), watchdog.FAULT))
         loop.recorder.send(codec.encode_event(loop.now_ns(), {"what": "crash", "text": why}))
     brake, sender = _brake(loop), loop.sender
     if brake is None or sender is None:
         return
     standing = silences = 0
     received = loop.pending
-    while standing < FAREWELLS and silences < _SILENCES:
+    while standing < FINAL_ANSWERS and silences < _SILENCES:
         try:
             received = received or loop.link.newest()
         except Exception:  # whatever it is
@@ -100,7 +100,7 @@ def bring_to_rest(loop: Loop, why: str) -> None:
         measured = None if received is None else _measured(received.data)
         if received is None or measured is not None:
             if measured is not None:
-                brake.hear(measured)
+                brake.update_position(measured)
             before = list(brake.q), list(brake.dq)
             data = brake.step(loop.now_ns() // 1_000_000)
             with suppress(Exception):
@@ -115,7 +115,7 @@ def _brake(loop: Loop) -> FallbackBrake | None:
     if loop.sent is None:
         return None
     told = messages.SensorMessage.FromString(loop.sent)
-    robot, setup = loop.pilot.setup.robot, loop.pilot.setup
+    robot, setup = loop.controller.setup.robot, loop.controller.setup
     ddq_max, q_min, q_max = (np.degrees(bound).tolist() for bound in (robot.ddq_max, robot.q_min, robot.q_max))
     q, dq = list(told.planned.joints.joints), list(told.speed_reference.joints.joints)
     tracking = math.degrees(setup.bounds.tracking_rad)

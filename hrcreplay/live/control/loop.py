@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hrcreplay.egm.link import Address, EgmServer, Received
-from hrcreplay.live.control.pilot import SessionController
+from hrcreplay.egm.udp_server import Address, EgmServer, Received
+from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.control.watchdog import REFUSED
 from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
@@ -24,7 +24,7 @@ _BIN_NS = 5_000
 _BINS = 20_000  # up to 0.1 s; the last one holds all that took longer
 
 
-class Durations:
+class DurationHistogram:
     """A histogram in steps of 5 us."""
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ ENDING = (
 )
 
 #: Answers at speed 0 before we leave: a robot keeps obeying the last one.
-FAREWELLS = 5
+FINAL_ANSWERS = 5
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class LoopSettings:
 class Loop:
     """One session's loop. ``now_ns`` is the session's clock."""
 
-    pilot: SessionController
+    controller: SessionController
     link: EgmServer
     person: HelperProcess
     recorder: HelperProcess
@@ -85,7 +85,7 @@ class Loop:
     caught: Signal = Signal.NONE  #: by the handlers of the operating system's signals
     signals: Signal = Signal.NONE  #: of the latest turn
     notes: list[str] = field(default_factory=list)
-    took: Durations = field(default_factory=Durations)
+    reply_times: DurationHistogram = field(default_factory=DurationHistogram)
     answers: int = 0
     skipped: int = 0  #: looks left out
     robot: str | None = None
@@ -111,27 +111,27 @@ class Loop:
         self._beat_ns = self.now_ns()
         self.person.send(b"G" + self.start_ns.to_bytes(8, "little"))
 
-    def turn(self) -> bool:
+    def run_cycle(self) -> bool:
         """One turn; False when the session is over."""
         received = self.pending = self.link.newest()
         signals = self.signals = self._signals()
         if received is None:
             t_ns = self.now_ns()
-            self.pilot.silence(t_ns, signals)
+            self.controller.silence(t_ns, signals)
             self.recorder.send(codec.encode_timeout(t_ns, signals))
         else:
             self._answer(received, signals)
         self._skipped = received is not None and received.waited and not self._skipped
         if self._skipped:
             self.skipped += 1
-            self.pilot.prepare()
+            self.controller.prepare()
         else:
-            self._look()
+            self._update_perception()
         return not self._over(signals)
 
     def _answer(self, received: Received, signals: Signal) -> None:
         event = TickEvent(received.t_ns + self.anchor_ns, (*received.older, received.data), signals)
-        answer = self.pilot.answer(event)
+        answer = self.controller.answer(event)
         if answer.datagram is not None and self.settings.sending:
             self.link.answer(answer.datagram, received.sender)
             self.sent, self.sender = answer.datagram, received.sender
@@ -144,26 +144,26 @@ class Loop:
         self.recorder.send(codec.encode_decision(answer, signals, len(event.datagrams), took_ns // 1000))
         if answer.datagram is not None:
             self.answers += 1
-            self.took.add(took_ns)
+            self.reply_times.add(took_ns)
             self.recorder.send(codec.encode_reply(event.t_ns, answer.datagram, sent=self.settings.sending))
         self.last = answer
 
-    def _look(self) -> None:
-        skeletons = self._hear_person()
+    def _update_perception(self) -> None:
+        skeletons = self._receive_skeletons()
         t_ns = self.now_ns()
-        sight = self.pilot.look(t_ns, skeletons)
+        perception = self.controller.update_perception(t_ns, skeletons)
         for skeleton in skeletons:
             self.recorder.send(codec.encode_skeleton(t_ns, skeleton))
-        if sight is None:
+        if perception is None:
             self.recorder.send(codec.encode_event(t_ns, {"what": "blind"}))
             return
-        self.recorder.send(codec.encode_perception(sight.states, sight.volumes, len(skeletons)))
+        self.recorder.send(codec.encode_perception(perception.states, perception.volumes, len(skeletons)))
         if t_ns - self._stored_ns >= self.settings.store_every_s * 1e9:
             self._stored_ns = t_ns
-            self.stored = codec.encode_volumes(sight.volumes)
+            self.stored = codec.encode_volumes(perception.volumes)
             self.recorder.send(self.stored)
 
-    def _hear_person(self) -> list[bytes]:
+    def _receive_skeletons(self) -> list[bytes]:
         skeletons = []
         for message in self.person.messages():
             self._beat_ns = self.now_ns()
@@ -194,7 +194,7 @@ class Loop:
             found |= Signal.PERSON_DEAD
         elif now_ns - self._beat_ns > self.settings.person_late_s * 1e9:
             found |= Signal.PERSON_LATE
-        if self.settings.keep_recorder and not self.recorder.notice():
+        if self.settings.keep_recorder and not self.recorder.check_alive():
             found |= Signal.RECORDER_DEAD
         if self.screen is not None and self.screen.crashed():
             found |= Signal.SCREEN_DEAD
@@ -203,7 +203,7 @@ class Loop:
         return found
 
     def _over(self, signals: Signal) -> bool:
-        if self.pilot.stop in REFUSED:
+        if self.controller.stop in REFUSED:
             return True
-        ending = bool(signals & ENDING) or self.pilot.fault is not None
-        return ending and (self.pilot.standing >= FAREWELLS or not self.pilot.connected)
+        ending = bool(signals & ENDING) or self.controller.fault is not None
+        return ending and (self.controller.standing >= FINAL_ANSWERS or not self.controller.connected)

@@ -56,25 +56,25 @@ class MotionStep(NamedTuple):
     after: MotionState
 
 
-def start_approach(setup: ControlSetup, course: MotionState) -> MotionState:
+def start_approach(setup: ControlSetup, motion: MotionState) -> MotionState:
     """From where the robot stands to where its programme has got."""
-    goal = setup.programme.sample(course.programme_s).q
-    follower = setup.follow(approach(setup.robot, course.state.q, goal, setup.approach_speed), 0.0)
-    follower.state = course.state
-    return replace(course, follower=follower, arrived=False)
+    goal = setup.programme.sample(motion.programme_s).q
+    follower = setup.follow(approach(setup.robot, motion.state.q, goal, setup.approach_speed), 0.0)
+    follower.state = motion.state
+    return replace(motion, follower=follower, arrived=False)
 
 
-def follow(setup: ControlSetup, course: MotionState, around: Obstacles) -> MotionStep:
+def follow(setup: ControlSetup, motion: MotionState, obstacles: Obstacles) -> MotionStep:
     """One tick along the path."""
-    if course.follower is None:
+    if motion.follower is None:
         raise ValueError("follow: the robot has not set out")
-    follower = copy(course.follower)
-    tick = follower.step(around)
-    after = replace(course, state=tick.step.next, follower=follower)
-    if course.arrived:
+    follower = copy(motion.follower)
+    tick = follower.step(obstacles)
+    after = replace(motion, state=tick.step.next, follower=follower)
+    if motion.arrived:
         after = replace(after, programme_s=tick.programme_s)
     elif _at_the_end(setup, follower):
-        follower = setup.follow(setup.programme, course.programme_s)
+        follower = setup.follow(setup.programme, motion.programme_s)
         follower.state = tick.step.next
         after = replace(after, follower=follower, arrived=True)
     return MotionStep(tick.point.T_world_tcp[:3, 3], float(np.linalg.norm(tick.point.twist[:3])), tick.step, after)
@@ -90,11 +90,11 @@ def _at_the_end(setup: ControlSetup, follower: Follower) -> bool:
     return float(np.linalg.norm(pose.T_world_tcp[:3, 3] - goal)) <= setup.waypoint_m
 
 
-def brake(setup: ControlSetup, course: MotionState, around: Obstacles) -> MotionStep:
+def brake(setup: ControlSetup, motion: MotionState, obstacles: Obstacles) -> MotionStep:
     """Eq. (67): each axis as fast as it can; a robot that stands stays."""
-    robot, plan, state = setup.robot, setup.plan, course.state
+    robot, plan, state = setup.robot, setup.plan, motion.state
     with np.errstate(all="ignore"):
-        seen = control_step.observe(robot, state, around, plan.clearance_m)
+        seen = control_step.observe(robot, state, obstacles, plan.clearance_m)
     step = seen.step(state, control_step.braked(state, robot.ddq_max, plan.dt_s), plan.dt_s, control_step.BRAKING)
-    point = setup.programme.sample(course.programme_s)
-    return MotionStep(point.T_world_tcp[:3, 3], 0.0, step, MotionState(step.next, course.programme_s))
+    point = setup.programme.sample(motion.programme_s)
+    return MotionStep(point.T_world_tcp[:3, 3], 0.0, step, MotionState(step.next, motion.programme_s))

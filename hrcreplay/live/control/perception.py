@@ -22,9 +22,11 @@ from hrcreplay.run.stages import NS, FusionStage, PredictionStage, no_frames
 class Observer:
     """Stages 1 and 2, fed with what has come since the look before."""
 
-    def __init__(self, eyes: FusionStage, foresight: PredictionStage, cameras: tuple[str, ...], gap_s: float) -> None:
-        self._eyes = eyes
-        self._foresight = foresight
+    def __init__(
+        self, fusion_stage: FusionStage, prediction_stage: PredictionStage, cameras: tuple[str, ...], gap_s: float
+    ) -> None:
+        self._fusion_stage = fusion_stage
+        self._prediction_stage = prediction_stage
         self._cameras = cameras
         self._nothing = no_frames(cameras)
         self._fusion = fuse.start(cameras)
@@ -33,7 +35,7 @@ class Observer:
         self._cleaner = Cleaner(cameras, gap_s, self.counts)
         self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
         """What is known of the person at ``t_ns``, which must be later than that of the look before.
 
         Args:
@@ -43,14 +45,16 @@ class Observer:
         frames = self._frames(t_ns, skeletons)
         measured = self._nothing
         if frames is not None:
-            self._memory, measured, found = self._eyes.measure(frames, self._memory)
+            self._memory, measured, found = self._fusion_stage.measure(frames, self._memory)
             self.counts.update(found)
             for camera, capture_ns in zip(measured.camera.tolist(), measured.capture_ns.tolist(), strict=True):
                 self.newest_ns[self._cameras[camera]] = capture_ns
         ticks = np.array([t_ns])
-        self._fusion, states, events = fuse.fuse(self._fusion, ticks, measured, self._eyes.filter, self._eyes.limits)
+        self._fusion, states, events = fuse.fuse(
+            self._fusion, ticks, measured, self._fusion_stage.filter, self._fusion_stage.limits
+        )
         self.counts.update(events)
-        volumes = self._foresight.volumes(states)
+        volumes = self._prediction_stage.volumes(states)
         return Perception(t_ns, states, volumes, obstacles(volumes, 0))
 
     def age_s(self, t_ns: int) -> float:
@@ -69,7 +73,7 @@ class Observer:
                 continue
             # a camera whose clock is ahead has seen nothing of the future
             self._cleaner.add(row._replace(capture_ns=min(row.capture_ns or t_ns, t_ns)), t_ns)
-        return self._cleaner.rest()
+        return self._cleaner.flush()
 
 
 def _row(data: bytes) -> RawSkeleton:

@@ -16,13 +16,13 @@ from pydantic import ValidationError
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_robot
-from hrcreplay.egm.session import EgmSession
+from hrcreplay.egm.protocol import EgmSession
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet, skeleton
 from hrcreplay.live.control import watchdog
 from hrcreplay.live.control.motion import ControlSetup, Follower
 from hrcreplay.live.control.perception import Observer
-from hrcreplay.live.control.pilot import SessionController
+from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
@@ -32,7 +32,7 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.run import build
 from hrcreplay.run.build import log_options
-from hrcreplay.run.job import Job, resolve, unlogged
+from hrcreplay.run.job import Job, job_without_log, resolve
 from hrcreplay.settings.load import Settings, load_settings
 
 
@@ -71,7 +71,7 @@ def live_job(
     if not cameras:
         raise SettingsError("live.zenoh.keys: no camera; name one there, or play a recording with --human LOG")
     where = Path("live.zenoh")
-    job = unlogged("live", where, settings, cell_file)
+    job = job_without_log("live", where, settings, cell_file)
     return job, _header(where, cameras, {}, None, None)
 
 
@@ -109,18 +109,22 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
             f"{header.path}: no task; a live robot needs one: name a task file with --set plan.task=FILE"
         )
     known, scene = job.meta(), HeaderOnlyLog(header)
-    T_world_base, eyes = build.standing(job, scene), build.fusion_stage(job, scene)
+    T_world_base, fusion_stage = build.robot_base(job, scene), build.fusion_stage(job, scene)
     robot = build.robot(job, T_world_base)
     if robot.nv != AXES:
         raise SettingsError(f"robot.urdf: {robot.name} has {robot.nv} axes; live drives robots of {AXES} over EGM")
-    volumes = Observer(eyes, build.prediction_stage(job), header.cameras, job.settings.logs.gap_s).look(0, ()).volumes
+    volumes = (
+        Observer(fusion_stage, build.prediction_stage(job), header.cameras, job.settings.logs.gap_s)
+        .update_perception(0, ())
+        .volumes
+    )
     return {
         "hrcreplay": __version__,
         "settings": known["settings"],
         "versions": known["versions"],
         "limits": known["limits"],
         "cell": known["cell"],
-        "cameras": {name: T.tolist() for name, T in zip(header.cameras, eyes.T_world_camera, strict=True)},
+        "cameras": {name: T.tolist() for name, T in zip(header.cameras, fusion_stage.T_world_camera, strict=True)},
         "T_world_base": T_world_base.tolist(),
         "task": task,
         "sending": sending,
@@ -180,12 +184,12 @@ def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
 
 def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
     live, plan = job.settings.live, job.settings.plan
-    robot = build.robot(job, build.standing(job, scene))
+    robot = build.robot(job, build.robot_base(job, scene))
     programme, _ = build.reference(job, scene, robot)
     settings = build.plan_settings(job, live.cycle_s)
 
     def follow(path: Reference, s_s: float) -> Follower:
-        return build.follow(job, plan.method, robot, path, settings, s_s)
+        return build.make_follower(job, plan.method, robot, path, settings, s_s)
 
     bounds = watchdog.WatchdogSettings(
         fresh_s=live.fresh_s,
@@ -232,25 +236,25 @@ _LENGTHS_M = np.array([[0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
 
 def compile_kernels(start: dict[str, Any]) -> None:
     """Runs a session of a second and a half with somebody who walks up to the robot."""
-    pilot = build_controller({**start, "sending": False})
+    controller = build_controller({**start, "sending": False})
     camera, T = next(iter(start["cameras"].items()))
     to_camera = np.linalg.inv(np.array(T))
     base = np.array(start["T_world_base"])[:3, 3]
-    q = pilot.setup.programme.q0
+    q = controller.setup.programme.q0
     for tick in range(_TICKS):
         t_ns = 10**18 + tick * _TICK_NS
         packet = RobotPacket(tick, tick * 4, t_ns, q, q, Motors.ON, Mci.RUNNING, Rapid.RUNNING, False, 0.0)
         event = TickEvent(t_ns, (encode_robot(packet),), Signal.NONE)
-        answer = pilot.answer(event)
+        answer = controller.answer(event)
         codec.encode_decision(answer, Signal.NONE, 1, 0)
         away_m = 2.0 - 1.6 * tick / _TICKS
         seen = [] if tick % _FRAME_EVERY else [_seen(camera, to_camera, base + np.array([away_m, 0.0, 0.0]), t_ns)]
-        sight = pilot.look(t_ns + 1_000_000, seen)
-        if pilot.fault is not None:
-            raise pilot.fault
-        if sight is not None:
-            codec.encode_perception(sight.states, sight.volumes, len(seen))
-            codec.encode_volumes(sight.volumes)
+        perception = controller.update_perception(t_ns + 1_000_000, seen)
+        if controller.fault is not None:
+            raise controller.fault
+        if perception is not None:
+            codec.encode_perception(perception.states, perception.volumes, len(seen))
+            codec.encode_volumes(perception.volumes)
 
 
 def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int) -> bytes:

@@ -50,7 +50,7 @@ class SendSchedule:
         self._source = source
         self._beat_ns = now_ns
 
-    def hear(self, message: bytes) -> None:
+    def receive(self, message: bytes) -> None:
         """Takes a message of control's."""
         if message[:1] == b"G" and len(message) == 9:
             self._source.go(int.from_bytes(message[1:], "little"))
@@ -87,7 +87,7 @@ def run(channel: ControlChannel, source: SkeletonSource, anchor_ns: int) -> NoRe
         now_ns = time.monotonic_ns() + anchor_ns
         message = channel.receive((pace.next_ns(now_ns) - now_ns) / 1e9)
         if message is not None:
-            pace.hear(message)
+            pace.receive(message)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

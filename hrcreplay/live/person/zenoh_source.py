@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError
 
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live.person.log_playback import Message as Outgoing
-from hrcreplay.live.person.log_playback import frames_of, ready, same
+from hrcreplay.live.person.log_playback import frames_of, ready_note, same_frame
 from hrcreplay.live.processes import ControlGoneError
 from hrcreplay.logs import decoders, ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
@@ -84,11 +84,11 @@ class CameraSubscription:
             yield from self._clocks(row, now_ns)
             if row.capture_ns is None or row.capture_ns - now_ns < _AHEAD_NS:
                 self._cleaner.add(row, now_ns)
-        table = self._cleaner.rest()
+        table = self._cleaner.flush()
         if table is not None:
             frames = list(frames_of(table))
             for frame, after in zip(frames, [*frames[1:], None], strict=True):
-                kind = b"f" if after is not None and same(frame, after) else b"F"
+                kind = b"f" if after is not None and same_frame(frame, after) else b"F"
                 yield kind, frame.skeleton.SerializeToString()
         for name, count in self._defects.items():
             if count and name in DEFECTS and name not in self._told:
@@ -193,7 +193,7 @@ class ZenohSource:
                 stream = CameraSubscription(name, given)
                 stream.prepare()
                 self._open.append(_subscribe(session, name, given, self._taker(stream)))
-            self._send(*ready(tuple(keys)))
+            self._send(*ready_note(tuple(keys)))
         except ControlGoneError:
             pass  # the main thread sees it too
         except Exception as error:  # raised again where the process can tell of it

@@ -110,10 +110,10 @@ class Perception:
     t_ns: int
     states: HumanStates  #: one row
     volumes: SweptVolumes  #: one row
-    around: Obstacles
+    obstacles: Obstacles
 
 
-ROBOT, REPLY, FRAME, LOOK, VOLUMES, ANSWER, SILENCE, EVENT = (b"R", b"C", b"F", b"L", b"V", b"A", b"S", b"E")
+ROBOT, REPLY, SKELETON, PERCEPTION, VOLUMES, DECISION, TIMEOUT, EVENT = (b"R", b"C", b"F", b"L", b"V", b"A", b"S", b"E")
 
 _HEAD = struct.Struct("<cq")
 _REPLY = struct.Struct("<cqB")
@@ -146,7 +146,7 @@ def encode_robot_packet(t_ns: int, datagram: bytes) -> bytes:
 
 def encode_skeleton(t_ns: int, skeleton: bytes) -> bytes:
     """A skeleton, by the look that took it."""
-    return _HEAD.pack(FRAME, t_ns) + skeleton
+    return _HEAD.pack(SKELETON, t_ns) + skeleton
 
 
 def encode_reply(t_ns: int, datagram: bytes, *, sent: bool) -> bytes:
@@ -172,7 +172,7 @@ def decode_event(message: bytes) -> dict[str, Any]:
 
 def encode_timeout(t_ns: int, signals: Signal) -> bytes:
     """The robot said nothing."""
-    return _SILENCE.pack(SILENCE, t_ns, signals)
+    return _SILENCE.pack(TIMEOUT, t_ns, signals)
 
 
 def decode_timeout(message: bytes) -> Signal:
@@ -185,7 +185,7 @@ class RecordedPerception:
     """A look as the record has it."""
 
     t_ns: int
-    skeletons: int  #: taken by it: the FRAME messages right before it
+    skeletons: int  #: taken by it: the SKELETON messages right before it
     state: Floats  #: all numbers of the state's row, in the order of the record's fields
     valid: bytes  #: a byte a camera
     digests: tuple[bytes, ...]  #: of vertices and radius, a limb each
@@ -196,7 +196,7 @@ def encode_perception(states: HumanStates, volumes: SweptVolumes, skeletons: int
     state = state_numbers(states)
     digests = [volume_digest(volumes, limb) for limb in range(len(volumes.limbs))]
     valid = states.valid[0].tobytes()
-    head = _LOOK.pack(LOOK, int(states.t_ns[0]), skeletons, len(state), len(valid), len(digests))
+    head = _LOOK.pack(PERCEPTION, int(states.t_ns[0]), skeletons, len(state), len(valid), len(digests))
     return b"".join([head, state.tobytes(), valid, *digests])
 
 
@@ -264,7 +264,7 @@ def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: i
     """A decision."""
     numbers = b"" if found.row is None else found.row.flat().tobytes()
     head = _ANSWER.pack(
-        ANSWER,
+        DECISION,
         found.t_ns,
         found.look_ns,
         took_us,

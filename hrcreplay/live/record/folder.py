@@ -29,10 +29,10 @@ from hrcreplay.run import build
 from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job
 from hrcreplay.run.report import write_report
-from hrcreplay.run.stages import store as store_volumes
+from hrcreplay.run.stages import store_volumes
 from hrcreplay.store import run_folder
+from hrcreplay.store.columns import Columns, measurement_columns, motion_columns, state_columns
 from hrcreplay.store.run_folder import RunWriter, TableWriter
-from hrcreplay.store.tables import Columns, measurement_columns, motion_columns, state_columns
 
 _BATCH = TableWriter.ROWS
 
@@ -56,11 +56,11 @@ class SessionTables:
         """Takes a message of the record."""
         kind = codec.kind(message)
         self.counts[_COUNTED[kind]] += 1
-        if kind == codec.LOOK:
+        if kind == codec.PERCEPTION:
             self._looks.append(codec.decode_perception(message))
         elif kind == codec.VOLUMES:
             store_volumes(codec.decode_volumes(message, self.limbs, self.method), np.zeros(1, np.int64), self.run)
-        elif kind == codec.ANSWER:
+        elif kind == codec.DECISION:
             self._answered(codec.decode_decision(message))
         elif kind == codec.EVENT:
             self.events.append(codec.decode_event(message))
@@ -93,11 +93,11 @@ class SessionTables:
 _COUNTED = {
     codec.ROBOT: "robot_packets",
     codec.REPLY: "replies",
-    codec.FRAME: "skeletons",
-    codec.LOOK: "looks",
+    codec.SKELETON: "skeletons",
+    codec.PERCEPTION: "looks",
     codec.VOLUMES: "looks_with_volumes",
-    codec.ANSWER: "answers",
-    codec.SILENCE: "silences",
+    codec.DECISION: "answers",
+    codec.TIMEOUT: "silences",
     codec.EVENT: "events",
 }
 
@@ -147,7 +147,7 @@ LOG = "log.mcap"
 _PARTIAL = ".partial"
 
 
-def begin(out: Path) -> Path:
+def make_partial(out: Path) -> Path:
     """Makes the folder that a session's log goes to; it gets its own name from ``finish``.
 
     Raises:
@@ -171,25 +171,25 @@ def finish(partial: Path) -> Path:
     writer = RunWriter(partial.with_name(partial.name.removesuffix(_PARTIAL)))
     if writer.folder.exists():
         raise SettingsError(f"{writer.folder}: exists already; move it away, then finish {partial}")
-    tape = SessionLogReader(partial / LOG)
-    start = tape.start()
+    log = SessionLogReader(partial / LOG)
+    start = log.start()
     job = job_of(start, writer.folder / LOG, run_folder.sha256(partial / LOG))
     cameras, links, limbs = (tuple(start[name]) for name in ("cameras", "links", "limbs"))
     tables = SessionTables(writer, cameras, links, limbs, start["method"])
-    for message in tape.messages():
+    for message in log.messages():
         tables.add(message)
     tables.flush()
     _measure(job, writer)
     writer.close_tables()
     crashes = processes.read_crashes(partial)
-    meta = _meta(job, start, tables, tape, crashes)
+    meta = _meta(job, start, tables, log, crashes)
     write_report(job, writer, meta)
     writer.timing.update(tables.timing())
     writer.finish(meta, complete=not crashes)
     return writer.folder
 
 
-def leave(partial: Path, crashes: list[str]) -> None:
+def keep_incomplete(partial: Path, crashes: list[str]) -> None:
     """Leaves of a session that no run folder can be made of its log and its crashes, and says so in run.json."""
     for path in sorted(partial.iterdir()):
         if path.is_dir():
@@ -207,19 +207,19 @@ def _crashed(crashes: list[str]) -> dict[str, Any]:
 def _measure(job: Job, writer: RunWriter) -> None:
     """The table of measurements: what each frame says by itself."""
     log = open_log(writer.partial / LOG, log_options(job.settings), skeletons=False)
-    eyes, memory = build.fusion_stage(job, log), PersonMemory()
+    fusion_stage, memory = build.fusion_stage(job, log), PersonMemory()
     for frames in log.frames():
-        memory, measured, _ = eyes.measure(frames, memory)
+        memory, measured, _ = fusion_stage.measure(frames, memory)
         writer.table("measurements", measurement_columns(measured))
 
 
 def _meta(
-    job: Job, start: dict[str, Any], tables: SessionTables, tape: SessionLogReader, crashes: list[str]
+    job: Job, start: dict[str, Any], tables: SessionTables, log: SessionLogReader, crashes: list[str]
 ) -> dict[str, Any]:
     """run.json of the session."""
     end: dict[str, Any] = next((event for event in tables.events if event.get("what") == "end"), {})
     notes = [str(event["text"]) for event in tables.events if event.get("what") == "note"]
-    notes += [f"{LOG}: {flaw}" for flaw in tape.flaws]
+    notes += [f"{LOG}: {flaw}" for flaw in log.flaws]
     notes += [f"not complete: {line}" for line in crashes]
     if not end and not crashes:
         notes.append("the session was killed: its record has no end")
@@ -233,7 +233,7 @@ def _meta(
         "stages": {},  # a replay of the log has ticks of its own: it takes nothing over
         "T_world_base": start["T_world_base"],
         "sending": start["sending"],
-        "created": f"{datetime.fromtimestamp(tape.first_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "created": f"{datetime.fromtimestamp(log.first_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}",
         "stops": end.get("stops", []),
         "reason": end.get("reason"),
         "counts": dict(sorted(counts.items())),

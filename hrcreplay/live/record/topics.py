@@ -19,13 +19,13 @@ ENCODING = "hrcreplay.live"  #: of the messages that only the record has; wire.p
 
 _BY_KIND = {
     codec.ROBOT: ROBOT,
-    codec.LOOK: "/live/look",
+    codec.PERCEPTION: "/live/look",
     codec.VOLUMES: "/live/volumes",
-    codec.ANSWER: "/live/answer",
-    codec.SILENCE: "/live/silence",
+    codec.DECISION: "/live/answer",
+    codec.TIMEOUT: "/live/silence",
     codec.EVENT: EVENT,
 }
-_KINDS = {topic: kind for kind, topic in _BY_KIND.items()} | {STRAY: codec.FRAME}
+_KINDS = {topic: kind for kind, topic in _BY_KIND.items()} | {STRAY: codec.SKELETON}
 
 
 def split(message: bytes) -> tuple[str, bytes]:
@@ -34,7 +34,7 @@ def split(message: bytes) -> tuple[str, bytes]:
     if kind == codec.REPLY:
         sent, datagram = codec.decode_reply(message)
         return SENT if sent else UNSENT, datagram
-    return STRAY if kind == codec.FRAME else _BY_KIND[kind], codec.body(message)
+    return STRAY if kind == codec.SKELETON else _BY_KIND[kind], codec.body(message)
 
 
 def join(topic: str, t_ns: int, data: bytes) -> bytes | None:

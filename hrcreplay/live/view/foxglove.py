@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.live.view.messages import Scene, SceneNames, Status, unpack
+from hrcreplay.live.view.status_messages import Scene, SceneNames, Status, unpack
 from hrcreplay.records import POINTS, Floats
 from hrcreplay.report.drawing import BONES
 

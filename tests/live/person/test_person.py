@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.errors import LogError
-from hrcreplay.live.person.log_playback import Frame, Item, Note, Opened, Playback, passes, play
+from hrcreplay.live.person.log_playback import Frame, Item, Note, Opened, Playback, play, playback_items
 from hrcreplay.live.person.source import BEAT_NS, SendSchedule, run
 from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.logs import skeleton_pb2 as pb
@@ -98,7 +98,7 @@ def test_a_repeated_recording_goes_on_rising(tmp_path: Path) -> None:
         **{**vars(frames), "capture_ns": frames.capture_ns - np.where(np.arange(12) < 4, 60_000_000, 0)}
     )
     log = open_log(own.write(tmp_path / "a.mcap", slow))
-    items = passes(log, repeat=True)
+    items = playback_items(log, repeat=True)
     sent: list[Frame] = []
     opened = next(items)
     assert isinstance(opened, Opened)
@@ -121,7 +121,7 @@ def test_two_bodies_of_a_frame_of_a_repeated_recording_both_stay(tmp_path: Path)
     other = CameraFrames(**{**vars(one), "body": one.body + 1})
     both = CameraFrames.join([one, other])
     log = open_log(own.write(tmp_path / "a.mcap", both.rows(np.argsort(both.arrival_ns, kind="stable"))))
-    items = passes(log, repeat=True)
+    items = playback_items(log, repeat=True)
     bodies = [frame.skeleton.body for _ in range(9) if isinstance(item := next(items), list) for frame in item]
     assert bodies[:24] == [7, 8] * 12
 
@@ -181,10 +181,10 @@ def test_heartbeats_keep_to_their_instants_and_missed_ones_are_not_made_up_for()
     assert pace.next_ns(BEAT_NS + 5_000_000) == 2 * BEAT_NS  # no drift
     assert list(pace.send(10 * BEAT_NS + 1)) == [(b"H", b"")]
     assert pace.next_ns(10 * BEAT_NS + 1) == 11 * BEAT_NS
-    pace.hear(b"G" + (12345).to_bytes(8, "little"))
+    pace.receive(b"G" + (12345).to_bytes(8, "little"))
     assert source.started == 12345
-    pace.hear(b"Gnonsense!")
-    pace.hear(b"?")
+    pace.receive(b"Gnonsense!")
+    pace.receive(b"?")
     assert source.started == 12345
 
 

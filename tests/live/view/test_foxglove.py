@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.live.record import codec
 from hrcreplay.live.view.foxglove import FoxgloveStream, mesh, upright_to
-from hrcreplay.live.view.messages import Scene, SceneNames, pack, unpack
+from hrcreplay.live.view.status_messages import Scene, SceneNames, pack, unpack
 from hrcreplay.records import POINTS, SweptVolumes
 from tests.live.statuses import status
 

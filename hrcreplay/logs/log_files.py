@@ -19,7 +19,7 @@ from ruamel.yaml.error import YAMLError
 from hrcreplay.errors import LogError
 from hrcreplay.logs import mcap_stream, ros_bags
 from hrcreplay.logs.mcap_stream import McapStream
-from hrcreplay.logs.messages import PROFILE, Damage, LazyChunk, Message, MessageStream, Topic, in_order
+from hrcreplay.logs.messages import PROFILE, Damage, LazyChunk, Message, MessageStream, Topic, merge_by_arrival
 from hrcreplay.logs.ros_bags import open_bag, open_db3
 
 _SQLITE = b"SQLite format 3\0"
@@ -76,7 +76,7 @@ class LogFiles:
     ) -> Iterator[Message]:
         """Messages of all files on these topics with start <= arrival < end, in order of arrival."""
         chosen = frozenset(names)
-        return in_order(
+        return merge_by_arrival(
             LazyChunk(stream.start_ns, partial(stream.messages, chosen, start_ns, end_ns))
             for stream in self.streams
             if (start_ns is None or stream.end_ns >= start_ns) and (end_ns is None or stream.start_ns < end_ns)

@@ -18,9 +18,9 @@ from pathlib import Path
 from types import FrameType
 
 from hrcreplay.egm.robot_double.faults import Datagram, Fault
-from hrcreplay.egm.robot_double.report import TwinReport, report_of
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.twin_report import TwinReport, report_of
 from hrcreplay.errors import SettingsError
 
 _SO_TIMESTAMPNS = 35  # Linux; the socket module has no name for it

@@ -94,7 +94,7 @@ class EgmSession:
         self._due = self._fresh = self._allowed = self._answered = self._ran = False
         self._strained = 0
 
-    def hear(self, packet: RobotPacket | None, t_ns: int) -> PacketStatus:
+    def classify(self, packet: RobotPacket | None, t_ns: int) -> PacketStatus:
         """Take one datagram in order of arrival; None stands for one that is no packet."""
         if packet is None:
             return self._refuse("no packet")
@@ -114,7 +114,7 @@ class EgmSession:
         self.counts["lost"] += lost
         return self._judge(packet, lost)
 
-    def hear_all(self, packets: Iterable[RobotPacket | None], t_ns: int) -> tuple[PacketStatus, RobotPacket | None]:
+    def classify_all(self, packets: Iterable[RobotPacket | None], t_ns: int) -> tuple[PacketStatus, RobotPacket | None]:
         """Take a queue that built up, in order of arrival: one decision, and the packet to answer if there is one.
 
         The last datagram need not be that packet: it may be garbage, or overtaken by one before it.
@@ -122,7 +122,7 @@ class EgmSession:
         newest, answered, lost, ended = None, None, 0, False
         heard = PacketStatus(answer=False, fresh=False, allowed=self._allowed, reason="no packet", ended=False, lost=0)
         for packet in packets:
-            heard = self.hear(packet, t_ns)
+            heard = self.classify(packet, t_ns)
             lost, ended = lost + heard.lost, ended or heard.ended
             if heard.answer:
                 newest, answered = packet, heard

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from hrcreplay.egm.codec import AXES, BadPacket, RobotPacket, decode_robot, encode_correction
-from hrcreplay.egm.session import EgmSession, PacketStatus
+from hrcreplay.egm.protocol import EgmSession, PacketStatus
 from hrcreplay.live.control import watchdog
 from hrcreplay.live.control.motion import ControlSetup, MotionState, MotionStep, brake, follow, start_approach
 from hrcreplay.live.control.perception import Observer
@@ -30,26 +30,28 @@ _STILL = np.zeros(AXES)
 class SessionController:
     """Answers the robot's packets: waits, approaches, follows its programme, brakes by Eq. (67) and holds.
 
-    Between two answers ``look`` brings in what the cameras saw. The robot moves only while the watchdog has no reason
-    against it; one that appears is kept until the session ends, or, where ``resume`` is set, until it has been gone
-    for ``resume_s``. From standing to moving there is but one way: from where the robot stands, at approach speed.
+    Between two answers ``update_perception`` brings in what the cameras saw. The robot moves only while the watchdog
+    has no reason against it. A reason that appears is kept until the session ends, or, where ``resume`` is set, until
+    it has been gone for ``resume_s``. A robot that stands starts to move in one way only: from where it stands, at
+    approach speed.
 
-    The step of the next answer follows from what was told and seen last, so a look ends with it, and an answer has only
-    to decide whether it is taken. Where there is no time for a look, ``prepare`` makes the step without one.
+    The step of the next answer depends only on the last answer and the last perception update, so it is computed at
+    the end of that update, and the answer only decides whether it is used. Where a cycle has no time for an update,
+    ``prepare`` computes the step without one.
     """
 
     def __init__(self, setup: ControlSetup, observer: Observer, session: EgmSession) -> None:
         self.setup = setup
         self.observer = observer
         self._session = session
-        self.sight: Perception | None = None
+        self.perception: Perception | None = None
         self.phase = codec.WAITING
         self.stop = ""  #: why the robot was stopped; empty while it may move
         self.stops: list[tuple[int, str]] = []  #: every stop: instant [ns] and reason
         self.waiting = ""  #: why it does not start
         self.fault: Exception | None = None  #: a bug that stopped it; to be raised once it stands
         self.standing = 0  #: answers since it stands
-        self._course: MotionState | None = None  # None: no robot is there
+        self._motion: MotionState | None = None  # None: no robot is there
         self._ready: tuple[MotionState, MotionStep] | None = None
         self._programme_s = 0.0  # of the robot that was there last
         self._heard_ns: int | None = None
@@ -59,103 +61,103 @@ class SessionController:
     @property
     def connected(self) -> bool:
         """Whether a robot is being answered."""
-        return self._course is not None
+        return self._motion is not None
 
     def counts(self) -> Counter[str]:
         """What was found of the person's frames and the robot's packets so far."""
         return self.observer.counts + Counter({f"robot {what}": n for what, n in self._session.counts.items()})
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
         """Stages 1 and 2 up to ``t_ns`` [ns, session clock]; None where they failed, which stops the robot."""
         self._ready = None
         try:
-            self.sight = self.observer.look(t_ns, skeletons)
-            if self._course is not None:
-                self._ready = self._course, self._step(self._course)
+            self.perception = self.observer.update_perception(t_ns, skeletons)
+            if self._motion is not None:
+                self._ready = self._motion, self._step(self._motion)
         except Exception as error:  # whatever it is, the robot must go on being answered
             self.fault = self.fault or error
-            self.sight = self.sight if self.sight is not None and self.sight.t_ns == t_ns else None
-        return self.sight
+            self.perception = self.perception if self.perception is not None and self.perception.t_ns == t_ns else None
+        return self.perception
 
     def prepare(self) -> None:
         """Makes the step of the next answer beside what was seen last; changes nothing that is said."""
-        if self._course is not None:
+        if self._motion is not None:
             with suppress(Exception):  # the answer fails in the same way, and says so
-                self._ready = self._course, self._step(self._course)
+                self._ready = self._motion, self._step(self._motion)
 
     def silence(self, t_ns: int, signals: Signal) -> None:
         """Nothing came from the robot within the time-out."""
-        self._hear_nothing(t_ns)
+        self._check_silence(t_ns)
         why = watchdog.of_signals(signals)
         if why and not self.stop:
             self._stop(t_ns, why)
 
     def answer(self, event: TickEvent) -> Decision:
         """The reply to what the robot sent, and why it is that one."""
-        self._hear_nothing(event.t_ns)  # also where the packet that ends a silence comes before its time-out is seen
+        self._check_silence(event.t_ns)  # also where the packet that ends a silence comes before its time-out is seen
         packets = [_decoded(data) for data in event.datagrams]
         cycles = {packet.clock_ns for packet in packets if packet is not None}
         self._behind_ns = (self._behind_ns or event.t_ns) if len(cycles) > 1 else None
-        heard, packet = self._session.hear_all(packets, event.t_ns)
-        look_ns = self.sight.t_ns if self.sight is not None else 0
+        packet_status, packet = self._session.classify_all(packets, event.t_ns)
+        look_ns = self.perception.t_ns if self.perception is not None else 0
         if packet is None:
-            self._refuse(event.t_ns, heard)
+            self._refuse(event.t_ns, packet_status)
             return Decision(event.t_ns, look_ns, None, self.phase, control_step.BRAKING, self.stop, -1, -1, None)
         measured = packet.q[:AXES]
         self._heard_ns = event.t_ns
-        if heard.fresh or self._course is None:
-            self._begin(measured)
-        self._judge(event, heard, measured)
-        before = self._course
+        if packet_status.fresh or self._motion is None:
+            self._begin_session(measured)
+        self._apply_watchdog(event, packet_status, measured)
+        before = self._motion
         assert before is not None  # noqa: S101 - for the type checker
-        said = self._say(before)
+        result = self._next_step(before)
         phase = self.phase
-        reply = self._session.reply(said.step.next.q, said.step.next.dq, event.t_ns)
+        reply = self._session.reply(result.step.next.q, result.step.next.dq, event.t_ns)
         told = RobotState(reply.q, reply.dq)  # which is an echo while the robot may not move
-        self._course = replace(said.after, state=told)
-        self._programme_s = said.after.programme_s
+        self._motion = replace(result.after, state=told)
+        self._programme_s = result.after.programme_s
         self._settle()
-        step, row = said.step, _row(measured, before, said)
-        reason = (self.stop or self.waiting) if said.after.follower is None else control_step.REASONS[step.reason]
+        step, row = result.step, _row(measured, before, result)
+        reason = (self.stop or self.waiting) if result.after.follower is None else control_step.REASONS[step.reason]
         return Decision(
             event.t_ns, look_ns, encode_correction(reply), phase, step.status, reason, step.limb, step.link, row
         )
 
     def _settle(self) -> None:
         """The phase after an answer that left the robot standing, or not."""
-        moving = self._course is not None and bool(np.any(self._course.state.dq))
+        moving = self._motion is not None and bool(np.any(self._motion.state.dq))
         self.standing = 0 if moving else self.standing + 1
         if self.phase == codec.ECHO:
             self.phase = codec.HOLDING if self.stop else codec.WAITING
         elif self.phase == codec.STOPPING and not moving:
             self.phase = codec.HOLDING
-        elif self.phase == codec.APPROACH and self._course is not None and self._course.arrived:
+        elif self.phase == codec.APPROACH and self._motion is not None and self._motion.arrived:
             self.phase = codec.FOLLOWING
 
-    def _refuse(self, t_ns: int, heard: PacketStatus) -> None:
+    def _refuse(self, t_ns: int, packet_status: PacketStatus) -> None:
         """Nothing to answer: a robot that must not be moved at all, or nothing of worth."""
-        if heard.reason in watchdog.REFUSED and not self.stop:
-            self._stop(t_ns, heard.reason)
-            self._course, self.phase = None, codec.HOLDING
-        self._hear_nothing(t_ns)
+        if packet_status.reason in watchdog.REFUSED and not self.stop:
+            self._stop(t_ns, packet_status.reason)
+            self._motion, self.phase = None, codec.HOLDING
+        self._check_silence(t_ns)
 
-    def _hear_nothing(self, t_ns: int) -> None:
+    def _check_silence(self, t_ns: int) -> None:
         """Whether the robot has been gone for too long: it has stopped listening, so it begins anew where it stands."""
         if self._heard_ns is None or t_ns - self._heard_ns <= self.setup.bounds.silent_s * 1e9:
             return
         if self.phase in (codec.APPROACH, codec.FOLLOWING, codec.STOPPING):
             self._stop(t_ns, watchdog.SILENT)
-        self._course, self._heard_ns = None, None
+        self._motion, self._heard_ns = None, None
         self.phase = codec.HOLDING if self.stop else codec.WAITING
 
-    def _begin(self, measured: Floats) -> None:
+    def _begin_session(self, measured: Floats) -> None:
         """A new session of the robot: whatever was commanded before, it is where it is."""
-        self._course = MotionState(RobotState(measured, _STILL), self._programme_s)
+        self._motion = MotionState(RobotState(measured, _STILL), self._programme_s)
         self.phase = codec.ECHO
 
-    def _judge(self, event: TickEvent, heard: PacketStatus, measured: Floats) -> None:
+    def _apply_watchdog(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> None:
         """What the watchdog says, and the phase that follows from it."""
-        why = self._why(event, heard, measured)
+        why = self._stop_reason(event, packet_status, measured)
         if self.phase in (codec.APPROACH, codec.FOLLOWING):
             if why:
                 self._stop(event.t_ns, why)
@@ -167,57 +169,57 @@ class SessionController:
             elif why and why not in watchdog.ENDINGS:
                 self.stop = why  # what holds it now
         self.waiting = why if self.phase == codec.WAITING else ""
-        if self.phase == codec.WAITING and not why and self._course is not None:
-            self._course, self.phase = start_approach(self.setup, self._course), codec.APPROACH
+        if self.phase == codec.WAITING and not why and self._motion is not None:
+            self._motion, self.phase = start_approach(self.setup, self._motion), codec.APPROACH
 
-    def _why(self, event: TickEvent, heard: PacketStatus, measured: Floats) -> str:
+    def _stop_reason(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> str:
         """The reason not to move, or none."""
         if self.fault is not None:
             return watchdog.FAULT
-        why = watchdog.of_signals(event.signals) or watchdog.of_robot(heard)
+        why = watchdog.of_signals(event.signals) or watchdog.of_robot(packet_status)
         behind_ns = 0 if self._behind_ns is None else event.t_ns - self._behind_ns
         if not why and behind_ns > self.setup.bounds.overrun_s * 1e9:
             why = watchdog.OVERRUN
         if not why:
-            why = watchdog.of_person(self.sight, self.observer.age_s(event.t_ns), self.setup.bounds)
-        if not why and self.setup.sending and self._course is not None and self.phase != codec.ECHO:
-            why = watchdog.of_tracking(measured, self._course.state.q, self.setup.bounds)
+            why = watchdog.of_person(self.perception, self.observer.age_s(event.t_ns), self.setup.bounds)
+        if not why and self.setup.sending and self._motion is not None and self.phase != codec.ECHO:
+            why = watchdog.of_tracking(measured, self._motion.state.q, self.setup.bounds)
         return why
 
     def _stop(self, t_ns: int, why: str) -> None:
         self.stop, self.phase, self._clear_ns = why, codec.STOPPING, None
         self.stops.append((t_ns, why))
-        if self._course is not None:
-            self._course = replace(self._course, follower=None)
+        if self._motion is not None:
+            self._motion = replace(self._motion, follower=None)
 
-    def _say(self, course: MotionState) -> MotionStep:
+    def _next_step(self, motion: MotionState) -> MotionStep:
         """The tick's step: the one that is ready, if it is still the one to take."""
-        if self._ready is not None and self._ready[0] is course:
-            said = self._ready[1]
+        if self._ready is not None and self._ready[0] is motion:
+            result = self._ready[1]
         else:
             try:
-                said = self._step(course)
+                result = self._step(motion)
             except Exception as error:  # whatever it is, the robot must brake
                 self.fault = self.fault or error
-                return self._give_up(course, watchdog.FAULT)
-        finite = math.isfinite(said.step.next.q.sum() + said.step.next.dq.sum())
-        return said if finite else self._give_up(course, watchdog.NOT_FINITE)
+                return self._fallback_stop(motion, watchdog.FAULT)
+        finite = math.isfinite(result.step.next.q.sum() + result.step.next.dq.sum())
+        return result if finite else self._fallback_stop(motion, watchdog.NOT_FINITE)
 
-    def _give_up(self, course: MotionState, why: str) -> MotionStep:
+    def _fallback_stop(self, motion: MotionState, why: str) -> MotionStep:
         """The stop of a robot whose step cannot be taken; once, however often it fails while the robot brakes."""
         if not self.stop or self.phase in (codec.APPROACH, codec.FOLLOWING):
             self._stop(self._heard_ns or 0, why)
-        return brake(self.setup, course, _UNSEEN)
+        return brake(self.setup, motion, _UNSEEN)
 
-    def _step(self, course: MotionState) -> MotionStep:
-        return (brake if course.follower is None else follow)(self.setup, course, self._around())
+    def _step(self, motion: MotionState) -> MotionStep:
+        return (brake if motion.follower is None else follow)(self.setup, motion, self._obstacles())
 
-    def _around(self) -> Obstacles:
+    def _obstacles(self) -> Obstacles:
         """What to keep clear of; unknown where nobody has been seen for too long."""
-        if self.sight is None:
+        if self.perception is None:
             return _UNSEEN
-        seen = self.observer.age_s(self.sight.t_ns) <= self.setup.memory_s
-        return self.sight.around if seen else replace(self.sight.around, known=False)
+        seen = self.observer.age_s(self.perception.t_ns) <= self.setup.memory_s
+        return self.perception.obstacles if seen else replace(self.perception.obstacles, known=False)
 
 
 def _decoded(data: bytes) -> RobotPacket | None:
@@ -227,8 +229,8 @@ def _decoded(data: bytes) -> RobotPacket | None:
         return None
 
 
-def _row(measured: Floats, before: MotionState, said: MotionStep) -> MotionRow:
-    pose, state = said.step.pose, before.state
+def _row(measured: Floats, before: MotionState, result: MotionStep) -> MotionRow:
+    pose, state = result.step.pose, before.state
     speed = float(np.linalg.norm(pose.J_tcp[:3] @ state.dq))
-    rest = np.array([speed, said.reference_speed, said.after.programme_s, said.step.distance_m])
-    return MotionRow(measured, state.q, state.dq, said.step.u, said.reference_m, pose.T_world_tcp[:3, 3], rest)
+    rest = np.array([speed, result.reference_speed, result.after.programme_s, result.step.distance_m])
+    return MotionRow(measured, state.q, state.dq, result.step.u, result.reference_m, pose.T_world_tcp[:3, 3], rest)
