@@ -1,4 +1,4 @@
-"""How far points stick out of swept volumes, and how much room several volumes take together."""
+"""Distances of points from swept volumes, and the volume of the union of several of them."""
 
 from __future__ import annotations
 

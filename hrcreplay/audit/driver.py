@@ -1,4 +1,4 @@
-"""The audit's driver: did the people of some logs stay in the volumes that were predicted for them?"""
+"""The command ``audit``: reads logs, compares people with their predictions and writes the run folder."""
 
 from __future__ import annotations
 
@@ -61,6 +61,15 @@ def run(
     The total counts every audited tick of every log once, so a long log weighs more than a short one: it is the share
     of all the recorded time. Its intervals draw each log anew by itself, keeping its length: they say how well these
     logs tell of more of the same people at the same work, and nothing of others.
+
+    Args:
+        sources: Logs, or run folders of earlier commands.
+        out: Run folder to make; None: ``reports/<log>/<UTC>-audit``.
+        config: Settings file, or none.
+        overrides: ``section.key=value`` of the command line, which win over the file.
+        cell_file: Poses of cameras and robot; None: those of the earlier run, else of the log.
+        start_s: Start of the span, from the log's first message [s]; None: as the earlier run, else its beginning.
+        end_s: End of the span, from the log's first message [s]; None: as the earlier run, else its end.
 
     Returns:
         The run folder: audit.json, audit.parquet (a row per tick, method and limb), escapes.parquet (a row per

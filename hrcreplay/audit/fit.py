@@ -1,8 +1,7 @@
-"""``fit-limits``: from logs of people to the limit set that holds them.
+"""The command ``fit-limits``: velocity and acceleration bounds fitted to logs, written as a limit set.
 
-What ``fit-limits`` tells the user, line by line.
-
-Fitted accelerations scaled until the volumes, not the joints, hold the people of the logs as often as was asked.
+With ``cover = "limbs"`` the fitted accelerations are scaled until the swept volumes, not the joint intervals, contain
+the people of the logs in the wanted share of the ticks.
 """
 
 from __future__ import annotations
@@ -90,7 +89,7 @@ _SMALLEST, _HALVINGS = 0.6, 4
 
 @dataclass(frozen=True)
 class SplitPerson:
-    """One log's person in parts: to fit on, and held back."""
+    """One log's ticks for the limbs: those to fit on, and those held back."""
 
     prediction_stage: PredictionStage
     training: RecordedFuture
@@ -125,6 +124,12 @@ def tightening_factor(people: Sequence[SplitPerson], found: Fit, positions: Limi
     Half of the ticks that may be missed are kept in reserve, for other ticks than those fitted on. Ticks that even the
     fitted accelerations do not hold, for what no bound can mend (a limb that is not where the model has it, a joint
     that keeps the standard bounds), do not count: they would drive the bounds of all others up.
+
+    Args:
+        people: One split log each.
+        found: Fit whose accelerations are scaled.
+        positions: Limit set that gives the position bounds.
+        share: Of the training ticks, in (0, 1).
     """
 
     def held(scale: float) -> Bools:
@@ -269,14 +274,8 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> FitSample:
         joints = fit_limits.recently_seen(joints, states.unseen_s, SEEN_S)
     every = max(1, round(rate_hz / FIT_HZ))
     ticks = np.arange(0, len(states), every)
-    some = fit_limits.futures(
-        states,
-        ticks[np.isfinite(states.p[ticks]).all(axis=1)],
-        recording.joints_t_ns,
-        joints,
-        horizon_s=horizon_s,
-        memory_s=SEEN_S,
-    )
+    ticks = ticks[np.isfinite(states.p[ticks]).all(axis=1)]
+    some = fit_limits.futures(states, ticks, recording.joints_t_ns, joints, horizon_s=horizon_s, memory_s=SEEN_S)
     training = states.rows(states.t_ns <= cut_ns)
     return FitSample(
         job,

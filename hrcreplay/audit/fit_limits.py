@@ -1,11 +1,9 @@
-"""The tightest bounds under which Alg. 1 holds what people went on to do.
+"""The smallest velocity and acceleration bounds under which Alg. 1 contains the recorded motion of the joints.
 
-A joint's recorded future lies in its interval where the highest and the lowest of it do, so a tick is three numbers:
-the velocity, and how far the joint then got up and down within the horizon. For a given velocity bound each tick needs
-an acceleration bound of at least so much, in closed form; how many ticks may be missed picks one of these. Of all pairs
-that miss no more, the fit takes the one whose intervals are shortest on average.
-
-Bounds for volumes rather than for joints: what people's estimated velocities leave to their accelerations.
+A joint's recorded future lies in its interval where its highest and its lowest position do, so each tick is reduced to
+three numbers: the velocity, and the largest displacement up and down within the horizon. For a given velocity bound
+the acceleration bound that a tick needs has a closed form, and the number of ticks that may be missed selects one of
+these bounds. Of all pairs that miss no more ticks, the fit takes the pair with the shortest mean interval.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ _FASTEST = 0.999
 
 
 def fit_each_side(training: Futures, standard: LimitSet, share: float, horizon_s: float) -> Fit:
-    """Bounds of another shape than ``fit``'s: velocities as fast as people are, and accelerations for the rest.
+    """Bounds fitted to each side of each joint: velocities from quantiles, then the accelerations that they need.
 
     Where a velocity bound is low, a joint may have any velocity up to it, whatever the estimate says. Under these the
     reach is where the estimated velocity leads, give or take what the accelerations change: with the same share of
@@ -137,7 +135,7 @@ def recently_seen(joints: Floats, unseen_s: Floats, memory_s: float) -> Floats:
 
 
 def outside_positions(p: Floats, limits: LimitSet) -> Bools:
-    """(n,) whether a posture (n, 12) is outside the position limits; False where it is not known."""
+    """(n,) whether a posture (n, 12) is outside of the position limits; False where it is unknown."""
     named = canonical(p)
     return np.asarray((np.abs(clamp(named, limits) - named) > _OUTSIDE).any(axis=1))
 
@@ -196,7 +194,14 @@ def all_joints_inside(within: Floats) -> Floats:
 
 
 def largest_displacement(v: Floats, v_bound: Floats, a_bound: Floats, horizon_s: float) -> Floats:
-    """How far up joints get from velocities v (n, k) under bounds (k,), by Alg. 1 with Eq. (40): at least 0."""
+    """(n, k) largest displacement upward from velocities v under bounds, by Alg. 1 with Eq. (40); at least 0.
+
+    Args:
+        v: (n, k) velocities at the tick [m/s, m/s, rad/s...].
+        v_bound: (k,) largest velocities [m/s, m/s, rad/s...].
+        a_bound: (k,) largest accelerations [m/s^2, m/s^2, rad/s^2...].
+        horizon_s: T_s [s].
+    """
     t_star = np.clip((v_bound - v) / a_bound, 0.0, horizon_s)
     return np.maximum(v * t_star + 0.5 * a_bound * t_star**2 + v_bound * (horizon_s - t_star), 0.0)
 
@@ -279,6 +284,12 @@ def least_acceleration(v: Floats, gone: Floats, bound: float, horizon_s: float) 
 
     Either the whole horizon is spent speeding up, gone = v T + a T^2 / 2, or the velocity bound V is reached, and
     the area that the profile lacks below V is a triangle: V T - gone = (V - v)^2 / (2 a).
+
+    Args:
+        v: (n,) velocities at the tick [m/s] or [rad/s].
+        gone: (n,) largest displacement within the horizon [m] or [rad].
+        bound: Velocity bound V [m/s] or [rad/s]; inf: none.
+        horizon_s: T_s [s].
     """
     whole = np.maximum(2.0 * (gone - v * horizon_s) / horizon_s**2, 0.0)
     if bound == np.inf:

@@ -1,7 +1,4 @@
-"""One log held against the predictions of all methods.
-
-Holds what was predicted at a tick against what the person did within the horizon.
-"""
+"""The audit of one log: the volumes that each method predicted, compared with the recorded future of the person."""
 
 from __future__ import annotations
 
@@ -110,12 +107,12 @@ def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
 
 
 def check_containment(volumes: SweptVolumes, future: RecordedFuture, counted: Bools, first_sample: int = 0) -> Outcome:
-    """One method's volumes against the recorded future.
+    """Compares one method's volumes with the recorded future.
 
     Args:
         volumes: Of the n ticks.
         future: Of the same ticks.
-        counted: (n,) the ticks whose union is counted out.
+        counted: (n,) the ticks whose union volume is estimated.
         first_sample: Number of ticks counted before, see ``union_volume_m3``.
     """
     n, limbs = len(volumes), volumes.limbs
@@ -196,7 +193,7 @@ _BATCH = 100
 
 @dataclass(frozen=True)
 class LogAudit:
-    """What one log showed."""
+    """Results of the audit of one log."""
 
     job: Job
     name: str
@@ -209,8 +206,8 @@ class LogAudit:
 
 
 def methods() -> tuple[str, ...]:
-    """Our own methods, then the peers."""
-    return (*reachable_sets.METHODS, *baselines.PEERS)
+    """Our own methods, then the baselines."""
+    return (*reachable_sets.METHODS, *baselines.BASELINES)
 
 
 def factors(method: str) -> tuple[float, ...]:
@@ -219,8 +216,8 @@ def factors(method: str) -> tuple[float, ...]:
 
 
 def volumes(prediction_stage: PredictionStage, window: RecordedFuture, method: str) -> SweptVolumes:
-    """Swept volumes by any method, ours or a peer's."""
-    if method in baselines.PEERS:
+    """Swept volumes by any method, ours or a baseline's."""
+    if method in baselines.BASELINES:
         return baselines.predict(
             window.states,
             horizon_s=standstill_s(prediction_stage),

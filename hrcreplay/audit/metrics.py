@@ -1,6 +1,6 @@
-"""What an audit found, as figures with intervals: per method, limb and joint, for one log or several together.
+"""Metrics of an audit with their intervals, by method, limb and joint, for one log or for several together.
 
-Which limbs and points of a recording an audit could check, and which it says nothing of.
+They also say which limbs and points could not be checked, since a coverage holds only for those that were.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""report.html of an audit."""
+"""The HTML page of an audit."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _lower(found: Mapping[str, Any]) -> str:
 
 
 def _equal(found: Mapping[str, Any]) -> str:
-    """How much room our methods take where their curves reach a peer's coverage less half a percent."""
+    """How much room our methods take where their curves reach a baseline's coverage less half a percent."""
     peer = found["total"]["methods"].get("v2_a50")
     if peer is None or peer["upper"]["covered_share"]["value"] is None or not peer["upper"]["union_m3"]["value"]:
         return ""

@@ -1,4 +1,4 @@
-"""What a log says the person did: the future that an audit holds a prediction against."""
+"""The recorded motion of the person in a log, with which an audit compares the predictions."""
 
 from __future__ import annotations
 
@@ -63,6 +63,12 @@ def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress
     the smoothed person, who knows what came later, or at the end of a bone of the person's own length: who squats or
     bends sideways leaves the model, not the room, and must not be thrown out for it; a marker that jumps away takes no
     bone along. Else the smoothed person. Recorded joints are those of the truth, else of the smoothed person.
+
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks of the span, increasing [ns].
+        fusion_stage: Cameras and settings of stage 1.
+        progress: Called with the number of ticks done since the last call.
 
     Raises:
         LogError: No camera saw anybody.

@@ -1,4 +1,4 @@
-"""Poses and clock offsets of a log's cameras, and the world they share, from the skeletons themselves."""
+"""Calibration of a log's cameras from the skeletons of one person: poses, clock offsets and a common world frame."""
 
 from __future__ import annotations
 

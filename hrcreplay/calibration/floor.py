@@ -1,4 +1,7 @@
-"""Floor and up direction from a person who stands and walks on it. Nothing is assumed of the sensor's axes."""
+"""Estimation of the floor plane and the upward direction from a person who stands and walks.
+
+Nothing is assumed about the directions of the sensor's axes.
+"""
 
 from __future__ import annotations
 

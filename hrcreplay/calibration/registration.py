@@ -1,8 +1,8 @@
-"""Where two sensors stand to one another, from the skeletons of the one person both saw.
+"""Registration of two sensors, pose and clock offset, from the skeletons of one person that both saw.
 
-Real skeletons carry gross errors at full confidence (left/right mix-ups, jumps), two clocks that do not agree, and
-frames taken at different instants. So both tracks are smoothed by the same kernel and compared at one camera's
-instants, and pose and clock offset are found together by a robust Gauss-Newton.
+Recorded skeletons have gross errors at full confidence (left and right exchanged, jumps), the two clocks differ, and
+frames are taken at different instants. So both tracks are smoothed by the same kernel and compared at the instants of
+one camera, and pose and clock offset are estimated together by a robust Gauss-Newton method.
 """
 
 from __future__ import annotations

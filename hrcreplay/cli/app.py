@@ -1,4 +1,7 @@
-"""Commands: parse, call, print the run folder. Heavy imports stand inside the commands, so that --help is quick."""
+"""The command line: parses the arguments, calls the command, prints the run folder.
+
+Slow imports stand inside the commands, so that ``--help`` answers at once.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands beside a robot: live, twin, verify."""
+"""The commands that work with a live robot: live, twin, verify."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""Datagrams to records and back. Degrees and millimetres stay in here.
+"""Encoding and decoding of EGM datagrams, and the pose of the flange that a controller reports beside the joints.
 
-Every call makes its message anew: one that is used again never gives memory back (0.5 kB a packet).
-
-Where the flange is: the pose that a controller tells beside the joints.
+Degrees and millimetres are used only in here. Each call makes a new protobuf message: one that is used again never
+gives its memory back (0.5 kB a packet).
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
-"""Our side of the conversation with the robot: packets and instants in, decisions out. No clock, no socket.
+"""State machine of our side of the EGM protocol: robot packets and instants in, replies out. No clock, no socket.
 
-The robot counts its packets. What a packet is to the conversation follows from its counter, ``ahead`` of the last:
+The robot numbers its packets. How a packet is treated follows from its number, ``ahead`` of the last:
 
 - older by the robot's clock, and not 0: overtaken on the way, however long ago. Not answered.
-- 1 to ``LEAP`` ahead, round 2**32 too: the next one; those between are lost.
-- the same counter, clock and stamp: a duplicate. Not answered, for a second answer queues up in the robot as lag.
-- anything else, as 0, and any packet after a silence: a new session.
+- 1 to ``LEAP`` ahead, modulo 2**32: the next one; those between are lost.
+- the same number, clock and stamp: a duplicate. Not answered, for a second answer waits in the robot's queue and adds
+  delay.
+- anything else, as 0, and any packet after a pause: a new session.
 
 A session begins with an echo: the first answer is what the robot measured, at speed 0, whatever is asked for. So is
-every answer while the robot may not move, since the last target is live again as soon as it may.
+every answer while the robot may not move, since the last target is valid again as soon as it may.
 """
 
 from __future__ import annotations

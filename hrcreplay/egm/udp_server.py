@@ -1,4 +1,7 @@
-"""Our socket: the robot calls, we answer. A blocking UDP socket and no thread, for that answers soonest."""
+"""The UDP server that receives the robot's packets and sends the replies.
+
+A blocking socket without a thread, because that has the shortest latency.
+"""
 
 from __future__ import annotations
 

@@ -1,16 +1,12 @@
-"""The processes beside the control loop, and the sockets to them. Nothing here waits for any of them.
+"""The helper processes of a live session: their start, their sockets, and the files that their crashes leave.
 
-What a crash of one of a session's processes leaves in the run folder: a file with its traceback.
+Messages between control and a helper are whole, and neither waits for the other: a message that the other does not
+take is dropped and counted. Each helper runs as ``python -m hrcreplay.live.processes FOLDER PART MODULE arguments``.
 
-The first line of ``crash_<part>.txt`` says which part failed, with what exception and where; that line is also what the
-user is told and what run.json has. A part may be a process that ended without a word.
-
-A helper process's end of its socket to the control loop: whole messages, and nobody ever waits for the other.
-
-How each process beside control runs: ``python -m hrcreplay.live.processes FOLDER PART MODULE arguments``.
-
-Whatever ends it that nobody foresaw is kept with its traceback in the run folder, not on the user's terminal; control
-sees the process gone, brakes the robot and tells of it.
+An exception that ends a part of the session is kept with its traceback in the run folder and not shown on the user's
+terminal; control sees that the process is gone, brakes the robot and reports it. The first line of
+``crash_<part>.txt`` says which part failed, with what exception and where; the user is told the same line, and run.json
+has it. A part may also be a process that ended without an exception.
 """
 
 from __future__ import annotations
@@ -148,7 +144,7 @@ class ControlChannel:
         return data
 
 
-#: Module through which every helper starts; see process.py.
+#: Module through which every helper starts; see ``main``.
 ENTRY = "hrcreplay.live.processes"
 
 _LARGEST = 1 << 20  #: no message is larger
@@ -157,7 +153,7 @@ _AT_ONCE = 256  #: messages taken at once, so that a flood does not hold up the 
 
 
 class HelperProcess:
-    """A process of ours, with a socket whose far end it holds."""
+    """A helper process and control's end of the socket to it."""
 
     def __init__(
         self, part: str, module: str, arguments: Sequence[str], folder: Path, expected: tuple[int, ...] = ()
@@ -165,11 +161,11 @@ class HelperProcess:
         """Starts ``module --fd N arguments`` in a session of its own: Ctrl-C is for control alone.
 
         Args:
-            part: Which part of the session it is, of crash.py.
+            part: Which part of the session it is: PERSON, RECORDER or SCREEN.
             module: Module to run.
             arguments: Of it, beside the socket.
             folder: Where it leaves its traceback if it crashes.
-            expected: Exit codes beside 0 of a process that has told why it ends: no crash.
+            expected: Exit codes beside 0 of a process that has said why it ends: no crash.
         """
         self.part = part
         self._folder = folder
@@ -204,7 +200,7 @@ class HelperProcess:
                 self.alive = False
 
     def messages(self) -> Iterator[bytes]:
-        """What it has said since."""
+        """Messages that have arrived since the last call."""
         for _ in range(_AT_ONCE):
             try:
                 message = self._socket.recv(_LARGEST)
@@ -218,14 +214,14 @@ class HelperProcess:
             yield message
 
     def check_alive(self) -> bool:
-        """Whether it is still there, for one that never says anything."""
+        """Whether the process still runs; for one that sends no messages."""
         if self.alive:
             for _ in self.messages():
                 pass
         return self.alive
 
     def crashed(self) -> bool:
-        """Whether it has ended as nobody foresaw; no for one that lives, or is about to end."""
+        """Whether it has ended with an unexpected exit code; False while it runs or is about to end."""
         return not self.alive and self.process.poll() not in (None, *self._told)
 
     def close(self, patience_s: float) -> int | None:

@@ -1,4 +1,4 @@
-"""`hrcreplay live`: the processes of a session, its loop, and what it leaves behind."""
+"""The command ``live``: starts the processes of a session, runs its control loop and makes its run folder."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from hrcreplay.live.record.codec import Signal
 from hrcreplay.live.view.status_publisher import StatusPublisher
 from hrcreplay.settings.load import Settings
 
-#: Longest wait for a packet before the loop looks after everything else [s].
+#: Longest wait for a packet before the loop turns to everything else [s].
 WAIT_S = 0.02
 
 #: Longest wait for the recording to be opened, and for the record to be finished [s].
@@ -120,7 +120,7 @@ class _Prepared:
 
 
 def _prepare(request: Request, stack: ExitStack) -> _Prepared:
-    """Settings, pilot, port; every kernel compiled."""
+    """Settings, controller, port; every kernel compiled."""
     job, header = live_job(request.human, request.config, request.overrides, request.cell)
     port = job.settings.live.port if request.port is None else request.port
     start = start_table(job, header, sending=request.send)

@@ -1,6 +1,6 @@
-"""`hrcreplay verify`: what a session's record says came out, against what comes out of it again, bit for bit.
+"""The command ``verify``: computes a recorded run again and compares it with the record, bit for bit.
 
-Runs the command of a replay again from its run.json, and compares what comes out with what came out.
+A live session is computed again from its log, message by message; a replay by running its command from its run.json.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ class Verdict:
 
 
 class DecisionMaker(Protocol):
-    """What makes a session's decisions; see pilot.py."""
+    """What makes a session's decisions: ``SessionController``, or a substitute in tests."""
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
         """What is known of the person."""
@@ -157,7 +157,7 @@ def verify(run: Path, build: ControllerFactory = setup.build_controller) -> Verd
 
     Args:
         run: Run folder; also that of a session under way or killed.
-        build: Makes a session's pilot from its start event.
+        build: Makes a session's controller from its start event.
 
     Raises:
         SettingsError: No run folder, or one of a command that cannot be run again.
@@ -209,13 +209,13 @@ def _changed(run: Path) -> Iterator[str]:
 
 
 class SessionRecomputation:
-    """A session once more: a fresh pilot is told what the record says, and must say what the record says."""
+    """Computes a session again: a new controller gets the recorded inputs and must give the recorded outputs."""
 
     def __init__(self, controller: DecisionMaker) -> None:
         self.ticks = 0  #: answers so far
         self.looks = 0
         self.ended = False
-        self.crashed = ""  #: how control crashed, after which no pilot answered
+        self.crashed = ""  #: how control crashed, after which no controller answered
         self._pilot = controller
         self._start_ns: int | None = None
         self._last_ns = 0
@@ -350,7 +350,7 @@ def _numbers(found: codec.RecordedDecision) -> Floats:
 
 
 def _volume(recorded: SweptVolumes, again: SweptVolumes) -> str | None:
-    """The first number that differs in a look's volumes."""
+    """The first number that differs in the volumes of a perception update."""
     for limb, name in enumerate(again.limbs):
         mine, yours = recorded.vertices(0, limb), again.vertices(0, limb)
         if len(mine) != len(yours):

@@ -1,6 +1,7 @@
-"""Dirt of real logs: each kind is handled here and counted under the name that DEFECTS gives it.
+"""Cleaning of recorded skeletons, and selection of the person of interest among several bodies.
 
-The person of interest among several bodies whose ids change: whoever is where the person last was.
+Each kind of defect is handled here and counted under its name in DEFECTS. Body ids change, so the person is the body
+that is nearest to where the person was last.
 """
 
 from __future__ import annotations
@@ -166,14 +167,14 @@ _A, _B = (np.array([POINTS.index(pair[end]) for pair in _PAIRS]) for end in (0, 
 
 
 class CleanedSkeleton(NamedTuple):
-    """A row as it is handed on, and what had to be done to its points."""
+    """A cleaned row, and the defects found in its points."""
 
     row: RawSkeleton
     flaws: tuple[tuple[str, int], ...]  #: name in DEFECTS -> points
 
 
 def clean_skeleton(row: RawSkeleton) -> CleanedSkeleton:
-    """The row with all that is no point of a body made missing: NaN, with confidence 0.
+    """Makes every point missing (NaN, confidence 0) that cannot be a point of a body.
 
     Of two ends of a bone in one place neither can be believed. A point of confidence 0 was said to be missing: it is
     made so, and not counted.
@@ -215,7 +216,7 @@ class RepeatedSkeleton(NamedTuple):
 
 
 class Cleaner:
-    """Takes rows in order of arrival, drops and mends them, and hands them out in chunks of at most a second."""
+    """Cleans rows in order of arrival and returns them as tables of at most a second."""
 
     def __init__(self, cameras: tuple[str, ...], gap_s: float, defects: Counter[str]) -> None:
         self._cameras = cameras
@@ -236,14 +237,14 @@ class Cleaner:
             defects[name] += 0
 
     def note_arrival(self, camera: str, arrival_ns: int) -> None:
-        """Notes that a camera is alive."""
+        """Notes the arrival of a message of a camera, and counts a gap before it."""
         first, last = self.arrivals.get(camera, (arrival_ns, arrival_ns))
         if arrival_ns - last > self._gap_ns:
             self._defects[f"gaps_{camera}"] += 1
         self.arrivals[camera] = (first, arrival_ns)
 
     def add(self, row: RawSkeleton, arrival_ns: int) -> CameraFrames | None:
-        """Takes a row; gives the chunk that ends before it, if one does."""
+        """Takes a row; returns the table that is complete before it, if there is one."""
         self.note_arrival(row.camera, arrival_ns)
         self._defects["frames_header_stamp_zero"] += row.stamp_zero
         capture_ns = self._captured(row, arrival_ns)
@@ -297,7 +298,7 @@ class Cleaner:
         self.flaws[(camera, name)] += count
 
     def flush(self) -> CameraFrames | None:
-        """What is not handed out yet."""
+        """The rows that were not returned yet; None without any."""
         rows, self._rows = self._rows, []
         if not rows:
             return None

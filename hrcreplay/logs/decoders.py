@@ -1,10 +1,7 @@
-"""Skeletons as openni_tracker publishes them: transforms camera -> left_elbow_1 on /tf, one message a joint.
+"""Decoders of skeleton topics, one class a message format.
 
-Skeletons of our own log.
-
-Skeletons as the Azure Kinect ROS driver publishes them: visualization_msgs/MarkerArray, a marker a joint.
-
-Skeletons of a message type that settings describe.
+Our own Skeleton message; the transforms of openni_tracker (camera to left_elbow_1 on /tf, one message a joint); the
+MarkerArray of the Azure Kinect ROS driver (a marker a joint); and message types that the settings describe.
 """
 
 from __future__ import annotations

@@ -1,16 +1,13 @@
-"""KERAAL text files: a Kinect v2 and optical targets of one movement, without time stamps.
+"""Importers of skeleton text files: Azure Kinect CSV, Kinect v2 CSV, and KERAAL text files.
 
-Azure Kinect body-tracking CSV: ``;``, a header row, microseconds, millimetres, one file a camera.
+Azure Kinect: ``;``, a header row, microseconds, millimetres, one file a camera. Kinect v2: no header, 100-ns ticks,
+metres, a tracking state for each of 25 joints, one file a camera. KERAAL: a Kinect v2 and optical targets of one
+movement, without time stamps.
 
-Kinect v2 CSV: no header, 100-ns ticks, metres, a tracking state for each of 25 joints, one file a camera.
-
-Joint centres from rigid targets on the skin: the point that stays fixed on both of two neighbouring segments.
-
-The symmetrical centre of rotation estimation of Ehrig et al. (2006), A survey of formal methods for determining the
-centre of rotation of ball joints, J. Biomech. 39, 2798-2809; with a weak pull of the centre towards both targets,
-which decides along the axis of a hinge, where the movement does not.
-
-Our log from the text files that skeleton recordings come in, one module a format.
+Optical targets lie on the skin. The joint centre is the point that stays fixed in both neighbouring segments, by the
+symmetrical centre of rotation estimation of Ehrig et al. (2006), A survey of formal methods for determining the centre
+of rotation of ball joints, J. Biomech. 39, 2798-2809. A weak term pulls the centre towards both targets: it decides
+along the axis of a hinge, where the movement does not.
 """
 
 from __future__ import annotations
@@ -91,7 +88,7 @@ def _joints(where: str, columns: list[str]) -> dict[str, int]:
 
 
 def _places(where: str, columns: list[str]) -> int:
-    """Number of joints, after a look at every column's name."""
+    """Number of joints, from the names of all columns."""
     count = (len(columns) - 2) // 4
     wanted = ["timestamp", "body_idx"]
     for name in columns[2::4]:
@@ -172,7 +169,14 @@ class Pivot:
     below_m: Floats  # (3,)
 
     def at(self, turn_a: Floats, place_a: Floats, turn_b: Floats, place_b: Floats) -> Floats:
-        """The centre (3,) when the targets have these rotations (3, 3) and places (3,): midway of what both say."""
+        """The centre (3,) when the targets have these rotations (3, 3) and places (3,): midway of what both say.
+
+        Args:
+            turn_a: (3, 3) rotation of the target above the joint.
+            place_a: (3,) position of the target above the joint [m].
+            turn_b: (3, 3) rotation of the target below the joint.
+            place_b: (3,) position of the target below the joint [m].
+        """
         return 0.5 * (turn_a @ self.above_m + place_a + turn_b @ self.below_m + place_b)
 
 

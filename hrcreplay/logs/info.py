@@ -1,4 +1,4 @@
-"""What is in a log and what is missing for the next step."""
+"""Summary of a log: what it contains, and what is missing for the next step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What kind of log a path is, and its files as streams."""
+"""The files of a log: detection of their format, and the files as streams of messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MCAP files: ours, and those of ROS 1 and ROS 2. Indexed, not indexed, or broken off."""
+"""MCAP files, of our own format, ROS 1 or ROS 2, as streams of messages; also without an index, or truncated."""
 
 from __future__ import annotations
 

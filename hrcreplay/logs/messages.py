@@ -1,10 +1,7 @@
-"""Raw messages of any kind of file, and how several files or chunks become one stream in order of arrival.
+"""Types that all log formats share: messages, topics, skeleton rows, and the interface of a decoder.
 
-Topics and message types of our own log; skeleton.proto has the messages.
-
-Which joint of which tracker is which of our POINTS. What a tracker lacks is left missing.
-
-What every skeleton decoder gives: rows, one a body a frame.
+Also the topics of our own log (skeleton.proto has its messages), the joints of other trackers that correspond to our
+POINTS (those that a tracker lacks stay missing), and the merging of files and chunks by arrival.
 """
 
 from __future__ import annotations

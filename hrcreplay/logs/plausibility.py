@@ -1,7 +1,7 @@
-"""Whether what a log shows can be a person: size, sides, uprightness, what was never measured.
+"""Checks whether the bodies of a log can be a person: size, left and right, uprightness, limbs never measured.
 
-What is odd is a note. What is certainly no person (a unit mistaken) is refused, with what would mend it. All of it is
-judged by medians: a tracker that errs now and then is none of it.
+What is unusual becomes a note. What is certainly no person (a wrong unit) is refused, with what would correct it. All
+checks use medians, so that occasional errors of a tracker change nothing.
 """
 
 from __future__ import annotations

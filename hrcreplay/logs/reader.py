@@ -1,7 +1,4 @@
-"""Opens a log of any supported kind as one lazy, time-ordered stream of records.
-
-Which topics of a log carry skeletons, and which decoder reads each.
-"""
+"""Opens a log of any supported format and reads its records in order of time; finds its skeleton topics."""
 
 from __future__ import annotations
 

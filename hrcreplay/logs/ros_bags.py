@@ -1,10 +1,7 @@
-"""ROS 1 bags without an index, or with a broken one: read by going through their chunks once.
+"""ROS 1 bags and sqlite3 files of ROS 2 bags as streams of messages, read without ROS.
 
-Layout: http://wiki.ros.org/Bags/Format/2.0
-
-ROS messages from their bytes, without ROS: by the definitions in the log, else by those of the known releases.
-
-ROS 1 bags and the sqlite3 files of ROS 2 bags, through rosbags.
+Messages are decoded by the definitions in the log, else by those of the known releases. ROS 1 bags without an index, or
+with a broken one, are read by going through their chunks once. Layout: http://wiki.ros.org/Bags/Format/2.0
 """
 
 from __future__ import annotations

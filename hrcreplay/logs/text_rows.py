@@ -1,4 +1,4 @@
-"""What the importers share: numbers out of text lines with their place, and rows merged by time into a log."""
+"""Functions that the importers share: numbers from text lines with error positions, and rows merged into a log."""
 
 from __future__ import annotations
 
@@ -87,6 +87,12 @@ def _is_number(text: str) -> bool:
 def time_stamp_ns(where: str, text: str, unit_ns: int, before_ns: int) -> int:
     """A time stamp [ns], not negative, that must not be before ``before_ns``.
 
+    Args:
+        where: ``file:line`` for messages.
+        text: Time stamp as the file has it.
+        unit_ns: Length of its unit [ns].
+        before_ns: Time stamp of the row before [ns].
+
     Raises:
         LogError: Not a whole number, negative or going backwards.
     """
@@ -104,7 +110,15 @@ def time_stamp_ns(where: str, text: str, unit_ns: int, before_ns: int) -> int:
 def skeleton_row(
     t_ns: int, body: int, found: Mapping[str, int] | list[int], points_m: Floats, confidence: Floats
 ) -> ImportedSkeleton:
-    """A row in the order of POINTS from a sensor's own joints; ``found`` tells where each stands."""
+    """A row in the order of POINTS from a sensor's own joints; ``found`` tells where each stands.
+
+    Args:
+        t_ns: Time of the frame [ns].
+        body: Identity of the body.
+        found: Index of the sensor's joint for each of POINTS, by name or in the order of POINTS.
+        points_m: (k, 3) the sensor's joints [m].
+        confidence: (k,) of the joints, in [0, 1].
+    """
     index = [found[name] for name in POINTS] if isinstance(found, Mapping) else found
     points, trust = points_m[index], confidence[index]
     missing = ~np.isfinite(points).all(axis=1)

@@ -1,7 +1,4 @@
-"""What travels in a log beside the skeletons: cameras' poses, task, base, joints, truth.
-
-What a log says of itself and the tracks that travel in it beside the camera frames.
-"""
+"""What a log holds beside the skeletons: camera poses, task, robot base, recorded joints, ground truth."""
 
 from __future__ import annotations
 

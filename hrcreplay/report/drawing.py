@@ -1,6 +1,6 @@
-"""The house style of every figure: colours that colour-blind readers can tell apart, few lines, units on every axis.
+"""Shared drawing functions: figure style and export, and swept volumes in orthographic projection.
 
-Swept volumes as a viewer sees them: convex hulls grown by the limb's radius, in orthographic projection.
+The colours can be told apart by readers with colour vision deficiency.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Figures of the person: swept volumes (Fig. 17), one coordinate (Fig. 18), all joints, and errors.
-
-The figure of the data that went in.
-"""
+"""Figures of the person: data quality, swept volumes (Fig. 17), joint coordinates (Fig. 18), fusion error."""
 
 from __future__ import annotations
 
@@ -131,7 +128,14 @@ def _scale_bar(ax: Axes, right: float, low: float) -> None:
 
 
 def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
-    """Fig. 18: one coordinate as each camera saw it, as fused and, where the log has it, as it was; and the errors."""
+    """Fig. 18: one coordinate as each camera saw it, as fused and, where the log has it, as it was; and the errors.
+
+    Args:
+        run: Tables of the run.
+        t0_ns: Instant of time zero [ns].
+        gap_s: A line is broken where a camera was silent for longer [s].
+        joint: Coordinate to draw, one of JOINTS.
+    """
     found = errors(run, gap_s)
     unit, factor, error_unit, error_factor = (
         ("deg", 180 / np.pi, "deg", 180 / np.pi) if joint in ANGLES else ("m", 1.0, "mm", 1e3)

@@ -1,7 +1,4 @@
-"""Figures of the robot's motion: its path (Fig. 13), its speed (Fig. 14), its status, and how often it stood.
-
-Figure of the robot: the capsules that stand for its links, beside what the person could reach.
-"""
+"""Figures of the robot: path (Fig. 13), speed (Fig. 14), status, stationary share, link capsules."""
 
 from __future__ import annotations
 
@@ -35,6 +32,12 @@ def path(
 
     The detail looks at the vertical plane that holds the deviation, so its length is seen undistorted. The swept
     volumes are those stored last before that tick, in outline.
+
+    Args:
+        motion: Rows of motion.parquet.
+        occupancy: Rows of occupancy.parquet; None without stored volumes.
+        t0_ns: Instant of time zero [ns].
+        T_world_base: (4, 4) pose of the robot's base, drawn as a square; None: not drawn.
     """
     reference, tcp = vectors(motion, "ref"), vectors(motion, "tcp")
     feet = path_feet(tcp, reference)
@@ -198,7 +201,16 @@ def status(
     near_m: float,
     slow_m_per_s: float,
 ) -> Figure:
-    """What the plan and each baseline did over time, and when each stood near the person though it should move."""
+    """What the plan and each baseline did over time, and when each stood near the person though it should move.
+
+    Args:
+        motion: Rows of motion.parquet.
+        baselines: Name of each baseline -> rows of its motion.
+        method: Method of the plan.
+        t0_ns: Instant of time zero [ns].
+        near_m: The person is near at a separation of at most this [m].
+        slow_m_per_s: The robot stands where its TCP is slower than this [m/s].
+    """
     tables = {f"plan: {method}": motion, **baselines}
     figure = drawing.new_figure(0.95 + 0.62 * len(tables))
     ax = drawing.panels(figure, 1, left_in=0.9, top_in=0.36)[0][0]

@@ -1,4 +1,7 @@
-"""Which limbs the cameras measured: one that they did not is where the model supposes it, and a reader has to know."""
+"""Which limbs the cameras measured, and for how much of the time.
+
+An unmeasured limb is where the model supposes it, so a reader has to know.
+"""
 
 from __future__ import annotations
 

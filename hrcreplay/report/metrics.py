@@ -1,6 +1,6 @@
-"""Time series as the report needs them: interpolation, derivatives, stretches, and fewer points for drawing.
+"""The table of metrics.json, and the time series functions that metrics and figures share.
 
-The table that metrics.json holds: name -> value, unit and meaning; null with a reason where one does not apply.
+A metric has a value, a unit and a meaning; one that does not apply is null with a reason.
 """
 
 from __future__ import annotations
@@ -23,7 +23,15 @@ class MetricTable:
         self._metrics: dict[str, Metric] = {}
 
     def add(self, name: str, value: float | str | None, unit: str, meaning: str, *, reason: str = "no samples") -> None:
-        """Adds one metric; ``reason`` says why it is null, if it is."""
+        """Adds one metric; ``reason`` says why it is null, if it is.
+
+        Args:
+            name: Key in metrics.json.
+            value: Number or text; None, or not finite: null.
+            unit: Unit of the value, ``1`` for a count or a share.
+            meaning: What it says, in a few words.
+            reason: Why it is null, if it is.
+        """
         if not isinstance(value, str) and value is not None:
             number = value.item() if isinstance(value, np.generic) else value
             value = number if np.isfinite(number) else None

@@ -1,7 +1,4 @@
-"""Errors of the cameras and of the fused state against ground truth.
-
-Metrics of the data that went in, and of the volumes that came out of it.
-"""
+"""Metrics of the input data, of the fused state against ground truth, and of the swept volumes."""
 
 from __future__ import annotations
 

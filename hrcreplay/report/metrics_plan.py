@@ -1,10 +1,9 @@
-"""Metrics of the robot's motion: what safety took, and what it cost the task.
+"""Metrics of the robot's motion: separation, stops, path deviation, and progress along the programme.
 
-The pace that a robot kept: how far it came itself along its programme, in the programme's own time.
-
-The reference may run ahead of the robot (by the leash, or without end where it does not wait), so its time says nothing
-of the way that was made. Counted is the robot's foot on the programmed path: the nearest point of the next stretch of
-it, which never goes back and never passes the reference. What the programme takes to the foot is the time reached.
+The reference may be ahead of the robot (by the leash, or without bound where it does not wait), so its time does not
+say how far the robot came. Progress is measured at the foot point of the TCP on the programmed path: the nearest point
+of the next section of the path, which never moves back and never passes the reference. The programmed time at the foot
+point is the time that the robot reached.
 """
 
 from __future__ import annotations
@@ -214,7 +213,17 @@ def add_plan(
     stationary_m_per_s: float,
     leash_m: float,
 ) -> None:
-    """Everything about the motion, the baselines' likewise, and the paper's own figures beside them."""
+    """Everything about the motion, the baselines' likewise, and the paper's own figures beside them.
+
+    Args:
+        metrics: Table that the metrics are added to.
+        motion: Rows of motion.parquet; None where nothing was planned.
+        baselines: Name of each baseline -> rows of its motion.
+        method: Method of the plan.
+        near_m: The person is near at a separation of at most this [m].
+        stationary_m_per_s: The robot stands where its TCP is slower than this [m/s].
+        leash_m: How far the TCP may be from the reference before the reference waits [m].
+    """
     if motion is None:
         metrics.add("plan_method", None, "name", "method of the plan", reason="not planned")
     else:

@@ -1,4 +1,4 @@
-"""report.html: one self-contained page, the same bytes for the same run."""
+"""The HTML page of a run: one self-contained file, the same bytes for the same run."""
 
 from __future__ import annotations
 

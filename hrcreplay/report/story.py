@@ -1,8 +1,6 @@
-"""The answer in words and headline numbers. Says what the replay shows, and never more than that.
+"""Results of a run in words: answers, headline numbers, defects of the log, and a line for each stage.
 
-What was wrong with a log, in lines for a page's first screen and a terminal.
-
-A run in a line for each stage, from the metrics that its page shows.
+They state what the replay shows, and no more than that.
 """
 
 from __future__ import annotations

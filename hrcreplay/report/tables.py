@@ -1,9 +1,4 @@
-"""Tables of the page: the paper's Table 1 and Table 2 as used, and comparisons of metrics side by side.
-
-Fixed words of the page.
-
-What a run tells of its robot: the chain that was read from a URDF and the capsules around its links.
-"""
+"""Tables of the page and its fixed texts: Table 1 and Table 2 as used, comparisons of metrics, the robot's capsules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""From settings, cell and log to what the stages take. The rooms never see a settings model."""
+"""Builds the stages and the robot from settings, cell and log.
+
+The rooms of the stages get plain values and never see a settings model.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ def log_options(settings: Settings) -> LogOptions:
 
 
 class LogLike(Protocol):
-    """A log, or what stands for one in a live session."""
+    """What the stages need of a log; in a live session a header without one."""
 
     @property
     def header(self) -> Header:
@@ -52,7 +55,7 @@ class LogLike(Protocol):
 
 
 def fusion_stage(job: Job, log: LogLike) -> FusionStage:
-    """Stage 1. A pose of the cell file wins over the log's.
+    """Stage 1 of a job. A camera pose of the cell file has priority over the log's.
 
     Raises:
         LogError: A camera's pose is known to neither.
@@ -84,7 +87,7 @@ def fusion_stage(job: Job, log: LogLike) -> FusionStage:
 
 
 def prediction_stage(job: Job) -> PredictionStage:
-    """Stage 2. Beside a real robot the volumes reach further, by the time until it obeys."""
+    """Stage 2 of a job. For a live robot the latency includes ``live.reaction_s``, so the volumes are larger."""
     occupancy = job.settings.occupancy
     radii = Radii(
         head=occupancy.radius_head_m,
@@ -107,7 +110,7 @@ def prediction_stage(job: Job) -> PredictionStage:
 
 
 def known_robot_base(job: Job, log: LogLike) -> Floats | None:
-    """(4, 4) the robot's base in the world: of the cell file, else of the log."""
+    """(4, 4) pose of the robot's base in the world: of the cell file, else of the log; None where neither has it."""
     if job.cell is not None and job.cell.T_world_base is not None:
         return job.cell.T_world_base
     return log.header.T_world_base
@@ -197,7 +200,7 @@ def planners(job: Job, log: LogLike, start_ns: int) -> dict[str, Planner]:
 
 
 def robot_base(job: Job, log: LogLike) -> Floats:
-    """(4, 4) where the robot stands.
+    """(4, 4) pose of the robot's base in the world, which must be known.
 
     Raises:
         SettingsError: Neither the cell nor the log knows.
@@ -228,7 +231,16 @@ def plan_settings(job: Job, dt_s: float) -> PlanSettings:
 def make_follower(
     job: Job, method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float
 ) -> QpFollower | ScalingFollower:
-    """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on."""
+    """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on.
+
+    Args:
+        job: Settings of the method.
+        method: ``scaling`` for the baseline [24]; every other one is the trajectory generator.
+        model: Robot that follows.
+        path: Programmed path.
+        settings: Section 5 for the length of a tick.
+        s_s: Programmed time at the start [s].
+    """
     if method == "scaling":
         return ScalingFollower(model, path, settings, s_s)
     plan = job.settings.plan

@@ -1,4 +1,4 @@
-"""The third stage: one method following its reference tick by tick, beside the people of each tick."""
+"""Stage 3: a method that follows its reference tick by tick, beside the people of each tick."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes st
 
 
 class FollowerTick(NamedTuple):
-    """What a method found at a tick, and what it decided."""
+    """State, reference and decision of a method at one tick."""
 
     state: RobotState
     point: ReferencePoint  #: of the reference
@@ -130,7 +130,7 @@ class Planner:
 
 @dataclass
 class InitialOverlap:
-    """Whether the robot stands in the person from the first: at every tick of the first second in which one is seen."""
+    """Whether robot and person overlap from the start: at every tick of the first second with a person in view."""
 
     dt_s: float
     ticks: int = 0

@@ -1,6 +1,6 @@
-"""Offline driver: log -> stages -> run folder.
+"""The offline driver: runs the stages of a command on a log and writes the run folder.
 
-Which stages of an earlier run come out the same, by digests of all that the result of each stage depends on.
+Stages of an earlier run are reused where digests show that nothing has changed that their results depend on.
 """
 
 from __future__ import annotations
@@ -49,6 +49,18 @@ def run(
     chunk_ticks: int = 250,
 ) -> Path:
     """Runs the stages up to that of ``command`` on a log or an earlier run.
+
+    Args:
+        command: ``fuse``, ``predict``, ``plan`` or ``report``.
+        source: A log, or the run folder of an earlier command.
+        out: Run folder to make; None: ``reports/<log>/<UTC>-<command>``.
+        config: Settings file, or none.
+        overrides: ``section.key=value`` of the command line, which win over the file.
+        cell_file: Poses of cameras and robot; None: those of the earlier run, else of the log.
+        start_s: Start of the span, from the log's first message [s]; None: as the earlier run, else its beginning.
+        end_s: End of the span, from the log's first message [s]; None: as the earlier run, else its end.
+        smooth: Whether to write the smoothed person too (smooth.parquet).
+        chunk_ticks: Ticks of a batch; changes no result.
 
     Returns:
         The run folder.
@@ -102,6 +114,15 @@ def run_stages(
     job: Job, log: Log, ticks_ns: Ints, size: int, sink: Sink, reused: tuple[str, ...], *, smooth: bool
 ) -> dict[str, Any]:
     """All stages of the job in one pass, without those whose tables were taken over.
+
+    Args:
+        job: What was asked for.
+        log: Log of the job.
+        ticks_ns: (n,) ticks of the run, increasing [ns].
+        size: Ticks of a batch.
+        sink: Where rows, counts and times go.
+        reused: Stages whose tables were taken over from an earlier run.
+        smooth: Whether to write the smoothed person too.
 
     Returns:
         ``counts`` and ``notes`` about the data, for run.json, and ``found_by``: those of each stage that reads the log.

@@ -1,7 +1,4 @@
-"""The report of a run: metrics first, then what only reads them.
-
-Everything that metrics.json holds, from a run's tables alone.
-"""
+"""The report of a run: computes all metrics from its tables, then the figures and the page that show them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The three stages as generators over batches of ticks: each hands its rows on and writes what it leaves behind.
+"""The three stages as generators over batches of ticks, and the progress bar of a run.
 
-What a person at a terminal sees of a run; a pipe sees nothing.
+Each stage passes its rows on to the next and writes its tables. The progress bar shows on a terminal only.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Sink:
 
 @dataclass(frozen=True)
 class FusionStage:
-    """What the first stage needs to know of cameras and person."""
+    """Stage 1: camera poses and clocks, point noise, and the settings of filter and person selection."""
 
     T_world_camera: Floats  #: (c, 4, 4)
     clock_offset_ns: Ints  #: (c,) camera's clock minus the reference camera's
@@ -63,7 +63,7 @@ class FusionStage:
     person_memory_s: float
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
-        """What the frames say of the person, by the clock of the reference camera; see ``person.pick``."""
+        """What the frames say of the person, by the clock of the reference camera; see ``clean.select_person``."""
         memory, mine, found = select_person(
             frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
         )
@@ -73,7 +73,7 @@ class FusionStage:
 
 @dataclass(frozen=True)
 class PredictionStage:
-    """What the second stage needs beside the person."""
+    """Stage 2: limit set, horizon, radii, margins and method of the swept volumes."""
 
     limits: LimitSet
     horizon_s: float
@@ -131,6 +131,14 @@ def fused(
     log: Log, ticks_ns: Ints, size: int, fusion_stage: FusionStage, sink: Sink, *, smooth: bool = False
 ) -> Iterator[HumanStates]:
     """Stage 1: camera frames to the fused person; leaves measurements and state, and ``smooth`` where asked.
+
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks, increasing [ns].
+        size: Ticks of a batch.
+        fusion_stage: Cameras and settings of the stage.
+        sink: Where rows, counts and times go.
+        smooth: Whether to write the smoothed person at the end.
 
     Raises:
         LogError: At the end: what the log shows is certainly no person, or nobody was ever seen.
@@ -193,7 +201,7 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
 
 
 def _oddities(log: Log, stands: list[BodyPosture]) -> Iterator[str]:
-    """What is odd about how the person stands in the world."""
+    """Notes on an unusual posture of the person in the world."""
     for camera, stand in zip(log.header.cameras, stands, strict=True):
         remark = stand.remark(camera)
         if remark is not None:
@@ -201,7 +209,7 @@ def _oddities(log: Log, stands: list[BodyPosture]) -> Iterator[str]:
 
 
 def no_frames(cameras: tuple[str, ...]) -> Measurements:
-    """No frame of any camera."""
+    """An empty table of measurements."""
     return Measurements(
         capture_ns=np.zeros(0, np.int64),
         arrival_ns=np.zeros(0, np.int64),
@@ -217,7 +225,14 @@ def no_frames(cameras: tuple[str, ...]) -> Measurements:
 
 
 def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
-    """Leaves the closed-form joints of the log's noise-free skeleton, where it has one."""
+    """Leaves the closed-form joints of the log's noise-free skeleton, where it has one.
+
+    Args:
+        log: Log to read.
+        start_ns: First instant to write [ns].
+        end_ns: Last instant to write [ns].
+        sink: Where the rows go.
+    """
     for truth in log.truth():
         within = truth.rows((truth.t_ns >= start_ns) & (truth.t_ns <= end_ns))
         if len(within):
@@ -227,7 +242,15 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
 def predicted(
     states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink, *, keep: bool
 ) -> Iterator[tuple[HumanStates, SweptVolumes]]:
-    """Stage 2: the swept volumes of every tick; where ``keep``, leaves those of one tick in ``store_every``."""
+    """Stage 2: the swept volumes of every tick; where ``keep``, leaves those of one tick in ``store_every``.
+
+    Args:
+        states: Batches of the fused person.
+        prediction_stage: Settings of the stage.
+        store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole.
+        sink: Where rows and times go.
+        keep: Whether volumes are stored at all.
+    """
     done = 0
     for batch in states:
         with sink.watch.stage("predict", len(batch)):
@@ -243,7 +266,7 @@ def predicted(
 
 
 def store_volumes(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
-    """Hull vertices and size of some ticks' volumes; a tick without a person leaves none."""
+    """Writes hull vertices and size of some ticks' volumes; a tick without a person has none."""
     t_ns: list[int] = []
     limbs: list[str] = []
     radii: list[float] = []
@@ -290,7 +313,7 @@ def print_note(text: str) -> None:
 
 
 class ProgressBar:
-    """A bar over the ticks of a run's last stage."""
+    """A progress bar over the ticks of a run's last stage; shown on a terminal only."""
 
     def __init__(self, stage: str, ticks: int) -> None:
         self._stage = stage

@@ -1,7 +1,6 @@
-"""All settings, by section, and where they come from.
+"""Loads the settings: defaults < settings file (TOML) < command line (``--set section.key=value``).
 
-Precedence: defaults < settings file (TOML) < command line (``--set section.key=value``).
-Rooms below never see these models: the drivers hand them plain values.
+The rooms of the stages never see these models: the drivers hand them plain values.
 """
 
 from __future__ import annotations

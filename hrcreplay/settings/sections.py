@@ -1,6 +1,6 @@
-"""Sections of the settings, one pydantic model each. Defaults are the paper's where it gives one.
+"""The sections of the settings, one pydantic model each, with units and defaults.
 
-Sections of the settings that only a live session has.
+Defaults are the paper's where it gives one. The last sections are used by live sessions only.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Records as the columns of a run folder's tables, and back. The names are a contract with whoever reads the files."""
+"""Conversion between records and the columns of a run folder's tables. Column names are a contract with readers."""
 
 from __future__ import annotations
 
@@ -94,7 +94,16 @@ def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
 def occupancy_columns(
     t_ns: Ints, limbs: list[str], method: str, radius_m: list[float], volume_m3: list[float], hulls: list[Floats]
 ) -> Columns:
-    """A row per stored tick and limb; ``hulls`` are (m, 3) hull vertices in the world [m], before the radius."""
+    """A row per stored tick and limb; ``hulls`` are (m, 3) hull vertices in the world [m], before the radius.
+
+    Args:
+        t_ns: (n,) ticks [ns].
+        limbs: Limb of each row.
+        method: Method of the swept volumes.
+        radius_m: Radius of the ball around each hull [m].
+        volume_m3: Volume of each hull with its ball [m^3].
+        hulls: (m, 3) hull vertices of each row, before the radius, world [m].
+    """
     return {
         "t_ns": t_ns,
         "limb": _text(limbs),

@@ -1,9 +1,8 @@
-"""A run folder: what a command leaves behind, and how it is read back.
+"""Writing and reading of a run folder.
 
-Written whole or not at all: everything goes to ``<folder>.partial`` first, which takes its final name with the last
-write. Tables are parquet without times or paths in them, so the same log and settings give the same bytes.
-
-Text files that appear whole or not at all.
+A folder is written completely or not at all: everything goes to ``<folder>.partial`` first, which gets its final name
+with the last write. Tables are parquet without times or paths in them, so the same log and settings give the same
+bytes.
 """
 
 from __future__ import annotations

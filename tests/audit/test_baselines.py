@@ -113,7 +113,7 @@ def test_iso_13855_is_the_limb_with_its_approach_speed_around() -> None:
     assert _solid(volumes, 0, "URA").volume_m3() == pytest.approx(capsule)
 
 
-@pytest.mark.parametrize("method", baselines.PEERS)
+@pytest.mark.parametrize("method", baselines.BASELINES)
 def test_the_lower_arm_ends_at_the_tip_of_the_hand(method: str) -> None:
     people = random_states(load_limits("paper"), 4, seed=9)
     volumes = _predict(people, method)
@@ -124,7 +124,7 @@ def test_the_lower_arm_ends_at_the_tip_of_the_hand(method: str) -> None:
         assert solid.distances_m(tip[None])[0] <= solid.radius_m - 0.07 + 1e-9
 
 
-@pytest.mark.parametrize("method", baselines.PEERS)
+@pytest.mark.parametrize("method", baselines.BASELINES)
 def test_a_person_not_known_yet_has_no_volume(method: str) -> None:
     people = states(np.full((2, 12), np.nan), np.full((2, 12), np.nan))
     volumes = _predict(people, method)

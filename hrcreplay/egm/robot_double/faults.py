@@ -1,6 +1,6 @@
-"""What goes wrong on purpose: faults of the link and of the robot, by script or by seed.
+"""Faults injected into the link and the robot, from a script or at random from a seed.
 
-One way of a link with faults: which datagrams come through, when, and what comes beside them.
+``FaultyChannel`` applies those of one direction of the link: which datagrams arrive, when, and in what order.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""What the controller makes of the references it is told: a state machine stepped once a cycle.
+"""The controller's response to position references: a state machine stepped once a cycle, without clock and socket.
 
-The robot's side of a session, without clock and socket. Settings bear the controller's names and units (degrees);
-all that moves is in radians.
+Settings have the controller's names and units (degrees); positions, speeds and accelerations are in radians.
 """
 
 from __future__ import annotations

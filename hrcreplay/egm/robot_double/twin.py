@@ -1,7 +1,4 @@
-"""A robot that is not there: the controller's side of a session, one cycle at a time, without clock or socket.
-
-What the robot double was told and what it did, as tables that grow.
-"""
+"""The simulated controller of one session, computed one cycle at a time without clock or socket, and its record."""
 
 from __future__ import annotations
 
@@ -100,7 +97,16 @@ class TwinRecord:
         told: Correction | None,
         queued: int,
     ) -> None:
-        """Notes a cycle after its step."""
+        """Notes a cycle after its step.
+
+        Args:
+            t_ns: Start of the cycle [ns].
+            session: Number of the session, from 1.
+            packet: What was sent; None where nothing was.
+            servo: State of the controller after the step.
+            told: Message that was read in this cycle; None without one.
+            queued: Messages that still wait in the queue.
+        """
         seqno = -1 if packet is None else packet.seqno
         states = (0, 0, 0) if packet is None else (packet.motors, packet.mci, packet.rapid)
         reference = (_NAN, _NAN) if servo.reference is None else (servo.reference.q, servo.reference.dq)

@@ -1,4 +1,4 @@
-"""What a run of the robot double shows: how it was answered, what it was told, how it came to rest."""
+"""Summary of a run of the robot double: reply times, what was commanded, and how it came to rest after faults."""
 
 from __future__ import annotations
 

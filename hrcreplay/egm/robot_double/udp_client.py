@@ -1,4 +1,4 @@
-"""The robot double at a socket: a UDP client that keeps the period by absolute deadlines."""
+"""The robot double as a UDP client that keeps its cycle time by absolute deadlines."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What answers the robot when control itself has crashed: it brakes from what was sent last, and needs nothing else.
+"""The fallback after a crash of the control process: brakes the robot from the last reply until it stands.
 
-Neither pilot nor stages, session or codec are used: whichever of them failed, the robot is told to stop. Numbers are in
-degrees as they go over the link.
+Controller, stages, protocol and codec are not used, because any of them may have failed. Numbers are in degrees as they
+go over the link.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _COUNTER = 2**32
 
 @dataclass
 class FallbackBrake:
-    """Each axis as fast as it can, Eq. (67), from the last reply on; positions stay within limits."""
+    """Brakes each axis as fast as it can, Eq. (67), starting from the last reply; positions stay within limits."""
 
     ddq_max: Sequence[float]  #: [deg/s^2]
     q_min: Sequence[float]  #: [deg]
@@ -48,7 +48,7 @@ class FallbackBrake:
         return not any(self.dq)
 
     def update_position(self, measured: Sequence[float]) -> None:
-        """Takes where the robot says it is [deg]."""
+        """Takes the measured joints [deg]; starts again from them where they are too far from the last reply."""
         if max(abs(m - q) for m, q in zip(measured, self.q, strict=True)) > self.tracking:
             self.q, self.dq = list(measured), [0.0] * len(measured)
 
@@ -139,7 +139,7 @@ def _record(
     brake: FallbackBrake,
     data: bytes,
 ) -> None:
-    """A row of the motion like any other; what only the stages know is missing in it."""
+    """Records a row of the motion; what only the stages know is missing in it."""
     t_ns = loop.now_ns() if received is None else received.t_ns + loop.anchor_ns
     datagrams = () if received is None else (*received.older, received.data)
     for datagram in datagrams:

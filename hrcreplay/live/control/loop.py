@@ -1,9 +1,8 @@
-"""The control loop: a packet, an answer, a look; everything else is told to others and waited for by nobody.
+"""The control loop: receives a packet, answers it, updates the perception, and hands records to the other processes.
 
-A look that lasts into the next packet makes its answer late. The look after that answer is left out, so that the one
-after it is on time again: what the robot keeps clear of is then a cycle older (`live.reaction_s` has room for that).
-
-Percentiles of many short times in little memory.
+The loop waits for no other process. A perception update that lasts into the next packet delays the answer to it. The
+update after that answer is left out, so that the next answer is on time again; the swept volumes are then one cycle
+older, which `live.reaction_s` allows for.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ _BINS = 20_000  # up to 0.1 s; the last one holds all that took longer
 
 
 class DurationHistogram:
-    """A histogram in steps of 5 us."""
+    """Histogram of durations in steps of 5 us: quantiles of any number of them in constant memory."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, dtype=np.int64)
 
     def add(self, duration_ns: int) -> None:
-        """One more."""
+        """Counts a duration [ns]."""
         self._counts[min(max(duration_ns, 0) // _BIN_NS, _BINS - 1)] += 1
 
     def quantiles_us(self, *shares: float) -> list[float] | None:
@@ -60,19 +59,19 @@ FINAL_ANSWERS = 5
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What the loop itself watches; see sections_live.Live."""
+    """Settings of the control loop; see ``settings.sections.Live``."""
 
     duration_s: float  #: inf: until it is stopped
     sending: bool
     person_late_s: float
     overrun_s: float
     keep_recorder: bool
-    store_every_s: float  #: between two looks whose volumes are recorded whole
+    store_every_s: float  #: between two perception updates whose volumes are recorded complete
 
 
 @dataclass
 class Loop:
-    """One session's loop. ``now_ns`` is the session's clock."""
+    """The control loop of one session."""
 
     controller: SessionController
     link: EgmServer
@@ -83,17 +82,17 @@ class Loop:
     start_ns: int
     screen: HelperProcess | None = None
     caught: Signal = Signal.NONE  #: by the handlers of the operating system's signals
-    signals: Signal = Signal.NONE  #: of the latest turn
+    signals: Signal = Signal.NONE  #: of the latest cycle
     notes: list[str] = field(default_factory=list)
     reply_times: DurationHistogram = field(default_factory=DurationHistogram)
     answers: int = 0
-    skipped: int = 0  #: looks left out
+    skipped: int = 0  #: perception updates left out
     robot: str | None = None
     last: Decision | None = None
     sent: bytes | None = None  #: the latest reply that went to the robot
     sender: Address | None = None  #: where the robot's packets come from
     pending: Received | None = None  #: what is not answered yet
-    stored: bytes | None = None  #: the latest swept volumes that were recorded whole
+    stored: bytes | None = None  #: the latest swept volumes that were recorded complete
     _bodies: list[bytes] = field(default_factory=list)
     _beat_ns: int = 0
     _late: bool = False
@@ -106,13 +105,13 @@ class Loop:
         return time.monotonic_ns() + self.anchor_ns
 
     def begin(self) -> None:
-        """Tells the human side to start."""
+        """Starts the human side."""
         self.link.clear()
         self._beat_ns = self.now_ns()
         self.person.send(b"G" + self.start_ns.to_bytes(8, "little"))
 
     def run_cycle(self) -> bool:
-        """One turn; False when the session is over."""
+        """Runs one cycle: answers a packet and updates the perception; False when the session is over."""
         received = self.pending = self.link.newest()
         signals = self.signals = self._signals()
         if received is None:
@@ -180,7 +179,7 @@ class Loop:
         return skeletons
 
     def note(self, text: str) -> None:
-        """Something worth telling and recording."""
+        """Keeps a note for the user and records it."""
         self.notes.append(text)
         self.recorder.send(codec.encode_event(self.now_ns(), {"what": "note", "text": text}))
 

@@ -1,4 +1,4 @@
-"""A live robot's next step: along the way to its programme, along the programme, or to a stop. Nothing is changed."""
+"""The next step of a live robot: along the approach, along the programme, or to a stop. Pure functions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Follower = QpFollower | ScalingFollower
 
 @dataclass(frozen=True)
 class ControlSetup:
-    """All that a session depends on beside what it hears."""
+    """Everything that the decisions of a session depend on beside its inputs."""
 
     robot: RobotModel
     programme: Reference
@@ -39,7 +39,7 @@ class ControlSetup:
 
 @dataclass(frozen=True, eq=False)
 class MotionState:
-    """Where a robot has got, as far as it was told."""
+    """State of the commanded motion after an answer."""
 
     state: RobotState
     programme_s: float  #: of the programme
@@ -48,7 +48,7 @@ class MotionState:
 
 
 class MotionStep(NamedTuple):
-    """One tick's decision before it is encoded, and where it leads."""
+    """The step of one tick, and the state of the motion after it."""
 
     reference_m: Floats
     reference_speed: float
@@ -57,7 +57,7 @@ class MotionStep(NamedTuple):
 
 
 def start_approach(setup: ControlSetup, motion: MotionState) -> MotionState:
-    """From where the robot stands to where its programme has got."""
+    """Starts the approach from where the robot stands to the point that its programme has reached."""
     goal = setup.programme.sample(motion.programme_s).q
     follower = setup.follow(approach(setup.robot, motion.state.q, goal, setup.approach_speed), 0.0)
     follower.state = motion.state
@@ -65,7 +65,11 @@ def start_approach(setup: ControlSetup, motion: MotionState) -> MotionState:
 
 
 def follow(setup: ControlSetup, motion: MotionState, obstacles: Obstacles) -> MotionStep:
-    """One tick along the path."""
+    """One tick along the approach or the programme.
+
+    Raises:
+        ValueError: No approach was started.
+    """
     if motion.follower is None:
         raise ValueError("follow: the robot has not set out")
     follower = copy(motion.follower)

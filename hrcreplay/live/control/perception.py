@@ -1,4 +1,4 @@
-"""The person of a live session: skeletons in, swept volumes out, a look at a time."""
+"""Stages 1 and 2 of a live session: skeletons in, fused person and swept volumes out, one update at a time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hrcreplay.run.stages import NS, FusionStage, PredictionStage, no_frames
 
 
 class Observer:
-    """Stages 1 and 2, fed with what has come since the look before."""
+    """Stages 1 and 2, updated with the skeletons that have come since the update before."""
 
     def __init__(
         self, fusion_stage: FusionStage, prediction_stage: PredictionStage, cameras: tuple[str, ...], gap_s: float
@@ -36,10 +36,10 @@ class Observer:
         self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
-        """What is known of the person at ``t_ns``, which must be later than that of the look before.
+        """Fused person and swept volumes at ``t_ns``, which must be later than that of the update before.
 
         Args:
-            t_ns: By the session's clock; the arrival of all that this look takes.
+            t_ns: By the session's clock; the arrival of all skeletons of this update [ns].
             skeletons: Serialised Skeleton messages. What cannot be read is counted and left out.
         """
         frames = self._frames(t_ns, skeletons)

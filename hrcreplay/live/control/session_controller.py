@@ -1,4 +1,7 @@
-"""What the robot is told in a live session. Pure: the same events in the same order give the same bits."""
+"""The controller of a live session: decides what the robot is told in each cycle.
+
+Pure: the same events in the same order give the same bits, so a recorded session can be computed again.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.control.separation import Obstacles
 
-#: What is kept clear of before the first look: nothing is known, so the robot stands.
+#: Obstacles before the first perception update: nothing is known, so the robot stands.
 _UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=False)
 _STILL = np.zeros(AXES)
 
@@ -64,7 +67,7 @@ class SessionController:
         return self._motion is not None
 
     def counts(self) -> Counter[str]:
-        """What was found of the person's frames and the robot's packets so far."""
+        """Counters of the person's frames and the robot's packets so far."""
         return self.observer.counts + Counter({f"robot {what}": n for what, n in self._session.counts.items()})
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
@@ -80,7 +83,7 @@ class SessionController:
         return self.perception
 
     def prepare(self) -> None:
-        """Makes the step of the next answer beside what was seen last; changes nothing that is said."""
+        """Computes the step of the next answer from the last perception; changes no answer."""
         if self._motion is not None:
             with suppress(Exception):  # the answer fails in the same way, and says so
                 self._ready = self._motion, self._step(self._motion)
@@ -135,7 +138,7 @@ class SessionController:
             self.phase = codec.FOLLOWING
 
     def _refuse(self, t_ns: int, packet_status: PacketStatus) -> None:
-        """Nothing to answer: a robot that must not be moved at all, or nothing of worth."""
+        """Handles datagrams without an answer: a robot that must not be moved at all, or no usable packet."""
         if packet_status.reason in watchdog.REFUSED and not self.stop:
             self._stop(t_ns, packet_status.reason)
             self._motion, self.phase = None, codec.HOLDING
@@ -151,12 +154,12 @@ class SessionController:
         self.phase = codec.HOLDING if self.stop else codec.WAITING
 
     def _begin_session(self, measured: Floats) -> None:
-        """A new session of the robot: whatever was commanded before, it is where it is."""
+        """Starts a new session of the robot from its measured joints, whatever was commanded before."""
         self._motion = MotionState(RobotState(measured, _STILL), self._programme_s)
         self.phase = codec.ECHO
 
     def _apply_watchdog(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> None:
-        """What the watchdog says, and the phase that follows from it."""
+        """Applies the watchdog's verdict to the phase."""
         why = self._stop_reason(event, packet_status, measured)
         if self.phase in (codec.APPROACH, codec.FOLLOWING):
             if why:
@@ -173,7 +176,7 @@ class SessionController:
             self._motion, self.phase = start_approach(self.setup, self._motion), codec.APPROACH
 
     def _stop_reason(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> str:
-        """The reason not to move, or none."""
+        """The watchdog's reason against moving; empty without one."""
         if self.fault is not None:
             return watchdog.FAULT
         why = watchdog.of_signals(event.signals) or watchdog.of_robot(packet_status)
@@ -193,7 +196,7 @@ class SessionController:
             self._motion = replace(self._motion, follower=None)
 
     def _next_step(self, motion: MotionState) -> MotionStep:
-        """The tick's step: the one that is ready, if it is still the one to take."""
+        """The step of this tick: the precomputed one where it is still valid, else a new one."""
         if self._ready is not None and self._ready[0] is motion:
             result = self._ready[1]
         else:
@@ -215,7 +218,7 @@ class SessionController:
         return (brake if motion.follower is None else follow)(self.setup, motion, self._obstacles())
 
     def _obstacles(self) -> Obstacles:
-        """What to keep clear of; unknown where nobody has been seen for too long."""
+        """Swept volumes to keep clear of; unknown where nobody has been seen for too long."""
         if self.perception is None:
             return _UNSEEN
         seen = self.observer.age_s(self.perception.t_ns) <= self.setup.memory_s

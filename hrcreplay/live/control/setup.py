@@ -1,6 +1,7 @@
-"""From a job to a session's pilot, by way of a table that the record keeps: what it says is enough to begin again.
+"""Set-up of a live session: from its settings to the session controller, by way of a table that is recorded.
 
-Every kernel compiled and every library loaded before the robot waits for an answer.
+The table holds everything that the decisions depend on, so that the record alone suffices to build the controller
+again. ``compile_kernels`` compiles every kernel and loads every library before the robot waits for an answer.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ from hrcreplay.settings.load import Settings, load_settings
 
 @dataclass(frozen=True)
 class HeaderOnlyLog:
-    """What stands for a log where there is none yet: see build.Source."""
+    """The header in place of a log that does not exist yet; see ``build.LogLike``."""
 
     header: Header
 
     def joints(self) -> Iterator[JointTrack]:
-        """None: a live robot is told where to go by a task."""
+        """None: a live robot follows a task."""
         return iter(())
 
 
@@ -97,7 +98,7 @@ def _header(
 
 
 def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
-    """All that the session's decisions depend on beside what it hears, as JSON.
+    """Everything that the session's decisions depend on beside its inputs, as JSON.
 
     Raises:
         SettingsError: There is no task, or it is not known where the robot stands.
@@ -135,7 +136,7 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
 
 
 def build_controller(start: dict[str, Any]) -> SessionController:
-    """The pilot of a session at its start.
+    """The controller of a session at its start.
 
     Raises:
         SettingsError: A setting of the table cannot be used.
@@ -156,7 +157,7 @@ def build_controller(start: dict[str, Any]) -> SessionController:
 
 
 def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
-    """What a session depended on, by its start table.
+    """The job of a session, from its start table.
 
     Raises:
         SettingsError: Its settings are not those of this version.
@@ -235,7 +236,7 @@ _LENGTHS_M = np.array([[0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
 
 
 def compile_kernels(start: dict[str, Any]) -> None:
-    """Runs a session of a second and a half with somebody who walks up to the robot."""
+    """Compiles every kernel by a simulated session of 1.6 s with a person who walks up to the robot."""
     controller = build_controller({**start, "sending": False})
     camera, T = next(iter(start["cameras"].items()))
     to_camera = np.linalg.inv(np.array(T))

@@ -1,4 +1,4 @@
-"""The watchdog: everything that must stop a live robot, by name."""
+"""The watchdog: every condition that must stop a live robot, with the name of its stop reason."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
 #: Robots that are not answered at all.
 REFUSED = ("radians", "axes")
 
-#: Reasons by signal, the most telling first.
+#: Reasons by signal, the most important first.
 SIGNALS = {
     Signal.INTERRUPT: INTERRUPTED,
     Signal.TERMINATE: TERMINATED,
@@ -45,7 +45,7 @@ _BASE = 4  #: x, y, heading and bend: the joints that carry the whole person
 
 @dataclass(frozen=True, slots=True)
 class WatchdogSettings:
-    """Settings of the watchdog; see sections_live.Live."""
+    """Settings of the watchdog; see ``settings.sections.Live``."""
 
     fresh_s: float
     uncertain_m: float

@@ -1,4 +1,7 @@
-"""A recording as the person of a live session: its frames at their own pace, read ahead so that none is late."""
+"""Playback of a recording as the source of skeletons: each frame is sent when it is due.
+
+A thread reads ahead, so that no frame is late because of the file.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ class Frame(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """What is known before the first frame."""
+    """Cameras and span of a recording, known before its first frame."""
 
     cameras: tuple[str, ...]
     start_ns: int
@@ -38,7 +41,7 @@ class Opened(NamedTuple):
 
 
 class Note(NamedTuple):
-    """Something to tell the user, when reading has come to it."""
+    """A note for the user, sent when its place in the recording is reached."""
 
     text: str
 
@@ -47,7 +50,7 @@ Item = Opened | Note | list[Frame] | Exception | None  #: None: nothing will fol
 
 
 def playback_items(log: Log, *, repeat: bool) -> Iterator[Item]:
-    """All that a recording gives: its span, its frames chunk by chunk, again and again with ``repeat``, remarks."""
+    """What is read from a recording: its span, its frames chunk by chunk (again and again with ``repeat``), notes."""
     header = log.header
     yield Opened(header.cameras, header.start_ns, header.end_ns)
     newest: dict[str, int] = {}  # last capture of each camera in the passes before

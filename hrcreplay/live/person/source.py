@@ -1,6 +1,6 @@
-"""The human side of a live session, a process of its own: skeletons to the control loop, from a recording or Zenoh.
+"""The process that sends skeletons to the control process, from a recording or from Zenoh.
 
-Messages to control: ``H`` heartbeat every 20 ms, whatever else goes on; ``F`` + a serialized Skeleton, captured in
+Messages to control: ``H`` heartbeat every 20 ms, whatever else happens; ``F`` + a serialized Skeleton, captured in
 session time, ``f`` where another body of the same frame follows; ``N`` + a note in UTF-8; ``Z`` end of the recording.
 The first note is ``ready {"cameras": [...]}``; a note that begins with ``failed`` is the reason why the process ends.
 From control: ``G`` + the session's start as 8 bytes, little-endian [ns], before which no frame is sent. The process
@@ -31,7 +31,7 @@ _SWITCH_S = 0.0005  # a thread that decodes gives way to one whose time has come
 
 
 class SkeletonSource(Protocol):
-    """Where skeletons come from."""
+    """A source of skeletons: a recording or Zenoh."""
 
     def go(self, start_ns: int) -> None:
         """Starts the flow at ``start_ns`` of session time."""
@@ -44,14 +44,14 @@ class SkeletonSource(Protocol):
 
 
 class SendSchedule:
-    """What to send when: heartbeats at fixed instants, and what the source has due. Knows no clock and no socket."""
+    """Schedule of the messages to control: heartbeats at fixed instants, and what is due. No clock, no socket."""
 
     def __init__(self, source: SkeletonSource, now_ns: int) -> None:
         self._source = source
         self._beat_ns = now_ns
 
     def receive(self, message: bytes) -> None:
-        """Takes a message of control's."""
+        """Handles a message from control."""
         if message[:1] == b"G" and len(message) == 9:
             self._source.go(int.from_bytes(message[1:], "little"))
 

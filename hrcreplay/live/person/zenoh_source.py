@@ -1,6 +1,6 @@
-"""Skeletons from live Zenoh keys: our own messages, or the CDR ones that a ROS 2 system puts there.
+"""Skeletons from Zenoh keys: messages of our own format, or the CDR messages of a ROS 2 system.
 
-Arrival is stamped by control. A capture time is taken as it is: it and the session's clock are both unix time.
+Control stamps the arrival. A capture time is used as it is, because it and the session's clock are both Unix time.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _GAP_S = 0.2
 
 @dataclass(frozen=True)
 class KeySettings:
-    """What lies under the keys of one camera."""
+    """Format of the payloads under the keys of one camera."""
 
     key: str  #: key expression: 0/kinect/skeleton/** of rmw_zenoh, kinect/skeleton of the DDS bridge
     payload: str = "hrcreplay"  #: "hrcreplay" or "cdr"
@@ -72,7 +72,7 @@ class CameraSubscription:
                 self._reader(given.key, ros_bags.plain(msgtype))[0].parse(b"")
 
     def take(self, key: str, data: bytes, now_ns: int) -> Iterator[Outgoing]:
-        """What control is to hear of a payload: its bodies, and remarks, each once."""
+        """Messages to control for one payload: its bodies, and notes, each once."""
         try:
             rows = self._rows(key, data, now_ns)
         except Exception as error:  # whatever a stranger sends: it is not worth more than a remark

@@ -1,7 +1,4 @@
-"""The messages of a session's record as the tables of a run folder.
-
-The run folder of a live session: a place for its log at the start, and all the rest from that log at the end.
-"""
+"""The run folder of a live session: made from its log when the session has ended or was killed."""
 
 from __future__ import annotations
 
@@ -68,7 +65,7 @@ class SessionTables:
             self.flush()
 
     def flush(self) -> None:
-        """Writes what waits."""
+        """Writes the rows collected so far."""
         if self._looks:
             self.run.table("state", state_columns(_states(self._looks, self.cameras, self.run.partial)))
         if self._answers:
@@ -190,7 +187,7 @@ def finish(partial: Path) -> Path:
 
 
 def keep_incomplete(partial: Path, crashes: list[str]) -> None:
-    """Leaves of a session that no run folder can be made of its log and its crashes, and says so in run.json."""
+    """Reduces a session without a run folder to its log and its crash files, and says so in run.json."""
     for path in sorted(partial.iterdir()):
         if path.is_dir():
             shutil.rmtree(path)

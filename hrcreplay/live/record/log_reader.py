@@ -1,7 +1,7 @@
-"""Reads the log of a live session back: the messages of the record in their order, and what is wrong with the file.
+"""Reader of a live session's log: the recorded messages in their order, and every flaw of the file.
 
 Every byte of a finished file is under a checksum, and the messages are numbered. Of an unfinished file all but the
-indices is, and those follow from the messages. So nothing changes or goes missing without a flaw that says where.
+indices is, and those follow from the messages. So nothing can change or be missing without a flaw that says where.
 """
 
 from __future__ import annotations
@@ -82,7 +82,9 @@ class SessionLogReader:
         self._first_ns = self._last_ns = -1
 
     def messages(self) -> Iterator[bytes]:
-        """The messages of wire.py as they were recorded, past all flaws; a flaw is in ``flaws`` before what follows it.
+        """The messages of ``codec`` as they were recorded, without what a flaw spoils.
+
+        A flaw is in ``flaws`` before the message that follows it.
 
         Raises:
             LogError: The file cannot be read, or has nothing of a session in it.

@@ -1,8 +1,8 @@
-"""The flight recorder, a process of its own: what control tells it, in order, into a log that outlives a crash.
+"""The recorder process: writes the messages of control, in order, to a log that stays readable after a crash.
 
-From control: the messages of wire.py. To control: ``K`` once, when the file is open. Ends when control does, after it
+From control: the messages of ``codec``. To control: ``K`` once, when the file is open. Ends when control does, after it
 has finished the file; when the file cannot be written, ends at once with a line on standard error and exit code 1.
-Chunks are closed and handed to the system several times a second, so that a kill costs no more than that.
+Chunks are closed and handed to the operating system several times a second, so that a kill loses no more than that.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class SessionLogWriter:
         self._count = 0
 
     def add(self, message: bytes) -> None:
-        """Takes a message of wire.py; the first event with cameras also fills the topics that hold for the session."""
+        """Writes a message of ``codec``; the first event with cameras also fills the topics of the whole session."""
         t_ns = codec.clock_ns(message)
         topic, data = topics.split(message)
         if topic == topics.STRAY:
@@ -138,7 +138,7 @@ class Inbox:
         self.ended.set()
 
     def take(self) -> list[bytes]:
-        """All that has come since."""
+        """Messages that have come since the last call."""
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
 

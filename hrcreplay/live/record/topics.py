@@ -1,7 +1,7 @@
-"""Where the messages of a session's record go in its log, and how they come back.
+"""The topics of a session's log: where each recorded message is stored, and how it is read back.
 
-The log is one of ours, so whatever reads logs reads it: skeletons, cameras, task and base lie on their usual topics.
-The rest of the record lies beside them, with the session's clock as log_time.
+The log has our own format, so every reader of logs reads it: skeletons, cameras, task and base are on their usual
+topics. All other messages are on topics of their own, with the session's clock as log_time.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ UNSENT = "/egm/correction/unsent"  #: datagrams that would have gone: shadow mod
 STRAY = "/live/frame"  #: skeletons of no camera of the session, or not to be read
 EVENT = "/live/event"  #: JSON
 
-ENCODING = "hrcreplay.live"  #: of the messages that only the record has; wire.py says what is in them
+ENCODING = "hrcreplay.live"  #: of the messages that only the record has; ``codec`` says what is in them
 
 _BY_KIND = {
     codec.ROBOT: ROBOT,

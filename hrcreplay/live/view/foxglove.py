@@ -1,4 +1,7 @@
-"""The scene of a live session for Foxglove, over its WebSocket. Nothing is built while nobody watches."""
+"""The 3-D scene of a live session as a Foxglove WebSocket server.
+
+Nothing is computed while no client is connected.
+"""
 
 from __future__ import annotations
 

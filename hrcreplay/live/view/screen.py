@@ -1,9 +1,9 @@
-"""A session's status for a person: a panel on a terminal, a line in a pipe.
+"""The screen process: shows the status of a live session on a terminal, in a pipe or in Foxglove.
 
-What a person sees of a live session, a process of its own, so that no terminal can hold up the control loop.
+A process of its own, so that a terminal that blocks cannot delay the control loop.
 
-From control: ``S`` + a Status as JSON, ten times a second; with ``--foxglove`` also ``J`` + a scene.Cast as JSON, once,
-and ``P`` + a scene.Scene as packed. On a terminal one panel follows the session; a pipe gets a line a second and one at
+From control: ``S`` + a Status as JSON, ten times a second; with ``--foxglove`` also ``J`` + the SceneNames as JSON,
+once, and ``P`` + a packed Scene. On a terminal one panel follows the session; a pipe gets a line a second and one at
 every change; ``--json`` writes each status as a line to standard output. The process ends when control does.
 """
 

@@ -1,4 +1,4 @@
-"""What control tells the screen, ten times a second."""
+"""Sends the status of the control loop to the screen process, ten times a second."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SECOND_NS = 1_000_000_000
 
 
 class StatusPublisher:
-    """Keeps the screen informed; costs the loop nothing between two tellings."""
+    """Sends status and scene to the screen process; does nothing between two messages."""
 
     def __init__(self, loop: Loop, names: dict[str, Any], *, in_3d: bool) -> None:
         self._loop = loop
@@ -35,7 +35,7 @@ class StatusPublisher:
             self._send(b"J" + json.dumps(cast).encode())
 
     def publish(self, *, last: bool = False) -> None:
-        """Tells, where it is time."""
+        """Sends the status where it is due."""
         now_ns = self._loop.now_ns()
         if now_ns - self._told_ns < _EVERY_NS and not last:
             return
