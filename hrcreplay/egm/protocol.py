@@ -32,13 +32,13 @@ LEAP: Final = 1000
 REFUSALS: Final = ("radians", "axes", "no packet", "stale", "duplicate")
 #: Why an answered robot must not be moved.
 STOPS: Final = ("motors off", "EGM error", "converged", "program stopped", "not answered yet", "utilization")
-#: Every reason that ``hear`` gives.
+#: Every reason that ``classify`` gives.
 REASONS: Final = (*REFUSALS, *STOPS)
 
 
 @dataclass(frozen=True, slots=True)
 class PacketStatus:
-    """What a packet means.
+    """How a packet is to be treated.
 
     Attributes:
         answer: It is to be answered, at once.
@@ -59,9 +59,9 @@ class PacketStatus:
 
 
 class EgmSession:
-    """Conversations with one robot, one after the other.
+    """State of our side of the link with one robot, over any number of EGM sessions.
 
-    ``counts`` has the packets and sessions heard, those lost, and each refusal by its reason.
+    ``counts`` has the packets and sessions received, those lost, and each refusal by its reason.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class EgmSession:
         return replace(answered or heard, lost=lost, ended=ended), newest
 
     def reply(self, q: Floats, dq: Floats, t_ns: int) -> Correction:
-        """Answer the packet just heard. What it says is what the robot was told, also where more was asked for.
+        """Answer the packet just classified. Returns what the robot is told, which may be less than what was asked for.
 
         Args:
             q: (6,) joints to be at [rad]. Held inside the limits, and a speed that leads out of them with it; where

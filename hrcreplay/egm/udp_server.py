@@ -23,7 +23,7 @@ _DRAIN: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """What lay in the queue.
+    """The datagrams that were in the socket's queue.
 
     Attributes:
         data: The newest datagram.
@@ -43,7 +43,7 @@ class Received:
 
 
 class EgmServer:
-    """The server's end, from one thread.
+    """The server's socket, used from one thread.
 
     Once a robot has been answered, other senders are not heard until it has been silent for the time-out: two robots
     on one port must not be mixed, nor a stray datagram take the answer of the robot.
@@ -103,12 +103,12 @@ class EgmServer:
             self.vanished += 1
 
     def clear(self) -> None:
-        """Forget what came while nobody was listening."""
+        """Discard the datagrams that are in the queue."""
         while self._drain():
             pass
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the socket."""
         self._socket.close()
 
     def _take(self, wait_ns: int) -> tuple[bytes, Address] | None:

@@ -33,7 +33,7 @@ class LastPosition:
 
 @dataclass(frozen=True)
 class PersonMemory:
-    """What is carried from one table of frames to the next.
+    """State of the person selection between two tables of frames.
 
     Cameras with known poses share the space "world"; every other camera is a space of its own.
     """

@@ -34,13 +34,13 @@ class OwnDecoder:
     """Topic /camera/<name>/skeleton of our own log."""
 
     notes: ClassVar[tuple[str, ...]] = ()
-    always_heard: ClassVar[bool] = False
+    shows_camera_alive: ClassVar[bool] = False
 
     def __init__(self, topic: str, camera: str) -> None:
         self.topic = topic
         self.cameras = (camera,)
 
-    def fresh(self) -> OwnDecoder:
+    def fresh_copy(self) -> OwnDecoder:
         """Itself: it remembers nothing."""
         return self
 
@@ -74,13 +74,13 @@ class MarkerDecoder:
     """
 
     notes: ClassVar[tuple[str, ...]] = ("markers carry no confidence: 1 for every point",)
-    always_heard: ClassVar[bool] = True
+    shows_camera_alive: ClassVar[bool] = True
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self.cameras = (camera_of(topic),)
 
-    def fresh(self) -> MarkerDecoder:
+    def fresh_copy(self) -> MarkerDecoder:
         """Itself: it remembers nothing."""
         return self
 
@@ -144,14 +144,14 @@ class TfDecoder:
     notes: ClassVar[tuple[str, ...]] = (
         "openni has no wrist and no pelvis: the hand and the middle of the hips stand for them",
     )
-    always_heard: ClassVar[bool] = False
+    shows_camera_alive: ClassVar[bool] = False
 
     def __init__(self, topic: str, cameras: tuple[str, ...]) -> None:
         self.topic = topic
         self.cameras = cameras
         self._people: dict[tuple[str, int], _Person] = defaultdict(_Person)
 
-    def fresh(self) -> TfDecoder:
+    def fresh_copy(self) -> TfDecoder:
         """A decoder that has seen nobody yet."""
         return TfDecoder(self.topic, self.cameras)
 
@@ -231,14 +231,14 @@ class GenericDecoder:
     confidence: str | None = None  #: path to an array of confidences in [0, 1]; None: 1 for every finite point
 
     notes: ClassVar[tuple[str, ...]] = ()
-    always_heard: ClassVar[bool] = True
+    shows_camera_alive: ClassVar[bool] = True
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The one sensor."""
         return (self.camera,)
 
-    def fresh(self) -> GenericDecoder:
+    def fresh_copy(self) -> GenericDecoder:
         """Itself: it remembers nothing."""
         return self
 

@@ -42,7 +42,7 @@ class CameraSummary:
 
 @dataclass(frozen=True)
 class Summary:
-    """Everything that ``hrcreplay info`` tells."""
+    """Everything that ``hrcreplay info`` prints."""
 
     path: Path
     kind: str
@@ -89,7 +89,7 @@ class _Tally:
 
 
 def summarize(log: Log) -> Summary:
-    """Goes through the log once.
+    """Summarizes a log in one pass over it.
 
     Args:
         log: An open log; also one without skeletons (``open_log(path, options, skeletons=False)``).

@@ -30,7 +30,7 @@ _IMPORT = ". It is text: hrcreplay import azure|kinect2|keraal {path} --out LOG.
 
 @dataclass
 class LogFiles:
-    """A log's files together."""
+    """All files of a log as one stream of messages."""
 
     path: Path
     kind: str  #: "hrcreplay", "mcap", "ros1" or "ros2"

@@ -45,7 +45,7 @@ class Message(NamedTuple):
     data: bytes
 
     def read(self) -> Any:
-        """Its fields. Raises Undecodable."""
+        """Decodes the fields. Raises Undecodable."""
         return self.topic.parse(self.data)
 
 
@@ -65,7 +65,7 @@ class MessageStream(Protocol):
 
 @dataclass
 class Damage:
-    """What was found wrong with a file."""
+    """Defects of a file."""
 
     defects: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
@@ -77,7 +77,7 @@ class Damage:
 
 
 class LazyChunk(NamedTuple):
-    """A stretch of messages that is opened only when its time has come."""
+    """A sequence of messages that is opened only when the merged stream reaches it."""
 
     start_ns: int  #: no message in it is earlier
     open: Callable[[], Iterator[Message]]  #: the messages in order of arrival
@@ -122,12 +122,12 @@ def skeleton_topic(camera: str) -> str:
 
 
 def camera_info_topic(camera: str) -> str:
-    """Topic of what is known of a camera."""
+    """Topic of a camera's description."""
     return f"/camera/{camera}/info"
 
 
 def camera_of_topic(topic: str) -> str:
-    """The camera that a topic of ours is about."""
+    """The camera of a topic of our own log."""
     return topic.split("/")[2]
 
 
@@ -215,13 +215,13 @@ class SkeletonDecoder(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know of how it reads."""
+        """Notes for the user on how the topic is read."""
 
     @property
-    def always_heard(self) -> bool:
-        """Whether a message without a body still tells that the camera (the only one) is alive."""
+    def shows_camera_alive(self) -> bool:
+        """Whether a message without a body still shows that the camera (the only one) delivers frames."""
 
-    def fresh(self) -> SkeletonDecoder:
+    def fresh_copy(self) -> SkeletonDecoder:
         """The decoder at the start of a pass, with nothing remembered."""
 
     def rows(self, message: Message) -> list[RawSkeleton]:

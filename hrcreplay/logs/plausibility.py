@@ -45,7 +45,7 @@ _UPRIGHT = np.cos(np.radians(60.0))
 
 
 class BodyShape:
-    """The bodies of one camera as they came, before anything is made missing."""
+    """Size and handedness of the bodies of one camera, from the points before cleaning."""
 
     def __init__(self) -> None:
         self._waiting: list[Floats] = []
@@ -65,7 +65,7 @@ class BodyShape:
             there = np.isfinite(points).all(axis=2) & (np.abs(points).max(axis=2) > 0.0)
             points = np.where(there[..., None] & (np.abs(points) < 1e12), points, np.nan)  # so that squares are numbers
             self._statures.append(statures(points))
-            self._sides.append(sides(points))
+            self._sides.append(handedness(points))
 
     @property
     def stature_m(self) -> float:
@@ -81,7 +81,7 @@ class BodyShape:
 
     @property
     def side(self) -> float:
-        """Median of ``sides``: 1 a person, -1 a mirror image; NaN where no foot was seen."""
+        """Median of ``handedness``: 1 a person, -1 a mirror image; NaN where no foot was seen."""
         self._flush()
         return _median(self._sides)
 
@@ -101,7 +101,7 @@ def statures(points: Floats) -> Floats:
     return found
 
 
-def sides(points: Floats) -> Floats:
+def handedness(points: Floats) -> Floats:
     """(n,) the volume that forward (ankle to foot), left and up span, of unit vectors: negative in a mirror image."""
 
     def at(name: str) -> Floats:
@@ -119,7 +119,7 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def size_remark(camera: str, stature_m: float, mend: str) -> str | None:
-    """What is to be said of a body's size; None where a person may have it. ``mend``: where its unit is set."""
+    """A note on a body's size; None where a person may have it. ``mend``: where its unit is set."""
     if np.isnan(stature_m) or PERSON_M[0] <= stature_m <= PERSON_M[1]:
         return None
     text = f"camera {camera}: by its bones the body is {stature_m:.3g} m tall"
@@ -137,8 +137,8 @@ def impossible_size(stature_m: float) -> bool:
     return stature_m > _CERTAIN * PERSON_M[1] or stature_m < PERSON_M[0] / _CERTAIN
 
 
-def side_remark(camera: str, side: float) -> str | None:
-    """What is to be said where a camera sees mirror images."""
+def mirror_remark(camera: str, side: float) -> str | None:
+    """A note where a camera sees mirror images; None where it does not."""
     if not side < -_MIRRORED:
         return None
     return (
@@ -148,7 +148,7 @@ def side_remark(camera: str, side: float) -> str | None:
 
 
 def unmeasured_limbs(seen: Mapping[str, Bools]) -> Iterator[str]:
-    """The limbs that no camera ever placed, by the points (20,) that each ever gave."""
+    """The limbs that no camera ever measured, by the points (20,) that each camera ever gave."""
     ever = np.logical_or.reduce([np.zeros(len(POINTS), dtype=np.bool_), *seen.values()])
     if not ever.any():
         return
@@ -162,7 +162,7 @@ def unmeasured_limbs(seen: Mapping[str, Bools]) -> Iterator[str]:
 
 
 class BodyPosture:
-    """How the bodies of one camera stand in the world."""
+    """Uprightness and height above the floor of the bodies of one camera."""
 
     def __init__(self) -> None:
         self._upright: list[Floats] = []
@@ -178,7 +178,7 @@ class BodyPosture:
         self._pelvis.append(pelvis[:, 2])
 
     def remark(self, camera: str) -> str | None:
-        """What is to be said of a body that no floor carries so."""
+        """A note on a body that cannot stand on the floor like this; None for a plausible one."""
         up, height_m = _median(self._upright), _median(self._pelvis)
         mend = "would be right: T_world_camera with z up and the floor at z = 0; find it with hrcreplay calibrate"
         if up < -_UPRIGHT:

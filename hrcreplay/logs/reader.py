@@ -66,7 +66,7 @@ def choose_decoders(
 
 
 def no_skeletons_message(source: LogFiles) -> LogError:
-    """What to tell the user where no topic carries skeletons."""
+    """The error text for a log in which no topic carries skeletons."""
     return LogError(f"{source.path}: no skeleton topic; found {topic_list(source.topics())}.\n{_HOW}")
 
 
@@ -159,7 +159,7 @@ class Log:
         """
         self._reading.clear()
         self._remarks = [note for decoder in self._decoders for note in decoder.notes]
-        decoders = {decoder.topic: decoder.fresh() for decoder in self._decoders}
+        decoders = {decoder.topic: decoder.fresh_copy() for decoder in self._decoders}
         self._refusals, self.points_seen = [], 0
         cleaner = Cleaner(self.header.cameras, self._options.gap_s, self._reading)
         shapes = {camera: plausibility.BodyShape() for camera in self.header.cameras}
@@ -170,7 +170,7 @@ class Log:
             except Undecodable:
                 self._reading["messages_undecodable"] += 1
                 continue
-            if decoder.always_heard:
+            if decoder.shows_camera_alive:
                 cleaner.note_arrival(decoder.cameras[0], message.arrival_ns)
             for row in rows:
                 shapes[row.camera].add(row.points_m)
@@ -184,7 +184,7 @@ class Log:
         self._judge(cleaner, shapes)
 
     def check(self) -> None:
-        """Refuses what the latest whole pass showed to be certainly no person.
+        """Refuses a log whose latest complete pass showed bodies that are certainly no person.
 
         Raises:
             LogError: What was found, and what would mend it.
@@ -201,7 +201,7 @@ class Log:
                 self._remarks.append(size)
                 if shape.certain and plausibility.impossible_size(shape.stature_m):
                     self._refusals.append(size)
-            side = plausibility.side_remark(camera, shape.side)
+            side = plausibility.mirror_remark(camera, shape.side)
             if side is not None:
                 self._remarks.append(side)
         self._remarks.extend(plausibility.unmeasured_limbs(cleaner.seen))

@@ -304,7 +304,7 @@ def open_db3(path: Path, *, zstd_messages: bool = False) -> MessageStream:
 
 
 class RosStream:
-    """A file that rosbags reads."""
+    """A bag file that the library rosbags reads."""
 
     def __init__(self, path: Path, reader: Callable[[Path], Any], *, cdr: bool, zstd_messages: bool = False) -> None:
         self._path = path

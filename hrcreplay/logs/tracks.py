@@ -20,7 +20,7 @@ from hrcreplay.records import Floats, Ints, Table
 
 @dataclass(frozen=True)
 class Header:
-    """All that is known of a log before its first frame."""
+    """What is known of a log before its first frame."""
 
     path: Path
     kind: str  #: "hrcreplay", "mcap", "ros1" or "ros2"
@@ -45,7 +45,7 @@ class JointTrack(Table):
 
 @dataclass(frozen=True)
 class Truth(Table):
-    """The person by a reference better than the cameras, a row an instant."""
+    """Ground truth of the person, from a reference better than the cameras, a row an instant."""
 
     t_ns: Ints  #: (n,)
     points_m: Floats  #: (n, 20, 3) POINTS in the world [m]
@@ -59,7 +59,7 @@ _RIGID = 1e-2  # of the axes of a pose: those of a recording may have been round
 
 @dataclass(frozen=True)
 class Latched:
-    """What holds for the whole log."""
+    """Values that hold for the whole log: camera poses, task, robot base."""
 
     cameras: tuple[str, ...]  #: declared, in that order
     T_world_camera: dict[str, Floats]
@@ -68,7 +68,7 @@ class Latched:
 
 
 def latched(source: LogFiles) -> Latched:
-    """Reads what our own logs say once. Raises LogError where it is broken."""
+    """Reads the messages that hold for a whole log of our own. Raises LogError where one is broken."""
     kinds = (_OWN_CAMERA, _OWN_TASK, _OWN_BASE)
     names = [topic.name for topic in source.topics() if topic.type in kinds]
     cameras: list[str] = []

@@ -117,7 +117,7 @@ def known_robot_base(job: Job, log: LogLike) -> Floats | None:
 
 
 def robot(job: Job, T_world_base: Floats) -> RobotModel:
-    """The manipulator on its base.
+    """The robot of a job at its place in the world.
 
     Raises:
         SettingsError: The URDF or a robot setting cannot be used.

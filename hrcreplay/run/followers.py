@@ -138,7 +138,7 @@ class InitialOverlap:
     pair: tuple[str, str] = ("", "")  #: link and limb at the first of them
 
     def add(self, states: HumanStates, motion: Motion) -> None:
-        """Takes a batch of ticks."""
+        """Takes a batch of ticks into account."""
         rows = np.flatnonzero(np.isfinite(states.p[:, 0]) & (motion.limb >= 0))
         rows = rows[: max(0, round(_FIRST_S / self.dt_s) - self.ticks)]
         if not len(rows):
@@ -149,7 +149,7 @@ class InitialOverlap:
         self.inside = self.inside and bool((motion.distance_m[rows] <= 0.0).all())
 
     def remark(self) -> str | None:
-        """What is to be said of it; None where there is room between the two."""
+        """The note for the user; None where there is a distance between the two."""
         if not self.ticks or not self.inside:
             return None
         link, limb = self.pair

@@ -268,7 +268,7 @@ def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] 
 
 
 def urdf_digest(settings: Settings) -> str | None:
-    """Of the robot's URDF and the meshes that its link capsules come from; None for the IRB 140."""
+    """Digest of the robot's URDF and of the meshes that its link capsules come from; None for the IRB 140."""
     digests = [file["sha256"] for file in _urdf_inputs(settings)]
     return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else None
 

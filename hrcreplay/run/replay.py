@@ -29,7 +29,7 @@ from hrcreplay.run.job import TABLES, Job, plain_limits, resolve, urdf_digest, v
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
 from hrcreplay.store import run_folder
-from hrcreplay.store.columns import lacks, read_states
+from hrcreplay.store.columns import missing_columns, read_states
 from hrcreplay.store.run_folder import Run, RunWriter, Stopwatch
 
 REPORTS = Path("reports")
@@ -320,7 +320,7 @@ def _damage(folder: Path, stage: str, outputs: Mapping[str, str]) -> str | None:
         path = folder / name
         if not path.exists() or run_folder.sha256(path) != outputs[name]:
             return f"{path} is not as its run left it"
-        if missing := lacks(path):
+        if missing := missing_columns(path):
             return f"{path} is of an earlier version, without {missing[0]}"
     return None
 

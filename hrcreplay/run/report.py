@@ -27,7 +27,7 @@ from hrcreplay.store.run_folder import Run, RunWriter
 
 
 def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
-    """Leaves metrics.json, the figures and report.html beside the tables that have just been written."""
+    """Writes metrics.json, the figures and report.html beside the tables that have just been written."""
     near = _bounds(job.settings.model_dump())
     run = run_folder.read(writer.partial, meta)
     found = compute(run, **near)

@@ -41,7 +41,7 @@ LONGEST_S = 24 * 3600
 
 @dataclass
 class Sink:
-    """Where the stages leave their rows, and what they count on the way."""
+    """Output of the stages: the run folder, times, progress, counters and notes."""
 
     run: RunWriter
     watch: Stopwatch
@@ -63,7 +63,7 @@ class FusionStage:
     person_memory_s: float
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
-        """What the frames say of the person, by the clock of the reference camera; see ``clean.select_person``."""
+        """Measurements of the person, by the clock of the reference camera; see ``clean.select_person``."""
         memory, mine, found = select_person(
             frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
         )
@@ -130,7 +130,7 @@ def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterat
 def fused(
     log: Log, ticks_ns: Ints, size: int, fusion_stage: FusionStage, sink: Sink, *, smooth: bool = False
 ) -> Iterator[HumanStates]:
-    """Stage 1: camera frames to the fused person; leaves measurements and state, and ``smooth`` where asked.
+    """Stage 1: camera frames to the fused person; writes measurements and state, and ``smooth`` where asked.
 
     Args:
         log: Log to read.
@@ -225,7 +225,7 @@ def no_frames(cameras: tuple[str, ...]) -> Measurements:
 
 
 def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
-    """Leaves the closed-form joints of the log's noise-free skeleton, where it has one.
+    """Writes the closed-form joints of the log's ground truth, where it has one.
 
     Args:
         log: Log to read.
@@ -242,7 +242,7 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
 def predicted(
     states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink, *, keep: bool
 ) -> Iterator[tuple[HumanStates, SweptVolumes]]:
-    """Stage 2: the swept volumes of every tick; where ``keep``, leaves those of one tick in ``store_every``.
+    """Stage 2: the swept volumes of every tick; where ``keep``, writes those of one tick in ``store_every``.
 
     Args:
         states: Batches of the fused person.
@@ -291,7 +291,7 @@ def store_volumes(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
 def planned(
     people: Iterable[tuple[HumanStates, SweptVolumes]], planners: dict[str, Planner], sink: Sink
 ) -> Iterator[None]:
-    """Stage 3: what the robot would have done by each method; leaves a motion for each."""
+    """Stage 3: what the robot would have done by each method; writes a motion for each."""
     beside = InitialOverlap(next(iter(planners.values())).dt_s)
     for states, volumes in people:
         for name, planner in planners.items():
@@ -308,7 +308,7 @@ def planned(
 
 
 def print_note(text: str) -> None:
-    """A line for the user beside the result, on standard error."""
+    """Prints a line for the user on standard error, where it does not mix with the result."""
     sys.stderr.write(f"hrcreplay: {text}\n")
 
 
@@ -327,7 +327,7 @@ class ProgressBar:
         return self
 
     def advance(self, stage: str, ticks: int) -> None:
-        """So many ticks of a stage are done."""
+        """Adds ticks that a stage has done."""
         if stage == self._stage:
             self._bar.advance(self._task, ticks)
 

@@ -67,7 +67,7 @@ COLUMNS = {
 }
 
 
-def lacks(path: Path) -> tuple[str, ...]:
+def missing_columns(path: Path) -> tuple[str, ...]:
     """The COLUMNS that a table lacks, as one of an earlier version may; ``motion_<baseline>`` has those of motion."""
     names = set(pq.read_schema(path).names)
     return tuple(name for name in COLUMNS[path.stem.split("_")[0]] if name not in names)
@@ -115,7 +115,7 @@ def occupancy_columns(
 
 
 def motion_columns(motion: Motion) -> Columns:
-    """A row a tick: what the robot was told, and how far it was from the person."""
+    """A row a tick: the commanded motion, and the distance from the person."""
     numbers = range(1, motion.q.shape[1] + 1)
     return {
         "t_ns": motion.t_ns,

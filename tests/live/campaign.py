@@ -1,4 +1,4 @@
-"""Random faults against the pilot, session by session: ``python -m tests.live.campaign --sessions 200``.
+"""Random faults against the controller, session by session: ``python -m tests.live.campaign --sessions 200``.
 
 In counted time, so a session is the same on every machine. What must never happen is looked for in every answer.
 """

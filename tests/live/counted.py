@@ -140,7 +140,7 @@ class CountedLoop(Loop):
 def counted(
     flight: Flight, *, duration_s: float = math.inf, work_s: float = 0.0003, look_s: float = 0.0
 ) -> CountedLoop:
-    """A flight's pilot and robot with the loop between them."""
+    """A flight's controller and robot with the loop between them."""
     clock = Clock()
     settings = LoopSettings(
         duration_s, sending=True, person_late_s=9, overrun_s=0.02, keep_recorder=True, store_every_s=9

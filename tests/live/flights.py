@@ -1,4 +1,4 @@
-"""Sessions in counted time: the pilot that `hrcreplay live` runs, the robot double, and a person who is made up."""
+"""Sessions in counted time: the controller of `hrcreplay live`, the robot double, and a person who is made up."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def start(*overrides: str) -> dict[str, Any]:
 
 @dataclass
 class Flight:
-    """A pilot beside a robot double, cycle by cycle."""
+    """A controller beside a robot double, cycle by cycle."""
 
     overrides: tuple[str, ...] = ()
     walk: Walk = far_away

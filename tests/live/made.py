@@ -1,4 +1,4 @@
-"""A session made up for tests: a small deterministic pilot, and the messages that control would record of it."""
+"""A session made up for tests: a small deterministic controller, and the messages that control would record of it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ START: dict[str, Any] = {
 }
 
 
-class Pilot:
+class MadeController:
     """Sums up what it is told, so that whatever changes in it changes all that follows."""
 
     def __init__(self, start: dict[str, Any]) -> None:
@@ -69,7 +69,7 @@ class Pilot:
         status = 2 if reason else 0
         return Decision(event.t_ns, self.looked_ns, reply, codec.FOLLOWING, status, reason, 1, -1, row)
 
-    def silence(self, t_ns: int, signals: Signal) -> None:  # noqa: ARG002 - part of what a pilot is
+    def silence(self, t_ns: int, signals: Signal) -> None:  # noqa: ARG002 - part of what a controller is
         """A silence moves the robot too."""
         self.silences += 1
 
@@ -84,14 +84,14 @@ def skeleton(number: int, camera: str = "left") -> bytes:
 
 
 def datagram(number: int) -> bytes:
-    """A packet of the robot, as far as this pilot cares."""
+    """A packet of the robot, as far as this controller cares."""
     return egm.RobotMessage(header=egm.Header(seqno=number, tm=4 * number)).SerializeToString()
 
 
-def session(ticks: int, *, controller: Pilot | None = None) -> Iterator[bytes]:
+def session(ticks: int, *, controller: MadeController | None = None) -> Iterator[bytes]:
     """What control records: garbage and a skeleton of nobody among it, a silence, a Ctrl-C near the end."""
     yield codec.encode_event(START_NS, START)
-    controller = controller or Pilot(START)
+    controller = controller or MadeController(START)
     for k in range(ticks):
         t_ns = START_NS + (k + 1) * TICK_NS
         if k == ticks // 2:

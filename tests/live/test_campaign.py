@@ -1,4 +1,4 @@
-"""Faults against the pilot in counted time: what must never happen does not. The long campaign is campaign.py."""
+"""Faults against the controller in counted time: what must never happen does not. The long campaign is campaign.py."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ from tests.live.crashing import BUG, failing
 from tests.live.flights import BEGIN_NS, CYCLE_S, DEMO, Flight
 from tests.live.sessions import children
 
-#: Where a bug may be; those of the stages the pilot catches itself.
+#: Where a bug may be; those of the stages the controller catches itself.
 PLACES: dict[str, tuple[Any, str]] = {
     "fusion": (Observer, "update_perception"),
     "controller": (QpFollower, "step"),

@@ -1,4 +1,4 @@
-"""Those of the ten ways in which other people's EGM programs fail that need our pilot or a robot, in counted time.
+"""Those of the ten ways in which other people's EGM programs fail that need our controller or a robot, in counted time.
 
 The others are in tests/egm/test_pitfalls.py. Each test fails when its handling is taken out.
 """

@@ -26,7 +26,7 @@ def messages() -> list[bytes]:
     return list(made.session(60))
 
 
-def _verdict(folder: Path, messages: list[bytes], build: type[made.Pilot] = made.Pilot) -> Verdict:
+def _verdict(folder: Path, messages: list[bytes], build: type[made.MadeController] = made.MadeController) -> Verdict:
     """What is said of a killed session with this record."""
     run = folder / "run.partial"
     shutil.rmtree(run, ignore_errors=True)
@@ -54,10 +54,10 @@ def test_the_same_again_is_identical(tmp_path: Path, messages: list[bytes]) -> N
     made.record(run / "log.mcap", messages)
     meta = {"complete": True, "outputs": {"log.mcap": run_folder.sha256(run / "log.mcap")}}
     (run / "run.json").write_text(json.dumps(meta))
-    assert verify(run, made.Pilot) == Verdict(identical=True, lines=("identical: 60 ticks, 60 looks",))
+    assert verify(run, made.MadeController) == Verdict(identical=True, lines=("identical: 60 ticks, 60 looks",))
 
 
-class Drifting(made.Pilot):
+class Drifting(made.MadeController):
     """Decides one thing otherwise from the 20th answer on."""
 
     answers = 0
@@ -75,7 +75,7 @@ def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messa
     recorded = codec.decode_decision(messages[_at(messages, codec.DECISION, 19)]).row
     assert recorded is not None
     seconds = 20 * made.TICK_NS / 1e9
-    q = float(recorded[2])  # of q_measured, which this pilot derives from q
+    q = float(recorded[2])  # of q_measured, which this controller derives from q
     assert verdict.lines[0].startswith(f"tick 19 at {seconds:.3f} s: q_measured3: recorded {q!r}, again ")
     assert verdict.lines[0] != f"tick 19 at {seconds:.3f} s: q_measured3: recorded {q!r}, again {q!r}"
     assert verdict.lines[-1] == "identical until then: 20 ticks"
@@ -163,7 +163,7 @@ def test_any_nan_is_like_any_other(tmp_path: Path, messages: list[bytes]) -> Non
 
 
 def test_a_look_that_failed_fails_again(tmp_path: Path, messages: list[bytes]) -> None:
-    class Blind(made.Pilot):
+    class Blind(made.MadeController):
         def update_perception(self, t_ns: int, skeletons: object) -> None:  # type: ignore[override]
             """A bug."""
 
@@ -181,7 +181,7 @@ def test_a_flipped_bit_is_named_with_its_chunk(tmp_path: Path, messages: list[by
     at = len(data) // 2
     data[at] ^= 4
     path.write_bytes(data)
-    verdict = verify(run, made.Pilot)
+    verdict = verify(run, made.MadeController)
     assert not verdict.identical
     assert verdict.lines[0].startswith(f"{path}: byte ")
     assert "between 0." in verdict.lines[0]
@@ -194,7 +194,7 @@ def test_a_changed_file_of_a_complete_session_is_named(tmp_path: Path, messages:
     outputs = {"log.mcap": run_folder.sha256(tmp_path / "log.mcap"), "motion.parquet": "0" * 64, "gone.svg": "0" * 64}
     (tmp_path / "run.json").write_text(json.dumps({"complete": True, "outputs": outputs}))
     (tmp_path / "motion.parquet").write_text("")
-    lines = verify(tmp_path, made.Pilot).lines
+    lines = verify(tmp_path, made.MadeController).lines
     assert lines[:2] == (
         f"{tmp_path / 'gone.svg'}: is gone",
         f"{tmp_path / 'motion.parquet'}: is not as the run left it",

@@ -24,7 +24,7 @@ _ROUNDING_RAD = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """What the axes can do."""
+    """Limits of the axes."""
 
     low_deg: tuple[float, ...]
     """Lower end of the range [deg]."""
@@ -87,7 +87,7 @@ class ServoSettings:
 
 
 class ServoController:
-    """The controller in a session: told one reference a cycle, or none, it moves the robot by one cycle.
+    """The controller in a session: takes at most one reference a cycle and moves the robot by one cycle.
 
     Attributes:
         motors_on: Set from outside. Off, the brakes stop the robot; back on, the last reference is live again.
@@ -120,7 +120,7 @@ class ServoController:
         self.begin()
 
     def begin(self) -> None:
-        """Starts a session: nothing of the one before counts."""
+        """Starts a session; the state of the one before is discarded."""
         self.error = ""
         self.converged = False
         self.ended_ns: int | None = None

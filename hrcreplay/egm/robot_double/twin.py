@@ -25,7 +25,7 @@ from hrcreplay.egm.codec import (
     encode_robot,
     flange_pose,
 )
-from hrcreplay.egm.robot_double.faults import Datagram, Fault, FaultyChannel, lasts
+from hrcreplay.egm.robot_double.faults import Datagram, Fault, FaultyChannel, is_active
 from hrcreplay.egm.robot_double.servo import PERIOD_NS, ServoController, ServoSettings
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats, Ints
@@ -66,7 +66,7 @@ _ARRIVAL = np.dtype(
 
 
 class TwinRecord:
-    """Everything of one run of the double.
+    """Record of one run of the robot double.
 
     Attributes:
         departed_ns: When the packets left that are owed an answer: duplicates and lost ones are not [ns].
@@ -79,8 +79,8 @@ class TwinRecord:
         self.departed_ns: list[int] = []
         self.garbage = 0
 
-    def arrived(self, datagram: Datagram, session: int) -> None:
-        """Notes a datagram as it arrives."""
+    def add_arrival(self, datagram: Datagram, session: int) -> None:
+        """Records a datagram as it arrives."""
         try:
             told = decode_correction(datagram.data)
         except BadPacket:
@@ -88,7 +88,7 @@ class TwinRecord:
             return
         self._arrivals.append((datagram.t_ns, session, told.seqno, told.q, told.dq))
 
-    def cycled(
+    def add_cycle(
         self,
         t_ns: int,
         session: int,
@@ -97,7 +97,7 @@ class TwinRecord:
         told: Correction | None,
         queued: int,
     ) -> None:
-        """Notes a cycle after its step.
+        """Records a cycle after its step.
 
         Args:
             t_ns: Start of the cycle [ns].
@@ -164,7 +164,7 @@ _QUEUE = 1024
 
 @dataclass(frozen=True, slots=True)
 class TwinSettings:
-    """Which controller it is, and where its robot stands."""
+    """Settings of the simulated controller, and the joints at the start."""
 
     servo: ServoSettings = field(default_factory=ServoSettings)
     """The session as RAPID sets it up."""
@@ -192,7 +192,7 @@ class TwinSettings:
 
 
 class TwinCore:
-    """The robot's side. Deterministic: the same instants and datagrams give the same answers for the same seed.
+    """The simulated controller and robot: the same instants, datagrams and seed give the same answers.
 
     Attributes:
         servo: The controller that moves.
@@ -238,11 +238,11 @@ class TwinCore:
         told = self._read()
         self.servo.step(t_ns, told)
         self.ends[-1] = self.servo.error or ("converged" if self.servo.converged else "")
-        self.record.cycled(t_ns, self.session, packet, self.servo, told, len(self._queue))
+        self.record.add_cycle(t_ns, self.session, packet, self.servo, told, len(self._queue))
         return departing
 
     def sent_at(self, t_ns: int) -> None:
-        """Says when the packet of this cycle has really left; it counts as its start otherwise [ns]."""
+        """Sets when the packet of this cycle was really sent; without it the start of the cycle counts [ns]."""
         if self.record.departed_ns and self.record.departed_ns[-1] == self._last_ns:
             self.record.departed_ns[-1] = t_ns
 
@@ -259,7 +259,7 @@ class TwinCore:
         """Applies the faults of the robot. Returns those that are on, by kind."""
         active = {}
         for number, fault in enumerate(self._robot_faults):
-            if not lasts(fault, since_s):
+            if not is_active(fault, since_s):
                 continue
             active[fault.kind] = fault
             if number not in self._happened:
@@ -288,8 +288,8 @@ class TwinCore:
     def _take_in(self, t_ns: int, since_s: float, arrived: Sequence[Datagram]) -> None:
         """Queues what is there by now, after the faults of the way in."""
         for datagram in arrived:
-            self.record.arrived(datagram, self.session)
-            for late in self._in.carry(datagram, since_s):
+            self.record.add_arrival(datagram, self.session)
+            for late in self._in.transmit(datagram, since_s):
                 heapq.heappush(self._coming, (late.t_ns, self._coming_count, late.data))
                 self._coming_count += 1
         while self._coming and self._coming[0][0] <= t_ns:
@@ -331,7 +331,7 @@ class TwinCore:
         """The packet's datagram after the faults of the way out."""
         pose = flange_pose(self.servo.measured)
         data = encode_robot(packet, version=self._settings.version, radians=self._settings.radians, q_cartesian=pose)
-        departing = self._out.carry(Datagram(t_ns, data), since_s)
+        departing = self._out.transmit(Datagram(t_ns, data), since_s)
         owed_ns = [datagram.t_ns for datagram in departing if datagram.data is data]
         if owed_ns and np.isfinite(packet.q).all():  # nobody has to answer nonsense
             self.record.departed_ns.append(min(owed_ns))

@@ -96,7 +96,7 @@ def _run(core: TwinCore, client: socket.socket, duration_s: float | None) -> int
     except KeyboardInterrupt:
         pass  # the report is what remains to be done
     for datagram in _arrived(client):
-        core.record.arrived(datagram, core.session)
+        core.record.add_arrival(datagram, core.session)
     return overruns
 
 

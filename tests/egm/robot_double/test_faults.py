@@ -29,7 +29,7 @@ def carried(fault: Fault, count: int = 100, seed: int = 1) -> list[Datagram]:
     channel = FaultyChannel([fault], (seed,))
     out: list[Datagram] = []
     for number in range(count):
-        out += channel.carry(Datagram(number * PERIOD_NS, b"%03d" % number), number * PERIOD_NS * 1e-9)
+        out += channel.transmit(Datagram(number * PERIOD_NS, b"%03d" % number), number * PERIOD_NS * 1e-9)
     return sorted(out, key=lambda datagram: datagram.t_ns)
 
 
@@ -42,7 +42,7 @@ ALL = [f"{number:03}" for number in range(100)]
 
 def test_a_way_without_faults_changes_nothing() -> None:
     datagram = Datagram(5, b"x")
-    assert FaultyChannel([], (0,)).carry(datagram, 0.0) == [datagram]
+    assert FaultyChannel([], (0,)).transmit(datagram, 0.0) == [datagram]
 
 
 def test_loss_drops_within_its_time_only() -> None:
@@ -87,7 +87,7 @@ def test_a_stall_delivers_all_at_once_in_their_order() -> None:
 
 def test_what_two_stalls_hold_waits_for_the_later() -> None:
     channel = FaultyChannel([Fault("stall", 0.1, 0.3), Fault("stall", 0.15, 0.1)], (0,))
-    assert channel.carry(Datagram(200 * MS, b""), 0.2) == [Datagram(400 * MS, b"")]
+    assert channel.transmit(Datagram(200 * MS, b""), 0.2) == [Datagram(400 * MS, b"")]
 
 
 @pytest.mark.parametrize("kind", ["garbage", "empty"])

@@ -135,7 +135,7 @@ def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
 
 
 class Suspended(Flight):
-    """A control process that the machine stopped from 2 to 2.5 s: nobody tells the pilot of the silence meanwhile."""
+    """A control process that the machine stopped from 2 to 2.5 s: the controller gets no time-out meanwhile."""
 
     def _guide(self, t_ns: int, datagrams: list[bytes]) -> Iterator[bytes]:
         if not 2.0 <= (t_ns - BEGIN_NS) * 1e-9 < 2.5:

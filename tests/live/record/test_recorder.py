@@ -133,10 +133,10 @@ def test_the_file_is_finished_when_control_is_gone(tmp_path: Path, messages: lis
         os.kill(process.popen.pid, signal.SIGINT)
         process.control.close()
         assert process.end() == (0, "")
-    tape = SessionLogReader(path)
-    assert list(tape.messages()) == messages
-    assert tape.finished
-    assert not tape.flaws
+    log = SessionLogReader(path)
+    assert list(log.messages()) == messages
+    assert log.finished
+    assert not log.flaws
 
 
 def test_a_killed_recorder_leaves_a_file_that_opens(tmp_path: Path, messages: list[bytes]) -> None:
@@ -149,10 +149,10 @@ def test_a_killed_recorder_leaves_a_file_that_opens(tmp_path: Path, messages: li
         process.popen.wait()
         with pytest.raises(OSError):  # noqa: PT011 - a pipe or a connection
             process.control.send(messages[0])
-    tape = SessionLogReader(path)
-    assert list(tape.messages()) == messages[:200]
-    assert not tape.finished
-    assert not tape.flaws
+    log = SessionLogReader(path)
+    assert list(log.messages()) == messages[:200]
+    assert not log.finished
+    assert not log.flaws
     assert len(next(iter(open_log(path).frames()))) > 1
 
 
