@@ -44,7 +44,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Resampling:
-    """How often each tick is in each resampled log."""
+    """Weight of each tick in each resampled log: how often it occurs there."""
 
     weights: Floats  #: (draws, n) whole numbers
     block: int  #: ticks a stretch
@@ -108,7 +108,7 @@ def _binomial(hits: float, trials: float) -> tuple[float, float]:
 
 
 def block_ticks(horizon_s: float, rate_hz: float, ticks: int) -> int:
-    """Length of a stretch: three horizons, or the cube root of the ticks of the longest log where that is more."""
+    """Length of a block: three horizons, or the cube root of the ticks of the longest log where that is more."""
     return max(1, int(np.ceil(3.0 * horizon_s * rate_hz)), int(np.ceil(ticks ** (1.0 / 3.0))))
 
 

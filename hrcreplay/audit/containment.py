@@ -48,7 +48,7 @@ class InflatedHull:
 
 
 def union_volume_m3(solids: Sequence[InflatedHull], points: int, first: int = 0) -> tuple[float, float]:
-    """Volume of a union of solids by counting evenly spread points of their common box.
+    """Volume of a union of inflated hulls, from the share of evenly spread points of their common box.
 
     The points are those of an additive recurrence with a generalised golden ratio, so the result is the same every
     time. Its error is told from the spread between four stretches of the sequence, each of which fills the box.

@@ -142,7 +142,7 @@ def _alike(jobs: Sequence[Job]) -> None:
 
 
 def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
-    """All that audit.json holds."""
+    """The content of audit.json."""
     prediction_stage = build.prediction_stage(audits[0].job)
     horizon_s = standstill_s(prediction_stage)
     lengths = [len(audit.outcomes[methods()[0]]) for audit in audits]

@@ -161,7 +161,7 @@ COVERS = ("joints", "limbs")
 
 @dataclass(frozen=True)
 class FitSample:
-    """One log's ticks, the first part to fit on, the last to try the fit on."""
+    """One log's ticks: the first part to fit on, the last part to test the fit on."""
 
     job: Job
     name: str

@@ -88,7 +88,7 @@ class Futures(Table):
 
 @dataclass(frozen=True)
 class Fit:
-    """Bounds (12,) and what they rest on."""
+    """Fitted bounds (12,), and how much motion they rest on."""
 
     v_min: Floats
     v_max: Floats

@@ -13,7 +13,7 @@ import numpy as np
 
 from hrcreplay.audit.bootstrap import Estimate, Resampling
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats, Ints, Table
-from hrcreplay.report.metrics import Metric, MetricTable, stretches
+from hrcreplay.report.metrics import Metric, MetricTable, true_runs
 from hrcreplay.report.tables import PageTable
 
 
@@ -47,7 +47,7 @@ def partly_checked(part: Mapping[str, Any], method: str) -> list[str]:
 
 
 def ticks_of(part: Mapping[str, Any], method: str, limb: str) -> int:
-    """At how many ticks a limb was held against its volume: it was seen to the horizon's end and has a volume."""
+    """At how many ticks a limb was compared with its volume: it was seen to the horizon's end and has a volume."""
     figures = part["methods"][method].get(limb)
     return 0 if figures is None else int(figures["covered_share"]["samples"])
 
@@ -87,7 +87,7 @@ def checked_table(total: Mapping[str, Any], method: str) -> PageTable:
 
 
 def checked_cameras(log: Mapping[str, Any]) -> PageTable:
-    """What of each camera's points was not believed."""
+    """How many of each camera's points were rejected."""
     rows = tuple(
         (camera, *("\u2013" if count is None else str(count) for count in counts.values()))
         for camera, counts in log["cameras"].items()
@@ -117,7 +117,7 @@ _BREAK = 2
 
 @dataclass(frozen=True)
 class Outcome(Table):
-    """One method's volumes held against what the person did, a row an audited tick."""
+    """One method's volumes compared with the recorded motion, a row an audited tick."""
 
     t_ns: Ints  #: (n,)
     beyond_m: (
@@ -251,7 +251,7 @@ def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
 def _joined(escaped: Bools) -> list[tuple[int, int]]:
     """Runs of true, those joined that lie close together."""
     runs: list[tuple[int, int]] = []
-    for first, last in stretches(escaped).tolist():
+    for first, last in true_runs(escaped).tolist():
         if runs and first - runs[-1][1] <= _BREAK:
             runs[-1] = (runs[-1][0], last)
         else:

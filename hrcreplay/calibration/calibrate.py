@@ -27,7 +27,7 @@ _APART_M, _DOUBTFUL_M = 0.15, 0.06
 
 
 class Survey(NamedTuple):
-    """A calibration and where it found the person."""
+    """A calibration, and where in its world the person stood."""
 
     cell: Cell
     lines: tuple[str, ...]  #: main figures, and what --base needs: where the person stood, which way the axes point
@@ -55,7 +55,7 @@ def survey(
     memory_s: float = 2.0,
     search_s: float = 2.0,
 ) -> Survey:
-    """Finds where the cameras of a log stand and how their clocks differ.
+    """Estimates the poses of a log's cameras and the offsets of their clocks.
 
     The world's origin is the floor under the reference camera, z is up and x the camera's viewing direction along the
     floor. Each camera is tied to the reference through the pairs that saw the person together most often.
@@ -129,7 +129,7 @@ def person_positions(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tupl
 
 
 def collect_tracks(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTrack]:
-    """The person as each camera saw it; of a long log, evenly spaced windows."""
+    """The track of the person in each camera's frame; of a long log, in evenly spaced windows."""
     cameras = log.header.cameras
     alone = np.full((len(cameras), 4, 4), np.nan)  # poses are what is sought: continuity in each camera's own frame
     memory = PersonMemory()

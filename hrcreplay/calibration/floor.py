@@ -36,7 +36,7 @@ class Floor:
 
 
 def up_direction(track: SkeletonTrack) -> tuple[Floats, float] | None:
-    """Where up is, by how the person holds the body.
+    """The upward direction, from the direction of the person's body.
 
     Returns:
         Unit vector (3,) in the sensor's frame and its standard deviation [rad]. Who stands keeps the centre of mass

@@ -42,7 +42,7 @@ class SkeletonTrack(Table):
 
 @dataclass(frozen=True)
 class Registration:
-    """How sensor b stands to sensor a."""
+    """Pose and clock of sensor b relative to sensor a."""
 
     T_a_b: Floats  #: (4, 4) takes points of b into the frame of a
     offset_s: float  #: clock of b minus clock of a [s]

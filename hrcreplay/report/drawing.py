@@ -250,7 +250,7 @@ def outline(vertices_m: Floats, radius_m: float, view: View) -> Floats:
     return np.zeros((0, 2)) if hull is None else np.asarray(cloud[hull.vertices])
 
 
-def picture(solids: Sequence[RenderedHull], view: View, low: Floats, high: Floats, pixel_m: float) -> Floats:
+def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: Floats, pixel_m: float) -> Floats:
     """What a viewer sees of solids that may intersect: each pixel shows the frontmost surface, lit from above.
 
     Args:

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch, Polygon
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import RenderedHull, View, bones, outline, picture, view_from
+from hrcreplay.report.drawing import RenderedHull, View, bones, outline, render_hulls, view_from
 from hrcreplay.report.metrics import (
     ANGLES,
     Metric,
@@ -24,8 +24,8 @@ from hrcreplay.report.metrics import (
     columns,
     envelope,
     seconds_from,
-    stretches,
     times,
+    true_runs,
     wrap,
 )
 from hrcreplay.report.metrics_data import cameras, errors, seconds_since
@@ -111,7 +111,7 @@ def _draw_person(
 ) -> None:
     solids = [RenderedHull(vertices, radius, to_rgb(drawing.LIMBS[limb])) for limb, (vertices, radius) in limbs.items()]
     low, high = window
-    image = picture(solids, view, low + centre, high + centre, (high[1] - low[1]) / 320.0)
+    image = render_hulls(solids, view, low + centre, high + centre, (high[1] - low[1]) / 320.0)
     image[..., 3] *= 0.78
     ax.imshow(image, origin="lower", extent=(low[0], high[0], low[1], high[1]), aspect="auto", interpolation="bilinear")
     drawing.set_window(ax, low.tolist(), high.tolist())
@@ -326,4 +326,4 @@ def _frame_bars(seconds: Floats, gap_s: float) -> list[tuple[float, float]]:
 
 def _tick_bars(seconds: Floats, mask: Bools) -> list[tuple[float, float]]:
     last = len(seconds) - 1
-    return [(float(seconds[a]), float(seconds[min(b, last)] - seconds[a])) for a, b in stretches(mask)]
+    return [(float(seconds[a]), float(seconds[min(b, last)] - seconds[a])) for a, b in true_runs(mask)]

@@ -60,7 +60,7 @@ def unmeasured_shares(unseen_s: Floats, memory_s: float) -> Floats:
 
 
 def add_limbs(metrics: MetricTable, run: Run) -> None:
-    """How much of the time each limb went unmeasured, and which of its joints always did."""
+    """Adds for how much of the time each limb was not measured, and which of its joints never were."""
     names = list(COLUMNS["state"])
     shares = np.full(len(LIMBS), np.nan)
     memory_s = float(run.meta.get("settings", {}).get("fusion", {}).get("memory_s", 0.5))

@@ -64,7 +64,7 @@ def difference(a: Floats, b: Floats) -> Floats:
 
 
 def columns(table: pd.DataFrame, suffix: str = "") -> Floats:
-    """(n, 12) the columns of JOINTS with a suffix."""
+    """(n, 12) columns of the JOINTS with a suffix."""
     return table[[joint + suffix for joint in JOINTS]].to_numpy(dtype=float)
 
 
@@ -111,7 +111,7 @@ def central_differences(t_ns: Ints, values: Floats) -> Floats:
     return rate
 
 
-def stretches(mask: Bools) -> Ints:
+def true_runs(mask: Bools) -> Ints:
     """(k, 2) the runs of true in ``mask``, each as [first, past the last)."""
     edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
     return np.column_stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)]).astype(np.int64)

@@ -45,7 +45,7 @@ def test_central_differences_of_a_turning_heading() -> None:
     [([], []), ([0, 0], []), ([1, 1], [[0, 2]]), ([0, 1, 1, 0, 1], [[1, 3], [4, 5]])],
 )
 def test_stretches(mask: list[int], expected: list[list[int]]) -> None:
-    assert metrics.stretches(np.array(mask, dtype=bool)).tolist() == expected
+    assert metrics.true_runs(np.array(mask, dtype=bool)).tolist() == expected
 
 
 def test_envelope_keeps_every_extreme_and_every_gap() -> None:
