@@ -94,7 +94,7 @@ def _file(folder: Path, part: str) -> Path:
     return folder / f"{PREFIX}{part.replace(' ', '_')}.txt"
 
 
-_LARGEST = 1 << 20  # no message is larger; one that is would be cut, never split
+_LARGEST = 1 << 20  #: no message is larger; one that is would be cut, never split
 
 
 class ControlGoneError(Exception):
@@ -147,7 +147,6 @@ class ControlChannel:
 #: Module through which every helper starts; see ``main``.
 ENTRY = "hrcreplay.live.processes"
 
-_LARGEST = 1 << 20  #: no message is larger
 _BUFFER = 4 << 20  #: of messages under way: seconds of them
 _AT_ONCE = 256  #: messages taken at once, so that a flood does not hold up the loop
 

@@ -65,8 +65,8 @@ def choose_decoders(
     return decoders
 
 
-def no_skeletons_message(source: LogFiles) -> LogError:
-    """The error text for a log in which no topic carries skeletons."""
+def no_skeletons_error(source: LogFiles) -> LogError:
+    """The error for a log in which no topic carries skeletons, with what the user can do."""
     return LogError(f"{source.path}: no skeleton topic; found {topic_list(source.topics())}.\n{_HOW}")
 
 
@@ -276,7 +276,7 @@ def open_log(path: Path, options: LogOptions = LogOptions(), *, skeletons: bool 
     source = open_source(path)
     decoders = choose_decoders(source, options.topics, options.decoders)
     if skeletons and not decoders:
-        raise no_skeletons_message(source)
+        raise no_skeletons_error(source)
     return Log(source, decoders, options)
 
 
