@@ -1,4 +1,4 @@
-"""Ballistic bounds against motions whose accelerations were drawn."""
+"""Bounds fitted to each side of a joint, against motions whose accelerations were drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The recorded future of a tick, and what is held against it."""
+"""The recorded future of a tick, and the comparison of volumes with it."""
 
 from __future__ import annotations
 

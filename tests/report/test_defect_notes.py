@@ -1,4 +1,4 @@
-"""What was wrong with a log, where it is seen first."""
+"""The defects of a log on the page and on the terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pace kept, beside motions whose programmed time at every tick is known because they were made from it."""
+"""Progress along the programme, for motions made from a known programmed time at every tick."""
 
 from __future__ import annotations
 
