@@ -6,16 +6,18 @@ from pathlib import Path
 
 __version__ = "0.1.0"
 
+_WITH_KERNELS = ("audit", "calibration", "geometry", "human", "robot")
+
 
 def _keep_kernels_apart() -> None:
     """Gives the compiled kernels of each state of the sources a folder of their own.
 
     numba compares a cached kernel with the file that it stands in, not with those of the functions it calls: after an
-    update it would go on with old code inside new. So the folder's name is a digest of all of them.
+    update it would go on with old code inside new. So the folder's name is a digest of all rooms that hold kernels.
     """
     here = Path(__file__).parent
     digest = hashlib.sha256()
-    for source in sorted([*here.glob("human/*.py"), *here.glob("robot/*.py")]):
+    for source in sorted(path for room in _WITH_KERNELS for path in (here / room).rglob("*.py")):
         digest.update(source.read_bytes())
     cache = here / "__pycache__"
     if not os.access(cache if cache.exists() else here, os.W_OK):

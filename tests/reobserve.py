@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.calibration.registration import MIRROR, Track, rigid
+from hrcreplay.calibration.registration import MIRROR, SkeletonTrack, rigid
 from hrcreplay.records import POINTS, Floats
 
 _ARM = ("CLAVICLE", "SHOULDER", "ELBOW", "WRIST", "HAND", "HANDTIP", "THUMB")
@@ -34,7 +34,7 @@ class Truth:
 POSE = rigid(Rotation.from_rotvec([0.1, np.radians(43.0), 0.08]).as_matrix(), np.array([-1.5, 0.1, 0.6]))
 
 
-def reobserve(track: Track, truth: Truth, seed: int) -> Track:
+def reobserve(track: SkeletonTrack, truth: Truth, seed: int) -> SkeletonTrack:
     """The track as the second camera gives it, 40 % of a frame later.
 
     White noise of 8 mm and errors of 12 mm that last a second on each axis (together the 25 mm by which real pairs
@@ -61,18 +61,20 @@ def reobserve(track: Track, truth: Truth, seed: int) -> Track:
     silent = int(rng.integers(0, len(points)))
     seen[silent : silent + 30] = False
     confidence = np.minimum(track.confidence[:-1], track.confidence[1:])
-    return Track((t_ns + round(truth.offset_s * 1e9))[seen], points[seen], confidence[seen])
+    return SkeletonTrack((t_ns + round(truth.offset_s * 1e9))[seen], points[seen], confidence[seen])
 
 
-def read_azure(path: Path) -> Track:
+def read_azure(path: Path) -> SkeletonTrack:
     """An Azure CSV of one body, read without the importer."""
     with gzip.open(path, "rt") as stream:
         table = np.genfromtxt(stream, delimiter=";", skip_header=1)
     joints = table[:, 2:].reshape(len(table), 32, 4)[:, COLUMNS]
-    return Track((table[:, 0] * 1000).astype(np.int64), joints[..., 1:] / 1000, np.minimum(joints[..., 0] / 2, 1))
+    return SkeletonTrack(
+        (table[:, 0] * 1000).astype(np.int64), joints[..., 1:] / 1000, np.minimum(joints[..., 0] / 2, 1)
+    )
 
 
-def write_azure(track: Track, path: Path, body: int = 1) -> None:
+def write_azure(track: SkeletonTrack, path: Path, body: int = 1) -> None:
     """Writes a track as Azure CSV; joints that POINTS lacks are zero."""
     header = ["timestamp", "body_idx", *(f"{joint} ({axis})" for joint in AZURE for axis in "cxyz")]
     rows = [";".join(header)]
@@ -84,7 +86,7 @@ def write_azure(track: Track, path: Path, body: int = 1) -> None:
     path.write_text("\n".join(rows) + "\n")
 
 
-def walker(seconds: float = 20.0, rate_hz: float = 30.0) -> Track:
+def walker(seconds: float = 20.0, rate_hz: float = 30.0) -> SkeletonTrack:
     """Somebody who walks a figure of eight of 2 m x 1 m and swings the arms, in a world of z up and floor z = 0."""
     t = np.arange(0, seconds, 1 / rate_hz)
     x, y = np.sin(0.6 * t), 0.5 * np.sin(1.2 * t)
@@ -114,7 +116,7 @@ def walker(seconds: float = 20.0, rate_hz: float = 30.0) -> Track:
             f"foot_{side}": at(0.1 + 0.2 * swing, s * 0.1, 0.03 + lift),
         }
     table = np.stack([points[name] for name in POINTS], axis=1)
-    return Track(1_000_000_000 + np.round(t * 1e9).astype(np.int64), table, np.ones(table.shape[:2]))
+    return SkeletonTrack(1_000_000_000 + np.round(t * 1e9).astype(np.int64), table, np.ones(table.shape[:2]))
 
 
 def angle_deg(R: Floats) -> float:

@@ -32,9 +32,19 @@ def test_a_changed_source_gets_a_cache_of_its_own(tmp_path: Path) -> None:
     before = _cache(package)
     assert Path(before).is_relative_to(tmp_path)
     assert _cache(package) == before
-    vectors = package / "human" / "vectors.py"
-    vectors.write_text(vectors.read_text() + "\n# changed\n")
-    assert _cache(package) != before
+    for name in ("geometry/vectors.py", "human/fusion/kalman.py", "robot/model.py", "audit/containment.py"):
+        source = package / name
+        source.write_text(source.read_text() + "\n# changed\n")
+        after = _cache(package)
+        assert after != before
+        before = after
+
+
+def test_every_module_with_kernels_is_in_a_room_that_counts() -> None:
+    package = Path(hrcreplay.__file__).parent
+    with_kernels = [path for path in package.rglob("*.py") if "njit" in path.read_text()]
+    assert with_kernels
+    assert {path.relative_to(package).parts[0] for path in with_kernels} <= set(hrcreplay._WITH_KERNELS)
 
 
 def test_the_users_own_choice_stands(tmp_path: Path) -> None:

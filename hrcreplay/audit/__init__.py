@@ -1,1 +1,1 @@
-"""Recorded people held against their predictions, and limits fitted to them. Imported by the commands alone."""
+"""Comparison of recorded people with the volumes predicted for them, and limit sets fitted to recordings."""

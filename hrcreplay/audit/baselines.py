@@ -1,6 +1,6 @@
-"""How others predict where a person can be: three peers, from their definitions, as swept volumes.
+"""Swept volumes by three methods from the literature, written from their definitions, for comparison with ours.
 
-All know the same as our methods, the fused posture and its velocity, and give the limbs the same thickness.
+All methods get the same input, the fused posture and its velocity, and give the limbs the same thickness.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import ARM_POINTS, HEAD, NECK, PELVIS, skeleton
 from hrcreplay.records import LIMBS, Floats, HumanStates, SweptVolumes
 
-PEERS = ("constant_velocity", "v2_a50", "iso_13855")
+BASELINES = ("constant_velocity", "v2_a50", "iso_13855")
 
 #: Bounds of ``v2_a50`` on a point of the body [m/s], [m/s^2].
 _SPEED, _ACCELERATION = 2.0, 50.0
@@ -22,7 +22,7 @@ _STEP_S = 1e-4
 
 
 def predict(states: HumanStates, *, horizon_s: float, radii_m: Floats, hand_m: float, method: str) -> SweptVolumes:
-    """Swept volumes of a peer: the hull of what each limb's ends can reach, as the limb lies between them.
+    """Swept volumes of a baseline: the hull of what each limb's ends can reach, as the limb lies between them.
 
     ``constant_velocity``: the limb now and after the horizon, its ends moving on as they do.
     ``v2_a50``: every motion of the ends with speeds up to 2 m/s and accelerations up to 50 m/s^2 from their present
@@ -44,8 +44,8 @@ def predict(states: HumanStates, *, horizon_s: float, radii_m: Floats, hand_m: f
     Raises:
         SettingsError: There is no such method.
     """
-    if method not in PEERS:
-        raise SettingsError(f"peer: found {method!r}; choose one of {', '.join(PEERS)}")
+    if method not in BASELINES:
+        raise SettingsError(f"peer: found {method!r}; choose one of {', '.join(BASELINES)}")
     now = ends(states.p, states.lengths_m, hand_m)
     grown = np.zeros(len(LIMBS))
     if method == "iso_13855":

@@ -1,13 +1,14 @@
-"""Statistics of an audit: shares, means and quantiles over ticks, with intervals that know that ticks are not alone.
+"""Means, shares and quantiles over ticks, with bootstrap intervals for samples that depend on each other.
 
-Neighbouring ticks share most of their future and a motion lasts longer than a tick, so n ticks are far fewer than n
-independent looks. All intervals here are from a circular moving-block bootstrap: each log is put together anew from
-stretches of it, three horizons long (longer for long logs, as the cube root of the ticks), and what is estimated is
-estimated again on each such log; the interval holds the middle 95 % of the results. Stretches never cross from one log
-to another, and each log keeps its length.
+Neighbouring ticks share most of their future, and a motion lasts longer than a tick, so n ticks hold much less
+information than n independent samples. The intervals come from a circular moving-block bootstrap: each log is
+resampled from blocks of consecutive ticks, three horizons long (longer for long logs, as the cube root of the ticks),
+the quantity is estimated on each resampled log, and the interval holds the middle 95 % of these estimates. Blocks do
+not cross from one log to another, and each log keeps its length.
 
-Few escapes, or none, leave little to resample. So the interval of a share also holds the exact binomial interval for as
-many independent looks as there are horizons in the logs: an excursion shows in the ticks of the one horizon before it.
+With few escapes, or none, resampling shows little variation. So the interval of a share also holds the exact binomial
+interval for as many independent samples as there are horizons in the logs: an excursion shows in the ticks of the one
+horizon before it.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Estimate:
     high: float
     samples: int  #: ticks behind it
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """JSON form; what is not known is null."""
         numbers = {"value": self.value, "low": self.low, "high": self.high}
         return {k: float(v) if np.isfinite(v) else None for k, v in numbers.items()} | {"samples": self.samples}
@@ -43,23 +44,23 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Resampling:
-    """How often each tick is in each resampled log."""
+    """Weight of each tick in each resampled log: how often it occurs there."""
 
     weights: Floats  #: (draws, n) whole numbers
     block: int  #: ticks a stretch
-    look: float  #: ticks that make one independent look at a share: those of a horizon
+    sample_ticks: float  #: ticks for one independent sample of a share: those of a horizon
 
     def of(self, which: slice) -> Resampling:
         """The same for some of the ticks."""
-        return Resampling(self.weights[:, which], self.block, self.look)
+        return Resampling(self.weights[:, which], self.block, self.sample_ticks)
 
     def share(self, hits: Floats) -> Estimate:
         """Share of ticks with 1 among those with 0 or 1, (n,); NaN is no sample."""
         found = self.mean(hits)
         if found.samples == 0:
             return found
-        looks = max(1.0, found.samples / self.look)
-        low, high = _binomial(found.value * looks, looks)
+        trials = max(1.0, found.samples / self.sample_ticks)
+        low, high = _binomial(found.value * trials, trials)
         return Estimate(found.value, min(found.low, low), max(found.high, high), found.samples)
 
     def mean(self, values: Floats) -> Estimate:
@@ -97,29 +98,29 @@ def _estimate(value: float, resampled: Floats, samples: int) -> Estimate:
     return Estimate(value, min(float(low), value), max(float(high), value), samples)
 
 
-def _binomial(hits: float, looks: float) -> tuple[float, float]:
+def _binomial(hits: float, trials: float) -> tuple[float, float]:
     """Clopper and Pearson's interval of a share; the counts need not be whole."""
     tail = 0.5 * (1.0 - LEVEL)
-    misses = looks - hits
+    misses = trials - hits
     low = betaincinv(hits, misses + 1.0, tail) if hits > 0.0 else 0.0
     high = betaincinv(hits + 1.0, misses, 1.0 - tail) if misses > 0.0 else 1.0
     return float(low), float(high)
 
 
 def block_ticks(horizon_s: float, rate_hz: float, ticks: int) -> int:
-    """Length of a stretch: three horizons, or the cube root of the ticks of the longest log where that is more."""
+    """Length of a block: three horizons, or the cube root of the ticks of the longest log where that is more."""
     return max(1, int(np.ceil(3.0 * horizon_s * rate_hz)), int(np.ceil(ticks ** (1.0 / 3.0))))
 
 
-def resample(lengths: Sequence[int], block: int, look: float, seed: int, draws: int = DRAWS) -> Resampling:
-    """Draws logs anew.
+def resample(lengths: Sequence[int], block: int, sample_ticks: float, seed: int, draws: int = DRAWS) -> Resampling:
+    """Weights of the ticks in logs resampled block by block.
 
     Args:
         lengths: Ticks of each log, in the order in which the values will come.
         block: Ticks a stretch; cut to a log that is shorter.
-        look: Ticks that make one independent look at a share.
+        sample_ticks: Ticks for one independent sample of a share.
         seed: Of the random numbers: the same seed and lengths give the same weights.
-        draws: How many times.
+        draws: Number of resampled logs.
     """
     random = np.random.default_rng(seed)
     parts = []
@@ -135,4 +136,4 @@ def resample(lengths: Sequence[int], block: int, look: float, seed: int, draws: 
             span = (starts[:, k : k + 1] + np.arange(size if k < pieces - 1 else last)) % n
             np.add.at(weights, (np.arange(draws)[:, None], span), 1.0)
         parts.append(weights)
-    return Resampling(np.concatenate(parts, axis=1) if parts else np.zeros((draws, 0)), block, look)
+    return Resampling(np.concatenate(parts, axis=1) if parts else np.zeros((draws, 0)), block, sample_ticks)

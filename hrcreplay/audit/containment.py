@@ -1,4 +1,4 @@
-"""How far points stick out of swept volumes, and how much room several volumes take together."""
+"""Distances of points from swept volumes, and the volume of the union of several of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PARTS = 4
 
 
 @dataclass(frozen=True)
-class Solid:
+class InflatedHull:
     """A convex hull with a ball around every point, Eq. (41)."""
 
     vertices_m: Floats  #: (m, 3) corners of the hull [m]
@@ -30,7 +30,7 @@ class Solid:
     radius_m: float
 
     @classmethod
-    def around(cls, points_m: Floats, radius_m: float) -> Solid:
+    def around(cls, points_m: Floats, radius_m: float) -> InflatedHull:
         """The solid of a set of points (n, 3), all finite [m]."""
         vertices, faces = hull(points_m)
         return cls(np.ascontiguousarray(vertices), np.ascontiguousarray(faces), radius_m)
@@ -47,8 +47,8 @@ class Solid:
         return _distances(np.ascontiguousarray(points_m), self.vertices_m, self.faces)
 
 
-def union_volume_m3(solids: Sequence[Solid], points: int, first: int = 0) -> tuple[float, float]:
-    """Volume of a union of solids by counting evenly spread points of their common box.
+def union_volume_m3(solids: Sequence[InflatedHull], points: int, first: int = 0) -> tuple[float, float]:
+    """Volume of a union of inflated hulls, from the share of evenly spread points of their common box.
 
     The points are those of an additive recurrence with a generalised golden ratio, so the result is the same every
     time. Its error is told from the spread between four stretches of the sequence, each of which fills the box.

@@ -1,4 +1,4 @@
-"""The audit's driver: did the people of some logs stay in the volumes that were predicted for them?"""
+"""The command ``audit``: reads logs, compares people with their predictions and writes the run folder."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import pyarrow as pa
 from hrcreplay.audit import page
 from hrcreplay.audit.bootstrap import DRAWS, LEVEL, Resampling, block_ticks, resample
 from hrcreplay.audit.figures import draw_all
-from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, methods, standstill_s, travel
+from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, joint_travel, methods, standstill_s
 from hrcreplay.audit.metrics import (
     checked_scope,
     curve_point,
     escapes,
-    flat,
+    headline_metrics,
     joint_figures,
     method_figures,
     unchecked_notes,
@@ -31,7 +31,7 @@ from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.records import LIMBS
 from hrcreplay.run import build
 from hrcreplay.run.job import Job, resolve
-from hrcreplay.run.stages import Foresight, say
+from hrcreplay.run.stages import PredictionStage, print_note
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
@@ -63,6 +63,15 @@ def run(
     of all the recorded time. Its intervals draw each log anew by itself, keeping its length: they say how well these
     logs tell of more of the same people at the same work, and nothing of others.
 
+    Args:
+        sources: Logs, or run folders of earlier commands.
+        out: Run folder to make; None: ``reports/<log>/<UTC>-audit``.
+        config: Settings file, or none.
+        overrides: ``section.key=value`` of the command line, which win over the file.
+        cell_file: Poses of cameras and robot; None: those of the earlier run, else of the log.
+        start_s: Start of the span, from the log's first message [s]; None: as the earlier run, else its beginning.
+        end_s: End of the span, from the log's first message [s]; None: as the earlier run, else its end.
+
     Returns:
         The run folder: audit.json, audit.parquet (a row per tick, method and limb), escapes.parquet (a row per
         escape), figures, report.html.
@@ -82,23 +91,23 @@ def run(
         audits = [audit_log(job, name, watch) for job, name in zip(jobs, _names(jobs), strict=True)]
         for audit in audits:
             _write_rows(audit, writer)
-        found = figures(audits)
+        found = audit_results(audits)
         for log in found["logs"]:
             for note in log["notes"]:
-                say(f"{log['log']}: {note}")
+                print_note(f"{log['log']}: {note}")
         _write_escapes(found, writer)
         writer.close_tables()
         writer.text("audit.json", run_folder.to_json(found))
         meta = _meta(jobs, began)
         folder = writer.partial / "figures"
         draw_all(found, folder)
-        metrics = flat(found)
+        metrics = headline_metrics(found)
         writer.text("metrics.json", run_folder.to_json(metrics))
         writer.text("report.html", page.render(found, metrics, meta, folder))
         writer.timing.update(watch.summary(1.0 / AUDIT_HZ))
         writer.finish(meta)
         for line in _summary(found):
-            say(line)
+            print_note(line)
         return writer.folder
 
 
@@ -118,7 +127,7 @@ def _summary(found: dict[str, Any]) -> list[str]:
 
 def _alike(jobs: Sequence[Job]) -> None:
     """Refuses logs whose ticks cannot be counted together."""
-    foresights = [build.foresight(job) for job in jobs]
+    foresights = [build.prediction_stage(job) for job in jobs]
     for what, values in (
         ("occupancy.stop_s and latency_s", [standstill_s(one) for one in foresights]),
         ("occupancy.method", [one.method for one in foresights]),
@@ -133,10 +142,10 @@ def _alike(jobs: Sequence[Job]) -> None:
                 )
 
 
-def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
-    """All that audit.json holds."""
-    foresight = build.foresight(audits[0].job)
-    horizon_s = standstill_s(foresight)
+def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
+    """The content of audit.json."""
+    prediction_stage = build.prediction_stage(audits[0].job)
+    horizon_s = standstill_s(prediction_stage)
     lengths = [len(audit.outcomes[methods()[0]]) for audit in audits]
     block = block_ticks(horizon_s, AUDIT_HZ, max(lengths))
     drawn = resample(lengths, block, horizon_s * AUDIT_HZ, SEED)
@@ -161,12 +170,12 @@ def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
                 "escapes": {method: escapes(outcome, start_ns) for method, outcome in audit.outcomes.items()},
             }
         )
-        logs[-1]["notes"] = [*audit.notes, *unchecked_notes(logs[-1], foresight.method)]
+        logs[-1]["notes"] = [*audit.notes, *unchecked_notes(logs[-1], prediction_stage.method)]
     return {
         "horizon_s": horizon_s,
         "audit_hz": AUDIT_HZ,
         "interval": {"level": LEVEL, "block_ticks": block, "draws": DRAWS, "seed": SEED},
-        "method": foresight.method,
+        "method": prediction_stage.method,
         "own_methods": list(reachable_sets.METHODS),
         "logs": logs,
         "total": {
@@ -182,21 +191,21 @@ def figures(audits: Sequence[LogAudit]) -> dict[str, Any]:
     }
 
 
-def _margins(foresight: Foresight) -> tuple[Any, ...]:
+def _margins(prediction_stage: PredictionStage) -> tuple[Any, ...]:
     """What ``sound`` adds to the model."""
-    occupancy = foresight.occupancy
+    occupancy = prediction_stage.occupancy
     names = ("sigmas", "latency_s", "hand_m", "legs_radius_m", "legs", "residual", "residual_unknown_m")
-    return (*(getattr(occupancy, name) for name in names), foresight.memory_s)
+    return (*(getattr(occupancy, name) for name in names), prediction_stage.memory_s)
 
 
 def _methods(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
-    radii = limb_radii(build.foresight(audits[0].job).occupancy)
+    radii = limb_radii(build.prediction_stage(audits[0].job).occupancy)
     body = dict(zip(LIMBS, radii.tolist(), strict=True))
     return {method: method_figures([audit.outcomes[method] for audit in audits], drawn, body) for method in methods()}
 
 
 def _joints(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
-    went = np.max([travel(audit.recording.joints) for audit in audits], axis=0)
+    went = np.max([joint_travel(audit.recording.joints) for audit in audits], axis=0)
     return {
         method: joint_figures(np.concatenate([audit.joints[method] for audit in audits]), went, drawn)
         for method in reachable_sets.METHODS
@@ -204,7 +213,7 @@ def _joints(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
 
 
 def _curves(audits: Sequence[LogAudit]) -> dict[str, Any]:
-    horizon_s = standstill_s(build.foresight(audits[0].job))
+    horizon_s = standstill_s(build.prediction_stage(audits[0].job))
 
     def point(method: str, factor: float) -> dict[str, Any]:
         outcomes = [audit.curve[method][factor] for audit in audits]

@@ -1,4 +1,4 @@
-"""Figures of an audit: coverage against volume of all methods, limb by limb, and which joint's bound fails."""
+"""Figures of an audit: coverage against volume by method, coverage by limb, and coverage by joint."""
 
 from __future__ import annotations
 

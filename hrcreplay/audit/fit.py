@@ -1,8 +1,7 @@
-"""``fit-limits``: from logs of people to the limit set that holds them.
+"""The command ``fit-limits``: velocity and acceleration bounds fitted to logs, written as a limit set.
 
-What ``fit-limits`` tells the user, line by line.
-
-Fitted accelerations scaled until the volumes, not the joints, hold the people of the logs as often as was asked.
+With ``cover = "limbs"`` the fitted accelerations are scaled until the swept volumes, not the joint intervals, contain
+the people of the logs in the wanted share of the ticks.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ import numpy as np
 from hrcreplay import __version__
 from hrcreplay.audit import fit_limits
 from hrcreplay.audit.bootstrap import Estimate, block_ticks, resample
-from hrcreplay.audit.fit_limits import Fit, Futures, ballistic
-from hrcreplay.audit.log_audit import Window, hold, standstill_s, window
-from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, record
+from hrcreplay.audit.fit_limits import Fit, Futures, fit_each_side
+from hrcreplay.audit.log_audit import RecordedFuture, check_containment, recorded_future, standstill_s
+from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, read_recording
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.limits import load_limits, write_limits
@@ -28,7 +27,7 @@ from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
 from hrcreplay.run import build
 from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job, resolve
-from hrcreplay.run.stages import NS, Bar, Foresight, tick_times
+from hrcreplay.run.stages import NS, PredictionStage, ProgressBar, tick_times
 
 
 def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) -> list[str]:
@@ -89,18 +88,18 @@ _SMALLEST, _HALVINGS = 0.6, 4
 
 
 @dataclass(frozen=True)
-class Held:
-    """One log's person in parts: to fit on, and held back."""
+class SplitPerson:
+    """One log's ticks for the limbs: those to fit on, and those held back."""
 
-    foresight: Foresight
-    training: Window
-    held_back: Window
+    prediction_stage: PredictionStage
+    training: RecordedFuture
+    held_back: RecordedFuture
 
 
-def unchecked(people: Sequence[Held]) -> list[str]:
+def unchecked_parts(people: Sequence[SplitPerson]) -> list[str]:
     """Limbs, and points of other limbs, that were never seen to a horizon's end, so that nothing is said of them."""
     parts = [part for one in people for part in (one.training, one.held_back)]
-    volumes = people[0].foresight.volumes(parts[0].states.rows(slice(0, 0))).limbs
+    volumes = people[0].prediction_stage.volumes(parts[0].states.rows(slice(0, 0))).limbs
     limbs = [limb for limb in BODY if limb not in volumes or not any(part.checked(limb).any() for part in parts)]
     points = [
         f"{point} of {limb}"
@@ -112,24 +111,30 @@ def unchecked(people: Sequence[Held]) -> list[str]:
     return limbs + points
 
 
-def stayed(foresight: Foresight, future: Window, limits: LimitSet) -> Floats:
+def all_limbs_inside(prediction_stage: PredictionStage, future: RecordedFuture, limits: LimitSet) -> Floats:
     """(n,) whether all limbs that were seen stayed in their volumes until the horizon: 1, 0, or NaN where none was."""
-    volumes = replace(foresight, limits=limits).volumes(future.states)
-    worst = hold(volumes, future, np.zeros(len(future.states), dtype=bool)).worst_m()
+    volumes = replace(prediction_stage, limits=limits).volumes(future.states)
+    worst = check_containment(volumes, future, np.zeros(len(future.states), dtype=bool)).worst_m()
     return np.where(np.isfinite(worst), (worst == 0.0).astype(float), np.nan)
 
 
-def tightening_factor(people: Sequence[Held], found: Fit, positions: LimitSet, share: float) -> float:
+def tightening_factor(people: Sequence[SplitPerson], found: Fit, positions: LimitSet, share: float) -> float:
     """The smallest factor on the fitted accelerations with which the volumes hold a share of the training ticks.
 
     Half of the ticks that may be missed are kept in reserve, for other ticks than those fitted on. Ticks that even the
     fitted accelerations do not hold, for what no bound can mend (a limb that is not where the model has it, a joint
     that keeps the standard bounds), do not count: they would drive the bounds of all others up.
+
+    Args:
+        people: One split log each.
+        found: Fit whose accelerations are scaled.
+        positions: Limit set that gives the position bounds.
+        share: Of the training ticks, in (0, 1).
     """
 
     def held(scale: float) -> Bools:
-        limits = scaled(found, scale).onto(positions, positions.name)
-        return np.concatenate([stayed(one.foresight, one.training, limits) == 1.0 for one in people])
+        limits = scale_accelerations(found, scale).onto(positions, positions.name)
+        return np.concatenate([all_limbs_inside(one.prediction_stage, one.training, limits) == 1.0 for one in people])
 
     best = held(1.0)
     low, high = _SMALLEST, 1.0
@@ -140,7 +145,7 @@ def tightening_factor(people: Sequence[Held], found: Fit, positions: LimitSet, s
     return high
 
 
-def scaled(found: Fit, scale: float) -> Fit:
+def scale_accelerations(found: Fit, scale: float) -> Fit:
     """The fit with its own accelerations scaled; joints that keep the standard bounds keep them."""
     by = np.where(found.kept, 1.0, scale)
     return replace(found, a_min=by * found.a_min, a_max=by * found.a_max)
@@ -155,8 +160,8 @@ COVERS = ("joints", "limbs")
 
 
 @dataclass(frozen=True)
-class Sample:
-    """One log's ticks, the first part to fit on, the last to try the fit on."""
+class FitSample:
+    """One log's ticks: the first part to fit on, the last part to test the fit on."""
 
     job: Job
     name: str
@@ -164,7 +169,7 @@ class Sample:
     training: Futures
     held_back: Futures
     outside: bool  #: whether a training posture is outside the standard positions
-    limbs: Held
+    limbs: SplitPerson
 
 
 def run(
@@ -215,7 +220,7 @@ def run(
     limbs: dict[str, Any] = {}
     if cover == "limbs":
         training = Futures.join([sample.training for sample in samples])
-        found = ballistic(training, load_limits(KEPT), BEFORE, horizon_s)
+        found = fit_each_side(training, load_limits(KEPT), BEFORE, horizon_s)
         found, limbs = _tightened([sample.limbs for sample in samples], found, limits, coverage, horizon_s)
         limits = found.onto(limits, out.stem)
     facts = _facts(samples, found, limits, coverage, horizon_s, held_back) | {"covers": cover} | limbs
@@ -242,13 +247,13 @@ def _refuse(logs: Sequence[Path], out: Path, coverage: float, held_back: float, 
 
 
 def _horizon_s(jobs: Sequence[Job]) -> float:
-    horizons = {build.foresight(job).horizon_s for job in jobs}
+    horizons = {build.prediction_stage(job).horizon_s for job in jobs}
     if len(horizons) > 1:
         raise SettingsError(f"occupancy.stop_s: found {sorted(horizons)} s; all logs need one horizon, set it")
     return horizons.pop()
 
 
-def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
+def _sample(job: Job, horizon_s: float, held_back: float) -> FitSample:
     log = open_log(job.log, log_options(job.settings))
     first_ns = log.header.start_ns
     begin_ns = first_ns + round((job.start_s or 0.0) * NS)
@@ -262,61 +267,55 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> Sample:
     rate_hz = job.settings.fusion.rate_hz
     ticks_ns = tick_times(begin_ns, end_ns, rate_hz)
     stage = f"reading {job.log.name}"
-    with Bar(stage, len(ticks_ns)) as bar:
-        recording = record(log, ticks_ns, build.eyes(job, log), lambda n: bar.advance(stage, n))
+    with ProgressBar(stage, len(ticks_ns)) as bar:
+        recording = read_recording(log, ticks_ns, build.fusion_stage(job, log), lambda n: bar.advance(stage, n))
     states, joints = recording.states, recording.joints
     if recording.source != TRUTH:
-        joints = fit_limits.believed(joints, states.unseen_s, SEEN_S)
+        joints = fit_limits.recently_seen(joints, states.unseen_s, SEEN_S)
     every = max(1, round(rate_hz / FIT_HZ))
     ticks = np.arange(0, len(states), every)
-    some = fit_limits.futures(
-        states,
-        ticks[np.isfinite(states.p[ticks]).all(axis=1)],
-        recording.joints_t_ns,
-        joints,
-        horizon_s=horizon_s,
-        memory_s=SEEN_S,
-    )
+    ticks = ticks[np.isfinite(states.p[ticks]).all(axis=1)]
+    some = fit_limits.futures(states, ticks, recording.joints_t_ns, joints, horizon_s=horizon_s, memory_s=SEEN_S)
     training = states.rows(states.t_ns <= cut_ns)
-    return Sample(
+    return FitSample(
         job,
         job.log.name,
         TRUTH if recording.source == TRUTH else SMOOTHED,
         some.rows(some.t_ns + round(horizon_s * NS) <= cut_ns),
         some.rows(some.t_ns > cut_ns),
-        bool(fit_limits.leave(training.p, load_limits(STANDARD)).any()),
+        bool(fit_limits.outside_positions(training.p, load_limits(STANDARD)).any()),
         _limbs(job, recording, cut_ns),
     )
 
 
-def _limbs(job: Job, recording: Recording, cut_ns: int) -> Held:
-    foresight, states = build.foresight(job), recording.states
-    horizon_s = standstill_s(foresight)
+def _limbs(job: Job, recording: Recording, cut_ns: int) -> SplitPerson:
+    prediction_stage, states = build.prediction_stage(job), recording.states
+    horizon_s = standstill_s(prediction_stage)
     horizon_ns = round(horizon_s * NS)
     ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / TIGHTEN_HZ)))
     ticks = ticks[np.isfinite(states.residual_m[ticks, : len(LIMBS)]).all(axis=1)]  # the filter has found the person
     end_ns = states.t_ns[ticks] + horizon_ns
     parts = ticks[end_ns <= cut_ns], ticks[(states.t_ns[ticks] > cut_ns) & (end_ns <= recording.t_ns[-1])]
-    return Held(foresight, *(window(recording, part, horizon_s) for part in parts))
+    return SplitPerson(prediction_stage, *(recorded_future(recording, part, horizon_s) for part in parts))
 
 
 def _tightened(
-    people: Sequence[Held], found: Fit, limits: LimitSet, coverage: float, horizon_s: float
+    people: Sequence[SplitPerson], found: Fit, limits: LimitSet, coverage: float, horizon_s: float
 ) -> tuple[Fit, dict[str, Any]]:
     """The fit with the accelerations that hold the limbs, and what it holds of all logs together and of each."""
     factor = tightening_factor(people, found, limits, coverage)
-    found = scaled(found, factor)
+    found = scale_accelerations(found, factor)
     limits = found.onto(limits, limits.name)
     shares: dict[str, Any] = {}
     for name in ("training", "held_back"):
-        parts = [stayed(one.foresight, getattr(one, name), limits)[:, None] for one in people]
+        parts = [all_limbs_inside(one.prediction_stage, getattr(one, name), limits)[:, None] for one in people]
         shares[name] = _plain(_share(parts, horizon_s, TIGHTEN_HZ))
         shares[f"{name}_by_log"] = [_plain(_share([part], horizon_s, TIGHTEN_HZ)) for part in parts]
-    method, gaps = people[0].foresight.method, unchecked(people)
+    method, gaps = people[0].prediction_stage.method, unchecked_parts(people)
     return found, {"factor": round(factor, 4), "method": method, "not_checked": gaps, "limbs": shares}
 
 
-def _fit(samples: Sequence[Sample], coverage: float, horizon_s: float) -> Fit:
+def _fit(samples: Sequence[FitSample], coverage: float, horizon_s: float) -> Fit:
     training = Futures.join([sample.training for sample in samples])
     try:
         return fit_limits.fit(training, load_limits(KEPT), coverage, horizon_s)
@@ -324,7 +323,7 @@ def _fit(samples: Sequence[Sample], coverage: float, horizon_s: float) -> Fit:
         raise LogError(f"{', '.join(sample.name for sample in samples)}: {error}") from error
 
 
-def _limits(found: Fit, samples: Sequence[Sample], name: str) -> LimitSet:
+def _limits(found: Fit, samples: Sequence[FitSample], name: str) -> LimitSet:
     """Positions are the standard ones, or where somebody was outside of these, the outer of both sets."""
     standard, wide = load_limits(STANDARD), load_limits(WIDE)
     if any(sample.outside for sample in samples):
@@ -335,19 +334,19 @@ def _limits(found: Fit, samples: Sequence[Sample], name: str) -> LimitSet:
 
 def _share(within: Sequence[Floats], horizon_s: float, rate_hz: float = FIT_HZ) -> Estimate:
     """Share of the ticks of some logs in which all joints stayed inside, with its interval."""
-    hits = [fit_limits.together(part) for part in within]
+    hits = [fit_limits.all_joints_inside(part) for part in within]
     lengths = [len(part) for part in hits]
     drawn = resample(lengths, block_ticks(horizon_s, rate_hz, max(lengths)), horizon_s * rate_hz, SEED)
     return drawn.share(np.concatenate(hits))
 
 
 def _facts(
-    samples: Sequence[Sample], found: Fit, limits: LimitSet, coverage: float, horizon_s: float, held_back: float
+    samples: Sequence[FitSample], found: Fit, limits: LimitSet, coverage: float, horizon_s: float, held_back: float
 ) -> dict[str, Any]:
     """The limit set's provenance."""
     fitted = ~found.kept
-    trained = [fit_limits.inside(sample.training, found, horizon_s) for sample in samples]
-    held = [fit_limits.inside(sample.held_back, found, horizon_s) for sample in samples]
+    trained = [fit_limits.inside_intervals(sample.training, found, horizon_s) for sample in samples]
+    held = [fit_limits.inside_intervals(sample.held_back, found, horizon_s) for sample in samples]
 
     def shares(training: Sequence[Floats], rest: Sequence[Floats]) -> dict[str, Any]:
         return {
@@ -364,7 +363,9 @@ def _facts(
         others = [*samples[:i], *samples[i + 1 :]]
         if any(fit_limits.arms_move(other.training).any() for other in others):
             foreign = _fit(others, coverage, horizon_s)
-            both = [fit_limits.inside(part, foreign, horizon_s) for part in (sample.training, sample.held_back)]
+            both = [
+                fit_limits.inside_intervals(part, foreign, horizon_s) for part in (sample.training, sample.held_back)
+            ]
             facts["left_out"] = _plain(_share([np.concatenate(both)[:, ~foreign.kept]], horizon_s))
         logs.append(facts)
     each = {

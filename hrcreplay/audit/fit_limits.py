@@ -1,11 +1,9 @@
-"""The tightest bounds under which Alg. 1 holds what people went on to do.
+"""The smallest velocity and acceleration bounds under which Alg. 1 contains the recorded motion of the joints.
 
-A joint's recorded future lies in its interval where the highest and the lowest of it do, so a tick is three numbers:
-the velocity, and how far the joint then got up and down within the horizon. For a given velocity bound each tick needs
-an acceleration bound of at least so much, in closed form; how many ticks may be missed picks one of these. Of all pairs
-that miss no more, the fit takes the one whose intervals are shortest on average.
-
-Bounds for volumes rather than for joints: what people's estimated velocities leave to their accelerations.
+A joint's recorded future lies in its interval where its highest and its lowest position do, so each tick is reduced to
+three numbers: the velocity, and the largest displacement up and down within the horizon. For a given velocity bound
+the acceleration bound that a tick needs has a closed form, and the number of ticks that may be missed selects one of
+these bounds. Of all pairs that miss no more ticks, the fit takes the pair with the shortest mean interval.
 """
 
 from __future__ import annotations
@@ -22,8 +20,8 @@ from hrcreplay.records import Bools, Floats, HumanStates, Ints, Table
 _FASTEST = 0.999
 
 
-def ballistic(training: Futures, standard: LimitSet, share: float, horizon_s: float) -> Fit:
-    """Bounds of another shape than ``fit``'s: velocities as fast as people are, and accelerations for the rest.
+def fit_each_side(training: Futures, standard: LimitSet, share: float, horizon_s: float) -> Fit:
+    """Bounds fitted to each side of each joint: velocities from quantiles, then the accelerations that they need.
 
     Where a velocity bound is low, a joint may have any velocity up to it, whatever the estimate says. Under these the
     reach is where the estimated velocity leads, give or take what the accelerations change: with the same share of
@@ -47,7 +45,7 @@ def ballistic(training: Futures, standard: LimitSet, share: float, horizon_s: fl
             (1, training.v[known, j], training.up[known, j]),
         ):
             fastest = np.quantile(np.concatenate([speed, gone / horizon_s]), _FASTEST)
-            needed = np.quantile(least_needed(speed, gone, np.inf, horizon_s), share)
+            needed = np.quantile(least_acceleration(speed, gone, np.inf, horizon_s), share)
             v[side, j], a[side, j] = rounded_up(np.maximum([fastest, needed], LEAST))
     return Fit(-v[0], v[1], -a[0], a[1], kept, excursions)
 
@@ -90,7 +88,7 @@ class Futures(Table):
 
 @dataclass(frozen=True)
 class Fit:
-    """Bounds (12,) and what they rest on."""
+    """Fitted bounds (12,), and how much motion they rest on."""
 
     v_min: Floats
     v_max: Floats
@@ -127,17 +125,17 @@ def futures(
         now = np.repeat(at.p[i : i + 1], len(future), axis=0)
         apart = _turned(nearest(future, now) - now, c[i], s[i])
         low[i], high[i] = apart.min(axis=0), apart.max(axis=0)
-    low, high = believed(low, at.unseen_s, memory_s), believed(high, at.unseen_s, memory_s)
+    low, high = recently_seen(low, at.unseen_s, memory_s), recently_seen(high, at.unseen_s, memory_s)
     return Futures(at.t_ns, _turned(at.v, c, s), low, high)
 
 
-def believed(joints: Floats, unseen_s: Floats, memory_s: float) -> Floats:
+def recently_seen(joints: Floats, unseen_s: Floats, memory_s: float) -> Floats:
     """Rows of JOINTS (n, 12), NaN where no camera had seen a joint's limb for longer; ``unseen_s`` (n, 6) by LIMBS."""
     return np.where((unseen_s <= memory_s)[:, SHOWN_BY], joints, np.nan)
 
 
-def leave(p: Floats, limits: LimitSet) -> Bools:
-    """(n,) whether a posture (n, 12) is outside the position limits; False where it is not known."""
+def outside_positions(p: Floats, limits: LimitSet) -> Bools:
+    """(n,) whether a posture (n, 12) is outside of the position limits; False where it is unknown."""
     named = canonical(p)
     return np.asarray((np.abs(clamp(named, limits) - named) > _OUTSIDE).any(axis=1))
 
@@ -182,21 +180,28 @@ def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -
     return Fit(-v[0], v[1], -a[0], a[1], kept, excursions)
 
 
-def inside(some: Futures, bounds: Fit | LimitSet, horizon_s: float) -> Floats:
+def inside_intervals(some: Futures, bounds: Fit | LimitSet, horizon_s: float) -> Floats:
     """(n, 12) whether each joint stayed in its interval, stops aside: 1, 0, or NaN where not recorded."""
-    high = farthest(some.v, bounds.v_max, bounds.a_max, horizon_s)
-    low = -farthest(-some.v, -bounds.v_min, -bounds.a_min, horizon_s)
+    high = largest_displacement(some.v, bounds.v_max, bounds.a_max, horizon_s)
+    low = -largest_displacement(-some.v, -bounds.v_min, -bounds.a_min, horizon_s)
     within = (some.up <= high) & (some.down >= low)
     return np.where(np.isfinite(some.moved), within.astype(float), np.nan)
 
 
-def together(within: Floats) -> Floats:
+def all_joints_inside(within: Floats) -> Floats:
     """(n,) whether all joints (n, k) that were recorded stayed inside: 1, 0, or NaN where none was."""
     return np.where(np.isfinite(within).any(axis=1), (within != 0.0).all(axis=1).astype(float), np.nan)
 
 
-def farthest(v: Floats, v_bound: Floats, a_bound: Floats, horizon_s: float) -> Floats:
-    """How far up joints get from velocities v (n, k) under bounds (k,), by Alg. 1 with Eq. (40): at least 0."""
+def largest_displacement(v: Floats, v_bound: Floats, a_bound: Floats, horizon_s: float) -> Floats:
+    """(n, k) largest displacement upward from velocities v under bounds, by Alg. 1 with Eq. (40); at least 0.
+
+    Args:
+        v: (n, k) velocities at the tick [m/s, m/s, rad/s...].
+        v_bound: (k,) largest velocities [m/s, m/s, rad/s...].
+        a_bound: (k,) largest accelerations [m/s^2, m/s^2, rad/s^2...].
+        horizon_s: T_s [s].
+    """
     t_star = np.clip((v_bound - v) / a_bound, 0.0, horizon_s)
     return np.maximum(v * t_star + 0.5 * a_bound * t_star**2 + v_bound * (horizon_s - t_star), 0.0)
 
@@ -238,13 +243,13 @@ class _Side:
         v, gone, horizon_s = self._v[known], self._gone[known], self._horizon_s
         rank = max(0, len(v) - 1 - misses)
         slowest = max(float(np.partition(gone, rank)[rank]) / horizon_s, LEAST)
-        free = float(np.partition(least_needed(v, gone, np.inf, horizon_s), rank)[rank])
+        free = float(np.partition(least_acceleration(v, gone, np.inf, horizon_s), rank)[rank])
         tried = rounded_up(np.geomspace(slowest, max(float(v.max()) + free * horizon_s, slowest), _TRIED))
-        needed = np.array([np.partition(least_needed(v, gone, bound, horizon_s), rank)[rank] for bound in tried])
+        needed = np.array([np.partition(least_acceleration(v, gone, bound, horizon_s), rank)[rank] for bound in tried])
         tried, a = tried[np.isfinite(needed)], rounded_up(np.maximum(needed[np.isfinite(needed)], LEAST))
-        lengths = farthest(v[:, None], tried, a, horizon_s).mean(axis=0)
+        lengths = largest_displacement(v[:, None], tried, a, horizon_s).mean(axis=0)
         k = np.argmin(np.where(lengths <= _HARDLY * lengths.min(), a, np.inf))
-        reached = farthest(self._v[:, None], tried[k : k + 1], a[k : k + 1], horizon_s)[:, 0]
+        reached = largest_displacement(self._v[:, None], tried[k : k + 1], a[k : k + 1], horizon_s)[:, 0]
         return _Pair(float(tried[k]), float(a[k]), float(lengths.min()), (known & (self._gone > reached)).astype(int))
 
 
@@ -274,11 +279,17 @@ def _give_up(sides: list[_Side], budget: int) -> None:
         missed = missed + side.now.missed
 
 
-def least_needed(v: Floats, gone: Floats, bound: float, horizon_s: float) -> Floats:
+def least_acceleration(v: Floats, gone: Floats, bound: float, horizon_s: float) -> Floats:
     """(n,) the least acceleration bound under which Alg. 1 reaches ``gone``; inf where none does.
 
     Either the whole horizon is spent speeding up, gone = v T + a T^2 / 2, or the velocity bound V is reached, and
     the area that the profile lacks below V is a triangle: V T - gone = (V - v)^2 / (2 a).
+
+    Args:
+        v: (n,) velocities at the tick [m/s] or [rad/s].
+        gone: (n,) largest displacement within the horizon [m] or [rad].
+        bound: Velocity bound V [m/s] or [rad/s]; inf: none.
+        horizon_s: T_s [s].
     """
     whole = np.maximum(2.0 * (gone - v * horizon_s) / horizon_s**2, 0.0)
     if bound == np.inf:

@@ -1,7 +1,4 @@
-"""One log held against the predictions of all methods.
-
-Holds what was predicted at a tick against what the person did within the horizon.
-"""
+"""The audit of one log: the volumes that each method predicted, compared with the recorded future of the person."""
 
 from __future__ import annotations
 
@@ -12,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.containment import Solid, union_volume_m3
+from hrcreplay.audit.containment import InflatedHull, union_volume_m3
 from hrcreplay.audit.metrics import Outcome
-from hrcreplay.audit.recording import Recording, record
+from hrcreplay.audit.recording import Recording, read_recording
 from hrcreplay.errors import LogError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import reachable_sets
@@ -26,7 +23,7 @@ from hrcreplay.report.metrics import difference
 from hrcreplay.run import build
 from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job
-from hrcreplay.run.stages import NS, Bar, Foresight, tick_times
+from hrcreplay.run.stages import NS, PredictionStage, ProgressBar, tick_times
 from hrcreplay.store.run_folder import Stopwatch
 
 #: Recorded points of a limb. The first two, its ends, must have been seen near the end of the horizon, or the limb is
@@ -47,13 +44,13 @@ _COUNT = 1024
 _SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
 
 
-def standstill_s(foresight: Foresight) -> float:
+def standstill_s(prediction_stage: PredictionStage) -> float:
     """How long the person must stay in what was predicted: until the robot has reacted and braked [s]."""
-    return foresight.horizon_s + foresight.occupancy.latency_s
+    return prediction_stage.horizon_s + prediction_stage.occupancy.latency_s
 
 
 @dataclass(frozen=True)
-class Window:
+class RecordedFuture:
     """The recorded future of some ticks."""
 
     states: HumanStates  #: (n,) the fused person at the ticks
@@ -62,10 +59,10 @@ class Window:
     last: Ints  #: (n,) row past the last one within the horizon
     seen: dict[str, Bools]  #: limb -> (n, k) whether a point was seen in the last quarter of the horizon
 
-    def rows(self, which: slice | Ints) -> Window:
+    def rows(self, which: slice | Ints) -> RecordedFuture:
         """The same for some of the ticks."""
         seen = {limb: part[which] for limb, part in self.seen.items()}
-        return Window(self.states.rows(which), self.limbs, self.first[which], self.last[which], seen)
+        return RecordedFuture(self.states.rows(which), self.limbs, self.first[which], self.last[which], seen)
 
     def checked(self, limb: str) -> Bools:
         """(n,) whether the limb can be checked: both its ends were seen near the horizon's end."""
@@ -81,7 +78,7 @@ class Window:
         }
 
 
-def window(recording: Recording, ticks: Ints, horizon_s: float) -> Window:
+def recorded_future(recording: Recording, ticks: Ints, horizon_s: float) -> RecordedFuture:
     """The recorded future (t, t + T] of some ticks.
 
     Args:
@@ -100,7 +97,7 @@ def window(recording: Recording, ticks: Ints, horizon_s: float) -> Window:
     first = np.searchsorted(recording.t_ns, states.t_ns, side="right")
     last = np.searchsorted(recording.t_ns, states.t_ns + horizon_ns, side="right")
     end = np.searchsorted(recording.t_ns, states.t_ns + round(_END * horizon_ns), side="right")
-    return Window(states, limbs, first, last, {limb: _seen(part, end, last) for limb, part in limbs.items()})
+    return RecordedFuture(states, limbs, first, last, {limb: _seen(part, end, last) for limb, part in limbs.items()})
 
 
 def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
@@ -110,13 +107,13 @@ def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
     return np.asarray(count[last] > count[first])
 
 
-def hold(volumes: SweptVolumes, future: Window, counted: Bools, first_sample: int = 0) -> Outcome:
-    """One method's volumes against the recorded future.
+def check_containment(volumes: SweptVolumes, future: RecordedFuture, counted: Bools, first_sample: int = 0) -> Outcome:
+    """Compares one method's volumes with the recorded future.
 
     Args:
         volumes: Of the n ticks.
         future: Of the same ticks.
-        counted: (n,) the ticks whose union is counted out.
+        counted: (n,) the ticks whose union volume is estimated.
         first_sample: Number of ticks counted before, see ``union_volume_m3``.
     """
     n, limbs = len(volumes), volumes.limbs
@@ -129,7 +126,7 @@ def hold(volumes: SweptVolumes, future: Window, counted: Bools, first_sample: in
             vertices = volumes.vertices(i, k)
             if np.isnan(vertices).any():
                 continue
-            solid = Solid.around(vertices, float(volumes.radius_m[i, k]))
+            solid = InflatedHull.around(vertices, float(volumes.radius_m[i, k]))
             size[i, k] = solid.volume_m3()
             solids.append(solid)
             if checked[i, k]:
@@ -143,7 +140,7 @@ def hold(volumes: SweptVolumes, future: Window, counted: Bools, first_sample: in
     return Outcome(volumes.t_ns, beyond, radius, size, union, union_std, upper, upper_std, limbs)
 
 
-def _farthest(solid: Solid, future: Window, tick: int, limb: str) -> float:
+def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str) -> float:
     """How far the recorded points of a limb, some of them seen, get from a hull [m]."""
     points = future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
     return float(np.nanmax(solid.distances_m(points)))
@@ -174,7 +171,7 @@ def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horiz
     return np.where(seen > 0.0, (left == 0.0).astype(float), np.nan)
 
 
-def travel(joints: Floats) -> Floats:
+def joint_travel(joints: Floats) -> Floats:
     """(12,) how far each joint went, between the 5th and the 95th percentile of its values [m, m, rad...]."""
     known = joints[np.isfinite(joints).all(axis=1)]
     if len(known) < 2:
@@ -197,7 +194,7 @@ _BATCH = 100
 
 @dataclass(frozen=True)
 class LogAudit:
-    """What one log showed."""
+    """Results of the audit of one log."""
 
     job: Job
     name: str
@@ -210,8 +207,8 @@ class LogAudit:
 
 
 def methods() -> tuple[str, ...]:
-    """Our own methods, then the peers."""
-    return (*reachable_sets.METHODS, *baselines.PEERS)
+    """Our own methods, then the baselines."""
+    return (*reachable_sets.METHODS, *baselines.BASELINES)
 
 
 def factors(method: str) -> tuple[float, ...]:
@@ -219,20 +216,20 @@ def factors(method: str) -> tuple[float, ...]:
     return _FACTORS.get(method, _STANDARD_FACTORS)
 
 
-def volumes(foresight: Foresight, window: Window, method: str) -> SweptVolumes:
-    """Swept volumes by any method, ours or a peer's."""
-    if method in baselines.PEERS:
+def volumes(prediction_stage: PredictionStage, window: RecordedFuture, method: str) -> SweptVolumes:
+    """Swept volumes by any method, ours or a baseline's."""
+    if method in baselines.BASELINES:
         return baselines.predict(
             window.states,
-            horizon_s=standstill_s(foresight),
-            radii_m=limb_radii(foresight.occupancy),
-            hand_m=foresight.occupancy.hand_m,
+            horizon_s=standstill_s(prediction_stage),
+            radii_m=limb_radii(prediction_stage.occupancy),
+            hand_m=prediction_stage.occupancy.hand_m,
             method=method,
         )
-    return foresight.volumes(window.states, method)
+    return prediction_stage.volumes(window.states, method)
 
 
-def scaled(limits: LimitSet, factor: float) -> LimitSet:
+def scale_rates(limits: LimitSet, factor: float) -> LimitSet:
     """A limit set whose velocities and accelerations are ``factor`` times as large."""
     grown = {name: factor * getattr(limits, name) for name in ("v_min", "v_max", "a_min", "a_max")}
     return replace(limits, name=f"{limits.name} x {factor:g}", **grown)
@@ -246,8 +243,8 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         LogError: The log cannot be read, is shorter than the horizon, or shows nobody.
     """
     log = open_log(job.log, log_options(job.settings))
-    foresight = build.foresight(job)
-    horizon_s = standstill_s(foresight)
+    prediction_stage = build.prediction_stage(job)
+    horizon_s = standstill_s(prediction_stage)
     first_ns, last_ns = log.header.start_ns, log.header.end_ns
     begin_ns = first_ns + round((job.start_s or 0.0) * NS)
     end_ns = last_ns if job.end_s is None else min(last_ns, first_ns + round(job.end_s * NS))
@@ -257,32 +254,34 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
             f"{horizon_s:g} s"
         )
     ticks_ns = tick_times(begin_ns, end_ns, job.settings.fusion.rate_hz)
-    with Bar(f"reading {name}", len(ticks_ns)) as bar, watch.stage("record", len(ticks_ns)):
-        recording = record(log, ticks_ns, build.eyes(job, log), lambda n: bar.advance(f"reading {name}", n))
+    with ProgressBar(f"reading {name}", len(ticks_ns)) as bar, watch.stage("record", len(ticks_ns)):
+        recording = read_recording(
+            log, ticks_ns, build.fusion_stage(job, log), lambda n: bar.advance(f"reading {name}", n)
+        )
     rows = _audited(recording, job.settings.fusion.rate_hz, horizon_s)
     if not len(rows):
         raise LogError(f"{job.log}: nobody was seen for longer than the horizon of {horizon_s:g} s")
-    future = window(recording, rows, horizon_s)
+    future = recorded_future(recording, rows, horizon_s)
     outcomes, curve = {}, {}
     stage = f"auditing {name}"
     more = sum(len(factors(method)) - 1 for method in reachable_sets.METHODS)
     work = len(rows) * len(methods()) + more * len(rows[::EVERY])
-    with Bar(stage, work) as bar:
+    with ProgressBar(stage, work) as bar:
         progress = partial(bar.advance, stage)
         for method in methods():
             with watch.stage(f"audit {method}", len(rows)):
-                outcomes[method] = _hold(foresight, future, method, EVERY, progress)
-        if not np.isfinite(outcomes[foresight.method].beyond_m).any():
+                outcomes[method] = _hold(prediction_stage, future, method, EVERY, progress)
+        if not np.isfinite(outcomes[prediction_stage.method].beyond_m).any():
             raise LogError(
                 f"{job.log}: nothing to check: no limb was both predicted and seen to the end of the horizon of "
                 f"{horizon_s:g} s"
             )
         for method in reachable_sets.METHODS:
             with watch.stage(f"curve {method}", len(rows)):
-                curve[method] = _curve(foresight, future, method, outcomes[method], progress)
+                curve[method] = _curve(prediction_stage, future, method, outcomes[method], progress)
     joints = {}
     for method in reachable_sets.METHODS:
-        interval = foresight.by(method).reachable(future.states)
+        interval = prediction_stage.by(method).reachable(future.states)
         joints[method] = joints_inside(recording, future.states, interval, horizon_s)
     notes = (*log.notes, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))
     return LogAudit(job, name, recording, outcomes, joints, curve, future.points(), notes)
@@ -299,27 +298,35 @@ def _audited(recording: Recording, rate_hz: float, horizon_s: float) -> Ints:
 
 
 def _hold(
-    foresight: Foresight, future: Window, method: str, union_every: int, progress: Callable[[int], None]
+    prediction_stage: PredictionStage,
+    future: RecordedFuture,
+    method: str,
+    union_every: int,
+    progress: Callable[[int], None],
 ) -> Outcome:
     n = len(future.states)
     parts = []
     for first in range(0, n, _BATCH):
         some = future.rows(slice(first, first + _BATCH))
         counted = np.arange(first, first + len(some.states)) % union_every == 0
-        parts.append(hold(volumes(foresight, some, method), some, counted, first))
+        parts.append(check_containment(volumes(prediction_stage, some, method), some, counted, first))
         progress(len(some.states))
     return Outcome.join(parts)
 
 
 def _curve(
-    foresight: Foresight, future: Window, method: str, standard: Outcome, progress: Callable[[int], None]
+    prediction_stage: PredictionStage,
+    future: RecordedFuture,
+    method: str,
+    standard: Outcome,
+    progress: Callable[[int], None],
 ) -> dict[float, Outcome]:
     """The method under scaled limits, at fewer ticks; factor 1 is its ``standard`` outcome with all ticks."""
     some = future.rows(np.arange(0, len(future.states), EVERY))
     found = {1.0: standard}
     for factor in factors(method):
         if factor not in found:
-            wider = replace(foresight, limits=scaled(foresight.limits, factor))
+            wider = replace(prediction_stage, limits=scale_rates(prediction_stage.limits, factor))
             found[factor] = _hold(wider, some, method, 2, progress)
     return dict(sorted(found.items()))
 
@@ -327,7 +334,7 @@ def _curve(
 def _remarks(recording: Recording, audited_s: float, horizon_s: float) -> tuple[str, ...]:
     """What the reader of one log's figures must know."""
     notes = [f"the recorded future is the {recording.source}"]
-    went = travel(recording.joints)
+    went = joint_travel(recording.joints)
     still = [
         f"{joint} ({went[j]:.2f} m)" if j < 2 else f"{joint} ({np.degrees(went[j]):.0f} deg)"
         for j, joint in enumerate(JOINTS)

@@ -1,6 +1,6 @@
-"""What an audit found, as figures with intervals: per method, limb and joint, for one log or several together.
+"""Metrics of an audit with their intervals, by method, limb and joint, for one log or for several together.
 
-Which limbs and points of a recording an audit could check, and which it says nothing of.
+They also say which limbs and points could not be checked, since a coverage holds only for those that were.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 
 from hrcreplay.audit.bootstrap import Estimate, Resampling
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats, Ints, Table
-from hrcreplay.report.metrics import Metric, MetricTable, stretches
+from hrcreplay.report.metrics import Metric, MetricTable, true_runs
 from hrcreplay.report.tables import PageTable
 
 
-def never(part: Mapping[str, Any], method: str) -> list[str]:
+def never_checked(part: Mapping[str, Any], method: str) -> list[str]:
     """Limbs that a method was not checked for at any tick, and points of other limbs that were never seen.
 
     Args:
@@ -35,7 +35,7 @@ def never(part: Mapping[str, Any], method: str) -> list[str]:
     return limbs + points
 
 
-def sometimes(part: Mapping[str, Any], method: str) -> list[str]:
+def partly_checked(part: Mapping[str, Any], method: str) -> list[str]:
     """Limbs and points that were checked at some ticks only, each with the number of those at which it was not."""
     found = []
     for limb, counts in part["points"].items():
@@ -47,7 +47,7 @@ def sometimes(part: Mapping[str, Any], method: str) -> list[str]:
 
 
 def ticks_of(part: Mapping[str, Any], method: str, limb: str) -> int:
-    """At how many ticks a limb was held against its volume: it was seen to the horizon's end and has a volume."""
+    """At how many ticks a limb was compared with its volume: it was seen to the horizon's end and has a volume."""
     figures = part["methods"][method].get(limb)
     return 0 if figures is None else int(figures["covered_share"]["samples"])
 
@@ -55,9 +55,9 @@ def ticks_of(part: Mapping[str, Any], method: str, limb: str) -> int:
 def unchecked_notes(part: Mapping[str, Any], method: str) -> list[str]:
     """What the reader of a log's figures must know of what was not checked."""
     told = []
-    if gaps := never(part, method):
+    if gaps := never_checked(part, method):
         told.append(f"not checked at all, so nothing is said of it: {', '.join(gaps)}")
-    if gaps := sometimes(part, method):
+    if gaps := partly_checked(part, method):
         told.append(f"not seen to the horizon's end, so not checked, of {part['ticks']} ticks: {', '.join(gaps)}")
     return told
 
@@ -87,7 +87,7 @@ def checked_table(total: Mapping[str, Any], method: str) -> PageTable:
 
 
 def checked_cameras(log: Mapping[str, Any]) -> PageTable:
-    """What of each camera's points was not believed."""
+    """How many of each camera's points were rejected."""
     rows = tuple(
         (camera, *("\u2013" if count is None else str(count) for count in counts.values()))
         for camera, counts in log["cameras"].items()
@@ -117,7 +117,7 @@ _BREAK = 2
 
 @dataclass(frozen=True)
 class Outcome(Table):
-    """One method's volumes held against what the person did, a row an audited tick."""
+    """One method's volumes compared with the recorded motion, a row an audited tick."""
 
     t_ns: Ints  #: (n,)
     beyond_m: (
@@ -165,25 +165,25 @@ def method_figures(
         ("upper", len(LIMBS), whole.upper_m3, whole.upper_std_m3),
     ):
         figures = _escape_figures(whole.worst_m(limbs), resampling)
-        figures["union_m3"] = resampling.mean(union).plain()
-        figures["union_counting_error"] = resampling.mean(_ratio(std, union)).plain()["value"]
-        figures["sum_m3"] = resampling.mean(whole.volume_m3[:, :limbs].sum(axis=1)).plain()
+        figures["union_m3"] = resampling.mean(union).to_dict()
+        figures["union_counting_error"] = resampling.mean(_ratio(std, union)).to_dict()["value"]
+        figures["sum_m3"] = resampling.mean(whole.volume_m3[:, :limbs].sum(axis=1)).to_dict()
         found[part] = figures
     for i, limb in enumerate(whole.limbs):
         found[limb] = _escape_figures(escapes[:, i], resampling)
-        found[limb]["volume_m3"] = resampling.mean(whole.volume_m3[:, i]).plain()
+        found[limb]["volume_m3"] = resampling.mean(whole.volume_m3[:, i]).to_dict()
         if limb in body_radius_m:
             room = whole.radius_m[:, i] - body_radius_m[limb] + _ROUNDING_M
-            found[limb]["whole_limb_share"] = resampling.share(_hits(whole.beyond_m[:, i], room)).plain()
+            found[limb]["whole_limb_share"] = resampling.share(_hits(whole.beyond_m[:, i], room)).to_dict()
     return found
 
 
 def _escape_figures(escape_m: Floats, resampling: Resampling) -> dict[str, Any]:
     deep = np.where(escape_m > 0.0, escape_m, np.nan)
     return {
-        "covered_share": resampling.share(_hits(escape_m, np.zeros(len(escape_m)))).plain(),
-        "escape_p50_m": resampling.quantile(deep, 0.5).plain(),
-        "escape_p95_m": resampling.quantile(deep, 0.95).plain(),
+        "covered_share": resampling.share(_hits(escape_m, np.zeros(len(escape_m)))).to_dict(),
+        "escape_p50_m": resampling.quantile(deep, 0.5).to_dict(),
+        "escape_p95_m": resampling.quantile(deep, 0.95).to_dict(),
         "escape_max_m": _number(np.nanmax(deep)) if np.isfinite(deep).any() else None,
     }
 
@@ -207,7 +207,7 @@ def joint_figures(inside: Floats, travel: Floats, resampling: Resampling) -> dic
         resampling: Of the n ticks.
     """
     return {
-        joint: {"inside_share": resampling.share(inside[:, j]).plain(), "travel": _number(travel[j])}
+        joint: {"inside_share": resampling.share(inside[:, j]).to_dict(), "travel": _number(travel[j])}
         for j, joint in enumerate(JOINTS)
     }
 
@@ -217,8 +217,8 @@ def curve_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str
     whole = Outcome.join(outcomes)
     worst = whole.worst_m(len(LIMBS))
     return {
-        "covered_share": resampling.share(_hits(worst, np.zeros(len(worst)))).plain(),
-        "union_m3": resampling.mean(whole.upper_m3).plain(),
+        "covered_share": resampling.share(_hits(worst, np.zeros(len(worst)))).to_dict(),
+        "union_m3": resampling.mean(whole.upper_m3).to_dict(),
     }
 
 
@@ -251,7 +251,7 @@ def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
 def _joined(escaped: Bools) -> list[tuple[int, int]]:
     """Runs of true, those joined that lie close together."""
     runs: list[tuple[int, int]] = []
-    for first, last in stretches(escaped).tolist():
+    for first, last in true_runs(escaped).tolist():
         if runs and first - runs[-1][1] <= _BREAK:
             runs[-1] = (runs[-1][0], last)
         else:
@@ -280,7 +280,7 @@ def volume_at(curve: Sequence[Mapping[str, Any]], share: float) -> float | None:
     return None
 
 
-def flat(found: Mapping[str, Any]) -> dict[str, Metric]:
+def headline_metrics(found: Mapping[str, Any]) -> dict[str, Metric]:
     """The headline figures of all logs together, as metrics.json has them.
 
     Args:
@@ -305,7 +305,7 @@ def flat(found: Mapping[str, Any]) -> dict[str, Metric]:
             room = "mean volume of their union" if part in WHAT else "mean volume"
             table.add(f"{name}_{key}", figures[key]["value"], "m^3", room)
     table.add("audit_ticks", found["total"]["ticks"], "1", "audited ticks of all logs")
-    gaps = never(found["total"], found["method"])
+    gaps = never_checked(found["total"], found["method"])
     meaning = "limbs, and points of other limbs, of which the audit says nothing: they were never seen"
     table.add("audit_not_checked", ", ".join(gaps) or "nothing", "", meaning)
     return table.sorted()
@@ -315,9 +315,9 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def text(figure: Mapping[str, Any] | Estimate, scale: float = 1.0, decimals: int = 1) -> str:
+def text_with_interval(figure: Mapping[str, Any] | Estimate, scale: float = 1.0, decimals: int = 1) -> str:
     """A figure with its interval, as tables show it; a dash where there is none."""
-    plain = figure.plain() if isinstance(figure, Estimate) else figure
+    plain = figure.to_dict() if isinstance(figure, Estimate) else figure
     if plain["value"] is None:
         return "\u2013"
     value = f"{scale * plain['value']:.{decimals}f}"

@@ -1,4 +1,4 @@
-"""report.html of an audit."""
+"""The HTML page of an audit."""
 
 from __future__ import annotations
 
@@ -12,10 +12,17 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from hrcreplay.audit.figures import METHODS, in_order
-from hrcreplay.audit.metrics import checked_cameras, checked_scope, checked_table, text, unchecked_notes, volume_at
+from hrcreplay.audit.metrics import (
+    checked_cameras,
+    checked_scope,
+    checked_table,
+    text_with_interval,
+    unchecked_notes,
+    volume_at,
+)
 from hrcreplay.records import JOINTS, LIMBS
 from hrcreplay.report.metrics import Metric
-from hrcreplay.report.page import PageFigure, Part
+from hrcreplay.report.page import PageFigure, PageSection
 from hrcreplay.report.story import Answer, Card
 from hrcreplay.report.tables import PageTable, text_of
 
@@ -104,7 +111,7 @@ def _cards(found: Mapping[str, Any]) -> tuple[Card, ...]:
     for method in in_order(found["total"]["methods"]):
         whole = found["total"]["methods"][method]["all"]
         if whole["covered_share"]["value"] is not None:
-            room = text(whole["union_m3"], decimals=2)
+            room = text_with_interval(whole["union_m3"], decimals=2)
             value = f"{100 * whole['covered_share']['value']:.1f} %"
             cards.append(Card(value, METHODS.get(method, method), f"union {room} m\u00b3"))
     return tuple(cards)
@@ -123,7 +130,7 @@ def _named(methods: Sequence[str]) -> tuple[str, ...]:
     return tuple(METHODS.get(method, method) for method in methods)
 
 
-def _coverage(found: Mapping[str, Any], folder: Path) -> Part:
+def _coverage(found: Mapping[str, Any], folder: Path) -> PageSection:
     methods = in_order(found["total"]["methods"])
     rows = [(log["log"], log) for log in found["logs"]]
     if len(rows) > 1:
@@ -133,7 +140,8 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> Part:
 
     def table(title: str, key: str, scale: float, decimals: int, note: str, limbs: str = "all") -> PageTable:
         body = tuple(
-            (name, *(text(part["methods"][m][limbs][key], scale, decimals) for m in methods)) for name, part in rows
+            (name, *(text_with_interval(part["methods"][m][limbs][key], scale, decimals) for m in methods))
+            for name, part in rows
         )
         return PageTable(title, ("log", *_named(methods)), body, note)
 
@@ -146,7 +154,7 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> Part:
     if len(found["logs"]) > 1:
         way += " The total counts every tick once: a long log weighs more than a short one."
     error = max(found["total"]["methods"][m]["all"]["union_counting_error"] or 0.0 for m in methods)
-    return Part(
+    return PageSection(
         "coverage",
         "Coverage",
         "Did the recorded person stay in what was predicted, and how much room did the prediction take?",
@@ -176,7 +184,7 @@ def _lower(found: Mapping[str, Any]) -> str:
 
 
 def _equal(found: Mapping[str, Any]) -> str:
-    """How much room our methods take where their curves reach a peer's coverage less half a percent."""
+    """How much room our methods take where their curves reach a baseline's coverage less half a percent."""
     peer = found["total"]["methods"].get("v2_a50")
     if peer is None or peer["upper"]["covered_share"]["value"] is None or not peer["upper"]["union_m3"]["value"]:
         return ""
@@ -193,7 +201,7 @@ def _equal(found: Mapping[str, Any]) -> str:
     return f"{at}, the lower body left out, of its volume: {', '.join(parts)}."
 
 
-def _limbs(found: Mapping[str, Any], folder: Path) -> Part:
+def _limbs(found: Mapping[str, Any], folder: Path) -> PageSection:
     methods = in_order(found["total"]["methods"])
     figures = found["total"]["methods"]
     limbs = [limb for limb in (*LIMBS, "LEGS") if any(limb in figures[m] for m in methods)]
@@ -207,7 +215,7 @@ def _limbs(found: Mapping[str, Any], folder: Path) -> Part:
         return PageTable(title, ("limb", *_named(methods)), tuple(body), note)
 
     deepest = [(limb, *(_millimetres(figures[m].get(limb, {}).get("escape_max_m")) for m in methods)) for limb in limbs]
-    return Part(
+    return PageSection(
         "limbs",
         "Limbs",
         "Each limb in its own volume. A dash: the method has no volume for it, or nobody left it.",
@@ -223,28 +231,28 @@ def _limbs(found: Mapping[str, Any], folder: Path) -> Part:
 
 
 def _cell(figure: Mapping[str, Any], scale: float, decimals: int) -> str:
-    return text(figure, scale, decimals) if figure["samples"] else "not checked"
+    return text_with_interval(figure, scale, decimals) if figure["samples"] else "not checked"
 
 
 def _millimetres(value: float | None) -> str:
     return "\u2013" if value is None else f"{1e3 * value:.0f}"
 
 
-def _joints(found: Mapping[str, Any], folder: Path) -> Part:
+def _joints(found: Mapping[str, Any], folder: Path) -> PageSection:
     tables = found["total"]["joints"]
     methods = in_order(tables)
     body = []
     for j, joint in enumerate(JOINTS):
         went = tables[methods[0]][joint]["travel"]
         moved = "\u2013" if went is None else f"{went:.2f} m" if j < 2 else f"{went * 57.29578:.0f}\u00b0"
-        body.append((joint, moved, *(text(tables[m][joint]["inside_share"], 100.0) for m in methods)))
+        body.append((joint, moved, *(text_with_interval(tables[m][joint]["inside_share"], 100.0) for m in methods)))
     table = PageTable(
         "Ticks with the joint in its reachable interval [%]", ("joint", "moved", *_named(methods)), tuple(body)
     )
-    return Part("joints", "Joints", "Which bound fails.", (_figure(folder, "audit_joints"),), (table,))
+    return PageSection("joints", "Joints", "Which bound fails.", (_figure(folder, "audit_joints"),), (table,))
 
 
-def _data(found: Mapping[str, Any]) -> Part:
+def _data(found: Mapping[str, Any]) -> PageSection:
     tables = []
     for log in found["logs"]:
         rows = [(f"limits of the prediction: {log['limits']}",), *((note,) for note in log["notes"])]
@@ -253,7 +261,7 @@ def _data(found: Mapping[str, Any]) -> Part:
         counts = tuple((name.replace("_", " "), str(count)) for name, count in log["counts"].items())
         tables.append(PageTable(f"{log['log']}: what was counted on the way", ("", "count"), counts))
         tables += [_escapes(log, method) for method in found["own_methods"]]
-    return Part(
+    return PageSection(
         "data",
         "Logs and escapes",
         "What each log was held against, what was thrown out, and when somebody left a volume.",

@@ -1,4 +1,4 @@
-"""What a log says the person did: the future that an audit holds a prediction against."""
+"""The recorded motion of the person in a log, with which an audit compares the predictions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import LENGTHS, POINTS, Bools, Floats, HumanStates, Ints, Measurements
-from hrcreplay.run.stages import Eyes, batches
+from hrcreplay.run.stages import FusionStage, batches
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
 
@@ -55,7 +55,7 @@ class Recording:
     counts: dict[str, int]
 
 
-def record(log: Log, ticks_ns: Ints, eyes: Eyes, progress: Callable[[int], None]) -> Recording:
+def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress: Callable[[int], None]) -> Recording:
     """Reads the span of ``ticks_ns``.
 
     The recorded future is the ground truth where the log has it. Else the points of the cameras, at their capture
@@ -64,11 +64,17 @@ def record(log: Log, ticks_ns: Ints, eyes: Eyes, progress: Callable[[int], None]
     bends sideways leaves the model, not the room, and must not be thrown out for it; a marker that jumps away takes no
     bone along. Else the smoothed person. Recorded joints are those of the truth, else of the smoothed person.
 
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks of the span, increasing [ns].
+        fusion_stage: Cameras and settings of stage 1.
+        progress: Called with the number of ticks done since the last call.
+
     Raises:
         LogError: No camera saw anybody.
     """
     counts: Counter[str] = Counter()
-    stretches = _fuse(log, ticks_ns, eyes, counts, progress)
+    stretches = _fuse(log, ticks_ns, fusion_stage, counts, progress)
     truth = [part.rows((part.t_ns >= ticks_ns[0]) & (part.t_ns <= ticks_ns[-1])) for part in log.truth()]
     truth = [part for part in truth if len(part)]
     if truth:
@@ -77,8 +83,8 @@ def record(log: Log, ticks_ns: Ints, eyes: Eyes, progress: Callable[[int], None]
         points = np.concatenate([part.points_m for part in truth])
         joints, _ = inverse_kinematics.inverse(points)
         return Recording(states, t_ns, points, t_ns, joints, TRUTH, _plain(log, counts))
-    states, seen, best = _smoothed(stretches, eyes)
-    points, rejected = _believed(seen, best, eyes)
+    states, seen, best = _smoothed(stretches, fusion_stage)
+    points, rejected = _believed(seen, best, fusion_stage)
     counts.update(rejected)
     order = np.argsort(seen.capture_ns, kind="stable")
     t_ns, points, source = seen.capture_ns[order], points[order], CAMERAS
@@ -91,7 +97,7 @@ Stretch = tuple[Measurements, HumanStates, fuse.Trace]
 
 
 def _fuse(
-    log: Log, ticks_ns: Ints, eyes: Eyes, counts: Counter[str], progress: Callable[[int], None]
+    log: Log, ticks_ns: Ints, fusion_stage: FusionStage, counts: Counter[str], progress: Callable[[int], None]
 ) -> Iterator[Stretch]:
     """Stage 1 from the first stretch on in which a camera saw somebody."""
     state, memory = fuse.start(log.header.cameras), PersonMemory()
@@ -99,13 +105,15 @@ def _fuse(
     for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _STRETCH):
         progress(len(ticks))
         if due is not None:
-            memory, measured, found = eyes.measure(due, memory)
+            memory, measured, found = fusion_stage.measure(due, memory)
             counts.update(found)
         elif measured is not None:
             measured = measured.rows(slice(0, 0))
         else:
             continue
-        state, states, events, trace = fuse.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
+        state, states, events, trace = fuse.fuse_traced(
+            state, ticks, measured, fusion_stage.filter, fusion_stage.limits
+        )
         counts.update(events)
         yield measured, states, trace
     log.check()
@@ -113,7 +121,7 @@ def _fuse(
         raise LogError(f"{log.header.path}: no camera saw anybody; an audit needs a person")
 
 
-def _smoothed(stretches: Iterator[Stretch], eyes: Eyes) -> tuple[HumanStates, Measurements, HumanStates]:
+def _smoothed(stretches: Iterator[Stretch], fusion_stage: FusionStage) -> tuple[HumanStates, Measurements, HumanStates]:
     """The states, the measurements and the smoothed states of all stretches."""
     seen, passed, best = [], [], []
     held: tuple[HumanStates, fuse.Trace] | None = None
@@ -126,7 +134,7 @@ def _smoothed(stretches: Iterator[Stretch], eyes: Eyes) -> tuple[HumanStates, Me
                 cov=np.concatenate([trace.cov, after[1].cov[:_LATER]]),
                 damping=np.concatenate([trace.damping, after[1].damping[:_LATER]]),
             )
-        best.append(fuse.smooth(states, trace, eyes.filter).rows(slice(0, len(held[0]))))
+        best.append(fuse.smooth(states, trace, fusion_stage.filter).rows(slice(0, len(held[0]))))
 
     for measured, states, trace in stretches:
         seen.append(measured)
@@ -139,7 +147,7 @@ def _smoothed(stretches: Iterator[Stretch], eyes: Eyes) -> tuple[HumanStates, Me
     return HumanStates.join(passed), Measurements.join(seen), HumanStates.join(best)
 
 
-def _believed(seen: Measurements, best: HumanStates, eyes: Eyes) -> tuple[Floats, Counter[str]]:
+def _believed(seen: Measurements, best: HumanStates, fusion_stage: FusionStage) -> tuple[Floats, Counter[str]]:
     """The measured points (m, 20, 3) that are believed, and how many per camera are not, by why.
 
     A missing point and one of confidence 0 were not seen. One that the camera trusts too little, that hangs from such a
@@ -149,7 +157,7 @@ def _believed(seen: Measurements, best: HumanStates, eyes: Eyes) -> tuple[Floats
     tick = np.clip(np.searchsorted(best.t_ns, seen.capture_ns), 0, len(best) - 1)
     expected = skeleton(best.p[tick], best.lengths_m[tick])
     measured: Bools = np.asarray(np.isfinite(seen.points_m).all(axis=2)) & (seen.confidence > 0.0)
-    trusted = measured & (seen.confidence >= eyes.filter.confidence_min)
+    trusted = measured & (seen.confidence >= fusion_stage.filter.confidence_min)
     good, jumped = trusted.copy(), np.zeros_like(trusted)
     points = seen.points_m.copy()
     neck, right, left = (POINTS.index(name) for name in ("neck", "shoulder_r", "shoulder_l"))
@@ -160,7 +168,7 @@ def _believed(seen: Measurements, best: HumanStates, eyes: Eyes) -> tuple[Floats
         k, j = POINTS.index(name), POINTS.index(start)
         own = part * best.lengths_m[tick, LENGTHS.index(length)]
         fits = np.abs(np.linalg.norm(points[:, k] - points[:, j], axis=1) - own) <= _BONE_M
-        good[:, k] &= (off[:, k] <= eyes.filter.outlier_m) | (fits & good[:, j])
+        good[:, k] &= (off[:, k] <= fusion_stage.filter.outlier_m) | (fits & good[:, j])
         jumped[:, k] = trusted[:, k] & ~good[:, k] & np.isfinite(off[:, k])
     for name, (parent, longest_m) in _HANGING.items():
         for side in "lr":

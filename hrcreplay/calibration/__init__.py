@@ -1,1 +1,1 @@
-"""Poses and clock offsets of cameras, the floor, and the cell file that keeps them."""
+"""Camera poses and clock offsets, the floor, and the cell file that stores them."""

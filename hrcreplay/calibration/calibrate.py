@@ -1,4 +1,4 @@
-"""Poses and clock offsets of a log's cameras, and the world they share, from the skeletons themselves."""
+"""Calibration of a log's cameras from the skeletons of one person: poses, clock offsets and a common world frame."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from hrcreplay.calibration.cell import Cell, Residual
 from hrcreplay.calibration.floor import LEVEL_VIEW, Floor, find_floor, floor_frame, up_direction
-from hrcreplay.calibration.registration import Registration, Track, disagreement, register, transform
+from hrcreplay.calibration.registration import Registration, SkeletonTrack, disagreement, register, transform
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.logs.clean import PersonMemory, pick
+from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import POINTS, CameraFrames, Floats
 
@@ -27,7 +27,7 @@ _APART_M, _DOUBTFUL_M = 0.15, 0.06
 
 
 class Survey(NamedTuple):
-    """A calibration and where it found the person."""
+    """A calibration, and where in its world the person stood."""
 
     cell: Cell
     lines: tuple[str, ...]  #: main figures, and what --base needs: where the person stood, which way the axes point
@@ -55,7 +55,7 @@ def survey(
     memory_s: float = 2.0,
     search_s: float = 2.0,
 ) -> Survey:
-    """Finds where the cameras of a log stand and how their clocks differ.
+    """Estimates the poses of a log's cameras and the offsets of their clocks.
 
     The world's origin is the floor under the reference camera, z is up and x the camera's viewing direction along the
     floor. Each camera is tied to the reference through the pairs that saw the person together most often.
@@ -82,7 +82,7 @@ def survey(
     direction = _direction(up)
     if height_m is not None and not 0.0 <= height_m < np.inf:
         raise SettingsError(f"height: found {height_m:g}; would be right: metres above the floor, 0 or more")
-    tracks = collect(log, jump_m, memory_s)
+    tracks = collect_tracks(log, jump_m, memory_s)
     ties = _tree(tracks, root)
     found = {root: Registration(np.eye(4), 0.0)}
     for pair in ties:
@@ -103,10 +103,10 @@ def survey(
         residuals=residuals,
         notes=(*_notes(floor, cameras[root]), *_doubts(residuals)),
     )
-    return Survey(cell, whereabouts(cell, tracks, cameras[root]))
+    return Survey(cell, person_positions(cell, tracks, cameras[root]))
 
 
-def whereabouts(cell: Cell, tracks: list[Track], root: str) -> tuple[str, ...]:
+def person_positions(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tuple[str, ...]:
     """Where the person stood in the cell's world and which way its axes point: what a robot's base is placed by."""
     looks_along = abs(cell.T_world_camera[root][2, 2]) <= LEVEL_VIEW
     x = f"x points where {root} looks, along the floor" if looks_along else f"x points along {root}'s own x"
@@ -128,14 +128,14 @@ def whereabouts(cell: Cell, tracks: list[Track], root: str) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def collect(log: Log, jump_m: float, memory_s: float) -> list[Track]:
-    """The person as each camera saw it; of a long log, evenly spaced windows."""
+def collect_tracks(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTrack]:
+    """The track of the person in each camera's frame; of a long log, in evenly spaced windows."""
     cameras = log.header.cameras
     alone = np.full((len(cameras), 4, 4), np.nan)  # poses are what is sought: continuity in each camera's own frame
     memory = PersonMemory()
     kept: list[CameraFrames] = []
     for frames in log.frames():
-        memory, mine, _ = pick(frames, memory, alone, jump_m, memory_s)
+        memory, mine, _ = select_person(frames, memory, alone, jump_m, memory_s)
         within = _in_window(mine, log.header.start_ns, log.header.end_ns)
         if len(rows := mine.rows(within)):
             kept.append(rows)
@@ -153,11 +153,11 @@ def _in_window(frames: CameraFrames, start_ns: int, end_ns: int) -> np.ndarray[t
     return np.asarray((frames.arrival_ns - start_ns) % every_ns < window_ns)
 
 
-def _track(table: CameraFrames, camera: int) -> Track:
+def _track(table: CameraFrames, camera: int) -> SkeletonTrack:
     mine = table.rows(table.camera == camera)
     _, first = np.unique(mine.capture_ns, return_index=True)  # in order of capture, a frame that came twice once
     mine = mine.rows(first.astype(np.int64))
-    return Track(mine.capture_ns, mine.points_m, mine.confidence)
+    return SkeletonTrack(mine.capture_ns, mine.points_m, mine.confidence)
 
 
 def _root(cameras: tuple[str, ...], reference: str | None, log: Log) -> int:
@@ -179,7 +179,7 @@ def _direction(up: Sequence[float] | None) -> Floats | None:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def _together(a: Track, b: Track) -> int:
+def _together(a: SkeletonTrack, b: SkeletonTrack) -> int:
     """Frames of a that have one of b close by."""
     if not len(a) or not len(b):
         return 0
@@ -189,7 +189,7 @@ def _together(a: Track, b: Track) -> int:
     return int((nearest <= _TOGETHER_S * 1e9).sum())
 
 
-def _tree(tracks: list[Track], root: int) -> list[Pair]:
+def _tree(tracks: list[SkeletonTrack], root: int) -> list[Pair]:
     """Pairs that tie every camera to the root, those with most frames together first (Prim)."""
     tied: list[int] = [root]
     ties: list[Pair] = []
@@ -202,7 +202,7 @@ def _tree(tracks: list[Track], root: int) -> list[Pair]:
         tied.append(best.b)
 
 
-def _tie(tracks: list[Track], pair: Pair, known: Registration, search_s: float, log: Log) -> Registration:
+def _tie(tracks: list[SkeletonTrack], pair: Pair, known: Registration, search_s: float, log: Log) -> Registration:
     """How camera b stands to the root, by way of camera a."""
     a, b = (tracks[i] for i in pair)
     names = " and ".join(log.header.cameras[i] for i in pair)
@@ -237,7 +237,9 @@ def _doubts(residuals: tuple[Residual, ...]) -> Iterator[str]:
             )
 
 
-def _residuals(cameras: tuple[str, ...], tracks: list[Track], found: dict[int, Registration]) -> tuple[Residual, ...]:
+def _residuals(
+    cameras: tuple[str, ...], tracks: list[SkeletonTrack], found: dict[int, Registration]
+) -> tuple[Residual, ...]:
     rests = []
     for a in range(len(cameras)):
         for b in range(a + 1, len(cameras)):
@@ -251,7 +253,7 @@ def _residuals(cameras: tuple[str, ...], tracks: list[Track], found: dict[int, R
 
 
 def _floor(
-    tracks: list[Track],
+    tracks: list[SkeletonTrack],
     found: dict[int, Registration],
     root: int,
     up: Floats | None,
@@ -262,7 +264,7 @@ def _floor(
     order = [root, *(i for i in found if i != root)]
     for i in order:
         T = found[i].T_a_b
-        track = Track(tracks[i].t_ns, transform(T, tracks[i].points_m), tracks[i].confidence)
+        track = SkeletonTrack(tracks[i].t_ns, transform(T, tracks[i].points_m), tracks[i].confidence)
         floor = find_floor(track, up)
         if floor is not None and np.isfinite([*floor.up, floor.height_m]).all():
             return floor if height_m is None else replace(floor, height_m=height_m)

@@ -1,4 +1,4 @@
-"""The cell: where cameras and robot stand, and how the cameras' clocks differ. World: z up, floor at z = 0."""
+"""The cell file: poses of cameras and robot, clock offsets. World frame: z up, floor at z = 0."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Floor and up direction from a person who stands and walks on it. Nothing is assumed of the sensor's axes."""
+"""Estimation of the floor plane and the upward direction from a person who stands and walks.
+
+Nothing is assumed about the directions of the sensor's axes.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hrcreplay.calibration.registration import Track, rigid
+from hrcreplay.calibration.registration import SkeletonTrack, rigid
 from hrcreplay.records import POINTS, Bools, Floats
 
 _SOLE_M = 0.03  # foot point above the floor, Winter's foot with a shoe's sole
@@ -32,8 +35,8 @@ class Floor:
     tilt_std_rad: float  #: how well ``up`` is known, standard deviation [rad]
 
 
-def up_direction(track: Track) -> tuple[Floats, float] | None:
-    """Where up is, by how the person holds the body.
+def up_direction(track: SkeletonTrack) -> tuple[Floats, float] | None:
+    """The upward direction, from the direction of the person's body.
 
     Returns:
         Unit vector (3,) in the sensor's frame and its standard deviation [rad]. Who stands keeps the centre of mass
@@ -55,7 +58,7 @@ def up_direction(track: Track) -> tuple[Floats, float] | None:
     return None
 
 
-def find_floor(track: Track, up: Floats | None = None) -> Floor | None:
+def find_floor(track: SkeletonTrack, up: Floats | None = None) -> Floor | None:
     """The plane under the feet.
 
     Ankles and feet that rest lie on two planes of one direction; the posture says which direction is likely, the more
@@ -109,7 +112,7 @@ def floor_frame(floor: Floor) -> Floats:
     return rigid(np.stack([x, np.cross(floor.up, x), floor.up]), np.array([0.0, 0.0, floor.height_m]))
 
 
-def _point(track: Track, name: str) -> Floats:
+def _point(track: SkeletonTrack, name: str) -> Floats:
     i = POINTS.index(name)
     return np.where((track.confidence[:, i] > 0)[:, None], track.points_m[:, i], np.nan)
 
@@ -124,7 +127,7 @@ def _length(vectors: Floats) -> Floats:
     return np.asarray(np.linalg.norm(vectors, axis=-1))
 
 
-def _rows_for(track: Track, seconds: float) -> float:
+def _rows_for(track: SkeletonTrack, seconds: float) -> float:
     """Number of rows of this track that last so long."""
     return max(1.0, seconds * 1e9 / float(np.median(np.diff(track.t_ns)))) if len(track) > 1 else np.inf
 
@@ -138,7 +141,7 @@ def _middle(directions: Floats) -> Floats:
     return middle
 
 
-def _feet(track: Track) -> tuple[Floats, Bools]:
+def _feet(track: SkeletonTrack) -> tuple[Floats, Bools]:
     """(m, 3) ankles and feet that the sensor is sure of, and (m,) which are ankles."""
     places, kinds = [], []
     for name in ("ankle_l", "ankle_r", "foot_l", "foot_r"):

@@ -1,8 +1,8 @@
-"""Where two sensors stand to one another, from the skeletons of the one person both saw.
+"""Registration of two sensors, pose and clock offset, from the skeletons of one person that both saw.
 
-Real skeletons carry gross errors at full confidence (left/right mix-ups, jumps), two clocks that do not agree, and
-frames taken at different instants. So both tracks are smoothed by the same kernel and compared at one camera's
-instants, and pose and clock offset are found together by a robust Gauss-Newton.
+Recorded skeletons have gross errors at full confidence (left and right exchanged, jumps), the two clocks differ, and
+frames are taken at different instants. So both tracks are smoothed by the same kernel and compared at the instants of
+one camera, and pose and clock offset are estimated together by a robust Gauss-Newton method.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _COARSE = 1200  # and of these at most, while offsets are only searched
 
 
 @dataclass(frozen=True)
-class Track(Table):
+class SkeletonTrack(Table):
     """One person as one sensor saw it, a row a frame, in order of capture."""
 
     t_ns: Ints  #: (n,) capture time on the sensor's own clock
@@ -42,7 +42,7 @@ class Track(Table):
 
 @dataclass(frozen=True)
 class Registration:
-    """How sensor b stands to sensor a."""
+    """Pose and clock of sensor b relative to sensor a."""
 
     T_a_b: Floats  #: (4, 4) takes points of b into the frame of a
     offset_s: float  #: clock of b minus clock of a [s]
@@ -88,7 +88,7 @@ def transform(T: Floats, points_m: Floats) -> Floats:
     return points_m @ T[:3, :3].T + T[:3, 3]
 
 
-def register(a: Track, b: Track, *, search_s: float = 2.0) -> Registration | None:
+def register(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float = 2.0) -> Registration | None:
     """Pose of sensor b in the frame of sensor a, and b's clock offset.
 
     Args:
@@ -126,7 +126,7 @@ def register(a: Track, b: Track, *, search_s: float = 2.0) -> Registration | Non
     return Registration(T, offset_s)
 
 
-def disagreement(a: Track, b: Track, found: Registration) -> Disagreement | None:
+def disagreement(a: SkeletonTrack, b: SkeletonTrack, found: Registration) -> Disagreement | None:
     """What remains between the raw points of two registered tracks, b interpolated linearly to a's instants.
 
     Returns:
@@ -151,7 +151,7 @@ def disagreement(a: Track, b: Track, found: Registration) -> Disagreement | None
     return Disagreement(float(median_m), float(p95_m), int(seen.sum()), float(mirrored[seen.any(axis=1)].mean()))
 
 
-def _without_jumps(track: Track) -> Track:
+def _without_jumps(track: SkeletonTrack) -> SkeletonTrack:
     """Points that leave the median of their five nearest frames by more than a fast arm could: confidence 0.
 
     Kept out before smoothing, which would smear them over their neighbours.
@@ -163,10 +163,10 @@ def _without_jumps(track: Track) -> Track:
     filled = np.where(seen[..., None], track.points_m, 0.0)
     middle = np.median(np.where(np.isnan(points[around]), filled[:, None], points[around]), axis=1)
     jumps = np.linalg.norm(filled - middle, axis=2) > 0.15
-    return Track(track.t_ns, filled, np.where(seen & ~jumps, track.confidence, 0.0))
+    return SkeletonTrack(track.t_ns, filled, np.where(seen & ~jumps, track.confidence, 0.0))
 
 
-def _smoothed(track: Track, t_ns: Ints, width_s: float) -> tuple[Floats, Floats, Floats]:
+def _smoothed(track: SkeletonTrack, t_ns: Ints, width_s: float) -> tuple[Floats, Floats, Floats]:
     """Points (n, 20, 3) [m], velocities [m/s] and weights (n, 20) of a track at other instants."""
     return _smooth(track.t_ns, track.points_m, track.confidence, t_ns, width_s / _NS)
 
@@ -212,7 +212,9 @@ def _smooth(
     return value, slope, weight
 
 
-def _coarse_offset(t_ns: Ints, velocity_a: Floats, b: Track, width_s: float, search_s: float) -> tuple[float, float]:
+def _coarse_offset(
+    t_ns: Ints, velocity_a: Floats, b: SkeletonTrack, width_s: float, search_s: float
+) -> tuple[float, float]:
     """Offset [s] at which the points' speeds correlate best, and how well; no pose of a sensor changes them."""
     speed_a = np.minimum(np.linalg.norm(velocity_a, axis=2), _SPEED_MAX)
     seen_a = speed_a > 0

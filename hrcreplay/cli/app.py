@@ -1,4 +1,7 @@
-"""Commands: parse, call, print the run folder. Heavy imports stand inside the commands, so that --help is quick."""
+"""The command line: parses the arguments, calls the command, prints the run folder.
+
+Slow imports stand inside the commands, so that ``--help`` answers at once.
+"""
 
 from __future__ import annotations
 
@@ -162,7 +165,7 @@ def _summarize(folder: Path) -> None:
     from hrcreplay.run import report, stages
 
     for line in report.summary(folder):
-        stages.say(line)
+        stages.print_note(line)
 
 
 _stage("fuse", "Stage 1: merge the cameras' skeletons into one person (state.parquet).")

@@ -1,4 +1,4 @@
-"""The commands beside a robot: live, twin, verify."""
+"""The commands that work with a live robot: live, twin, verify."""
 
 from __future__ import annotations
 
@@ -98,9 +98,9 @@ def twin(
 ) -> None:
     """Play the robot of an EGM session: a UDP client with the controller's behaviour, and faults on demand."""
     from hrcreplay.egm.robot_double.faults import load_faults
-    from hrcreplay.egm.robot_double.loop import run_twin
     from hrcreplay.egm.robot_double.servo import ServoSettings
     from hrcreplay.egm.robot_double.twin import TwinSettings
+    from hrcreplay.egm.robot_double.udp_client import run_twin
 
     servo = ServoSettings(
         gain=gain,

@@ -1,4 +1,4 @@
-"""Commands about logs and cells rather than runs: info, import, calibrate."""
+"""The commands that make no run folder: info, import, calibrate."""
 
 from __future__ import annotations
 
@@ -79,6 +79,16 @@ def calibrate(
     base: str | None,
 ) -> list[str]:
     """Writes the cell file of a log's cameras; returns the residuals and what is not sure, line by line.
+
+    Args:
+        log: Log whose cameras saw one person.
+        out: Cell file to write.
+        config: Settings file, or none.
+        overrides: ``section.key=value`` of the command line, which win over the file.
+        reference: Camera that defines the world; None: the first.
+        up: ``X,Y,Z``, up in the reference camera's frame; None: from the person's feet.
+        height_m: Height of the reference camera above the floor [m]; None: from the person's feet.
+        base: ``X,Y,Z,YAW`` of the robot base in the world [m, m, m, deg]; None: not known.
 
     Raises:
         SettingsError: An option cannot be used, or ``out`` exists.

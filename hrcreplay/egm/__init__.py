@@ -1,1 +1,1 @@
-"""The link to the robot: messages, our side of the conversation, the socket, and a robot double to try them on."""
+"""The EGM link: message codec, our side of the protocol, UDP server, and a robot double for tests."""

@@ -1,8 +1,7 @@
-"""Datagrams to records and back. Degrees and millimetres stay in here.
+"""Encoding and decoding of EGM datagrams, and the pose of the flange that a controller reports beside the joints.
 
-Every call makes its message anew: one that is used again never gives memory back (0.5 kB a packet).
-
-Where the flange is: the pose that a controller tells beside the joints.
+Degrees and millimetres are used only in here. Each call makes a new protobuf message: one that is used again never
+gives its memory back (0.5 kB a packet).
 """
 
 from __future__ import annotations
@@ -108,7 +107,7 @@ class Rapid(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class RobotPacket:
-    """What the robot says each cycle.
+    """The feedback of the robot in one cycle.
 
     Attributes:
         seqno: The robot's counter, None where it sent none.
@@ -137,7 +136,7 @@ class RobotPacket:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """What we tell the robot: ``q`` (6,) [rad] and the speed reference ``dq`` (6,) [rad/s]."""
+    """Our reply to the robot: ``q`` (6,) [rad] and the speed reference ``dq`` (6,) [rad/s]."""
 
     seqno: int
     tm_ms: int
@@ -199,7 +198,7 @@ def encode_correction(correction: Correction) -> bytes:
 
 
 def decode_correction(data: bytes) -> Correction:
-    """Read what a guide told the robot; without a speed reference the speed is 0.
+    """Read a reply to the robot; without a speed reference the speed is 0.
 
     Raises:
         BadPacket: Empty, garbage, a robot's own message, not six joints, or a joint that is no finite number.

@@ -1,1 +1,1 @@
-"""The live driver: the stages of the replay at a real robot's pace, with everything it hears and says on record."""
+"""Live sessions: the stages of the replay at the cycle time of a real robot, with inputs and outputs recorded."""

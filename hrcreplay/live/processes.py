@@ -1,16 +1,12 @@
-"""The processes beside the control loop, and the sockets to them. Nothing here waits for any of them.
+"""The helper processes of a live session: their start, their sockets, and the files that their crashes leave.
 
-What a crash of one of a session's processes leaves in the run folder: a file with its traceback.
+Messages between control and a helper are whole, and neither waits for the other: a message that the other does not
+take is dropped and counted. Each helper runs as ``python -m hrcreplay.live.processes FOLDER PART MODULE arguments``.
 
-The first line of ``crash_<part>.txt`` says which part failed, with what exception and where; that line is also what the
-user is told and what run.json has. A part may be a process that ended without a word.
-
-A helper process's end of its socket to the control loop: whole messages, and nobody ever waits for the other.
-
-How each process beside control runs: ``python -m hrcreplay.live.processes FOLDER PART MODULE arguments``.
-
-Whatever ends it that nobody foresaw is kept with its traceback in the run folder, not on the user's terminal; control
-sees the process gone, brakes the robot and tells of it.
+An exception that ends a part of the session is kept with its traceback in the run folder and not shown on the user's
+terminal; control sees that the process is gone, brakes the robot and reports it. The first line of
+``crash_<part>.txt`` says which part failed, with what exception and where; the user is told the same line, and run.json
+has it. A part may also be a process that ended without an exception.
 """
 
 from __future__ import annotations
@@ -41,7 +37,7 @@ PREFIX = "crash_"
 _PACKAGE = Path(hrcreplay.__file__).parent
 
 
-def said_of(error: BaseException) -> str:
+def describe_exception(error: BaseException) -> str:
     """An exception in one line: its kind, its message, and where in our code it arose."""
     message = " ".join(str(error).split())
     frames = traceback.extract_tb(error.__traceback__)
@@ -54,7 +50,7 @@ def said_of(error: BaseException) -> str:
     return name
 
 
-def end_of(code: int) -> str:
+def describe_exit(code: int) -> str:
     """How a process ended that left nothing else: killed, or by an exit code."""
     if code >= 0:
         return f"ended with exit code {code}"
@@ -63,13 +59,13 @@ def end_of(code: int) -> str:
     return f"killed by signal {-code}"
 
 
-def write(folder: Path, part: str, error: BaseException | str) -> str:
+def write_crash(folder: Path, part: str, error: BaseException | str) -> str:
     """Keeps a crash; one of the same part that came first stays first.
 
     Returns:
-        What to say of it, as ``read`` gives it.
+        What to say of it, as ``read_crashes`` gives it.
     """
-    said = f"{part}: {error if isinstance(error, str) else said_of(error)}"
+    said = f"{part}: {error if isinstance(error, str) else describe_exception(error)}"
     trace = "" if isinstance(error, str) else "".join(traceback.format_exception(error))
     try:
         with _file(folder, part).open("a") as file:
@@ -80,7 +76,7 @@ def write(folder: Path, part: str, error: BaseException | str) -> str:
     return said
 
 
-def read(folder: Path) -> list[str]:
+def read_crashes(folder: Path) -> list[str]:
     """What there is to say of the crashes that a session's folder holds, a line each."""
     lines = []
     for path in sorted(folder.glob(f"{PREFIX}*.txt")):
@@ -89,7 +85,7 @@ def read(folder: Path) -> list[str]:
     return lines
 
 
-def left(folder: Path, part: str) -> bool:
+def has_crash_file(folder: Path, part: str) -> bool:
     """Whether a part has left a file."""
     return _file(folder, part).exists()
 
@@ -98,14 +94,14 @@ def _file(folder: Path, part: str) -> Path:
     return folder / f"{PREFIX}{part.replace(' ', '_')}.txt"
 
 
-_LARGEST = 1 << 20  # no message is larger; one that is would be cut, never split
+_LARGEST = 1 << 20  #: no message is larger; one that is would be cut, never split
 
 
 class ControlGoneError(Exception):
     """The control process closed its end, or is dead: the helper has nothing left to do."""
 
 
-class Channel:
+class ControlChannel:
     """SOCK_SEQPACKET socket inherited from the control process; the first byte of a message is its kind."""
 
     def __init__(self, fd: int) -> None:
@@ -148,32 +144,31 @@ class Channel:
         return data
 
 
-#: Module through which every helper starts; see process.py.
+#: Module through which every helper starts; see ``main``.
 ENTRY = "hrcreplay.live.processes"
 
-_LARGEST = 1 << 20  #: no message is larger
 _BUFFER = 4 << 20  #: of messages under way: seconds of them
 _AT_ONCE = 256  #: messages taken at once, so that a flood does not hold up the loop
 
 
-class Helper:
-    """A process of ours, with a socket whose far end it holds."""
+class HelperProcess:
+    """A helper process and control's end of the socket to it."""
 
     def __init__(
-        self, part: str, module: str, arguments: Sequence[str], folder: Path, told: tuple[int, ...] = ()
+        self, part: str, module: str, arguments: Sequence[str], folder: Path, expected: tuple[int, ...] = ()
     ) -> None:
         """Starts ``module --fd N arguments`` in a session of its own: Ctrl-C is for control alone.
 
         Args:
-            part: Which part of the session it is, of crash.py.
+            part: Which part of the session it is: PERSON, RECORDER or SCREEN.
             module: Module to run.
             arguments: Of it, beside the socket.
             folder: Where it leaves its traceback if it crashes.
-            told: Exit codes beside 0 of a process that has told why it ends: no crash.
+            expected: Exit codes beside 0 of a process that has said why it ends: no crash.
         """
         self.part = part
         self._folder = folder
-        self._told = (0, *told)
+        self._told = (0, *expected)
         near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         for end in (near, far):
             _enlarge(end)
@@ -204,7 +199,7 @@ class Helper:
                 self.alive = False
 
     def messages(self) -> Iterator[bytes]:
-        """What it has said since."""
+        """Messages that have arrived since the last call."""
         for _ in range(_AT_ONCE):
             try:
                 message = self._socket.recv(_LARGEST)
@@ -217,18 +212,18 @@ class Helper:
                 return
             yield message
 
-    def notice(self) -> bool:
-        """Whether it is still there, for one that never says anything."""
+    def check_alive(self) -> bool:
+        """Whether the process still runs; for one that sends no messages."""
         if self.alive:
             for _ in self.messages():
                 pass
         return self.alive
 
     def crashed(self) -> bool:
-        """Whether it has ended as nobody foresaw; no for one that lives, or is about to end."""
+        """Whether it has ended with an unexpected exit code; False while it runs or is about to end."""
         return not self.alive and self.process.poll() not in (None, *self._told)
 
-    def dismiss(self, patience_s: float) -> int | None:
+    def close(self, patience_s: float) -> int | None:
         """Closes the socket, which ends the process; its exit code, None where it had to be killed.
 
         A process that crashed has left a file in the run folder; of one that could not, this leaves it.
@@ -241,8 +236,8 @@ class Helper:
             self.process.kill()
             self.process.wait()
             return None
-        if self.crashed() and not left(self._folder, self.part):
-            write(self._folder, self.part, end_of(code))
+        if self.crashed() and not has_crash_file(self._folder, self.part):
+            write_crash(self._folder, self.part, describe_exit(code))
         return code
 
 
@@ -255,7 +250,7 @@ def _enlarge(end: socket.socket) -> None:
         end.setsockopt(socket.SOL_SOCKET, forced, _BUFFER)
 
 
-def take_precedence() -> list[str]:
+def raise_priority() -> list[str]:
     """Asks the system to run this process before others and to keep it in memory; returns what was refused."""
     import ctypes
 
@@ -273,8 +268,8 @@ def take_precedence() -> list[str]:
     return refused
 
 
-def step_back() -> None:
-    """Ends what ``take_precedence`` asked for."""
+def restore_priority() -> None:
+    """Ends what ``raise_priority`` asked for."""
     import ctypes
 
     with contextlib.suppress(OSError, AttributeError):
@@ -292,7 +287,7 @@ def main() -> None:
     folder, part, module, *arguments = sys.argv[1:]
 
     def die(error: BaseException) -> NoReturn:
-        write(Path(folder), part, error)
+        write_crash(Path(folder), part, error)
         os._exit(CRASHED)  # other threads may wait for one that is gone
 
     threading.excepthook = lambda raised: die(raised.exc_value or SystemError("a thread ended without a reason"))

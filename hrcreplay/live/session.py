@@ -1,4 +1,4 @@
-"""`hrcreplay live`: the processes of a session, its loop, and what it leaves behind."""
+"""The command ``live``: starts the processes of a session, runs its control loop and makes its run folder."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from hrcreplay.egm.link import Link
+from hrcreplay.egm.udp_server import EgmServer
 from hrcreplay.errors import HrcReplayError, LiveStopped, LogError, SettingsError
 from hrcreplay.live import processes
 from hrcreplay.live.control import watchdog
 from hrcreplay.live.control.last_resort import bring_to_rest
 from hrcreplay.live.control.loop import ENDING, Loop, LoopSettings
-from hrcreplay.live.control.pilot import Pilot
-from hrcreplay.live.control.setup import build_pilot, live_job, start_table, warm
-from hrcreplay.live.processes import Helper, step_back, take_precedence
+from hrcreplay.live.control.session_controller import SessionController
+from hrcreplay.live.control.setup import build_controller, compile_kernels, live_job, start_table
+from hrcreplay.live.processes import HelperProcess, raise_priority, restore_priority
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import Signal
-from hrcreplay.live.view.status_publisher import Teller
+from hrcreplay.live.view.status_publisher import StatusPublisher
 from hrcreplay.settings.load import Settings
 
-#: Longest wait for a packet before the loop looks after everything else [s].
+#: Longest wait for a packet before the loop turns to everything else [s].
 WAIT_S = 0.02
 
 #: Longest wait for the recording to be opened, and for the record to be finished [s].
@@ -64,19 +64,19 @@ def run(request: Request) -> Path:
         LogError: The recording of the person cannot be read.
         LiveStopped: The session ended by a stop reason, or a part of it crashed; then its record is not complete.
     """
-    partial = folder.begin(request.out)
+    partial = folder.make_partial(request.out)
     try:
         with ExitStack() as stack:
             prepared = _prepare(request, stack)
-            loop, crashes = _conduct(request, prepared, partial)
+            loop, crashes = _run_processes(request, prepared, partial)
     except _CrashedError:
-        raise _broken_off(partial, processes.read(partial)) from None
+        raise _broken_off(partial, processes.read_crashes(partial)) from None
     except (HrcReplayError, KeyboardInterrupt, SystemExit):
         if not (partial / folder.LOG).exists():
             shutil.rmtree(partial, ignore_errors=True)  # there is nothing in it
         raise
     except Exception as error:  # whatever it is
-        raise _broken_off(partial, [processes.write(partial, processes.CONTROL, error)]) from None
+        raise _broken_off(partial, [processes.write_crash(partial, processes.CONTROL, error)]) from None
     done = _finish(partial, crashes)
     _verdict(loop, done, crashes)
     return done
@@ -96,12 +96,12 @@ def _finish(partial: Path, crashes: list[str]) -> Path:
             raise
         raise _broken_off(partial, crashes) from None
     except Exception as error:  # whatever it is
-        raise _broken_off(partial, [*crashes, processes.write(partial, processes.FOLDER, error)]) from None
+        raise _broken_off(partial, [*crashes, processes.write_crash(partial, processes.FOLDER, error)]) from None
 
 
 def _broken_off(partial: Path, crashes: list[str]) -> LiveStopped:
     """What to say of a session that no run folder can be made of; what there is of it says the same."""
-    folder.leave(partial, crashes)
+    folder.keep_incomplete(partial, crashes)
     return LiveStopped(f"{crashes[0]}; not complete: what there is of the record, and the traceback, is in {partial}")
 
 
@@ -115,49 +115,51 @@ class _Prepared:
 
     settings: Settings
     start: dict[str, Any]
-    pilot: Pilot
-    link: Link
+    controller: SessionController
+    link: EgmServer
 
 
 def _prepare(request: Request, stack: ExitStack) -> _Prepared:
-    """Settings, pilot, port; every kernel compiled."""
+    """Settings, controller, port; every kernel compiled."""
     job, header = live_job(request.human, request.config, request.overrides, request.cell)
     port = job.settings.live.port if request.port is None else request.port
     start = start_table(job, header, sending=request.send)
-    pilot = build_pilot(start)
-    link = stack.enter_context(closing(Link("", port, WAIT_S)))
-    warm(start)
-    return _Prepared(job.settings, start, pilot, link)
+    controller = build_controller(start)
+    link = stack.enter_context(closing(EgmServer("", port, WAIT_S)))
+    compile_kernels(start)
+    return _Prepared(job.settings, start, controller, link)
 
 
-def _conduct(request: Request, prepared: _Prepared, partial: Path) -> tuple[Loop, list[str]]:
+def _run_processes(request: Request, prepared: _Prepared, partial: Path) -> tuple[Loop, list[str]]:
     """The loop with the processes around it; the loop, which is over, and what is to be said of crashes."""
     settings = prepared.settings
     anchor_ns = time.time_ns() - time.monotonic_ns()
     to_record = ["--path", str(partial / folder.LOG)]
-    recorder = Helper(processes.RECORDER, "hrcreplay.live.record.recorder", to_record, partial)
+    recorder = HelperProcess(processes.RECORDER, "hrcreplay.live.record.recorder", to_record, partial)
     person_arguments = _person_arguments(request, settings, anchor_ns)
-    person = Helper(processes.PERSON, "hrcreplay.live.person.source", person_arguments, partial, told=(2, 3))
-    screen = Helper(processes.SCREEN, "hrcreplay.live.view.screen", _screen_arguments(request), partial)
+    person = HelperProcess(processes.PERSON, "hrcreplay.live.person.source", person_arguments, partial, expected=(2, 3))
+    screen = HelperProcess(processes.SCREEN, "hrcreplay.live.view.screen", _screen_arguments(request), partial)
     begun = False
     try:
         _await_person(person, request.human)
         begun, start_ns = True, time.monotonic_ns() + anchor_ns
-        parts = prepared.pilot, prepared.link, person, recorder
+        parts = prepared.controller, prepared.link, person, recorder
         loop = Loop(*parts, _loop_settings(request, settings), anchor_ns, start_ns, screen)
-        recorder.send(codec.event(loop.start_ns, {"what": "start", **prepared.start}))
-        crashes = _fly(loop, prepared.start, partial, real_time=settings.live.real_time, in_3d=bool(request.foxglove))
+        recorder.send(codec.encode_event(loop.start_ns, {"what": "start", **prepared.start}))
+        crashes = _run_loop(
+            loop, prepared.start, partial, real_time=settings.live.real_time, in_3d=bool(request.foxglove)
+        )
     finally:
-        screen.dismiss(2.0)
-        person.dismiss(2.0)
-        if recorder.dismiss(PATIENCE_S) is None:
-            processes.write(partial, processes.RECORDER, f"did not finish within {PATIENCE_S:g} s")
+        screen.close(2.0)
+        person.close(2.0)
+        if recorder.close(PATIENCE_S) is None:
+            processes.write_crash(partial, processes.RECORDER, f"did not finish within {PATIENCE_S:g} s")
         if not begun:
             (partial / folder.LOG).unlink(missing_ok=True)  # there is nothing in it
-    return loop, list(dict.fromkeys([*crashes, *processes.read(partial)]))
+    return loop, list(dict.fromkeys([*crashes, *processes.read_crashes(partial)]))
 
 
-def _fly(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, in_3d: bool) -> list[str]:
+def _run_loop(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, in_3d: bool) -> list[str]:
     """The loop, alone with the robot: no garbage collector, no waiting for anybody. Returns its crashes."""
     found: list[Exception] = []
     with _signals(loop):
@@ -165,53 +167,53 @@ def _fly(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, i
         gc.freeze()
         gc.disable()
         try:
-            for refused in take_precedence() if real_time else ():
+            for refused in raise_priority() if real_time else ():
                 loop.note(f"the system refuses {refused}")
-            teller = Teller(loop, start, in_3d=in_3d)
+            publisher = StatusPublisher(loop, start, in_3d=in_3d)
             loop.begin()
-            while loop.turn():
-                teller.tell()
+            while loop.run_cycle():
+                publisher.publish()
         except Exception as error:  # whatever it is, the robot is braked first
             found.append(error)
-            bring_to_rest(loop, processes.said_of(error))
+            bring_to_rest(loop, processes.describe_exception(error))
         finally:
-            step_back()
+            restore_priority()
             gc.enable()
             gc.unfreeze()
         try:
-            loop.recorder.send(codec.event(loop.now_ns(), {"what": "end", **outcome(loop)}))
-            teller.tell(last=True)
+            loop.recorder.send(codec.encode_event(loop.now_ns(), {"what": "end", **outcome(loop)}))
+            publisher.publish(last=True)
         except Exception as error:  # whatever it is
             found.append(error)
-    if loop.pilot.fault is not None:
-        found.insert(0, loop.pilot.fault)
-    return [processes.write(partial, processes.CONTROL, error) for error in found]
+    if loop.controller.fault is not None:
+        found.insert(0, loop.controller.fault)
+    return [processes.write_crash(partial, processes.CONTROL, error) for error in found]
 
 
 def outcome(loop: Loop) -> dict[str, Any]:
     """What there is to say of a session at its end, as JSON."""
     return {
-        "stops": [{"t_ns": t_ns, "reason": reason} for t_ns, reason in loop.pilot.stops],
+        "stops": [{"t_ns": t_ns, "reason": reason} for t_ns, reason in loop.controller.stops],
         "reason": _reason(loop),
-        "waiting": loop.pilot.waiting,
+        "waiting": loop.controller.waiting,
         "answers": loop.answers,
         "looks_skipped": loop.skipped,
         "dropped": loop.recorder.dropped,
-        "counts": {name: int(count) for name, count in sorted(loop.pilot.counts().items())},
+        "counts": {name: int(count) for name, count in sorted(loop.controller.counts().items())},
     }
 
 
 def _reason(loop: Loop) -> str:
-    return loop.pilot.stop or watchdog.of_signals(loop.caught | (loop.signals & ENDING))
+    return loop.controller.stop or watchdog.of_signals(loop.caught | (loop.signals & ENDING))
 
 
 def _verdict(loop: Loop, done: Path, crashes: list[str]) -> None:
     if crashes:
-        braked = "braked; " if loop.pilot.stops else ""
+        braked = "braked; " if loop.controller.stops else ""
         raise LiveStopped(f"{crashes[0]}; {braked}the record, not complete, and the traceback are in {done}")
     reason = _reason(loop)
     if reason and reason not in (watchdog.SESSION_OVER, watchdog.RECORDING_OVER):
-        at = next((t_ns for t_ns, why in loop.pilot.stops if why == reason), None)
+        at = next((t_ns for t_ns, why in loop.controller.stops if why == reason), None)
         when = "" if at is None else f" after {(at - loop.start_ns) / 1e9:.1f} s"
         last_words = [note.removeprefix("failed ") for note in loop.notes if note.startswith("failed ")]
         why = f" ({last_words[-1]})" if reason == watchdog.PERSON_DEAD and last_words else ""
@@ -234,7 +236,7 @@ def _signals(loop: Loop) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _await_person(person: Helper, human: Path | None) -> None:
+def _await_person(person: HelperProcess, human: Path | None) -> None:
     """Waits until the human side is ready.
 
     Raises:

@@ -1,6 +1,6 @@
-"""`hrcreplay verify`: what a session's record says came out, against what comes out of it again, bit for bit.
+"""The command ``verify``: computes a recorded run again and compares it with the record, bit for bit.
 
-Runs the command of a replay again from its run.json, and compares what comes out with what came out.
+A live session is computed again from its log, message by message; a replay by running its command from its run.json.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from hrcreplay.egm.codec import AXES
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live.control import setup
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, Sight, Signal, TickEvent
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.records import STATUSES, Floats, SweptVolumes
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
-from hrcreplay.store.tables import state_columns
+from hrcreplay.store.columns import state_columns
 
 COMMANDS = ("fuse", "predict", "plan", "report")
 _CONTEXT = ("versions", "limits", "task", "cell")  #: of run.json: what else may make a difference
@@ -136,28 +136,28 @@ class Verdict:
     lines: tuple[str, ...]
 
 
-class Pilot(Protocol):
-    """What makes a session's decisions; see pilot.py."""
+class DecisionMaker(Protocol):
+    """What makes a session's decisions: ``SessionController``, or a substitute in tests."""
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Sight | None:
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
         """What is known of the person."""
 
-    def answer(self, event: TickEvent) -> Answer:
+    def answer(self, event: TickEvent) -> Decision:
         """What the robot is told."""
 
     def silence(self, t_ns: int, signals: Signal) -> None:
         """The robot said nothing."""
 
 
-Build = Callable[[dict[str, Any]], Pilot]
+ControllerFactory = Callable[[dict[str, Any]], DecisionMaker]
 
 
-def verify(run: Path, build: Build = setup.build_pilot) -> Verdict:
+def verify(run: Path, build: ControllerFactory = setup.build_controller) -> Verdict:
     """Runs a live session or a replay again from what its folder holds, and compares.
 
     Args:
         run: Run folder; also that of a session under way or killed.
-        build: Makes a session's pilot from its start event.
+        build: Makes a session's controller from its start event.
 
     Raises:
         SettingsError: No run folder, or one of a command that cannot be run again.
@@ -169,25 +169,25 @@ def verify(run: Path, build: Build = setup.build_pilot) -> Verdict:
     return _session(run, build)
 
 
-def _session(run: Path, build: Build) -> Verdict:
-    tape = Tape(run / LOG)
-    again = Again(build(tape.start()))
+def _session(run: Path, build: ControllerFactory) -> Verdict:
+    log = SessionLogReader(run / LOG)
+    again = SessionRecomputation(build(log.start()))
     difference = None
-    for message in tape.messages():
-        if tape.flaws or again.crashed:
+    for message in log.messages():
+        if log.flaws or again.crashed:
             break
-        difference = again.differs(message)
+        difference = again.difference_at(message)
         if difference is not None:
             break
     else:
-        difference = again.owed()
-    lines = [f"{tape.path}: {flaw}" for flaw in tape.flaws]
+        difference = again.pending_difference()
+    lines = [f"{log.path}: {flaw}" for flaw in log.flaws]
     if difference is not None:
         lines.append(difference)
     lines += _changed(run)
     if lines:
         return Verdict(identical=False, lines=(*lines, f"identical until then: {again.ticks} ticks"))
-    end = "" if again.ended and tape.finished else "; the record breaks off: the session or its recorder was killed"
+    end = "" if again.ended and log.finished else "; the record breaks off: the session or its recorder was killed"
     end = f"; then control crashed: {again.crashed}" if again.crashed else end
     return Verdict(identical=True, lines=(f"identical: {again.ticks} ticks, {again.looks} looks{end}",))
 
@@ -208,41 +208,41 @@ def _changed(run: Path) -> Iterator[str]:
             yield f"{path}: is not as the run left it"
 
 
-class Again:
-    """A session once more: a fresh pilot is told what the record says, and must say what the record says."""
+class SessionRecomputation:
+    """Computes a session again: a new controller gets the recorded inputs and must give the recorded outputs."""
 
-    def __init__(self, pilot: Pilot) -> None:
+    def __init__(self, controller: DecisionMaker) -> None:
         self.ticks = 0  #: answers so far
         self.looks = 0
         self.ended = False
-        self.crashed = ""  #: how control crashed, after which no pilot answered
-        self._pilot = pilot
+        self.crashed = ""  #: how control crashed, after which no controller answered
+        self._pilot = controller
         self._start_ns: int | None = None
         self._last_ns = 0
         self._frames: list[bytes] = []
         self._datagrams: list[bytes] = []
         self._reply: bytes | None = None  # due as the next message
-        self._sight: Sight | None = None
+        self._perception: Perception | None = None
         self._suspect = ""  # a limb whose volume is not that of the record; perhaps it is there whole
         self._take = {
             codec.ROBOT: self._robot,
             codec.REPLY: self._replied,
-            codec.FRAME: self._frame,
-            codec.LOOK: self._look,
+            codec.SKELETON: self._frame,
+            codec.PERCEPTION: self._look,
             codec.VOLUMES: self._volumes,
-            codec.ANSWER: self._answer,
-            codec.SILENCE: self._silence,
+            codec.DECISION: self._answer,
+            codec.TIMEOUT: self._silence,
             codec.EVENT: self._event,
         }
 
-    def differs(self, message: bytes) -> str | None:
+    def difference_at(self, message: bytes) -> str | None:
         """The first thing about a message, or due before it, that is not the same again."""
         kind, t_ns = codec.kind(message), codec.clock_ns(message)
         if self._start_ns is None:
             self._start_ns = t_ns
         self._last_ns = t_ns
         found = None
-        if kind == codec.EVENT and (event := codec.read_event(message)).get("what") == "crash":
+        if kind == codec.EVENT and (event := codec.decode_event(message)).get("what") == "crash":
             self.crashed = str(event["text"])
             return None
         if self._reply is not None and kind != codec.REPLY:
@@ -253,7 +253,7 @@ class Again:
             found = self._take[kind](message)
         return None if found is None else self._at(t_ns, found)
 
-    def owed(self) -> str | None:
+    def pending_difference(self) -> str | None:
         """What differs that the message after the last one would have shown."""
         return self._at(self._last_ns, self._suspect) if self._suspect else None
 
@@ -267,63 +267,63 @@ class Again:
         self._frames.append(codec.body(message))
 
     def _silence(self, message: bytes) -> None:
-        self._pilot.silence(codec.clock_ns(message), codec.read_silence(message))
+        self._pilot.silence(codec.clock_ns(message), codec.decode_timeout(message))
 
     def _event(self, message: bytes) -> str | None:
-        what = codec.read_event(message).get("what")
+        what = codec.decode_event(message).get("what")
         self.ended = what == "end"
         if what != "blind":
             return None
         frames, self._frames = self._frames, []
-        self._sight = self._pilot.look(codec.clock_ns(message), frames)
-        return None if self._sight is None else _both("look", "failed", "none of it")
+        self._perception = self._pilot.update_perception(codec.clock_ns(message), frames)
+        return None if self._perception is None else _both("look", "failed", "none of it")
 
     def _look(self, message: bytes) -> str | None:
         frames, self._frames = self._frames, []
-        recorded = codec.read_look(message)
+        recorded = codec.decode_perception(message)
         if len(frames) != recorded.skeletons:
             return f"the record has {len(frames)} of the {recorded.skeletons} skeletons of this look"
-        sight = self._sight = self._pilot.look(recorded.t_ns, frames)
+        perception = self._perception = self._pilot.update_perception(recorded.t_ns, frames)
         self.looks += 1
-        if sight is None:
+        if perception is None:
             return _both("look", "done", "failed")
-        if codec.look(sight.states, sight.volumes, len(frames)) == message:
+        if codec.encode_perception(perception.states, perception.volumes, len(frames)) == message:
             return None
-        columns = state_columns(sight.states)
-        cameras = [f"valid_{camera}" for camera in sight.states.cameras]
+        columns = state_columns(perception.states)
+        cameras = [f"valid_{camera}" for camera in perception.states.cameras]
         names = [name for name in columns if name != "t_ns" and name not in cameras]
-        found = _first(names, recorded.state, codec.flat(sight.states))
-        found = found or _first(cameras, list(recorded.valid), list(sight.states.valid[0].tobytes()))
+        found = _first(names, recorded.state, codec.state_numbers(perception.states))
+        found = found or _first(cameras, list(recorded.valid), list(perception.states.valid[0].tobytes()))
         if found is None:
-            digests = [codec.digest(sight.volumes, limb) for limb in range(len(sight.volumes.limbs))]
-            whole = [f"volume of {limb} (digest)" for limb in sight.volumes.limbs]
+            digests = [codec.volume_digest(perception.volumes, limb) for limb in range(len(perception.volumes.limbs))]
+            whole = [f"volume of {limb} (digest)" for limb in perception.volumes.limbs]
             self._suspect = _first(whole, [d.hex() for d in recorded.digests], [d.hex() for d in digests]) or ""
         return found
 
     def _volumes(self, message: bytes) -> str | None:
         suspect, self._suspect = self._suspect, ""
-        if self._sight is None:
+        if self._perception is None:
             return _both("volumes", "some", "none")
-        volumes = self._sight.volumes
-        if codec.whole(volumes) == message:
+        volumes = self._perception.volumes
+        if codec.encode_volumes(volumes) == message:
             return suspect or None
-        return _volume(codec.read_whole(message, volumes.limbs, volumes.method), volumes) or suspect or None
+        return _volume(codec.decode_volumes(message, volumes.limbs, volumes.method), volumes) or suspect or None
 
     def _answer(self, message: bytes) -> str | None:
         datagrams, self._datagrams = tuple(self._datagrams), []
-        recorded = codec.read_answer(message)
+        recorded = codec.decode_decision(message)
         self.ticks += 1
         if len(datagrams) != recorded.datagrams:
             return f"the record has {len(datagrams)} of the {recorded.datagrams} packets of this tick"
         again = self._pilot.answer(TickEvent(recorded.t_ns, datagrams, recorded.signals))
         self._reply = again.datagram
-        said = codec.read_answer(codec.answer(again, recorded.signals, len(datagrams), recorded.took_us))
+        said = codec.decode_decision(codec.encode_decision(again, recorded.signals, len(datagrams), recorded.took_us))
         return _first(
             ("phase", "status", "reason", "look_ns", "limb", "link"), _decision(recorded), _decision(said)
         ) or (_first(_ROW, _numbers(recorded), _numbers(said)))
 
     def _replied(self, message: bytes) -> str | None:
-        _, recorded = codec.read_reply(message)
+        _, recorded = codec.decode_reply(message)
         again, self._reply = self._reply, None
         if again is None:
             return _both("reply", f"{len(recorded)} bytes", "none")
@@ -334,7 +334,7 @@ class Again:
         return _first([f"byte {i} of the reply" for i in range(len(again))], list(recorded), list(again))
 
 
-def _decision(found: codec.Answered) -> list[Any]:
+def _decision(found: codec.RecordedDecision) -> list[Any]:
     return [
         codec.PHASES[found.phase],
         STATUSES[found.status],
@@ -345,12 +345,12 @@ def _decision(found: codec.Answered) -> list[Any]:
     ]
 
 
-def _numbers(found: codec.Answered) -> Floats:
+def _numbers(found: codec.RecordedDecision) -> Floats:
     return np.empty(0) if found.row is None else found.row
 
 
 def _volume(recorded: SweptVolumes, again: SweptVolumes) -> str | None:
-    """The first number that differs in a look's volumes."""
+    """The first number that differs in the volumes of a perception update."""
     for limb, name in enumerate(again.limbs):
         mine, yours = recorded.vertices(0, limb), again.vertices(0, limb)
         if len(mine) != len(yours):

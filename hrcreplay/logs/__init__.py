@@ -1,1 +1,1 @@
-"""Files in: logs of any supported kind as one lazy, time-ordered stream of records."""
+"""Reading of logs: any supported format as one lazy stream of records in order of time; importers; writer."""

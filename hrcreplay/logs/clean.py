@@ -1,6 +1,7 @@
-"""Dirt of real logs: each kind is handled here and counted under the name that DEFECTS gives it.
+"""Cleaning of recorded skeletons, and selection of the person of interest among several bodies.
 
-The person of interest among several bodies whose ids change: whoever is where the person last was.
+Each kind of defect is handled here and counted under its name in DEFECTS. Body ids change, so the person is the body
+that is nearest to where the person was last.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.logs.messages import Row
+from hrcreplay.logs.messages import RawSkeleton
 from hrcreplay.records import POINTS, Bools, CameraFrames, Floats
 
 _TORSO = ("pelvis", "chest", "neck", "shoulder_l", "shoulder_r", "hip_l", "hip_r")
@@ -23,7 +24,7 @@ Place = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Sighting:
+class LastPosition:
     """Where and when the person was last seen."""
 
     position_m: Place
@@ -32,16 +33,16 @@ class Sighting:
 
 @dataclass(frozen=True)
 class PersonMemory:
-    """What is carried from one table of frames to the next.
+    """State of the person selection between two tables of frames.
 
     Cameras with known poses share the space "world"; every other camera is a space of its own.
     """
 
-    sightings: tuple[tuple[str, Sighting], ...] = ()  #: space -> last sighting
+    sightings: tuple[tuple[str, LastPosition], ...] = ()  #: space -> last sighting
     bodies: tuple[tuple[str, int], ...] = ()  #: camera -> body id of the person
 
 
-def pick(
+def select_person(
     frames: CameraFrames,
     memory: PersonMemory,
     T_world_camera: Floats,
@@ -85,7 +86,7 @@ def pick(
             continue
         keep[row] = True
         x, y, z = places_m[row]
-        sightings[space] = Sighting((x, y, z), now_ns)
+        sightings[space] = LastPosition((x, y, z), now_ns)
         body = int(frames.body[row])
         counts["person_id_switches"] += bodies.get(name, body) != body
         bodies[name] = body
@@ -165,15 +166,15 @@ _PAIRS = (
 _A, _B = (np.array([POINTS.index(pair[end]) for pair in _PAIRS]) for end in (0, 1))
 
 
-class Mended(NamedTuple):
-    """A row as it is handed on, and what had to be done to its points."""
+class CleanedSkeleton(NamedTuple):
+    """A cleaned row, and the defects found in its points."""
 
-    row: Row
+    row: RawSkeleton
     flaws: tuple[tuple[str, int], ...]  #: name in DEFECTS -> points
 
 
-def mended(row: Row) -> Mended:
-    """The row with all that is no point of a body made missing: NaN, with confidence 0.
+def clean_skeleton(row: RawSkeleton) -> CleanedSkeleton:
+    """Makes every point missing (NaN, confidence 0) that cannot be a point of a body.
 
     Of two ends of a bone in one place neither can be believed. A point of confidence 0 was said to be missing: it is
     made so, and not counted.
@@ -195,7 +196,7 @@ def mended(row: Row) -> Mended:
         "points_too_far": far & told,
         "points_coincident": together & told,
     }
-    return Mended(whole, tuple((name, int(which.sum())) for name, which in found.items() if which.any()))
+    return CleanedSkeleton(whole, tuple((name, int(which.sum())) for name, which in found.items() if which.any()))
 
 
 def _together(points: Floats) -> Bools:
@@ -207,7 +208,7 @@ def _together(points: Floats) -> Bools:
     return found
 
 
-class Repeats(NamedTuple):
+class RepeatedSkeleton(NamedTuple):
     """The longest time for which a camera gave one and the same skeleton."""
 
     seconds: float
@@ -215,7 +216,7 @@ class Repeats(NamedTuple):
 
 
 class Cleaner:
-    """Takes rows in order of arrival, drops and mends them, and hands them out in chunks of at most a second."""
+    """Cleans rows in order of arrival and returns them as tables of at most a second."""
 
     def __init__(self, cameras: tuple[str, ...], gap_s: float, defects: Counter[str]) -> None:
         self._cameras = cameras
@@ -223,26 +224,28 @@ class Cleaner:
         self._gap_ns = round(gap_s * 1e9)
         self._defects = defects
         self._newest: dict[tuple[str, int], int] = {}
-        self._last: dict[tuple[str, int], tuple[Row, int]] = {}  # of each body: its last new skeleton, and its arrival
-        self._rows: list[tuple[int, int, Row]] = []
-        self.heard: dict[str, tuple[int, int]] = {}  #: camera -> first and last arrival
+        self._last: dict[
+            tuple[str, int], tuple[RawSkeleton, int]
+        ] = {}  # of each body: its last new skeleton, and its arrival
+        self._rows: list[tuple[int, int, RawSkeleton]] = []
+        self.arrivals: dict[str, tuple[int, int]] = {}  #: camera -> first and last arrival
         self.seen: dict[str, Bools] = {}  #: camera -> (20,) points it ever gave a place and a confidence
         self.points: Counter[str] = Counter()  #: camera -> points with a place and a confidence
         self.flaws: Counter[tuple[str, str]] = Counter()  #: (camera, name in DEFECTS) -> points or rows
-        self.frozen: dict[str, Repeats] = {}  #: camera -> its longest standstill
+        self.frozen: dict[str, RepeatedSkeleton] = {}  #: camera -> its longest standstill
         for name in (*_ALWAYS, *(f"{kind}_{camera}" for kind in ("frames", "gaps") for camera in cameras)):
             defects[name] += 0
 
-    def hear(self, camera: str, arrival_ns: int) -> None:
-        """Notes that a camera is alive."""
-        first, last = self.heard.get(camera, (arrival_ns, arrival_ns))
+    def note_arrival(self, camera: str, arrival_ns: int) -> None:
+        """Notes the arrival of a message of a camera, and counts a gap before it."""
+        first, last = self.arrivals.get(camera, (arrival_ns, arrival_ns))
         if arrival_ns - last > self._gap_ns:
             self._defects[f"gaps_{camera}"] += 1
-        self.heard[camera] = (first, arrival_ns)
+        self.arrivals[camera] = (first, arrival_ns)
 
-    def add(self, row: Row, arrival_ns: int) -> CameraFrames | None:
-        """Takes a row; gives the chunk that ends before it, if one does."""
-        self.hear(row.camera, arrival_ns)
+    def add(self, row: RawSkeleton, arrival_ns: int) -> CameraFrames | None:
+        """Takes a row; returns the table that is complete before it, if there is one."""
+        self.note_arrival(row.camera, arrival_ns)
         self._defects["frames_header_stamp_zero"] += row.stamp_zero
         capture_ns = self._captured(row, arrival_ns)
         newest_ns = self._newest.get((row.camera, row.body))
@@ -250,7 +253,7 @@ class Cleaner:
             self._defects["frames_duplicate" if capture_ns == newest_ns else "frames_out_of_order"] += 1
             return None
         self._newest[(row.camera, row.body)] = capture_ns
-        whole, flaws = mended(row)
+        whole, flaws = clean_skeleton(row)
         for name, count in flaws:
             self._flaw(row.camera, name, count)
         if self._repeats(whole, arrival_ns):
@@ -259,11 +262,11 @@ class Cleaner:
         self.seen[row.camera] = self.seen.get(row.camera, False) | known
         self.points[row.camera] += int(known.sum())
         self._defects[f"frames_{row.camera}"] += 1
-        chunk = self.rest() if self._rows and arrival_ns - self._rows[0][1] >= _CHUNK_NS else None
+        chunk = self.flush() if self._rows and arrival_ns - self._rows[0][1] >= _CHUNK_NS else None
         self._rows.append((capture_ns, arrival_ns, whole))
         return chunk
 
-    def _captured(self, row: Row, arrival_ns: int) -> int:
+    def _captured(self, row: RawSkeleton, arrival_ns: int) -> int:
         """When the row was captured; its arrival where its stamp cannot be right."""
         if row.capture_ns is None:
             return arrival_ns
@@ -272,7 +275,7 @@ class Cleaner:
             return arrival_ns
         return row.capture_ns
 
-    def _repeats(self, row: Row, arrival_ns: int) -> bool:
+    def _repeats(self, row: RawSkeleton, arrival_ns: int) -> bool:
         """Whether the row shows the very skeleton of the one before it, which no sensor measures twice."""
         key = (row.camera, row.body)
         before = self._last.get(key)
@@ -286,16 +289,16 @@ class Cleaner:
             return False
         self._flaw(row.camera, "frames_repeated", 1)
         lasted_s = (arrival_ns - before[1]) / 1e9
-        if lasted_s > self.frozen.get(row.camera, Repeats(0.0, 0)).seconds:
-            self.frozen[row.camera] = Repeats(lasted_s, before[1])
+        if lasted_s > self.frozen.get(row.camera, RepeatedSkeleton(0.0, 0)).seconds:
+            self.frozen[row.camera] = RepeatedSkeleton(lasted_s, before[1])
         return True
 
     def _flaw(self, camera: str, name: str, count: int) -> None:
         self._defects[name] += count
         self.flaws[(camera, name)] += count
 
-    def rest(self) -> CameraFrames | None:
-        """What is not handed out yet."""
+    def flush(self) -> CameraFrames | None:
+        """The rows that were not returned yet; None without any."""
         rows, self._rows = self._rows, []
         if not rows:
             return None

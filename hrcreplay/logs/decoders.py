@@ -1,10 +1,7 @@
-"""Skeletons as openni_tracker publishes them: transforms camera -> left_elbow_1 on /tf, one message a joint.
+"""Decoders of skeleton topics, one class a message format.
 
-Skeletons of our own log.
-
-Skeletons as the Azure Kinect ROS driver publishes them: visualization_msgs/MarkerArray, a marker a joint.
-
-Skeletons of a message type that settings describe.
+Our own Skeleton message; the transforms of openni_tracker (camera to left_elbow_1 on /tf, one message a joint); the
+MarkerArray of the Azure Kinect ROS driver (a marker a joint); and message types that the settings describe.
 """
 
 from __future__ import annotations
@@ -24,10 +21,10 @@ from hrcreplay.logs.messages import (
     OPENNI_JOINTS,
     OPENNI_POINTS,
     Message,
-    Row,
+    RawSkeleton,
     Undecodable,
-    blank,
     camera_of,
+    missing_body,
     stamp_ns,
 )
 from hrcreplay.records import POINTS, Floats
@@ -37,24 +34,24 @@ class OwnDecoder:
     """Topic /camera/<name>/skeleton of our own log."""
 
     notes: ClassVar[tuple[str, ...]] = ()
-    always_heard: ClassVar[bool] = False
+    shows_camera_alive: ClassVar[bool] = False
 
     def __init__(self, topic: str, camera: str) -> None:
         self.topic = topic
         self.cameras = (camera,)
 
-    def fresh(self) -> OwnDecoder:
+    def fresh_copy(self) -> OwnDecoder:
         """Itself: it remembers nothing."""
         return self
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """The one row of a message."""
         skeleton = message.read()
         confidence = np.array(skeleton.confidence, dtype=np.float64)
         if len(confidence) != len(POINTS):
             raise Undecodable(f"{self.topic}: a skeleton of {len(confidence)} confidences; {len(POINTS)} are right")
         points = points_of(skeleton.points, self.topic)
-        return [Row(skeleton.capture_ns, self.cameras[0], skeleton.body, points, confidence)]
+        return [RawSkeleton(skeleton.capture_ns, self.cameras[0], skeleton.body, points, confidence)]
 
 
 def points_of(values: Any, topic: str) -> Floats:
@@ -77,28 +74,28 @@ class MarkerDecoder:
     """
 
     notes: ClassVar[tuple[str, ...]] = ("markers carry no confidence: 1 for every point",)
-    always_heard: ClassVar[bool] = True
+    shows_camera_alive: ClassVar[bool] = True
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self.cameras = (camera_of(topic),)
 
-    def fresh(self) -> MarkerDecoder:
+    def fresh_copy(self) -> MarkerDecoder:
         """Itself: it remembers nothing."""
         return self
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """A row a body; none for an empty or a clearing array."""
         rows = []
         for body, markers in sorted(_bodies(message.read()).items()):
-            points, confidence = blank()
+            points, confidence = missing_body()
             for joint, marker in markers.items():
                 if joint in AZURE_INDEX:
                     at = marker.pose.position
                     points[AZURE_INDEX[joint]] = at.x, at.y, at.z
                     confidence[AZURE_INDEX[joint]] = 1.0
             stamp = stamp_ns(next(iter(markers.values())).header.stamp, self.topic)
-            rows.append(Row(stamp or None, self.cameras[0], body, points, confidence, stamp_zero=not stamp))
+            rows.append(RawSkeleton(stamp or None, self.cameras[0], body, points, confidence, stamp_zero=not stamp))
         return rows
 
 
@@ -147,20 +144,20 @@ class TfDecoder:
     notes: ClassVar[tuple[str, ...]] = (
         "openni has no wrist and no pelvis: the hand and the middle of the hips stand for them",
     )
-    always_heard: ClassVar[bool] = False
+    shows_camera_alive: ClassVar[bool] = False
 
     def __init__(self, topic: str, cameras: tuple[str, ...]) -> None:
         self.topic = topic
         self.cameras = cameras
         self._people: dict[tuple[str, int], _Person] = defaultdict(_Person)
 
-    def fresh(self) -> TfDecoder:
+    def fresh_copy(self) -> TfDecoder:
         """A decoder that has seen nobody yet."""
         return TfDecoder(self.topic, self.cameras)
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """The frames that this message completes."""
-        rows: list[Row] = []
+        rows: list[RawSkeleton] = []
         if not _JOINT_BYTES.search(message.data):
             return rows
         for transform in message.read().transforms:
@@ -182,9 +179,9 @@ class TfDecoder:
         return rows
 
 
-def _finish(person: _Person, camera: str, body: int) -> Row:
+def _finish(person: _Person, camera: str, body: int) -> RawSkeleton:
     person.known.update(person.joints)
-    points, confidence = blank()
+    points, confidence = missing_body()
     for joint, at in person.joints.items():
         points[_WHERE[joint]] = at
         confidence[_WHERE[joint]] = 1.0
@@ -193,7 +190,7 @@ def _finish(person: _Person, camera: str, body: int) -> Row:
         points[POINTS.index("pelvis")] = (left + right) / 2.0
         confidence[POINTS.index("pelvis")] = 1.0
     person.joints = {}
-    return Row(person.first_ns or None, camera, body, points, confidence, stamp_zero=not person.first_ns)
+    return RawSkeleton(person.first_ns or None, camera, body, points, confidence, stamp_zero=not person.first_ns)
 
 
 def find_cameras(messages: Iterable[Message]) -> tuple[str, ...]:
@@ -234,18 +231,18 @@ class GenericDecoder:
     confidence: str | None = None  #: path to an array of confidences in [0, 1]; None: 1 for every finite point
 
     notes: ClassVar[tuple[str, ...]] = ()
-    always_heard: ClassVar[bool] = True
+    shows_camera_alive: ClassVar[bool] = True
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The one sensor."""
         return (self.camera,)
 
-    def fresh(self) -> GenericDecoder:
+    def fresh_copy(self) -> GenericDecoder:
         """Itself: it remembers nothing."""
         return self
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """The one row of a message; none where the array is empty."""
         content = message.read()
         where = f"{self.topic} ({message.topic.type})"
@@ -253,7 +250,7 @@ class GenericDecoder:
         trust = None if self.confidence is None else _array(content, self.confidence, where)
         if not len(elements):
             return []
-        points, confidence = blank()
+        points, confidence = missing_body()
         scale = _METRES[self.unit]
         for name, element in self.index.items():
             if not 0 <= element < len(elements):
@@ -267,7 +264,7 @@ class GenericDecoder:
                 ) from error
             confidence[i] = 1.0 if trust is None else float(trust[element]) if element < len(trust) else 0.0
         stamp = None if self.stamp is None else stamp_ns(_field(content, self.stamp, where), where)
-        return [Row(stamp or None, self.camera, 0, points, confidence, stamp_zero=stamp == 0)]
+        return [RawSkeleton(stamp or None, self.camera, 0, points, confidence, stamp_zero=stamp == 0)]
 
 
 def _array(content: Any, path: str, where: str) -> Any:

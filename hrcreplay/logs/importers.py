@@ -1,16 +1,13 @@
-"""KERAAL text files: a Kinect v2 and optical targets of one movement, without time stamps.
+"""Importers of skeleton text files: Azure Kinect CSV, Kinect v2 CSV, and KERAAL text files.
 
-Azure Kinect body-tracking CSV: ``;``, a header row, microseconds, millimetres, one file a camera.
+Azure Kinect: ``;``, a header row, microseconds, millimetres, one file a camera. Kinect v2: no header, 100-ns ticks,
+metres, a tracking state for each of 25 joints, one file a camera. KERAAL: a Kinect v2 and optical targets of one
+movement, without time stamps.
 
-Kinect v2 CSV: no header, 100-ns ticks, metres, a tracking state for each of 25 joints, one file a camera.
-
-Joint centres from rigid targets on the skin: the point that stays fixed on both of two neighbouring segments.
-
-The symmetrical centre of rotation estimation of Ehrig et al. (2006), A survey of formal methods for determining the
-centre of rotation of ball joints, J. Biomech. 39, 2798-2809; with a weak pull of the centre towards both targets,
-which decides along the axis of a hinge, where the movement does not.
-
-Our log from the text files that skeleton recordings come in, one module a format.
+Optical targets lie on the skin. The joint centre is the point that stays fixed in both neighbouring segments, by the
+symmetrical centre of rotation estimation of Ehrig et al. (2006), A survey of formal methods for determining the centre
+of rotation of ball joints, J. Biomech. 39, 2798-2809. A weak term pulls the centre towards both targets: it decides
+along the axis of a hinge, where the movement does not.
 """
 
 from __future__ import annotations
@@ -23,7 +20,16 @@ from pathlib import Path
 import numpy as np
 
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.logs.text_rows import START_NS, Row, import_cameras, instant, lines, numbers, row, write_log
+from hrcreplay.logs.text_rows import (
+    START_NS,
+    ImportedSkeleton,
+    import_cameras,
+    lines,
+    numbers,
+    skeleton_row,
+    time_stamp_ns,
+    write_log,
+)
 from hrcreplay.records import POINTS, Floats
 
 #: K4ABT's joint confidence: none, low, medium, high. 'High' is reserved by the SDK; medium is the most it gives.
@@ -60,7 +66,7 @@ def import_azure(paths: Mapping[str, Path], out: Path) -> list[str]:
     return import_cameras(paths, out, _azure_rows)
 
 
-def _azure_rows(path: Path) -> Iterator[Row]:
+def _azure_rows(path: Path) -> Iterator[ImportedSkeleton]:
     stream = lines(path)
     where, header = next(stream)
     columns = header.lstrip("\ufeff").split(";")
@@ -82,7 +88,7 @@ def _joints(where: str, columns: list[str]) -> dict[str, int]:
 
 
 def _places(where: str, columns: list[str]) -> int:
-    """Number of joints, after a look at every column's name."""
+    """Number of joints, from the names of all columns."""
     count = (len(columns) - 2) // 4
     wanted = ["timestamp", "body_idx"]
     for name in columns[2::4]:
@@ -95,17 +101,17 @@ def _places(where: str, columns: list[str]) -> int:
     return count
 
 
-def _row(where: str, text: str, before_ns: int, width: int, at: int, joints: dict[str, int]) -> Row:
+def _row(where: str, text: str, before_ns: int, width: int, at: int, joints: dict[str, int]) -> ImportedSkeleton:
     fields = text.split(";")
     values = numbers(where, fields, width)
-    t_ns = instant(where, fields[0], 1000, before_ns)
+    t_ns = time_stamp_ns(where, fields[0], 1000, before_ns)
     table = values[2:].reshape(at, 4)
     confidence = table[:, 0].copy()
     for level in set(confidence.tolist()):
         if level not in _AZURE_CONFIDENCE:
             raise LogError(f"{where}: confidence: found {level:g}; would be right: 0, 1, 2 or 3")
         confidence[table[:, 0] == level] = _AZURE_CONFIDENCE[level]
-    return row(t_ns, int(values[1]), joints, table[:, 1:] * 1e-3, confidence)
+    return skeleton_row(t_ns, int(values[1]), joints, table[:, 1:] * 1e-3, confidence)
 
 
 #: Confidence of the tracking states 'not tracked', 'inferred' and 'tracked'.
@@ -137,18 +143,18 @@ def import_kinect2(paths: Mapping[str, Path], out: Path) -> list[str]:
     return import_cameras(paths, out, _kinect2_rows)
 
 
-def _kinect2_rows(path: Path) -> Iterator[Row]:
+def _kinect2_rows(path: Path) -> Iterator[ImportedSkeleton]:
     before_ns = 0
     for where, text in lines(path):
         fields = text.removesuffix(",").split(",")
         values = numbers(where, fields, 1 + 4 * _COUNT)
-        before_ns = instant(where, fields[0], 100, before_ns)
+        before_ns = time_stamp_ns(where, fields[0], 100, before_ns)
         table = values[1:].reshape(_COUNT, 4)
         state = table[:, 3]
         wrong = ~np.isin(state, (0, 1, 2))
         if wrong.any():
             raise LogError(f"{where}: tracking state: found {state[wrong][0]:g}; would be right: 0, 1 or 2")
-        yield row(before_ns, 0, JOINTS, table[:, :3].copy(), _KINECT2_CONFIDENCE[state.astype(int)])
+        yield skeleton_row(before_ns, 0, JOINTS, table[:, :3].copy(), _KINECT2_CONFIDENCE[state.astype(int)])
 
 
 _PULL = 0.04  # skin movement (4 mm) over the usual distance of a target from the centre (0.1 m)
@@ -163,7 +169,14 @@ class Pivot:
     below_m: Floats  # (3,)
 
     def at(self, turn_a: Floats, place_a: Floats, turn_b: Floats, place_b: Floats) -> Floats:
-        """The centre (3,) when the targets have these rotations (3, 3) and places (3,): midway of what both say."""
+        """The centre (3,) when the targets have these rotations (3, 3) and places (3,): midway of what both say.
+
+        Args:
+            turn_a: (3, 3) rotation of the target above the joint.
+            place_a: (3,) position of the target above the joint [m].
+            turn_b: (3, 3) rotation of the target below the joint.
+            place_b: (3,) position of the target below the joint [m].
+        """
         return 0.5 * (turn_a @ self.above_m + place_a + turn_b @ self.below_m + place_b)
 
 
@@ -271,11 +284,11 @@ def _t_ns(number: int, rate_hz: float) -> int:
     return START_NS + round(number / rate_hz * 1e9)
 
 
-def _kinect_rows(path: Path, rate_hz: float) -> Iterator[Row]:
+def _kinect_rows(path: Path, rate_hz: float) -> Iterator[ImportedSkeleton]:
     for number, table in enumerate(_tables(path, _KINECT_JOINTS)):
         points = table[:, :3].copy()
         points[(points == 0).all(axis=1)] = np.nan
-        yield row(_t_ns(number, rate_hz), 0, JOINTS, points, np.ones(_KINECT_JOINTS))
+        yield skeleton_row(_t_ns(number, rate_hz), 0, JOINTS, points, np.ones(_KINECT_JOINTS))
 
 
 def _tables(path: Path, count: int) -> Iterator[Floats]:
@@ -306,7 +319,7 @@ def _pivots(path: Path) -> dict[str, Pivot]:
     return found
 
 
-def _optical_rows(path: Path, rate_hz: float, pivots: dict[str, Pivot]) -> Iterator[Row]:
+def _optical_rows(path: Path, rate_hz: float, pivots: dict[str, Pivot]) -> Iterator[ImportedSkeleton]:
     for number, (turns, positions) in enumerate(_poses(path)):
         points, trust = np.full((len(POINTS), 3), np.nan), np.ones(len(POINTS))
         for name, target in _ON_TARGET.items():
@@ -317,7 +330,7 @@ def _optical_rows(path: Path, rate_hz: float, pivots: dict[str, Pivot]) -> Itera
             points[POINTS.index(name)] = pivot.at(turns[a], positions[a], turns[b], positions[b])
         shoulders = points[[POINTS.index("shoulder_l"), POINTS.index("shoulder_r")]]
         points[POINTS.index("neck")] = shoulders.mean(axis=0)
-        yield row(_t_ns(number, rate_hz), 0, list(range(len(POINTS))), points, trust)
+        yield skeleton_row(_t_ns(number, rate_hz), 0, list(range(len(POINTS))), points, trust)
 
 
 __all__ = ["import_azure", "import_keraal", "import_kinect2"]

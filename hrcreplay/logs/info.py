@@ -1,4 +1,4 @@
-"""What is in a log and what is missing for the next step."""
+"""Summary of a log: what it contains, and what is missing for the next step."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hrcreplay.logs.plausibility import Stand
+from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats
 
@@ -42,7 +42,7 @@ class CameraSummary:
 
 @dataclass(frozen=True)
 class Summary:
-    """Everything that ``hrcreplay info`` tells."""
+    """Everything that ``hrcreplay info`` prints."""
 
     path: Path
     kind: str
@@ -89,7 +89,7 @@ class _Tally:
 
 
 def summarize(log: Log) -> Summary:
-    """Goes through the log once.
+    """Summarizes a log in one pass over it.
 
     Args:
         log: An open log; also one without skeletons (``open_log(path, options, skeletons=False)``).
@@ -99,7 +99,7 @@ def summarize(log: Log) -> Summary:
     """
     header = log.header
     tallies = [_Tally() for _ in header.cameras]
-    stands = {name: Stand() for name in header.cameras if name in header.T_world_camera}
+    stands = {name: BodyPosture() for name in header.cameras if name in header.T_world_camera}
     for frames in log.frames():
         _count(frames, tallies)
         for name, stand in stands.items():

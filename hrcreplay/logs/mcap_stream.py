@@ -1,4 +1,4 @@
-"""MCAP files: ours, and those of ROS 1 and ROS 2. Indexed, not indexed, or broken off."""
+"""MCAP files, of our own format, ROS 1 or ROS 2, as streams of messages; also without an index, or truncated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from zstandard import ZstdError
 from hrcreplay.errors import LogError
 from hrcreplay.logs import ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.messages import Damage, Message, Part, Topic, Undecodable, in_order
+from hrcreplay.logs.messages import Damage, LazyChunk, Message, Topic, Undecodable, merge_by_arrival
 
 MAGIC = b"\x89MCAP0\r\n"
 _RUN_BYTES = 1 << 20
@@ -98,13 +98,13 @@ class McapStream:
         wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
         with self._path.open("rb") as file:
             parts = [
-                Part(block.start_ns, partial(self._block, file, block, wanted, start_ns, end_ns))
+                LazyChunk(block.start_ns, partial(self._block, file, block, wanted, start_ns, end_ns))
                 for block in self._blocks
                 if (start_ns is None or block.end_ns >= start_ns)
                 and (end_ns is None or block.start_ns < end_ns)
                 and (block.channels is None or not block.channels.isdisjoint(wanted))
             ]
-            yield from in_order(parts)
+            yield from merge_by_arrival(parts)
 
     def _block(
         self, file: IO[bytes], block: _Block, wanted: dict[int, Topic], start_ns: int | None, end_ns: int | None

@@ -1,10 +1,7 @@
-"""Raw messages of any kind of file, and how several files or chunks become one stream in order of arrival.
+"""Types that all log formats share: messages, topics, skeleton rows, and the interface of a decoder.
 
-Topics and message types of our own log; skeleton.proto has the messages.
-
-Which joint of which tracker is which of our POINTS. What a tracker lacks is left missing.
-
-What every skeleton decoder gives: rows, one a body a frame.
+Also the topics of our own log (skeleton.proto has its messages), the joints of other trackers that correspond to our
+POINTS (those that a tracker lacks stay missing), and the merging of files and chunks by arrival.
 """
 
 from __future__ import annotations
@@ -35,7 +32,7 @@ class Topic:
     parse: Callable[[bytes], Any]  #: bytes of a message -> its fields; raises Undecodable
 
 
-def listed(found: Iterable[Topic]) -> str:
+def topic_list(found: Iterable[Topic]) -> str:
     """Topics and their types in one line."""
     return ", ".join(f"{topic.name} ({topic.type})" for topic in found) or "no topics at all"
 
@@ -48,11 +45,11 @@ class Message(NamedTuple):
     data: bytes
 
     def read(self) -> Any:
-        """Its fields. Raises Undecodable."""
+        """Decodes the fields. Raises Undecodable."""
         return self.topic.parse(self.data)
 
 
-class Stream(Protocol):
+class MessageStream(Protocol):
     """One file of a log."""
 
     topics: tuple[Topic, ...]
@@ -68,7 +65,7 @@ class Stream(Protocol):
 
 @dataclass
 class Damage:
-    """What was found wrong with a file."""
+    """Defects of a file."""
 
     defects: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
@@ -79,14 +76,14 @@ class Damage:
         self.notes.append(f"the file breaks off {(last_ns - start_ns) / 1e9:.3f} s after its first message")
 
 
-class Part(NamedTuple):
-    """A stretch of messages that is opened only when its time has come."""
+class LazyChunk(NamedTuple):
+    """A sequence of messages that is opened only when the merged stream reaches it."""
 
     start_ns: int  #: no message in it is earlier
     open: Callable[[], Iterator[Message]]  #: the messages in order of arrival
 
 
-def in_order(parts: Iterable[Part]) -> Iterator[Message]:
+def merge_by_arrival(parts: Iterable[LazyChunk]) -> Iterator[Message]:
     """Messages of all parts in order of arrival; parts that do not overlap are never open together.
 
     Messages of one arrival keep the order of their parts.
@@ -125,12 +122,12 @@ def skeleton_topic(camera: str) -> str:
 
 
 def camera_info_topic(camera: str) -> str:
-    """Topic of what is known of a camera."""
+    """Topic of a camera's description."""
     return f"/camera/{camera}/info"
 
 
 def camera_of_topic(topic: str) -> str:
-    """The camera that a topic of ours is about."""
+    """The camera of a topic of our own log."""
     return topic.split("/")[2]
 
 
@@ -194,7 +191,7 @@ KINECT2_INDEX: Mapping[int, int] = {
 }
 
 
-class Row(NamedTuple):
+class RawSkeleton(NamedTuple):
     """One body in one frame, not yet cleaned."""
 
     capture_ns: int | None  #: None: the arrival is the best that is known
@@ -205,7 +202,7 @@ class Row(NamedTuple):
     stamp_zero: bool = False  #: whether the capture is missing because a ROS header's stamp is zero
 
 
-class Decoder(Protocol):
+class SkeletonDecoder(Protocol):
     """Reads the skeletons of one topic."""
 
     @property
@@ -218,20 +215,20 @@ class Decoder(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know of how it reads."""
+        """Notes for the user on how the topic is read."""
 
     @property
-    def always_heard(self) -> bool:
-        """Whether a message without a body still tells that the camera (the only one) is alive."""
+    def shows_camera_alive(self) -> bool:
+        """Whether a message without a body still shows that the camera (the only one) delivers frames."""
 
-    def fresh(self) -> Decoder:
+    def fresh_copy(self) -> SkeletonDecoder:
         """The decoder at the start of a pass, with nothing remembered."""
 
-    def rows(self, message: Message) -> list[Row]:
+    def rows(self, message: Message) -> list[RawSkeleton]:
         """The rows that are complete with this message. Raises Undecodable, LogError."""
 
 
-def blank() -> tuple[Floats, Floats]:
+def missing_body() -> tuple[Floats, Floats]:
     """Points and confidence of a body of which nothing is known."""
     return np.full((len(POINTS), 3), np.nan), np.zeros(len(POINTS))
 

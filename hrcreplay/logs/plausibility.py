@@ -1,7 +1,7 @@
-"""Whether what a log shows can be a person: size, sides, uprightness, what was never measured.
+"""Checks whether the bodies of a log can be a person: size, left and right, uprightness, limbs never measured.
 
-What is odd is a note. What is certainly no person (a unit mistaken) is refused, with what would mend it. All of it is
-judged by medians: a tracker that errs now and then is none of it.
+What is unusual becomes a note. What is certainly no person (a wrong unit) is refused, with what would correct it. All
+checks use medians, so that occasional errors of a tracker change nothing.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ _PELVIS_M = (0.0, 1.6)  # above the floor: of who sits on it, of who stands on a
 _UPRIGHT = np.cos(np.radians(60.0))
 
 
-class Shape:
-    """The bodies of one camera as they came, before anything is made missing."""
+class BodyShape:
+    """Size and handedness of the bodies of one camera, from the points before cleaning."""
 
     def __init__(self) -> None:
         self._waiting: list[Floats] = []
@@ -65,7 +65,7 @@ class Shape:
             there = np.isfinite(points).all(axis=2) & (np.abs(points).max(axis=2) > 0.0)
             points = np.where(there[..., None] & (np.abs(points) < 1e12), points, np.nan)  # so that squares are numbers
             self._statures.append(statures(points))
-            self._sides.append(sides(points))
+            self._sides.append(handedness(points))
 
     @property
     def stature_m(self) -> float:
@@ -81,7 +81,7 @@ class Shape:
 
     @property
     def side(self) -> float:
-        """Median of ``sides``: 1 a person, -1 a mirror image; NaN where no foot was seen."""
+        """Median of ``handedness``: 1 a person, -1 a mirror image; NaN where no foot was seen."""
         self._flush()
         return _median(self._sides)
 
@@ -101,7 +101,7 @@ def statures(points: Floats) -> Floats:
     return found
 
 
-def sides(points: Floats) -> Floats:
+def handedness(points: Floats) -> Floats:
     """(n,) the volume that forward (ankle to foot), left and up span, of unit vectors: negative in a mirror image."""
 
     def at(name: str) -> Floats:
@@ -119,7 +119,7 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def size_remark(camera: str, stature_m: float, mend: str) -> str | None:
-    """What is to be said of a body's size; None where a person may have it. ``mend``: where its unit is set."""
+    """A note on a body's size; None where a person may have it. ``mend``: where its unit is set."""
     if np.isnan(stature_m) or PERSON_M[0] <= stature_m <= PERSON_M[1]:
         return None
     text = f"camera {camera}: by its bones the body is {stature_m:.3g} m tall"
@@ -132,13 +132,13 @@ def size_remark(camera: str, stature_m: float, mend: str) -> str | None:
     return f"{text}; are its points in metres? {mend}"
 
 
-def impossible(stature_m: float) -> bool:
+def impossible_size(stature_m: float) -> bool:
     """Whether nobody can be of that size."""
     return stature_m > _CERTAIN * PERSON_M[1] or stature_m < PERSON_M[0] / _CERTAIN
 
 
-def side_remark(camera: str, side: float) -> str | None:
-    """What is to be said where a camera sees mirror images."""
+def mirror_remark(camera: str, side: float) -> str | None:
+    """A note where a camera sees mirror images; None where it does not."""
     if not side < -_MIRRORED:
         return None
     return (
@@ -147,8 +147,8 @@ def side_remark(camera: str, side: float) -> str | None:
     )
 
 
-def unmeasured(seen: Mapping[str, Bools]) -> Iterator[str]:
-    """The limbs that no camera ever placed, by the points (20,) that each ever gave."""
+def unmeasured_limbs(seen: Mapping[str, Bools]) -> Iterator[str]:
+    """The limbs that no camera ever measured, by the points (20,) that each camera ever gave."""
     ever = np.logical_or.reduce([np.zeros(len(POINTS), dtype=np.bool_), *seen.values()])
     if not ever.any():
         return
@@ -161,8 +161,8 @@ def unmeasured(seen: Mapping[str, Bools]) -> Iterator[str]:
             )
 
 
-class Stand:
-    """How the bodies of one camera stand in the world."""
+class BodyPosture:
+    """Uprightness and height above the floor of the bodies of one camera."""
 
     def __init__(self) -> None:
         self._upright: list[Floats] = []
@@ -178,7 +178,7 @@ class Stand:
         self._pelvis.append(pelvis[:, 2])
 
     def remark(self, camera: str) -> str | None:
-        """What is to be said of a body that no floor carries so."""
+        """A note on a body that cannot stand on the floor like this; None for a plausible one."""
         up, height_m = _median(self._upright), _median(self._pelvis)
         mend = "would be right: T_world_camera with z up and the floor at z = 0; find it with hrcreplay calibrate"
         if up < -_UPRIGHT:

@@ -1,7 +1,4 @@
-"""Opens a log of any supported kind as one lazy, time-ordered stream of records.
-
-Which topics of a log carry skeletons, and which decoder reads each.
-"""
+"""Opens a log of any supported format and reads its records in order of time; finds its skeleton topics."""
 
 from __future__ import annotations
 
@@ -24,8 +21,8 @@ from hrcreplay.logs.decoders import (
     find_cameras,
     is_skeleton,
 )
-from hrcreplay.logs.messages import Decoder, Topic, Undecodable, listed
-from hrcreplay.logs.source import Source, open_source
+from hrcreplay.logs.log_files import LogFiles, open_source
+from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, topic_list
 from hrcreplay.logs.tracks import Header, JointTopic, JointTrack, Truth
 from hrcreplay.records import CameraFrames
 
@@ -34,7 +31,9 @@ _PEEK = 300  # markers: ten seconds of a sensor to show a body in
 _HOW = "Name one with --topic NAME, or a decoder for it in [logs.decoders] of the settings file."
 
 
-def choose(source: Source, names: tuple[str, ...], described: tuple[GenericDecoder, ...]) -> list[Decoder]:
+def choose_decoders(
+    source: LogFiles, names: tuple[str, ...], described: tuple[GenericDecoder, ...]
+) -> list[SkeletonDecoder]:
     """The decoders of a log's skeleton topics.
 
     Args:
@@ -51,9 +50,9 @@ def choose(source: Source, names: tuple[str, ...], described: tuple[GenericDecod
     found = {topic.name: topic for topic in source.topics()}
     for name in (*names, *(decoder.topic for decoder in described)):
         if name not in found:
-            raise LogError(f"{source.path}: no topic {name}; found {listed(found.values())}")
+            raise LogError(f"{source.path}: no topic {name}; found {topic_list(found.values())}")
     by_topic = {decoder.topic: decoder for decoder in described}
-    decoders: list[Decoder] = []
+    decoders: list[SkeletonDecoder] = []
     for topic in found.values():
         if names and topic.name not in names:
             continue
@@ -66,12 +65,12 @@ def choose(source: Source, names: tuple[str, ...], described: tuple[GenericDecod
     return decoders
 
 
-def none_found(source: Source) -> LogError:
-    """What to tell the user where no topic carries skeletons."""
-    return LogError(f"{source.path}: no skeleton topic; found {listed(source.topics())}.\n{_HOW}")
+def no_skeletons_error(source: LogFiles) -> LogError:
+    """The error for a log in which no topic carries skeletons, with what the user can do."""
+    return LogError(f"{source.path}: no skeleton topic; found {topic_list(source.topics())}.\n{_HOW}")
 
 
-def _known(source: Source, topic: Topic, *, asked: bool) -> Decoder | None:
+def _known(source: LogFiles, topic: Topic, *, asked: bool) -> SkeletonDecoder | None:
     if not topic.count:
         return None
     if topic.type == _OWN:
@@ -85,7 +84,7 @@ def _known(source: Source, topic: Topic, *, asked: bool) -> Decoder | None:
     return None
 
 
-def _check_cameras(source: Source, decoders: list[Decoder]) -> None:
+def _check_cameras(source: LogFiles, decoders: list[SkeletonDecoder]) -> None:
     met: dict[str, str] = {}
     for decoder in decoders:
         for camera in decoder.cameras:
@@ -116,7 +115,7 @@ class LogOptions:
 class Log:
     """An open log. ``defects`` (names: clean.DEFECTS) and ``notes`` are about the latest pass over its frames."""
 
-    def __init__(self, source: Source, decoders: list[Decoder], options: LogOptions) -> None:
+    def __init__(self, source: LogFiles, decoders: list[SkeletonDecoder], options: LogOptions) -> None:
         self._source = source
         self._decoders = decoders
         self._options = options
@@ -160,10 +159,10 @@ class Log:
         """
         self._reading.clear()
         self._remarks = [note for decoder in self._decoders for note in decoder.notes]
-        decoders = {decoder.topic: decoder.fresh() for decoder in self._decoders}
+        decoders = {decoder.topic: decoder.fresh_copy() for decoder in self._decoders}
         self._refusals, self.points_seen = [], 0
         cleaner = Cleaner(self.header.cameras, self._options.gap_s, self._reading)
-        shapes = {camera: plausibility.Shape() for camera in self.header.cameras}
+        shapes = {camera: plausibility.BodyShape() for camera in self.header.cameras}
         for message in self._source.messages(list(decoders), start_ns, end_ns):
             decoder = decoders[message.topic.name]
             try:
@@ -171,21 +170,21 @@ class Log:
             except Undecodable:
                 self._reading["messages_undecodable"] += 1
                 continue
-            if decoder.always_heard:
-                cleaner.hear(decoder.cameras[0], message.arrival_ns)
+            if decoder.shows_camera_alive:
+                cleaner.note_arrival(decoder.cameras[0], message.arrival_ns)
             for row in rows:
                 shapes[row.camera].add(row.points_m)
                 chunk = cleaner.add(row, message.arrival_ns)
                 if chunk is not None:
                     yield chunk
-        chunk = cleaner.rest()
+        chunk = cleaner.flush()
         if chunk is not None:
             yield chunk
         self._remark(cleaner, start_ns, end_ns)
         self._judge(cleaner, shapes)
 
     def check(self) -> None:
-        """Refuses what the latest whole pass showed to be certainly no person.
+        """Refuses a log whose latest complete pass showed bodies that are certainly no person.
 
         Raises:
             LogError: What was found, and what would mend it.
@@ -193,19 +192,19 @@ class Log:
         if self._refusals:
             raise LogError(f"{self.header.path}: {self._refusals[0]}")
 
-    def _judge(self, cleaner: Cleaner, shapes: dict[str, plausibility.Shape]) -> None:
+    def _judge(self, cleaner: Cleaner, shapes: dict[str, plausibility.BodyShape]) -> None:
         self.points_seen = cleaner.points.total()
         self.stature_m = {camera: shape.stature_m for camera, shape in shapes.items()}
         for camera, shape in shapes.items():
             size = plausibility.size_remark(camera, shape.stature_m, self._unit_of(camera))
             if size is not None:
                 self._remarks.append(size)
-                if shape.certain and plausibility.impossible(shape.stature_m):
+                if shape.certain and plausibility.impossible_size(shape.stature_m):
                     self._refusals.append(size)
-            side = plausibility.side_remark(camera, shape.side)
+            side = plausibility.mirror_remark(camera, shape.side)
             if side is not None:
                 self._remarks.append(side)
-        self._remarks.extend(plausibility.unmeasured(cleaner.seen))
+        self._remarks.extend(plausibility.unmeasured_limbs(cleaner.seen))
 
     def _unit_of(self, camera: str) -> str:
         """Where the unit of a camera's points is set."""
@@ -232,10 +231,10 @@ class Log:
         begin = max(self.header.start_ns, start_ns or self.header.start_ns)
         end = min(self.header.end_ns, end_ns or self.header.end_ns)
         for camera in self.header.cameras:
-            if camera not in cleaner.heard:
+            if camera not in cleaner.arrivals:
                 self._remarks.append(f"camera {camera} is never heard")
                 continue
-            first, last = cleaner.heard[camera]
+            first, last = cleaner.arrivals[camera]
             if first - begin > _LATE_NS:
                 self._remarks.append(f"camera {camera} starts {(first - begin) / 1e9:.2f} s after the log")
             if end - last > _LATE_NS:
@@ -275,14 +274,14 @@ def open_log(path: Path, options: LogOptions = LogOptions(), *, skeletons: bool 
         LogError: It cannot be read, holds no messages, lacks a named topic, or has no skeletons.
     """
     source = open_source(path)
-    decoders = choose(source, options.topics, options.decoders)
+    decoders = choose_decoders(source, options.topics, options.decoders)
     if skeletons and not decoders:
-        raise none_found(source)
+        raise no_skeletons_error(source)
     return Log(source, decoders, options)
 
 
 def _header(
-    source: Source, decoders: list[Decoder], joints: JointTopic | None, truth: str | None, *, chosen: bool
+    source: LogFiles, decoders: list[SkeletonDecoder], joints: JointTopic | None, truth: str | None, *, chosen: bool
 ) -> Header:
     known = tracks.latched(source)
     seen = [camera for decoder in decoders for camera in decoder.cameras]

@@ -1,10 +1,7 @@
-"""ROS 1 bags without an index, or with a broken one: read by going through their chunks once.
+"""ROS 1 bags and sqlite3 files of ROS 2 bags as streams of messages, read without ROS.
 
-Layout: http://wiki.ros.org/Bags/Format/2.0
-
-ROS messages from their bytes, without ROS: by the definitions in the log, else by those of the known releases.
-
-ROS 1 bags and the sqlite3 files of ROS 2 bags, through rosbags.
+Messages are decoded by the definitions in the log, else by those of the known releases. ROS 1 bags without an index, or
+with a broken one, are read by going through their chunks once. Layout: http://wiki.ros.org/Bags/Format/2.0
 """
 
 from __future__ import annotations
@@ -29,7 +26,7 @@ from rosbags.typesys.store import Typestore
 from zstandard import ZstdDecompressor, ZstdError
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.messages import Damage, Message, Part, Stream, Topic, Undecodable, in_order
+from hrcreplay.logs.messages import Damage, LazyChunk, Message, MessageStream, Topic, Undecodable, merge_by_arrival
 
 _IDL_RULE = "=" * 80 + "\n"
 _ROS1 = (Stores.ROS1_NOETIC,)
@@ -127,7 +124,7 @@ Fields = dict[str, bytes]
 
 
 @dataclass(frozen=True)
-class _Chunk:
+class _BagChunk:
     start_ns: int
     end_ns: int
     offset: int
@@ -147,7 +144,7 @@ class RecoveredBag:
         damage = Damage()
         damage.notes.append("the bag has no usable index: it was read once more to make one (rosbag reindex mends it)")
         damage.defects["unindexed"] = 1
-        self._chunks: list[_Chunk] = []
+        self._chunks: list[_BagChunk] = []
         connections: dict[int, tuple[str, Fields]] = {}
         counts: Counter[int] = Counter()
         with path.open("rb") as file:
@@ -168,8 +165,8 @@ class RecoveredBag:
         """Messages on these topics with start <= arrival < end, in order of arrival."""
         wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
         with self._path.open("rb") as file:
-            for message in in_order(
-                Part(chunk.start_ns, partial(self._chunk, file, chunk, wanted))
+            for message in merge_by_arrival(
+                LazyChunk(chunk.start_ns, partial(self._chunk, file, chunk, wanted))
                 for chunk in self._chunks
                 if (start_ns is None or chunk.end_ns >= start_ns) and (end_ns is None or chunk.start_ns < end_ns)
             ):
@@ -205,9 +202,9 @@ class RecoveredBag:
                 times.append(_time_ns(fields))
                 counts[_number(fields)] += 1
         if times:
-            self._chunks.append(_Chunk(min(times), max(times), offset))
+            self._chunks.append(_BagChunk(min(times), max(times), offset))
 
-    def _chunk(self, file: IO[bytes], chunk: _Chunk, wanted: dict[int, Topic]) -> Iterator[Message]:
+    def _chunk(self, file: IO[bytes], chunk: _BagChunk, wanted: dict[int, Topic]) -> Iterator[Message]:
         file.seek(chunk.offset)
         header = _fields(file) or {}
         data = file.read(struct.unpack("<L", file.read(4))[0])
@@ -278,7 +275,7 @@ _NO_INDEX = (rosbag1.ReaderError, AssertionError, struct.error, ValueError, Inde
 _BROKEN = (*_NO_INDEX, rosbag2.ReaderError, ZstdError, RuntimeError, OSError)  # the last two: lz4's, bz2's
 
 
-def open_bag(path: Path) -> Stream:
+def open_bag(path: Path) -> MessageStream:
     """A ROS 1 bag, by its index or, where that is missing or broken, without it.
 
     Raises:
@@ -290,7 +287,7 @@ def open_bag(path: Path) -> Stream:
         return RecoveredBag(path)
 
 
-def open_db3(path: Path, *, zstd_messages: bool = False) -> Stream:
+def open_db3(path: Path, *, zstd_messages: bool = False) -> MessageStream:
     """A sqlite3 file of a ROS 2 bag, by itself; ``zstd_messages`` where each message is compressed.
 
     Raises:
@@ -307,7 +304,7 @@ def open_db3(path: Path, *, zstd_messages: bool = False) -> Stream:
 
 
 class RosStream:
-    """A file that rosbags reads."""
+    """A bag file that the library rosbags reads."""
 
     def __init__(self, path: Path, reader: Callable[[Path], Any], *, cdr: bool, zstd_messages: bool = False) -> None:
         self._path = path

@@ -1,4 +1,4 @@
-"""What the importers share: numbers out of text lines with their place, and rows merged by time into a log."""
+"""Functions that the importers share: numbers from text lines with error positions, and rows merged into a log."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ARRIVAL_NOTE = "the files hold capture times only: arrival is taken as capture, 
 _CHUNK = 256  # rows written at once
 
 
-class Row(NamedTuple):
+class ImportedSkeleton(NamedTuple):
     """One body in one frame."""
 
     t_ns: int
@@ -84,8 +84,14 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def instant(where: str, text: str, unit_ns: int, before_ns: int) -> int:
+def time_stamp_ns(where: str, text: str, unit_ns: int, before_ns: int) -> int:
     """A time stamp [ns], not negative, that must not be before ``before_ns``.
+
+    Args:
+        where: ``file:line`` for messages.
+        text: Time stamp as the file has it.
+        unit_ns: Length of its unit [ns].
+        before_ns: Time stamp of the row before [ns].
 
     Raises:
         LogError: Not a whole number, negative or going backwards.
@@ -101,16 +107,26 @@ def instant(where: str, text: str, unit_ns: int, before_ns: int) -> int:
     return t_ns
 
 
-def row(t_ns: int, body: int, found: Mapping[str, int] | list[int], points_m: Floats, confidence: Floats) -> Row:
-    """A row in the order of POINTS from a sensor's own joints; ``found`` tells where each stands."""
+def skeleton_row(
+    t_ns: int, body: int, found: Mapping[str, int] | list[int], points_m: Floats, confidence: Floats
+) -> ImportedSkeleton:
+    """A row in the order of POINTS from a sensor's own joints; ``found`` tells where each stands.
+
+    Args:
+        t_ns: Time of the frame [ns].
+        body: Identity of the body.
+        found: Index of the sensor's joint for each of POINTS, by name or in the order of POINTS.
+        points_m: (k, 3) the sensor's joints [m].
+        confidence: (k,) of the joints, in [0, 1].
+    """
     index = [found[name] for name in POINTS] if isinstance(found, Mapping) else found
     points, trust = points_m[index], confidence[index]
     missing = ~np.isfinite(points).all(axis=1)
     points[missing], trust[missing] = np.nan, 0.0
-    return Row(t_ns, body, points, trust)
+    return ImportedSkeleton(t_ns, body, points, trust)
 
 
-def write_log(sources: Mapping[str, Iterator[Row]], out: Path) -> dict[str, tuple[int, int]]:
+def write_log(sources: Mapping[str, Iterator[ImportedSkeleton]], out: Path) -> dict[str, tuple[int, int]]:
     """Writes the rows of all cameras, merged by time, as our log; nothing is left behind when a source fails.
 
     Returns:
@@ -138,7 +154,9 @@ def write_log(sources: Mapping[str, Iterator[Row]], out: Path) -> dict[str, tupl
     return spans
 
 
-def import_cameras(paths: Mapping[str, Path], out: Path, read: Callable[[Path], Iterator[Row]]) -> list[str]:
+def import_cameras(
+    paths: Mapping[str, Path], out: Path, read: Callable[[Path], Iterator[ImportedSkeleton]]
+) -> list[str]:
     """Makes our log from one file a camera, whose times are those of the captures.
 
     Args:
@@ -168,12 +186,12 @@ def overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:
     ]
 
 
-def _numbered(index: int, stream: Iterator[Row]) -> Iterator[tuple[int, Row]]:
+def _numbered(index: int, stream: Iterator[ImportedSkeleton]) -> Iterator[tuple[int, ImportedSkeleton]]:
     return ((index, item) for item in stream)
 
 
-def _batches(merged: Iterable[tuple[int, Row]]) -> Iterator[list[tuple[int, Row]]]:
-    batch: list[tuple[int, Row]] = []
+def _batches(merged: Iterable[tuple[int, ImportedSkeleton]]) -> Iterator[list[tuple[int, ImportedSkeleton]]]:
+    batch: list[tuple[int, ImportedSkeleton]] = []
     for pair in merged:
         # The bodies of one frame stay together.
         if len(batch) >= _CHUNK and pair[1].t_ns != batch[-1][1].t_ns:
@@ -184,7 +202,7 @@ def _batches(merged: Iterable[tuple[int, Row]]) -> Iterator[list[tuple[int, Row]
         yield batch
 
 
-def _frames(batch: list[tuple[int, Row]], cameras: tuple[str, ...]) -> CameraFrames:
+def _frames(batch: list[tuple[int, ImportedSkeleton]], cameras: tuple[str, ...]) -> CameraFrames:
     t_ns = np.array([item.t_ns for _, item in batch], dtype=np.int64)
     return CameraFrames(
         capture_ns=t_ns,

@@ -1,7 +1,4 @@
-"""What travels in a log beside the skeletons: cameras' poses, task, base, joints, truth.
-
-What a log says of itself and the tracks that travel in it beside the camera frames.
-"""
+"""What a log holds beside the skeletons: camera poses, task, robot base, recorded joints, ground truth."""
 
 from __future__ import annotations
 
@@ -16,14 +13,14 @@ import numpy as np
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs.decoders import points_of
-from hrcreplay.logs.messages import Message, Topic, Undecodable, listed, stamp_ns
-from hrcreplay.logs.source import Source
+from hrcreplay.logs.log_files import LogFiles
+from hrcreplay.logs.messages import Message, Topic, Undecodable, stamp_ns, topic_list
 from hrcreplay.records import Floats, Ints, Table
 
 
 @dataclass(frozen=True)
 class Header:
-    """All that is known of a log before its first frame."""
+    """What is known of a log before its first frame."""
 
     path: Path
     kind: str  #: "hrcreplay", "mcap", "ros1" or "ros2"
@@ -48,7 +45,7 @@ class JointTrack(Table):
 
 @dataclass(frozen=True)
 class Truth(Table):
-    """The person by a reference better than the cameras, a row an instant."""
+    """Ground truth of the person, from a reference better than the cameras, a row an instant."""
 
     t_ns: Ints  #: (n,)
     points_m: Floats  #: (n, 20, 3) POINTS in the world [m]
@@ -62,7 +59,7 @@ _RIGID = 1e-2  # of the axes of a pose: those of a recording may have been round
 
 @dataclass(frozen=True)
 class Latched:
-    """What holds for the whole log."""
+    """Values that hold for the whole log: camera poses, task, robot base."""
 
     cameras: tuple[str, ...]  #: declared, in that order
     T_world_camera: dict[str, Floats]
@@ -70,8 +67,8 @@ class Latched:
     T_world_base: Floats | None
 
 
-def latched(source: Source) -> Latched:
-    """Reads what our own logs say once. Raises LogError where it is broken."""
+def latched(source: LogFiles) -> Latched:
+    """Reads the messages that hold for a whole log of our own. Raises LogError where one is broken."""
     kinds = (_OWN_CAMERA, _OWN_TASK, _OWN_BASE)
     names = [topic.name for topic in source.topics() if topic.type in kinds]
     cameras: list[str] = []
@@ -122,7 +119,7 @@ class JointTopic:
     names: tuple[str, ...]
 
 
-def find_joints(source: Source, name: str | None) -> JointTopic | None:
+def find_joints(source: LogFiles, name: str | None) -> JointTopic | None:
     """The joint track: of the topic named, else of the first that carries one.
 
     Raises:
@@ -132,7 +129,7 @@ def find_joints(source: Source, name: str | None) -> JointTopic | None:
     if name is not None:
         found = [topic for topic in found if topic.name == name]
         if not found:
-            raise LogError(f"{source.path}: no joint states on {name}; found {listed(source.topics())}")
+            raise LogError(f"{source.path}: no joint states on {name}; found {topic_list(source.topics())}")
     for topic in found:
         for message in source.messages([topic.name]):
             _, q = _joint_state(message)
@@ -141,7 +138,7 @@ def find_joints(source: Source, name: str | None) -> JointTopic | None:
     return None
 
 
-def joints(source: Source, track: JointTopic, defects: Counter[str]) -> Iterator[JointTrack]:
+def joints(source: LogFiles, track: JointTopic, defects: Counter[str]) -> Iterator[JointTrack]:
     """The joint track in chunks of at most a second."""
     times: list[int] = []
     rows: list[list[float]] = []
@@ -176,12 +173,12 @@ def _joint_state(message: Message) -> tuple[int, dict[str, float]]:
     return t_ns, {str(name): float(q) for name, q in zip(content.name, content.position, strict=False)}
 
 
-def truth_topic(source: Source) -> str | None:
+def truth_topic(source: LogFiles) -> str | None:
     """The topic of the ground truth, where the log has one."""
     return next((topic.name for topic in source.topics() if topic.type == _OWN_TRUTH and topic.count), None)
 
 
-def truth(source: Source, topic: str) -> Iterator[Truth]:
+def truth(source: LogFiles, topic: str) -> Iterator[Truth]:
     """The ground truth in chunks of at most a second."""
     times: list[int] = []
     rows: list[Floats] = []

@@ -1,4 +1,4 @@
-"""Writes our own log: MCAP with the messages of skeleton.proto, whole or not at all."""
+"""Writes a log of our own format: MCAP with the messages of skeleton.proto, complete or not at all."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a run shows: metrics, figures, page."""
+"""Evaluation of a run: metrics, figures, HTML page."""

@@ -1,6 +1,6 @@
-"""The house style of every figure: colours that colour-blind readers can tell apart, few lines, units on every axis.
+"""Shared drawing functions: figure style and export, and swept volumes in orthographic projection.
 
-Swept volumes as a viewer sees them: convex hulls grown by the limb's radius, in orthographic projection.
+The colours can be told apart by readers with colour vision deficiency.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ BONES = (
 
 
 @dataclass(frozen=True)
-class Solid:
+class RenderedHull:
     """A convex hull grown by a ball, and the colour to paint it in."""
 
     vertices_m: Floats  #: (m, 3) world [m]
@@ -250,7 +250,7 @@ def outline(vertices_m: Floats, radius_m: float, view: View) -> Floats:
     return np.zeros((0, 2)) if hull is None else np.asarray(cloud[hull.vertices])
 
 
-def picture(solids: Sequence[Solid], view: View, low: Floats, high: Floats, pixel_m: float) -> Floats:
+def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: Floats, pixel_m: float) -> Floats:
     """What a viewer sees of solids that may intersect: each pixel shows the frontmost surface, lit from above.
 
     Args:

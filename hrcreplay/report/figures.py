@@ -1,4 +1,4 @@
-"""Which figures a run can show, and drawing them all into its folder."""
+"""Selects the figures that the data of a run allow, and draws them into its folder."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Figures of the person: swept volumes (Fig. 17), one coordinate (Fig. 18), all joints, and errors.
-
-The figure of the data that went in.
-"""
+"""Figures of the person: data quality, swept volumes (Fig. 17), joint coordinates (Fig. 18), fusion error."""
 
 from __future__ import annotations
 
@@ -19,8 +16,18 @@ from matplotlib.patches import Patch, Polygon
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import Solid, View, bones, outline, picture, view_from
-from hrcreplay.report.metrics import ANGLES, Metric, broken, columns, envelope, seconds_from, stretches, times, wrap
+from hrcreplay.report.drawing import RenderedHull, View, bones, outline, render_hulls, view_from
+from hrcreplay.report.metrics import (
+    ANGLES,
+    Metric,
+    break_at_gaps,
+    columns,
+    envelope,
+    seconds_from,
+    times,
+    true_runs,
+    wrap,
+)
 from hrcreplay.report.metrics_data import cameras, errors, seconds_since
 from hrcreplay.store.run_folder import Run
 
@@ -102,9 +109,9 @@ def _draw_person(
     centre: Floats,
     window: tuple[Floats, Floats],
 ) -> None:
-    solids = [Solid(vertices, radius, to_rgb(drawing.LIMBS[limb])) for limb, (vertices, radius) in limbs.items()]
+    solids = [RenderedHull(vertices, radius, to_rgb(drawing.LIMBS[limb])) for limb, (vertices, radius) in limbs.items()]
     low, high = window
-    image = picture(solids, view, low + centre, high + centre, (high[1] - low[1]) / 320.0)
+    image = render_hulls(solids, view, low + centre, high + centre, (high[1] - low[1]) / 320.0)
     image[..., 3] *= 0.78
     ax.imshow(image, origin="lower", extent=(low[0], high[0], low[1], high[1]), aspect="auto", interpolation="bilinear")
     drawing.set_window(ax, low.tolist(), high.tolist())
@@ -121,7 +128,14 @@ def _scale_bar(ax: Axes, right: float, low: float) -> None:
 
 
 def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
-    """Fig. 18: one coordinate as each camera saw it, as fused and, where the log has it, as it was; and the errors."""
+    """Fig. 18: one coordinate as each camera saw it, as fused and, where the log has it, as it was; and the errors.
+
+    Args:
+        run: Tables of the run.
+        t0_ns: Instant of time zero [ns].
+        gap_s: A line is broken where a camera was silent for longer [s].
+        joint: Coordinate to draw, one of JOINTS.
+    """
     found = errors(run, gap_s)
     unit, factor, error_unit, error_factor = (
         ("deg", 180 / np.pi, "deg", 180 / np.pi) if joint in ANGLES else ("m", 1.0, "mm", 1e3)
@@ -151,7 +165,9 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
                 seconds = seconds_from(found[source].t_ns, t0_ns)
                 values = error_factor * found[source].position[:, JOINTS.index(joint)]
                 below.plot(
-                    *envelope(*broken(seconds, values, gap_s)), color=colour, lw=1.3 if source == "fused" else 0.7
+                    *envelope(*break_at_gaps(seconds, values, gap_s)),
+                    color=colour,
+                    lw=1.3 if source == "fused" else 0.7,
                 )
         below.set(title="Error against ground truth", ylabel=f"{error_unit}")
     rows[-1][0].set_xlabel("time [s]")
@@ -166,7 +182,7 @@ def _seen(run: Run, camera: str, joint: str, t0_ns: int, gap_s: float) -> tuple[
     rows = run.measurements[run.measurements["camera"] == camera].sort_values("capture_ns", kind="stable")
     seconds = seconds_from(times(rows, "capture_ns"), t0_ns)
     values = _beside_fused(run, joint, times(rows, "capture_ns"), rows[joint].to_numpy(dtype=float))
-    return broken(seconds, values, gap_s)
+    return break_at_gaps(seconds, values, gap_s)
 
 
 def _span(ax: Axes, run: Run, t0_ns: int) -> None:
@@ -310,4 +326,4 @@ def _frame_bars(seconds: Floats, gap_s: float) -> list[tuple[float, float]]:
 
 def _tick_bars(seconds: Floats, mask: Bools) -> list[tuple[float, float]]:
     last = len(seconds) - 1
-    return [(float(seconds[a]), float(seconds[min(b, last)] - seconds[a])) for a, b in stretches(mask)]
+    return [(float(seconds[a]), float(seconds[min(b, last)] - seconds[a])) for a, b in true_runs(mask)]

@@ -1,7 +1,4 @@
-"""Figures of the robot's motion: its path (Fig. 13), its speed (Fig. 14), its status, and how often it stood.
-
-Figure of the robot: the capsules that stand for its links, beside what the person could reach.
-"""
+"""Figures of the robot: path (Fig. 13), speed (Fig. 14), status, stationary share, link capsules."""
 
 from __future__ import annotations
 
@@ -18,9 +15,9 @@ from matplotlib.patches import Patch, Polygon
 
 from hrcreplay.records import STATUSES, Floats
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import Solid, View, outline, picture, view_from
-from hrcreplay.report.metrics import Metric, envelope, seconds_from, stretches, thin_path, times
-from hrcreplay.report.metrics_plan import numbers, path_feet, stationary, vectors
+from hrcreplay.report.drawing import RenderedHull, View, outline, render_hulls, view_from
+from hrcreplay.report.metrics import Metric, envelope, seconds_from, thin_path, times, true_runs
+from hrcreplay.report.metrics_plan import numeric_column, path_feet, position_columns, stationary
 
 ABOVE = View(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 1.0, 0.0]), toward=np.array([0.0, 0.0, 1.0]))
 SIDE = view_from(-0.5 * np.pi, 0.0)
@@ -35,8 +32,14 @@ def path(
 
     The detail looks at the vertical plane that holds the deviation, so its length is seen undistorted. The swept
     volumes are those stored last before that tick, in outline.
+
+    Args:
+        motion: Rows of motion.parquet.
+        occupancy: Rows of occupancy.parquet; None without stored volumes.
+        t0_ns: Instant of time zero [ns].
+        T_world_base: (4, 4) pose of the robot's base, drawn as a square; None: not drawn.
     """
-    reference, tcp = vectors(motion, "ref"), vectors(motion, "tcp")
+    reference, tcp = position_columns(motion, "ref"), position_columns(motion, "tcp")
     feet = path_feet(tcp, reference)
     far = np.linalg.norm(tcp - feet, axis=1)
     worst = int(np.argmax(np.where(np.isfinite(far), far, -1.0)))
@@ -144,11 +147,11 @@ def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
     figure = drawing.new_figure(4.6)
     rows = drawing.panels(figure, 3, heights=[1.0, 1.0, 1.0], gap_in=(0.34, 0.0), share_x=True, top_in=0.26)
     nominal, actual, separation = (row[0] for row in rows)
-    nominal.plot(*envelope(seconds, numbers(motion, "ref_speed")), color=drawing.NOMINAL, lw=0.9)
+    nominal.plot(*envelope(seconds, numeric_column(motion, "ref_speed")), color=drawing.NOMINAL, lw=0.9)
     nominal.set(title="Programmed TCP speed", ylabel="m/s")
-    actual.plot(*envelope(seconds, numbers(motion, "tcp_speed")), color=drawing.ACTUAL, lw=0.9)
+    actual.plot(*envelope(seconds, numeric_column(motion, "tcp_speed")), color=drawing.ACTUAL, lw=0.9)
     actual.set(title="Actual TCP speed", ylabel="m/s")
-    separation.plot(*envelope(seconds, numbers(motion, "distance_m")), color=drawing.PURPLE, lw=1.0)
+    separation.plot(*envelope(seconds, numeric_column(motion, "distance_m")), color=drawing.PURPLE, lw=1.0)
     separation.axhline(near_m, color=drawing.INK, lw=0.8, ls=(0, (4, 3)))
     separation.set(title="Separation from the swept volumes", ylabel="m", xlabel="time [s]", ylim=(0, None))
     high = max(_top(motion, "ref_speed"), _top(motion, "tcp_speed")) * 1.08
@@ -164,7 +167,7 @@ def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
 
 
 def _top(motion: pd.DataFrame, name: str) -> float:
-    values = numbers(motion, name)
+    values = numeric_column(motion, name)
     values = values[np.isfinite(values)]
     return max(float(values.max()), 1e-3) if len(values) else 1.0
 
@@ -180,7 +183,7 @@ def _bars(seconds: Floats, mask: np.ndarray) -> list[tuple[float, float]]:
     """Stretches as (start, width) [s]; neighbours closer than a line's width on paper are one bar."""
     bars: list[tuple[float, float]] = []
     resolution = (seconds[-1] - seconds[0]) / 1500.0 if len(seconds) else 0.0
-    for first, last in stretches(mask):
+    for first, last in true_runs(mask):
         start, end = float(seconds[first]), float(seconds[min(last, len(seconds) - 1)])
         if bars and start - sum(bars[-1]) < resolution:
             bars[-1] = (bars[-1][0], end - bars[-1][0])
@@ -198,7 +201,16 @@ def status(
     near_m: float,
     slow_m_per_s: float,
 ) -> Figure:
-    """What the plan and each baseline did over time, and when each stood near the person though it should move."""
+    """What the plan and each baseline did over time, and when each stood near the person though it should move.
+
+    Args:
+        motion: Rows of motion.parquet.
+        baselines: Name of each baseline -> rows of its motion.
+        method: Method of the plan.
+        t0_ns: Instant of time zero [ns].
+        near_m: The person is near at a separation of at most this [m].
+        slow_m_per_s: The robot stands where its TCP is slower than this [m/s].
+    """
     tables = {f"plan: {method}": motion, **baselines}
     figure = drawing.new_figure(0.95 + 0.62 * len(tables))
     ax = drawing.panels(figure, 1, left_in=0.9, top_in=0.36)[0][0]
@@ -293,7 +305,7 @@ def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
     names = list(dict.fromkeys(pose.bodies))
     colours = {name: to_rgb(_COLOURS[i % len(_COLOURS)]) for i, name in enumerate(names)}
     solids = [
-        Solid(ends, float(radius), colours[body])
+        RenderedHull(ends, float(radius), colours[body])
         for body, ends, radius in zip(pose.bodies, pose.ends_m, pose.radius_m, strict=True)
     ]
     rows = -(-(len(names) + 1) // 4)
@@ -320,7 +332,7 @@ def _beside(pose: LinkPose, base_m: Floats) -> float:
     return float(np.arctan2(person[1] - base_m[1], person[0] - base_m[0]) - 0.5 * np.pi)
 
 
-def _draw(ax: Axes, view: View, solids: list[Solid], pose: LinkPose, base_m: Floats) -> None:
+def _draw(ax: Axes, view: View, solids: list[RenderedHull], pose: LinkPose, base_m: Floats) -> None:
     edges = [outline(solid.vertices_m, solid.radius_m, view) for solid in solids]
     corners = np.vstack([*edges, view.flat(base_m[None])])
     low, high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
@@ -331,7 +343,7 @@ def _draw(ax: Axes, view: View, solids: list[Solid], pose: LinkPose, base_m: Flo
             colour = drawing.LIMBS.get(limb, drawing.FAINT)
             ax.add_patch(Polygon(edge, facecolor=colour, alpha=0.12, lw=0, zorder=0))
             ax.add_patch(Polygon(edge, fill=False, edgecolor=colour, lw=0.7, alpha=0.7, zorder=0))
-    image = picture(solids, view, low, high, (high[1] - low[1]) / 420.0)
+    image = render_hulls(solids, view, low, high, (high[1] - low[1]) / 420.0)
     extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
     limits = ax.get_xlim(), ax.get_ylim()
     ax.imshow(image, origin="lower", extent=extent, aspect="auto", interpolation="bilinear", zorder=2)

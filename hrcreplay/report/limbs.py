@@ -1,4 +1,7 @@
-"""Which limbs the cameras measured: one that they did not is where the model supposes it, and a reader has to know."""
+"""Which limbs the cameras measured, and for how much of the time.
+
+An unmeasured limb is where the model supposes it, so a reader has to know.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,7 @@ def unmeasured_shares(unseen_s: Floats, memory_s: float) -> Floats:
 
 
 def add_limbs(metrics: MetricTable, run: Run) -> None:
-    """How much of the time each limb went unmeasured, and which of its joints always did."""
+    """Adds for how much of the time each limb was not measured, and which of its joints never were."""
     names = list(COLUMNS["state"])
     shares = np.full(len(LIMBS), np.nan)
     memory_s = float(run.meta.get("settings", {}).get("fusion", {}).get("memory_s", 0.5))
@@ -88,7 +91,7 @@ def _never_measured(measurements: pd.DataFrame | None) -> frozenset[str]:
     return frozenset(joint for joint in JOINTS if not np.isfinite(measurements[joint].to_numpy(dtype=float)).any())
 
 
-def called(limbs: list[str]) -> str:
+def limb_names_text(limbs: list[str]) -> str:
     """Limbs as a reader calls them, with their abbreviations: "left lower arm (LLA) and head (HD)"."""
     names = [f"{NAMES[limb]} ({limb})" for limb in limbs]
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
@@ -121,11 +124,11 @@ def remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
                 "its volume holds all that its joints allow"
             )
     lines += [
-        f"the {called([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"
+        f"the {limb_names_text([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"
         for limb, share in mostly.items()
     ]
     for limb in LIMBS:
         joints = metrics[f"limb_{limb}_joints_unmeasured"]["value"]
         if joints is not None and limb not in never and limb != "HD":  # the head hangs on the trunk's joints
-            lines.append(f"the {called([limb])} was measured only in part: never its {joints}")
+            lines.append(f"the {limb_names_text([limb])} was measured only in part: never its {joints}")
     return lines

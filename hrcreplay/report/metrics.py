@@ -1,6 +1,6 @@
-"""Time series as the report needs them: interpolation, derivatives, stretches, and fewer points for drawing.
+"""The table of metrics.json, and the time series functions that metrics and figures share.
 
-The table that metrics.json holds: name -> value, unit and meaning; null with a reason where one does not apply.
+A metric has a value, a unit and a meaning; one that does not apply is null with a reason.
 """
 
 from __future__ import annotations
@@ -23,7 +23,15 @@ class MetricTable:
         self._metrics: dict[str, Metric] = {}
 
     def add(self, name: str, value: float | str | None, unit: str, meaning: str, *, reason: str = "no samples") -> None:
-        """Adds one metric; ``reason`` says why it is null, if it is."""
+        """Adds one metric; ``reason`` says why it is null, if it is.
+
+        Args:
+            name: Key in metrics.json.
+            value: Number or text; None, or not finite: null.
+            unit: Unit of the value, ``1`` for a count or a share.
+            meaning: What it says, in a few words.
+            reason: Why it is null, if it is.
+        """
         if not isinstance(value, str) and value is not None:
             number = value.item() if isinstance(value, np.generic) else value
             value = number if np.isfinite(number) else None
@@ -56,7 +64,7 @@ def difference(a: Floats, b: Floats) -> Floats:
 
 
 def columns(table: pd.DataFrame, suffix: str = "") -> Floats:
-    """(n, 12) the columns of JOINTS with a suffix."""
+    """(n, 12) columns of the JOINTS with a suffix."""
     return table[[joint + suffix for joint in JOINTS]].to_numpy(dtype=float)
 
 
@@ -103,7 +111,7 @@ def central_differences(t_ns: Ints, values: Floats) -> Floats:
     return rate
 
 
-def stretches(mask: Bools) -> Ints:
+def true_runs(mask: Bools) -> Ints:
     """(k, 2) the runs of true in ``mask``, each as [first, past the last)."""
     edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
     return np.column_stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)]).astype(np.int64)
@@ -117,7 +125,7 @@ def durations_s(t_ns: Ints) -> Floats:
     return np.append(steps, np.median(steps))
 
 
-def broken(x: Floats, y: Floats, gap: float) -> tuple[Floats, Floats]:
+def break_at_gaps(x: Floats, y: Floats, gap: float) -> tuple[Floats, Floats]:
     """A line with a NaN put in wherever its abscissa leaps by more than ``gap``."""
     leaps = np.flatnonzero(np.diff(x) > gap) + 1
     return np.insert(x, leaps, x[leaps - 1]), np.insert(y, leaps, np.nan)

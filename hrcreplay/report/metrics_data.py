@@ -1,7 +1,4 @@
-"""Errors of the cameras and of the fused state against ground truth.
-
-Metrics of the data that went in, and of the volumes that came out of it.
-"""
+"""Metrics of the input data, of the fused state against ground truth, and of the swept volumes."""
 
 from __future__ import annotations
 
@@ -20,8 +17,8 @@ from hrcreplay.report.metrics import (
     difference,
     durations_s,
     interpolate,
-    stretches,
     times,
+    true_runs,
 )
 from hrcreplay.store.run_folder import Run
 
@@ -108,7 +105,7 @@ def _add_coverage(metrics: MetricTable, state: pd.DataFrame) -> None:
     names = [name for name in state.columns if name.startswith("valid_")]
     any_valid: Bools = np.asarray(state[names].to_numpy(dtype=bool).any(axis=1))
     t_ns = times(state)
-    runs = stretches(~any_valid)
+    runs = true_runs(~any_valid)
     ends = (t_ns + np.round(durations_s(t_ns) * 1e9)).astype(np.int64)
     longest = max(((ends[last - 1] - t_ns[first]) * 1e-9 for first, last in runs), default=0.0)
     metrics.add("ticks_without_camera", int((~any_valid).sum()), "1", "ticks whose update used no camera at all")

@@ -1,10 +1,9 @@
-"""Metrics of the robot's motion: what safety took, and what it cost the task.
+"""Metrics of the robot's motion: separation, stops, path deviation, and progress along the programme.
 
-The pace that a robot kept: how far it came itself along its programme, in the programme's own time.
-
-The reference may run ahead of the robot (by the leash, or without end where it does not wait), so its time says nothing
-of the way that was made. Counted is the robot's foot on the programmed path: the nearest point of the next stretch of
-it, which never goes back and never passes the reference. What the programme takes to the foot is the time reached.
+The reference may be ahead of the robot (by the leash, or without bound where it does not wait), so its time does not
+say how far the robot came. Progress is measured at the foot point of the TCP on the programmed path: the nearest point
+of the next section of the path, which never moves back and never passes the reference. The programmed time at the foot
+point is the time that the robot reached.
 """
 
 from __future__ import annotations
@@ -92,7 +91,7 @@ def reached_s(path: Programme, passed: int, share: float) -> float:
     return float(time_s - path.from_s[0]) if made_m > _ROUNDING_M else 0.0
 
 
-def pace(motion: pd.DataFrame, ahead_m: float) -> tuple[float, float] | None:
+def programme_progress(motion: pd.DataFrame, ahead_m: float) -> tuple[float, float] | None:
     """Programmed time that the robot reached, and the time that it had [s]; None where its programme only stands.
 
     Args:
@@ -125,12 +124,12 @@ PAPER = {
 }
 
 
-def vectors(motion: pd.DataFrame, what: str) -> Floats:
+def position_columns(motion: pd.DataFrame, what: str) -> Floats:
     """(n, 3) ``ref`` or ``tcp`` positions, world [m]."""
     return motion[[f"{what}_x", f"{what}_y", f"{what}_z"]].to_numpy(dtype=float)
 
 
-def numbers(motion: pd.DataFrame, name: str) -> Floats:
+def numeric_column(motion: pd.DataFrame, name: str) -> Floats:
     """(n,) one column."""
     return motion[name].to_numpy(dtype=float)
 
@@ -141,9 +140,9 @@ def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -
     It stands when the TCP is slower than ``stationary_m_per_s``. It should move when the reference is not, and when the
     reference waits for the robot: at a waypoint it stands itself.
     """
-    near = numbers(motion, "distance_m") <= near_m
-    stands = numbers(motion, "tcp_speed") < stationary_m_per_s
-    wanted = numbers(motion, "ref_speed") >= stationary_m_per_s
+    near = numeric_column(motion, "distance_m") <= near_m
+    stands = numeric_column(motion, "tcp_speed") < stationary_m_per_s
+    wanted = numeric_column(motion, "ref_speed") >= stationary_m_per_s
     waits = waited_s(motion) > 0.5 * durations_s(times(motion))
     return near, stands & (wanted | waits)
 
@@ -152,7 +151,7 @@ def is_moving(motion: pd.DataFrame, slow_m_per_s: float) -> Bools:
     """(n,) ticks at which the robot moves: its TCP, or any joint at 1 mrad/s, for a link can sweep past a still TCP."""
     joints = [name for name in motion.columns if name.startswith("dq")]
     turning = (np.abs(motion[joints].to_numpy(dtype=float)) >= 1e-3).any(axis=1)
-    return np.asarray((numbers(motion, "tcp_speed") >= slow_m_per_s) | turning)
+    return np.asarray((numeric_column(motion, "tcp_speed") >= slow_m_per_s) | turning)
 
 
 def path_feet(points: Floats, path: Floats) -> Floats:
@@ -183,21 +182,21 @@ def path_feet(points: Floats, path: Floats) -> Floats:
 
 def deviation_m(motion: pd.DataFrame) -> Floats:
     """(n,) distance of the TCP from the programmed path [m]."""
-    tcp = vectors(motion, "tcp")
-    return np.asarray(np.linalg.norm(tcp - path_feet(tcp, vectors(motion, "ref")), axis=1))
+    tcp = position_columns(motion, "tcp")
+    return np.asarray(np.linalg.norm(tcp - path_feet(tcp, position_columns(motion, "ref")), axis=1))
 
 
 def waited_s(motion: pd.DataFrame) -> Floats:
     """(n,) how much of each tick the reference waited for the robot instead of going on [s]; 0 after the last tick."""
     waited = durations_s(times(motion))
-    waited[:-1] -= np.diff(numbers(motion, "programme_s"))
+    waited[:-1] -= np.diff(numeric_column(motion, "programme_s"))
     waited[-1:] = 0.0  # what the reference does after the last tick is not known
     return np.clip(waited, 0.0, None)
 
 
 def cycles(motion: pd.DataFrame, *, at_m: float = 0.002, away_m: float = 0.05) -> int:
     """How often the reference came back to its first point (within ``at_m``) after being ``away_m`` from it."""
-    reference = vectors(motion, "ref")
+    reference = position_columns(motion, "ref")
     gap = np.linalg.norm(reference - reference[0], axis=1)
     marks = np.where(gap >= away_m, 1, np.where(gap <= at_m, -1, 0))
     marks = marks[marks != 0]
@@ -214,7 +213,17 @@ def add_plan(
     stationary_m_per_s: float,
     leash_m: float,
 ) -> None:
-    """Everything about the motion, the baselines' likewise, and the paper's own figures beside them."""
+    """Everything about the motion, the baselines' likewise, and the paper's own figures beside them.
+
+    Args:
+        metrics: Table that the metrics are added to.
+        motion: Rows of motion.parquet; None where nothing was planned.
+        baselines: Name of each baseline -> rows of its motion.
+        method: Method of the plan.
+        near_m: The person is near at a separation of at most this [m].
+        stationary_m_per_s: The robot stands where its TCP is slower than this [m/s].
+        leash_m: How far the TCP may be from the reference before the reference waits [m].
+    """
     if motion is None:
         metrics.add("plan_method", None, "name", "method of the plan", reason="not planned")
     else:
@@ -258,14 +267,14 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
         "1",
         f"ticks of {what} in braking with the robot still moving: inequality (2) may not hold there",
     )
-    overlap = numbers(motion, "distance_m") <= 0.0
+    overlap = numeric_column(motion, "distance_m") <= 0.0
     metrics.add(
         f"{prefix}_contact_moving_ticks",
         int((overlap & moving).sum()),
         "1",
         f"ticks of {what} with the robot moving while a link touched a swept volume",
     )
-    closest = numbers(motion, "distance_m")[braking & moving]
+    closest = numeric_column(motion, "distance_m")[braking & moving]
     closest = closest[np.isfinite(closest)]
     metrics.add(
         f"{prefix}_braking_moving_separation_min_m",
@@ -277,7 +286,7 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
 
 
 def _add_separation(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
-    distance = numbers(motion, "distance_m")
+    distance = numeric_column(motion, "distance_m")
     known = np.isfinite(distance)
     reason = "no tick has a separation"
     k = int(np.argmin(np.where(known, distance, np.inf))) if known.any() else None
@@ -327,7 +336,7 @@ def _add_stationary(
 
 
 def _add_path(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str) -> None:
-    along = np.linalg.norm(vectors(motion, "tcp") - vectors(motion, "ref"), axis=1)
+    along = np.linalg.norm(position_columns(motion, "tcp") - position_columns(motion, "ref"), axis=1)
     for name, values, meaning in (
         ("deviation", deviation_m(motion), "distance from the TCP to the nearest point of the programmed path"),
         ("tracking_error", along, "distance from the TCP to the reference of the same tick"),
@@ -343,7 +352,7 @@ def _p95(values: Floats) -> float:
 
 
 def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, leash_m: float) -> None:
-    tcp_speed, ref_speed = numbers(motion, "tcp_speed"), numbers(motion, "ref_speed")
+    tcp_speed, ref_speed = numeric_column(motion, "tcp_speed"), numeric_column(motion, "ref_speed")
     for name, speed, meaning in (
         ("tcp_speed", tcp_speed, "speed of the TCP"),
         ("ref_speed", ref_speed, "programmed speed of the TCP where the reference is"),
@@ -352,7 +361,7 @@ def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what:
         mean = float(known.mean()) if len(known) else None
         metrics.add(f"{prefix}_{name}_mean_m_per_s", mean, "m/s", f"mean over all ticks of {what}: {meaning}")
     for name, what_moved in (("tcp", "TCP"), ("ref", "reference")):
-        steps = np.linalg.norm(np.diff(vectors(motion, name), axis=0), axis=1)
+        steps = np.linalg.norm(np.diff(position_columns(motion, name), axis=0), axis=1)
         metrics.add(
             f"{prefix}_{name}_travelled_m",
             float(np.nansum(steps)),
@@ -367,7 +376,7 @@ def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what:
         f"times the reference came back to its first point, {what}",
         reason="the reference never came back to its first point",
     )
-    found = pace(motion, leash_m)
+    found = programme_progress(motion, leash_m)
     reason = "the programme stands for all of the time"
     metrics.add(
         f"{prefix}_time_lost_s",

@@ -1,4 +1,4 @@
-"""report.html: one self-contained page, the same bytes for the same run."""
+"""The HTML page of a run: one self-contained file, the same bytes for the same run."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from markupsafe import Markup
 
 from hrcreplay.records import LIMBS
 from hrcreplay.report import story
-from hrcreplay.report.limbs import called
+from hrcreplay.report.limbs import limb_names_text
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
-from hrcreplay.report.story import flaws
+from hrcreplay.report.story import defect_notes
 from hrcreplay.report.tables import (
     CAMERA,
     CAPTIONS,
@@ -48,7 +48,7 @@ class PageFigure:
 
 
 @dataclass(frozen=True)
-class Part:
+class PageSection:
     """A section of the page; ``missing`` says what it would take to fill it."""
 
     key: str
@@ -87,7 +87,7 @@ def render(
         inputs=inputs,
         versions=sorted(run.meta.get("versions", {}).items()),
         stages=sorted((run.meta.get("stages") or {}).items()),
-        flaws=flaws(run.counts, run.notes),
+        flaws=defect_notes(run.counts, run.notes),
         command=shlex.join(run.meta.get("arguments") or [str(run.meta.get("command", ""))]),
         not_claimed=NOT_CLAIMED,
         metrics=[
@@ -107,7 +107,9 @@ def _subtitle(run: Run, metrics: Mapping[str, Metric]) -> str:
     return " \u00b7 ".join(parts)
 
 
-def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: Sequence[PageTable]) -> tuple[Part, ...]:
+def _parts(
+    run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: Sequence[PageTable]
+) -> tuple[PageSection, ...]:
     def figures(*names: str) -> tuple[PageFigure, ...]:
         found = [name for name in names if (figures_dir / f"{name}.svg").is_file()]
         return tuple(PageFigure(name, CAPTIONS[name], inline_svg(figures_dir / f"{name}.svg", name)) for name in found)
@@ -118,7 +120,7 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
     seen = cameras(run)
     with_truth = metrics["fusion_angle_rmse"]["value"] is not None
     return (
-        Part(
+        PageSection(
             "safety",
             "Safety",
             "How fast the robot moved, how near to what the person could reach, and what held it.",
@@ -128,7 +130,7 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             else (),
             no_plan,
         ),
-        Part(
+        PageSection(
             "cost",
             "Cost to the task",
             "How often it stood, how far it left its path, and how much time that took.",
@@ -139,7 +141,7 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             no_plan,
         ),
         *_robot(run, figures("robot_links")),
-        Part(
+        PageSection(
             "prediction",
             "Prediction",
             "What the person could reach within the robot's stopping time, and the bounds that this rests on.",
@@ -149,7 +151,7 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             if run.occupancy is not None
             else "No swept volumes in this run. Run predict, plan or report on the log.",
         ),
-        Part(
+        PageSection(
             "fusion",
             "Fusion",
             "The person as each camera saw them, and as the filter has them.",
@@ -157,7 +159,7 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
             (_fusion_table(metrics, seen),) if with_truth else (),
             "" if with_truth else "The log has no ground truth, so there is nothing to tell errors by.",
         ),
-        Part(
+        PageSection(
             "data",
             "Data quality",
             "What the log held, and what was wrong with it.",
@@ -171,10 +173,14 @@ def _parts(run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: S
     )
 
 
-def _robot(run: Run, drawn: tuple[PageFigure, ...]) -> tuple[Part, ...]:
+def _robot(run: Run, drawn: tuple[PageFigure, ...]) -> tuple[PageSection, ...]:
     """The section of the robot, where the run moved one."""
     tables = (robot_table(run.meta["robot"]),) if "robot" in run.meta else ()
-    return (Part("robot", "Robot", "The capsules that stand for its links.", drawn, tables),) if drawn or tables else ()
+    return (
+        (PageSection("robot", "Robot", "The capsules that stand for its links.", drawn, tables),)
+        if drawn or tables
+        else ()
+    )
 
 
 def _papers(metrics: Mapping[str, Metric]) -> str:
@@ -227,7 +233,7 @@ def _fusion_table(metrics: Mapping[str, Metric], seen: Sequence[str]) -> PageTab
 def _limbs(metrics: Mapping[str, Metric]) -> tuple[PageTable, ...]:
     shares, joints = ([metrics[f"limb_{limb}_{what}"] for limb in LIMBS] for what in _LIMB)
     rows = [
-        (called([limb]), percent(share), text_of(names))
+        (limb_names_text([limb]), percent(share), text_of(names))
         for limb, share, names in zip(LIMBS, shares, joints, strict=True)
     ]
     if shares[0]["value"] is None:

@@ -1,8 +1,6 @@
-"""The answer in words and headline numbers. Says what the replay shows, and never more than that.
+"""Results of a run in words: answers, headline numbers, defects of the log, and a line for each stage.
 
-What was wrong with a log, in lines for a page's first screen and a terminal.
-
-A run in a line for each stage, from the metrics that its page shows.
+They state what the replay shows, and no more than that.
 """
 
 from __future__ import annotations
@@ -11,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hrcreplay.logs.clean import DEFECTS
-from hrcreplay.report.limbs import called, unmeasured
+from hrcreplay.report.limbs import limb_names_text, unmeasured
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
-from hrcreplay.report.tables import happened, percent, text_of
+from hrcreplay.report.tables import percent, reason_text, text_of
 from hrcreplay.store.run_folder import Run
 
 #: Between groups of digits.
@@ -24,7 +22,7 @@ _CAMERA = "_<camera>"
 _NONE, _INSTANT = "no defect", "an instant"
 
 
-def flaws(counts: Mapping[str, int], notes: Sequence[str]) -> tuple[str, ...]:
+def defect_notes(counts: Mapping[str, int], notes: Sequence[str]) -> tuple[str, ...]:
     """The notes of a run, then what was counted of each defect of its log; nothing of a clean log.
 
     Args:
@@ -81,9 +79,10 @@ def _with_unmeasured(safe: Answer, metrics: Mapping[str, Metric]) -> Answer:
     never, mostly = unmeasured(metrics)
     if not never and not mostly:
         return safe
-    parts = [f"the {called(never)}: never measured"] if never else []
+    parts = [f"the {limb_names_text(never)}: never measured"] if never else []
     parts += [
-        f"the {called([limb])}: not measured at {100 * share:.0f} % of the ticks" for limb, share in mostly.items()
+        f"the {limb_names_text([limb])}: not measured at {100 * share:.0f} % of the ticks"
+        for limb, share in mostly.items()
     ]
     short = f"Not known of {'; '.join(parts)}."
     words = (
@@ -142,7 +141,7 @@ def _braked(metrics: Mapping[str, Metric]) -> str:
     mark = "plan_braking_ticks_"
     found = [(m["value"], name.removeprefix(mark)) for name, m in metrics.items() if name.startswith(mark)]
     parts = [
-        f"at {text_of(metrics[mark + slug])} tick{'' if count == 1 else 's'} {happened(slug.replace('_', ' '))}"
+        f"at {text_of(metrics[mark + slug])} tick{'' if count == 1 else 's'} {reason_text(slug.replace('_', ' '))}"
         for count, slug in sorted(found, key=lambda part: (-part[0], part[1]))
     ]
     return f"Why it braked, moving or standing: {'; '.join(parts)}." if parts else ""

@@ -1,9 +1,4 @@
-"""Tables of the page: the paper's Table 1 and Table 2 as used, and comparisons of metrics side by side.
-
-Fixed words of the page.
-
-What a run tells of its robot: the chain that was read from a URDF and the capsules around its links.
-"""
+"""Tables of the page and its fixed texts: Table 1 and Table 2 as used, comparisons of metrics, the robot's capsules."""
 
 from __future__ import annotations
 
@@ -125,7 +120,7 @@ REASONS = {
 }
 
 
-def happened(reason: str) -> str:
+def reason_text(reason: str) -> str:
     """What happened at a tick with a reason to brake; of a reason without words, the record's own."""
     return REASONS.get(reason, f"the record says '{reason}'")
 

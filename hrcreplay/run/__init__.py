@@ -1,1 +1,1 @@
-"""Offline runs: a job, its stages, the followers of a programme, the run folder."""
+"""Offline runs: job, stages, followers of a programme, report."""

@@ -1,4 +1,7 @@
-"""From settings, cell and log to what the stages take. The rooms never see a settings model."""
+"""Builds the stages and the robot from settings, cell and log.
+
+The rooms of the stages get plain values and never see a settings model.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.robot.programme.task import parse_task
 from hrcreplay.run.followers import Planner, QpFollower, ScalingFollower
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
-from hrcreplay.run.stages import Eyes, Foresight
+from hrcreplay.run.stages import FusionStage, PredictionStage
 from hrcreplay.settings.load import Settings
 
 
@@ -36,8 +39,8 @@ def log_options(settings: Settings) -> LogOptions:
     )
 
 
-class Source(Protocol):
-    """A log, or what stands for one in a live session."""
+class LogLike(Protocol):
+    """What the stages need of a log; in a live session a header without one."""
 
     @property
     def header(self) -> Header:
@@ -47,8 +50,8 @@ class Source(Protocol):
         """The recorded joints, where there are any."""
 
 
-def eyes(job: Job, log: Source) -> Eyes:
-    """Stage 1. A pose of the cell file wins over the log's.
+def fusion_stage(job: Job, log: LogLike) -> FusionStage:
+    """Stage 1 of a job. A camera pose of the cell file has priority over the log's.
 
     Raises:
         LogError: A camera's pose is known to neither.
@@ -68,7 +71,7 @@ def eyes(job: Job, log: Source) -> Eyes:
         )
     offsets_s = [cell.clock_offset_s.get(camera, 0.0) for camera in log.header.cameras]
     logs = job.settings.logs
-    return Eyes(
+    return FusionStage(
         T_world_camera=np.array([poses[camera] for camera in log.header.cameras]),
         clock_offset_ns=np.round(np.array(offsets_s) * 1e9).astype(np.int64),
         filter=job.settings.fusion,
@@ -78,23 +81,23 @@ def eyes(job: Job, log: Source) -> Eyes:
     )
 
 
-def foresight(job: Job) -> Foresight:
-    """Stage 2. Beside a real robot the volumes reach further, by the time until it obeys."""
+def prediction_stage(job: Job) -> PredictionStage:
+    """Stage 2 of a job. For a live robot the latency includes ``live.reaction_s``, so the volumes are larger."""
     occupancy = job.settings.occupancy
     if job.command == "live":
         occupancy = occupancy.model_copy(update={"latency_s": occupancy.latency_s + job.settings.live.reaction_s})
-    return Foresight(job.prediction, occupancy, job.settings.fusion.memory_s)
+    return PredictionStage(job.prediction, occupancy, job.settings.fusion.memory_s)
 
 
-def base(job: Job, log: Source) -> Floats | None:
-    """(4, 4) the robot's base in the world: of the cell file, else of the log."""
+def known_robot_base(job: Job, log: LogLike) -> Floats | None:
+    """(4, 4) pose of the robot's base in the world: of the cell file, else of the log; None where neither has it."""
     if job.cell is not None and job.cell.T_world_base is not None:
         return job.cell.T_world_base
     return log.header.T_world_base
 
 
 def robot(job: Job, T_world_base: Floats) -> RobotModel:
-    """The manipulator on its base.
+    """The robot of a job at its place in the world.
 
     Raises:
         SettingsError: The URDF or a robot setting cannot be used.
@@ -139,7 +142,7 @@ def _capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -
     return model.segments
 
 
-def reference(job: Job, log: Source, model: RobotModel) -> tuple[Reference, int | None]:
+def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int | None]:
     """The programmed path: of the task file, else of the log's task, else the log's joint track.
 
     Returns:
@@ -162,27 +165,27 @@ def reference(job: Job, log: Source, model: RobotModel) -> tuple[Reference, int 
     return recorded(whole.t_ns, whole.q, model), int(whole.t_ns.min())
 
 
-def planners(job: Job, log: Source, start_ns: int) -> dict[str, Planner]:
+def planners(job: Job, log: LogLike, start_ns: int) -> dict[str, Planner]:
     """Stage 3: the chosen method and its baselines, each with a robot of its own."""
-    plan, model = job.settings.plan, robot(job, standing(job, log))
+    plan, model = job.settings.plan, robot(job, robot_base(job, log))
     path, begin_ns = reference(job, log, model)
     settings = plan_settings(job, 1.0 / job.settings.fusion.rate_hz)
     s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
 
     def planner(name: str) -> Planner:
-        follower = follow(name, model, path, settings, s_s)
+        follower = make_follower(name, model, path, settings, s_s)
         return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
 
 
-def standing(job: Job, log: Source) -> Floats:
-    """(4, 4) where the robot stands.
+def robot_base(job: Job, log: LogLike) -> Floats:
+    """(4, 4) pose of the robot's base in the world, which must be known.
 
     Raises:
         SettingsError: Neither the cell nor the log knows.
     """
-    T_world_base = base(job, log)
+    T_world_base = known_robot_base(job, log)
     if T_world_base is None:
         raise SettingsError(
             f"{log.header.path}: where the robot stands is not known; give a --cell file with T_world_base"
@@ -195,10 +198,18 @@ def plan_settings(job: Job, dt_s: float) -> PlanSettings:
     return PlanSettings(job.settings.plan, dt_s=dt_s, stop_s=job.settings.occupancy.stop_s)
 
 
-def follow(
+def make_follower(
     method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float
 ) -> QpFollower | ScalingFollower:
-    """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on."""
+    """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on.
+
+    Args:
+        method: ``scaling`` for the baseline [24]; every other one is the trajectory generator.
+        model: Robot that follows.
+        path: Programmed path.
+        settings: Section 5 for the length of a tick.
+        s_s: Programmed time at the start [s].
+    """
     if method == "scaling":
         return ScalingFollower(model, path, settings, s_s)
     return QpFollower(model, path, settings, s_s)

@@ -1,4 +1,4 @@
-"""The third stage: one method following its reference tick by tick, beside the people of each tick."""
+"""Stage 3: a method that follows its reference tick by tick, beside the people of each tick."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from hrcreplay.robot.programme.reference import Reference, ReferencePoint, advan
 _FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
 
 
-class Tick(NamedTuple):
-    """What a method found at a tick, and what it decided."""
+class FollowerTick(NamedTuple):
+    """State, reference and decision of a method at one tick."""
 
     state: RobotState
     point: ReferencePoint  #: of the reference
@@ -40,7 +40,7 @@ class QpFollower:
         self.point = self.reference.sample(self.s_s)
         self.state = RobotState(self.point.q, np.zeros(self.robot.nv))
 
-    def step(self, volumes: Obstacles) -> Tick:
+    def step(self, volumes: Obstacles) -> FollowerTick:
         """One tick of the trajectory generator."""
         state, point, now_s = self.state, self.point, self.s_s
         tcp_m = self.robot.pose(state.q, state.dq).T_world_tcp[:3, 3]
@@ -51,7 +51,7 @@ class QpFollower:
             self.robot, state, self.point.T_world_tcp, rate * self.point.twist, volumes, self.settings
         )
         self.state = step.next
-        return Tick(state, point, now_s, step)
+        return FollowerTick(state, point, now_s, step)
 
 
 @dataclass
@@ -67,13 +67,13 @@ class ScalingFollower:
         self.along = PathState(self.s_s, 0.0)
         self.state = RobotState(self.reference.sample(self.s_s).q, np.zeros(self.robot.nv))
 
-    def step(self, volumes: Obstacles) -> Tick:
+    def step(self, volumes: Obstacles) -> FollowerTick:
         """One tick of the baseline."""
         state, now_s = self.state, self.along.s_s
         point = self.reference.sample(now_s)
         step, self.along = scaling_controller.step(self.robot, self.reference, self.along, volumes, self.settings)
         self.state = step.next
-        return Tick(state, point, now_s, step)
+        return FollowerTick(state, point, now_s, step)
 
 
 @dataclass
@@ -118,7 +118,7 @@ class Planner:
             reasons=control_step.REASONS,
         )
 
-    def _tick(self, volumes: SweptVolumes, row: int, t_ns: int, seen: bool) -> Tick:
+    def _tick(self, volumes: SweptVolumes, row: int, t_ns: int, seen: bool) -> FollowerTick:
         if seen:
             self.seen_ns = t_ns
         around = obstacles(volumes, row)
@@ -128,8 +128,8 @@ class Planner:
 
 
 @dataclass
-class Beside:
-    """Whether the robot stands in the person from the first: at every tick of the first second in which one is seen."""
+class InitialOverlap:
+    """Whether robot and person overlap from the start: at every tick of the first second with a person in view."""
 
     dt_s: float
     ticks: int = 0
@@ -137,7 +137,7 @@ class Beside:
     pair: tuple[str, str] = ("", "")  #: link and limb at the first of them
 
     def add(self, states: HumanStates, motion: Motion) -> None:
-        """Takes a batch of ticks."""
+        """Takes a batch of ticks into account."""
         rows = np.flatnonzero(np.isfinite(states.p[:, 0]) & (motion.limb >= 0))
         rows = rows[: max(0, round(_FIRST_S / self.dt_s) - self.ticks)]
         if not len(rows):
@@ -148,7 +148,7 @@ class Beside:
         self.inside = self.inside and bool((motion.distance_m[rows] <= 0.0).all())
 
     def remark(self) -> str | None:
-        """What is to be said of it; None where there is room between the two."""
+        """The note for the user; None where there is a distance between the two."""
         if not self.ticks or not self.inside:
             return None
         link, limb = self.pair

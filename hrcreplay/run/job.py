@@ -1,6 +1,6 @@
-"""What a run depends on: log, settings, cell, span.
+"""The job of a run: log, settings, cell, task and span, resolved from the command line or an earlier run.
 
-The files behind ``robot.urdf``: the URDF itself and the meshes of its links, wherever its packages are.
+Also the files behind ``robot.urdf``: the URDF and the meshes of its links, which may be in several packages.
 """
 
 from __future__ import annotations
@@ -175,6 +175,15 @@ def resolve(
 
     Settings of a run folder are those of the run unless a settings file or ``--set`` says otherwise.
 
+    Args:
+        command: Command of the run.
+        source: A log, or the run folder of an earlier command.
+        config: Settings file, or none.
+        overrides: ``section.key=value`` of the command line, which win over the file.
+        cell_file: Poses of cameras and robot; None: those of the earlier run, else of the log.
+        start_s: Start of the span, from the log's first message [s]; None: as the earlier run, else its beginning.
+        end_s: End of the span, from the log's first message [s]; None: as the earlier run, else its end.
+
     Raises:
         SettingsError: A setting, the cell, a limit set or the run folder cannot be used.
         LogError: There is nothing at that path.
@@ -210,8 +219,14 @@ def resolve(
     )
 
 
-def unlogged(command: str, where: Path, settings: Settings, cell_file: Path | None) -> Job:
+def job_without_log(command: str, where: Path, settings: Settings, cell_file: Path | None) -> Job:
     """The job of a command that has no log yet; ``where`` is what messages call it.
+
+    Args:
+        command: Command of the run.
+        where: What messages name in place of the log.
+        settings: Settings of the run.
+        cell_file: Poses of cameras and robot, or none.
 
     Raises:
         SettingsError: The cell, the task or a limit set cannot be used.
@@ -253,7 +268,7 @@ def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] 
 
 
 def urdf_digest(settings: Settings) -> str | None:
-    """Of the robot's URDF and the meshes that its link capsules come from; None for the IRB 140."""
+    """Digest of the robot's URDF and of the meshes that its link capsules come from; None for the IRB 140."""
     digests = [file["sha256"] for file in _urdf_inputs(settings)]
     return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else None
 

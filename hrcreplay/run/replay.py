@@ -1,6 +1,6 @@
-"""Offline driver: log -> stages -> run folder.
+"""The offline driver: runs the stages of a command on a log and writes the run folder.
 
-Which stages of an earlier run come out the same, by digests of all that the result of each stage depends on.
+Stages of an earlier run are reused where digests show that nothing has changed that their results depend on.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import HumanStates, Ints
 from hrcreplay.report import limbs, tables
-from hrcreplay.report.story import flaws
+from hrcreplay.report.story import defect_notes
 from hrcreplay.run import build, stages
-from hrcreplay.run.build import Source, log_options
+from hrcreplay.run.build import LogLike, log_options
 from hrcreplay.run.job import TABLES, Job, plain_limits, resolve, urdf_digest, versions
 from hrcreplay.run.report import write_report
-from hrcreplay.run.stages import NS, Bar, Sink, say
+from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
 from hrcreplay.store import run_folder
+from hrcreplay.store.columns import missing_columns, read_states
 from hrcreplay.store.run_folder import Run, RunWriter, Stopwatch
-from hrcreplay.store.tables import lacks, read_states
 
 REPORTS = Path("reports")
 
@@ -50,6 +50,18 @@ def run(
 ) -> Path:
     """Runs the stages up to that of ``command`` on a log or an earlier run.
 
+    Args:
+        command: ``fuse``, ``predict``, ``plan`` or ``report``.
+        source: A log, or the run folder of an earlier command.
+        out: Run folder to make; None: ``reports/<log>/<UTC>-<command>``.
+        config: Settings file, or none.
+        overrides: ``section.key=value`` of the command line, which win over the file.
+        cell_file: Poses of cameras and robot; None: those of the earlier run, else of the log.
+        start_s: Start of the span, from the log's first message [s]; None: as the earlier run, else its beginning.
+        end_s: End of the span, from the log's first message [s]; None: as the earlier run, else its end.
+        smooth: Whether to write the smoothed person too (smooth.parquet).
+        chunk_ticks: Ticks of a batch; changes no result.
+
     Returns:
         The run folder.
 
@@ -68,19 +80,19 @@ def run(
         parts = dependencies(job, log, ticks_ns)
         reused = _take_over(job, parts, writer, smooth=smooth)
         last = [stage for stage in job.stages if stage not in reused][-1:]
-        with Bar(last[0] if last else "", len(ticks_ns)) as bar:
+        with ProgressBar(last[0] if last else "", len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
             found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth)
-        base = build.base(job, log)
+        base = build.known_robot_base(job, log)
         writer.close_tables()
         notes = [*found["notes"], *_unmeasured(writer.partial, known, found["notes"])]
         if "plan" in job.stages:
-            robot = build.robot(job, build.standing(job, log))
+            robot = build.robot(job, build.robot_base(job, log))
             notes += tables.remarks(robot)
             found["robot"] = tables.summary(robot)
         found["notes"] = list(dict.fromkeys(notes))
-        for line in flaws(found["counts"], found["notes"]):
-            say(line)
+        for line in defect_notes(found["counts"], found["notes"]):
+            print_note(line)
         meta = {
             **known,
             **found,
@@ -103,6 +115,15 @@ def run_stages(
 ) -> dict[str, Any]:
     """All stages of the job in one pass, without those whose tables were taken over.
 
+    Args:
+        job: What was asked for.
+        log: Log of the job.
+        ticks_ns: (n,) ticks of the run, increasing [ns].
+        size: Ticks of a batch.
+        sink: Where rows, counts and times go.
+        reused: Stages whose tables were taken over from an earlier run.
+        smooth: Whether to write the smoothed person too.
+
     Returns:
         ``counts`` and ``notes`` about the data, for run.json, and ``found_by``: those of each stage that reads the log.
     """
@@ -110,12 +131,12 @@ def run_stages(
     states: Iterable[HumanStates]
     if "fuse" in todo:
         stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
-        states = stages.fused(log, ticks_ns, size, build.eyes(job, log), sink, smooth=smooth)
+        states = stages.fused(log, ticks_ns, size, build.fusion_stage(job, log), sink, smooth=smooth)
     else:
         states = read_states(sink.run.partial / "state.parquet", size)
     flow: Iterable[Any] = states
     if "predict" in todo or "plan" in todo:
-        people = stages.predicted(states, build.foresight(job), _store_every(job), sink, keep="predict" in todo)
+        people = stages.predicted(states, build.prediction_stage(job), _store_every(job), sink, keep="predict" in todo)
         flow = people
         if "plan" in todo:
             flow = stages.planned(people, build.planners(job, log, int(ticks_ns[0])), sink)
@@ -171,9 +192,9 @@ def _take_over(job: Job, parts: Mapping[str, str], writer: RunWriter, *, smooth:
         if stage in reused:
             for name in names:
                 writer.copy(name, job.earlier)
-            say(f"{stage}: taken over from {job.earlier}")
+            print_note(f"{stage}: taken over from {job.earlier}")
         elif names:
-            say(f"{stage}: {stale[stage]}; computed again")
+            print_note(f"{stage}: {stale[stage]}; computed again")
     return reused
 
 
@@ -220,7 +241,7 @@ PARTS = {
 }
 
 
-def dependencies(job: Job, log: Source, ticks_ns: Ints) -> dict[str, str]:
+def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
     """Digest of every part that a stage of the job depends on.
 
     A section of the settings counts whole, so that a new setting cannot be forgotten, but for the keys that stand here
@@ -236,12 +257,12 @@ def dependencies(job: Job, log: Source, ticks_ns: Ints) -> dict[str, str]:
         LogError: The pose of a camera is not known.
     """
     settings = job.settings.model_dump(mode="json")
-    eyes = build.eyes(job, log)
+    fusion_stage = build.fusion_stage(job, log)
     found: dict[str, Any] = {
         "versions": versions(),
         "log": job.log_sha256,
         "ticks": [int(ticks_ns[0]), int(ticks_ns[-1]), len(ticks_ns)],
-        "cameras": [log.header.cameras, eyes.T_world_camera.tolist(), eyes.clock_offset_ns.tolist()],
+        "cameras": [log.header.cameras, fusion_stage.T_world_camera.tolist(), fusion_stage.clock_offset_ns.tolist()],
         "settings logs": _without(settings["logs"], "joints_topic", "gap_s"),
         "logs.gap_s": settings["logs"]["gap_s"],
         "settings fusion": settings["fusion"],
@@ -251,7 +272,7 @@ def dependencies(job: Job, log: Source, ticks_ns: Ints) -> dict[str, str]:
         "limits.prediction": _without(plain_limits(job.prediction), "name"),
     }
     if "plan" in job.stages:
-        base = build.base(job, log)
+        base = build.known_robot_base(job, log)
         found |= {
             "base": None if base is None else base.tolist(),
             "programme": job.task or log.header.task or {"joints_topic": settings["logs"]["joints_topic"]},
@@ -262,7 +283,7 @@ def dependencies(job: Job, log: Source, ticks_ns: Ints) -> dict[str, str]:
 
 
 def stage_digests(job: Job, found: Mapping[str, str]) -> dict[str, str]:
-    """Digest of all that the result of each stage of the job depends on, from those of ``parts``."""
+    """Digest of all that the result of each stage of the job depends on, from those of ``dependencies``."""
     return {stage: _digest([found[name] for name in PARTS[stage]]) for stage in job.stages}
 
 
@@ -299,7 +320,7 @@ def _damage(folder: Path, stage: str, outputs: Mapping[str, str]) -> str | None:
         path = folder / name
         if not path.exists() or run_folder.sha256(path) != outputs[name]:
             return f"{path} is not as its run left it"
-        if missing := lacks(path):
+        if missing := missing_columns(path):
             return f"{path} is of an earlier version, without {missing[0]}"
     return None
 

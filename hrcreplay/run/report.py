@@ -1,7 +1,4 @@
-"""The report of a run: metrics first, then what only reads them.
-
-Everything that metrics.json holds, from a run's tables alone.
-"""
+"""The report of a run: computes all metrics from its tables, then the figures and the page that show them."""
 
 from __future__ import annotations
 
@@ -22,27 +19,27 @@ from hrcreplay.report.metrics_plan import add_plan
 from hrcreplay.report.story import lines
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
-from hrcreplay.run.stages import Foresight
+from hrcreplay.run.stages import PredictionStage
 from hrcreplay.store import run_folder
+from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run, RunWriter
-from hrcreplay.store.tables import read_states
 
 
 def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
-    """Leaves metrics.json, the figures and report.html beside the tables that have just been written."""
+    """Writes metrics.json, the figures and report.html beside the tables that have just been written."""
     near = _bounds(job.settings.model_dump())
     run = run_folder.read(writer.partial, meta)
     found = compute(run, **near)
     writer.text("metrics.json", run_folder.to_json(found))
-    foresight = build.foresight(job)
-    occupancy = foresight.occupancy
+    prediction_stage = build.prediction_stage(job)
+    occupancy = prediction_stage.occupancy
     parts = ("head", "thorax", "upper_arm", "lower_arm")
     radii = {part.replace("_", " "): getattr(occupancy, f"radius_{part}_m") for part in parts}
-    if foresight.method == "sound" and occupancy.legs:
+    if prediction_stage.method == "sound" and occupancy.legs:
         radii["legs, of sound"] = occupancy.legs_radius_m
     folder = writer.partial / "figures"
-    robot = _links(job, foresight, run)
-    figures.draw_all(run, folder, found, **near, volumes=_instants(foresight, run), robot=robot)
+    robot = _links(job, prediction_stage, run)
+    figures.draw_all(run, folder, found, **near, volumes=_instants(prediction_stage, run), robot=robot)
     shown = [
         tables.limit_table(job.prediction, use="prediction"),
         tables.limit_table(job.tracking, use="tracking"),
@@ -66,14 +63,14 @@ def _bounds(settings: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def _instants(foresight: Foresight, run: Run) -> list[Instant]:
+def _instants(prediction_stage: PredictionStage, run: Run) -> list[Instant]:
     """The swept volumes by the paper's two methods and the run's own at the instants that Fig. 17 shows."""
     wanted = figures.instants(run)
     if not len(wanted):
         return []
     states = _states(run, wanted)
-    methods = dict.fromkeys(("paper", "positions", foresight.method))
-    by_method = {method: foresight.volumes(states, method) for method in methods}
+    methods = dict.fromkeys(("paper", "positions", prediction_stage.method))
+    by_method = {method: prediction_stage.volumes(states, method) for method in methods}
 
     return [
         (int(t), {method: _hulls(volumes, row) for method, volumes in by_method.items()})
@@ -81,7 +78,7 @@ def _instants(foresight: Foresight, run: Run) -> list[Instant]:
     ]
 
 
-def _links(job: Job, foresight: Foresight, run: Run) -> LinkPose | None:
+def _links(job: Job, prediction_stage: PredictionStage, run: Run) -> LinkPose | None:
     """The robot's capsules and the swept volumes at the tick of the smallest separation."""
     if run.motion is None or not len(run.motion) or run.T_world_base is None:
         return None
@@ -91,7 +88,7 @@ def _links(job: Job, foresight: Foresight, run: Run) -> LinkPose | None:
     if not np.isfinite(q).all():
         return None
     states = _states(run, np.array([row["t_ns"]]))
-    hulls = _hulls(foresight.volumes(states), 0) if len(states) else {}
+    hulls = _hulls(prediction_stage.volumes(states), 0) if len(states) else {}
     return LinkPose(
         t_ns=int(row["t_ns"]),
         distance_m=float(row["distance_m"]),

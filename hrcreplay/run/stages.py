@@ -1,6 +1,6 @@
-"""The three stages as generators over batches of ticks: each hands its rows on and writes what it leaves behind.
+"""The three stages as generators over batches of ticks, and the progress bar of a run.
 
-What a person at a terminal sees of a run; a pipe sees nothing.
+Each stage passes its rows on to the next and writes its tables. The progress bar shows on a terminal only.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from hrcreplay.human.fusion import fuse, inverse_kinematics
 from hrcreplay.human.fusion import fuse as smoother
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import reachable_sets, swept_volumes
-from hrcreplay.logs.clean import PersonMemory, pick
-from hrcreplay.logs.plausibility import Stand
+from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
-from hrcreplay.run.followers import Beside, Planner
+from hrcreplay.run.followers import InitialOverlap, Planner
 from hrcreplay.settings.sections import Fusion, Occupancy
+from hrcreplay.store.columns import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
-from hrcreplay.store.tables import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 
 NS = 1_000_000_000
 #: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
@@ -41,7 +41,7 @@ LONGEST_S = 24 * 3600
 
 @dataclass
 class Sink:
-    """Where the stages leave their rows, and what they count on the way."""
+    """Output of the stages: the run folder, times, progress, counters and notes."""
 
     run: RunWriter
     watch: Stopwatch
@@ -51,8 +51,8 @@ class Sink:
 
 
 @dataclass(frozen=True)
-class Eyes:
-    """What the first stage needs to know of cameras and person."""
+class FusionStage:
+    """Stage 1: camera poses and clocks, point noise, and the settings of filter and person selection."""
 
     T_world_camera: Floats  #: (c, 4, 4)
     clock_offset_ns: Ints  #: (c,) camera's clock minus the reference camera's
@@ -62,15 +62,17 @@ class Eyes:
     person_memory_s: float
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
-        """What the frames say of the person, by the clock of the reference camera; see ``person.pick``."""
-        memory, mine, found = pick(frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s)
+        """Measurements of the person, by the clock of the reference camera; see ``clean.select_person``."""
+        memory, mine, found = select_person(
+            frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
+        )
         mine = replace(mine, capture_ns=mine.capture_ns - self.clock_offset_ns[mine.camera])
         return memory, inverse_kinematics.measure(mine, self.T_world_camera, self.filter), found
 
 
 @dataclass(frozen=True)
-class Foresight:
-    """What the second stage needs beside the person."""
+class PredictionStage:
+    """Stage 2: limit set, horizon, radii, margins and method of the swept volumes."""
 
     limits: LimitSet
     occupancy: Occupancy
@@ -86,7 +88,7 @@ class Foresight:
         """How the volumes are predicted."""
         return self.occupancy.method
 
-    def by(self, method: str) -> Foresight:
+    def by(self, method: str) -> PredictionStage:
         """The same by another method."""
         return replace(self, occupancy=self.occupancy.model_copy(update={"method": method}))
 
@@ -140,9 +142,17 @@ def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterat
 
 
 def fused(
-    log: Log, ticks_ns: Ints, size: int, eyes: Eyes, sink: Sink, *, smooth: bool = False
+    log: Log, ticks_ns: Ints, size: int, fusion_stage: FusionStage, sink: Sink, *, smooth: bool = False
 ) -> Iterator[HumanStates]:
-    """Stage 1: camera frames to the fused person; leaves measurements and state, and ``smooth`` where asked.
+    """Stage 1: camera frames to the fused person; writes measurements and state, and ``smooth`` where asked.
+
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks, increasing [ns].
+        size: Ticks of a batch.
+        fusion_stage: Cameras and settings of the stage.
+        sink: Where rows, counts and times go.
+        smooth: Whether to write the smoothed person at the end.
 
     Raises:
         LogError: At the end: what the log shows is certainly no person, or nobody was ever seen.
@@ -151,23 +161,25 @@ def fused(
     memory = PersonMemory()
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
     passed: list[tuple[HumanStates, fuse.Trace]] = []
-    stands = [Stand() for _ in log.header.cameras]
+    stands = [BodyPosture() for _ in log.header.cameras]
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
-        measured = nothing(log.header.cameras)
+        measured = no_frames(log.header.cameras)
         if seen is not None:
             with sink.watch.stage("angles", len(ticks)):
-                memory, measured, found = eyes.measure(seen, memory)
+                memory, measured, found = fusion_stage.measure(seen, memory)
             sink.counts.update(found)
             sink.run.table("measurements", measurement_columns(measured))
             for stand, c in zip(stands, range(len(stands)), strict=True):
                 stand.add(measured.points_m[measured.camera == c])
         with sink.watch.stage("fuse", len(ticks)):
             if smooth:
-                state, states, events, trace = fuse.fuse_traced(state, ticks, measured, eyes.filter, eyes.limits)
+                state, states, events, trace = fuse.fuse_traced(
+                    state, ticks, measured, fusion_stage.filter, fusion_stage.limits
+                )
                 passed.append((states, trace))
             else:
-                state, states, events = fuse.fuse(state, ticks, measured, eyes.filter, eyes.limits)
+                state, states, events = fuse.fuse(state, ticks, measured, fusion_stage.filter, fusion_stage.limits)
         sink.counts.update(events)
         ever = ever or bool(states.valid.any())
         sink.run.table("state", state_columns(states))
@@ -184,7 +196,7 @@ def fused(
             cov=np.concatenate([trace.cov for trace in traces]),
             damping=np.concatenate([trace.damping for trace in traces]),
         )
-        sink.run.table("smooth", state_columns(smoother.smooth(whole, trace, eyes.filter)))
+        sink.run.table("smooth", state_columns(smoother.smooth(whole, trace, fusion_stage.filter)))
 
 
 def _nobody(log: Log, found: Counter[str]) -> LogError:
@@ -202,16 +214,16 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
     )
 
 
-def _oddities(log: Log, stands: list[Stand]) -> Iterator[str]:
-    """What is odd about how the person stands in the world."""
+def _oddities(log: Log, stands: list[BodyPosture]) -> Iterator[str]:
+    """Notes on an unusual posture of the person in the world."""
     for camera, stand in zip(log.header.cameras, stands, strict=True):
         remark = stand.remark(camera)
         if remark is not None:
             yield remark
 
 
-def nothing(cameras: tuple[str, ...]) -> Measurements:
-    """No frame of any camera."""
+def no_frames(cameras: tuple[str, ...]) -> Measurements:
+    """An empty table of measurements."""
     return Measurements(
         capture_ns=np.zeros(0, np.int64),
         arrival_ns=np.zeros(0, np.int64),
@@ -227,7 +239,14 @@ def nothing(cameras: tuple[str, ...]) -> Measurements:
 
 
 def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
-    """Leaves the closed-form joints of the log's noise-free skeleton, where it has one."""
+    """Writes the closed-form joints of the log's ground truth, where it has one.
+
+    Args:
+        log: Log to read.
+        start_ns: First instant to write [ns].
+        end_ns: Last instant to write [ns].
+        sink: Where the rows go.
+    """
     for truth in log.truth():
         within = truth.rows((truth.t_ns >= start_ns) & (truth.t_ns <= end_ns))
         if len(within):
@@ -235,25 +254,33 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
 
 
 def predicted(
-    states: Iterable[HumanStates], foresight: Foresight, store_every: float, sink: Sink, *, keep: bool
+    states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink, *, keep: bool
 ) -> Iterator[tuple[HumanStates, SweptVolumes]]:
-    """Stage 2: the swept volumes of every tick; where ``keep``, leaves those of one tick in ``store_every``."""
+    """Stage 2: the swept volumes of every tick; where ``keep``, writes those of one tick in ``store_every``.
+
+    Args:
+        states: Batches of the fused person.
+        prediction_stage: Settings of the stage.
+        store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole.
+        sink: Where rows and times go.
+        keep: Whether volumes are stored at all.
+    """
     done = 0
     for batch in states:
         with sink.watch.stage("predict", len(batch)):
-            volumes = foresight.volumes(batch)
+            volumes = prediction_stage.volumes(batch)
         if keep:
             number = np.arange(done, done + len(batch))
             stored = np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
             with sink.watch.stage("hulls", len(stored)):
-                store(volumes, stored, sink.run)
+                store_volumes(volumes, stored, sink.run)
         done += len(batch)
         sink.progress("predict", len(batch))
         yield batch, volumes
 
 
-def store(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
-    """Hull vertices and size of some ticks' volumes; a tick without a person leaves none."""
+def store_volumes(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
+    """Writes hull vertices and size of some ticks' volumes; a tick without a person has none."""
     t_ns: list[int] = []
     limbs: list[str] = []
     radii: list[float] = []
@@ -278,8 +305,8 @@ def store(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
 def planned(
     people: Iterable[tuple[HumanStates, SweptVolumes]], planners: dict[str, Planner], sink: Sink
 ) -> Iterator[None]:
-    """Stage 3: what the robot would have done by each method; leaves a motion for each."""
-    beside = Beside(next(iter(planners.values())).dt_s)
+    """Stage 3: what the robot would have done by each method; writes a motion for each."""
+    beside = InitialOverlap(next(iter(planners.values())).dt_s)
     for states, volumes in people:
         for name, planner in planners.items():
             with sink.watch.stage(f"plan {name}", len(volumes)):
@@ -294,13 +321,13 @@ def planned(
         sink.notes["plan"].append(remark)
 
 
-def say(text: str) -> None:
-    """A line for the user beside the result, on standard error."""
+def print_note(text: str) -> None:
+    """Prints a line for the user on standard error, where it does not mix with the result."""
     sys.stderr.write(f"hrcreplay: {text}\n")
 
 
-class Bar:
-    """A bar over the ticks of a run's last stage."""
+class ProgressBar:
+    """A progress bar over the ticks of a run's last stage; shown on a terminal only."""
 
     def __init__(self, stage: str, ticks: int) -> None:
         self._stage = stage
@@ -314,7 +341,7 @@ class Bar:
         return self
 
     def advance(self, stage: str, ticks: int) -> None:
-        """So many ticks of a stage are done."""
+        """Adds ticks that a stage has done."""
         if stage == self._stage:
             self._bar.advance(self._task, ticks)
 

@@ -1,7 +1,6 @@
-"""All settings, by section, and where they come from.
+"""Loads the settings: defaults < settings file (TOML) < command line (``--set section.key=value``).
 
-Precedence: defaults < settings file (TOML) < command line (``--set section.key=value``).
-Rooms below never see these models: the drivers hand them plain values.
+The rooms of the stages never see these models: the drivers hand them plain values.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.settings.sections import Fusion, Limits, Live, Logs, Occupancy, Plan, Report, Robot, Section
+from hrcreplay.settings.sections import Fusion, LimitNames, Live, Logs, Occupancy, Plan, Report, Robot, Section
 
 #: Words that TOML takes for something else than a text.
 _WORDS = frozenset({"true", "false", "inf", "nan"})
@@ -26,7 +25,7 @@ class Settings(Section):
 
     logs: Logs = Logs()
     fusion: Fusion = Fusion()
-    limits: Limits = Limits()
+    limits: LimitNames = LimitNames()
     occupancy: Occupancy = Occupancy()
     robot: Robot = Robot()
     plan: Plan = Plan()

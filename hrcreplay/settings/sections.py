@@ -117,7 +117,7 @@ class Fusion(Section):
     """Without a valid row for longer than this the person counts as lost [s]."""
 
 
-class Limits(Section):
+class LimitNames(Section):
     """Named limit sets (paper, human, people) or paths of TOML files."""
 
     tracking: str = "human"

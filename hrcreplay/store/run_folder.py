@@ -1,9 +1,8 @@
-"""A run folder: what a command leaves behind, and how it is read back.
+"""Writing and reading of a run folder.
 
-Written whole or not at all: everything goes to ``<folder>.partial`` first, which takes its final name with the last
-write. Tables are parquet without times or paths in them, so the same log and settings give the same bytes.
-
-Text files that appear whole or not at all.
+A folder is written completely or not at all: everything goes to ``<folder>.partial`` first, which gets its final name
+with the last write. Tables are parquet without times or paths in them, so the same log and settings give the same
+bytes.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class TableWriter:
         self._writer.write_table(table.combine_chunks())
 
     def close(self) -> None:
-        """Writes what still waits. A table that never got a row leaves no file."""
+        """Writes the remaining rows. A table that never got a row has no file."""
         rest = [table for table in self._waiting if len(table)]
         if rest or (self._waiting and self._writer is None):
             self._flush(pa.concat_tables(rest or self._waiting[:1]))
@@ -249,7 +248,7 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str, ticks: int) -> Iterator[None]:
-        """Books the time that the block takes on a stage, and on so many of its ticks."""
+        """Adds the time that the block takes to a stage, for so many of its ticks."""
         start = self._clock_ns()
         yield
         self._calls.setdefault(name, []).append((ticks, self._clock_ns() - start))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.containment import Solid
+from hrcreplay.audit.containment import InflatedHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.swept_volumes import limb_radii
@@ -38,9 +38,9 @@ def _predict(people: HumanStates, method: str, horizon_s: float = HORIZON_S) -> 
     return baselines.predict(people, horizon_s=horizon_s, radii_m=RADII_M, hand_m=HAND_M, method=method)
 
 
-def _solid(volumes: SweptVolumes, tick: int, limb: str) -> Solid:
+def _solid(volumes: SweptVolumes, tick: int, limb: str) -> InflatedHull:
     i = volumes.limbs.index(limb)
-    return Solid.around(volumes.vertices(tick, i), float(volumes.radius_m[tick, i]))
+    return InflatedHull.around(volumes.vertices(tick, i), float(volumes.radius_m[tick, i]))
 
 
 def _walk(start: Floats, v0: Floats, horizon_s: float, rng: np.random.Generator) -> Floats:
@@ -112,7 +112,7 @@ def test_iso_13855_is_the_limb_with_its_approach_speed_around() -> None:
     assert _solid(volumes, 0, "URA").volume_m3() == pytest.approx(capsule)
 
 
-@pytest.mark.parametrize("method", baselines.PEERS)
+@pytest.mark.parametrize("method", baselines.BASELINES)
 def test_the_lower_arm_ends_at_the_tip_of_the_hand(method: str) -> None:
     people = random_states(load_limits("paper"), 4, seed=9)
     volumes = _predict(people, method)
@@ -123,7 +123,7 @@ def test_the_lower_arm_ends_at_the_tip_of_the_hand(method: str) -> None:
         assert solid.distances_m(tip[None])[0] <= solid.radius_m - 0.07 + 1e-9
 
 
-@pytest.mark.parametrize("method", baselines.PEERS)
+@pytest.mark.parametrize("method", baselines.BASELINES)
 def test_a_person_not_known_yet_has_no_volume(method: str) -> None:
     people = states(np.full((2, 12), np.nan), np.full((2, 12), np.nan))
     volumes = _predict(people, method)

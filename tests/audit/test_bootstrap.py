@@ -60,7 +60,7 @@ def test_shares_means_and_quantiles_by_hand() -> None:
     assert once.share(np.array([1.0, 0.0, 1.0, np.nan, 1.0])).value == 0.75
     nothing = once.share(np.full(5, np.nan))
     assert nothing.samples == 0
-    assert nothing.plain() == {"value": None, "low": None, "high": None, "samples": 0}
+    assert nothing.to_dict() == {"value": None, "low": None, "high": None, "samples": 0}
 
 
 def test_a_weighted_quantile_is_that_of_the_rows_repeated() -> None:
@@ -167,7 +167,7 @@ def test_every_limb_is_every_limb_that_was_checked() -> None:
 
     points = {limb: dict.fromkeys(names, count) for limb, (names, count) in _POINTS.items()}
     part = {"ticks": 8, "points": points, "methods": {"sound": figures}}
-    assert audit_checked.never(part, "sound") == ["LLA", "hand_r of LRA"]
+    assert audit_checked.never_checked(part, "sound") == ["LLA", "hand_r of LRA"]
     assert audit_checked.checked_scope(part, "sound") == "not LLA"
     late = "not seen to the horizon's end, so not checked"
     assert audit_checked.unchecked_notes(part, "sound") == [
@@ -178,7 +178,7 @@ def test_every_limb_is_every_limb_that_was_checked() -> None:
     assert (rows["HD"], rows["LLA"], rows["LRA: hand_r"]) == ("7", "not checked", "not checked")
     assert (rows["LEGS: foot_l"], rows["THX: shoulder_l"]) == ("3", "7")
     found = {"total": part, "method": "sound"}
-    metrics = audit_metrics.flat(found | {"total": part | {"methods": {"sound": figures}}})
+    metrics = audit_metrics.headline_metrics(found | {"total": part | {"methods": {"sound": figures}}})
     assert metrics["audit_not_checked"]["value"] == "LLA, hand_r of LRA"
     assert metrics["audit_sound_LLA_covered_share"]["value"] is None
     assert metrics["audit_sound_LLA_covered_share"]["reason"] == "not checked: not seen to the end of a horizon"

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.audit.containment import Solid, union_volume_m3
+from hrcreplay.audit.containment import InflatedHull, union_volume_m3
 from hrcreplay.records import Floats
 
 
@@ -39,7 +39,7 @@ def test_distances_are_those_of_the_nearest_convex_combination(kind: str) -> Non
         points = np.concatenate([1.5 * rng.normal(size=(40, 3)), vertices[:3], vertices.mean(axis=0)[None]])
         if kind == "flat":
             points[:10, 2] = 0.3  # in its plane
-        found = Solid.around(vertices, 0.1).distances_m(points)
+        found = InflatedHull.around(vertices, 0.1).distances_m(points)
         expected = [_by_least_squares(point, vertices) for point in points]
         np.testing.assert_allclose(found, expected, atol=2e-6)
         assert (found[40:] < 1e-8).all()
@@ -51,20 +51,20 @@ def test_far_from_the_origin_distances_are_as_exact_as_coordinates(place_m: floa
     turn = Rotation.from_rotvec([0.3, -1.1, 0.7])
     square = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 2.0, 0.0], [0.0, 2.0, 0.0]])
     points = np.array([[5.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, 1.0, 0.5], [5.0, 6.0, 0.0], [-1.0, 0.3, 0.0]])
-    found = Solid.around(turn.apply(square) + place_m, 0.1).distances_m(turn.apply(points) + place_m)
+    found = InflatedHull.around(turn.apply(square) + place_m, 0.1).distances_m(turn.apply(points) + place_m)
     np.testing.assert_allclose(found, [3.0, 0.0, 0.5, 5.0, 1.0], atol=1e-9 + 20.0 * float(np.spacing(place_m)))
 
 
 def test_a_missing_point_has_no_distance() -> None:
-    found = Solid.around(np.eye(3), 0.1).distances_m(np.array([[np.nan, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    found = InflatedHull.around(np.eye(3), 0.1).distances_m(np.array([[np.nan, 0.0, 0.0], [1.0, 0.0, 0.0]]))
     assert np.isnan(found[0])
     assert found[1] == 0.0
 
 
 def test_the_union_of_solids_apart_is_their_sum() -> None:
     rng = np.random.default_rng(3)
-    one = Solid.around(rng.normal(size=(20, 3)) * 0.2, 0.1)
-    two = Solid.around(rng.normal(size=(20, 3)) * 0.2 + 1.5, 0.2)
+    one = InflatedHull.around(rng.normal(size=(20, 3)) * 0.2, 0.1)
+    two = InflatedHull.around(rng.normal(size=(20, 3)) * 0.2 + 1.5, 0.2)
     exact = one.volume_m3() + two.volume_m3()
     found, error = union_volume_m3([one, two], 40_000)
     assert found == pytest.approx(exact, rel=0.01)
@@ -73,7 +73,7 @@ def test_the_union_of_solids_apart_is_their_sum() -> None:
 
 def test_the_union_of_two_balls_that_meet() -> None:
     """Lens of two unit balls one apart: 5 pi / 12."""
-    balls = [Solid.around(np.array([[x, 0.0, 0.0]]), 1.0) for x in (0.0, 1.0)]
+    balls = [InflatedHull.around(np.array([[x, 0.0, 0.0]]), 1.0) for x in (0.0, 1.0)]
     exact = 8.0 / 3.0 * np.pi - 5.0 / 12.0 * np.pi
     errors = []
     for k in range(12):

@@ -57,7 +57,7 @@ def test_an_audit_leaves_what_it_promises(folder: Path, found: dict[str, Any]) -
         assert (folder / "figures" / f"{name}.png").stat().st_size > 5_000
     table = pd.read_parquet(folder / "audit.parquet")
     assert {"t_ns", "log", "method", "limb", "covered", "escape_m", "volume_m3"} <= set(table.columns)
-    assert set(table["method"]) == {*reachable_sets.METHODS, *baselines.PEERS}
+    assert set(table["method"]) == {*reachable_sets.METHODS, *baselines.BASELINES}
     assert set(table["limb"]) >= set(LIMBS)
     assert found["logs"][0]["recorded_future"] == "ground truth"
     assert found["total"]["ticks"] == 140  # (6 s - 0.377 s) at 25 Hz; the first tick is before the first frame

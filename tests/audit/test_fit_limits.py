@@ -55,8 +55,8 @@ def test_known_bounds_are_found_and_hold_on_a_motion_that_was_not_used(training:
         fitted = [found.v_min[j], found.v_max[j], found.a_min[j], found.a_max[j]]
         # trapezoids of the made motion against Alg. 1's parabolas, and the grid of velocity bounds
         np.testing.assert_allclose(fitted, bounds, rtol=0.12)
-    held_back = fit_limits.inside(seen(bang_bang(120.0, seed=2)), found, T_S)
-    share = np.nanmean(fit_limits.together(held_back[:, list(KNOWN)]))
+    held_back = fit_limits.inside_intervals(seen(bang_bang(120.0, seed=2)), found, T_S)
+    share = np.nanmean(fit_limits.all_joints_inside(held_back[:, list(KNOWN)]))
     assert share > 0.99
 
 
@@ -72,14 +72,16 @@ def test_joints_at_rest_keep_the_standard_bounds(training: Futures) -> None:
 @pytest.mark.parametrize("share", [0.8, 0.9])
 def test_the_share_is_reached_by_all_joints_together_and_hardly_exceeded(training: Futures, share: float) -> None:
     found = fit_limits.fit(training, PAPER, share, T_S)
-    reached = np.nanmean(fit_limits.together(fit_limits.inside(training, found, T_S)[:, ~found.kept]))
+    reached = np.nanmean(
+        fit_limits.all_joints_inside(fit_limits.inside_intervals(training, found, T_S)[:, ~found.kept])
+    )
     assert share <= reached <= share + 0.3 * (1.0 - share)
 
 
 def test_less_coverage_needs_shorter_intervals(training: Futures) -> None:
     def length(share: float) -> float:
         found = fit_limits.fit(training, PAPER, share, T_S)
-        return float(fit_limits.farthest(training.v, found.v_max, found.a_max, T_S)[:, list(KNOWN)].mean())
+        return float(fit_limits.largest_displacement(training.v, found.v_max, found.a_max, T_S)[:, list(KNOWN)].mean())
 
     assert length(0.8) < length(0.95) < length(0.999)
 
@@ -89,11 +91,11 @@ def test_no_pair_of_bounds_that_misses_no_tick_has_clearly_shorter_intervals(tra
     j = 4
     v, gone = training.v[:, j], training.up[:, j]
     v, gone = v[np.isfinite(gone)], gone[np.isfinite(gone)]
-    fitted = fit_limits.farthest(v[:, None], found.v_max[j : j + 1], found.a_max[j : j + 1], T_S).mean()
+    fitted = fit_limits.largest_displacement(v[:, None], found.v_max[j : j + 1], found.a_max[j : j + 1], T_S).mean()
     shortest = np.inf
     for v_max in np.linspace(1.5, 5.0, 71):
         for a_max in np.geomspace(1.0, 100.0, 81):
-            reach = fit_limits.farthest(v[:, None], np.array([v_max]), np.array([a_max]), T_S)[:, 0]
+            reach = fit_limits.largest_displacement(v[:, None], np.array([v_max]), np.array([a_max]), T_S)[:, 0]
             if (gone <= reach).all():
                 shortest = min(shortest, float(reach.mean()))
     assert fitted <= 1.08 * shortest  # 5 % are spent on less acceleration, some on the grid
@@ -105,15 +107,15 @@ def test_a_glitch_is_given_up_rather_than_fitted(training: Futures) -> None:
     glitch = replace(training, up=up)
     honest, found = (fit_limits.fit(some, PAPER, 0.998, T_S) for some in (training, glitch))
     assert found.v_max[4] < 1.2 * honest.v_max[4]
-    assert (fit_limits.inside(glitch, found, T_S)[700:705, 4] == 0.0).all()
+    assert (fit_limits.inside_intervals(glitch, found, T_S)[700:705, 4] == 0.0).all()
 
 
 def test_farthest_is_alg_1() -> None:
     person = random_states(HUMAN, 500, seed=3)
     wide = replace(HUMAN, p_min=np.full(12, -1e9), p_max=np.full(12, 1e9))
     reach = reachable(person, wide, T_S, "paper")
-    high = fit_limits.farthest(person.v, HUMAN.v_max, HUMAN.a_max, T_S)
-    low = -fit_limits.farthest(-person.v, -HUMAN.v_min, -HUMAN.a_min, T_S)
+    high = fit_limits.largest_displacement(person.v, HUMAN.v_max, HUMAN.a_max, T_S)
+    low = -fit_limits.largest_displacement(-person.v, -HUMAN.v_min, -HUMAN.a_min, T_S)
     np.testing.assert_allclose((reach.high - person.p)[:, 3:], high[:, 3:], atol=1e-12)
     np.testing.assert_allclose((reach.low - person.p)[:, 3:], low[:, 3:], atol=1e-12)
 
@@ -170,13 +172,13 @@ def test_no_arm_motion_is_refused() -> None:
 
 def test_postures_outside_the_positions_are_seen() -> None:
     inside = random_states(PAPER, 50, seed=7).p.copy()
-    assert not fit_limits.leave(inside, PAPER).any()
+    assert not fit_limits.outside_positions(inside, PAPER).any()
     inside[10, 3] = np.radians(-60.0)
     inside[20] = np.nan
-    rows: Ints = np.flatnonzero(fit_limits.leave(inside, PAPER))
+    rows: Ints = np.flatnonzero(fit_limits.outside_positions(inside, PAPER))
     assert rows.tolist() == [10]
 
 
 def test_together_counts_a_tick_where_any_joint_was_recorded() -> None:
     within: Floats = np.array([[1.0, 1.0], [1.0, np.nan], [0.0, np.nan], [np.nan, np.nan], [1.0, 0.0]])
-    np.testing.assert_array_equal(fit_limits.together(within), [1.0, 1.0, 0.0, np.nan, 0.0])
+    np.testing.assert_array_equal(fit_limits.all_joints_inside(within), [1.0, 1.0, 0.0, np.nan, 0.0])

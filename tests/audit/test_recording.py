@@ -14,7 +14,7 @@ from hrcreplay.audit import driver, recording
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import POINTS, Bools, Floats, Measurements
-from hrcreplay.run.stages import Eyes
+from hrcreplay.run.stages import FusionStage
 from hrcreplay.settings.sections import Fusion
 from tests.audit.standing import frames, standing
 from tests.human.people import states
@@ -36,8 +36,8 @@ def _seen(points: Floats) -> Measurements:
     )
 
 
-def _eyes() -> Eyes:
-    return Eyes(
+def _eyes() -> FusionStage:
+    return FusionStage(
         T_world_camera=np.eye(4)[None],
         clock_offset_ns=np.zeros(1, np.int64),
         filter=Fusion(),

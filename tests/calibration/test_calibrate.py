@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.calibration.calibrate import calibrate, collect, survey
-from hrcreplay.calibration.registration import Disagreement, Registration, Track, rigid, transform
+from hrcreplay.calibration.calibrate import calibrate, collect_tracks, survey
+from hrcreplay.calibration.registration import Disagreement, Registration, SkeletonTrack, rigid, transform
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.importers import import_azure, import_keraal, import_kinect2
 from hrcreplay.logs.reader import Log, open_log
@@ -23,16 +23,16 @@ OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x r
 T_WORLD_A = rigid(OPTICAL @ Rotation.from_euler("x", -10, degrees=True).as_matrix(), np.array([0.0, 0.0, 1.6]))
 
 
-def _by_camera_a(shift_m: Floats | None = None) -> Track:
+def _by_camera_a(shift_m: Floats | None = None) -> SkeletonTrack:
     """The walker, 3 m in front of camera a."""
     person = walker(15.0)
     place = np.array([3.0, 0.0, 0.0]) if shift_m is None else shift_m
     there = transform(np.asarray(np.linalg.inv(T_WORLD_A)), person.points_m + place)
     noise = np.random.default_rng(9).normal(0, 0.01, there.shape)
-    return Track(person.t_ns, there + noise, person.confidence)
+    return SkeletonTrack(person.t_ns, there + noise, person.confidence)
 
 
-def _log(path: Path, tracks: dict[str, Track]) -> Log:
+def _log(path: Path, tracks: dict[str, SkeletonTrack]) -> Log:
     """A log of the tracks, one body a camera, arrival 10 ms after capture."""
     cameras = tuple(tracks)
     tables = [
@@ -112,7 +112,7 @@ def test_floor_of_one_camera(name: str, up_axis: int, sign: int, stature: float,
     log = open_log(tmp_path / "log.mcap")
     T = calibrate(log).T_world_camera["only"]
     assert sign * T[2, up_axis] > 0.95
-    (track,) = collect(log, 0.8, 2.0)
+    (track,) = collect_tracks(log, 0.8, 2.0)
     heads = transform(T, track.points_m)[:, 3, 2]
     assert np.nanpercentile(heads, 90) == pytest.approx(stature, abs=0.08)
     np.testing.assert_allclose(T[:2, 3], 0.0, atol=1e-12)
@@ -145,7 +145,7 @@ def test_cameras_that_never_met_are_tied_by_a_third(tmp_path: Path) -> None:
     a = _by_camera_a()
     b = reobserve(a, Truth(POSE, 0.03), 2)
     T_b_c = np.asarray(np.linalg.inv(POSE))
-    c = reobserve(Track(b.t_ns, b.points_m, b.confidence), Truth(T_b_c, -0.1), 3)
+    c = reobserve(SkeletonTrack(b.t_ns, b.points_m, b.confidence), Truth(T_b_c, -0.1), 3)
     early, late = a.rows(a.t_ns < a.t_ns[0] + 7e9), c.rows(c.t_ns > a.t_ns[0] + 8e9)
     cell = calibrate(_log(tmp_path / "log.mcap", {"a": early, "b": b, "c": late}))
     T_a_c = np.asarray(np.linalg.inv(cell.T_world_camera["a"])) @ cell.T_world_camera["c"]
@@ -161,7 +161,7 @@ def test_a_second_person_does_not_disturb(tmp_path: Path) -> None:
     write_azure(a, tmp_path / "a.csv")
     write_azure(b, tmp_path / "b.csv")
     rows = (tmp_path / "b.csv").read_text().splitlines()
-    ghost = Track(b.t_ns, b.points_m * [0.9, 1, 1] + [2.5, 0, 2.0], b.confidence)
+    ghost = SkeletonTrack(b.t_ns, b.points_m * [0.9, 1, 1] + [2.5, 0, 2.0], b.confidence)
     write_azure(ghost, tmp_path / "ghost.csv", body=2)
     both = [
         line
@@ -176,8 +176,8 @@ def test_a_second_person_does_not_disturb(tmp_path: Path) -> None:
 
 def test_a_long_log_is_looked_at_in_windows(tmp_path: Path) -> None:
     a = walker(20.0)
-    hours = Track(a.t_ns * 200, a.points_m, a.confidence)  # 600 frames, 6.7 s apart: 67 minutes
-    (track,) = collect(_log(tmp_path / "log.mcap", {"a": hours}), 10.0, 2.0)
+    hours = SkeletonTrack(a.t_ns * 200, a.points_m, a.confidence)  # 600 frames, 6.7 s apart: 67 minutes
+    (track,) = collect_tracks(_log(tmp_path / "log.mcap", {"a": hours}), 10.0, 2.0)
     assert 60 <= len(track) <= 120
     assert track.t_ns[-1] - track.t_ns[0] > 0.95 * (hours.t_ns[-1] - hours.t_ns[0])
 
@@ -185,10 +185,12 @@ def test_a_long_log_is_looked_at_in_windows(tmp_path: Path) -> None:
 def test_what_cannot_be_calibrated_is_told(tmp_path: Path) -> None:
     a = _by_camera_a()
     other = walker(15.0)
-    blind = Track(a.t_ns, a.points_m, np.where(np.arange(20) < 12, a.confidence, 0.0))
+    blind = SkeletonTrack(a.t_ns, a.points_m, np.where(np.arange(20) < 12, a.confidence, 0.0))
     rng = np.random.default_rng(5)
-    strange = Track(other.t_ns, other.points_m + np.cumsum(rng.normal(0, 0.05, (len(a), 1, 3)), 0), a.confidence)
-    later = Track(a.t_ns + 10**12, a.points_m, a.confidence)
+    strange = SkeletonTrack(
+        other.t_ns, other.points_m + np.cumsum(rng.normal(0, 0.05, (len(a), 1, 3)), 0), a.confidence
+    )
+    later = SkeletonTrack(a.t_ns + 10**12, a.points_m, a.confidence)
     log = _log(tmp_path / "one.mcap", {"a": a})
     with pytest.raises(SettingsError, match="reference camera: found 'z'; would be right: a"):
         calibrate(log, "z")
@@ -228,7 +230,7 @@ def test_it_tells_where_the_person_stood_and_which_way_x_points(tmp_path: Path) 
 def test_x_of_a_camera_that_looks_down_is_its_own(tmp_path: Path) -> None:
     down = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 4.0]))
     person = walker(15.0)
-    track = Track(person.t_ns, transform(np.asarray(np.linalg.inv(down)), person.points_m), person.confidence)
+    track = SkeletonTrack(person.t_ns, transform(np.asarray(np.linalg.inv(down)), person.points_m), person.confidence)
     _, lines = survey(_log(tmp_path / "log.mcap", {"a": track}))
     assert "x points along a's own x" in lines[0]
 
@@ -261,7 +263,9 @@ def test_cameras_that_hardly_fit_are_doubted(tmp_path: Path) -> None:
     a = _by_camera_a()
     b = reobserve(a, Truth(POSE, 0.0), 5)
     noise = np.random.default_rng(6).normal(0.0, 0.06, b.points_m.shape)
-    cell = calibrate(_log(tmp_path / "log.mcap", {"a": a, "b": Track(b.t_ns, b.points_m + noise, b.confidence)}))
+    cell = calibrate(
+        _log(tmp_path / "log.mcap", {"a": a, "b": SkeletonTrack(b.t_ns, b.points_m + noise, b.confidence)})
+    )
     (rest,) = cell.residuals
     assert 0.06 < rest.median_m < 0.15
     assert f"a and b stay {1e3 * rest.median_m:.0f} mm apart (median), where one movement leaves" in cell.notes[-1]
@@ -269,7 +273,7 @@ def test_cameras_that_hardly_fit_are_doubted(tmp_path: Path) -> None:
 
 def test_millimetres_are_no_person_to_calibrate_by(tmp_path: Path) -> None:
     a = _by_camera_a()
-    log = _log(tmp_path / "log.mcap", {"a": Track(a.t_ns, 1e3 * a.points_m, a.confidence)})
+    log = _log(tmp_path / "log.mcap", {"a": SkeletonTrack(a.t_ns, 1e3 * a.points_m, a.confidence)})
     with pytest.raises(LogError, match="millimetres were taken for metres"):
         calibrate(log)
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration.floor import find_floor, floor_frame, up_direction
-from hrcreplay.calibration.registration import Track, rigid, transform
+from hrcreplay.calibration.registration import SkeletonTrack, rigid, transform
 from hrcreplay.records import POINTS, Floats
 from tests.reobserve import angle_deg, walker
 
@@ -15,11 +15,11 @@ OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x r
 KINECT2 = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # x left, y up, z ahead
 
 
-def _seen(T_world_sensor: Floats, seed: int = 0) -> Track:
+def _seen(T_world_sensor: Floats, seed: int = 0) -> SkeletonTrack:
     person = walker()
     noise = np.random.default_rng(seed).normal(0, 0.01, person.points_m.shape)
     T_sensor_world = np.asarray(np.linalg.inv(T_world_sensor))
-    return Track(person.t_ns, transform(T_sensor_world, person.points_m + noise), person.confidence)
+    return SkeletonTrack(person.t_ns, transform(T_sensor_world, person.points_m + noise), person.confidence)
 
 
 @pytest.mark.parametrize("axes", [OPTICAL, KINECT2, np.eye(3)], ids=["y down", "y up", "z up"])
@@ -48,7 +48,7 @@ def test_sitting_person_gives_up_by_the_trunk() -> None:
     for name in ("knee_l", "knee_r", "ankle_l", "ankle_r", "foot_l", "foot_r"):
         points[:, POINTS.index(name)] = np.nan
     points[::2, POINTS.index("neck")] = np.nan  # the middle of the shoulders stands in
-    up = up_direction(Track(person.t_ns, points, person.confidence))
+    up = up_direction(SkeletonTrack(person.t_ns, points, person.confidence))
     assert up is not None
     np.testing.assert_allclose(up[0], [0, 0, 1], atol=1e-9)
     assert np.degrees(up[1]) == pytest.approx(8.0)
@@ -61,7 +61,7 @@ def test_bending_person_keeps_the_balance() -> None:
     pelvis = points[:, :1]
     points[:, :12] = (points[:, :12] - pelvis) @ lean.T + pelvis - [0.12, 0, 0]
     points[:, [12, 16]] -= [0.12, 0, 0]
-    up = up_direction(Track(person.t_ns, points, person.confidence))
+    up = up_direction(SkeletonTrack(person.t_ns, points, person.confidence))
     assert up is not None
     assert np.degrees(np.arccos(up[0][2])) < 5.0  # the trunk leans by 35
 
@@ -70,7 +70,7 @@ def test_no_feet_no_floor() -> None:
     person = walker()
     confidence = person.confidence.copy()
     confidence[:, [POINTS.index(name) for name in ("ankle_l", "ankle_r", "foot_l", "foot_r")]] = 0.5
-    assert find_floor(Track(person.t_ns, person.points_m, confidence)) is None
+    assert find_floor(SkeletonTrack(person.t_ns, person.points_m, confidence)) is None
 
 
 @pytest.mark.parametrize("axes", [OPTICAL, KINECT2], ids=["y down", "y up"])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from hrcreplay.calibration.registration import (
     MIRROR,
     Registration,
-    Track,
+    SkeletonTrack,
     disagreement,
     kabsch,
     register,
@@ -59,7 +59,7 @@ def test_register_recovers_pose_and_offset(seed: int, offset_s: float) -> None:
 
 def test_register_is_exact_without_noise() -> None:
     a = walker()
-    b = Track(a.t_ns, (a.points_m - POSE[:3, 3]) @ POSE[:3, :3], a.confidence)
+    b = SkeletonTrack(a.t_ns, (a.points_m - POSE[:3, 3]) @ POSE[:3, :3], a.confidence)
     found = register(a, b)
     assert found is not None
     np.testing.assert_allclose(found.T_a_b, POSE, atol=1e-9)
@@ -87,8 +87,8 @@ def test_register_works_at_half_the_rate() -> None:
 
 def test_register_of_nothing_in_common_is_none() -> None:
     a = walker(5.0)
-    blind = Track(a.t_ns, a.points_m, np.zeros_like(a.confidence))
-    later = Track(a.t_ns + 60_000_000_000, a.points_m, a.confidence)
+    blind = SkeletonTrack(a.t_ns, a.points_m, np.zeros_like(a.confidence))
+    later = SkeletonTrack(a.t_ns + 60_000_000_000, a.points_m, a.confidence)
     assert register(a, blind) is None
     assert register(a, later) is None
     assert register(a, a.rows(slice(0, 2))) is None
@@ -98,7 +98,7 @@ def test_clocks_are_left_alone_where_nobody_moves() -> None:
     rng = np.random.default_rng(8)
     person = walker(10.0)
     still = np.broadcast_to(person.points_m[0], person.points_m.shape)
-    a, b = (Track(person.t_ns, still + rng.normal(0, 0.01, still.shape), person.confidence) for _ in range(2))
+    a, b = (SkeletonTrack(person.t_ns, still + rng.normal(0, 0.01, still.shape), person.confidence) for _ in range(2))
     found = register(a, b)
     assert found is not None
     assert found.offset_s == 0.0
@@ -109,7 +109,7 @@ def test_register_takes_missing_points() -> None:
     a = walker(8.0)
     points = a.points_m.copy()
     points[:, 12:] = np.nan
-    b = Track(a.t_ns, (points - POSE[:3, 3]) @ POSE[:3, :3], a.confidence)
+    b = SkeletonTrack(a.t_ns, (points - POSE[:3, 3]) @ POSE[:3, :3], a.confidence)
     found = register(a, b)
     assert found is not None
     np.testing.assert_allclose(found.T_a_b, POSE, atol=1e-9)
@@ -119,7 +119,7 @@ def test_disagreement_is_that_of_the_interpolated_points() -> None:
     a = walker(4.0)
     t_ns = a.t_ns[:-1] + 10_000_000
     rng = np.random.default_rng(7)
-    b = Track(t_ns, walker(4.0).points_m[:-1] + rng.normal(0, 0.02, (len(t_ns), 20, 3)), a.confidence[:-1])
+    b = SkeletonTrack(t_ns, walker(4.0).points_m[:-1] + rng.normal(0, 0.02, (len(t_ns), 20, 3)), a.confidence[:-1])
     found = Registration(rigid(np.eye(3), np.array([0.01, 0.0, 0.0])), 0.005)
     rest = disagreement(a, b, found)
     assert rest is not None
@@ -139,7 +139,7 @@ def test_disagreement_counts_mirrored_frames() -> None:
     a = walker(4.0)
     points = a.points_m.copy()
     points[30:60] = points[30:60][:, list(MIRROR)]
-    rest = disagreement(a, Track(a.t_ns, points, a.confidence), Registration(np.eye(4), 0.0))
+    rest = disagreement(a, SkeletonTrack(a.t_ns, points, a.confidence), Registration(np.eye(4), 0.0))
     assert rest is not None
     assert rest.mirrored == pytest.approx(30 / 120)
 

@@ -41,4 +41,4 @@ def rehearse(core: TwinCore, guide: Guide, *, cycles: int, begin_ns: int = 0, re
                 together.append(heapq.heappop(wire)[2])
             answers += [Datagram(at_ns + response_ns, data) for data in guide(at_ns, together)]
     for answer in answers:
-        core.record.arrived(answer, core.session)
+        core.record.add_arrival(answer, core.session)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.egm.codec import RobotPacket
-from hrcreplay.egm.session import Heard, Session
+from hrcreplay.egm.protocol import EgmSession, PacketStatus
 
 CYCLE_NS = 4_032_000
 T0_NS = 1_700_000_000_000_000_000
@@ -17,8 +17,8 @@ DQ_MAX = np.radians([200.0, 200.0, 260.0, 360.0, 360.0, 450.0])
 ZERO = np.zeros(6)
 
 
-def session(**settings: Any) -> Session:
-    return Session(-Q_MAX, Q_MAX, DQ_MAX, **settings)
+def session(**settings: Any) -> EgmSession:
+    return EgmSession(-Q_MAX, Q_MAX, DQ_MAX, **settings)
 
 
 def packet(seqno: int | None, **fields: Any) -> RobotPacket:
@@ -39,11 +39,11 @@ def packet(seqno: int | None, **fields: Any) -> RobotPacket:
     return replace(usual, **fields)
 
 
-def talk(talking: Session, seqnos: list[int], start: int = 0) -> list[Heard]:
+def talk(talking: EgmSession, seqnos: list[int], start: int = 0) -> list[PacketStatus]:
     """Hear and answer a packet a cycle."""
     heard = []
     for cycle, seqno in enumerate(seqnos, start):
-        heard.append(talking.hear(packet(seqno), cycle * CYCLE_NS))
+        heard.append(talking.classify(packet(seqno), cycle * CYCLE_NS))
         if heard[-1].answer:
             talking.reply(ZERO, ZERO, cycle * CYCLE_NS)
     return heard

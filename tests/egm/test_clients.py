@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.egm.robot_double.loop import run_twin
+from hrcreplay.egm.robot_double.udp_client import run_twin
 from tests.egm.guide_client import SWAY_DEG
 
 #: The issue asks for 30; the suite has less time.

@@ -24,8 +24,8 @@ from hrcreplay.egm.codec import (
     encode_correction,
     encode_robot,
 )
-from hrcreplay.egm.link import Link, Received
-from hrcreplay.egm.session import Heard, Session
+from hrcreplay.egm.protocol import EgmSession, PacketStatus
+from hrcreplay.egm.udp_server import EgmServer, Received
 from hrcreplay.records import Floats
 
 CYCLE_NS = 4_032_000
@@ -41,19 +41,19 @@ class Guide:
     """Our side as the control loop drives it, with a plan that is the same whatever happens."""
 
     def __init__(self, q: Floats = ZERO, dq: Floats = ZERO) -> None:
-        self.session = Session(-Q_MAX, Q_MAX, DQ_MAX)
+        self.session = EgmSession(-Q_MAX, Q_MAX, DQ_MAX)
         self.q, self.dq = q, dq
-        self.heard: list[Heard] = []
+        self.heard: list[PacketStatus] = []
 
     def answer(self, datagrams: list[bytes], t_ns: int) -> Correction | None:
         """What the robot would read, if anything."""
-        heard, packet = self.session.hear_all(map(read, datagrams), t_ns)
+        heard, packet = self.session.classify_all(map(read, datagrams), t_ns)
         self.heard.append(heard)
         if packet is None:
             return None
         return decode_correction(encode_correction(self.session.reply(self.q, self.dq, t_ns)))
 
-    def serve(self, link: Link) -> Received | None:
+    def serve(self, link: EgmServer) -> Received | None:
         """One turn of the loop."""
         received = link.newest()
         if received is not None:
@@ -90,7 +90,7 @@ def datagram(seqno: int, q: Floats = HOME) -> bytes:
     return encode_robot(packet(seqno, q))
 
 
-def call(link: Link) -> socket.socket:
+def call(link: EgmServer) -> socket.socket:
     """A robot's socket, with a port of its own."""
     made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     made.settimeout(5.0)
@@ -99,13 +99,13 @@ def call(link: Link) -> socket.socket:
 
 
 @pytest.fixture
-def link() -> Iterator[Link]:
-    with closing(Link("127.0.0.1", 0, 5.0)) as made:
+def link() -> Iterator[EgmServer]:
+    with closing(EgmServer("127.0.0.1", 0, 5.0)) as made:
         yield made
 
 
 @pytest.fixture
-def robot(link: Link) -> Iterator[socket.socket]:
+def robot(link: EgmServer) -> Iterator[socket.socket]:
     with call(link) as made:
         yield made
 
@@ -119,7 +119,7 @@ def test_1_radians_of_an_old_controller_are_refused_with_a_reason() -> None:
     assert (guide.heard[0].allowed, guide.heard[0].reason) == (False, "radians")
 
 
-def test_2_a_backlog_gets_one_answer_to_its_newest_packet(link: Link, robot: socket.socket) -> None:
+def test_2_a_backlog_gets_one_answer_to_its_newest_packet(link: EgmServer, robot: socket.socket) -> None:
     """A loop that answers one datagram after the other is as late for ever as it once was."""
     guide = Guide()
     robot.send(datagram(0))
@@ -200,7 +200,7 @@ def test_6_every_packet_is_answered_at_once_in_whatever_state(state: dict[str, i
 def test_7_the_end_of_a_session_is_told_and_the_next_one_served() -> None:
     """Converged, the robot hangs up. That is no failure, and the next call comes from another port."""
     guide = Guide()
-    with closing(Link("127.0.0.1", 0, 0.2)) as link:
+    with closing(EgmServer("127.0.0.1", 0, 0.2)) as link:
         with call(link) as robot:
             for seqno in range(3):
                 robot.send(encode_robot(replace(packet(seqno), converged=seqno == 2)))
@@ -264,7 +264,7 @@ def test_9_no_old_target_is_live_when_the_robot_may_move_again(state: dict[str, 
             np.testing.assert_allclose(told.q, HOME + 0.4, atol=1e-12)
 
 
-def test_10_the_loop_answers_when_called_and_not_at_a_pace_of_its_own(link: Link, robot: socket.socket) -> None:
+def test_10_the_loop_answers_when_called_and_not_at_a_pace_of_its_own(link: EgmServer, robot: socket.socket) -> None:
     """A loop with a pace of 16 to 25 ms leaves three of four packets unanswered; none of its rounds is shorter."""
     rounds, guide = 250, Guide()
     server = threading.Thread(target=lambda: [guide.serve(link) for _ in range(rounds)])

@@ -1,4 +1,4 @@
-"""Random faults against the pilot, session by session: ``python -m tests.live.campaign --sessions 200``.
+"""Random faults against the controller, session by session: ``python -m tests.live.campaign --sessions 200``.
 
 In counted time, so a session is the same on every machine. What must never happen is looked for in every answer.
 """
@@ -36,8 +36,8 @@ def session(seed: int, faults: tuple[Fault, ...] | None = None, seconds: float =
 def violations(flight: Flight) -> list[str]:
     """What a session did that none may do."""
     found = []
-    if flight.pilot.fault is not None:
-        found.append(f"crash: {flight.pilot.fault!r}")
+    if flight.controller.fault is not None:
+        found.append(f"crash: {flight.controller.fault!r}")
     try:
         steps_keep_the_limits(flight)
     except AssertionError:
@@ -49,8 +49,8 @@ def _motion_after_stops(flight: Flight) -> list[str]:
     """Whether each stop is Eq. (67) to standstill, within T_s and two cycles."""
     found = []
     stop_s = flight.start["settings"]["occupancy"]["stop_s"]
-    ddq_max, dt_s = flight.robot.ddq_max, flight.pilot.setup.plan.dt_s
-    for at_ns, reason in flight.pilot.stops:
+    ddq_max, dt_s = flight.robot.ddq_max, flight.controller.setup.plan.dt_s
+    for at_ns, reason in flight.controller.stops:
         rows = [answer for answer in flight.answers if answer.t_ns >= at_ns and answer.row is not None]
         speeds: list[np.ndarray] = []
         for answer in rows:
@@ -87,7 +87,7 @@ def _unanswered(flight: Flight) -> list[str]:
 def _judge(seed: int) -> tuple[int, list[str], Counter[str], Counter[str]]:
     flight = session(seed)
     faults = Counter(fault.kind for fault in flight.faults)
-    return seed, violations(flight), faults, Counter(reason for _, reason in flight.pilot.stops)
+    return seed, violations(flight), faults, Counter(reason for _, reason in flight.controller.stops)
 
 
 def main() -> int:

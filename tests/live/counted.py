@@ -7,12 +7,12 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from hrcreplay.egm.link import Address, Received
 from hrcreplay.egm.robot_double.faults import Datagram
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore
+from hrcreplay.egm.udp_server import Address, Received
 from hrcreplay.live.control.loop import Loop, LoopSettings
-from hrcreplay.live.record.codec import Answer, Sight, TickEvent
+from hrcreplay.live.record.codec import Decision, Perception, TickEvent
 from tests.live.flights import BEGIN_NS, FRAME_NS, RESPONSE_NS, Flight, far_away
 
 ROBOT: Address = ("192.0.2.1", 6510)
@@ -111,7 +111,7 @@ class Recorder:
         """Keeps it."""
         self.messages.append(message)
 
-    def notice(self) -> bool:
+    def check_alive(self) -> bool:
         """It is there."""
         return True
 
@@ -123,7 +123,7 @@ class CountedLoop(Loop):
     clock: Clock = field(default_factory=Clock)
     work_ns: int = 300_000  #: from a packet to its answer
     look_ns: int = 0  #: what a look takes
-    seen: list[Answer] = field(default_factory=list)
+    seen: list[Decision] = field(default_factory=list)
 
     def now_ns(self) -> int:
         """The time counted."""
@@ -132,7 +132,7 @@ class CountedLoop(Loop):
     def fly(self, seconds: float = math.inf) -> CountedLoop:
         """Turns for so long, or until it is over."""
         end_ns = seconds * 1e9 + self.clock.t_ns
-        while self.clock.t_ns < end_ns and self.turn():
+        while self.clock.t_ns < end_ns and self.run_cycle():
             pass
         return self
 
@@ -140,27 +140,27 @@ class CountedLoop(Loop):
 def counted(
     flight: Flight, *, duration_s: float = math.inf, work_s: float = 0.0003, look_s: float = 0.0
 ) -> CountedLoop:
-    """A flight's pilot and robot with the loop between them."""
+    """A flight's controller and robot with the loop between them."""
     clock = Clock()
     settings = LoopSettings(
         duration_s, sending=True, person_late_s=9, overrun_s=0.02, keep_recorder=True, store_every_s=9
     )
     parts = Cable(flight.core, clock), Person(flight, clock), Recorder()
-    loop = CountedLoop(flight.pilot, *parts, settings, 0, clock.t_ns, clock=clock)  # type: ignore[arg-type]
+    loop = CountedLoop(flight.controller, *parts, settings, 0, clock.t_ns, clock=clock)  # type: ignore[arg-type]
     loop.work_ns, loop.look_ns = round(work_s * 1e9), round(look_s * 1e9)
-    answer, look = flight.pilot.answer, flight.pilot.look
+    answer, look = flight.controller.answer, flight.controller.update_perception
 
-    def works(event: TickEvent) -> Answer:
+    def works(event: TickEvent) -> Decision:
         clock.t_ns += loop.work_ns
         loop.seen.append(answer(event))
         return loop.seen[-1]
 
-    def looks(t_ns: int, skeletons: Sequence[bytes]) -> Sight | None:
-        sight = look(t_ns, skeletons)
+    def looks(t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
+        perception = look(t_ns, skeletons)
         clock.t_ns += loop.look_ns
-        return sight
+        return perception
 
-    flight.pilot.answer = works  # type: ignore[method-assign]
-    flight.pilot.look = looks  # type: ignore[method-assign]
+    flight.controller.answer = works  # type: ignore[method-assign]
+    flight.controller.update_perception = looks  # type: ignore[method-assign]
     loop.begin()
     return loop

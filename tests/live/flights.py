@@ -1,4 +1,4 @@
-"""Sessions in counted time: the pilot that `hrcreplay live` runs, the robot double, and a person who is made up."""
+"""Sessions in counted time: the controller of `hrcreplay live`, the robot double, and a person who is made up."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
 from hrcreplay.human.model import skeleton
-from hrcreplay.live.control.pilot import Pilot
-from hrcreplay.live.control.setup import build_pilot, live_job, start_table
+from hrcreplay.live.control.session_controller import SessionController
+from hrcreplay.live.control.setup import build_controller, live_job, start_table
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import PHASES, Answer, MotionRow, Signal, TickEvent
+from hrcreplay.live.record.codec import PHASES, Decision, MotionRow, Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
 from hrcreplay.records import Floats, HumanStates
 from hrcreplay.robot.model import RobotModel
@@ -50,7 +50,7 @@ def start(*overrides: str) -> dict[str, Any]:
 
 @dataclass
 class Flight:
-    """A pilot beside a robot double, cycle by cycle."""
+    """A controller beside a robot double, cycle by cycle."""
 
     overrides: tuple[str, ...] = ()
     walk: Walk = far_away
@@ -59,21 +59,21 @@ class Flight:
     twin: TwinSettings = field(default_factory=TwinSettings)
     signals: Callable[[float], Signal] = lambda _s: Signal.NONE
     messages: list[bytes] = field(default_factory=list)  #: what the recorder would get
-    answers: list[Answer] = field(default_factory=list)
-    heard: list[tuple[Answer, tuple[bytes, ...]]] = field(default_factory=list)  #: with what they answer
+    answers: list[Decision] = field(default_factory=list)
+    heard: list[tuple[Decision, tuple[bytes, ...]]] = field(default_factory=list)  #: with what they answer
     states: list[HumanStates] = field(default_factory=list)
     frames: list[tuple[int, bytes]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.start = start(*self.overrides)
-        self.pilot: Pilot = build_pilot(self.start)
+        self.controller: SessionController = build_controller(self.start)
         self.core = TwinCore(self.twin, self.faults, self.seed)
         self._framed_ns = BEGIN_NS
         self._cycles = 0
 
     @property
     def robot(self) -> RobotModel:
-        return self.pilot.setup.robot
+        return self.controller.setup.robot
 
     def fly(self, seconds: float) -> Flight:
         """Goes on for so long."""
@@ -87,32 +87,32 @@ class Flight:
         signals = self.signals((t_ns - BEGIN_NS) * 1e-9)
         if datagrams:
             event = TickEvent(t_ns, tuple(datagrams), signals)
-            answer = self.pilot.answer(event)
+            answer = self.controller.answer(event)
             self.answers.append(answer)
             self.heard.append((answer, event.datagrams))
-            self.messages += [codec.robot(t_ns, datagram) for datagram in datagrams]
-            self.messages.append(codec.answer(answer, signals, len(datagrams), 0))
+            self.messages += [codec.encode_robot_packet(t_ns, datagram) for datagram in datagrams]
+            self.messages.append(codec.encode_decision(answer, signals, len(datagrams), 0))
             if answer.datagram is not None:
-                self.messages.append(codec.reply(t_ns, answer.datagram, sent=True))
+                self.messages.append(codec.encode_reply(t_ns, answer.datagram, sent=True))
                 yield answer.datagram
         else:
-            self.pilot.silence(t_ns, signals)
-            self.messages.append(codec.silence(t_ns, signals))
-        self._look(t_ns + 1)
+            self.controller.silence(t_ns, signals)
+            self.messages.append(codec.encode_timeout(t_ns, signals))
+        self._update_perception(t_ns + 1)
 
-    def _look(self, t_ns: int) -> None:
+    def _update_perception(self, t_ns: int) -> None:
         seen = []
         while self._framed_ns <= t_ns:
             place = self.walk((self._framed_ns - BEGIN_NS) * 1e-9)
             if place is not None:
                 seen += [self._skeleton(camera, place, self._framed_ns) for camera in self.start["cameras"]]
             self._framed_ns += FRAME_NS
-        sight = self.pilot.look(t_ns, seen)
+        perception = self.controller.update_perception(t_ns, seen)
         self.frames += [(t_ns, data) for data in seen]
-        self.messages += [codec.frame(t_ns, data) for data in seen]
-        if sight is not None:
-            self.states.append(sight.states)
-            self.messages.append(codec.look(sight.states, sight.volumes, len(seen)))
+        self.messages += [codec.encode_skeleton(t_ns, data) for data in seen]
+        if perception is not None:
+            self.states.append(perception.states)
+            self.messages.append(codec.encode_perception(perception.states, perception.volumes, len(seen)))
 
     def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
         base = np.array(self.start["T_world_base"])[:3, 3]

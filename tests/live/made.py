@@ -1,4 +1,4 @@
-"""A session made up for tests: a small deterministic pilot, and the messages that control would record of it."""
+"""A session made up for tests: a small deterministic controller, and the messages that control would record of it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, MotionRow, Sight, Signal, TickEvent
-from hrcreplay.live.record.recorder import SessionWriter
+from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
+from hrcreplay.live.record.recorder import SessionLogWriter
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.records import LIMBS, HumanStates, SweptVolumes
 from hrcreplay.robot.control.separation import obstacles
@@ -27,7 +27,7 @@ START: dict[str, Any] = {
 }
 
 
-class Pilot:
+class MadeController:
     """Sums up what it is told, so that whatever changes in it changes all that follows."""
 
     def __init__(self, start: dict[str, Any]) -> None:
@@ -37,7 +37,7 @@ class Pilot:
         self.looked_ns = 0
         self.silences = 0
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Sight:
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
         """Every point of every skeleton moves the person."""
         for data in skeletons:
             self.p += self.gain * np.array(pb.Skeleton.FromString(data).points)[:12]
@@ -57,9 +57,9 @@ class Pilot:
         vertices = np.arange(6 * 4 * 3).reshape(-1, 3) + np.tanh(self.p[0])
         offsets = np.arange(0, 4 * len(LIMBS) + 1, 4)
         volumes = SweptVolumes(np.array([t_ns]), offsets, vertices, np.full((1, 6), 0.1), LIMBS, "positions")
-        return Sight(t_ns, states, volumes, obstacles(volumes, 0))
+        return Perception(t_ns, states, volumes, obstacles(volumes, 0))
 
-    def answer(self, event: TickEvent) -> Answer:
+    def answer(self, event: TickEvent) -> Decision:
         """Every byte of every datagram moves the robot."""
         self.q += 1e-6 * sum(sum(data) for data in event.datagrams) + 1e-9 * self.p[:6] + 1e-4 * self.silences
         row = MotionRow(self.q - 0.01, self.q.copy(), self.q / 2, self.q / 3, self.q[:3], self.q[3:], np.full(4, 0.25))
@@ -67,9 +67,9 @@ class Pilot:
         reply = egm.SensorMessage(planned=egm.Planned(joints=egm.Joints(joints=numbers))).SerializeToString()
         reason = "Ctrl-C" if Signal.INTERRUPT in event.signals else ""
         status = 2 if reason else 0
-        return Answer(event.t_ns, self.looked_ns, reply, codec.FOLLOWING, status, reason, 1, -1, row)
+        return Decision(event.t_ns, self.looked_ns, reply, codec.FOLLOWING, status, reason, 1, -1, row)
 
-    def silence(self, t_ns: int, signals: Signal) -> None:  # noqa: ARG002 - part of what a pilot is
+    def silence(self, t_ns: int, signals: Signal) -> None:  # noqa: ARG002 - part of what a controller is
         """A silence moves the robot too."""
         self.silences += 1
 
@@ -84,40 +84,40 @@ def skeleton(number: int, camera: str = "left") -> bytes:
 
 
 def datagram(number: int) -> bytes:
-    """A packet of the robot, as far as this pilot cares."""
+    """A packet of the robot, as far as this controller cares."""
     return egm.RobotMessage(header=egm.Header(seqno=number, tm=4 * number)).SerializeToString()
 
 
-def session(ticks: int, *, pilot: Pilot | None = None) -> Iterator[bytes]:
+def session(ticks: int, *, controller: MadeController | None = None) -> Iterator[bytes]:
     """What control records: garbage and a skeleton of nobody among it, a silence, a Ctrl-C near the end."""
-    yield codec.event(START_NS, START)
-    pilot = pilot or Pilot(START)
+    yield codec.encode_event(START_NS, START)
+    controller = controller or MadeController(START)
     for k in range(ticks):
         t_ns = START_NS + (k + 1) * TICK_NS
         if k == ticks // 2:
-            yield codec.silence(t_ns - 1000, Signal.PERSON_LATE)
-            pilot.silence(t_ns - 1000, Signal.PERSON_LATE)
+            yield codec.encode_timeout(t_ns - 1000, Signal.PERSON_LATE)
+            controller.silence(t_ns - 1000, Signal.PERSON_LATE)
         datagrams = (b"\xff garbage", b"", datagram(k)) if k % 7 == 3 else (datagram(k),)
         signals = Signal.INTERRUPT if k == ticks - 2 else Signal(0)
-        yield from (codec.robot(t_ns, data) for data in datagrams)
-        answer = pilot.answer(TickEvent(t_ns, datagrams, signals))
-        yield codec.answer(answer, signals, len(datagrams), 300 + k % 50)
+        yield from (codec.encode_robot_packet(t_ns, data) for data in datagrams)
+        answer = controller.answer(TickEvent(t_ns, datagrams, signals))
+        yield codec.encode_decision(answer, signals, len(datagrams), 300 + k % 50)
         if answer.datagram is not None:
-            yield codec.reply(t_ns, answer.datagram, sent=k > 2)
+            yield codec.encode_reply(t_ns, answer.datagram, sent=k > 2)
         skeletons = [skeleton(k, ("left", "right")[k % 2]), skeleton(k, "nobody's")] if k % 5 == 0 else []
         look_ns = t_ns + 500_000
-        yield from (codec.frame(look_ns, data) for data in skeletons)
-        sight = pilot.look(look_ns, skeletons)
-        yield codec.look(sight.states, sight.volumes, len(skeletons))
+        yield from (codec.encode_skeleton(look_ns, data) for data in skeletons)
+        perception = controller.update_perception(look_ns, skeletons)
+        yield codec.encode_perception(perception.states, perception.volumes, len(skeletons))
         if k % 10 == 0:
-            yield codec.whole(sight.volumes)
-    yield codec.event(START_NS + (ticks + 2) * TICK_NS, {"what": "end", "reason": "Ctrl-C"})
+            yield codec.encode_volumes(perception.volumes)
+    yield codec.encode_event(START_NS + (ticks + 2) * TICK_NS, {"what": "end", "reason": "Ctrl-C"})
 
 
 def record(path: Path, messages: list[bytes], *, chunk: int = 100, finish: bool = True) -> Path:
     """The log that the recorder makes of them, with so many messages a chunk."""
     with path.open("xb") as stream:
-        writer = SessionWriter(stream)
+        writer = SessionLogWriter(stream)
         for first in range(0, len(messages), chunk):
             for message in messages[first : first + chunk]:
                 writer.add(message)

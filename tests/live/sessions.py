@@ -166,7 +166,7 @@ class Session(Command):
         return status
 
     def until_phase(self, *phases: str) -> dict[str, Any]:
-        """Waits until the pilot is that far."""
+        """Waits until the controller is that far."""
         return self.until(" or ".join(phases), lambda status: status["phase"] in phases)
 
     def interrupt(self) -> None:

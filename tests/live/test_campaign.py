@@ -1,4 +1,4 @@
-"""Faults against the pilot in counted time: what must never happen does not. The long campaign is campaign.py."""
+"""Faults against the controller in counted time: what must never happen does not. The long campaign is campaign.py."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_each_fault_by_itself(kind: str) -> None:
     fault = Fault(kind, 1.2, 0.4, delay_s=0.03, angle_deg=40.0, **direction)  # type: ignore[arg-type]
     flight = session(1 + KINDS.index(kind), (fault,), seconds=2.2)
     assert violations(flight) == []
-    reasons = {reason for _, reason in flight.pilot.stops}
+    reasons = {reason for _, reason in flight.controller.stops}
     assert EXPECTED.get(kind) in {None, *reasons}
     assert len(flight.said()) * CYCLE_S > 1.2
 

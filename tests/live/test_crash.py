@@ -15,16 +15,16 @@ import pytest
 
 from hrcreplay.cli import app
 from hrcreplay.egm.codec import Correction, decode_correction
-from hrcreplay.egm.link import Received
-from hrcreplay.egm.session import Session
+from hrcreplay.egm.protocol import EgmSession
+from hrcreplay.egm.udp_server import Received
 from hrcreplay.errors import LiveStopped
 from hrcreplay.live import processes, session
-from hrcreplay.live.control import last_resort, pilot, watchdog
-from hrcreplay.live.control.loop import FAREWELLS, Loop
+from hrcreplay.live.control import last_resort, session_controller, watchdog
+from hrcreplay.live.control.loop import FINAL_ANSWERS, Loop
 from hrcreplay.live.control.perception import Observer
-from hrcreplay.live.control.setup import build_pilot
+from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.record import codec, folder
-from hrcreplay.live.verify import Again
+from hrcreplay.live.verify import SessionRecomputation
 from hrcreplay.live.view import status_publisher
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import RobotState
@@ -35,22 +35,22 @@ from tests.live.crashing import BUG, failing
 from tests.live.flights import BEGIN_NS, CYCLE_S, DEMO, Flight
 from tests.live.sessions import children
 
-#: Where a bug may be; those of the stages the pilot catches itself.
+#: Where a bug may be; those of the stages the controller catches itself.
 PLACES: dict[str, tuple[Any, str]] = {
-    "fusion": (Observer, "look"),
+    "fusion": (Observer, "update_perception"),
     "controller": (QpFollower, "step"),
     "every pose": (RobotModel, "pose"),
-    "packets": (pilot, "decode_robot"),
-    "conversation": (Session, "hear_all"),
-    "reply": (Session, "reply"),
-    "encoding": (pilot, "encode_correction"),
+    "packets": (session_controller, "decode_robot"),
+    "conversation": (EgmSession, "classify_all"),
+    "reply": (EgmSession, "reply"),
+    "encoding": (session_controller, "encode_correction"),
     "watchdog": (watchdog, "of_person"),
     "age of the frames": (Observer, "age_s"),
-    "messages of the human side": (Loop, "_hear_person"),
-    "record of an answer": (codec, "answer"),
-    "record of a packet": (codec, "robot"),
-    "record of a look": (codec, "look"),
-    "status": (status_publisher.Teller, "_status"),
+    "messages of the human side": (Loop, "_receive_skeletons"),
+    "record of an answer": (codec, "encode_decision"),
+    "record of a packet": (codec, "encode_robot_packet"),
+    "record of a look": (codec, "encode_perception"),
+    "status": (status_publisher.StatusPublisher, "_status"),
     "link": (Cable, "newest"),
 }
 MOVING_S = 0.45
@@ -85,7 +85,7 @@ class Sent:
 
         owner, name = PLACES[place]
         monkeypatch.setattr(owner, name, failing(getattr(owner, name), fails))
-        self.lines = session._fly(self.loop, self.flight.start, folder, real_time=False, in_3d=False)
+        self.lines = session._run_loop(self.loop, self.flight.start, folder, real_time=False, in_3d=False)
 
     def after(self) -> list[Correction]:
         """From the last reply before the bug on."""
@@ -106,9 +106,9 @@ def test_a_bug_anywhere_in_control_brakes_a_moving_robot_to_rest(
         np.testing.assert_allclose(reply.q, state.q, rtol=0, atol=1e-12)
         np.testing.assert_allclose(reply.dq, state.dq, rtol=0, atol=1e-12)
         state = RobotState(reply.q, reply.dq)
-    assert not any(np.any(reply.dq) for reply in replies[-FAREWELLS:])
+    assert not any(np.any(reply.dq) for reply in replies[-FINAL_ANSWERS:])
     assert all((two.seqno - one.seqno) % 2**32 == 1 for one, two in pairwise(replies))
-    assert [why for _, why in found.flight.pilot.stops] == [watchdog.FAULT]
+    assert [why for _, why in found.flight.controller.stops] == [watchdog.FAULT]
     gaps = np.diff([t_ns for t_ns, _ in found.sent]) * 1e-9
     assert gaps.max() < 3 * CYCLE_S, "it went on being answered"
 
@@ -121,7 +121,7 @@ def test_a_bug_is_one_line_and_a_traceback_in_the_folder(
     found = Sent(place, 0.0, tmp_path, monkeypatch)
     assert found.lines
     assert all(line.startswith("control: ZeroDivisionError: put there by a test (") for line in found.lines)
-    assert processes.read(tmp_path) == found.lines[:1]
+    assert processes.read_crashes(tmp_path) == found.lines[:1]
     text = (tmp_path / "crash_control.txt").read_text()
     assert text.startswith(f"{found.lines[0]}\n\nTraceback (most recent call last):\n")
     assert text.count("put there\nby a test") >= len(found.lines)
@@ -133,7 +133,7 @@ def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
     try:
         control_step.braked("nonsense", np.ones(6), 0.004)  # type: ignore[arg-type]
     except AttributeError as error:
-        said = processes.said_of(error)
+        said = processes.describe_exception(error)
     lines = Path(control_step.__file__).read_text().splitlines()
     number = next(i for i, line in enumerate(lines, 1) if "speed = np.abs(state.dq)" in line)
     place = f"hrcreplay/robot/control/control_step.py:{number}, in braked"
@@ -141,10 +141,10 @@ def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
 
 
 def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
-    brake = last_resort.Brake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7)
-    brake.hear([9.0] * 6)  # it lags
+    brake = last_resort.FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7)
+    brake.update_position([9.0] * 6)  # it lags
     assert brake.dq == [20.0] * 6
-    brake.hear([11.0] * 6)
+    brake.update_position([11.0] * 6)
     said = decode_correction(brake.step(0))
     assert brake.at_rest
     assert said.seqno == 8
@@ -152,7 +152,9 @@ def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
 
 
 def test_a_brake_stays_within_the_joints_limits() -> None:
-    brake = last_resort.Brake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0)
+    brake = last_resort.FallbackBrake(
+        [360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0
+    )
     said = [decode_correction(brake.step(0)) for _ in range(20)]
     assert brake.at_rest
     np.testing.assert_allclose(np.degrees([reply.q[:5] for reply in said]).max(), 90.0)
@@ -185,15 +187,17 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
     monkeypatch.undo()
     messages: list[bytes] = found.loop.recorder.messages  # type: ignore[assignment]
     kinds = [codec.kind(message) for message in messages]
-    events = [codec.read_event(message) for message in messages if codec.kind(message) == codec.EVENT]
+    events = [codec.decode_event(message) for message in messages if codec.kind(message) == codec.EVENT]
     assert [event["what"] for event in events] == ["crash", "end"]
     assert events[1]["reason"] == watchdog.FAULT
-    again = Again(build_pilot(found.flight.start))
+    again = SessionRecomputation(build_controller(found.flight.start))
     crashed_at = next(i for i, message in enumerate(messages) if b'"crash"' in message)
-    assert all(again.differs(message) is None for message in messages[: crashed_at + 1])
+    assert all(again.difference_at(message) is None for message in messages[: crashed_at + 1])
     assert again.crashed.startswith("ZeroDivisionError: put there by a test")
-    rows = [codec.motion_row(codec.read_answer(m)) for m in messages[crashed_at:] if codec.kind(m) == codec.ANSWER]
-    assert kinds[crashed_at:].count(codec.REPLY) == len(rows) > 50 + FAREWELLS
+    rows = [
+        codec.motion_row(codec.decode_decision(m)) for m in messages[crashed_at:] if codec.kind(m) == codec.DECISION
+    ]
+    assert kinds[crashed_at:].count(codec.REPLY) == len(rows) > 50 + FINAL_ANSWERS
     assert rows[0] is not None
     assert rows[0].dq.any()
     assert rows[-1] is not None
@@ -202,7 +206,7 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
 
 def test_a_recording_that_cannot_be_read_any_further_is_named() -> None:
     loop = counted(Flight())
-    loop.pilot.stop = watchdog.PERSON_DEAD
+    loop.controller.stop = watchdog.PERSON_DEAD
     loop.notes += ["failed log.mcap: no further", "a later remark"]
     with pytest.raises(
         LiveStopped, match=r"stopped by: human side dead \(log.mcap: no further\); the record is in run"
@@ -234,7 +238,7 @@ class Live:
         said, _, where = line.removeprefix("hrcreplay: ").partition("; ")
         assert self.code == 4
         assert where == f"not complete: what there is of the record, and the traceback, is in {self.partial}"
-        assert processes.read(self.partial) == [said]
+        assert processes.read_crashes(self.partial) == [said]
         assert said.startswith(f"{part}: ZeroDivisionError: put there by a test (")
         meta = json.loads((self.partial / "run.json").read_text())
         assert meta == {"command": "live", "complete": False, "reason": said, "crashes": [said]}
@@ -248,7 +252,7 @@ def broken(*_args: object, **_named: object) -> None:
 def test_a_bug_before_the_session(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(session, "warm", broken)
+    monkeypatch.setattr(session, "compile_kernels", broken)
     live = Live(tmp_path / "out", monkeypatch, capfd)
     live.told(processes.CONTROL)
     assert live.files == {"run.json", "crash_control.txt"}
@@ -257,7 +261,7 @@ def test_a_bug_before_the_session(
 def test_a_bug_in_the_human_side_before_the_session(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(session, "warm", lambda _start: None)
+    monkeypatch.setattr(session, "compile_kernels", lambda _start: None)
     monkeypatch.setattr(processes, "ENTRY", "tests.live.crashing")
     monkeypatch.setenv(BUG, f"human side/hrcreplay.live.person.log_playback:Playback.due@{tmp_path}")
     live = Live(tmp_path / "out", monkeypatch, capfd)
@@ -268,7 +272,7 @@ def test_a_bug_in_the_human_side_before_the_session(
 def test_a_bug_in_the_report_leaves_the_record_to_be_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(session, "warm", lambda _start: None)
+    monkeypatch.setattr(session, "compile_kernels", lambda _start: None)
     with monkeypatch.context() as within:
         within.setattr(folder, "write_report", broken)
         live = Live(tmp_path / "out", monkeypatch, capfd)

@@ -15,7 +15,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.live import processes
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import APPROACH, FOLLOWING
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.store import run_folder
 from tests.live.flown import MOVING, Flown, Group, brakes_for, leaves_nobody, never_stalls, read_json, told, verified
 from tests.live.sessions import kill
@@ -23,8 +23,8 @@ from tests.live.sessions import kill
 #: Session -> part and place of its bug.
 BUGS = {
     "recorder": "recorder/hrcreplay.live.record.topics:split",
-    "screen": "screen/hrcreplay.live.processes:Channel.receive",
-    "status": "control/hrcreplay.live.view.status_publisher:Teller._status",
+    "screen": "screen/hrcreplay.live.processes:ControlChannel.receive",
+    "status": "control/hrcreplay.live.view.status_publisher:StatusPublisher._status",
 }
 
 
@@ -118,7 +118,7 @@ def not_complete(one: Flown) -> str:
     meta = read_json(one.folder / "run.json")
     assert (meta["complete"], meta["reason"], meta["crashes"]) == (False, said, [said])
     assert f"not complete: {said}" in meta["notes"]
-    assert processes.read(one.folder) == [said]
+    assert processes.read_crashes(one.folder) == [said]
     (kept,) = one.folder.glob("crash_*.txt")
     assert ("Traceback (most recent call last)" in kept.read_text()) == ("ZeroDivisionError" in said)
     with pytest.raises(SettingsError, match="a live session that broke off"):
@@ -141,7 +141,9 @@ def test_without_control_the_robot_stops_by_itself_and_is_echoed_by_the_next_ses
     one.session.end()
     leaves_nobody(one.helpers)
     rows = [
-        codec.read_answer(m) for m in Tape(one.session.partial / "log.mcap").messages() if codec.kind(m) == codec.ANSWER
+        codec.decode_decision(m)
+        for m in SessionLogReader(one.session.partial / "log.mcap").messages()
+        if codec.kind(m) == codec.DECISION
     ]
     assert rows[-1].phase in (APPROACH, FOLLOWING)
     assert not one.folder.exists()

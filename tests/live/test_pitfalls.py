@@ -1,4 +1,4 @@
-"""Those of the ten ways in which other people's EGM programs fail that need our pilot or a robot, in counted time.
+"""Those of the ten ways in which other people's EGM programs fail that need our controller or a robot, in counted time.
 
 The others are in tests/egm/test_pitfalls.py. Each test fails when its handling is taken out.
 """
@@ -12,7 +12,7 @@ from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.egm.robot_double.servo import ServoSettings
 from hrcreplay.egm.robot_double.twin import TwinSettings
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.loop import FAREWELLS
+from hrcreplay.live.control.loop import FINAL_ANSWERS
 from hrcreplay.live.record import codec
 from hrcreplay.records import Floats
 from tests.live.counted import Cable, CountedLoop, counted
@@ -59,8 +59,8 @@ def test_5_silence_finds_the_robot_standing() -> None:
     loop.fly(2.9)
     assert np.abs(planned(flight)[1][-1]).max() > 0.2
     loop.fly()
-    assert flight.pilot.stop == watchdog.SESSION_OVER
-    last = flight.core.record.arrivals()[-(FAREWELLS - 1) :]
+    assert flight.controller.stop == watchdog.SESSION_OVER
+    last = flight.core.record.arrivals()[-(FINAL_ANSWERS - 1) :]
     assert not last["ref_rad_per_s"].any()
     cable(loop).pass_by(3.0)
     joints, _ = planned(flight)
@@ -74,8 +74,8 @@ def test_7_a_session_that_ends_by_convergence_is_told_and_the_next_one_served() 
     converging = TwinSettings(servo=ServoSettings(cond_time_s=1.0), restart_s=0.5)
     flight = Flight(overrides=FAST, twin=converging, walk=lambda s: None if s < 1.4 else (3.0, 0.0)).fly(2.4)
     assert flight.core.ends == ["converged", ""]
-    assert flight.pilot.fault is None
-    assert not flight.pilot.stops
+    assert flight.controller.fault is None
+    assert not flight.controller.stops
     assert "converged" in {answer.reason for answer in flight.answers if answer.phase == codec.WAITING}
     assert flight.phases()[:4] == ["echo", "waiting", "echo", "approach"]
     steps_keep_the_limits(flight)
@@ -88,7 +88,7 @@ def test_7_idling_in_a_stop_ends_a_session_but_not_ours() -> None:
     seen = lambda s: None if 0.4 < s < 2.6 else (3.0, 0.0)  # noqa: E731
     flight = Flight(overrides=RESUME, twin=converging, walk=seen).fly(4.2)
     assert flight.core.ends == ["converged", ""]
-    assert [reason for _, reason in flight.pilot.stops] == [watchdog.NO_FRAME]
+    assert [reason for _, reason in flight.controller.stops] == [watchdog.NO_FRAME]
     assert flight.phases().count("echo") == 2
     steps_keep_the_limits(flight)
     assert np.abs(planned(flight)[1][-250:]).max() > 0.1
@@ -104,7 +104,7 @@ def test_8_the_robot_follows_without_a_lag_at_the_gains_of_its_controller(gain: 
     behind = np.abs(cycles["ref_rad"] - cycles["planned_rad"]).max(axis=0)
     assert np.count_nonzero(speed > 0.3) >= 3
     assert np.all(behind[speed > 0.3] / speed[speed > 0.3] < 0.02)
-    assert not flight.pilot.stops
+    assert not flight.controller.stops
 
 
 @pytest.mark.parametrize("turn_s", [0.01, 0.016, 0.025])
@@ -115,7 +115,7 @@ def test_10_a_loop_slower_than_the_robot_brakes_by_name_and_builds_no_backlog(tu
     assert np.abs(planned(flight)[1][-50:]).max() > 0.2
     loop.work_ns = round(turn_s * 1e9)
     loop.fly(1.5)
-    assert [reason for _, reason in flight.pilot.stops] == [watchdog.OVERRUN]
+    assert [reason for _, reason in flight.controller.stops] == [watchdog.OVERRUN]
     arrivals, cycles = flight.core.record.arrivals(), flight.core.record.cycles()
     assert set(np.diff(arrivals["seqno"])) == {1}
     assert cycles["queued"].max() == 0

@@ -17,7 +17,7 @@ import pytest
 
 from hrcreplay.cli import app
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from tests.live.flights import DEMO, start
@@ -96,7 +96,11 @@ def test_shadow_mode_sends_nothing_and_records_all(flown: dict[str, Flown]) -> N
     assert shadow.report["answers"]["answered"] == 0
     assert shadow.report["answers"]["packets"]
     assert shadow.report["sessions"] == [""]
-    replies = [codec.read_reply(m) for m in Tape(shadow.folder / "log.mcap").messages() if codec.kind(m) == codec.REPLY]
+    replies = [
+        codec.decode_reply(m)
+        for m in SessionLogReader(shadow.folder / "log.mcap").messages()
+        if codec.kind(m) == codec.REPLY
+    ]
     assert replies
     assert not any(sent for sent, _ in replies)
 

@@ -13,7 +13,7 @@ import pytest
 from hrcreplay.egm.robot_double.faults import KINDS, Fault
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, Signal, TickEvent
+from hrcreplay.live.record.codec import Decision, Signal, TickEvent
 from hrcreplay.live.verify import Verdict, verify
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
@@ -26,7 +26,7 @@ def messages() -> list[bytes]:
     return list(made.session(60))
 
 
-def _verdict(folder: Path, messages: list[bytes], build: type[made.Pilot] = made.Pilot) -> Verdict:
+def _verdict(folder: Path, messages: list[bytes], build: type[made.MadeController] = made.MadeController) -> Verdict:
     """What is said of a killed session with this record."""
     run = folder / "run.partial"
     shutil.rmtree(run, ignore_errors=True)
@@ -54,15 +54,15 @@ def test_the_same_again_is_identical(tmp_path: Path, messages: list[bytes]) -> N
     made.record(run / "log.mcap", messages)
     meta = {"complete": True, "outputs": {"log.mcap": run_folder.sha256(run / "log.mcap")}}
     (run / "run.json").write_text(json.dumps(meta))
-    assert verify(run, made.Pilot) == Verdict(identical=True, lines=("identical: 60 ticks, 60 looks",))
+    assert verify(run, made.MadeController) == Verdict(identical=True, lines=("identical: 60 ticks, 60 looks",))
 
 
-class Drifting(made.Pilot):
+class Drifting(made.MadeController):
     """Decides one thing otherwise from the 20th answer on."""
 
     answers = 0
 
-    def answer(self, event: TickEvent) -> Answer:
+    def answer(self, event: TickEvent) -> Decision:
         self.answers += 1
         if self.answers == 20:
             self.q[2] += 1e-15
@@ -72,10 +72,10 @@ class Drifting(made.Pilot):
 def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messages: list[bytes]) -> None:
     verdict = _verdict(tmp_path, messages, Drifting)
     assert not verdict.identical
-    recorded = codec.read_answer(messages[_at(messages, codec.ANSWER, 19)]).row
+    recorded = codec.decode_decision(messages[_at(messages, codec.DECISION, 19)]).row
     assert recorded is not None
     seconds = 20 * made.TICK_NS / 1e9
-    q = float(recorded[2])  # of q_measured, which this pilot derives from q
+    q = float(recorded[2])  # of q_measured, which this controller derives from q
     assert verdict.lines[0].startswith(f"tick 19 at {seconds:.3f} s: q_measured3: recorded {q!r}, again ")
     assert verdict.lines[0] != f"tick 19 at {seconds:.3f} s: q_measured3: recorded {q!r}, again {q!r}"
     assert verdict.lines[-1] == "identical until then: 20 ticks"
@@ -84,10 +84,10 @@ def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messa
 @pytest.mark.parametrize(
     ("kind", "number", "offset", "names"),
     [
-        (codec.LOOK, 7, struct.calcsize("<cqHHHH") + 8 * (12 + 3), "rho_vel: recorded "),
-        (codec.LOOK, 7, struct.calcsize("<cqHHHH") + 8 * 79, "pi_forearm_r: recorded "),
-        (codec.ANSWER, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 17, "dq6: recorded "),
-        (codec.ANSWER, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
+        (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * (12 + 3), "rho_vel: recorded "),
+        (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * 79, "pi_forearm_r: recorded "),
+        (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 17, "dq6: recorded "),
+        (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
         (codec.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
         (codec.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 5), "radius of LLA: recorded 1.1, again 0.1"),
     ],
@@ -104,8 +104,8 @@ def test_changed_numbers_are_named(
 
 
 def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[bytes]) -> None:
-    at = _at(messages, codec.ANSWER, 58)
-    assert codec.read_answer(messages[at]).reason == "Ctrl-C"
+    at = _at(messages, codec.DECISION, 58)
+    assert codec.decode_decision(messages[at]).reason == "Ctrl-C"
     changed = list(messages)
     changed[at] = changed[at].replace(b"Ctrl-C", b"SIGINT")
     assert "tick 58 at" in (line := _verdict(tmp_path, changed).lines[0])
@@ -113,7 +113,7 @@ def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[
 
     changed = list(messages)
     changed[at + 1] = changed[at + 1][:-3] + bytes([changed[at + 1][-3] ^ 1]) + changed[at + 1][-2:]
-    reply = codec.read_reply(messages[at + 1])[1]
+    reply = codec.decode_reply(messages[at + 1])[1]
     value = reply[-3]
     assert (
         _verdict(tmp_path, changed)
@@ -127,15 +127,17 @@ def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[
 
 
 def test_a_volume_that_is_not_stored_is_compared_by_digest(tmp_path: Path, messages: list[bytes]) -> None:
-    changed, at = list(messages), _at(messages, codec.LOOK, 7)
+    changed, at = list(messages), _at(messages, codec.PERCEPTION, 7)
     changed[at] = changed[at][:-1] + bytes([changed[at][-1] ^ 64])
     assert "s: volume of LLA (digest): recorded '" in _verdict(tmp_path, changed).lines[0]
-    at = _at(messages, codec.LOOK, -1)
+    at = _at(messages, codec.PERCEPTION, -1)
     changed = [*messages[:at], messages[at][:-1] + bytes([messages[at][-1] ^ 64])]
     assert "tick 59 at" in _verdict(tmp_path, changed).lines[0]  # nothing follows it
 
 
-@pytest.mark.parametrize(("kind", "number"), [(codec.ROBOT, 5), (codec.FRAME, 3), (codec.SILENCE, 0), (codec.EVENT, 0)])
+@pytest.mark.parametrize(
+    ("kind", "number"), [(codec.ROBOT, 5), (codec.SKELETON, 3), (codec.TIMEOUT, 0), (codec.EVENT, 0)]
+)
 def test_inputs_that_are_missing_or_changed_show(
     tmp_path: Path, messages: list[bytes], kind: bytes, number: int
 ) -> None:
@@ -146,7 +148,7 @@ def test_inputs_that_are_missing_or_changed_show(
         return
     verdict = _verdict(tmp_path, messages[:at] + messages[at + 1 :])
     assert not verdict.identical
-    if kind != codec.SILENCE:
+    if kind != codec.TIMEOUT:
         assert "s: the record has " in verdict.lines[0]
 
 
@@ -154,19 +156,19 @@ def test_any_nan_is_like_any_other(tmp_path: Path, messages: list[bytes]) -> Non
     changed = list(messages)
     quiet, other = struct.pack("<d", np.nan), b"\x01\0\0\0\0\0\xf8\xff"
     for i, message in enumerate(messages):
-        if codec.kind(message) == codec.LOOK:
+        if codec.kind(message) == codec.PERCEPTION:
             changed[i] = message.replace(quiet, other)
             assert changed[i] != message
     assert _verdict(tmp_path, changed).identical
 
 
 def test_a_look_that_failed_fails_again(tmp_path: Path, messages: list[bytes]) -> None:
-    class Blind(made.Pilot):
-        def look(self, t_ns: int, skeletons: object) -> None:  # type: ignore[override]
+    class Blind(made.MadeController):
+        def update_perception(self, t_ns: int, skeletons: object) -> None:  # type: ignore[override]
             """A bug."""
 
     t_ns = made.START_NS + 10
-    record = [messages[0], codec.frame(t_ns, made.skeleton(0)), codec.event(t_ns, {"what": "blind"})]
+    record = [messages[0], codec.encode_skeleton(t_ns, made.skeleton(0)), codec.encode_event(t_ns, {"what": "blind"})]
     assert _verdict(tmp_path, record, Blind).identical
     assert "look: recorded 'failed'" in _verdict(tmp_path, record).lines[0]
 
@@ -179,7 +181,7 @@ def test_a_flipped_bit_is_named_with_its_chunk(tmp_path: Path, messages: list[by
     at = len(data) // 2
     data[at] ^= 4
     path.write_bytes(data)
-    verdict = verify(run, made.Pilot)
+    verdict = verify(run, made.MadeController)
     assert not verdict.identical
     assert verdict.lines[0].startswith(f"{path}: byte ")
     assert "between 0." in verdict.lines[0]
@@ -192,7 +194,7 @@ def test_a_changed_file_of_a_complete_session_is_named(tmp_path: Path, messages:
     outputs = {"log.mcap": run_folder.sha256(tmp_path / "log.mcap"), "motion.parquet": "0" * 64, "gone.svg": "0" * 64}
     (tmp_path / "run.json").write_text(json.dumps({"complete": True, "outputs": outputs}))
     (tmp_path / "motion.parquet").write_text("")
-    lines = verify(tmp_path, made.Pilot).lines
+    lines = verify(tmp_path, made.MadeController).lines
     assert lines[:2] == (
         f"{tmp_path / 'gone.svg'}: is gone",
         f"{tmp_path / 'motion.parquet'}: is not as the run left it",
@@ -251,7 +253,7 @@ def test_a_replay_of_another_log_is_not_run(replayed: Path, tmp_path: Path) -> N
 
 
 def test_signals_are_part_of_what_is_told(tmp_path: Path, messages: list[bytes]) -> None:
-    changed, at = list(messages), _at(messages, codec.ANSWER, 30)
+    changed, at = list(messages), _at(messages, codec.DECISION, 30)
     offset = struct.calcsize("<cqqI")
     changed[at] = changed[at][:offset] + struct.pack("<I", Signal.INTERRUPT) + changed[at][offset + 4 :]
     assert "status: recorded 'tracking', again 'braking'" in _verdict(tmp_path, changed).lines[0]
@@ -263,9 +265,9 @@ def test_a_session_with_every_fault_is_identical(tmp_path: Path) -> None:
     )
     flight = Flight(overrides=("live.resume=true", "live.resume_s=0.05"), faults=faults)
     flight.fly(1.3 + 0.3 * len(KINDS))
-    assert len(flight.pilot.stops) >= 3
+    assert len(flight.controller.stops) >= 3
     run = tmp_path / "run.partial"
     run.mkdir()
-    made.record(run / "log.mcap", [codec.event(BEGIN_NS - 1, flight.start), *flight.messages], chunk=500)
+    made.record(run / "log.mcap", [codec.encode_event(BEGIN_NS - 1, flight.start), *flight.messages], chunk=500)
     verdict = verify(run)
     assert verdict.identical, verdict.lines

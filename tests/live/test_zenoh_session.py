@@ -17,7 +17,7 @@ from hrcreplay.calibration.cell import Cell, write_cell
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.live.verify import verify
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.robot.model import irb140
@@ -104,13 +104,13 @@ def moves_only_while_seen(log: Path, stop_s: float) -> None:
     """What the robot was told, by the record: never to go on without a fresh frame, nor to jump."""
     robot = irb140(np.eye(4), stop_s=stop_s)
     captured = dict.fromkeys(POSES, 0)
-    rows: list[codec.Answered] = []
-    for message in Tape(log).messages():
-        if codec.kind(message) == codec.FRAME:
+    rows: list[codec.RecordedDecision] = []
+    for message in SessionLogReader(log).messages():
+        if codec.kind(message) == codec.SKELETON:
             skeleton = pb.Skeleton.FromString(codec.body(message))
             captured[skeleton.camera] = skeleton.capture_ns
-        elif codec.kind(message) == codec.ANSWER:
-            rows.append(codec.read_answer(message))
+        elif codec.kind(message) == codec.DECISION:
+            rows.append(codec.decode_decision(message))
             if PHASES[rows[-1].phase] in MOVING:
                 assert rows[-1].t_ns - max(captured.values()) <= FRESH_S * 1e9
     assert all(captured.values())  # both came through

@@ -10,8 +10,8 @@ from mcap.writer import Writer
 from ruamel.yaml import YAML
 
 from hrcreplay.errors import LogError
+from hrcreplay.logs.log_files import open_source
 from hrcreplay.logs.reader import open_log
-from hrcreplay.logs.source import open_source
 from tests.logs import own
 from tests.logs.bags import bag, write_openni
 from tests.realdata import data_path

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.calibration.registration import rigid
-from hrcreplay.logs.clean import PersonMemory, pick
+from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.records import CameraFrames, Floats
 
 UNKNOWN = np.full((2, 4, 4), np.nan)
@@ -31,7 +31,7 @@ def _bodies(*rows: tuple[float, int, int, float], cameras: tuple[str, ...] = ("a
 
 
 def _pick(frames: CameraFrames, T: Floats = UNKNOWN, memory: PersonMemory | None = None) -> tuple[Floats, Counter[str]]:
-    _, mine, counts = pick(frames, memory or PersonMemory(), T, 0.8, 2.0)
+    _, mine, counts = select_person(frames, memory or PersonMemory(), T, 0.8, 2.0)
     return mine.points_m[:, 0, 0], counts
 
 
@@ -90,7 +90,7 @@ def test_place_needs_no_torso() -> None:
 
 
 def test_no_rows() -> None:
-    memory, mine, counts = pick(_bodies((0, 0, 1, 0.0)).rows(slice(0, 0)), PersonMemory(), UNKNOWN, 0.8, 2.0)
+    memory, mine, counts = select_person(_bodies((0, 0, 1, 0.0)).rows(slice(0, 0)), PersonMemory(), UNKNOWN, 0.8, 2.0)
     assert memory == PersonMemory()
     assert len(mine) == 0
     assert counts == {}
@@ -105,11 +105,11 @@ def test_one_frame_and_many_give_the_same(seed: int) -> None:
         rows += [(k * 0.15, camera, int(rng.integers(4)), float(rng.normal(0, 1.5))) for _ in range(rng.integers(1, 4))]
     frames = _bodies(*rows)
     T = np.stack([np.eye(4), np.full((4, 4), np.nan)])
-    memory, whole, counts = pick(frames, PersonMemory(), T, 0.8, 2.0)
+    memory, whole, counts = select_person(frames, PersonMemory(), T, 0.8, 2.0)
     starts = np.flatnonzero(np.diff(frames.capture_ns, prepend=-1))
     pieces, total, carried = [], Counter[str](), PersonMemory()
     for first, last in zip(starts, [*starts[1:], len(frames)], strict=True):
-        carried, piece, some = pick(frames.rows(slice(int(first), int(last))), carried, T, 0.8, 2.0)
+        carried, piece, some = select_person(frames.rows(slice(int(first), int(last))), carried, T, 0.8, 2.0)
         pieces.append(piece)
         total.update(some)
     parts = CameraFrames.join(pieces)

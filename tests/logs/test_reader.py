@@ -16,9 +16,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from ruamel.yaml import YAML
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.messages import Message, Part, Topic, in_order
+from hrcreplay.logs.log_files import open_source
+from hrcreplay.logs.messages import LazyChunk, Message, Topic, merge_by_arrival
 from hrcreplay.logs.reader import LogOptions, open_log
-from hrcreplay.logs.source import open_source
 from tests.logs import own
 from tests.logs.bags import KINDS, bag, header, make, marker_array, write_openni
 from tests.realdata import data_path
@@ -35,7 +35,7 @@ MCAP = "ros_bags/rosbag2/rosbag2_py/test/resources/mcap"
 def test_any_parts_come_in_order_of_arrival(times: list[list[int]]) -> None:
     topic = Topic("/t", "t", 0, bytes)
     parts = [[Message(t, topic, b"%d" % i) for t in sorted(part)] for i, part in enumerate(times)]
-    merged = list(in_order(Part(part[0].arrival_ns if part else 0, partial(iter, part)) for part in parts))
+    merged = list(merge_by_arrival(LazyChunk(part[0].arrival_ns if part else 0, partial(iter, part)) for part in parts))
     assert [m.arrival_ns for m in merged] == sorted(t for part in times for t in part)
     assert Counter(m.data for m in merged) == Counter(m.data for part in parts for m in part)
 
@@ -52,7 +52,7 @@ def test_parts_that_do_not_overlap_are_never_open_together() -> None:
         yield from (Message(10 * number + k, topic, b"") for k in range(5))
         open_now.discard(number)
 
-    assert len(list(in_order(Part(10 * n, partial(part, n)) for n in reversed(range(6))))) == 30
+    assert len(list(merge_by_arrival(LazyChunk(10 * n, partial(part, n)) for n in reversed(range(6))))) == 30
     assert most == 1
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.report import figures, figures_human, figures_robot
-from hrcreplay.report.drawing import Solid, outline, picture, view_from
+from hrcreplay.report.drawing import RenderedHull, outline, render_hulls, view_from
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import RADII_M, T0_NS, make_run, volumes_at
@@ -121,10 +121,10 @@ def test_outline_of_missing_vertices_is_empty() -> None:
 
 def test_picture_shows_the_nearer_solid_and_the_area_of_a_ball() -> None:
     view = view_from(0.0, 0.0)  # looks along -x: larger x is nearer
-    near = Solid(np.array([[1.0, 0.0, 0.0]]), 0.2, (1.0, 0.0, 0.0))
-    far = Solid(np.array([[-1.0, 0.0, 0.0]]), 0.4, (0.0, 0.0, 1.0))
+    near = RenderedHull(np.array([[1.0, 0.0, 0.0]]), 0.2, (1.0, 0.0, 0.0))
+    far = RenderedHull(np.array([[-1.0, 0.0, 0.0]]), 0.4, (0.0, 0.0, 1.0))
     for order in ((near, far), (far, near)):
-        image = picture(order, view, np.array([-0.5, -0.5]), np.array([0.5, 0.5]), 0.01)
+        image = render_hulls(order, view, np.array([-0.5, -0.5]), np.array([0.5, 0.5]), 0.01)
         assert image.shape == (100, 100, 4)
         middle, rim = image[50, 50], image[50, 20]
         assert middle[0] > 0.5

@@ -148,8 +148,8 @@ def test_a_robot_that_kept_the_constraint_throughout(tmp_path: Path) -> None:
 
 def test_every_reason_to_brake_has_its_words() -> None:
     assert set(control_step.REASONS[1:]) <= set(wording.REASONS)
-    assert len({wording.happened(reason) for reason in control_step.REASONS[1:]}) == len(control_step.REASONS) - 1
-    assert wording.happened("no oil") == "the record says 'no oil'"
+    assert len({wording.reason_text(reason) for reason in control_step.REASONS[1:]}) == len(control_step.REASONS) - 1
+    assert wording.reason_text("no oil") == "the record says 'no oil'"
 
 
 def test_the_verdict_says_by_reason_what_happened(tmp_path: Path) -> None:

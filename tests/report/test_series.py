@@ -45,7 +45,7 @@ def test_central_differences_of_a_turning_heading() -> None:
     [([], []), ([0, 0], []), ([1, 1], [[0, 2]]), ([0, 1, 1, 0, 1], [[1, 3], [4, 5]])],
 )
 def test_stretches(mask: list[int], expected: list[list[int]]) -> None:
-    assert metrics.stretches(np.array(mask, dtype=bool)).tolist() == expected
+    assert metrics.true_runs(np.array(mask, dtype=bool)).tolist() == expected
 
 
 def test_envelope_keeps_every_extreme_and_every_gap() -> None:
@@ -69,7 +69,7 @@ def test_envelope_leaves_short_lines_alone() -> None:
 
 
 def test_broken_lines_get_a_gap() -> None:
-    x, y = metrics.broken(np.array([0.0, 0.1, 5.0]), np.array([1.0, 2.0, 3.0]), 0.2)
+    x, y = metrics.break_at_gaps(np.array([0.0, 0.1, 5.0]), np.array([1.0, 2.0, 3.0]), 0.2)
     assert x.tolist() == [0.0, 0.1, 0.1, 5.0]
     assert np.isnan(y).tolist() == [False, False, True, False]
 

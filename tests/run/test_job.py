@@ -18,7 +18,7 @@ from hrcreplay.errors import LogError
 from hrcreplay.run import replay
 from hrcreplay.run.job import resolve
 from hrcreplay.store import run_folder
-from hrcreplay.store.tables import COLUMNS, lacks
+from hrcreplay.store.columns import COLUMNS, missing_columns
 
 #: What tables of the version before had not.
 NEW = {
@@ -67,7 +67,7 @@ def test_our_tables_lack_nothing(planned: Path) -> None:
     tables = sorted(planned.glob("*.parquet"))
     assert {path.stem for path in tables} >= set(COLUMNS)
     for path in tables:
-        assert lacks(path) == ()
+        assert missing_columns(path) == ()
         of_the_cell = re.compile(r"valid_.*|(q|dq|u)\d")
         own = {name for name in pq.read_schema(path).names if not of_the_cell.fullmatch(name)}
         assert own == set(COLUMNS[path.stem.split("_")[0]]), path
@@ -93,7 +93,7 @@ def test_states_that_tell_nothing_of_the_legs_are_computed_again(
     planned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = _aged(planned, tmp_path / "old", "state.parquet", new={"state.parquet": ["residual_LEGS"]})
-    assert lacks(old / "state.parquet") == ("residual_LEGS",)
+    assert missing_columns(old / "state.parquet") == ("residual_LEGS",)
     again = replay.run("predict", old, out=tmp_path / "new")
     said = capsys.readouterr().err
     assert f"{old / 'state.parquet'} is of an earlier version, without residual_LEGS; computed again" in said

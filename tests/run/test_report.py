@@ -9,7 +9,7 @@ import pytest
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS
 from hrcreplay.run import replay, report
-from hrcreplay.run.stages import Foresight
+from hrcreplay.run.stages import PredictionStage
 from hrcreplay.settings.sections import Occupancy
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
@@ -25,8 +25,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_the_figure_of_volumes_holds_the_runs_own_method(sound: Run) -> None:
-    foresight = Foresight(load_limits("paper"), Occupancy(sigmas=3.0), memory_s=0.5)
-    (_, methods), *others = report._instants(foresight, sound)
+    prediction_stage = PredictionStage(load_limits("paper"), Occupancy(sigmas=3.0), memory_s=0.5)
+    (_, methods), *others = report._instants(prediction_stage, sound)
     assert len(others) == 3
     assert list(methods) == ["paper", "positions", "sound"]
     assert list(methods["paper"]) == list(LIMBS)

@@ -209,13 +209,13 @@ def test_a_setting_makes_the_stages_stale_that_depend_on_it(
 
 def _handed(job: Job, log: Log) -> dict[str, str]:
     """What the first two stages are handed, however it came about, and how the third weighs."""
-    eyes, foresight = asdict(build.eyes(job, log)), asdict(build.foresight(job))
-    for limits in (eyes["limits"], foresight["limits"]):
+    fusion_stage, prediction_stage = asdict(build.fusion_stage(job, log)), asdict(build.prediction_stage(job))
+    for limits in (fusion_stage["limits"], prediction_stage["limits"]):
         del limits["name"]
     reading = asdict(log_options(job.settings))
     del reading["joints_topic"]
-    first = repr((eyes, reading, _ticks(job, log).tolist()))
-    second = repr((foresight, replay._store_every(job)))
+    first = repr((fusion_stage, reading, _ticks(job, log).tolist()))
+    second = repr((prediction_stage, replay._store_every(job)))
     return {"fuse": first, "predict": second, "plan": repr(build.plan_settings(job, 0.004))}
 
 

@@ -13,7 +13,7 @@ from hrcreplay.live.control.setup import live_job, start_table
 from hrcreplay.report.tables import remarks, robot_table, summary
 from hrcreplay.robot.model import from_urdf
 from hrcreplay.run.build import robot as robot_of
-from hrcreplay.run.job import Job, read_urdf, unlogged, urdf_digest
+from hrcreplay.run.job import Job, job_without_log, read_urdf, urdf_digest
 from hrcreplay.settings.load import load_settings
 from tests.live.flights import DEMO
 from tests.robot.test_model import joint, link, robot_xml
@@ -39,7 +39,7 @@ def urdf(path: Path, mesh: str, shape: str = "") -> Path:
 
 
 def job(path: Path, *overrides: str) -> Job:
-    return unlogged("plan", path, load_settings(None, (f"robot.urdf={path}", *overrides)), None)
+    return job_without_log("plan", path, load_settings(None, (f"robot.urdf={path}", *overrides)), None)
 
 
 def found(path: Path, *overrides: str) -> list[str]:
@@ -110,7 +110,7 @@ def test_other_settings_of_a_urdf_are_refused_for_the_built_in_robot() -> None:
     for override in ('robot.base_frame="x"', 'robot.packages=["/x"]', 'robot.tcp_frame="x"'):
         settings = load_settings(None, (override,))
         with pytest.raises(SettingsError, match=r"for the IRB 140; it goes with a robot.urdf"):
-            robot_of(unlogged("plan", DEMO, settings, None), np.eye(4))
+            robot_of(job_without_log("plan", DEMO, settings, None), np.eye(4))
 
 
 def test_live_drives_six_axes_and_says_so(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from hrcreplay.human.prediction.reachable_sets import METHODS
 from hrcreplay.records import LIMBS, HumanStates, SweptVolumes
 from hrcreplay.run import build
-from hrcreplay.run.job import unlogged
+from hrcreplay.run.job import job_without_log
 from hrcreplay.settings.load import load_settings
 from tests.soundness import run as sampling
 from tests.soundness.__main__ import main
@@ -110,12 +110,12 @@ def test_the_command_samples_what_predict_does_by_default(method: str, capsys: p
     found = json.loads(line)
     sound = method == "sound"
     settings = load_settings()
-    foresight = build.foresight(unlogged("predict", Path(), settings, None))
-    assert (found["method"], found["limits"]) == (method, foresight.limits.name)
-    assert found["horizon_s"] == foresight.horizon_s
-    assert found["latency_s"] == foresight.occupancy.latency_s
-    assert found["sigmas"] == (foresight.occupancy.sigmas if sound else 0.0)  # the print knows no margins
-    assert found["hand_m"] == (foresight.occupancy.hand_m if sound else 0.0)
+    prediction_stage = build.prediction_stage(job_without_log("predict", Path(), settings, None))
+    assert (found["method"], found["limits"]) == (method, prediction_stage.limits.name)
+    assert found["horizon_s"] == prediction_stage.horizon_s
+    assert found["latency_s"] == prediction_stage.occupancy.latency_s
+    assert found["sigmas"] == (prediction_stage.occupancy.sigmas if sound else 0.0)  # the print knows no margins
+    assert found["hand_m"] == (prediction_stage.occupancy.hand_m if sound else 0.0)
     plan = Plan(method, "people", 0, sigmas=found["sigmas"], hand_m=found["hand_m"])
     result = run(plan, 2000, processes=1)
     assert (found["samples"], found["states"]) == (2000, 2)

@@ -1,1 +1,1 @@
-"""A robot double: the controller's side of EGM, with faults on request and a report of what it was told."""
+"""A simulated robot controller for EGM sessions, with injected faults and a report of what it received."""

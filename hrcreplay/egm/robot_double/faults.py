@@ -1,6 +1,6 @@
-"""What goes wrong on purpose: faults of the link and of the robot, by script or by seed.
+"""Faults injected into the link and the robot, from a script or at random from a seed.
 
-One way of a link with faults: which datagrams come through, when, and what comes beside them.
+``FaultyChannel`` applies those of one direction of the link: which datagrams arrive, when, and in what order.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Datagram(NamedTuple):
     data: bytes
 
 
-class Channel:
+class FaultyChannel:
     """Faults of one direction, in the order in which they were given. Draws from its own generator alone."""
 
     def __init__(self, faults: Iterable[Fault], seed: Sequence[int]) -> None:
@@ -33,8 +33,8 @@ class Channel:
         self._dropping = 0
         self._held: Datagram | None = None
 
-    def carry(self, datagram: Datagram, since_s: float) -> list[Datagram]:
-        """What becomes of a datagram.
+    def transmit(self, datagram: Datagram, since_s: float) -> list[Datagram]:
+        """The datagrams that arrive in place of one, after the faults of this direction.
 
         Args:
             datagram: The one to carry.
@@ -51,7 +51,7 @@ class Channel:
             self._dropping -= 1
             out = []
         for fault in self._faults:
-            if lasts(fault, since_s) and self._rng.random() < fault.probability:
+            if is_active(fault, since_s) and self._rng.random() < fault.probability:
                 out = self._touch(fault, out, beside, datagram.t_ns, since_s)
         if self._held is not None and out and out[-1] is not self._held:
             out.append(Datagram(out[-1].t_ns, self._held.data))
@@ -87,7 +87,7 @@ class Channel:
         return out
 
 
-def lasts(fault: Fault, since_s: float) -> bool:
+def is_active(fault: Fault, since_s: float) -> bool:
     """Whether a fault is on; one without duration is on for less than a cycle."""
     return fault.at_s <= since_s < fault.at_s + max(fault.duration_s, 0.004032)
 

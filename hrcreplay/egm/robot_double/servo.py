@@ -1,7 +1,6 @@
-"""What the controller makes of the references it is told: a state machine stepped once a cycle.
+"""The controller's response to position references: a state machine stepped once a cycle, without clock and socket.
 
-The robot's side of a session, without clock and socket. Settings bear the controller's names and units (degrees);
-all that moves is in radians.
+Settings have the controller's names and units (degrees); positions, speeds and accelerations are in radians.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _ROUNDING_RAD = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """What the axes can do."""
+    """Limits of the axes."""
 
     low_deg: tuple[float, ...]
     """Lower end of the range [deg]."""
@@ -87,8 +86,8 @@ class ServoSettings:
                 raise SettingsError(f"robot double: {name} is 0; a positive number would be right")
 
 
-class Servo:
-    """The controller in a session: told one reference a cycle, or none, it moves the robot by one cycle.
+class ServoController:
+    """The controller in a session: takes at most one reference a cycle and moves the robot by one cycle.
 
     Attributes:
         motors_on: Set from outside. Off, the brakes stop the robot; back on, the last reference is live again.
@@ -121,7 +120,7 @@ class Servo:
         self.begin()
 
     def begin(self) -> None:
-        """Starts a session: nothing of the one before counts."""
+        """Starts a session; the state of the one before is discarded."""
         self.error = ""
         self.converged = False
         self.ended_ns: int | None = None

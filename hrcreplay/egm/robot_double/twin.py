@@ -1,7 +1,4 @@
-"""A robot that is not there: the controller's side of a session, one cycle at a time, without clock or socket.
-
-What the robot double was told and what it did, as tables that grow.
-"""
+"""The simulated controller of one session, computed one cycle at a time without clock or socket, and its record."""
 
 from __future__ import annotations
 
@@ -28,8 +25,8 @@ from hrcreplay.egm.codec import (
     encode_robot,
     flange_pose,
 )
-from hrcreplay.egm.robot_double.faults import Channel, Datagram, Fault, lasts
-from hrcreplay.egm.robot_double.servo import PERIOD_NS, Servo, ServoSettings
+from hrcreplay.egm.robot_double.faults import Datagram, Fault, FaultyChannel, is_active
+from hrcreplay.egm.robot_double.servo import PERIOD_NS, ServoController, ServoSettings
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats, Ints
 
@@ -69,7 +66,7 @@ _ARRIVAL = np.dtype(
 
 
 class TwinRecord:
-    """Everything of one run of the double.
+    """Record of one run of the robot double.
 
     Attributes:
         departed_ns: When the packets left that are owed an answer: duplicates and lost ones are not [ns].
@@ -82,8 +79,8 @@ class TwinRecord:
         self.departed_ns: list[int] = []
         self.garbage = 0
 
-    def arrived(self, datagram: Datagram, session: int) -> None:
-        """Notes a datagram as it arrives."""
+    def add_arrival(self, datagram: Datagram, session: int) -> None:
+        """Records a datagram as it arrives."""
         try:
             told = decode_correction(datagram.data)
         except BadPacket:
@@ -91,10 +88,25 @@ class TwinRecord:
             return
         self._arrivals.append((datagram.t_ns, session, told.seqno, told.q, told.dq))
 
-    def cycled(
-        self, t_ns: int, session: int, packet: RobotPacket | None, servo: Servo, told: Correction | None, queued: int
+    def add_cycle(
+        self,
+        t_ns: int,
+        session: int,
+        packet: RobotPacket | None,
+        servo: ServoController,
+        told: Correction | None,
+        queued: int,
     ) -> None:
-        """Notes a cycle after its step."""
+        """Records a cycle after its step.
+
+        Args:
+            t_ns: Start of the cycle [ns].
+            session: Number of the session, from 1.
+            packet: What was sent; None where nothing was.
+            servo: State of the controller after the step.
+            told: Message that was read in this cycle; None without one.
+            queued: Messages that still wait in the queue.
+        """
         seqno = -1 if packet is None else packet.seqno
         states = (0, 0, 0) if packet is None else (packet.motors, packet.mci, packet.rapid)
         reference = (_NAN, _NAN) if servo.reference is None else (servo.reference.q, servo.reference.dq)
@@ -152,7 +164,7 @@ _QUEUE = 1024
 
 @dataclass(frozen=True, slots=True)
 class TwinSettings:
-    """Which controller it is, and where its robot stands."""
+    """Settings of the simulated controller, and the joints at the start."""
 
     servo: ServoSettings = field(default_factory=ServoSettings)
     """The session as RAPID sets it up."""
@@ -180,7 +192,7 @@ class TwinSettings:
 
 
 class TwinCore:
-    """The robot's side. Deterministic: the same instants and datagrams give the same answers for the same seed.
+    """The simulated controller and robot: the same instants, datagrams and seed give the same answers.
 
     Attributes:
         servo: The controller that moves.
@@ -191,15 +203,15 @@ class TwinCore:
 
     def __init__(self, settings: TwinSettings, faults: Sequence[Fault] = (), seed: int = 0) -> None:
         self._settings = settings
-        self.servo = Servo(settings.servo, np.radians(settings.start_deg))
+        self.servo = ServoController(settings.servo, np.radians(settings.start_deg))
         self.record = TwinRecord()
         self.session = 1
         self.ends = [""]
         link = [fault for fault in faults if fault.of_link]
         self._robot_faults = [fault for fault in faults if not fault.of_link]
         self._happened: set[int] = set()
-        self._out = Channel((fault for fault in link if fault.direction != "in"), (seed, 0))
-        self._in = Channel((fault for fault in link if fault.direction != "out"), (seed, 1))
+        self._out = FaultyChannel((fault for fault in link if fault.direction != "in"), (seed, 0))
+        self._in = FaultyChannel((fault for fault in link if fault.direction != "out"), (seed, 1))
         self._coming: list[tuple[int, int, bytes]] = []
         self._coming_count = 0
         self._queue: deque[bytes] = deque()
@@ -219,18 +231,18 @@ class TwinCore:
         """
         self._catch_up(t_ns)
         since_s = (t_ns - (self._first_ns or 0)) * 1e-9
-        active = self._befall(t_ns, since_s)
+        active = self._apply_faults(t_ns, since_s)
         self._take_in(t_ns, since_s, arrived)
         packet = None if self._silent(t_ns, active) else self._packet(t_ns, active)
         departing = [] if packet is None else self._send(t_ns, since_s, packet)
         told = self._read()
         self.servo.step(t_ns, told)
         self.ends[-1] = self.servo.error or ("converged" if self.servo.converged else "")
-        self.record.cycled(t_ns, self.session, packet, self.servo, told, len(self._queue))
+        self.record.add_cycle(t_ns, self.session, packet, self.servo, told, len(self._queue))
         return departing
 
     def sent_at(self, t_ns: int) -> None:
-        """Says when the packet of this cycle has really left; it counts as its start otherwise [ns]."""
+        """Sets when the packet of this cycle was really sent; without it the start of the cycle counts [ns]."""
         if self.record.departed_ns and self.record.departed_ns[-1] == self._last_ns:
             self.record.departed_ns[-1] = t_ns
 
@@ -243,11 +255,11 @@ class TwinCore:
                 self.servo.step(passed_ns, None)
         self._last_ns = t_ns
 
-    def _befall(self, t_ns: int, since_s: float) -> dict[str, Fault]:
+    def _apply_faults(self, t_ns: int, since_s: float) -> dict[str, Fault]:
         """Applies the faults of the robot. Returns those that are on, by kind."""
         active = {}
         for number, fault in enumerate(self._robot_faults):
-            if not lasts(fault, since_s):
+            if not is_active(fault, since_s):
                 continue
             active[fault.kind] = fault
             if number not in self._happened:
@@ -276,8 +288,8 @@ class TwinCore:
     def _take_in(self, t_ns: int, since_s: float, arrived: Sequence[Datagram]) -> None:
         """Queues what is there by now, after the faults of the way in."""
         for datagram in arrived:
-            self.record.arrived(datagram, self.session)
-            for late in self._in.carry(datagram, since_s):
+            self.record.add_arrival(datagram, self.session)
+            for late in self._in.transmit(datagram, since_s):
                 heapq.heappush(self._coming, (late.t_ns, self._coming_count, late.data))
                 self._coming_count += 1
         while self._coming and self._coming[0][0] <= t_ns:
@@ -319,7 +331,7 @@ class TwinCore:
         """The packet's datagram after the faults of the way out."""
         pose = flange_pose(self.servo.measured)
         data = encode_robot(packet, version=self._settings.version, radians=self._settings.radians, q_cartesian=pose)
-        departing = self._out.carry(Datagram(t_ns, data), since_s)
+        departing = self._out.transmit(Datagram(t_ns, data), since_s)
         owed_ns = [datagram.t_ns for datagram in departing if datagram.data is data]
         if owed_ns and np.isfinite(packet.q).all():  # nobody has to answer nonsense
             self.record.departed_ns.append(min(owed_ns))

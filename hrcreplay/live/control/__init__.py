@@ -1,1 +1,1 @@
-"""The control process of a live session: a packet, an answer, a look at the person."""
+"""The control process of a live session: receive a packet, answer it, update the perception of the person."""

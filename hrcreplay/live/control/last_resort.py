@@ -1,7 +1,7 @@
-"""What answers the robot when control itself has crashed: it brakes from what was sent last, and needs nothing else.
+"""The fallback after a crash of the control process: brakes the robot from the last reply until it stands.
 
-Neither pilot nor stages, session or codec are used: whichever of them failed, the robot is told to stop. Numbers are in
-degrees as they go over the link.
+Controller, stages, protocol and codec are not used, because any of them may have failed. Numbers are in degrees as they
+go over the link.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from hrcreplay.egm import motion_link_pb2 as messages
-from hrcreplay.egm.link import Received
+from hrcreplay.egm.udp_server import Received
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.loop import FAREWELLS, Loop
+from hrcreplay.live.control.loop import FINAL_ANSWERS, Loop
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, MotionRow, Signal
+from hrcreplay.live.record.codec import Decision, MotionRow, Signal
 from hrcreplay.robot.control.control_step import BRAKING
 
 #: A robot that says nothing for so many waits of the link has stopped listening; it stops by itself.
@@ -30,8 +30,8 @@ _COUNTER = 2**32
 
 
 @dataclass
-class Brake:
-    """Each axis as fast as it can, Eq. (67), from the last reply on; positions stay within limits."""
+class FallbackBrake:
+    """Brakes each axis as fast as it can, Eq. (67), starting from the last reply; positions stay within limits."""
 
     ddq_max: Sequence[float]  #: [deg/s^2]
     q_min: Sequence[float]  #: [deg]
@@ -47,8 +47,8 @@ class Brake:
         """Whether the robot has been told to stand."""
         return not any(self.dq)
 
-    def hear(self, measured: Sequence[float]) -> None:
-        """Takes where the robot says it is [deg]."""
+    def update_position(self, measured: Sequence[float]) -> None:
+        """Takes the measured joints [deg]; starts again from them where they are too far from the last reply."""
         if max(abs(m - q) for m, q in zip(measured, self.q, strict=True)) > self.tracking:
             self.q, self.dq = list(measured), [0.0] * len(measured)
 
@@ -78,16 +78,16 @@ def bring_to_rest(loop: Loop, why: str) -> None:
         why: What the record is to say of it.
     """
     with suppress(Exception):
-        if loop.pilot.stop != watchdog.FAULT:
-            loop.pilot.stop = watchdog.FAULT
-            loop.pilot.stops.append((loop.now_ns(), watchdog.FAULT))
-        loop.recorder.send(codec.event(loop.now_ns(), {"what": "crash", "text": why}))
+        if loop.controller.stop != watchdog.FAULT:
+            loop.controller.stop = watchdog.FAULT
+            loop.controller.stops.append((loop.now_ns(), watchdog.FAULT))
+        loop.recorder.send(codec.encode_event(loop.now_ns(), {"what": "crash", "text": why}))
     brake, sender = _brake(loop), loop.sender
     if brake is None or sender is None:
         return
     standing = silences = 0
     received = loop.pending
-    while standing < FAREWELLS and silences < _SILENCES:
+    while standing < FINAL_ANSWERS and silences < _SILENCES:
         try:
             received = received or loop.link.newest()
         except Exception:  # whatever it is
@@ -100,7 +100,7 @@ def bring_to_rest(loop: Loop, why: str) -> None:
         measured = None if received is None else _measured(received.data)
         if received is None or measured is not None:
             if measured is not None:
-                brake.hear(measured)
+                brake.update_position(measured)
             before = list(brake.q), list(brake.dq)
             data = brake.step(loop.now_ns() // 1_000_000)
             with suppress(Exception):
@@ -111,15 +111,15 @@ def bring_to_rest(loop: Loop, why: str) -> None:
         received = None
 
 
-def _brake(loop: Loop) -> Brake | None:
+def _brake(loop: Loop) -> FallbackBrake | None:
     if loop.sent is None:
         return None
     told = messages.SensorMessage.FromString(loop.sent)
-    robot, setup = loop.pilot.setup.robot, loop.pilot.setup
+    robot, setup = loop.controller.setup.robot, loop.controller.setup
     ddq_max, q_min, q_max = (np.degrees(bound).tolist() for bound in (robot.ddq_max, robot.q_min, robot.q_max))
     q, dq = list(told.planned.joints.joints), list(told.speed_reference.joints.joints)
     tracking = math.degrees(setup.bounds.tracking_rad)
-    return Brake(ddq_max, q_min, q_max, setup.plan.dt_s, tracking, q, dq, told.header.seqno)
+    return FallbackBrake(ddq_max, q_min, q_max, setup.plan.dt_s, tracking, q, dq, told.header.seqno)
 
 
 def _measured(data: bytes) -> list[float] | None:
@@ -136,20 +136,20 @@ def _record(
     received: Received | None,
     measured: list[float] | None,
     before: tuple[list[float], list[float]],
-    brake: Brake,
+    brake: FallbackBrake,
     data: bytes,
 ) -> None:
-    """A row of the motion like any other; what only the stages know is missing in it."""
+    """Records a row of the motion; what only the stages know is missing in it."""
     t_ns = loop.now_ns() if received is None else received.t_ns + loop.anchor_ns
     datagrams = () if received is None else (*received.older, received.data)
     for datagram in datagrams:
-        loop.recorder.send(codec.robot(t_ns, datagram))
+        loop.recorder.send(codec.encode_robot_packet(t_ns, datagram))
     q, dq = (np.radians(numbers) for numbers in before)
     u = (np.radians(brake.dq) - dq) / brake.cycle_s
     where = np.full(len(q), np.nan) if measured is None else np.radians(measured)
     unknown = np.full(3, np.nan)
     row = MotionRow(where, q, dq, u, unknown, unknown, np.full(4, np.nan))
     phase = codec.HOLDING if brake.at_rest else codec.STOPPING
-    answer = Answer(t_ns, 0, data, phase, BRAKING, watchdog.FAULT, -1, -1, row)
-    loop.recorder.send(codec.answer(answer, Signal.NONE, len(datagrams), 0))
-    loop.recorder.send(codec.reply(t_ns, data, sent=True))
+    answer = Decision(t_ns, 0, data, phase, BRAKING, watchdog.FAULT, -1, -1, row)
+    loop.recorder.send(codec.encode_decision(answer, Signal.NONE, len(datagrams), 0))
+    loop.recorder.send(codec.encode_reply(t_ns, data, sent=True))

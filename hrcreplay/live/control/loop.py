@@ -1,9 +1,8 @@
-"""The control loop: a packet, an answer, a look; everything else is told to others and waited for by nobody.
+"""The control loop: receives a packet, answers it, updates the perception, and hands records to the other processes.
 
-A look that lasts into the next packet makes its answer late. The look after that answer is left out, so that the one
-after it is on time again: what the robot keeps clear of is then a cycle older (`live.reaction_s` has room for that).
-
-Percentiles of many short times in little memory.
+The loop waits for no other process. A perception update that lasts into the next packet delays the answer to it. The
+update after that answer is left out, so that the next answer is on time again; the swept volumes are then one cycle
+older, which `live.reaction_s` allows for.
 """
 
 from __future__ import annotations
@@ -13,25 +12,25 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hrcreplay.egm.link import Address, Link, Received
-from hrcreplay.live.control.pilot import Pilot
+from hrcreplay.egm.udp_server import Address, EgmServer, Received
+from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.control.watchdog import REFUSED
-from hrcreplay.live.processes import Helper
+from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Answer, Signal, TickEvent
+from hrcreplay.live.record.codec import Decision, Signal, TickEvent
 
 _BIN_NS = 5_000
 _BINS = 20_000  # up to 0.1 s; the last one holds all that took longer
 
 
-class Durations:
-    """A histogram in steps of 5 us."""
+class DurationHistogram:
+    """Histogram of durations in steps of 5 us: quantiles of any number of them in constant memory."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, dtype=np.int64)
 
     def add(self, duration_ns: int) -> None:
-        """One more."""
+        """Counts a duration [ns]."""
         self._counts[min(max(duration_ns, 0) // _BIN_NS, _BINS - 1)] += 1
 
     def quantiles_us(self, *shares: float) -> list[float] | None:
@@ -55,45 +54,45 @@ ENDING = (
 )
 
 #: Answers at speed 0 before we leave: a robot keeps obeying the last one.
-FAREWELLS = 5
+FINAL_ANSWERS = 5
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What the loop itself watches; see sections_live.Live."""
+    """Settings of the control loop; see ``settings.sections.Live``."""
 
     duration_s: float  #: inf: until it is stopped
     sending: bool
     person_late_s: float
     overrun_s: float
     keep_recorder: bool
-    store_every_s: float  #: between two looks whose volumes are recorded whole
+    store_every_s: float  #: between two perception updates whose volumes are recorded complete
 
 
 @dataclass
 class Loop:
-    """One session's loop. ``now_ns`` is the session's clock."""
+    """The control loop of one session."""
 
-    pilot: Pilot
-    link: Link
-    person: Helper
-    recorder: Helper
+    controller: SessionController
+    link: EgmServer
+    person: HelperProcess
+    recorder: HelperProcess
     settings: LoopSettings
     anchor_ns: int
     start_ns: int
-    screen: Helper | None = None
+    screen: HelperProcess | None = None
     caught: Signal = Signal.NONE  #: by the handlers of the operating system's signals
-    signals: Signal = Signal.NONE  #: of the latest turn
+    signals: Signal = Signal.NONE  #: of the latest cycle
     notes: list[str] = field(default_factory=list)
-    took: Durations = field(default_factory=Durations)
+    reply_times: DurationHistogram = field(default_factory=DurationHistogram)
     answers: int = 0
-    skipped: int = 0  #: looks left out
+    skipped: int = 0  #: perception updates left out
     robot: str | None = None
-    last: Answer | None = None
+    last: Decision | None = None
     sent: bytes | None = None  #: the latest reply that went to the robot
     sender: Address | None = None  #: where the robot's packets come from
     pending: Received | None = None  #: what is not answered yet
-    stored: bytes | None = None  #: the latest swept volumes that were recorded whole
+    stored: bytes | None = None  #: the latest swept volumes that were recorded complete
     _bodies: list[bytes] = field(default_factory=list)
     _beat_ns: int = 0
     _late: bool = False
@@ -106,32 +105,32 @@ class Loop:
         return time.monotonic_ns() + self.anchor_ns
 
     def begin(self) -> None:
-        """Tells the human side to start."""
+        """Starts the human side."""
         self.link.clear()
         self._beat_ns = self.now_ns()
         self.person.send(b"G" + self.start_ns.to_bytes(8, "little"))
 
-    def turn(self) -> bool:
-        """One turn; False when the session is over."""
+    def run_cycle(self) -> bool:
+        """Runs one cycle: answers a packet and updates the perception; False when the session is over."""
         received = self.pending = self.link.newest()
         signals = self.signals = self._signals()
         if received is None:
             t_ns = self.now_ns()
-            self.pilot.silence(t_ns, signals)
-            self.recorder.send(codec.silence(t_ns, signals))
+            self.controller.silence(t_ns, signals)
+            self.recorder.send(codec.encode_timeout(t_ns, signals))
         else:
             self._answer(received, signals)
         self._skipped = received is not None and received.waited and not self._skipped
         if self._skipped:
             self.skipped += 1
-            self.pilot.prepare()
+            self.controller.prepare()
         else:
-            self._look()
+            self._update_perception()
         return not self._over(signals)
 
     def _answer(self, received: Received, signals: Signal) -> None:
         event = TickEvent(received.t_ns + self.anchor_ns, (*received.older, received.data), signals)
-        answer = self.pilot.answer(event)
+        answer = self.controller.answer(event)
         if answer.datagram is not None and self.settings.sending:
             self.link.answer(answer.datagram, received.sender)
             self.sent, self.sender = answer.datagram, received.sender
@@ -140,30 +139,30 @@ class Loop:
         self._late = took_ns > self.settings.overrun_s * 1e9
         self.robot = "{}:{}".format(*received.sender)
         for datagram in event.datagrams:
-            self.recorder.send(codec.robot(event.t_ns, datagram))
-        self.recorder.send(codec.answer(answer, signals, len(event.datagrams), took_ns // 1000))
+            self.recorder.send(codec.encode_robot_packet(event.t_ns, datagram))
+        self.recorder.send(codec.encode_decision(answer, signals, len(event.datagrams), took_ns // 1000))
         if answer.datagram is not None:
             self.answers += 1
-            self.took.add(took_ns)
-            self.recorder.send(codec.reply(event.t_ns, answer.datagram, sent=self.settings.sending))
+            self.reply_times.add(took_ns)
+            self.recorder.send(codec.encode_reply(event.t_ns, answer.datagram, sent=self.settings.sending))
         self.last = answer
 
-    def _look(self) -> None:
-        skeletons = self._hear_person()
+    def _update_perception(self) -> None:
+        skeletons = self._receive_skeletons()
         t_ns = self.now_ns()
-        sight = self.pilot.look(t_ns, skeletons)
+        perception = self.controller.update_perception(t_ns, skeletons)
         for skeleton in skeletons:
-            self.recorder.send(codec.frame(t_ns, skeleton))
-        if sight is None:
-            self.recorder.send(codec.event(t_ns, {"what": "blind"}))
+            self.recorder.send(codec.encode_skeleton(t_ns, skeleton))
+        if perception is None:
+            self.recorder.send(codec.encode_event(t_ns, {"what": "blind"}))
             return
-        self.recorder.send(codec.look(sight.states, sight.volumes, len(skeletons)))
+        self.recorder.send(codec.encode_perception(perception.states, perception.volumes, len(skeletons)))
         if t_ns - self._stored_ns >= self.settings.store_every_s * 1e9:
             self._stored_ns = t_ns
-            self.stored = codec.whole(sight.volumes)
+            self.stored = codec.encode_volumes(perception.volumes)
             self.recorder.send(self.stored)
 
-    def _hear_person(self) -> list[bytes]:
+    def _receive_skeletons(self) -> list[bytes]:
         skeletons = []
         for message in self.person.messages():
             self._beat_ns = self.now_ns()
@@ -180,9 +179,9 @@ class Loop:
         return skeletons
 
     def note(self, text: str) -> None:
-        """Something worth telling and recording."""
+        """Keeps a note for the user and records it."""
         self.notes.append(text)
-        self.recorder.send(codec.event(self.now_ns(), {"what": "note", "text": text}))
+        self.recorder.send(codec.encode_event(self.now_ns(), {"what": "note", "text": text}))
 
     def _signals(self) -> Signal:
         now_ns, found = self.now_ns(), self.caught
@@ -194,7 +193,7 @@ class Loop:
             found |= Signal.PERSON_DEAD
         elif now_ns - self._beat_ns > self.settings.person_late_s * 1e9:
             found |= Signal.PERSON_LATE
-        if self.settings.keep_recorder and not self.recorder.notice():
+        if self.settings.keep_recorder and not self.recorder.check_alive():
             found |= Signal.RECORDER_DEAD
         if self.screen is not None and self.screen.crashed():
             found |= Signal.SCREEN_DEAD
@@ -203,7 +202,7 @@ class Loop:
         return found
 
     def _over(self, signals: Signal) -> bool:
-        if self.pilot.stop in REFUSED:
+        if self.controller.stop in REFUSED:
             return True
-        ending = bool(signals & ENDING) or self.pilot.fault is not None
-        return ending and (self.pilot.standing >= FAREWELLS or not self.pilot.connected)
+        ending = bool(signals & ENDING) or self.controller.fault is not None
+        return ending and (self.controller.standing >= FINAL_ANSWERS or not self.controller.connected)

@@ -1,4 +1,4 @@
-"""A live robot's next step: along the way to its programme, along the programme, or to a stop. Nothing is changed."""
+"""The next step of a live robot: along the approach, along the programme, or to a stop. Pure functions."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ Follower = QpFollower | ScalingFollower
 
 
 @dataclass(frozen=True)
-class Setup:
-    """All that a session depends on beside what it hears."""
+class ControlSetup:
+    """Everything that the decisions of a session depend on beside its inputs."""
 
     robot: RobotModel
     programme: Reference
@@ -38,8 +38,8 @@ class Setup:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """Where a robot has got, as far as it was told."""
+class MotionState:
+    """State of the commanded motion after an answer."""
 
     state: RobotState
     programme_s: float  #: of the programme
@@ -47,40 +47,44 @@ class Course:
     arrived: bool = False  #: whether it follows the programme, not the way to it
 
 
-class Said(NamedTuple):
-    """One tick's decision before it is encoded, and where it leads."""
+class MotionStep(NamedTuple):
+    """The step of one tick, and the state of the motion after it."""
 
     reference_m: Floats
     reference_speed: float
     step: Step
-    after: Course
+    after: MotionState
 
 
-def set_out(setup: Setup, course: Course) -> Course:
-    """From where the robot stands to where its programme has got."""
-    goal = setup.programme.sample(course.programme_s).q
-    follower = setup.follow(approach(setup.robot, course.state.q, goal, setup.approach_speed), 0.0)
-    follower.state = course.state
-    return replace(course, follower=follower, arrived=False)
+def start_approach(setup: ControlSetup, motion: MotionState) -> MotionState:
+    """Starts the approach from where the robot stands to the point that its programme has reached."""
+    goal = setup.programme.sample(motion.programme_s).q
+    follower = setup.follow(approach(setup.robot, motion.state.q, goal, setup.approach_speed), 0.0)
+    follower.state = motion.state
+    return replace(motion, follower=follower, arrived=False)
 
 
-def follow(setup: Setup, course: Course, around: Obstacles) -> Said:
-    """One tick along the path."""
-    if course.follower is None:
+def follow(setup: ControlSetup, motion: MotionState, obstacles: Obstacles) -> MotionStep:
+    """One tick along the approach or the programme.
+
+    Raises:
+        ValueError: No approach was started.
+    """
+    if motion.follower is None:
         raise ValueError("follow: the robot has not set out")
-    follower = copy(course.follower)
-    tick = follower.step(around)
-    after = replace(course, state=tick.step.next, follower=follower)
-    if course.arrived:
+    follower = copy(motion.follower)
+    tick = follower.step(obstacles)
+    after = replace(motion, state=tick.step.next, follower=follower)
+    if motion.arrived:
         after = replace(after, programme_s=tick.programme_s)
     elif _at_the_end(setup, follower):
-        follower = setup.follow(setup.programme, course.programme_s)
+        follower = setup.follow(setup.programme, motion.programme_s)
         follower.state = tick.step.next
         after = replace(after, follower=follower, arrived=True)
-    return Said(tick.point.T_world_tcp[:3, 3], float(np.linalg.norm(tick.point.twist[:3])), tick.step, after)
+    return MotionStep(tick.point.T_world_tcp[:3, 3], float(np.linalg.norm(tick.point.twist[:3])), tick.step, after)
 
 
-def _at_the_end(setup: Setup, follower: Follower) -> bool:
+def _at_the_end(setup: ControlSetup, follower: Follower) -> bool:
     """Whether the approach has come to its end."""
     along_s = follower.s_s if isinstance(follower, QpFollower) else follower.along.s_s
     if along_s < follower.reference.duration_s:
@@ -90,11 +94,11 @@ def _at_the_end(setup: Setup, follower: Follower) -> bool:
     return float(np.linalg.norm(pose.T_world_tcp[:3, 3] - goal)) <= setup.waypoint_m
 
 
-def brake(setup: Setup, course: Course, around: Obstacles) -> Said:
+def brake(setup: ControlSetup, motion: MotionState, obstacles: Obstacles) -> MotionStep:
     """Eq. (67): each axis as fast as it can; a robot that stands stays."""
-    robot, plan, state = setup.robot, setup.plan, course.state
+    robot, plan, state = setup.robot, setup.plan, motion.state
     with np.errstate(all="ignore"):
-        seen = control_step.observe(robot, state, around, plan.plan.clearance_m)
+        seen = control_step.observe(robot, state, obstacles, plan.plan.clearance_m)
     step = seen.step(state, control_step.braked(state, robot.ddq_max, plan.dt_s), plan.dt_s, control_step.BRAKING)
-    point = setup.programme.sample(course.programme_s)
-    return Said(point.T_world_tcp[:3, 3], 0.0, step, Course(step.next, course.programme_s))
+    point = setup.programme.sample(motion.programme_s)
+    return MotionStep(point.T_world_tcp[:3, 3], 0.0, step, MotionState(step.next, motion.programme_s))

@@ -1,4 +1,4 @@
-"""The person of a live session: skeletons in, swept volumes out, a look at a time."""
+"""Stages 1 and 2 of a live session: skeletons in, fused person and swept volumes out, one update at a time."""
 
 from __future__ import annotations
 
@@ -9,49 +9,53 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from hrcreplay.human.fusion import fuse
-from hrcreplay.live.record.codec import Sight
+from hrcreplay.live.record.codec import Perception
 from hrcreplay.logs import skeleton_pb2
 from hrcreplay.logs.clean import Cleaner, PersonMemory
 from hrcreplay.logs.decoders import points_of
-from hrcreplay.logs.messages import Row, Undecodable
+from hrcreplay.logs.messages import RawSkeleton, Undecodable
 from hrcreplay.records import CameraFrames
 from hrcreplay.robot.control.separation import obstacles
-from hrcreplay.run.stages import NS, Eyes, Foresight, nothing
+from hrcreplay.run.stages import NS, FusionStage, PredictionStage, no_frames
 
 
 class Observer:
-    """Stages 1 and 2, fed with what has come since the look before."""
+    """Stages 1 and 2, updated with the skeletons that have come since the update before."""
 
-    def __init__(self, eyes: Eyes, foresight: Foresight, cameras: tuple[str, ...], gap_s: float) -> None:
-        self._eyes = eyes
-        self._foresight = foresight
+    def __init__(
+        self, fusion_stage: FusionStage, prediction_stage: PredictionStage, cameras: tuple[str, ...], gap_s: float
+    ) -> None:
+        self._fusion_stage = fusion_stage
+        self._prediction_stage = prediction_stage
         self._cameras = cameras
-        self._nothing = nothing(cameras)
+        self._nothing = no_frames(cameras)
         self._fusion = fuse.start(cameras)
         self._memory = PersonMemory()
         self.counts: Counter[str] = Counter()
         self._cleaner = Cleaner(cameras, gap_s, self.counts)
         self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
 
-    def look(self, t_ns: int, skeletons: Sequence[bytes]) -> Sight:
-        """What is known of the person at ``t_ns``, which must be later than that of the look before.
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
+        """Fused person and swept volumes at ``t_ns``, which must be later than that of the update before.
 
         Args:
-            t_ns: By the session's clock; the arrival of all that this look takes.
+            t_ns: By the session's clock; the arrival of all skeletons of this update [ns].
             skeletons: Serialised Skeleton messages. What cannot be read is counted and left out.
         """
         frames = self._frames(t_ns, skeletons)
         measured = self._nothing
         if frames is not None:
-            self._memory, measured, found = self._eyes.measure(frames, self._memory)
+            self._memory, measured, found = self._fusion_stage.measure(frames, self._memory)
             self.counts.update(found)
             for camera, capture_ns in zip(measured.camera.tolist(), measured.capture_ns.tolist(), strict=True):
                 self.newest_ns[self._cameras[camera]] = capture_ns
         ticks = np.array([t_ns])
-        self._fusion, states, events = fuse.fuse(self._fusion, ticks, measured, self._eyes.filter, self._eyes.limits)
+        self._fusion, states, events = fuse.fuse(
+            self._fusion, ticks, measured, self._fusion_stage.filter, self._fusion_stage.limits
+        )
         self.counts.update(events)
-        volumes = self._foresight.volumes(states)
-        return Sight(t_ns, states, volumes, obstacles(volumes, 0))
+        volumes = self._prediction_stage.volumes(states)
+        return Perception(t_ns, states, volumes, obstacles(volumes, 0))
 
     def age_s(self, t_ns: int) -> float:
         """How old the newest frame of the person is; inf before the first [s]."""
@@ -69,12 +73,14 @@ class Observer:
                 continue
             # a camera whose clock is ahead has seen nothing of the future
             self._cleaner.add(row._replace(capture_ns=min(row.capture_ns or t_ns, t_ns)), t_ns)
-        return self._cleaner.rest()
+        return self._cleaner.flush()
 
 
-def _row(data: bytes) -> Row:
+def _row(data: bytes) -> RawSkeleton:
     skeleton = skeleton_pb2.Skeleton.FromString(data)
     points = points_of(skeleton.points, skeleton.camera)
     if len(skeleton.confidence) != len(points):
         raise Undecodable(f"{skeleton.camera}: {len(skeleton.confidence)} confidences")
-    return Row(skeleton.capture_ns, skeleton.camera, skeleton.body, points, np.array(skeleton.confidence, np.float64))
+    return RawSkeleton(
+        skeleton.capture_ns, skeleton.camera, skeleton.body, points, np.array(skeleton.confidence, np.float64)
+    )

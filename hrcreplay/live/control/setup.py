@@ -1,6 +1,7 @@
-"""From a job to a session's pilot, by way of a table that the record keeps: what it says is enough to begin again.
+"""Set-up of a live session: from its settings to the session controller, by way of a table that is recorded.
 
-Every kernel compiled and every library loaded before the robot waits for an answer.
+The table holds everything that the decisions depend on, so that the record alone suffices to build the controller
+again. ``compile_kernels`` compiles every kernel and loads every library before the robot waits for an answer.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from pydantic import ValidationError
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_robot
-from hrcreplay.egm.session import Session
+from hrcreplay.egm.protocol import EgmSession
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet, skeleton
-from hrcreplay.live.control.motion import Follower, Setup
+from hrcreplay.live.control.motion import ControlSetup, Follower
 from hrcreplay.live.control.perception import Observer
-from hrcreplay.live.control.pilot import Pilot
+from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
@@ -31,18 +32,18 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.run import build
 from hrcreplay.run.build import log_options
-from hrcreplay.run.job import Job, resolve, unlogged
+from hrcreplay.run.job import Job, job_without_log, resolve
 from hrcreplay.settings.load import Settings, load_settings
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What stands for a log where there is none yet: see build.Source."""
+class HeaderOnlyLog:
+    """The header in place of a log that does not exist yet; see ``build.LogLike``."""
 
     header: Header
 
     def joints(self) -> Iterator[JointTrack]:
-        """None: a live robot is told where to go by a task."""
+        """None: a live robot follows a task."""
         return iter(())
 
 
@@ -70,7 +71,7 @@ def live_job(
     if not cameras:
         raise SettingsError("live.zenoh.keys: no camera; name one there, or play a recording with --human LOG")
     where = Path("live.zenoh")
-    job = unlogged("live", where, settings, cell_file)
+    job = job_without_log("live", where, settings, cell_file)
     return job, _header(where, cameras, {}, None, None)
 
 
@@ -96,7 +97,7 @@ def _header(
 
 
 def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
-    """All that the session's decisions depend on beside what it hears, as JSON.
+    """Everything that the session's decisions depend on beside its inputs, as JSON.
 
     Raises:
         SettingsError: There is no task, or it is not known where the robot stands.
@@ -107,19 +108,23 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         raise SettingsError(
             f"{header.path}: no task; a live robot needs one: name a task file with --set plan.task=FILE"
         )
-    known, scene = job.meta(), Scene(header)
-    T_world_base, eyes = build.standing(job, scene), build.eyes(job, scene)
+    known, scene = job.meta(), HeaderOnlyLog(header)
+    T_world_base, fusion_stage = build.robot_base(job, scene), build.fusion_stage(job, scene)
     robot = build.robot(job, T_world_base)
     if robot.nv != AXES:
         raise SettingsError(f"robot.urdf: {robot.name} has {robot.nv} axes; live drives robots of {AXES} over EGM")
-    volumes = Observer(eyes, build.foresight(job), header.cameras, job.settings.logs.gap_s).look(0, ()).volumes
+    volumes = (
+        Observer(fusion_stage, build.prediction_stage(job), header.cameras, job.settings.logs.gap_s)
+        .update_perception(0, ())
+        .volumes
+    )
     return {
         "hrcreplay": __version__,
         "settings": known["settings"],
         "versions": known["versions"],
         "limits": known["limits"],
         "cell": known["cell"],
-        "cameras": {name: T.tolist() for name, T in zip(header.cameras, eyes.T_world_camera, strict=True)},
+        "cameras": {name: T.tolist() for name, T in zip(header.cameras, fusion_stage.T_world_camera, strict=True)},
         "T_world_base": T_world_base.tolist(),
         "task": task,
         "sending": sending,
@@ -129,8 +134,8 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
     }
 
 
-def build_pilot(start: dict[str, Any]) -> Pilot:
-    """The pilot of a session at its start.
+def build_controller(start: dict[str, Any]) -> SessionController:
+    """The controller of a session at its start.
 
     Raises:
         SettingsError: A setting of the table cannot be used.
@@ -138,18 +143,20 @@ def build_pilot(start: dict[str, Any]) -> Pilot:
     job = job_of(start, Path("live session"), "")
     poses = {name: np.array(T) for name, T in start["cameras"].items()}
     header = _header(job.log, tuple(start["cameras"]), poses, np.array(start["T_world_base"]), job.task)
-    scene = Scene(header)
+    scene = HeaderOnlyLog(header)
     setup = _setup(job, scene, sending=start["sending"])
-    observer = Observer(build.eyes(job, scene), build.foresight(job), header.cameras, job.settings.logs.gap_s)
+    observer = Observer(
+        build.fusion_stage(job, scene), build.prediction_stage(job), header.cameras, job.settings.logs.gap_s
+    )
     robot, live = setup.robot, job.settings.live
-    session = Session(
+    session = EgmSession(
         robot.q_min, robot.q_max, robot.dq_max, utilization_max=live.utilization_max, silence_s=live.silent_s
     )
-    return Pilot(setup, observer, session)
+    return SessionController(setup, observer, session)
 
 
 def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
-    """What a session depended on, by its start table.
+    """The job of a session, from its start table.
 
     Raises:
         SettingsError: Its settings are not those of this version.
@@ -175,16 +182,16 @@ def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
     )
 
 
-def _setup(job: Job, scene: Scene, *, sending: bool) -> Setup:
+def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
     live, plan = job.settings.live, job.settings.plan
-    robot = build.robot(job, build.standing(job, scene))
+    robot = build.robot(job, build.robot_base(job, scene))
     programme, _ = build.reference(job, scene, robot)
     settings = build.plan_settings(job, live.cycle_s)
 
     def follow(path: Reference, s_s: float) -> Follower:
-        return build.follow(plan.method, robot, path, settings, s_s)
+        return build.make_follower(plan.method, robot, path, settings, s_s)
 
-    return Setup(
+    return ControlSetup(
         robot=robot,
         programme=programme,
         plan=settings,
@@ -217,27 +224,27 @@ _FRAME_EVERY = 8
 _LENGTHS_M = np.array([[0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
 
 
-def warm(start: dict[str, Any]) -> None:
-    """Runs a session of a second and a half with somebody who walks up to the robot."""
-    pilot = build_pilot({**start, "sending": False})
+def compile_kernels(start: dict[str, Any]) -> None:
+    """Compiles every kernel by a simulated session of 1.6 s with a person who walks up to the robot."""
+    controller = build_controller({**start, "sending": False})
     camera, T = next(iter(start["cameras"].items()))
     to_camera = np.linalg.inv(np.array(T))
     base = np.array(start["T_world_base"])[:3, 3]
-    q = pilot.setup.programme.q0
+    q = controller.setup.programme.q0
     for tick in range(_TICKS):
         t_ns = 10**18 + tick * _TICK_NS
         packet = RobotPacket(tick, tick * 4, t_ns, q, q, Motors.ON, Mci.RUNNING, Rapid.RUNNING, False, 0.0)
         event = TickEvent(t_ns, (encode_robot(packet),), Signal.NONE)
-        answer = pilot.answer(event)
-        codec.answer(answer, Signal.NONE, 1, 0)
+        answer = controller.answer(event)
+        codec.encode_decision(answer, Signal.NONE, 1, 0)
         away_m = 2.0 - 1.6 * tick / _TICKS
         seen = [] if tick % _FRAME_EVERY else [_seen(camera, to_camera, base + np.array([away_m, 0.0, 0.0]), t_ns)]
-        sight = pilot.look(t_ns + 1_000_000, seen)
-        if pilot.fault is not None:
-            raise pilot.fault
-        if sight is not None:
-            codec.look(sight.states, sight.volumes, len(seen))
-            codec.whole(sight.volumes)
+        perception = controller.update_perception(t_ns + 1_000_000, seen)
+        if controller.fault is not None:
+            raise controller.fault
+        if perception is not None:
+            codec.encode_perception(perception.states, perception.volumes, len(seen))
+            codec.encode_volumes(perception.volumes)
 
 
 def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int) -> bytes:

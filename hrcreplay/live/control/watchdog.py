@@ -1,4 +1,4 @@
-"""The watchdog: everything that must stop a live robot, by name."""
+"""The watchdog: every condition that must stop a live robot, with the name of its stop reason."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from hrcreplay.egm.session import Heard
-from hrcreplay.live.record.codec import Sight, Signal
+from hrcreplay.egm.protocol import PacketStatus
+from hrcreplay.live.record.codec import Perception, Signal
 from hrcreplay.records import Floats
 from hrcreplay.settings.sections import Live
 
@@ -27,7 +27,7 @@ ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
 #: Robots that are not answered at all.
 REFUSED = ("radians", "axes")
 
-#: Reasons by signal, the most telling first.
+#: Reasons by signal, the most important first.
 SIGNALS = {
     Signal.INTERRUPT: INTERRUPTED,
     Signal.TERMINATE: TERMINATED,
@@ -48,19 +48,19 @@ def of_signals(signals: Signal) -> str:
     return next((reason for signal, reason in SIGNALS.items() if signal in signals), "")
 
 
-def of_robot(heard: Heard) -> str:
+def of_robot(packet_status: PacketStatus) -> str:
     """The reason that lies with the robot, or none."""
-    if heard.reason:
-        return heard.reason
-    return "" if heard.allowed else "robot not ready"
+    if packet_status.reason:
+        return packet_status.reason
+    return "" if packet_status.allowed else "robot not ready"
 
 
-def of_person(sight: Sight | None, age_s: float, bounds: Live) -> str:
+def of_person(perception: Perception | None, age_s: float, bounds: Live) -> str:
     """The reason that lies with what is known of the person, or none."""
-    if sight is None or not age_s <= bounds.fresh_s:
+    if perception is None or not age_s <= bounds.fresh_s:
         return NO_FRAME
-    std = sight.states.p_std[0, :_BASE]
-    if not math.isfinite(sight.states.p.sum() + sight.states.v.sum()):
+    std = perception.states.p_std[0, :_BASE]
+    if not math.isfinite(perception.states.p.sum() + perception.states.v.sum()):
         return NOT_FINITE
     sure = max(std[0], std[1]) <= bounds.uncertain_m and max(std[2], std[3]) <= bounds.uncertain_rad
     return "" if sure else UNCERTAIN

@@ -1,1 +1,1 @@
-"""The person of a live session, a process of its own: a recording or Zenoh, as skeletons for the control loop."""
+"""The process that supplies a live session with skeletons, from a recording or from Zenoh."""

@@ -1,4 +1,7 @@
-"""A recording as the person of a live session: its frames at their own pace, read ahead so that none is late."""
+"""Playback of a recording as the source of skeletons: each frame is sent when it is due.
+
+A thread reads ahead, so that no frame is late because of the file.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ class Frame(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """What is known before the first frame."""
+    """Cameras and span of a recording, known before its first frame."""
 
     cameras: tuple[str, ...]
     start_ns: int
@@ -38,7 +41,7 @@ class Opened(NamedTuple):
 
 
 class Note(NamedTuple):
-    """Something to tell the user, when reading has come to it."""
+    """A note for the user, sent when its place in the recording is reached."""
 
     text: str
 
@@ -46,8 +49,8 @@ class Note(NamedTuple):
 Item = Opened | Note | list[Frame] | Exception | None  #: None: nothing will follow
 
 
-def passes(log: Log, *, repeat: bool) -> Iterator[Item]:
-    """All that a recording gives: its span, its frames chunk by chunk, again and again with ``repeat``, remarks."""
+def playback_items(log: Log, *, repeat: bool) -> Iterator[Item]:
+    """What is read from a recording: its span, its frames chunk by chunk (again and again with ``repeat``), notes."""
     header = log.header
     yield Opened(header.cameras, header.start_ns, header.end_ns)
     newest: dict[str, int] = {}  # last capture of each camera in the passes before
@@ -90,12 +93,12 @@ def frames_of(table: CameraFrames, later_ns: int = 0) -> Iterator[Frame]:
         yield Frame(int(table.arrival_ns[i]) + later_ns, skeleton)
 
 
-def same(one: Frame, two: Frame) -> bool:
+def same_frame(one: Frame, two: Frame) -> bool:
     """Whether two bodies stood in one frame. The shift to session time comes when the first of them is sent."""
     return (one.skeleton.camera, one.skeleton.capture_ns) == (two.skeleton.camera, two.skeleton.capture_ns)
 
 
-def ready(cameras: tuple[str, ...]) -> Message:
+def ready_note(cameras: tuple[str, ...]) -> Message:
     """The note that tells control that frames can come, and from whom."""
     return b"N", b"ready " + json.dumps({"cameras": list(cameras)}).encode()
 
@@ -143,7 +146,7 @@ class Playback:
             if isinstance(head, Note):
                 yield b"N", head.text.encode()
             else:
-                more = self._waiting and isinstance(self._waiting[0], Frame) and same(head, self._waiting[0])
+                more = self._waiting and isinstance(self._waiting[0], Frame) and same_frame(head, self._waiting[0])
                 head.skeleton.capture_ns += self._shift_ns
                 yield b"f" if more else b"F", head.skeleton.SerializeToString()
         if not self._exhausted and not self._behind:
@@ -171,7 +174,7 @@ class Playback:
         if isinstance(opened, Opened):
             self._opened = opened
             self._end_ns = opened.end_ns
-            yield ready(opened.cameras)
+            yield ready_note(opened.cameras)
 
     def _fill(self) -> bool:
         """Whether a message waits, taking what has been read where none does."""
@@ -208,4 +211,4 @@ def play(path: Path, options: dict[str, Any], *, repeat: bool) -> Playback:
         topics=tuple(options.get("topics", ())),
         decoders=tuple(GenericDecoder(**described) for described in options.get("decoders", ())),
     )
-    return Playback(lambda: passes(open_log(path, chosen), repeat=repeat))
+    return Playback(lambda: playback_items(open_log(path, chosen), repeat=repeat))

@@ -1,6 +1,6 @@
-"""The human side of a live session, a process of its own: skeletons to the control loop, from a recording or Zenoh.
+"""The process that sends skeletons to the control process, from a recording or from Zenoh.
 
-Messages to control: ``H`` heartbeat every 20 ms, whatever else goes on; ``F`` + a serialized Skeleton, captured in
+Messages to control: ``H`` heartbeat every 20 ms, whatever else happens; ``F`` + a serialized Skeleton, captured in
 session time, ``f`` where another body of the same frame follows; ``N`` + a note in UTF-8; ``Z`` end of the recording.
 The first note is ``ready {"cameras": [...]}``; a note that begins with ``failed`` is the reason why the process ends.
 From control: ``G`` + the session's start as 8 bytes, little-endian [ns], before which no frame is sent. The process
@@ -23,15 +23,15 @@ from typing import NoReturn, Protocol
 from hrcreplay.errors import HrcReplayError
 from hrcreplay.live.person.log_playback import Message, play
 from hrcreplay.live.person.zenoh_source import ZenohSource
-from hrcreplay.live.processes import Channel, ControlGoneError
+from hrcreplay.live.processes import ControlChannel, ControlGoneError
 
 BEAT_NS = 20_000_000
 _NICE = -10  # where that is permitted: right after control, before recorder and screen
 _SWITCH_S = 0.0005  # a thread that decodes gives way to one whose time has come after this long
 
 
-class Source(Protocol):
-    """Where skeletons come from."""
+class SkeletonSource(Protocol):
+    """A source of skeletons: a recording or Zenoh."""
 
     def go(self, start_ns: int) -> None:
         """Starts the flow at ``start_ns`` of session time."""
@@ -43,15 +43,15 @@ class Source(Protocol):
         """When the next message is due; None: not known, or woken otherwise."""
 
 
-class Pace:
-    """What to send when: heartbeats at fixed instants, and what the source has due. Knows no clock and no socket."""
+class SendSchedule:
+    """Schedule of the messages to control: heartbeats at fixed instants, and what is due. No clock, no socket."""
 
-    def __init__(self, source: Source, now_ns: int) -> None:
+    def __init__(self, source: SkeletonSource, now_ns: int) -> None:
         self._source = source
         self._beat_ns = now_ns
 
-    def hear(self, message: bytes) -> None:
-        """Takes a message of control's."""
+    def receive(self, message: bytes) -> None:
+        """Handles a message from control."""
         if message[:1] == b"G" and len(message) == 9:
             self._source.go(int.from_bytes(message[1:], "little"))
 
@@ -68,14 +68,14 @@ class Pace:
         return self._beat_ns if due_ns is None else min(self._beat_ns, due_ns)
 
 
-def run(channel: Channel, source: Source, anchor_ns: int) -> NoReturn:
+def run(channel: ControlChannel, source: SkeletonSource, anchor_ns: int) -> NoReturn:
     """Serves until control is gone.
 
     Raises:
         ControlGoneError: It is.
         HrcReplayError: The source cannot go on.
     """
-    pace = Pace(source, time.monotonic_ns() + anchor_ns)
+    pace = SendSchedule(source, time.monotonic_ns() + anchor_ns)
     told = 0
     while True:
         now_ns = time.monotonic_ns() + anchor_ns
@@ -87,7 +87,7 @@ def run(channel: Channel, source: Source, anchor_ns: int) -> NoReturn:
         now_ns = time.monotonic_ns() + anchor_ns
         message = channel.receive((pace.next_ns(now_ns) - now_ns) / 1e9)
         if message is not None:
-            pace.hear(message)
+            pace.receive(message)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.setswitchinterval(_SWITCH_S)
     with suppress(PermissionError):
         os.nice(_NICE)
-    channel = Channel(given.fd)
+    channel = ControlChannel(given.fd)
     try:
         source = _source(given, channel)
         gc.freeze()
@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
 
 
-def _source(given: argparse.Namespace, channel: Channel) -> Source:
+def _source(given: argparse.Namespace, channel: ControlChannel) -> SkeletonSource:
     if given.log is not None:
         return play(given.log, given.options, repeat=given.repeat)
     return ZenohSource(given.zenoh, channel.send, lambda: time.monotonic_ns() + int(given.anchor))

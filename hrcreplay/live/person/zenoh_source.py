@@ -1,6 +1,6 @@
-"""Skeletons from live Zenoh keys: our own messages, or the CDR ones that a ROS 2 system puts there.
+"""Skeletons from Zenoh keys: messages of our own format, or the CDR messages of a ROS 2 system.
 
-Arrival is stamped by control. A capture time is taken as it is: it and the session's clock are both unix time.
+Control stamps the arrival. A capture time is used as it is, because it and the session's clock are both Unix time.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from google.protobuf.message import DecodeError
 
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live.person.log_playback import Message as Outgoing
-from hrcreplay.live.person.log_playback import frames_of, ready, same
+from hrcreplay.live.person.log_playback import frames_of, ready_note, same_frame
 from hrcreplay.live.processes import ControlGoneError
 from hrcreplay.logs import decoders, ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
 from hrcreplay.logs.decoders import GenericDecoder, MarkerDecoder, OwnDecoder, TfDecoder
-from hrcreplay.logs.messages import Decoder, Message, Row, Topic, Undecodable
+from hrcreplay.logs.messages import Message, RawSkeleton, SkeletonDecoder, Topic, Undecodable
 
 _OWN = "hrcreplay.Skeleton"
 _RMW_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")  # in the keys of rmw_zenoh: <domain>/<topic>/<type>/<hash>
@@ -37,7 +37,7 @@ _GAP_S = 0.2
 
 @dataclass(frozen=True)
 class KeySettings:
-    """What lies under the keys of one camera."""
+    """Format of the payloads under the keys of one camera."""
 
     key: str  #: key expression: 0/kinect/skeleton/** of rmw_zenoh, kinect/skeleton of the DDS bridge
     payload: str = "hrcreplay"  #: "hrcreplay" or "cdr"
@@ -50,14 +50,14 @@ class KeySettings:
     confidence: str | None = None
 
 
-class Stream:
+class CameraSubscription:
     """The keys of one camera: payloads in, cleaned skeletons out."""
 
     def __init__(self, camera: str, settings: KeySettings) -> None:
         self._camera = camera
         self._settings = settings
         self._where = f"live.zenoh.keys.{camera}"
-        self._readers: dict[str, tuple[Topic, Decoder]] = {}  # of each type
+        self._readers: dict[str, tuple[Topic, SkeletonDecoder]] = {}  # of each type
         self._defects: Counter[str] = Counter()
         self._cleaner = Cleaner((camera,), _GAP_S, self._defects)
         self._told: set[str] = set()
@@ -72,7 +72,7 @@ class Stream:
                 self._reader(given.key, ros_bags.plain(msgtype))[0].parse(b"")
 
     def take(self, key: str, data: bytes, now_ns: int) -> Iterator[Outgoing]:
-        """What control is to hear of a payload: its bodies, and remarks, each once."""
+        """Messages to control for one payload: its bodies, and notes, each once."""
         try:
             rows = self._rows(key, data, now_ns)
         except Exception as error:  # whatever a stranger sends: it is not worth more than a remark
@@ -84,18 +84,18 @@ class Stream:
             yield from self._clocks(row, now_ns)
             if row.capture_ns is None or row.capture_ns - now_ns < _AHEAD_NS:
                 self._cleaner.add(row, now_ns)
-        table = self._cleaner.rest()
+        table = self._cleaner.flush()
         if table is not None:
             frames = list(frames_of(table))
             for frame, after in zip(frames, [*frames[1:], None], strict=True):
-                kind = b"f" if after is not None and same(frame, after) else b"F"
+                kind = b"f" if after is not None and same_frame(frame, after) else b"F"
                 yield kind, frame.skeleton.SerializeToString()
         for name, count in self._defects.items():
             if count and name in DEFECTS and name not in self._told:
                 self._told.add(name)
                 yield self._note(f"{name}: {DEFECTS[name]}")
 
-    def _clocks(self, row: Row, now_ns: int) -> Iterator[Outgoing]:
+    def _clocks(self, row: RawSkeleton, now_ns: int) -> Iterator[Outgoing]:
         age_ns = 0 if row.capture_ns is None else now_ns - row.capture_ns
         if not -_AHEAD_NS < age_ns < _OLD_NS and "clocks" not in self._told:
             self._told.add("clocks")
@@ -103,7 +103,7 @@ class Stream:
             what = f"before; {kept}" if age_ns > 0 else "after; left out"
             yield self._note(f"captured {abs(age_ns) / 1e9:.3f} s {what}. Set the clocks of both computers")
 
-    def _rows(self, key: str, data: bytes, now_ns: int) -> list[Row]:
+    def _rows(self, key: str, data: bytes, now_ns: int) -> list[RawSkeleton]:
         topic, decoder = self._reader(key, self._type(key))
         rows = decoder.rows(Message(now_ns, topic, data))
         return [row._replace(camera=self._camera) if row.capture_ns else _unstamped(row, self._camera) for row in rows]
@@ -118,12 +118,12 @@ class Stream:
             raise LogError(f"key {key} does not tell its type; name it: type = 'package/msg/Name'")
         return f"{named[1]}/{named[2]}"
 
-    def _reader(self, key: str, msgtype: str) -> tuple[Topic, Decoder]:
+    def _reader(self, key: str, msgtype: str) -> tuple[Topic, SkeletonDecoder]:
         if msgtype not in self._readers:
             self._readers[msgtype] = self._new_reader(key, msgtype)
         return self._readers[msgtype]
 
-    def _new_reader(self, key: str, msgtype: str) -> tuple[Topic, Decoder]:
+    def _new_reader(self, key: str, msgtype: str) -> tuple[Topic, SkeletonDecoder]:
         given = self._settings
         if msgtype == _OWN:
             return Topic(key, msgtype, 1, _own), OwnDecoder(key, self._camera)
@@ -141,7 +141,7 @@ class Stream:
         return b"N", f"{self._where}: {text}".encode()
 
 
-def _unstamped(row: Row, camera: str) -> Row:
+def _unstamped(row: RawSkeleton, camera: str) -> RawSkeleton:
     return row._replace(camera=camera, capture_ns=None, stamp_zero=row.stamp_zero or row.capture_ns == 0)
 
 
@@ -190,16 +190,16 @@ class ZenohSource:
             session = open_session(self._settings)
             self._open.append(session)
             for name, given in keys.items():
-                stream = Stream(name, given)
+                stream = CameraSubscription(name, given)
                 stream.prepare()
                 self._open.append(_subscribe(session, name, given, self._taker(stream)))
-            self._send(*ready(tuple(keys)))
+            self._send(*ready_note(tuple(keys)))
         except ControlGoneError:
             pass  # the main thread sees it too
         except Exception as error:  # raised again where the process can tell of it
             self._failure = error
 
-    def _taker(self, stream: Stream) -> Callable[[Any], None]:
+    def _taker(self, stream: CameraSubscription) -> Callable[[Any], None]:
         def take(sample: Any) -> None:
             data = sample.payload.to_bytes()
             if not self._going or not data:  # a deletion has no payload

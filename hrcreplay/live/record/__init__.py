@@ -1,1 +1,1 @@
-"""The record of a live session: the recorder's process, its messages, and the run folder made of them."""
+"""The record of a live session: its messages, the process that writes them, and the run folder made from them."""

@@ -1,20 +1,18 @@
-"""The record of a live session as messages: what control tells the recorder, and what the log holds.
+"""Messages of a session's record: what control sends to the recorder, and what the log holds.
 
-The first byte is the kind, the next eight the session's clock [ns]; numbers are little-endian. Whatever decides a tick
-is in here, so the log alone is enough to run the session again (see verify).
+The first byte is the kind, the next eight the session's clock [ns]; numbers are little-endian. Everything that decides
+a tick is recorded, so the log alone suffices to compute the session again (see ``live.verify``).
 
 ======  ==========================================================================================================
 ``R``   a datagram of the robot, as it came
-``C``   our reply, as it went (or would have gone: in shadow mode ``sent`` is 0)
-``F``   a skeleton that a look took: the serialised Skeleton message; the clock is that of the look, its arrival
-``L``   a look: state of the person, digests of the swept volumes
-``V``   the swept volumes of some looks, whole
-``A``   an answer: signals in, decision out
-``S``   nothing came from the robot within the time-out
-``E``   JSON: the settings at the start, remarks, the end
+``C``   our reply, as it was sent (in shadow mode nothing is sent, and ``sent`` is 0)
+``F``   a skeleton that a perception update used: the serialised Skeleton message, with the clock of the update
+``L``   a perception update: state of the person, digests of the swept volumes
+``V``   the swept volumes of some perception updates, complete
+``A``   a decision: the loop's signals in, what the robot was told out
+``S``   no packet came from the robot within the time-out
+``E``   JSON: the settings at the start, notes, the end
 ======  ==========================================================================================================
-
-What goes into one tick of a live session, and what comes out.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ WAITING, ECHO, APPROACH, FOLLOWING, STOPPING, HOLDING = range(len(PHASES))
 
 
 class Signal(IntFlag):
-    """What the loop found outside the stages and tells the pilot with an event. Part of the record."""
+    """Conditions that the loop finds outside the stages and passes to the controller with an event. Recorded."""
 
     NONE = 0
     INTERRUPT = 1  #: Ctrl-C
@@ -64,7 +62,7 @@ class TickEvent:
 
 @dataclass(frozen=True, slots=True)
 class MotionRow:
-    """What the robot was told in one answer. Angles in rad, positions in the world in m."""
+    """The commanded motion of one answer. Angles in rad, positions in the world in m."""
 
     q_measured: Floats  #: (6,) where it said it was
     q: Floats  #: (6,) commanded position at the tick
@@ -89,11 +87,11 @@ WIDTHS = (AXES, AXES, AXES, AXES, 3, 3, 4)
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """What the pilot decided on an event."""
+class Decision:
+    """What the controller decided on an event."""
 
     t_ns: int  #: of the event
-    look_ns: int  #: of the look whose volumes it kept clear of
+    look_ns: int  #: of the perception update whose volumes it kept clear of
     datagram: bytes | None  #: reply to the robot; None where none is due
     phase: int  #: index into PHASES
     status: int  #: index into records.STATUSES
@@ -104,16 +102,16 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
-    """What is known of the person after a look."""
+class Perception:
+    """What is known of the person after a perception update."""
 
     t_ns: int
     states: HumanStates  #: one row
     volumes: SweptVolumes  #: one row
-    around: Obstacles
+    obstacles: Obstacles
 
 
-ROBOT, REPLY, FRAME, LOOK, VOLUMES, ANSWER, SILENCE, EVENT = (b"R", b"C", b"F", b"L", b"V", b"A", b"S", b"E")
+ROBOT, REPLY, SKELETON, PERCEPTION, VOLUMES, DECISION, TIMEOUT, EVENT = (b"R", b"C", b"F", b"L", b"V", b"A", b"S", b"E")
 
 _HEAD = struct.Struct("<cq")
 _REPLY = struct.Struct("<cqB")
@@ -125,83 +123,83 @@ _DIGEST = 8
 
 
 def kind(message: bytes) -> bytes:
-    """Which message it is."""
+    """Kind of a message: its first byte."""
     return message[:1]
 
 
 def clock_ns(message: bytes) -> int:
-    """When it was, by the session's clock."""
+    """Instant of a message by the session's clock [ns]."""
     return int(_HEAD.unpack_from(message)[1])
 
 
 def body(message: bytes) -> bytes:
-    """What follows kind and clock: the datagram, the skeleton."""
+    """Content of a message after kind and clock: the datagram, the skeleton."""
     return message[_HEAD.size :]
 
 
-def robot(t_ns: int, datagram: bytes) -> bytes:
-    """A datagram that came."""
+def encode_robot_packet(t_ns: int, datagram: bytes) -> bytes:
+    """Encodes a datagram of the robot."""
     return _HEAD.pack(ROBOT, t_ns) + datagram
 
 
-def frame(t_ns: int, skeleton: bytes) -> bytes:
-    """A skeleton, by the look that took it."""
-    return _HEAD.pack(FRAME, t_ns) + skeleton
+def encode_skeleton(t_ns: int, skeleton: bytes) -> bytes:
+    """Encodes a skeleton with the clock of the perception update that used it."""
+    return _HEAD.pack(SKELETON, t_ns) + skeleton
 
 
-def reply(t_ns: int, datagram: bytes, *, sent: bool) -> bytes:
-    """A datagram that went, or would have gone."""
+def encode_reply(t_ns: int, datagram: bytes, *, sent: bool) -> bytes:
+    """Encodes a reply; ``sent`` is False in shadow mode."""
     return _REPLY.pack(REPLY, t_ns, sent) + datagram
 
 
-def read_reply(message: bytes) -> tuple[bool, bytes]:
-    """Whether it was sent, and the datagram."""
+def decode_reply(message: bytes) -> tuple[bool, bytes]:
+    """Whether a recorded reply was sent, and its datagram."""
     return bool(_REPLY.unpack_from(message)[2]), message[_REPLY.size :]
 
 
-def event(t_ns: int, what: dict[str, Any]) -> bytes:
-    """Something worth telling."""
+def encode_event(t_ns: int, what: dict[str, Any]) -> bytes:
+    """Encodes an event as JSON."""
     return _HEAD.pack(EVENT, t_ns) + json.dumps(what, sort_keys=True, allow_nan=False).encode()
 
 
-def read_event(message: bytes) -> dict[str, Any]:
-    """What there was to tell."""
+def decode_event(message: bytes) -> dict[str, Any]:
+    """Content of a recorded event."""
     found: dict[str, Any] = json.loads(body(message))
     return found
 
 
-def silence(t_ns: int, signals: Signal) -> bytes:
-    """The robot said nothing."""
-    return _SILENCE.pack(SILENCE, t_ns, signals)
+def encode_timeout(t_ns: int, signals: Signal) -> bytes:
+    """Encodes a time-out: no packet came from the robot."""
+    return _SILENCE.pack(TIMEOUT, t_ns, signals)
 
 
-def read_silence(message: bytes) -> Signal:
-    """What else was the matter then."""
+def decode_timeout(message: bytes) -> Signal:
+    """Signals of a recorded time-out."""
     return Signal(_SILENCE.unpack_from(message)[2])
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """A look as the record has it."""
+class RecordedPerception:
+    """A perception update as it is recorded."""
 
     t_ns: int
-    skeletons: int  #: taken by it: the FRAME messages right before it
+    skeletons: int  #: used by it: the SKELETON messages right before it
     state: Floats  #: all numbers of the state's row, in the order of the record's fields
     valid: bytes  #: a byte a camera
     digests: tuple[bytes, ...]  #: of vertices and radius, a limb each
 
 
-def look(states: HumanStates, volumes: SweptVolumes, skeletons: int) -> bytes:
-    """A look that took so many skeletons."""
-    state = flat(states)
-    digests = [digest(volumes, limb) for limb in range(len(volumes.limbs))]
+def encode_perception(states: HumanStates, volumes: SweptVolumes, skeletons: int) -> bytes:
+    """Encodes a perception update that used so many skeletons."""
+    state = state_numbers(states)
+    digests = [volume_digest(volumes, limb) for limb in range(len(volumes.limbs))]
     valid = states.valid[0].tobytes()
-    head = _LOOK.pack(LOOK, int(states.t_ns[0]), skeletons, len(state), len(valid), len(digests))
+    head = _LOOK.pack(PERCEPTION, int(states.t_ns[0]), skeletons, len(state), len(valid), len(digests))
     return b"".join([head, state.tobytes(), valid, *digests])
 
 
-def read_look(message: bytes) -> Look:
-    """A look as it was recorded."""
+def decode_perception(message: bytes) -> RecordedPerception:
+    """Decodes a perception update."""
     _, t_ns, skeletons, numbers, cameras, limbs = _LOOK.unpack_from(message)
     at = _LOOK.size
     state = np.frombuffer(message, "<f8", numbers, at)
@@ -209,30 +207,30 @@ def read_look(message: bytes) -> Look:
     valid = message[at : at + cameras]
     at += cameras
     digests = tuple(message[at + _DIGEST * i : at + _DIGEST * (i + 1)] for i in range(limbs))
-    return Look(t_ns, skeletons, state, valid, digests)
+    return RecordedPerception(t_ns, skeletons, state, valid, digests)
 
 
-def flat(states: HumanStates) -> Floats:
-    """The numbers of one row of states, field after field."""
+def state_numbers(states: HumanStates) -> Floats:
+    """All numbers of one row of states, field after field."""
     found = vars(states).values()
     return np.concatenate([value[0] for value in found if isinstance(value, np.ndarray) and value.dtype == np.float64])
 
 
-def digest(volumes: SweptVolumes, limb: int) -> bytes:
-    """What stands for one limb's volume of a single tick."""
+def volume_digest(volumes: SweptVolumes, limb: int) -> bytes:
+    """Hash of one limb's volume at a single tick."""
     what = hashlib.blake2b(volumes.vertices(0, limb).data, digest_size=_DIGEST)
     what.update(volumes.radius_m[0, limb].tobytes())
     return what.digest()
 
 
-def whole(volumes: SweptVolumes) -> bytes:
-    """The swept volumes of one look."""
+def encode_volumes(volumes: SweptVolumes) -> bytes:
+    """Encodes the swept volumes of one perception update."""
     head = _VOLUMES.pack(VOLUMES, int(volumes.t_ns[0]), len(volumes.limbs), len(volumes.vertices_m))
     return b"".join([head, volumes.offsets.tobytes(), volumes.radius_m.tobytes(), volumes.vertices_m.tobytes()])
 
 
-def read_whole(message: bytes, limbs: tuple[str, ...], method: str) -> SweptVolumes:
-    """The swept volumes as they were recorded; their limbs' names and method are known from the session's start."""
+def decode_volumes(message: bytes, limbs: tuple[str, ...], method: str) -> SweptVolumes:
+    """Decodes swept volumes; the names of their limbs and their method are in the session's start event."""
     _, t_ns, count, vertices = _VOLUMES.unpack_from(message)
     at = _VOLUMES.size
     offsets = np.frombuffer(message, "<i8", count + 1, at)
@@ -244,8 +242,8 @@ def read_whole(message: bytes, limbs: tuple[str, ...], method: str) -> SweptVolu
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
-    """An answer as the record has it; its reply is the REPLY message right after it, where one was due."""
+class RecordedDecision:
+    """A decision as it is recorded; its reply is the REPLY message right after it, where one was due."""
 
     t_ns: int
     look_ns: int
@@ -260,11 +258,18 @@ class Answered:
     row: Floats | None  #: (34,) of a MotionRow
 
 
-def answer(found: Answer, signals: Signal, datagrams: int, took_us: int) -> bytes:
-    """A decision."""
+def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: int) -> bytes:
+    """Encodes a decision.
+
+    Args:
+        found: What the controller decided.
+        signals: What the loop had found outside the stages.
+        datagrams: Number of the robot's datagrams that the decision answers.
+        took_us: From the first datagram's arrival to the reply's departure [us].
+    """
     numbers = b"" if found.row is None else found.row.flat().tobytes()
     head = _ANSWER.pack(
-        ANSWER,
+        DECISION,
         found.t_ns,
         found.look_ns,
         took_us,
@@ -278,16 +283,16 @@ def answer(found: Answer, signals: Signal, datagrams: int, took_us: int) -> byte
     return b"".join([head, bytes([len(numbers) // 8]), numbers, found.reason.encode()])
 
 
-def read_answer(message: bytes) -> Answered:
-    """A decision as it was recorded."""
+def decode_decision(message: bytes) -> RecordedDecision:
+    """Decodes a decision."""
     _, t_ns, look_ns, took_us, signals, phase, status, limb, link, datagrams = _ANSWER.unpack_from(message)
     at = _ANSWER.size
     numbers = message[at]
     row = np.frombuffer(message, "<f8", numbers, at + 1) if numbers else None
     reason = message[at + 1 + 8 * numbers :].decode()
-    return Answered(t_ns, look_ns, took_us, Signal(signals), phase, status, reason, limb, link, datagrams, row)
+    return RecordedDecision(t_ns, look_ns, took_us, Signal(signals), phase, status, reason, limb, link, datagrams, row)
 
 
-def motion_row(answered: Answered) -> MotionRow | None:
-    """The numbers of an answer by name."""
+def motion_row(answered: RecordedDecision) -> MotionRow | None:
+    """The commanded motion of a recorded decision; None without a reply."""
     return None if answered.row is None else MotionRow.of(answered.row)

@@ -1,7 +1,4 @@
-"""The messages of a session's record as the tables of a run folder.
-
-The run folder of a live session: a place for its log at the start, and all the rest from that log at the end.
-"""
+"""The run folder of a live session: made from its log when the session has ended or was killed."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ from hrcreplay.live import processes
 from hrcreplay.live.control.setup import job_of
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, MotionRow
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Motion
@@ -29,10 +26,10 @@ from hrcreplay.run import build
 from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job
 from hrcreplay.run.report import write_report
-from hrcreplay.run.stages import store as store_volumes
+from hrcreplay.run.stages import store_volumes
 from hrcreplay.store import run_folder
+from hrcreplay.store.columns import Columns, measurement_columns, motion_columns, state_columns
 from hrcreplay.store.run_folder import RunWriter, TableWriter
-from hrcreplay.store.tables import Columns, measurement_columns, motion_columns, state_columns
 
 _BATCH = TableWriter.ROWS
 
@@ -49,33 +46,33 @@ class SessionTables:
     counts: Counter[str] = field(default_factory=Counter)
     took_us: list[int] = field(default_factory=list)  #: of every reply
     events: list[dict[str, Any]] = field(default_factory=list)  #: beside the start
-    _looks: list[codec.Look] = field(default_factory=list)
-    _answers: list[codec.Answered] = field(default_factory=list)
+    _looks: list[codec.RecordedPerception] = field(default_factory=list)
+    _answers: list[codec.RecordedDecision] = field(default_factory=list)
 
     def add(self, message: bytes) -> None:
         """Takes a message of the record."""
         kind = codec.kind(message)
         self.counts[_COUNTED[kind]] += 1
-        if kind == codec.LOOK:
-            self._looks.append(codec.read_look(message))
+        if kind == codec.PERCEPTION:
+            self._looks.append(codec.decode_perception(message))
         elif kind == codec.VOLUMES:
-            store_volumes(codec.read_whole(message, self.limbs, self.method), np.zeros(1, np.int64), self.run)
-        elif kind == codec.ANSWER:
-            self._answered(codec.read_answer(message))
+            store_volumes(codec.decode_volumes(message, self.limbs, self.method), np.zeros(1, np.int64), self.run)
+        elif kind == codec.DECISION:
+            self._answered(codec.decode_decision(message))
         elif kind == codec.EVENT:
-            self.events.append(codec.read_event(message))
+            self.events.append(codec.decode_event(message))
         if max(len(self._looks), len(self._answers)) >= _BATCH:
             self.flush()
 
     def flush(self) -> None:
-        """Writes what waits."""
+        """Writes the rows collected so far."""
         if self._looks:
             self.run.table("state", state_columns(_states(self._looks, self.cameras, self.run.partial)))
         if self._answers:
             self.run.table("motion", _motion(self._answers, self.limbs, self.links))
         self._looks, self._answers = [], []
 
-    def _answered(self, answered: codec.Answered) -> None:
+    def _answered(self, answered: codec.RecordedDecision) -> None:
         if answered.row is not None:  # else there was no packet to answer
             self._answers.append(answered)
             self.took_us.append(answered.took_us)
@@ -93,16 +90,16 @@ class SessionTables:
 _COUNTED = {
     codec.ROBOT: "robot_packets",
     codec.REPLY: "replies",
-    codec.FRAME: "skeletons",
-    codec.LOOK: "looks",
+    codec.SKELETON: "skeletons",
+    codec.PERCEPTION: "looks",
     codec.VOLUMES: "looks_with_volumes",
-    codec.ANSWER: "answers",
-    codec.SILENCE: "silences",
+    codec.DECISION: "answers",
+    codec.TIMEOUT: "silences",
     codec.EVENT: "events",
 }
 
 
-def _states(looks: list[codec.Look], cameras: tuple[str, ...], where: Path) -> HumanStates:
+def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], where: Path) -> HumanStates:
     numbers = np.array([look.state for look in looks])
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), 12)
     widths |= {"lengths_m": 8, "lengths_std_m": 8, "residual_m": len(BODY), "unseen_s": len(LIMBS)}
@@ -121,7 +118,7 @@ def _states(looks: list[codec.Look], cameras: tuple[str, ...], where: Path) -> H
     )
 
 
-def _motion(answers: list[codec.Answered], limbs: tuple[str, ...], links: tuple[str, ...]) -> Columns:
+def _motion(answers: list[codec.RecordedDecision], limbs: tuple[str, ...], links: tuple[str, ...]) -> Columns:
     rows = [row for answered in answers if (row := codec.motion_row(answered)) is not None]
     column: dict[str, Floats] = {f.name: np.array([getattr(row, f.name) for row in rows]) for f in fields(MotionRow)}
     rest = dict(zip(("tcp_speed", "ref_speed", "programme_s", "distance_m"), column["rest"].T, strict=True))
@@ -147,7 +144,7 @@ LOG = "log.mcap"
 _PARTIAL = ".partial"
 
 
-def begin(out: Path) -> Path:
+def make_partial(out: Path) -> Path:
     """Makes the folder that a session's log goes to; it gets its own name from ``finish``.
 
     Raises:
@@ -171,26 +168,26 @@ def finish(partial: Path) -> Path:
     writer = RunWriter(partial.with_name(partial.name.removesuffix(_PARTIAL)))
     if writer.folder.exists():
         raise SettingsError(f"{writer.folder}: exists already; move it away, then finish {partial}")
-    tape = Tape(partial / LOG)
-    start = tape.start()
+    log = SessionLogReader(partial / LOG)
+    start = log.start()
     job = job_of(start, writer.folder / LOG, run_folder.sha256(partial / LOG))
     cameras, links, limbs = (tuple(start[name]) for name in ("cameras", "links", "limbs"))
     tables = SessionTables(writer, cameras, links, limbs, start["method"])
-    for message in tape.messages():
+    for message in log.messages():
         tables.add(message)
     tables.flush()
     _measure(job, writer)
     writer.close_tables()
-    crashes = processes.read(partial)
-    meta = _meta(job, start, tables, tape, crashes)
+    crashes = processes.read_crashes(partial)
+    meta = _meta(job, start, tables, log, crashes)
     write_report(job, writer, meta)
     writer.timing.update(tables.timing())
     writer.finish(meta, complete=not crashes)
     return writer.folder
 
 
-def leave(partial: Path, crashes: list[str]) -> None:
-    """Leaves of a session that no run folder can be made of its log and its crashes, and says so in run.json."""
+def keep_incomplete(partial: Path, crashes: list[str]) -> None:
+    """Reduces a session without a run folder to its log and its crash files, and says so in run.json."""
     for path in sorted(partial.iterdir()):
         if path.is_dir():
             shutil.rmtree(path)
@@ -207,17 +204,19 @@ def _crashed(crashes: list[str]) -> dict[str, Any]:
 def _measure(job: Job, writer: RunWriter) -> None:
     """The table of measurements: what each frame says by itself."""
     log = open_log(writer.partial / LOG, log_options(job.settings), skeletons=False)
-    eyes, memory = build.eyes(job, log), PersonMemory()
+    fusion_stage, memory = build.fusion_stage(job, log), PersonMemory()
     for frames in log.frames():
-        memory, measured, _ = eyes.measure(frames, memory)
+        memory, measured, _ = fusion_stage.measure(frames, memory)
         writer.table("measurements", measurement_columns(measured))
 
 
-def _meta(job: Job, start: dict[str, Any], tables: SessionTables, tape: Tape, crashes: list[str]) -> dict[str, Any]:
+def _meta(
+    job: Job, start: dict[str, Any], tables: SessionTables, log: SessionLogReader, crashes: list[str]
+) -> dict[str, Any]:
     """run.json of the session."""
     end: dict[str, Any] = next((event for event in tables.events if event.get("what") == "end"), {})
     notes = [str(event["text"]) for event in tables.events if event.get("what") == "note"]
-    notes += [f"{LOG}: {flaw}" for flaw in tape.flaws]
+    notes += [f"{LOG}: {flaw}" for flaw in log.flaws]
     notes += [f"not complete: {line}" for line in crashes]
     if not end and not crashes:
         notes.append("the session was killed: its record has no end")
@@ -231,7 +230,7 @@ def _meta(job: Job, start: dict[str, Any], tables: SessionTables, tape: Tape, cr
         "stages": {},  # a replay of the log has ticks of its own: it takes nothing over
         "T_world_base": start["T_world_base"],
         "sending": start["sending"],
-        "created": f"{datetime.fromtimestamp(tape.first_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "created": f"{datetime.fromtimestamp(log.first_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}",
         "stops": end.get("stops", []),
         "reason": end.get("reason"),
         "counts": dict(sorted(counts.items())),

@@ -1,7 +1,7 @@
-"""Reads the log of a live session back: the messages of the record in their order, and what is wrong with the file.
+"""Reader of a live session's log: the recorded messages in their order, and every flaw of the file.
 
 Every byte of a finished file is under a checksum, and the messages are numbered. Of an unfinished file all but the
-indices is, and those follow from the messages. So nothing changes or goes missing without a flaw that says where.
+indices is, and those follow from the messages. So nothing can change or be missing without a flaw that says where.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class _CutError(ValueError):
 
 
 @dataclass
-class _Chunk:
+class _McapChunk:
     """What a chunk holds."""
 
     end: int  #: offset of what follows
@@ -65,7 +65,7 @@ class _Chunk:
     index: bytes  #: the records that must follow
 
 
-class Tape:
+class SessionLogReader:
     """The log of a live session. ``flaws`` and ``finished`` are about the latest pass over its messages."""
 
     def __init__(self, path: Path) -> None:
@@ -82,7 +82,9 @@ class Tape:
         self._first_ns = self._last_ns = -1
 
     def messages(self) -> Iterator[bytes]:
-        """The messages of wire.py as they were recorded, past all flaws; a flaw is in ``flaws`` before what follows it.
+        """The messages of ``codec`` as they were recorded, without what a flaw spoils.
+
+        A flaw is in ``flaws`` before the message that follows it.
 
         Raises:
             LogError: The file cannot be read, or has nothing of a session in it.
@@ -110,7 +112,7 @@ class Tape:
             LogError: The file cannot be read, or does not begin with it.
         """
         message = next(self.messages(), b"")
-        if codec.kind(message) == codec.EVENT and "cameras" in (found := codec.read_event(message)):
+        if codec.kind(message) == codec.EVENT and "cameras" in (found := codec.decode_event(message)):
             return found
         damage = f" ({self.flaws[0]})" if self.flaws else ""
         raise LogError(f"{self.path}: does not begin with the start of a live session{damage}")
@@ -142,7 +144,7 @@ class Tape:
             raise LogError(f"{self.path}: is no log of a live session")
         return self._resume(data, 0, ValueError("the head of the file is not what the recorder writes"))
 
-    def _chunk(self, data: mmap.mmap, offset: int) -> _Chunk:
+    def _chunk(self, data: mmap.mmap, offset: int) -> _McapChunk:
         """Reads a chunk with all that must hold of it. Raises one of _UNREADABLE."""
         if offset + _CHUNK.size > len(data):
             raise _CutError("the chunk is cut short")
@@ -159,9 +161,9 @@ class Tape:
         times = [t_ns for _, _, t_ns, _ in messages]
         if (start_ns, end_ns) != (min(times), max(times)):
             raise ValueError("the chunk's span is not that of its messages")
-        return _Chunk(end, messages, index)
+        return _McapChunk(end, messages, index)
 
-    def _messages(self, chunk: _Chunk, offset: int) -> Iterator[bytes]:
+    def _messages(self, chunk: _McapChunk, offset: int) -> Iterator[bytes]:
         for channel, number, t_ns, content in chunk.messages:
             self._first_ns = t_ns if self._first_ns < 0 else self._first_ns
             if self._number not in (None, number):
@@ -173,7 +175,7 @@ class Tape:
             if message is not None:
                 yield message
 
-    def _indices(self, data: mmap.mmap, chunk: _Chunk, offset: int) -> int:
+    def _indices(self, data: mmap.mmap, chunk: _McapChunk, offset: int) -> int:
         """The offset behind the indices of a chunk, which must be those of its messages."""
         end = chunk.end + len(chunk.index)
         found = data[chunk.end : end]

@@ -1,8 +1,8 @@
-"""The flight recorder, a process of its own: what control tells it, in order, into a log that outlives a crash.
+"""The recorder process: writes the messages of control, in order, to a log that stays readable after a crash.
 
-From control: the messages of wire.py. To control: ``K`` once, when the file is open. Ends when control does, after it
+From control: the messages of ``codec``. To control: ``K`` once, when the file is open. Ends when control does, after it
 has finished the file; when the file cannot be written, ends at once with a line on standard error and exit code 1.
-Chunks are closed and handed to the system several times a second, so that a kill costs no more than that.
+Chunks are closed and handed to the operating system several times a second, so that a kill loses no more than that.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _LARGEST = 1 << 22  # of a message
 _TYPES = {topics.ROBOT: egm.RobotMessage, topics.SENT: egm.SensorMessage, topics.UNSENT: egm.SensorMessage}
 
 
-class SessionWriter:
+class SessionLogWriter:
     """The log of a session under way. Every message carries its number, so that a hole in the record shows."""
 
     def __init__(self, stream: IO[bytes]) -> None:
@@ -53,7 +53,7 @@ class SessionWriter:
         self._count = 0
 
     def add(self, message: bytes) -> None:
-        """Takes a message of wire.py; the first event with cameras also fills the topics that hold for the session."""
+        """Writes a message of ``codec``; the first event with cameras also fills the topics of the whole session."""
         t_ns = codec.clock_ns(message)
         topic, data = topics.split(message)
         if topic == topics.STRAY:
@@ -61,7 +61,7 @@ class SessionWriter:
             return
         self._write(topic, t_ns, t_ns, data, _TYPES.get(topic))
         if topic == topics.EVENT and not self._cameras:
-            self._latch(t_ns, codec.read_event(message))
+            self._latch(t_ns, codec.decode_event(message))
 
     def flush(self) -> None:
         """Closes the chunk and hands all to the system. Raises OSError."""
@@ -138,7 +138,7 @@ class Inbox:
         self.ended.set()
 
     def take(self) -> list[bytes]:
-        """All that has come since."""
+        """Messages that have come since the last call."""
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
 
@@ -150,7 +150,7 @@ def record(control: socket.socket, path: Path) -> None:
     """
     inbox = Inbox(control)
     with path.open("xb") as stream:
-        writer = SessionWriter(stream)
+        writer = SessionLogWriter(stream)
         writer.flush()
         with suppress(BrokenPipeError):  # whoever is gone already may have left messages
             control.send(READY)

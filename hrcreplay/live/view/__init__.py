@@ -1,1 +1,1 @@
-"""What a person sees of a live session: panel, JSON lines or Foxglove."""
+"""Displays of a live session: terminal panel, JSON lines and Foxglove."""

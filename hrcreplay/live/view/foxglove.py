@@ -1,4 +1,7 @@
-"""The scene of a live session for Foxglove, over its WebSocket. Nothing is built while nobody watches."""
+"""The 3-D scene of a live session as a Foxglove WebSocket server.
+
+Nothing is computed while no client is connected.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.live.view.messages import Cast, Scene, Status, unpack
+from hrcreplay.live.view.status_messages import Scene, SceneNames, Status, unpack
 from hrcreplay.records import POINTS, Floats
 from hrcreplay.report.drawing import BONES
 
@@ -48,9 +51,9 @@ class FoxgloveStream:
         except (RuntimeError, OSError) as error:
             raise SettingsError(f"--foxglove {port}: {error}; name a port that is free") from error
         self.port = self._server.port
-        self._cast = Cast(limbs=[], links=[], radii_m=[])
+        self._cast = SceneNames(limbs=[], links=[], radii_m=[])
 
-    def cast(self, cast: Cast) -> None:
+    def cast(self, cast: SceneNames) -> None:
         """Takes what stays the same."""
         self._cast = cast
 

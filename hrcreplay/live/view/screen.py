@@ -1,9 +1,9 @@
-"""A session's status for a person: a panel on a terminal, a line in a pipe.
+"""The screen process: shows the status of a live session on a terminal, in a pipe or in Foxglove.
 
-What a person sees of a live session, a process of its own, so that no terminal can hold up the control loop.
+A process of its own, so that a terminal that blocks cannot delay the control loop.
 
-From control: ``S`` + a Status as JSON, ten times a second; with ``--foxglove`` also ``J`` + a scene.Cast as JSON, once,
-and ``P`` + a scene.Scene as packed. On a terminal one panel follows the session; a pipe gets a line a second and one at
+From control: ``S`` + a Status as JSON, ten times a second; with ``--foxglove`` also ``J`` + the SceneNames as JSON,
+once, and ``P`` + a packed Scene. On a terminal one panel follows the session; a pipe gets a line a second and one at
 every change; ``--json`` writes each status as a line to standard output. The process ends when control does.
 """
 
@@ -23,8 +23,8 @@ from rich.table import Table
 from rich.text import Text
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.live.processes import Channel, ControlGoneError
-from hrcreplay.live.view.messages import CameraStatus, Status
+from hrcreplay.live.processes import ControlChannel, ControlGoneError
+from hrcreplay.live.view.status_messages import CameraStatus, Status
 
 _COLOUR = {"tracking": "green", "limited": "yellow", "braking": "bold red"}
 _STALE_S = 0.2  # as logs.gap_s: a camera silent for longer has a gap
@@ -177,7 +177,7 @@ class Lines:
         self._write(line(status) + "\n")
 
 
-def serve(channel: Channel, show: Show, stream: FoxgloveStream | None) -> None:
+def serve(channel: ControlChannel, show: Show, stream: FoxgloveStream | None) -> None:
     """Shows what comes until control is gone; of what has piled up, the newest."""
     newest: dict[bytes, bytes] = {}
 
@@ -211,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="one JSON object a line instead of a panel")
     parser.add_argument("--foxglove", type=int, metavar="PORT", help="stream the scene to Foxglove on this port")
     given = parser.parse_args(arguments)
-    channel = Channel(given.fd)
+    channel = ControlChannel(given.fd)
     stream = _stream(given.foxglove)
     try:
         if given.json:

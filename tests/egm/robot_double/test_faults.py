@@ -9,7 +9,15 @@ from typing import Any
 
 import pytest
 
-from hrcreplay.egm.robot_double.faults import KINDS, LINK_FAULTS, Channel, Datagram, Fault, load_faults, random_faults
+from hrcreplay.egm.robot_double.faults import (
+    KINDS,
+    LINK_FAULTS,
+    Datagram,
+    Fault,
+    FaultyChannel,
+    load_faults,
+    random_faults,
+)
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.errors import SettingsError
 
@@ -18,10 +26,10 @@ MS = 1_000_000
 
 def carried(fault: Fault, count: int = 100, seed: int = 1) -> list[Datagram]:
     """What becomes of numbered datagrams, a period apart from 0, in order of departure."""
-    channel = Channel([fault], (seed,))
+    channel = FaultyChannel([fault], (seed,))
     out: list[Datagram] = []
     for number in range(count):
-        out += channel.carry(Datagram(number * PERIOD_NS, b"%03d" % number), number * PERIOD_NS * 1e-9)
+        out += channel.transmit(Datagram(number * PERIOD_NS, b"%03d" % number), number * PERIOD_NS * 1e-9)
     return sorted(out, key=lambda datagram: datagram.t_ns)
 
 
@@ -34,7 +42,7 @@ ALL = [f"{number:03}" for number in range(100)]
 
 def test_a_way_without_faults_changes_nothing() -> None:
     datagram = Datagram(5, b"x")
-    assert Channel([], (0,)).carry(datagram, 0.0) == [datagram]
+    assert FaultyChannel([], (0,)).transmit(datagram, 0.0) == [datagram]
 
 
 def test_loss_drops_within_its_time_only() -> None:
@@ -78,8 +86,8 @@ def test_a_stall_delivers_all_at_once_in_their_order() -> None:
 
 
 def test_what_two_stalls_hold_waits_for_the_later() -> None:
-    channel = Channel([Fault("stall", 0.1, 0.3), Fault("stall", 0.15, 0.1)], (0,))
-    assert channel.carry(Datagram(200 * MS, b""), 0.2) == [Datagram(400 * MS, b"")]
+    channel = FaultyChannel([Fault("stall", 0.1, 0.3), Fault("stall", 0.15, 0.1)], (0,))
+    assert channel.transmit(Datagram(200 * MS, b""), 0.2) == [Datagram(400 * MS, b"")]
 
 
 @pytest.mark.parametrize("kind", ["garbage", "empty"])

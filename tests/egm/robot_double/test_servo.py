@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.egm.codec import Correction
-from hrcreplay.egm.robot_double.servo import IRB140, PERIOD_NS, Axes, Servo, ServoSettings
+from hrcreplay.egm.robot_double.servo import IRB140, PERIOD_NS, Axes, ServoController, ServoSettings
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
 
@@ -23,7 +23,7 @@ def told(q: float | Floats, dq: float | Floats = 0.0) -> Correction:
 
 
 def drive(
-    servo: Servo, reference: Callable[[float], Correction | None], seconds: float, begin_s: float = 0.0
+    servo: ServoController, reference: Callable[[float], Correction | None], seconds: float, begin_s: float = 0.0
 ) -> Floats:
     """Steps through the time; planned joints before each step (n, 6)."""
     places = []
@@ -33,8 +33,8 @@ def drive(
     return np.array(places)
 
 
-def at_rest(**settings: Any) -> Servo:
-    return Servo(ServoSettings(**settings), np.zeros(6))
+def at_rest(**settings: Any) -> ServoController:
+    return ServoController(ServoSettings(**settings), np.zeros(6))
 
 
 @pytest.mark.parametrize(("gain", "share"), [(5.0, 1.0), (10.0, 1.0), (10.0, 0.5)])

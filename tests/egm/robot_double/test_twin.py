@@ -18,9 +18,9 @@ import pytest
 from hrcreplay.egm import motion_link_pb2 as messages
 from hrcreplay.egm.codec import Correction, Mci, Motors, Rapid, decode_robot, encode_correction
 from hrcreplay.egm.robot_double.faults import Datagram
-from hrcreplay.egm.robot_double.loop import run_twin
 from hrcreplay.egm.robot_double.servo import PERIOD_NS, ServoSettings
 from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.udp_client import run_twin
 from hrcreplay.errors import SettingsError
 from tests.egm.echo import echo
 from tests.egm.rehearsals import HOME, Guide, ramp, ramp_until, rehearsed, still
@@ -185,7 +185,10 @@ def test_with_nobody_there_it_goes_on(server: socket.socket, tmp_path: Path) -> 
 
 def test_sigterm_ends_it_with_its_report(server: socket.socket) -> None:
     port = server.getsockname()[1]
-    code = f"from hrcreplay.egm.robot_double.loop import run_twin; print(run_twin('127.0.0.1', {port}).answers.packets)"
+    code = (
+        "from hrcreplay.egm.robot_double.udp_client import run_twin; "
+        f"print(run_twin('127.0.0.1', {port}).answers.packets)"
+    )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         server.recvfrom(65536)
         os.kill(process.pid, signal.SIGTERM)

@@ -14,11 +14,11 @@ from hrcreplay.human.fusion.fuse import fuse, start
 from hrcreplay.human.fusion.inverse_kinematics import inverse, measure
 from hrcreplay.human.fusion.model_residual import LEAST
 from hrcreplay.human.model import skeleton
-from hrcreplay.logs.clean import PersonMemory, pick
+from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
-from hrcreplay.store.tables import read_states, state_columns
+from hrcreplay.store.columns import read_states, state_columns
 from tests.human.bent import RATE_HZ, WIDE, bent, fused, measured, ticks, used_frames
 
 DEMO = Path(__file__).parents[3] / "datasets" / "demo.mcap"
@@ -42,7 +42,7 @@ def demo() -> tuple[Measurements, Ints]:
     log = open_log(DEMO)
     poses, memory, parts = np.array([log.header.T_world_camera[c] for c in log.header.cameras]), PersonMemory(), []
     for chunk in log.frames():
-        memory, mine, _ = pick(chunk, memory, poses, 0.8, 2.0)
+        memory, mine, _ = select_person(chunk, memory, poses, 0.8, 2.0)
         parts.append(measure(mine, poses, Fusion()))
     m = Measurements.join(parts)
     first = int(m.arrival_ns[0]) - 100_000_000

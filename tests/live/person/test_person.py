@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from hrcreplay.errors import LogError
-from hrcreplay.live.person.log_playback import Frame, Item, Note, Opened, Playback, passes, play
-from hrcreplay.live.person.source import BEAT_NS, Pace, run
-from hrcreplay.live.processes import Channel, ControlGoneError
+from hrcreplay.live.person.log_playback import Frame, Item, Note, Opened, Playback, play, playback_items
+from hrcreplay.live.person.source import BEAT_NS, SendSchedule, run
+from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import CameraFrames
@@ -98,7 +98,7 @@ def test_a_repeated_recording_goes_on_rising(tmp_path: Path) -> None:
         **{**vars(frames), "capture_ns": frames.capture_ns - np.where(np.arange(12) < 4, 60_000_000, 0)}
     )
     log = open_log(own.write(tmp_path / "a.mcap", slow))
-    items = passes(log, repeat=True)
+    items = playback_items(log, repeat=True)
     sent: list[Frame] = []
     opened = next(items)
     assert isinstance(opened, Opened)
@@ -121,7 +121,7 @@ def test_two_bodies_of_a_frame_of_a_repeated_recording_both_stay(tmp_path: Path)
     other = CameraFrames(**{**vars(one), "body": one.body + 1})
     both = CameraFrames.join([one, other])
     log = open_log(own.write(tmp_path / "a.mcap", both.rows(np.argsort(both.arrival_ns, kind="stable"))))
-    items = passes(log, repeat=True)
+    items = playback_items(log, repeat=True)
     bodies = [frame.skeleton.body for _ in range(9) if isinstance(item := next(items), list) for frame in item]
     assert bodies[:24] == [7, 8] * 12
 
@@ -173,7 +173,7 @@ class Nothing:
 
 def test_heartbeats_keep_to_their_instants_and_missed_ones_are_not_made_up_for() -> None:
     source = Nothing()
-    pace = Pace(source, 0)
+    pace = SendSchedule(source, 0)
     assert list(pace.send(0)) == [(b"H", b"")]
     assert pace.next_ns(0) == BEAT_NS
     assert list(pace.send(BEAT_NS - 1)) == []
@@ -181,16 +181,16 @@ def test_heartbeats_keep_to_their_instants_and_missed_ones_are_not_made_up_for()
     assert pace.next_ns(BEAT_NS + 5_000_000) == 2 * BEAT_NS  # no drift
     assert list(pace.send(10 * BEAT_NS + 1)) == [(b"H", b"")]
     assert pace.next_ns(10 * BEAT_NS + 1) == 11 * BEAT_NS
-    pace.hear(b"G" + (12345).to_bytes(8, "little"))
+    pace.receive(b"G" + (12345).to_bytes(8, "little"))
     assert source.started == 12345
-    pace.hear(b"Gnonsense!")
-    pace.hear(b"?")
+    pace.receive(b"Gnonsense!")
+    pace.receive(b"?")
     assert source.started == 12345
 
 
 def test_a_full_socket_drops_and_counts_and_a_closed_one_ends() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    channel = Channel(theirs.detach())
+    channel = ControlChannel(theirs.detach())
     assert channel.receive(0.0) is None
     taken = 0
     while channel.send(b"F", bytes(1000)):
@@ -209,7 +209,7 @@ def test_a_full_socket_drops_and_counts_and_a_closed_one_ends() -> None:
         channel.send(b"H")
 
 
-class Deaf(Channel):
+class Deaf(ControlChannel):
     """A channel to a control process that does not read for a while."""
 
     def __init__(self) -> None:

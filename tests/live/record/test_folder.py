@@ -16,7 +16,7 @@ from hrcreplay.live.verify import verify
 from hrcreplay.records import BODY, STATUSES
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
-from hrcreplay.store.tables import read_states
+from hrcreplay.store.columns import read_states
 from tests.live import made
 from tests.live.flights import BEGIN_NS, Flight
 
@@ -24,11 +24,11 @@ from tests.live.flights import BEGIN_NS, Flight
 class Stored(Flight):
     """A flight that keeps the volumes of every tenth look, as the loop does at 25 Hz."""
 
-    def _look(self, t_ns: int) -> None:
-        super()._look(t_ns)
-        sight = self.pilot.sight
-        if sight is not None and len(self.states) % 10 == 1:
-            self.messages.append(codec.whole(sight.volumes))
+    def _update_perception(self, t_ns: int) -> None:
+        super()._update_perception(t_ns)
+        perception = self.controller.perception
+        if perception is not None and len(self.states) % 10 == 1:
+            self.messages.append(codec.encode_volumes(perception.volumes))
 
 
 @pytest.fixture(scope="module")
@@ -46,13 +46,18 @@ def messages(flight: Flight) -> list[bytes]:
     end = {"what": "end", "reason": "Ctrl-C", "counts": {"robot lost": 2}, "dropped": 0, "looks_skipped": 3}
     end |= {"stops": []}
     start = {"what": "start", **flight.start}
-    note = codec.event(BEGIN_NS + 2, {"what": "note", "text": "a remark"})
-    return [codec.event(BEGIN_NS - 1, start), *flight.messages, note, codec.event(BEGIN_NS + 4_000_000_000, end)]
+    note = codec.encode_event(BEGIN_NS + 2, {"what": "note", "text": "a remark"})
+    return [
+        codec.encode_event(BEGIN_NS - 1, start),
+        *flight.messages,
+        note,
+        codec.encode_event(BEGIN_NS + 4_000_000_000, end),
+    ]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory, messages: list[bytes]) -> Path:
-    partial = folder.begin(tmp_path_factory.mktemp("runs") / "session")
+    partial = folder.make_partial(tmp_path_factory.mktemp("runs") / "session")
     made.record(partial / "log.mcap", messages, chunk=500)
     return folder.finish(partial)
 
@@ -105,7 +110,7 @@ def test_motions_are_those_of_the_session(run: Path, flight: Flight) -> None:
 
 def test_volumes_are_those_that_were_stored(run: Path, messages: list[bytes]) -> None:
     table = pd.read_parquet(run / "occupancy.parquet")
-    stored = [codec.read_whole(m, BODY, "") for m in messages if codec.kind(m) == codec.VOLUMES]
+    stored = [codec.decode_volumes(m, BODY, "") for m in messages if codec.kind(m) == codec.VOLUMES]
     known = [volumes for volumes in stored if np.isfinite(volumes.vertices_m).all()]
     assert sorted(set(table["t_ns"])) == [int(volumes.t_ns[0]) for volumes in known]
     last = table[table["t_ns"] == known[-1].t_ns[0]]
@@ -131,9 +136,9 @@ def test_a_killed_session_can_be_finished(
     tmp_path: Path, messages: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(folder, "write_report", lambda *_: None)  # it takes long, and is the same for any session
-    partial = folder.begin(tmp_path / "session")
+    partial = folder.make_partial(tmp_path / "session")
     with pytest.raises(SettingsError, match="under way or was killed"):
-        folder.begin(tmp_path / "session")
+        folder.make_partial(tmp_path / "session")
     assert json.loads((partial / "run.json").read_text()) == {"complete": False}
     made.record(partial / "log.mcap", messages[:800], chunk=300, finish=False)
     assert verify(partial).identical
@@ -144,11 +149,11 @@ def test_a_killed_session_can_be_finished(
     with pytest.raises(SettingsError, match="no session to be finished"):
         folder.finish(run)
     with pytest.raises(SettingsError, match="exists already"):
-        folder.begin(run)
+        folder.make_partial(run)
 
 
 def test_a_session_in_which_nothing_happened_is_a_run(tmp_path: Path, messages: list[bytes]) -> None:
-    partial = folder.begin(tmp_path / "session")
+    partial = folder.make_partial(tmp_path / "session")
     made.record(partial / "log.mcap", [messages[0], messages[-1]])
     run = folder.finish(partial)
     assert run_folder.read(run).state is None
@@ -156,7 +161,7 @@ def test_a_session_in_which_nothing_happened_is_a_run(tmp_path: Path, messages: 
 
 
 def test_a_record_that_cannot_be_read_is_left_as_it_is(tmp_path: Path, messages: list[bytes]) -> None:
-    partial = folder.begin(tmp_path / "session")
+    partial = folder.make_partial(tmp_path / "session")
     made.record(partial / "log.mcap", messages[1:100])
     with pytest.raises(LogError, match="does not begin with the start"):
         folder.finish(partial)
@@ -168,11 +173,11 @@ def test_a_record_that_cannot_be_read_is_left_as_it_is(tmp_path: Path, messages:
 
 
 def test_a_record_of_another_version_is_left_as_it_is(tmp_path: Path, messages: list[bytes], flight: Flight) -> None:
-    sight = flight.pilot.sight
-    assert sight is not None
-    other = replace(sight.states, residual_m=sight.states.residual_m[:, 1:])
-    partial = folder.begin(tmp_path / "session")
-    made.record(partial / "log.mcap", [messages[0], codec.look(other, sight.volumes, 0)])
+    perception = flight.controller.perception
+    assert perception is not None
+    other = replace(perception.states, residual_m=perception.states.residual_m[:, 1:])
+    partial = folder.make_partial(tmp_path / "session")
+    made.record(partial / "log.mcap", [messages[0], codec.encode_perception(other, perception.volumes, 0)])
     with pytest.raises(LogError, match=r"session.partial: found 100 numbers a look where this version has 101; would"):
         folder.finish(partial)
     assert (partial / "log.mcap").exists()

@@ -8,7 +8,7 @@ import pytest
 
 from hrcreplay.errors import LogError
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.logs.writer import LogWriter
 from tests.live import made
 from tests.logs import own
@@ -21,12 +21,12 @@ def messages() -> list[bytes]:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory, messages: list[bytes]) -> Path:
-    return made.record(tmp_path_factory.mktemp("tape") / "log.mcap", messages, chunk=30)
+    return made.record(tmp_path_factory.mktemp("log") / "log.mcap", messages, chunk=30)
 
 
 @pytest.fixture(scope="module")
 def unfinished(tmp_path_factory: pytest.TempPathFactory, messages: list[bytes]) -> Path:
-    return made.record(tmp_path_factory.mktemp("tape") / "log.mcap", messages, chunk=30, finish=False)
+    return made.record(tmp_path_factory.mktemp("log") / "log.mcap", messages, chunk=30, finish=False)
 
 
 def _chunks(data: bytes | bytearray) -> list[int]:
@@ -37,19 +37,19 @@ def _chunks(data: bytes | bytearray) -> list[int]:
     return found
 
 
-def _changed(path: Path, target: Path, data: bytes | bytearray) -> Tape:
+def _changed(path: Path, target: Path, data: bytes | bytearray) -> SessionLogReader:
     shutil.copyfile(path, target)
     target.write_bytes(data)
-    return Tape(target)
+    return SessionLogReader(target)
 
 
 def test_messages_come_back_in_order(finished: Path, unfinished: Path, messages: list[bytes]) -> None:
     for path in (finished, unfinished):
-        tape = Tape(path)
-        assert list(tape.messages()) == messages
-        assert tape.flaws == []
-        assert tape.finished == (path is finished)
-        assert tape.start() == made.START
+        log = SessionLogReader(path)
+        assert list(log.messages()) == messages
+        assert log.flaws == []
+        assert log.finished == (path is finished)
+        assert log.start() == made.START
 
 
 @pytest.mark.parametrize("kind", ["finished", "unfinished"])
@@ -65,12 +65,12 @@ def test_every_flipped_bit_is_found(
     for at in frames + (tail if kind == "finished" else []) + everywhere:
         bad = bytearray(data)
         bad[at] ^= 1 << (at % 8)
-        tape = _changed(path, tmp_path / "log.mcap", bad)
-        read = list(tape.messages())
+        log = _changed(path, tmp_path / "log.mcap", bad)
+        read = list(log.messages())
         if kind == "unfinished" and at >= chunks[-1]:  # a length there may look like a file that was cut
-            assert tape.flaws or read == [m for m in messages if m in set(read)]
+            assert log.flaws or read == [m for m in messages if m in set(read)]
             continue
-        assert tape.flaws, at
+        assert log.flaws, at
         remaining = iter(messages)
         assert all(message in remaining for message in read), at  # what is left is as it was, in order
 
@@ -79,14 +79,14 @@ def test_a_damaged_chunk_is_named_and_read_past(finished: Path, tmp_path: Path, 
     data = bytearray(finished.read_bytes())
     third = _chunks(data)[2]
     data[third + 200] ^= 16
-    tape = _changed(finished, tmp_path / "log.mcap", data)
+    log = _changed(finished, tmp_path / "log.mcap", data)
     until = len(messages[:60])
     read: list[bytes] = []
-    for message in tape.messages():
-        assert bool(tape.flaws) == (len(read) >= until)  # known before anything behind it is handed out
+    for message in log.messages():
+        assert bool(log.flaws) == (len(read) >= until)  # known before anything behind it is handed out
         read.append(message)
     assert read == messages[:60] + messages[90:]
-    (flaw,) = tape.flaws
+    (flaw,) = log.flaws
     assert flaw.at_byte == third
     last, following = ((codec.clock_ns(messages[i]) - made.START_NS) / 1e9 for i in (59, 90))
     assert (flaw.after_s, flaw.before_s) == (last, following)
@@ -96,9 +96,9 @@ def test_a_damaged_chunk_is_named_and_read_past(finished: Path, tmp_path: Path, 
 def test_a_chunk_that_is_gone_is_missed(finished: Path, tmp_path: Path) -> None:
     data = finished.read_bytes()
     chunks = _chunks(data)
-    tape = _changed(finished, tmp_path / "log.mcap", data[: chunks[1]] + data[chunks[2] :])
-    list(tape.messages())
-    assert "message 34 is missing" in str(tape.flaws[0])  # 30 and the four that hold for the whole session
+    log = _changed(finished, tmp_path / "log.mcap", data[: chunks[1]] + data[chunks[2] :])
+    list(log.messages())
+    assert "message 34 is missing" in str(log.flaws[0])  # 30 and the four that hold for the whole session
 
 
 def test_a_file_that_breaks_off_is_read_to_its_last_whole_chunk(
@@ -107,24 +107,24 @@ def test_a_file_that_breaks_off_is_read_to_its_last_whole_chunk(
     data = finished.read_bytes()
     chunks = _chunks(data)
     for number, end in ((3, chunks[3] + 5), (3, chunks[3] + 100), (4, chunks[4]), (4, chunks[4] - 10)):
-        tape = _changed(finished, tmp_path / "log.mcap", data[:end])
-        assert list(tape.messages()) == messages[: 30 * number]
-        assert not tape.flaws
-        assert not tape.finished
+        log = _changed(finished, tmp_path / "log.mcap", data[:end])
+        assert list(log.messages()) == messages[: 30 * number]
+        assert not log.flaws
+        assert not log.finished
 
 
 def test_what_is_no_session_says_so(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with pytest.raises(LogError, match="cannot be read"):
-        list(Tape(path).messages())
+        list(SessionLogReader(path).messages())
     path.write_bytes(b"")
     with pytest.raises(LogError, match="holds nothing"):
-        list(Tape(path).messages())
+        list(SessionLogReader(path).messages())
     path.write_bytes(b"something else")
     with pytest.raises(LogError, match="no log of a live session"):
-        list(Tape(path).messages())
+        list(SessionLogReader(path).messages())
     path.unlink()
     with LogWriter(path) as writer:
         writer.frames(own.frames(10))
     with pytest.raises(LogError, match="does not begin with the start"):
-        Tape(path).start()
+        SessionLogReader(path).start()

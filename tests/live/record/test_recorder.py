@@ -16,7 +16,7 @@ import pytest
 from mcap.reader import make_reader
 
 from hrcreplay.live.record import codec, recorder, topics
-from hrcreplay.live.record.log_reader import Tape
+from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.logs.reader import open_log
 from tests.live import made
 
@@ -54,21 +54,23 @@ def test_datagrams_lie_raw_on_their_topics_even_garbage(tmp_path: Path, messages
     assert b"\xff garbage" in robot
     assert b"" in robot
     replies = [m for m in messages if codec.kind(m) == codec.REPLY]
-    assert [d for t, _, _, d in rows if t == "/egm/correction"] == [codec.read_reply(m)[1] for m in replies[3:]]
-    assert [d for t, _, _, d in rows if t == "/egm/correction/unsent"] == [codec.read_reply(m)[1] for m in replies[:3]]
+    assert [d for t, _, _, d in rows if t == "/egm/correction"] == [codec.decode_reply(m)[1] for m in replies[3:]]
+    assert [d for t, _, _, d in rows if t == "/egm/correction/unsent"] == [
+        codec.decode_reply(m)[1] for m in replies[:3]
+    ]
     assert {t for t, _, _, _ in rows if t.startswith("/live/")} == {
         f"/live/{name}" for name in ("answer", "event", "frame", "look", "silence", "volumes")
     }
 
 
 def test_skeletons_that_cannot_be_read_are_on_record(tmp_path: Path) -> None:
-    messages = [codec.event(5, made.START), codec.frame(7, b"\xff\xff"), codec.frame(8, b"")]
+    messages = [codec.encode_event(5, made.START), codec.encode_skeleton(7, b"\xff\xff"), codec.encode_skeleton(8, b"")]
     path = made.record(tmp_path / "log.mcap", messages)
     assert [row for row in _by_hand(path) if row[0] == topics.STRAY] == [
         (topics.STRAY, 7, 7, b"\xff\xff"),
         (topics.STRAY, 8, 8, b""),
     ]
-    assert list(Tape(path).messages()) == messages
+    assert list(SessionLogReader(path).messages()) == messages
 
 
 class Process:
@@ -115,7 +117,7 @@ def recording(path: Path, before: Callable[[], None] | None = None) -> Iterator[
 def _on_disk(path: Path, number: int) -> list[bytes]:
     """The messages in a file that is being written, once there are so many."""
     while True:
-        found = list(Tape(path).messages()) if path.exists() and path.stat().st_size else []
+        found = list(SessionLogReader(path).messages()) if path.exists() and path.stat().st_size else []
         if len(found) >= number:
             return found
         select.select([], [], [], 0.02)
@@ -131,10 +133,10 @@ def test_the_file_is_finished_when_control_is_gone(tmp_path: Path, messages: lis
         os.kill(process.popen.pid, signal.SIGINT)
         process.control.close()
         assert process.end() == (0, "")
-    tape = Tape(path)
-    assert list(tape.messages()) == messages
-    assert tape.finished
-    assert not tape.flaws
+    log = SessionLogReader(path)
+    assert list(log.messages()) == messages
+    assert log.finished
+    assert not log.flaws
 
 
 def test_a_killed_recorder_leaves_a_file_that_opens(tmp_path: Path, messages: list[bytes]) -> None:
@@ -147,10 +149,10 @@ def test_a_killed_recorder_leaves_a_file_that_opens(tmp_path: Path, messages: li
         process.popen.wait()
         with pytest.raises(OSError):  # noqa: PT011 - a pipe or a connection
             process.control.send(messages[0])
-    tape = Tape(path)
-    assert list(tape.messages()) == messages[:200]
-    assert not tape.finished
-    assert not tape.flaws
+    log = SessionLogReader(path)
+    assert list(log.messages()) == messages[:200]
+    assert not log.finished
+    assert not log.flaws
     assert len(next(iter(open_log(path).frames()))) > 1
 
 
@@ -161,7 +163,7 @@ def test_a_full_disk_ends_the_recorder_with_one_line(tmp_path: Path) -> None:
     with recording(path, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))) as process:
         process.control.recv(10)
         for k in range(20):
-            process.control.send(codec.robot(1000 + k, noise.bytes(5000)))
+            process.control.send(codec.encode_robot_packet(1000 + k, noise.bytes(5000)))
         code, said = process.end()
         assert process.control.recv(10) == b""  # this is how control knows
     assert code == 1

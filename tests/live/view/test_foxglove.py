@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.live.record import codec
 from hrcreplay.live.view.foxglove import FoxgloveStream, mesh, upright_to
-from hrcreplay.live.view.messages import Cast, Scene, pack, unpack
+from hrcreplay.live.view.status_messages import Scene, SceneNames, pack, unpack
 from hrcreplay.records import POINTS, SweptVolumes
 from tests.live.statuses import status
 
@@ -45,7 +45,7 @@ def scene(t_ns: int = 1_800_000_000_123_456_789) -> Scene:
 
 
 def packed(now: Scene) -> bytes:
-    return pack(now.t_ns, now.points_m, now.ends_m, codec.whole(now.volumes))
+    return pack(now.t_ns, now.points_m, now.ends_m, codec.encode_volumes(now.volumes))
 
 
 def test_a_scene_comes_out_as_it_went_in() -> None:
@@ -149,7 +149,7 @@ class Viewer:
 def watched(*topics: str) -> Iterator[tuple[FoxgloveStream, Viewer]]:
     pytest.importorskip("foxglove")
     stream = FoxgloveStream(0)
-    stream.cast(Cast(limbs=["HD", "THX"], links=["upper", "fore", "hand"], radii_m=[0.1, 0.2, 0.3]))
+    stream.cast(SceneNames(limbs=["HD", "THX"], links=["upper", "fore", "hand"], radii_m=[0.1, 0.2, 0.3]))
     viewer = Viewer(stream.port)
     try:
         viewer.subscribe(*topics)

@@ -11,9 +11,9 @@ from io import StringIO
 
 from rich.console import Console
 
-from hrcreplay.live.processes import Channel
-from hrcreplay.live.view.messages import RecorderStatus, Status
+from hrcreplay.live.processes import ControlChannel
 from hrcreplay.live.view.screen import Lines, clock, line, panel, serve
+from hrcreplay.live.view.status_messages import RecorderStatus, Status
 from tests.live.statuses import status
 
 
@@ -102,7 +102,7 @@ def test_of_what_has_piled_up_the_newest_is_shown_and_the_last_always() -> None:
     ours.send(b"?nobody knows")
     ours.close()
     seen: list[float] = []
-    serve(Channel(theirs.detach()), lambda now: seen.append(now["t_s"]), None)
+    serve(ControlChannel(theirs.detach()), lambda now: seen.append(now["t_s"]), None)
     assert seen == [4.0]
 
 

@@ -1,4 +1,4 @@
-"""What kind of log a path is, and its files as streams."""
+"""The files of a log: detection of their format, and the files as streams of messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ruamel.yaml.error import YAMLError
 from hrcreplay.errors import LogError
 from hrcreplay.logs import mcap_stream, ros_bags
 from hrcreplay.logs.mcap_stream import McapStream
-from hrcreplay.logs.messages import PROFILE, Damage, Message, Part, Stream, Topic, in_order
+from hrcreplay.logs.messages import PROFILE, Damage, LazyChunk, Message, MessageStream, Topic, merge_by_arrival
 from hrcreplay.logs.ros_bags import open_bag, open_db3
 
 _SQLITE = b"SQLite format 3\0"
@@ -29,12 +29,12 @@ _IMPORT = ". It is text: hrcreplay import azure|kinect2|keraal {path} --out LOG.
 
 
 @dataclass
-class Source:
-    """A log's files together."""
+class LogFiles:
+    """All files of a log as one stream of messages."""
 
     path: Path
     kind: str  #: "hrcreplay", "mcap", "ros1" or "ros2"
-    streams: list[Stream]
+    streams: list[MessageStream]
     defects: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
     folder: Any = None  #: temporary files that live as long as the source
@@ -76,14 +76,14 @@ class Source:
     ) -> Iterator[Message]:
         """Messages of all files on these topics with start <= arrival < end, in order of arrival."""
         chosen = frozenset(names)
-        return in_order(
-            Part(stream.start_ns, partial(stream.messages, chosen, start_ns, end_ns))
+        return merge_by_arrival(
+            LazyChunk(stream.start_ns, partial(stream.messages, chosen, start_ns, end_ns))
             for stream in self.streams
             if (start_ns is None or stream.end_ns >= start_ns) and (end_ns is None or stream.start_ns < end_ns)
         )
 
 
-def open_source(path: Path) -> Source:
+def open_source(path: Path) -> LogFiles:
     """The log at a path: a file, or the folder of a ROS 2 bag.
 
     Raises:
@@ -98,13 +98,13 @@ def open_source(path: Path) -> Source:
     return source
 
 
-def _single(path: Path) -> Source:
+def _single(path: Path) -> LogFiles:
     stream = _file(path)
     kind = stream.profile if stream.profile in (PROFILE, "ros1", "ros2") else "mcap"
-    return Source(path, kind, [stream])
+    return LogFiles(path, kind, [stream])
 
 
-def _file(path: Path, *, zstd_messages: bool = False) -> Stream:
+def _file(path: Path, *, zstd_messages: bool = False) -> MessageStream:
     try:
         with path.open("rb") as file:
             head = file.read(16)
@@ -132,7 +132,7 @@ def _is_text(path: Path) -> bool:
     return path.suffix.lower() != ".bag" and bool(head) and all(byte >= 32 or byte in b"\t\r\n" for byte in head)
 
 
-def _folder(path: Path) -> Source:
+def _folder(path: Path) -> LogFiles:
     """A ROS 2 bag. Its files are opened one by one, so that their messages are all there are."""
     metadata = path / "metadata.yaml"
     if not metadata.exists():
@@ -168,8 +168,8 @@ def _folder(path: Path) -> Source:
     return source
 
 
-def _together(path: Path, files: list[Path], *, zstd_messages: bool = False) -> Source:
-    source = Source(path, "ros2", [])
+def _together(path: Path, files: list[Path], *, zstd_messages: bool = False) -> LogFiles:
+    source = LogFiles(path, "ros2", [])
     for file in files:
         if not file.stat().st_size:
             source.defects["files_empty"] += 1

@@ -13,7 +13,7 @@ from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.human.fusion import fuse
 from hrcreplay.live.control import watchdog
 from hrcreplay.live.control.perception import Observer
-from hrcreplay.live.control.setup import build_pilot
+from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.logs.clean import PersonMemory
@@ -37,7 +37,9 @@ def test_it_echoes_then_approaches_then_follows_without_a_jump() -> None:
     assert flight.phases()[-2:] == ["approach", "following"]
     steps_keep_the_limits(flight)
     q, _ = flight.commanded()
-    assert np.abs(q - flight.pilot.setup.programme.q0).max(axis=1).min() < 0.05  # it came past where the path begins
+    assert (
+        np.abs(q - flight.controller.setup.programme.q0).max(axis=1).min() < 0.05
+    )  # it came past where the path begins
     assert moved(flight, after=-200)
 
 
@@ -47,7 +49,7 @@ def test_it_does_not_start_before_it_has_seen_the_person() -> None:
     assert {PHASES[answer.phase] for answer in early} == {"echo", "waiting"}
     assert not any(answer.row is not None and np.any(answer.row.dq) for answer in early)
     assert flight.phases()[-1] == "approach"
-    assert not flight.pilot.stops
+    assert not flight.controller.stops
 
 
 def after_start(signal: Signal, at_s: float, for_s: float = np.inf) -> dict[str, Any]:
@@ -78,9 +80,9 @@ STOPS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("reason", STOPS)
 def test_every_reason_of_the_watchdog_brakes_by_67_and_holds(reason: str) -> None:
     flight = Flight(**STOPS[reason]).fly(5.0)
-    assert [why for _, why in flight.pilot.stops] == [reason]
-    stopped_ns = flight.pilot.stops[0][0]
-    robot, dt_s = flight.robot, flight.pilot.setup.plan.dt_s
+    assert [why for _, why in flight.controller.stops] == [reason]
+    stopped_ns = flight.controller.stops[0][0]
+    robot, dt_s = flight.robot, flight.controller.setup.plan.dt_s
     later = [answer for answer in flight.answers if answer.t_ns >= stopped_ns and answer.row is not None]
     assert any(np.any(answer.row.dq) for answer in flight.answers if answer.row is not None)  # it was moving
     speeds = np.array([answer.row.dq for answer in later if answer.row is not None])
@@ -102,10 +104,10 @@ def test_every_reason_of_the_watchdog_brakes_by_67_and_holds(reason: str) -> Non
 def test_it_goes_on_by_a_setting_only_and_from_where_it_stands(reason: str) -> None:
     kept = STOPS[reason]
     flight = Flight(**{**kept, "overrides": (*kept.get("overrides", ()), "live.resume=true")}).fly(9.0)
-    assert [why for _, why in flight.pilot.stops] == [reason]
+    assert [why for _, why in flight.controller.stops] == [reason]
     names = flight.phases()
     assert "approach" in names[names.index("holding") :]
-    assert flight.pilot.stop == ""
+    assert flight.controller.stop == ""
     steps_keep_the_limits(flight)
     assert moved(flight, after=-100)
 
@@ -117,7 +119,7 @@ def test_it_tells_what_holds_it_once_another_reason_has_taken_over() -> None:
     flight = Flight(
         walk=lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0), signals=signals, overrides=("live.resume=true",)
     ).fly(5.0)
-    assert [why for _, why in flight.pilot.stops] == [watchdog.NO_FRAME]
+    assert [why for _, why in flight.controller.stops] == [watchdog.NO_FRAME]
     told = {answer.t_ns: answer.reason for answer in flight.answers if answer.row is not None}
     assert [reason for t_ns, reason in told.items() if t_ns < BEGIN_NS + 2.45e9][-1] == watchdog.NO_FRAME
     assert {reason for t_ns, reason in told.items() if t_ns > BEGIN_NS + 2.7e9} == {watchdog.RECORDER_DEAD}
@@ -125,7 +127,7 @@ def test_it_tells_what_holds_it_once_another_reason_has_taken_over() -> None:
 
 def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
     flight = Flight(faults=(Fault("silence", 2.0, 0.5),), overrides=("live.resume=true",)).fly(6.0)
-    assert [why for _, why in flight.pilot.stops] == [watchdog.SILENT]
+    assert [why for _, why in flight.controller.stops] == [watchdog.SILENT]
     assert flight.phases().count("echo") == 2
     replies = [answer for answer in flight.answers if answer.phase == codec.ECHO]
     assert_array_equal([answer.row.dq for answer in replies if answer.row is not None], 0.0)
@@ -133,7 +135,7 @@ def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
 
 
 class Suspended(Flight):
-    """A control process that the machine stopped from 2 to 2.5 s: nobody tells the pilot of the silence meanwhile."""
+    """A control process that the machine stopped from 2 to 2.5 s: the controller gets no time-out meanwhile."""
 
     def _guide(self, t_ns: int, datagrams: list[bytes]) -> Iterator[bytes]:
         if not 2.0 <= (t_ns - BEGIN_NS) * 1e-9 < 2.5:
@@ -143,7 +145,7 @@ class Suspended(Flight):
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_silence_that_only_the_next_packet_tells_of_stops_the_robot_too(resume: bool) -> None:
     flight = Suspended(overrides=(f"live.resume={str(resume).lower()}",)).fly(6.0)
-    assert [why for _, why in flight.pilot.stops] == [watchdog.SILENT]
+    assert [why for _, why in flight.controller.stops] == [watchdog.SILENT]
     assert flight.phases().count("echo") == 2
     assert flight.phases().count("approach") == 1 + resume  # it goes on only where that was asked for
     steps_keep_the_limits(flight)
@@ -154,7 +156,7 @@ def test_a_person_in_the_way_stops_the_motion_but_not_the_session() -> None:
     flight = Flight(walk=lambda s: (max(0.3, abs(3.0 - 1.0 * max(0.0, s - 6.0)) if s < 9.0 else s - 9.0), 0.0)).fly(
         13.0
     )
-    assert not flight.pilot.stops
+    assert not flight.controller.stops
     held = [answer for answer in flight.answers if STATUSES[answer.status] != "tracking" and answer.row is not None]
     assert len(held) > 100
     assert np.nanmin([answer.row.rest[3] for answer in held if answer.row is not None]) < 0.05
@@ -167,7 +169,7 @@ def test_a_robot_that_sends_radians_is_refused() -> None:
     flight = Flight()
     flight = Flight(twin=replace(flight.twin, radians=True)).fly(0.5)
     assert not flight.said()
-    assert flight.pilot.stop == "radians"
+    assert flight.controller.stop == "radians"
 
 
 def test_the_same_events_give_the_same_bytes() -> None:
@@ -181,19 +183,21 @@ def test_the_same_events_give_the_same_bytes() -> None:
 def test_looks_are_the_replay_tick_by_tick() -> None:
     """One fuse and one predict over all ticks give the bits that thousands of looks gave."""
     flight = Flight(walk=lambda s: (2.0 + 0.5 * np.sin(s), 0.3 * s)).fly(4.0)
-    pilot = build_pilot(start())
-    observer: Observer = pilot.observer
-    eyes, foresight = observer._eyes, observer._foresight
+    controller = build_controller(start())
+    observer: Observer = controller.observer
+    fusion_stage, prediction_stage = observer._fusion_stage, observer._prediction_stage
     ticks = np.array([int(states.t_ns[0]) for states in flight.states])
     frames = [observer._frames(t_ns, [data]) for t_ns, data in flight.frames]
-    _, measured, _ = eyes.measure(CameraFrames.join([frame for frame in frames if frame is not None]), PersonMemory())
-    _, states, _ = fuse.fuse(fuse.start(observer._cameras), ticks, measured, eyes.filter, eyes.limits)
+    _, measured, _ = fusion_stage.measure(
+        CameraFrames.join([frame for frame in frames if frame is not None]), PersonMemory()
+    )
+    _, states, _ = fuse.fuse(fuse.start(observer._cameras), ticks, measured, fusion_stage.filter, fusion_stage.limits)
     live = HumanStates.join(flight.states)
     for name in ("p", "v", "a", "j", "p_std", "v_std", "lengths_m", "residual_m", "unseen_s", "valid"):
         assert_array_equal(getattr(live, name), getattr(states, name), err_msg=name)
-    assert pilot.sight is None
-    volumes = foresight.volumes(states)
-    last = flight.pilot.sight
+    assert controller.perception is None
+    volumes = prediction_stage.volumes(states)
+    last = flight.controller.perception
     assert last is not None
     for limb in range(len(volumes.limbs)):
         assert_array_equal(last.volumes.vertices(0, limb), volumes.vertices(len(ticks) - 1, limb))
@@ -209,8 +213,8 @@ def test_a_bug_in_the_stages_brakes_the_robot_and_is_told(monkeypatch: pytest.Mo
     monkeypatch.setattr(QpFollower, "step", broken)
     before = len(flight.said())
     flight.fly(1.0)
-    assert isinstance(flight.pilot.fault, ZeroDivisionError)
-    assert [why for _, why in flight.pilot.stops] == [watchdog.FAULT]
+    assert isinstance(flight.controller.fault, ZeroDivisionError)
+    assert [why for _, why in flight.controller.stops] == [watchdog.FAULT]
     assert not moved(flight, after=before + 100)
     assert len(flight.said()) > before + 200
 

@@ -1,4 +1,4 @@
-"""What was wrong with a log, where it is seen first."""
+"""The defects of a log on the page and on the terminal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from hrcreplay.logs.clean import DEFECTS
-from hrcreplay.report.story import flaws
+from hrcreplay.report.story import defect_notes
 from tests.report.synthetic import make_run
 from tests.report.test_page import read, rendered
 
@@ -14,7 +14,7 @@ from tests.report.test_page import read, rendered
 def test_every_kind_of_defect_is_told_in_the_words_of_the_reader_and_nothing_else_is() -> None:
     """Generically: a defect that the reader learns to count is told without a word here."""
     counts = {name.replace("<camera>", "left"): 1234 for name in DEFECTS}
-    told = flaws({**counts, "outlier_points_left": 7, "frames_right": 3}, ("a remark",))
+    told = defect_notes({**counts, "outlier_points_left": 7, "frames_right": 3}, ("a remark",))
     assert told[0] == "a remark"
     silent = [name for name, text in DEFECTS.items() if text.startswith(("no defect", "an instant"))]
     assert set(silent) == {"frames_<camera>", "truncated_at_ns"}
@@ -26,7 +26,7 @@ def test_every_kind_of_defect_is_told_in_the_words_of_the_reader_and_nothing_els
 
 def test_a_clean_log_has_no_flaws() -> None:
     counts = {"frames_left": 100, "frames_duplicate": 0, "gaps_left": 0, "outlier_points_left": 7}
-    assert flaws(counts, ()) == ()
+    assert defect_notes(counts, ()) == ()
 
 
 def test_the_first_screen_tells_what_was_wrong_and_only_then(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_of_packets_that_come_at_once_the_newest_is_owed_an_answer() -> None:
     core.cycle(0, [])
     core.record.departed_ns += [3_800_000, 4_032_000, 8_064_000]
     for t_ns in (300_000, 4_332_000, 8_364_000):
-        core.record.arrived(Datagram(t_ns, encode_correction(Correction(0, 0, *ramp(0.0)))), 1)
+        core.record.add_arrival(Datagram(t_ns, encode_correction(Correction(0, 0, *ramp(0.0)))), 1)
     answers = shown(core).answers
     assert (answers.answered, answers.missed, answers.doubled) == (3, 0, 0)
     assert answers.latency_us["max"] == pytest.approx(300.0)

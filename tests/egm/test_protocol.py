@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay.egm.session import REASONS, Heard
+from hrcreplay.egm.protocol import REASONS, PacketStatus
 from tests.egm.talks import CYCLE_NS, T0_NS, ZERO, packet, session, talk
 
 
 def test_a_session_begins_once_and_each_packet_is_answered() -> None:
     heard = talk(session(), [0, 1, 2, 3])
-    assert heard[0] == Heard(answer=True, fresh=True, allowed=True, reason="", ended=False, lost=0)
-    assert heard[1:] == [Heard(answer=True, fresh=False, allowed=True, reason="", ended=False, lost=0)] * 3
+    assert heard[0] == PacketStatus(answer=True, fresh=True, allowed=True, reason="", ended=False, lost=0)
+    assert heard[1:] == [PacketStatus(answer=True, fresh=False, allowed=True, reason="", ended=False, lost=0)] * 3
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_what_the_robot_s_counter_says(seqnos: list[int], what: list[str]) -> No
     clock = {seqno: step for step, seqno in enumerate(dict.fromkeys(sorted(seqnos, key=lambda n: (n + 2**31) % 2**32)))}
     talking = session()
     for cycle, seqno in enumerate(seqnos):
-        heard = talking.hear(packet(seqno, clock_ns=T0_NS + clock[seqno] * CYCLE_NS), cycle * CYCLE_NS)
+        heard = talking.classify(packet(seqno, clock_ns=T0_NS + clock[seqno] * CYCLE_NS), cycle * CYCLE_NS)
         said.append(heard.reason or ("fresh" if heard.fresh else f"lost {heard.lost}" if heard.lost else ""))
         assert heard.answer == (heard.reason == "")
         if heard.answer:
@@ -49,31 +49,31 @@ def test_a_robot_started_again_within_its_first_packets_is_no_straggler() -> Non
     talking = session()
     talk(talking, [0, 1, 2, 3, 4])
     later = packet(3, clock_ns=T0_NS + 1000 * CYCLE_NS)  # its 0 to 2 were lost
-    assert talking.hear(later, 5 * CYCLE_NS).fresh
+    assert talking.classify(later, 5 * CYCLE_NS).fresh
     talking.reply(ZERO, ZERO, 5 * CYCLE_NS)
-    assert talking.hear(packet(4), 6 * CYCLE_NS).reason == "stale"  # of the session before
+    assert talking.classify(packet(4), 6 * CYCLE_NS).reason == "stale"  # of the session before
 
 
 def test_a_robot_that_starts_again_twice_at_zero_is_heard_both_times() -> None:
     talking = session()
-    assert talking.hear(packet(0), 0).fresh
+    assert talking.classify(packet(0), 0).fresh
     talking.reply(ZERO, ZERO, 0)
-    assert talking.hear(packet(0), 0).reason == "duplicate"
-    assert talking.hear(packet(0, clock_ns=T0_NS + 9), CYCLE_NS).fresh
+    assert talking.classify(packet(0), 0).reason == "duplicate"
+    assert talking.classify(packet(0, clock_ns=T0_NS + 9), CYCLE_NS).fresh
 
 
 def test_a_silence_makes_a_new_session_of_the_next_packet() -> None:
     talking = session(silence_s=0.1)
     talk(talking, [0, 1])
-    assert not talking.hear(packet(2), CYCLE_NS + 100_000_000).fresh
+    assert not talking.classify(packet(2), CYCLE_NS + 100_000_000).fresh
     talking.reply(ZERO, ZERO, 0)
-    assert talking.hear(packet(3), CYCLE_NS + 200_000_001).fresh
+    assert talking.classify(packet(3), CYCLE_NS + 200_000_001).fresh
     assert talking.counts["sessions"] == 2
 
 
 def test_a_robot_without_a_counter_is_served() -> None:
     talking = session()
-    heard = [talking.hear(packet(None), cycle * CYCLE_NS) for cycle in range(3)]
+    heard = [talking.classify(packet(None), cycle * CYCLE_NS) for cycle in range(3)]
     assert all(one.answer for one in heard)
 
 
@@ -96,16 +96,16 @@ def test_a_robot_without_a_counter_is_served() -> None:
 def test_when_the_robot_may_be_moved(fields: dict[str, Any], allowed: bool, reason: str) -> None:
     talking = session()
     talk(talking, [0])
-    heard = talking.hear(packet(1, **fields), CYCLE_NS)
+    heard = talking.classify(packet(1, **fields), CYCLE_NS)
     assert (heard.answer, heard.allowed, heard.reason) == (True, allowed, reason)
 
 
 def test_egm_that_waits_for_its_first_answer_has_not_stopped() -> None:
     talking = session()
-    assert talking.hear(packet(0, mci=2), 0).reason == "not answered yet"
-    assert talking.hear(packet(1, mci=2), 1).reason == "not answered yet"
+    assert talking.classify(packet(0, mci=2), 0).reason == "not answered yet"
+    assert talking.classify(packet(1, mci=2), 1).reason == "not answered yet"
     talking.reply(ZERO, ZERO, 1)
-    assert talking.hear(packet(2, mci=2), 2).reason == "program stopped"
+    assert talking.classify(packet(2, mci=2), 2).reason == "program stopped"
 
 
 def test_reasons_are_all_listed() -> None:
@@ -116,36 +116,36 @@ def test_reasons_are_all_listed() -> None:
 def test_radians_are_refused_and_change_nothing() -> None:
     talking = session()
     talk(talking, [0, 1])
-    heard = talking.hear(packet(2, clock_ns=None), 2 * CYCLE_NS)
+    heard = talking.classify(packet(2, clock_ns=None), 2 * CYCLE_NS)
     assert (heard.answer, heard.allowed, heard.reason) == (False, False, "radians")
     assert talking.counts["radians"] == 1
 
 
 def test_a_robot_with_other_axes_is_refused() -> None:
-    heard = session().hear(packet(0, q=np.zeros(7)), 0)
+    heard = session().classify(packet(0, q=np.zeros(7)), 0)
     assert (heard.answer, heard.allowed, heard.reason) == (False, False, "axes")
 
 
 def test_what_is_no_packet_is_counted_and_changes_nothing() -> None:
     talking = session()
     talk(talking, [0, 1])
-    assert talking.hear(None, 2 * CYCLE_NS) == Heard(False, False, True, "no packet", False, 0)
-    assert talking.hear(packet(2), 2 * CYCLE_NS) == Heard(True, False, True, "", False, 0)
+    assert talking.classify(None, 2 * CYCLE_NS) == PacketStatus(False, False, True, "no packet", False, 0)
+    assert talking.classify(packet(2), 2 * CYCLE_NS) == PacketStatus(True, False, True, "", False, 0)
     assert talking.counts == {"packets": 3, "sessions": 1, "no packet": 1, "lost": 0}
 
 
 def test_utilization_has_to_last() -> None:
     talking = session(utilization_max=90.0, utilization_packets=3)
     rates = [95.0, 95.0, 20.0, 95.0, inf, 91.0, 95.0, nan, 95.0]
-    reasons = [talking.hear(packet(k, utilization=rate), k * CYCLE_NS).reason for k, rate in enumerate(rates)]
+    reasons = [talking.classify(packet(k, utilization=rate), k * CYCLE_NS).reason for k, rate in enumerate(rates)]
     assert reasons == ["", "", "", "", "", "utilization", "utilization", "", ""]
 
 
 def test_the_end_is_told() -> None:
     talking = session()
-    assert not talking.hear(packet(0, mci=2), 0).ended  # has not begun
+    assert not talking.classify(packet(0, mci=2), 0).ended  # has not begun
     talking.reply(ZERO, ZERO, 0)
-    assert not talking.hear(packet(1), CYCLE_NS).ended
-    assert talking.hear(packet(2, converged=True), 2 * CYCLE_NS) == Heard(True, True, True, "", True, 0)
-    assert talking.hear(packet(3, mci=2), 3 * CYCLE_NS).ended
-    assert not talking.hear(packet(0), 4 * CYCLE_NS).ended
+    assert not talking.classify(packet(1), CYCLE_NS).ended
+    assert talking.classify(packet(2, converged=True), 2 * CYCLE_NS) == PacketStatus(True, True, True, "", True, 0)
+    assert talking.classify(packet(3, mci=2), 3 * CYCLE_NS).ended
+    assert not talking.classify(packet(0), 4 * CYCLE_NS).ended

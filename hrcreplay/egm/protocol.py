@@ -1,14 +1,15 @@
-"""Our side of the conversation with the robot: packets and instants in, decisions out. No clock, no socket.
+"""State machine of our side of the EGM protocol: robot packets and instants in, replies out. No clock, no socket.
 
-The robot counts its packets. What a packet is to the conversation follows from its counter, ``ahead`` of the last:
+The robot numbers its packets. How a packet is treated follows from its number, ``ahead`` of the last:
 
 - older by the robot's clock, and not 0: overtaken on the way, however long ago. Not answered.
-- 1 to ``LEAP`` ahead, round 2**32 too: the next one; those between are lost.
-- the same counter, clock and stamp: a duplicate. Not answered, for a second answer queues up in the robot as lag.
-- anything else, as 0, and any packet after a silence: a new session.
+- 1 to ``LEAP`` ahead, modulo 2**32: the next one; those between are lost.
+- the same number, clock and stamp: a duplicate. Not answered, for a second answer waits in the robot's queue and adds
+  delay.
+- anything else, as 0, and any packet after a pause: a new session.
 
 A session begins with an echo: the first answer is what the robot measured, at speed 0, whatever is asked for. So is
-every answer while the robot may not move, since the last target is live again as soon as it may.
+every answer while the robot may not move, since the last target is valid again as soon as it may.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ LEAP: Final = 1000
 REFUSALS: Final = ("radians", "axes", "no packet", "stale", "duplicate")
 #: Why an answered robot must not be moved.
 STOPS: Final = ("motors off", "EGM error", "converged", "program stopped", "not answered yet", "utilization")
-#: Every reason that ``hear`` gives.
+#: Every reason that ``classify`` gives.
 REASONS: Final = (*REFUSALS, *STOPS)
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """What a packet means.
+class PacketStatus:
+    """How a packet is to be treated.
 
     Attributes:
         answer: It is to be answered, at once.
@@ -57,10 +58,10 @@ class Heard:
     lost: int
 
 
-class Session:
-    """Conversations with one robot, one after the other.
+class EgmSession:
+    """State of our side of the link with one robot, over any number of EGM sessions.
 
-    ``counts`` has the packets and sessions heard, those lost, and each refusal by its reason.
+    ``counts`` has the packets and sessions received, those lost, and each refusal by its reason.
     """
 
     def __init__(
@@ -94,7 +95,7 @@ class Session:
         self._due = self._fresh = self._allowed = self._answered = self._ran = False
         self._strained = 0
 
-    def hear(self, packet: RobotPacket | None, t_ns: int) -> Heard:
+    def classify(self, packet: RobotPacket | None, t_ns: int) -> PacketStatus:
         """Take one datagram in order of arrival; None stands for one that is no packet."""
         if packet is None:
             return self._refuse("no packet")
@@ -114,22 +115,22 @@ class Session:
         self.counts["lost"] += lost
         return self._judge(packet, lost)
 
-    def hear_all(self, packets: Iterable[RobotPacket | None], t_ns: int) -> tuple[Heard, RobotPacket | None]:
+    def classify_all(self, packets: Iterable[RobotPacket | None], t_ns: int) -> tuple[PacketStatus, RobotPacket | None]:
         """Take a queue that built up, in order of arrival: one decision, and the packet to answer if there is one.
 
         The last datagram need not be that packet: it may be garbage, or overtaken by one before it.
         """
         newest, answered, lost, ended = None, None, 0, False
-        heard = Heard(answer=False, fresh=False, allowed=self._allowed, reason="no packet", ended=False, lost=0)
+        heard = PacketStatus(answer=False, fresh=False, allowed=self._allowed, reason="no packet", ended=False, lost=0)
         for packet in packets:
-            heard = self.hear(packet, t_ns)
+            heard = self.classify(packet, t_ns)
             lost, ended = lost + heard.lost, ended or heard.ended
             if heard.answer:
                 newest, answered = packet, heard
         return replace(answered or heard, lost=lost, ended=ended), newest
 
     def reply(self, q: Floats, dq: Floats, t_ns: int) -> Correction:
-        """Answer the packet just heard. What it says is what the robot was told, also where more was asked for.
+        """Answer the packet just classified. Returns what the robot is told, which may be less than what was asked for.
 
         Args:
             q: (6,) joints to be at [rad]. Held inside the limits, and a speed that leads out of them with it; where
@@ -183,12 +184,12 @@ class Session:
         self._answered = self._ran = False
         self._strained = 0
 
-    def _refuse(self, reason: str) -> Heard:
+    def _refuse(self, reason: str) -> PacketStatus:
         """Count a datagram that is not answered."""
         self.counts[reason] += 1
-        return Heard(answer=False, fresh=False, allowed=self._allowed, reason=reason, ended=False, lost=0)
+        return PacketStatus(answer=False, fresh=False, allowed=self._allowed, reason=reason, ended=False, lost=0)
 
-    def _judge(self, packet: RobotPacket, lost: int) -> Heard:
+    def _judge(self, packet: RobotPacket, lost: int) -> PacketStatus:
         """Whether the robot may be moved."""
         allowed = packet.motors == Motors.ON and packet.mci == Mci.RUNNING and packet.rapid != Rapid.STOPPED
         self._fresh = self._fresh or (allowed and not self._allowed)
@@ -200,7 +201,7 @@ class Session:
         if allowed and self._strained >= often:
             reason = "utilization"
         ended = packet.converged or (self._ran and packet.mci != Mci.RUNNING)
-        return Heard(answer=True, fresh=self._fresh, allowed=allowed, reason=reason, ended=ended, lost=lost)
+        return PacketStatus(answer=True, fresh=self._fresh, allowed=allowed, reason=reason, ended=ended, lost=lost)
 
     def _standing(self, packet: RobotPacket) -> str:
         """Why the robot may not move. EGM does not run before the first answer: that is no stop."""

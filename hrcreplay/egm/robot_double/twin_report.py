@@ -1,4 +1,4 @@
-"""What a run of the robot double shows: how it was answered, what it was told, how it came to rest."""
+"""Summary of a run of the robot double: reply times, what was commanded, and how it came to rest after faults."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DRAINED_NS = 500_000
 
 @dataclass(frozen=True)
 class Answers:
-    """How the packets were answered."""
+    """Counts and times of the answers to the packets."""
 
     packets: int
     before_first: int
@@ -46,7 +46,7 @@ class Answers:
 
 @dataclass(frozen=True)
 class Commanded:
-    """Largest of what arrived, for each axis."""
+    """Largest commanded jumps, speeds and accelerations, for each axis."""
 
     start_jump_rad: list[float]
     """From the measured joints to a session's first reference [rad]."""
@@ -63,7 +63,7 @@ class Commanded:
 
 
 @dataclass(frozen=True)
-class FaultSeen:
+class FaultOutcome:
     """A fault and what came after its onset. None: not within the run."""
 
     fault: Fault
@@ -83,7 +83,7 @@ class FaultSeen:
 
 @dataclass(frozen=True)
 class TwinReport:
-    """All of it, with the record that it was made from."""
+    """The report of a run, with the record that it was made from."""
 
     duration_s: float
     cycles: int
@@ -93,7 +93,7 @@ class TwinReport:
     """How each session ended; empty for one that was cut off."""
     answers: Answers
     commanded: Commanded
-    faults: list[FaultSeen]
+    faults: list[FaultOutcome]
     record: TwinRecord
 
     def as_json(self) -> dict[str, Any]:
@@ -145,7 +145,7 @@ class TwinReport:
 
 
 def report_of(core: TwinCore, faults: Sequence[Fault], *, overruns: int = 0) -> TwinReport:
-    """What a run of the double shows."""
+    """The report of a run of the robot double."""
     cycles, arrivals = core.record.cycles(), core.record.arrivals()
     return TwinReport(
         duration_s=len(cycles) and float(cycles["t_ns"][-1] - cycles["t_ns"][0] + PERIOD_NS) * 1e-9,
@@ -221,7 +221,7 @@ def _largest(values: Floats) -> list[float]:
     return [float(value) for value in values.max(axis=0, initial=0.0)]
 
 
-def _seen(fault: Fault, cycles: NDArray[Any]) -> FaultSeen:
+def _seen(fault: Fault, cycles: NDArray[Any]) -> FaultOutcome:
     """How long it took from the onset of a fault until everything stood still."""
     since_s = (cycles["t_ns"] - cycles["t_ns"][:1]) * 1e-9
     told = _told_still(cycles)
@@ -231,7 +231,7 @@ def _seen(fault: Fault, cycles: NDArray[Any]) -> FaultSeen:
         moved = np.flatnonzero(~told & (since_s < fault.at_s + robot_s))
         last_s = float(since_s[moved[-1]]) if len(moved) else fault.at_s
         coast_s = min(robot_s, fault.at_s + robot_s - last_s)
-    return FaultSeen(fault, _rest_s(fault, since_s, told), robot_s, coast_s)
+    return FaultOutcome(fault, _rest_s(fault, since_s, told), robot_s, coast_s)
 
 
 def _told_still(cycles: NDArray[Any]) -> Bools:

@@ -1,4 +1,7 @@
-"""Our socket: the robot calls, we answer. A blocking UDP socket and no thread, for that answers soonest."""
+"""The UDP server that receives the robot's packets and sends the replies.
+
+A blocking socket without a thread, because that has the shortest latency.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ _DRAIN: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """What lay in the queue.
+    """The datagrams that were in the socket's queue.
 
     Attributes:
         data: The newest datagram.
@@ -39,8 +42,8 @@ class Received:
     waited: bool
 
 
-class Link:
-    """The server's end, from one thread.
+class EgmServer:
+    """The server's socket, used from one thread.
 
     Once a robot has been answered, other senders are not heard until it has been silent for the time-out: two robots
     on one port must not be mixed, nor a stray datagram take the answer of the robot.
@@ -100,12 +103,12 @@ class Link:
             self.vanished += 1
 
     def clear(self) -> None:
-        """Forget what came while nobody was listening."""
+        """Discard the datagrams that are in the queue."""
         while self._drain():
             pass
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the socket."""
         self._socket.close()
 
     def _take(self, wait_ns: int) -> tuple[bytes, Address] | None:

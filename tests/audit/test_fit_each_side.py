@@ -1,11 +1,11 @@
-"""Ballistic bounds against motions whose accelerations were drawn."""
+"""Bounds fitted to each side of a joint, against motions whose accelerations were drawn."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from hrcreplay.audit.fit_limits import Futures, ballistic, inside
+from hrcreplay.audit.fit_limits import Futures, fit_each_side, inside_intervals
 from hrcreplay.limits import load_limits
 
 PAPER = load_limits("paper")
@@ -25,23 +25,23 @@ def pushed(at_rest: tuple[int, ...] = ()) -> Futures:
 
 
 def test_the_bounds_are_those_that_hold_the_share_of_each_side() -> None:
-    found = ballistic(pushed(), PAPER, 0.9, T_S)
+    found = fit_each_side(pushed(), PAPER, 0.9, T_S)
     assert not found.kept.any()
     assert (found.a_max < 5.0).all()
     assert (found.a_max > 3.0).all()
-    within = inside(pushed(), found, T_S)
+    within = inside_intervals(pushed(), found, T_S)
     assert within.mean(axis=0) == pytest.approx(0.8, abs=0.03)  # each side may miss a tenth
 
 
 def test_velocities_are_as_fast_as_people_are_so_that_they_hold_nothing_back() -> None:
-    found = ballistic(pushed(), PAPER, 0.9, T_S)
+    found = fit_each_side(pushed(), PAPER, 0.9, T_S)
     assert (found.v_max >= 1.95).all()
     assert (found.v_max <= 2.0 + 5.0 * T_S / 2.0).all()
     assert (found.v_min <= -1.95).all()
 
 
 def test_joints_at_rest_keep_the_standard_bounds() -> None:
-    found = ballistic(pushed((3, 7)), PAPER, 0.9, T_S)
+    found = fit_each_side(pushed((3, 7)), PAPER, 0.9, T_S)
     assert np.flatnonzero(found.kept).tolist() == [3, 7]
     for name in ("v_min", "v_max", "a_min", "a_max"):
         assert getattr(found, name)[[3, 7]] == pytest.approx(getattr(PAPER, name)[[3, 7]])

@@ -10,14 +10,14 @@ from contextlib import closing, contextmanager
 
 import pytest
 
-from hrcreplay.egm.link import Link
+from hrcreplay.egm.udp_server import EgmServer
 from hrcreplay.errors import SettingsError
 
 LONG_S = 5.0
 
 
 @contextmanager
-def robot(link: Link) -> Iterator[socket.socket]:
+def robot(link: EgmServer) -> Iterator[socket.socket]:
     """A socket that calls the link."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
         own.settimeout(LONG_S)
@@ -26,12 +26,12 @@ def robot(link: Link) -> Iterator[socket.socket]:
 
 
 @pytest.fixture
-def link() -> Iterator[Link]:
-    with closing(Link("127.0.0.1", 0, LONG_S)) as made:
+def link() -> Iterator[EgmServer]:
+    with closing(EgmServer("127.0.0.1", 0, LONG_S)) as made:
         yield made
 
 
-def test_a_datagram_comes_with_its_sender_and_its_instant(link: Link) -> None:
+def test_a_datagram_comes_with_its_sender_and_its_instant(link: EgmServer) -> None:
     with robot(link) as own:
         before = time.monotonic_ns()
         own.send(b"one")
@@ -45,7 +45,7 @@ def test_a_datagram_comes_with_its_sender_and_its_instant(link: Link) -> None:
         assert own.recv(100) == b"told"
 
 
-def test_the_queue_is_emptied_and_kept(link: Link) -> None:
+def test_the_queue_is_emptied_and_kept(link: EgmServer) -> None:
     with robot(link) as own:
         for number in range(50):
             own.send(b"%d" % number)
@@ -59,7 +59,7 @@ def test_the_queue_is_emptied_and_kept(link: Link) -> None:
         assert (received.data, received.older) == (b"next", ())
 
 
-def test_empty_and_long_datagrams_arrive_whole(link: Link) -> None:
+def test_empty_and_long_datagrams_arrive_whole(link: EgmServer) -> None:
     with robot(link) as own:
         own.send(b"")
         own.send(b"x" * 60_000)
@@ -68,7 +68,7 @@ def test_empty_and_long_datagrams_arrive_whole(link: Link) -> None:
         assert (len(received.data), received.older) == (60_000, (b"",))
 
 
-def test_it_wakes_as_soon_as_a_datagram_comes(link: Link) -> None:
+def test_it_wakes_as_soon_as_a_datagram_comes(link: EgmServer) -> None:
     with robot(link) as own:
         later = threading.Timer(0.05, own.send, [b"late"])
         later.start()
@@ -81,13 +81,13 @@ def test_it_wakes_as_soon_as_a_datagram_comes(link: Link) -> None:
 
 
 def test_silence_is_none() -> None:
-    with closing(Link("127.0.0.1", 0, 0.02)) as link:
+    with closing(EgmServer("127.0.0.1", 0, 0.02)) as link:
         began = time.monotonic()
         assert link.newest() is None
         assert time.monotonic() - began >= 0.019
 
 
-def test_a_vanished_peer_stops_nothing(link: Link) -> None:
+def test_a_vanished_peer_stops_nothing(link: EgmServer) -> None:
     with robot(link) as own:
         own.send(b"one")
         received = link.newest()
@@ -104,7 +104,7 @@ def test_a_vanished_peer_stops_nothing(link: Link) -> None:
         assert received.data == b"another"
 
 
-def test_a_stranger_takes_no_answer_and_joins_no_queue(link: Link) -> None:
+def test_a_stranger_takes_no_answer_and_joins_no_queue(link: EgmServer) -> None:
     with robot(link) as own, robot(link) as stranger:
         own.send(b"one")
         received = link.newest()
@@ -120,7 +120,7 @@ def test_a_stranger_takes_no_answer_and_joins_no_queue(link: Link) -> None:
 
 
 def test_a_stranger_does_not_prolong_the_wait_and_is_heard_once_the_robot_is_silent() -> None:
-    with closing(Link("127.0.0.1", 0, 0.3)) as link, robot(link) as own, robot(link) as stranger:
+    with closing(EgmServer("127.0.0.1", 0, 0.3)) as link, robot(link) as own, robot(link) as stranger:
         own.send(b"one")
         received = link.newest()
         assert received is not None
@@ -134,7 +134,7 @@ def test_a_stranger_does_not_prolong_the_wait_and_is_heard_once_the_robot_is_sil
         assert (received.data, received.sender) == (b"now", stranger.getsockname())
 
 
-def test_without_a_robot_yet_the_last_sender_is_heard(link: Link) -> None:
+def test_without_a_robot_yet_the_last_sender_is_heard(link: EgmServer) -> None:
     with robot(link) as first, robot(link) as second:
         first.send(b"scan")
         second.send(b"robot")
@@ -143,16 +143,16 @@ def test_without_a_robot_yet_the_last_sender_is_heard(link: Link) -> None:
         assert (received.data, received.older, received.sender) == (b"robot", (), second.getsockname())
 
 
-def test_a_taken_port_is_a_setting_to_mend(link: Link) -> None:
+def test_a_taken_port_is_a_setting_to_mend(link: EgmServer) -> None:
     with pytest.raises(SettingsError, match=rf"UDP port {link.port} of 127\.0\.0\.1 cannot be opened.*free port"):
-        Link("127.0.0.1", link.port, 0.1)
+        EgmServer("127.0.0.1", link.port, 0.1)
     with pytest.raises(SettingsError, match="cannot be opened"):
-        Link("127.0.0.1", 70_000, 0.1)
+        EgmServer("127.0.0.1", 70_000, 0.1)
     with pytest.raises(SettingsError, match="cannot be opened"):
-        Link("192.0.2.1", 0, 0.1)  # nobody's address
+        EgmServer("192.0.2.1", 0, 0.1)  # nobody's address
 
 
 def test_a_closed_link_gives_its_port_back() -> None:
-    link = Link("127.0.0.1", 0, 0.1)
+    link = EgmServer("127.0.0.1", 0, 0.1)
     link.close()
-    Link("127.0.0.1", link.port, 0.1).close()
+    EgmServer("127.0.0.1", link.port, 0.1).close()

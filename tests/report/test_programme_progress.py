@@ -1,4 +1,4 @@
-"""The pace kept, beside motions whose programmed time at every tick is known because they were made from it."""
+"""Progress along the programme, for motions made from a known programmed time at every tick."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from hrcreplay.records import Floats
-from hrcreplay.report.metrics_plan import pace
+from hrcreplay.report.metrics_plan import programme_progress
 from hrcreplay.run.report import compute
 from tests.report.synthetic import T0_NS, make_run
 
@@ -37,7 +37,7 @@ def table(reference_s: Floats, tcp_m: Floats) -> pd.DataFrame:
 
 
 def share(motion: pd.DataFrame) -> float:
-    found = pace(motion, LEASH_M)
+    found = programme_progress(motion, LEASH_M)
     assert found is not None
     return found[0] / found[1]
 

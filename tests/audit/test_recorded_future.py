@@ -1,4 +1,4 @@
-"""The recorded future of a tick, and what is held against it."""
+"""The recorded future of a tick, and the comparison of volumes with it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit import recording
-from hrcreplay.audit.log_audit import hold, joints_inside, travel, window
+from hrcreplay.audit.log_audit import check_containment, joint_travel, joints_inside, recorded_future
 from hrcreplay.audit.recording import Recording
 from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.records import JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
@@ -32,21 +32,23 @@ def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
     people = states(np.zeros((1, 12)), np.zeros((1, 12)))
     points = np.zeros((10, len(POINTS), 3))
     points[:, :, 0] = np.arange(10)[:, None]
-    future = window(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4)
-    outcome = hold(_balls(people, 1.5), future, np.array([True]))
+    future = recorded_future(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4)
+    outcome = check_containment(_balls(people, 1.5), future, np.array([True]))
     np.testing.assert_allclose(outcome.beyond_m, 4.0)  # the sample at the horizon counts, the next does not
     np.testing.assert_allclose(outcome.escape_m(), 2.5)
     assert outcome.union_m3[0] == pytest.approx(4.0 / 3.0 * np.pi * 1.5**3, rel=0.05)
     points[4, POINTS.index("wrist_l")] = np.nan  # not seen near the end: the lower arm cannot be audited
-    future = window(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4)
-    outcome = hold(_balls(people, 1.5), future, np.array([False]))
+    future = recorded_future(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4)
+    outcome = check_containment(_balls(people, 1.5), future, np.array([False]))
     assert np.isnan(outcome.beyond_m[0]).tolist() == [limb == "LLA" for limb in LIMBS]
     assert outcome.worst_m()[0] == pytest.approx(2.5)
     assert not future.checked("LLA")[0]
     assert future.points()["LLA"] == {"hand_l": 0}  # seen, but its limb is not checked
     assert future.points()["LRA"] == {"hand_r": 1}
     points[4, POINTS.index("hand_r")] = np.nan
-    assert window(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4).points()["LRA"] == {"hand_r": 0}
+    assert recorded_future(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4).points()["LRA"] == {
+        "hand_r": 0
+    }
     assert np.isnan(outcome.union_m3[0])
 
 
@@ -69,4 +71,4 @@ def test_a_joint_stays_inside_whatever_its_name_and_turn() -> None:
     )
     assert late[0, 4] == 0.0
     assert np.isnan(late[1]).all()  # the recording is over
-    assert travel(joints[:6])[4] == pytest.approx(0.09)
+    assert joint_travel(joints[:6])[4] == pytest.approx(0.09)

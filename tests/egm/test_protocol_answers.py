@@ -12,25 +12,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hrcreplay.egm.codec import RobotPacket
-from hrcreplay.egm.session import REASONS, Heard
+from hrcreplay.egm.protocol import REASONS, PacketStatus
 from tests.egm.talks import CYCLE_NS, DQ_MAX, Q_MAX, ZERO, packet, session, talk
 
 
 def test_the_first_answer_is_an_echo_whatever_is_asked() -> None:
     talking = session()
     measured = np.linspace(-0.5, 0.5, 6)
-    talking.hear(packet(0, q=measured), 0)
+    talking.classify(packet(0, q=measured), 0)
     told = talking.reply(np.ones(6), np.ones(6), 0)
     assert (told.q.tolist(), told.dq.tolist()) == (measured.tolist(), [0.0] * 6)
-    talking.hear(packet(1, q=measured), CYCLE_NS)
+    talking.classify(packet(1, q=measured), CYCLE_NS)
     told = talking.reply(np.full(6, 0.2), np.full(6, 0.3), CYCLE_NS)
     assert (told.q.tolist(), told.dq.tolist()) == ([0.2] * 6, [0.3] * 6)
 
 
 def test_the_echo_is_owed_until_it_is_given() -> None:
     talking = session()
-    assert talking.hear(packet(0), 0).fresh
-    assert talking.hear(packet(1, q=np.full(6, 0.4)), CYCLE_NS).fresh
+    assert talking.classify(packet(0), 0).fresh
+    assert talking.classify(packet(1, q=np.full(6, 0.4)), CYCLE_NS).fresh
     assert talking.reply(ZERO, ZERO, CYCLE_NS).q.tolist() == [0.4] * 6
 
 
@@ -39,19 +39,19 @@ def test_a_robot_that_may_not_move_hears_where_it_is(state: dict[str, int]) -> N
     talking = session()
     talk(talking, [0, 1])
     for seqno, angle in ((2, 0.3), (3, 0.31)):
-        talking.hear(packet(seqno, q=np.full(6, angle), **state), seqno * CYCLE_NS)
+        talking.classify(packet(seqno, q=np.full(6, angle), **state), seqno * CYCLE_NS)
         told = talking.reply(np.ones(6), np.ones(6), 0)
         assert (told.q.tolist(), told.dq.tolist()) == ([angle] * 6, [0.0] * 6)
-    assert talking.hear(packet(4, q=np.full(6, 0.32)), 4 * CYCLE_NS).fresh
+    assert talking.classify(packet(4, q=np.full(6, 0.32)), 4 * CYCLE_NS).fresh
     assert talking.reply(np.ones(6), np.ones(6), 0).q.tolist() == [0.32] * 6
-    assert not talking.hear(packet(5), 5 * CYCLE_NS).fresh
+    assert not talking.classify(packet(5), 5 * CYCLE_NS).fresh
 
 
 def test_our_counter_steps_by_one_through_everything() -> None:
     talking = session()
     told = []
     for cycle, seqno in enumerate([0, 1, 1, 5, 4, 0, 1, 900, 901]):
-        if talking.hear(packet(seqno), cycle * CYCLE_NS).answer:
+        if talking.classify(packet(seqno), cycle * CYCLE_NS).answer:
             told.append(talking.reply(ZERO, ZERO, cycle * CYCLE_NS).seqno)
     assert told == list(range(7))
 
@@ -61,7 +61,7 @@ def test_our_counter_and_stamp_go_round() -> None:
     talking._seqno = 2**32 - 2
     told = []
     for cycle in range(2):
-        talking.hear(packet(cycle), 0)
+        talking.classify(packet(cycle), 0)
         told.append(talking.reply(ZERO, ZERO, (2**32 - 1 + cycle) * 1_000_000))
     assert [(one.seqno, one.tm_ms) for one in told] == [(2**32 - 1, 2**32 - 1), (0, 0)]
 
@@ -80,7 +80,7 @@ def test_nonsense_is_never_told(bad: Any) -> None:
     talking = session()
     talk(talking, [0])
     for q, dq in ((bad, ZERO), (ZERO, bad)):
-        talking.hear(packet(1), CYCLE_NS)
+        talking.classify(packet(1), CYCLE_NS)
         with pytest.raises(ValueError, match="finite"):
             talking.reply(q, dq, 0)
 
@@ -88,7 +88,7 @@ def test_nonsense_is_never_told(bad: Any) -> None:
 def test_limits_hold_place_and_speed() -> None:
     talking = session()
     talk(talking, [0])
-    talking.hear(packet(1), CYCLE_NS)
+    talking.classify(packet(1), CYCLE_NS)
     told = talking.reply(
         np.array([9.0, -9.0, 0.0, 0.0, Q_MAX[4], -9.0]), np.array([1.0, -1.0, 99.0, -99.0, 1.0, 1.0]), 0
     )
@@ -99,13 +99,13 @@ def test_limits_hold_place_and_speed() -> None:
 def test_a_robot_outside_its_limits_is_not_thrown_back_in() -> None:
     talking = session()
     outside = np.array([0.0, Q_MAX[1] + 0.2, 0.0, 0.0, 0.0, 0.0])
-    talking.hear(packet(0, q=outside), 0)
+    talking.classify(packet(0, q=outside), 0)
     assert talking.reply(ZERO, ZERO, 0).q.tolist() == outside.tolist()
-    talking.hear(packet(1, q=outside), CYCLE_NS)
+    talking.classify(packet(1, q=outside), CYCLE_NS)
     assert talking.reply(outside + 0.1, np.full(6, 0.1), 0).q[1] == outside[1]
-    talking.hear(packet(0), 2 * CYCLE_NS)  # from inside, the limits are the limits again
+    talking.classify(packet(0), 2 * CYCLE_NS)  # from inside, the limits are the limits again
     talking.reply(ZERO, ZERO, 0)
-    talking.hear(packet(1), 3 * CYCLE_NS)
+    talking.classify(packet(1), 3 * CYCLE_NS)
     assert talking.reply(outside, ZERO, 0).q[1] == Q_MAX[1]
 
 
@@ -113,9 +113,9 @@ def test_a_queue_gets_one_answer_to_its_newest_packet() -> None:
     talking = session()
     talk(talking, [0, 1])
     lot = [packet(3), packet(2), None, packet(5), packet(5), packet(4), None]
-    heard, newest = talking.hear_all(lot, 2 * CYCLE_NS)
+    heard, newest = talking.classify_all(lot, 2 * CYCLE_NS)
     assert newest is lot[3]
-    assert heard == Heard(answer=True, fresh=False, allowed=True, reason="", ended=False, lost=2)
+    assert heard == PacketStatus(answer=True, fresh=False, allowed=True, reason="", ended=False, lost=2)
     assert talking.reply(ZERO, ZERO, 0).seqno == 2
     with pytest.raises(ValueError, match="no packet is waiting"):
         talking.reply(ZERO, ZERO, 0)
@@ -126,13 +126,13 @@ def test_a_session_that_began_in_a_queue_is_echoed_from_its_newest_packet() -> N
     talking = session()
     talk(talking, [700, 701])
     lot = [packet(702), packet(0), packet(1, q=np.full(6, 0.2))]
-    assert [talking.hear(one, 2 * CYCLE_NS).fresh for one in lot] == [False, True, True]
+    assert [talking.classify(one, 2 * CYCLE_NS).fresh for one in lot] == [False, True, True]
     assert talking.reply(ZERO, ZERO, 0).q.tolist() == [0.2] * 6
 
 
 @pytest.mark.parametrize("lot", [[], [None, None], [replace(packet(0), clock_ns=None)]])
 def test_a_queue_without_a_packet_gets_no_answer(lot: list[RobotPacket | None]) -> None:
-    heard, newest = session().hear_all(lot, 0)
+    heard, newest = session().classify_all(lot, 0)
     assert newest is None
     assert not heard.answer
     assert heard.reason in REASONS
@@ -165,7 +165,7 @@ def test_whatever_comes_the_same_words_give_the_same_answers(
         said: list[object] = []
         for one, gap_ns in zip(lots, gaps_ns, strict=False):
             t_ns += gap_ns
-            heard = talking.hear(one, t_ns)
+            heard = talking.classify(one, t_ns)
             said.append(heard)
             assert heard.reason == "" or heard.reason in REASONS
             assert heard.answer or not heard.fresh

@@ -1,6 +1,7 @@
-"""What the screen needs to draw a live session in 3-D: the message ``P``, and ``J`` with the names in it, once.
+"""Messages from control to the screen process: the status, and the 3-D scene.
 
-What control tells the screen ten times a second: ``S`` + this as JSON. Not known is null, never NaN.
+``S`` + a Status as JSON, ten times a second; what is not known is null, never NaN. For the scene ``J`` + its
+SceneNames as JSON once, and ``P`` + a packed Scene.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class CameraStatus(TypedDict):
 
 
 class RecorderStatus(TypedDict):
-    """The flight recorder."""
+    """State of the recorder process."""
 
     alive: bool
     dropped: int  #: messages that it could not take
@@ -62,8 +63,8 @@ class Status(TypedDict):
 _HEAD = struct.Struct("<qH")
 
 
-class Cast(TypedDict):
-    """What stays the same for a session."""
+class SceneNames(TypedDict):
+    """Names and radii that stay the same for a session."""
 
     limbs: list[str]  #: of the swept volumes
     links: list[str]  #: of the robot's segments
@@ -81,7 +82,14 @@ class Scene:
 
 
 def pack(t_ns: int, points_m: Floats, ends_m: Floats, volumes: bytes) -> bytes:
-    """The payload of ``P``, of the fields of a Scene; ``volumes`` as ``wire.whole`` packs them for the record."""
+    """The payload of ``P``, of the fields of a Scene.
+
+    Args:
+        t_ns: Instant of the perception [ns].
+        points_m: (20, 3) fused person, world [m]; NaN where the model has no such point.
+        ends_m: (s, 2, 3) both ends of the robot's s segments, world [m].
+        volumes: Swept volumes of one tick, as ``codec.encode_volumes`` packs them for the record.
+    """
     return b"".join([_HEAD.pack(t_ns, len(ends_m)), points_m.tobytes(), ends_m.tobytes(), volumes])
 
 
@@ -93,4 +101,4 @@ def unpack(data: bytes, limbs: tuple[str, ...]) -> Scene:
     at += points.nbytes
     ends = np.frombuffer(data, "<f8", 6 * segments, at).reshape(-1, 2, 3)
     at += ends.nbytes
-    return Scene(t_ns, points, ends, codec.read_whole(data[at:], limbs, ""))
+    return Scene(t_ns, points, ends, codec.decode_volumes(data[at:], limbs, ""))

@@ -1,4 +1,4 @@
-"""Records as the columns of a run folder's tables, and back. The names are a contract with whoever reads the files."""
+"""Conversion between records and the columns of a run folder's tables. Column names are a contract with readers."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ COLUMNS = {
 }
 
 
-def lacks(path: Path) -> tuple[str, ...]:
+def missing_columns(path: Path) -> tuple[str, ...]:
     """The COLUMNS that a table lacks, as one of an earlier version may; ``motion_<baseline>`` has those of motion."""
     names = set(pq.read_schema(path).names)
     return tuple(name for name in COLUMNS[path.stem.split("_")[0]] if name not in names)
@@ -94,7 +94,16 @@ def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
 def occupancy_columns(
     t_ns: Ints, limbs: list[str], method: str, radius_m: list[float], volume_m3: list[float], hulls: list[Floats]
 ) -> Columns:
-    """A row per stored tick and limb; ``hulls`` are (m, 3) hull vertices in the world [m], before the radius."""
+    """A row per stored tick and limb; ``hulls`` are (m, 3) hull vertices in the world [m], before the radius.
+
+    Args:
+        t_ns: (n,) ticks [ns].
+        limbs: Limb of each row.
+        method: Method of the swept volumes.
+        radius_m: Radius of the ball around each hull [m].
+        volume_m3: Volume of each hull with its ball [m^3].
+        hulls: (m, 3) hull vertices of each row, before the radius, world [m].
+    """
     return {
         "t_ns": t_ns,
         "limb": _text(limbs),
@@ -106,7 +115,7 @@ def occupancy_columns(
 
 
 def motion_columns(motion: Motion) -> Columns:
-    """A row a tick: what the robot was told, and how far it was from the person."""
+    """A row a tick: the commanded motion, and the distance from the person."""
     numbers = range(1, motion.q.shape[1] + 1)
     return {
         "t_ns": motion.t_ns,

@@ -1,4 +1,4 @@
-"""The robot double at a socket: a UDP client that keeps the period by absolute deadlines."""
+"""The robot double as a UDP client that keeps its cycle time by absolute deadlines."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from pathlib import Path
 from types import FrameType
 
 from hrcreplay.egm.robot_double.faults import Datagram, Fault
-from hrcreplay.egm.robot_double.report import TwinReport, report_of
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.twin_report import TwinReport, report_of
 from hrcreplay.errors import SettingsError
 
 _SO_TIMESTAMPNS = 35  # Linux; the socket module has no name for it
@@ -96,7 +96,7 @@ def _run(core: TwinCore, client: socket.socket, duration_s: float | None) -> int
     except KeyboardInterrupt:
         pass  # the report is what remains to be done
     for datagram in _arrived(client):
-        core.record.arrived(datagram, core.session)
+        core.record.add_arrival(datagram, core.session)
     return overruns
 
 

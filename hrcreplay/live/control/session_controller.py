@@ -1,0 +1,239 @@
+"""The controller of a live session: decides what the robot is told in each cycle.
+
+Pure: the same events in the same order give the same bits, so a recorded session can be computed again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from hrcreplay.egm.codec import AXES, BadPacket, RobotPacket, decode_robot, encode_correction
+from hrcreplay.egm.protocol import EgmSession, PacketStatus
+from hrcreplay.live.control import watchdog
+from hrcreplay.live.control.motion import ControlSetup, MotionState, MotionStep, brake, follow, start_approach
+from hrcreplay.live.control.perception import Observer
+from hrcreplay.live.record import codec
+from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
+from hrcreplay.records import Floats
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.separation import Obstacles
+
+#: Obstacles before the first perception update: nothing is known, so the robot stands.
+_UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=False)
+_STILL = np.zeros(AXES)
+
+
+class SessionController:
+    """Answers the robot's packets: waits, approaches, follows its programme, brakes by Eq. (67) and holds.
+
+    Between two answers ``update_perception`` brings in what the cameras saw. The robot moves only while the watchdog
+    has no reason against it. A reason that appears is kept until the session ends, or, where ``resume`` is set, until
+    it has been gone for ``resume_s``. A robot that stands starts to move in one way only: from where it stands, at
+    approach speed.
+
+    The step of the next answer depends only on the last answer and the last perception update, so it is computed at
+    the end of that update, and the answer only decides whether it is used. Where a cycle has no time for an update,
+    ``prepare`` computes the step without one.
+    """
+
+    def __init__(self, setup: ControlSetup, observer: Observer, session: EgmSession) -> None:
+        self.setup = setup
+        self.observer = observer
+        self._session = session
+        self.perception: Perception | None = None
+        self.phase = codec.WAITING
+        self.stop = ""  #: why the robot was stopped; empty while it may move
+        self.stops: list[tuple[int, str]] = []  #: every stop: instant [ns] and reason
+        self.waiting = ""  #: why it does not start
+        self.fault: Exception | None = None  #: a bug that stopped it; to be raised once it stands
+        self.standing = 0  #: answers since it stands
+        self._motion: MotionState | None = None  # None: no robot is there
+        self._ready: tuple[MotionState, MotionStep] | None = None
+        self._programme_s = 0.0  # of the robot that was there last
+        self._heard_ns: int | None = None
+        self._clear_ns: int | None = None
+        self._behind_ns: int | None = None  # since when every event has packets of several cycles: we are too slow
+
+    @property
+    def connected(self) -> bool:
+        """Whether a robot is being answered."""
+        return self._motion is not None
+
+    def counts(self) -> Counter[str]:
+        """Counters of the person's frames and the robot's packets so far."""
+        return self.observer.counts + Counter({f"robot {what}": n for what, n in self._session.counts.items()})
+
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
+        """Stages 1 and 2 up to ``t_ns`` [ns, session clock]; None where they failed, which stops the robot."""
+        self._ready = None
+        try:
+            self.perception = self.observer.update_perception(t_ns, skeletons)
+            if self._motion is not None:
+                self._ready = self._motion, self._step(self._motion)
+        except Exception as error:  # whatever it is, the robot must go on being answered
+            self.fault = self.fault or error
+            self.perception = self.perception if self.perception is not None and self.perception.t_ns == t_ns else None
+        return self.perception
+
+    def prepare(self) -> None:
+        """Computes the step of the next answer from the last perception; changes no answer."""
+        if self._motion is not None:
+            with suppress(Exception):  # the answer fails in the same way, and says so
+                self._ready = self._motion, self._step(self._motion)
+
+    def silence(self, t_ns: int, signals: Signal) -> None:
+        """Nothing came from the robot within the time-out."""
+        self._check_silence(t_ns)
+        why = watchdog.of_signals(signals)
+        if why and not self.stop:
+            self._stop(t_ns, why)
+
+    def answer(self, event: TickEvent) -> Decision:
+        """The reply to what the robot sent, and why it is that one."""
+        self._check_silence(event.t_ns)  # also where the packet that ends a silence comes before its time-out is seen
+        packets = [_decoded(data) for data in event.datagrams]
+        cycles = {packet.clock_ns for packet in packets if packet is not None}
+        self._behind_ns = (self._behind_ns or event.t_ns) if len(cycles) > 1 else None
+        packet_status, packet = self._session.classify_all(packets, event.t_ns)
+        look_ns = self.perception.t_ns if self.perception is not None else 0
+        if packet is None:
+            self._refuse(event.t_ns, packet_status)
+            return Decision(event.t_ns, look_ns, None, self.phase, control_step.BRAKING, self.stop, -1, -1, None)
+        measured = packet.q[:AXES]
+        self._heard_ns = event.t_ns
+        if packet_status.fresh or self._motion is None:
+            self._begin_session(measured)
+        self._apply_watchdog(event, packet_status, measured)
+        before = self._motion
+        assert before is not None  # noqa: S101 - for the type checker
+        result = self._next_step(before)
+        phase = self.phase
+        reply = self._session.reply(result.step.next.q, result.step.next.dq, event.t_ns)
+        told = RobotState(reply.q, reply.dq)  # which is an echo while the robot may not move
+        self._motion = replace(result.after, state=told)
+        self._programme_s = result.after.programme_s
+        self._settle()
+        step, row = result.step, _row(measured, before, result)
+        reason = (self.stop or self.waiting) if result.after.follower is None else control_step.REASONS[step.reason]
+        return Decision(
+            event.t_ns, look_ns, encode_correction(reply), phase, step.status, reason, step.limb, step.link, row
+        )
+
+    def _settle(self) -> None:
+        """The phase after an answer that left the robot standing, or not."""
+        moving = self._motion is not None and bool(np.any(self._motion.state.dq))
+        self.standing = 0 if moving else self.standing + 1
+        if self.phase == codec.ECHO:
+            self.phase = codec.HOLDING if self.stop else codec.WAITING
+        elif self.phase == codec.STOPPING and not moving:
+            self.phase = codec.HOLDING
+        elif self.phase == codec.APPROACH and self._motion is not None and self._motion.arrived:
+            self.phase = codec.FOLLOWING
+
+    def _refuse(self, t_ns: int, packet_status: PacketStatus) -> None:
+        """Handles datagrams without an answer: a robot that must not be moved at all, or no usable packet."""
+        if packet_status.reason in watchdog.REFUSED and not self.stop:
+            self._stop(t_ns, packet_status.reason)
+            self._motion, self.phase = None, codec.HOLDING
+        self._check_silence(t_ns)
+
+    def _check_silence(self, t_ns: int) -> None:
+        """Whether the robot has been gone for too long: it has stopped listening, so it begins anew where it stands."""
+        if self._heard_ns is None or t_ns - self._heard_ns <= self.setup.bounds.silent_s * 1e9:
+            return
+        if self.phase in (codec.APPROACH, codec.FOLLOWING, codec.STOPPING):
+            self._stop(t_ns, watchdog.SILENT)
+        self._motion, self._heard_ns = None, None
+        self.phase = codec.HOLDING if self.stop else codec.WAITING
+
+    def _begin_session(self, measured: Floats) -> None:
+        """Starts a new session of the robot from its measured joints, whatever was commanded before."""
+        self._motion = MotionState(RobotState(measured, _STILL), self._programme_s)
+        self.phase = codec.ECHO
+
+    def _apply_watchdog(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> None:
+        """Applies the watchdog's verdict to the phase."""
+        why = self._stop_reason(event, packet_status, measured)
+        if self.phase in (codec.APPROACH, codec.FOLLOWING):
+            if why:
+                self._stop(event.t_ns, why)
+            return
+        if self.phase == codec.HOLDING and self.setup.bounds.resume:
+            self._clear_ns = None if why else (self._clear_ns or event.t_ns)
+            if self._clear_ns is not None and event.t_ns - self._clear_ns >= self.setup.bounds.resume_s * 1e9:
+                self.stop, self.phase = "", codec.WAITING
+            elif why and why not in watchdog.ENDINGS:
+                self.stop = why  # what holds it now
+        self.waiting = why if self.phase == codec.WAITING else ""
+        if self.phase == codec.WAITING and not why and self._motion is not None:
+            self._motion, self.phase = start_approach(self.setup, self._motion), codec.APPROACH
+
+    def _stop_reason(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> str:
+        """The watchdog's reason against moving; empty without one."""
+        if self.fault is not None:
+            return watchdog.FAULT
+        why = watchdog.of_signals(event.signals) or watchdog.of_robot(packet_status)
+        behind_ns = 0 if self._behind_ns is None else event.t_ns - self._behind_ns
+        if not why and behind_ns > self.setup.bounds.overrun_s * 1e9:
+            why = watchdog.OVERRUN
+        if not why:
+            why = watchdog.of_person(self.perception, self.observer.age_s(event.t_ns), self.setup.bounds)
+        if not why and self.setup.sending and self._motion is not None and self.phase != codec.ECHO:
+            why = watchdog.of_tracking(measured, self._motion.state.q, self.setup.bounds)
+        return why
+
+    def _stop(self, t_ns: int, why: str) -> None:
+        self.stop, self.phase, self._clear_ns = why, codec.STOPPING, None
+        self.stops.append((t_ns, why))
+        if self._motion is not None:
+            self._motion = replace(self._motion, follower=None)
+
+    def _next_step(self, motion: MotionState) -> MotionStep:
+        """The step of this tick: the precomputed one where it is still valid, else a new one."""
+        if self._ready is not None and self._ready[0] is motion:
+            result = self._ready[1]
+        else:
+            try:
+                result = self._step(motion)
+            except Exception as error:  # whatever it is, the robot must brake
+                self.fault = self.fault or error
+                return self._fallback_stop(motion, watchdog.FAULT)
+        finite = math.isfinite(result.step.next.q.sum() + result.step.next.dq.sum())
+        return result if finite else self._fallback_stop(motion, watchdog.NOT_FINITE)
+
+    def _fallback_stop(self, motion: MotionState, why: str) -> MotionStep:
+        """The stop of a robot whose step cannot be taken; once, however often it fails while the robot brakes."""
+        if not self.stop or self.phase in (codec.APPROACH, codec.FOLLOWING):
+            self._stop(self._heard_ns or 0, why)
+        return brake(self.setup, motion, _UNSEEN)
+
+    def _step(self, motion: MotionState) -> MotionStep:
+        return (brake if motion.follower is None else follow)(self.setup, motion, self._obstacles())
+
+    def _obstacles(self) -> Obstacles:
+        """Swept volumes to keep clear of; unknown where nobody has been seen for too long."""
+        if self.perception is None:
+            return _UNSEEN
+        seen = self.observer.age_s(self.perception.t_ns) <= self.setup.memory_s
+        return self.perception.obstacles if seen else replace(self.perception.obstacles, known=False)
+
+
+def _decoded(data: bytes) -> RobotPacket | None:
+    try:
+        return decode_robot(data)
+    except BadPacket:
+        return None
+
+
+def _row(measured: Floats, before: MotionState, result: MotionStep) -> MotionRow:
+    pose, state = result.step.pose, before.state
+    speed = float(np.linalg.norm(pose.J_tcp[:3] @ state.dq))
+    rest = np.array([speed, result.reference_speed, result.after.programme_s, result.step.distance_m])
+    return MotionRow(measured, state.q, state.dq, result.step.u, result.reference_m, pose.T_world_tcp[:3, 3], rest)
