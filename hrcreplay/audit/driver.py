@@ -127,12 +127,12 @@ def _summary(found: dict[str, Any]) -> list[str]:
 
 def _alike(jobs: Sequence[Job]) -> None:
     """Refuses logs whose ticks cannot be counted together."""
-    foresights = [build.prediction_stage(job) for job in jobs]
+    stages = [build.prediction_stage(job) for job in jobs]
     for what, values in (
-        ("occupancy.stop_s and latency_s", [standstill_s(one) for one in foresights]),
-        ("occupancy.method", [one.method for one in foresights]),
-        ("occupancy.radius_*", [limb_radii(one.occupancy).tolist() for one in foresights]),
-        ("the margins of occupancy", [_margins(one) for one in foresights]),
+        ("occupancy.stop_s and latency_s", [standstill_s(one) for one in stages]),
+        ("occupancy.method", [one.method for one in stages]),
+        ("occupancy.radius_*", [limb_radii(one.occupancy).tolist() for one in stages]),
+        ("the margins of occupancy", [_margins(one) for one in stages]),
     ):
         for job, value in zip(jobs, values, strict=True):
             if value != values[0]:
