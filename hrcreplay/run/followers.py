@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from hrcreplay.records import HumanStates, Motion, SweptVolumes
 from hrcreplay.robot.control import control_step, qp_controller, scaling_controller
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step
 from hrcreplay.robot.control.scaling_controller import PathState
-from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.reference import Reference, ReferencePoint, advance
 
@@ -90,10 +91,11 @@ class Planner:
         """The time between two ticks [s]."""
         return self.follower.settings.dt_s
 
-    def follow(self, states: HumanStates, volumes: SweptVolumes) -> Motion:
-        """The motion of a batch of ticks."""
+    def follow(self, states: HumanStates, volumes: SweptVolumes, around: Sequence[Obstacles]) -> Motion:
+        """The motion of a batch of ticks, beside the obstacles that the volumes of each are."""
         robot = self.follower.robot
-        rows = [self._tick(volumes, i, int(t), bool(states.valid[i].any())) for i, t in enumerate(volumes.t_ns)]
+        seen = states.valid.any(axis=1).tolist()
+        rows = [self._tick(around[i], int(t), seen[i]) for i, t in enumerate(volumes.t_ns)]
         found, points, steps = ([getattr(row, name) for row in rows] for name in ("state", "point", "step"))
         poses = [step.pose for step in steps]
         return Motion(
@@ -118,10 +120,9 @@ class Planner:
             reasons=control_step.REASONS,
         )
 
-    def _tick(self, volumes: SweptVolumes, row: int, t_ns: int, seen: bool) -> FollowerTick:
+    def _tick(self, around: Obstacles, t_ns: int, seen: bool) -> FollowerTick:
         if seen:
             self.seen_ns = t_ns
-        around = obstacles(volumes, row)
         if self.seen_ns is None or t_ns - self.seen_ns > self.memory_s * 1e9:
             around = replace(around, known=False)
         return self.follower.step(around)

@@ -26,6 +26,7 @@ from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.run.followers import InitialOverlap, Planner
 from hrcreplay.settings.sections import Fusion, Occupancy
 from hrcreplay.store.columns import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
@@ -308,9 +309,10 @@ def planned(
     """Stage 3: what the robot would have done by each method; writes a motion for each."""
     beside = InitialOverlap(next(iter(planners.values())).dt_s)
     for states, volumes in people:
+        around = [obstacles(volumes, tick) for tick in range(len(volumes))]
         for name, planner in planners.items():
             with sink.watch.stage(f"plan {name}", len(volumes)):
-                motion = planner.follow(states, volumes)
+                motion = planner.follow(states, volumes, around)
             sink.run.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
             if planner.chosen:
                 beside.add(states, motion)
