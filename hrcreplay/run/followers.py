@@ -94,7 +94,7 @@ class Planner:
     def follow(self, states: HumanStates, volumes: SweptVolumes, around: Sequence[Obstacles]) -> Motion:
         """The motion of a batch of ticks, beside the obstacles that the volumes of each are."""
         robot = self.follower.robot
-        seen = states.valid.any(axis=1).tolist()
+        seen: list[bool] = list(states.valid.any(axis=1))
         rows = [self._tick(around[i], int(t), seen[i]) for i, t in enumerate(volumes.t_ns)]
         found, points, steps = ([getattr(row, name) for row in rows] for name in ("state", "point", "step"))
         poses = [step.pose for step in steps]
