@@ -25,7 +25,6 @@ from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
 from hrcreplay.run import build
-from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job, resolve
 from hrcreplay.run.stages import NS, PredictionStage, ProgressBar, tick_times
 
@@ -254,7 +253,7 @@ def _horizon_s(jobs: Sequence[Job]) -> float:
 
 
 def _sample(job: Job, horizon_s: float, held_back: float) -> FitSample:
-    log = open_log(job.log, log_options(job.settings))
+    log = open_log(job.log, job.settings.logs)
     first_ns = log.header.start_ns
     begin_ns = first_ns + round((job.start_s or 0.0) * NS)
     end_ns = log.header.end_ns if job.end_s is None else min(log.header.end_ns, first_ns + round(job.end_s * NS))

@@ -21,7 +21,6 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report.metrics import difference
 from hrcreplay.run import build
-from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job
 from hrcreplay.run.stages import NS, PredictionStage, ProgressBar, tick_times
 from hrcreplay.store.run_folder import Stopwatch
@@ -242,7 +241,7 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         SettingsError: The cell does not fit the log.
         LogError: The log cannot be read, is shorter than the horizon, or shows nobody.
     """
-    log = open_log(job.log, log_options(job.settings))
+    log = open_log(job.log, job.settings.logs)
     prediction_stage = build.prediction_stage(job)
     horizon_s = standstill_s(prediction_stage)
     first_ns, last_ns = log.header.start_ns, log.header.end_ns

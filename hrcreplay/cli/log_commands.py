@@ -12,7 +12,6 @@ from hrcreplay.calibration.cell import pose_from_position, write_cell
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs import importers, info
 from hrcreplay.logs.reader import open_log
-from hrcreplay.run.build import log_options
 from hrcreplay.settings.load import load_settings
 
 KINDS = ("azure", "kinect2", "keraal")
@@ -26,7 +25,7 @@ def describe(path: Path, config: Path | None, overrides: tuple[str, ...]) -> lis
         LogError: The log cannot be read.
     """
     settings = load_settings(config, overrides)
-    return info.lines(info.summarize(open_log(path, log_options(settings), skeletons=False)))
+    return info.lines(info.summarize(open_log(path, settings.logs, skeletons=False)))
 
 
 def import_files(kind: str, files: list[str], out: Path, rate_hz: float) -> list[str]:
@@ -101,7 +100,7 @@ def calibrate(
     place = None if base is None else _numbers("--base", base, 4)
     if height_m is not None and not 0.0 <= height_m < np.inf:
         raise SettingsError(f"--height {height_m:g}: would be right: metres above the floor, 0 or more, e.g. 1.6")
-    opened = open_log(log, log_options(settings))
+    opened = open_log(log, settings.logs)
     cell, stood = calibration.survey(
         opened,
         reference,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -28,6 +28,7 @@ from hrcreplay.logs.messages import (
     stamp_ns,
 )
 from hrcreplay.records import POINTS, Floats
+from hrcreplay.settings.sections import Decoder
 
 
 class OwnDecoder:
@@ -220,23 +221,22 @@ _METRES = {"m": 1.0, "mm": 1e-3}
 
 @dataclass(frozen=True)
 class GenericDecoder:
-    """How to read skeletons from a message type the package does not know; one body, called 0."""
+    """Reads skeletons from a message type that settings describe; one body, called 0."""
 
-    topic: str
-    camera: str
-    points: str  #: path to the array of points, fields joined by dots; its elements have x, y, z
-    index: Mapping[str, int]  #: body point -> element
-    unit: str = "m"  #: "m" or "mm"
-    stamp: str | None = "header.stamp"  #: path to the capture time; None: the arrival time is used
-    confidence: str | None = None  #: path to an array of confidences in [0, 1]; None: 1 for every finite point
+    how: Decoder
 
     notes: ClassVar[tuple[str, ...]] = ()
     shows_camera_alive: ClassVar[bool] = True
 
     @property
+    def topic(self) -> str:
+        """Topic of the messages."""
+        return self.how.topic
+
+    @property
     def cameras(self) -> tuple[str, ...]:
         """The one sensor."""
-        return (self.camera,)
+        return (self.how.camera,)
 
     def fresh_copy(self) -> GenericDecoder:
         """Itself: it remembers nothing."""
@@ -245,14 +245,14 @@ class GenericDecoder:
     def rows(self, message: Message) -> list[RawSkeleton]:
         """The one row of a message; none where the array is empty."""
         content = message.read()
-        where = f"{self.topic} ({message.topic.type})"
-        elements = _array(content, self.points, where)
-        trust = None if self.confidence is None else _array(content, self.confidence, where)
+        where = f"{self.how.topic} ({message.topic.type})"
+        elements = _array(content, self.how.points, where)
+        trust = None if self.how.confidence is None else _array(content, self.how.confidence, where)
         if not len(elements):
             return []
         points, confidence = missing_body()
-        scale = _METRES[self.unit]
-        for name, element in self.index.items():
+        scale = _METRES[self.how.unit]
+        for name, element in self.how.index.items():
             if not 0 <= element < len(elements):
                 continue  # a shorter array has no such point
             at, i = elements[element], POINTS.index(name)
@@ -260,11 +260,11 @@ class GenericDecoder:
                 points[i] = scale * at.x, scale * at.y, scale * at.z
             except AttributeError as error:
                 raise LogError(
-                    f"{where}: elements of {self.points!r} have no x, y, z; name an array of points"
+                    f"{where}: elements of {self.how.points!r} have no x, y, z; name an array of points"
                 ) from error
             confidence[i] = 1.0 if trust is None else float(trust[element]) if element < len(trust) else 0.0
-        stamp = None if self.stamp is None else stamp_ns(_field(content, self.stamp, where), where)
-        return [RawSkeleton(stamp or None, self.camera, 0, points, confidence, stamp_zero=stamp == 0)]
+        stamp = None if self.how.stamp is None else stamp_ns(_field(content, self.how.stamp, where), where)
+        return [RawSkeleton(stamp or None, self.how.camera, 0, points, confidence, stamp_zero=stamp == 0)]
 
 
 def _array(content: Any, path: str, where: str) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
@@ -25,15 +24,18 @@ from hrcreplay.logs.log_files import LogFiles, open_source
 from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, topic_list
 from hrcreplay.logs.tracks import Header, JointTopic, JointTrack, Truth
 from hrcreplay.records import CameraFrames
+from hrcreplay.settings.sections import Decoder, Logs
 
 _OWN = "hrcreplay.Skeleton"
 _PEEK = 300  # markers: ten seconds of a sensor to show a body in
 _HOW = "Name one with --topic NAME, or a decoder for it in [logs.decoders] of the settings file."
 
 
-def choose_decoders(
-    source: LogFiles, names: tuple[str, ...], described: tuple[GenericDecoder, ...]
-) -> list[SkeletonDecoder]:
+#: How to read a log of which the settings say nothing.
+DEFAULT = Logs()
+
+
+def choose_decoders(source: LogFiles, names: tuple[str, ...], described: tuple[Decoder, ...]) -> list[SkeletonDecoder]:
     """The decoders of a log's skeleton topics.
 
     Args:
@@ -51,7 +53,7 @@ def choose_decoders(
     for name in (*names, *(decoder.topic for decoder in described)):
         if name not in found:
             raise LogError(f"{source.path}: no topic {name}; found {topic_list(found.values())}")
-    by_topic = {decoder.topic: decoder for decoder in described}
+    by_topic = {decoder.topic: GenericDecoder(decoder) for decoder in described}
     decoders: list[SkeletonDecoder] = []
     for topic in found.values():
         if names and topic.name not in names:
@@ -102,20 +104,10 @@ _FROZEN_S = 0.5  # so is one that gives the same skeleton for so long
 _TOLD = ("points_at_origin", "points_coincident", "points_not_finite", "points_too_far")
 
 
-@dataclass(frozen=True)
-class LogOptions:
-    """How to read a log."""
-
-    topics: tuple[str, ...] = ()  #: skeleton topics; () for all that a decoder knows
-    decoders: tuple[GenericDecoder, ...] = ()  #: for message types the package does not know
-    joints_topic: str | None = None  #: topic of the robot's joint states; None for the first
-    gap_s: float = 0.2  #: a camera silent for longer has a gap [s]
-
-
 class Log:
     """An open log. ``defects`` (names: clean.DEFECTS) and ``notes`` are about the latest pass over its frames."""
 
-    def __init__(self, source: LogFiles, decoders: list[SkeletonDecoder], options: LogOptions) -> None:
+    def __init__(self, source: LogFiles, decoders: list[SkeletonDecoder], options: Logs) -> None:
         self._source = source
         self._decoders = decoders
         self._options = options
@@ -210,8 +202,8 @@ class Log:
         """Where the unit of a camera's points is set."""
         for decoder in self._decoders:
             if camera in decoder.cameras and isinstance(decoder, GenericDecoder):
-                other = "m" if decoder.unit == "mm" else "mm"
-                return f'would be right, in its [[logs.decoders]]: unit = "{other}", or points in {decoder.unit}'
+                other = "m" if decoder.how.unit == "mm" else "mm"
+                return f'would be right, in its [[logs.decoders]]: unit = "{other}", or points in {decoder.how.unit}'
         return "would be right: points in metres"
 
     def joints(self) -> Iterator[JointTrack]:
@@ -262,7 +254,7 @@ def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
         )
 
 
-def open_log(path: Path, options: LogOptions = LogOptions(), *, skeletons: bool = True) -> Log:
+def open_log(path: Path, options: Logs = DEFAULT, *, skeletons: bool = True) -> Log:
     """Opens a log.
 
     Args:

@@ -14,8 +14,6 @@ import numpy as np
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.geometry.vectors import from_rpy
-from hrcreplay.logs.decoders import GenericDecoder
-from hrcreplay.logs.reader import LogOptions
 from hrcreplay.logs.tracks import Header, JointTrack
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.control_step import PlanSettings
@@ -26,17 +24,6 @@ from hrcreplay.robot.programme.task import parse_task
 from hrcreplay.run.followers import Planner, QpFollower, ScalingFollower
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
 from hrcreplay.run.stages import FusionStage, PredictionStage
-from hrcreplay.settings.load import Settings
-
-
-def log_options(settings: Settings) -> LogOptions:
-    """How to read a log."""
-    return LogOptions(
-        topics=settings.logs.topics,
-        decoders=tuple(GenericDecoder(**decoder.model_dump()) for decoder in settings.logs.decoders),
-        joints_topic=settings.logs.joints_topic,
-        gap_s=settings.logs.gap_s,
-    )
 
 
 class LogLike(Protocol):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.records import Bools, HumanStates, Motion, SweptVolumes
+from hrcreplay.records import HumanStates, Motion, SweptVolumes
 from hrcreplay.robot.control import control_step, qp_controller, scaling_controller
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step
 from hrcreplay.robot.control.scaling_controller import PathState
@@ -94,7 +94,7 @@ class Planner:
     def follow(self, states: HumanStates, volumes: SweptVolumes, around: Sequence[Obstacles]) -> Motion:
         """The motion of a batch of ticks, beside the obstacles that the volumes of each are."""
         robot = self.follower.robot
-        seen: Bools = states.valid.any(axis=1)
+        seen = np.any(states.valid, axis=1)
         rows = [self._tick(around[i], int(t), bool(seen[i])) for i, t in enumerate(volumes.t_ns)]
         found, points, steps = ([getattr(row, name) for row in rows] for name in ("state", "point", "step"))
         poses = [step.pose for step in steps]

@@ -24,7 +24,7 @@ from hrcreplay.records import HumanStates, Ints
 from hrcreplay.report import limbs, tables
 from hrcreplay.report.story import defect_notes
 from hrcreplay.run import build, stages
-from hrcreplay.run.build import LogLike, log_options
+from hrcreplay.run.build import LogLike
 from hrcreplay.run.job import TABLES, Job, plain_limits, resolve, urdf_digest, versions
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
@@ -75,7 +75,7 @@ def run(
     )
     known = job.meta()
     with RunWriter(out or _folder(job, began)) as writer:
-        log = open_log(job.log, log_options(job.settings))
+        log = open_log(job.log, job.settings.logs)
         ticks_ns = _ticks(job, log)
         parts = dependencies(job, log, ticks_ns)
         reused = _take_over(job, parts, writer, smooth=smooth)

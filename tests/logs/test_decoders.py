@@ -11,9 +11,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs import messages
-from hrcreplay.logs.decoders import GenericDecoder
-from hrcreplay.logs.reader import LogOptions, open_log
+from hrcreplay.logs.reader import open_log
 from hrcreplay.records import POINTS
+from hrcreplay.settings.sections import Decoder, Logs
 from tests.logs import own
 from tests.logs.bags import (
     KINDS,
@@ -196,17 +196,17 @@ def test_markers_of_an_old_release_without_definitions(tmp_path: Path) -> None:
 # --- settings ---
 
 
-def described(**change: Any) -> GenericDecoder:
+def described(**change: Any) -> Decoder:
     values: dict[str, Any] = {
         "topic": "/SaRA_demo_human_capsules", "camera": "mocap", "points": "positions", "index": SARA,
     }  # fmt: skip
-    return GenericDecoder(**(values | change))
+    return Decoder(**(values | change))
 
 
 @pytest.mark.parametrize(("name", "n"), [("exp_box", 1056), ("exp_appraoching", 1297)])
 def test_sara_bags_by_a_described_decoder(name: str, n: int) -> None:
     path = data_path(f"sara_human_robot_bags/{name}.bag")
-    log = open_log(path, LogOptions(decoders=(described(),)))
+    log = open_log(path, Logs(decoders=(described(),)))
     frames = own.read(log)
     assert frames.cameras == ("mocap",)
     assert len(frames) + log.defects["frames_repeated"] == n
@@ -226,7 +226,7 @@ def test_sara_bags_by_a_described_decoder(name: str, n: int) -> None:
 
 def test_described_decoder_equals_rosbags_reading() -> None:
     path = data_path("sara_human_robot_bags/exp_box.bag")
-    frames = own.read(open_log(path, LogOptions(decoders=(described(),))))
+    frames = own.read(open_log(path, Logs(decoders=(described(),))))
     with AnyReader([path]) as reader:
         wanted = [c for c in reader.connections if c.topic == "/SaRA_demo_human_capsules"]
         raw = [(t, reader.deserialize(data, c.msgtype)) for c, t, data in reader.messages(wanted)]
@@ -251,10 +251,15 @@ def test_described_decoder_takes_units_stamp_and_confidence(tmp_path: Path, kind
                 score=np.array([0.5, 0.25], dtype=np.float32),
             )
             write("/people", "lab/msg/Person", BEGIN + frame * 10**7 + 1000, person)
-    decoder = GenericDecoder(
-        "/people", "lidar", "joints", {"head": 0, "pelvis": 1, "neck": 5}, "mm", confidence="score"
+    decoder = Decoder(
+        topic="/people",
+        camera="lidar",
+        points="joints",
+        index={"head": 0, "pelvis": 1, "neck": 5},
+        unit="mm",
+        confidence="score",
     )
-    log = open_log(path, LogOptions(decoders=(decoder,)))
+    log = open_log(path, Logs(decoders=(decoder,)))
     frames = own.read(log)
     np.testing.assert_array_equal(frames.capture_ns, BEGIN + np.arange(3) * 10**7)
     np.testing.assert_allclose(frames.points_m[0, at("head")], [0.1, 0.2, 0.3], rtol=1e-15)
@@ -263,8 +268,8 @@ def test_described_decoder_takes_units_stamp_and_confidence(tmp_path: Path, kind
     assert frames.confidence[:, at("pelvis")].tolist() == [0.25, 0.25, 0.25]
     assert np.isnan(frames.points_m[:, at("neck")]).all()  # the array is shorter
     assert log.defects["points_not_finite"] == 2
-    unstamped = GenericDecoder("/people", "lidar", "joints", {"head": 0}, stamp=None)
-    log = open_log(path, LogOptions(decoders=(unstamped,)))
+    unstamped = Decoder(topic="/people", camera="lidar", points="joints", index={"head": 0}, stamp=None)
+    log = open_log(path, Logs(decoders=(unstamped,)))
     np.testing.assert_array_equal(own.read(log).capture_ns, BEGIN + np.arange(3) * 10**7 + 1000)
     assert log.defects["frames_header_stamp_zero"] == 0
 
@@ -282,12 +287,12 @@ def test_described_decoder_takes_units_stamp_and_confidence(tmp_path: Path, kind
 def test_wrong_description_is_told(change: dict[str, Any], message: str) -> None:
     path = data_path("sara_human_robot_bags/exp_box.bag")
     with pytest.raises(LogError, match=message):
-        list(open_log(path, LogOptions(decoders=(described(**change),))).frames())
+        list(open_log(path, Logs(decoders=(described(**change),))).frames())
 
 
 def test_elements_that_are_no_points(tmp_path: Path) -> None:
     with bag(tmp_path / "a.bag", "ros1") as (write, store):
         write("/js", "sensor_msgs/msg/JointState", BEGIN, make(store, "sensor_msgs/msg/JointState", name=["a", "b"]))
-    decoder = GenericDecoder("/js", "x", "name", {"head": 0})
+    decoder = Decoder(topic="/js", camera="x", points="name", index={"head": 0})
     with pytest.raises(LogError, match="have no x, y, z"):
-        list(open_log(tmp_path / "a.bag", LogOptions(decoders=(decoder,))).frames())
+        list(open_log(tmp_path / "a.bag", Logs(decoders=(decoder,))).frames())

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.logs.clean import DEFECTS
-from hrcreplay.logs.reader import Log, LogOptions, open_log
+from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import POINTS, CameraFrames
+from hrcreplay.settings.sections import Logs
 from tests.logs import own
 from tests.logs.bags import KINDS, OPENNI, bag, make, marker_array, openni_at, transform, write_openni
 
@@ -18,7 +19,7 @@ RESOURCES = "ros_bags/rosbag2/rosbag2_py/test/resources"
 
 
 def opened(tmp_path: Path, table: CameraFrames, **options: Any) -> Log:
-    return open_log(own.write(tmp_path / "a.mcap", table), LogOptions(**options))
+    return open_log(own.write(tmp_path / "a.mcap", table), Logs(**options))
 
 
 def changed(table: CameraFrames, **fields: Any) -> CameraFrames:
@@ -153,7 +154,7 @@ def test_gaps_are_counted_by_camera(tmp_path: Path) -> None:
     log = opened(tmp_path, own.frames(200, which=which), gap_s=0.5)
     own.read(log)
     assert (log.defects["gaps_left"], log.defects["gaps_right"]) == (2, 0)
-    log = open_log(tmp_path / "a.mcap", LogOptions(gap_s=1.0))
+    log = open_log(tmp_path / "a.mcap", Logs(gap_s=1.0))
     own.read(log)
     assert log.defects["gaps_left"] == 1
 

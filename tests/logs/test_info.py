@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.logs.decoders import GenericDecoder
 from hrcreplay.logs.info import lines, summarize
-from hrcreplay.logs.reader import LogOptions, open_log
+from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import CameraFrames
+from hrcreplay.settings.sections import Decoder, Logs
 from tests.logs import own
 from tests.realdata import data_path
 
@@ -88,9 +88,9 @@ def test_log_without_skeletons_is_described() -> None:
 
 def test_sara_bag() -> None:
     index = {"shoulder_l": 0, "elbow_l": 1, "head": 6, "pelvis": 9}
-    decoder = GenericDecoder("/SaRA_demo_human_capsules", "mocap", "positions", index)
+    decoder = Decoder(topic="/SaRA_demo_human_capsules", camera="mocap", points="positions", index=index)
     path = data_path("sara_human_robot_bags/exp_box.bag")
-    found = summarize(open_log(path, LogOptions(decoders=(decoder,))))
+    found = summarize(open_log(path, Logs(decoders=(decoder,))))
     [camera] = found.cameras
     assert (camera.frames, camera.bodies) == (1055, {0: 1055})
     assert found.defects["frames_repeated"] == 1

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.decoders import GenericDecoder
 from hrcreplay.logs.info import lines, summarize
-from hrcreplay.logs.reader import Log, LogOptions, open_log
+from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import POINTS, CameraFrames, Floats
+from hrcreplay.settings.sections import Decoder, Logs
 from tests.logs import own
 from tests.logs.bags import bag, define, header, make, point
 from tests.reobserve import walker
@@ -93,12 +93,14 @@ def test_a_described_decoder_is_told_which_unit_would_be_right(tmp_path: Path) -
             )
             write("/people", "lab/msg/Person", stamp + 1000, person)
     index = {name: i for i, name in enumerate(names)}
-    log = open_log(tmp_path / "a.bag", LogOptions(decoders=(GenericDecoder("/people", "lidar", "joints", index),)))
+    log = open_log(
+        tmp_path / "a.bag", Logs(decoders=(Decoder(topic="/people", camera="lidar", points="joints", index=index),))
+    )
     _notes(log)
     with pytest.raises(LogError, match=r'in its \[\[logs.decoders\]\]: unit = "mm"'):
         log.check()
-    right = GenericDecoder("/people", "lidar", "joints", index, "mm")
-    log = open_log(tmp_path / "a.bag", LogOptions(decoders=(right,)))
+    right = Decoder(topic="/people", camera="lidar", points="joints", index=index, unit="mm")
+    log = open_log(tmp_path / "a.bag", Logs(decoders=(right,)))
     assert not any("tall" in note for note in _notes(log))
     log.check()
 

@@ -18,7 +18,8 @@ from ruamel.yaml import YAML
 from hrcreplay.errors import LogError
 from hrcreplay.logs.log_files import open_source
 from hrcreplay.logs.messages import LazyChunk, Message, Topic, merge_by_arrival
-from hrcreplay.logs.reader import LogOptions, open_log
+from hrcreplay.logs.reader import open_log
+from hrcreplay.settings.sections import Logs
 from tests.logs import own
 from tests.logs.bags import KINDS, bag, header, make, marker_array, write_openni
 from tests.realdata import data_path
@@ -207,16 +208,16 @@ def test_messages_before_the_clock_do_not_stretch_the_span(tmp_path: Path) -> No
 
 def test_topics_can_be_chosen(tmp_path: Path) -> None:
     path = own.write(tmp_path / "a.mcap", own.frames(100))
-    log = open_log(path, LogOptions(topics=("/camera/right/skeleton",)))
+    log = open_log(path, Logs(topics=("/camera/right/skeleton",)))
     assert log.header.cameras == ("right",)
     assert len(own.read(log)) == 50
     with pytest.raises(LogError, match=r"a\.mcap: no topic /camera/top/skeleton; found /camera/left/info \(hrcreplay"):
-        open_log(path, LogOptions(topics=("/camera/top/skeleton",)))
+        open_log(path, Logs(topics=("/camera/top/skeleton",)))
 
 
 def test_chosen_topic_without_skeletons() -> None:
     with pytest.raises(LogError, match=r"example\.bag: no skeletons on /rosout \(rosgraph_msgs/Log\)\. Name one with"):
-        open_log(data_path("ros_bags/example.bag"), LogOptions(topics=("/rosout",)))
+        open_log(data_path("ros_bags/example.bag"), Logs(topics=("/rosout",)))
 
 
 def test_log_without_skeletons_is_refused_with_what_it_has() -> None:
@@ -265,6 +266,6 @@ def test_joint_states(tmp_path: Path, kind: str) -> None:
     expected[49] += 1000  # its stamp is zero
     np.testing.assert_array_equal(np.concatenate([t.t_ns for t in track]), expected)
     assert (log.defects["joints_incomplete"], log.defects["joints_out_of_order"]) == (50, 1)
-    assert open_log(path, LogOptions(joints_topic="/robot/joint_states")).header.joint_names == ("a", "b", "c")
+    assert open_log(path, Logs(joints_topic="/robot/joint_states")).header.joint_names == ("a", "b", "c")
     with pytest.raises(LogError, match=r"no joint states on /tf; found /tf \(tf2_msgs/TFMessage\), /robot/joint"):
-        open_log(path, LogOptions(joints_topic="/tf"))
+        open_log(path, Logs(joints_topic="/tf"))

@@ -19,7 +19,6 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.run import build, replay
 from hrcreplay.run import replay as reuse
-from hrcreplay.run.build import log_options
 from hrcreplay.run.job import STAGES, Job, resolve
 from hrcreplay.run.stages import tick_times
 from hrcreplay.settings.load import Settings
@@ -51,6 +50,8 @@ STALE = {
     "fusion.residual_quantile": ALL,
     "fusion.residual_memory_s": ALL,
     "fusion.spread_memory_s": ALL,
+    "fusion.spread_least": ALL,
+    "fusion.spread_most": ALL,
     "fusion.memory_s": ALL,
     "limits.tracking": ALL,
     "limits.prediction": "predict plan",
@@ -212,8 +213,7 @@ def _handed(job: Job, log: Log) -> dict[str, str]:
     fusion_stage, prediction_stage = asdict(build.fusion_stage(job, log)), asdict(build.prediction_stage(job))
     for limits in (fusion_stage["limits"], prediction_stage["limits"]):
         del limits["name"]
-    reading = asdict(log_options(job.settings))
-    del reading["joints_topic"]
+    reading = job.settings.logs.model_dump(exclude={"joints_topic"})
     first = repr((fusion_stage, reading, _ticks(job, log).tolist()))
     second = repr((prediction_stage, replay._store_every(job)))
     return {"fuse": first, "predict": second, "plan": repr(build.plan_settings(job, 0.004))}

@@ -31,7 +31,6 @@ from hrcreplay.logs.tracks import Header, JointTrack
 from hrcreplay.records import Floats
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.run import build
-from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job, job_without_log, resolve
 from hrcreplay.settings.load import Settings, load_settings
 
@@ -65,7 +64,7 @@ def live_job(
     span: dict[str, Any] = {"start_s": None, "end_s": None}
     if human is not None:
         job = resolve("live", human, config=config, overrides=overrides, cell_file=cell_file, **span)
-        return job, open_log(job.log, log_options(job.settings)).header
+        return job, open_log(job.log, job.settings.logs).header
     settings = load_settings(config, overrides)
     cameras = tuple(sorted(settings.live.zenoh.keys))
     if not cameras:

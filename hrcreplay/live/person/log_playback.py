@@ -14,9 +14,9 @@ from threading import Thread
 from typing import Any, NamedTuple
 
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.decoders import GenericDecoder
-from hrcreplay.logs.reader import Log, LogOptions, open_log
+from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import CameraFrames
+from hrcreplay.settings.sections import Logs
 
 _SEAM_NS = 40_000_000  # between the end of a recording and its repetition: about one frame
 _AHEAD = 16  # chunks of at most a second each that wait decoded
@@ -207,8 +207,5 @@ def play(path: Path, options: dict[str, Any], *, repeat: bool) -> Playback:
         options: ``topics`` and ``decoders`` as in the settings' section ``logs``; may be empty.
         repeat: Whether it starts again at its end.
     """
-    chosen = LogOptions(
-        topics=tuple(options.get("topics", ())),
-        decoders=tuple(GenericDecoder(**described) for described in options.get("decoders", ())),
-    )
+    chosen = Logs.model_validate({name: options.get(name, ()) for name in ("topics", "decoders")})
     return Playback(lambda: playback_items(open_log(path, chosen), repeat=repeat))

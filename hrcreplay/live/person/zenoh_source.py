@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from threading import Thread
 from typing import Any
 
@@ -25,6 +24,7 @@ from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
 from hrcreplay.logs.decoders import GenericDecoder, MarkerDecoder, OwnDecoder, TfDecoder
 from hrcreplay.logs.messages import Message, RawSkeleton, SkeletonDecoder, Topic, Undecodable
+from hrcreplay.settings.sections import Decoder, ZenohKey
 
 _OWN = "hrcreplay.Skeleton"
 _RMW_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")  # in the keys of rmw_zenoh: <domain>/<topic>/<type>/<hash>
@@ -35,25 +35,10 @@ _OLD_NS = 10**9  # an older capture hints at clocks that are not set
 _GAP_S = 0.2
 
 
-@dataclass(frozen=True)
-class KeySettings:
-    """Format of the payloads under the keys of one camera."""
-
-    key: str  #: key expression: 0/kinect/skeleton/** of rmw_zenoh, kinect/skeleton of the DDS bridge
-    payload: str = "hrcreplay"  #: "hrcreplay" or "cdr"
-    type: str | None = None  #: cdr: message type; None: as the keys of rmw_zenoh tell
-    definition: str = ""  #: cdr: the type's .msg and those it uses, as bags hold them, where no release has it
-    points: str | None = None  #: cdr: as in [[logs.decoders]], of a type without a decoder of its own
-    index: Mapping[str, int] = field(default_factory=dict)
-    unit: str = "m"
-    stamp: str | None = "header.stamp"
-    confidence: str | None = None
-
-
 class CameraSubscription:
     """The keys of one camera: payloads in, cleaned skeletons out."""
 
-    def __init__(self, camera: str, settings: KeySettings) -> None:
+    def __init__(self, camera: str, settings: ZenohKey) -> None:
         self._camera = camera
         self._settings = settings
         self._where = f"live.zenoh.keys.{camera}"
@@ -129,8 +114,8 @@ class CameraSubscription:
             return Topic(key, msgtype, 1, _own), OwnDecoder(key, self._camera)
         topic = Topic(key, msgtype, 1, ros_bags.parser(self._where, msgtype, given.definition, "msg", cdr=True))
         if given.points is not None:
-            how = (given.points, given.index, given.unit, given.stamp, given.confidence)
-            return topic, GenericDecoder(key, self._camera, *how)
+            how = {name: getattr(given, name) for name in ("points", "index", "unit", "stamp", "confidence")}
+            return topic, GenericDecoder(Decoder(topic=key, camera=self._camera, **how))
         if msgtype in decoders.TF_TYPES:
             return topic, TfDecoder(key, (self._camera,))
         if msgtype == decoders.MARKER_TYPE:
@@ -186,7 +171,7 @@ class ZenohSource:
 
     def _begin(self) -> None:
         try:
-            keys = {name: KeySettings(**given) for name, given in self._settings["keys"].items()}
+            keys = {name: ZenohKey.model_validate(given) for name, given in self._settings["keys"].items()}
             session = open_session(self._settings)
             self._open.append(session)
             for name, given in keys.items():
@@ -241,7 +226,7 @@ def open_session(settings: Mapping[str, Any]) -> Any:
         raise SettingsError(f"live.zenoh: no session ({error}); check mode, connect and listen") from error
 
 
-def _subscribe(session: Any, camera: str, given: KeySettings, take: Callable[[Any], None]) -> Any:
+def _subscribe(session: Any, camera: str, given: ZenohKey, take: Callable[[Any], None]) -> Any:
     import zenoh
 
     try:

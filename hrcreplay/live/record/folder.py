@@ -23,7 +23,6 @@ from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Motion
 from hrcreplay.run import build
-from hrcreplay.run.build import log_options
 from hrcreplay.run.job import Job
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import store_volumes
@@ -203,7 +202,7 @@ def _crashed(crashes: list[str]) -> dict[str, Any]:
 
 def _measure(job: Job, writer: RunWriter) -> None:
     """The table of measurements: what each frame says by itself."""
-    log = open_log(writer.partial / LOG, log_options(job.settings), skeletons=False)
+    log = open_log(writer.partial / LOG, job.settings.logs, skeletons=False)
     fusion_stage, memory = build.fusion_stage(job, log), PersonMemory()
     for frames in log.frames():
         memory, measured, _ = fusion_stage.measure(frames, memory)

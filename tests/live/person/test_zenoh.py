@@ -16,10 +16,11 @@ import pytest
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.live.person import zenoh_source
-from hrcreplay.live.person.zenoh_source import CameraSubscription, KeySettings
+from hrcreplay.live.person.zenoh_source import CameraSubscription
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.messages import AZURE_INDEX, OPENNI_JOINTS
 from hrcreplay.records import POINTS
+from hrcreplay.settings.sections import ZenohKey
 from tests.live import zenoh_publisher
 from tests.live.human import Human
 from tests.logs.bags import make, marker_array, store_of, transform
@@ -57,7 +58,7 @@ def own(capture_ns: int, **change: Any) -> bytes:
 
 
 def test_the_type_comes_from_the_key_of_rmw_zenoh_and_all_bodies_are_read() -> None:
-    stream = CameraSubscription("kinect", KeySettings(MARKER_KEY, "cdr"))
+    stream = CameraSubscription("kinect", ZenohKey(key=MARKER_KEY, payload="cdr"))
     bodies = {3: spread(0.25), 1: spread(2.0)}
     sent = skeletons(list(stream.take(MARKER_KEY, markers(NOW_NS - 40_000_000, bodies), NOW_NS)))
     assert [(s.body, s.points[0], s.camera, s.capture_ns) for s in sent] == [
@@ -67,10 +68,12 @@ def test_the_type_comes_from_the_key_of_rmw_zenoh_and_all_bodies_are_read() -> N
 
 
 def test_the_key_of_the_bridge_needs_a_type() -> None:
-    stream = CameraSubscription("kinect", KeySettings("cell/kinect", "cdr"))
+    stream = CameraSubscription("kinect", ZenohKey(key="cell/kinect", payload="cdr"))
     (told,) = notes(list(stream.take("cell/kinect", markers(NOW_NS), NOW_NS)))
     assert told.startswith("live.zenoh.keys.kinect: 1 undecodable: key cell/kinect does not tell its type; name it")
-    stream = CameraSubscription("kinect", KeySettings("cell/kinect", "cdr", type="visualization_msgs/msg/MarkerArray"))
+    stream = CameraSubscription(
+        "kinect", ZenohKey(key="cell/kinect", payload="cdr", type="visualization_msgs/msg/MarkerArray")
+    )
     assert len(skeletons(list(stream.take("cell/kinect", markers(NOW_NS), NOW_NS)))) == 1
 
 
@@ -81,14 +84,14 @@ def test_transforms_of_a_tracker() -> None:
         for k, joint in enumerate(sorted(OPENNI_JOINTS))
     ]
     data = bytes(store.serialize_cdr(make(store, "tf2_msgs/msg/TFMessage", transforms=sent), "tf2_msgs/msg/TFMessage"))
-    stream = CameraSubscription("cam", KeySettings("0/tf/**", "cdr"))
+    stream = CameraSubscription("cam", ZenohKey(key="0/tf/**", payload="cdr"))
     (found,) = skeletons(list(stream.take("0/tf/tf2_msgs::msg::dds_::TFMessage_/RIHS01_0", data, NOW_NS)))
     assert found.capture_ns == NOW_NS - 10**7
     assert found.points[3 * POINTS.index("head")] == sorted(OPENNI_JOINTS).index("head")
 
 
 def test_a_stamp_of_zero_is_the_receipt_and_told_once() -> None:
-    stream = CameraSubscription("kinect", KeySettings(MARKER_KEY, "cdr"))
+    stream = CameraSubscription("kinect", ZenohKey(key=MARKER_KEY, payload="cdr"))
     sent = (markers(0, {1: spread(1.0 + i)}) for i in range(2))
     first, second = (list(stream.take(MARKER_KEY, data, NOW_NS + i)) for i, data in enumerate(sent))
     assert [s.capture_ns for s in skeletons(first + second)] == [NOW_NS, NOW_NS + 1]
@@ -96,12 +99,12 @@ def test_a_stamp_of_zero_is_the_receipt_and_told_once() -> None:
         "live.zenoh.keys.kinect: frames_header_stamp_zero: rows with a capture time of zero; their arrival is used"
     ]
     assert notes(second) == []
-    stream = CameraSubscription("ours", KeySettings("hrc/x"))
+    stream = CameraSubscription("ours", ZenohKey(key="hrc/x"))
     assert skeletons(list(stream.take("hrc/x", own(0), NOW_NS)))[0].capture_ns == NOW_NS
 
 
 def test_frames_that_come_twice_or_late_are_dropped() -> None:
-    stream = CameraSubscription("ours", KeySettings("hrc/x"))
+    stream = CameraSubscription("ours", ZenohKey(key="hrc/x"))
     captures = (10, 10, 9, 11)
     taken = [list(stream.take("hrc/x", own(NOW_NS + c), NOW_NS + 100)) for c in captures]
     assert [len(skeletons(messages)) for messages in taken] == [1, 0, 0, 1]
@@ -110,7 +113,7 @@ def test_frames_that_come_twice_or_late_are_dropped() -> None:
 
 
 def test_a_capture_in_the_future_does_not_shut_out_those_that_follow() -> None:
-    stream = CameraSubscription("ours", KeySettings("hrc/x"))
+    stream = CameraSubscription("ours", ZenohKey(key="hrc/x"))
     ahead = list(stream.take("hrc/x", own(NOW_NS + 3_600 * 10**9), NOW_NS))
     assert skeletons(ahead) == []
     assert notes(ahead) == [
@@ -120,7 +123,7 @@ def test_a_capture_in_the_future_does_not_shut_out_those_that_follow() -> None:
 
 
 def test_points_that_are_no_numbers_are_missing() -> None:
-    stream = CameraSubscription("ours", KeySettings("hrc/x"))
+    stream = CameraSubscription("ours", ZenohKey(key="hrc/x"))
     points = [np.inf, 0.0, 0.0, *[1.0] * 57]
     (sent,) = skeletons(list(stream.take("hrc/x", own(NOW_NS, points=points), NOW_NS)))
     assert np.isnan(sent.points[:3]).all()
@@ -130,7 +133,7 @@ def test_points_that_are_no_numbers_are_missing() -> None:
 
 def test_what_cannot_be_decoded_is_counted_and_told_at_powers_of_ten() -> None:
     rng = np.random.default_rng(5)
-    stream = CameraSubscription("kinect", KeySettings(MARKER_KEY, "cdr"))
+    stream = CameraSubscription("kinect", ZenohKey(key=MARKER_KEY, payload="cdr"))
     whole = markers(NOW_NS)
     told = notes(list(stream.take(MARKER_KEY, whole, NOW_NS - 1)))
     for i in range(300):
@@ -140,7 +143,7 @@ def test_what_cannot_be_decoded_is_counted_and_told_at_powers_of_ten() -> None:
         told += notes(list(stream.take(MARKER_KEY, bytes(data), NOW_NS + i)))
     undecodable = [text.split(":")[1].split()[0] for text in told if "undecodable" in text]
     assert undecodable == ["1", "10", "100"]
-    stream = CameraSubscription("ours", KeySettings("hrc/x"))
+    stream = CameraSubscription("ours", ZenohKey(key="hrc/x"))
     for wrong in (b"", b"\xff", own(NOW_NS, points=[1.0]), own(NOW_NS, confidence=[])):
         assert skeletons(list(stream.take("hrc/x", wrong, NOW_NS))) == []
 
