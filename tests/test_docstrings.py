@@ -18,12 +18,8 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py") if not path.name.endswit
 MANY = 4
 #: The command line: here the help of each option documents it, and a docstring is the text of --help.
 COMMANDS = ("cli/app.py", "cli/live.py")
-#: Rooms whose functions still lack the section.
-EXCEPTIONS = ("geometry/", "human/", "robot/")
 #: Modules of one name in several rooms are counterparts: the same task, each for its room.
 COUNTERPARTS = {"__init__", "codec", "figures", "inverse_kinematics", "metrics", "model", "page"}
-#: One is a table of the fusion's kernels, one a part of the programmed path: rooms that never meet.
-SHARED_CLASSES = {"Track"}
 
 _SECTIONS = re.compile(r"^(Returns|Raises|Yields|Attributes):$", re.MULTILINE)
 
@@ -70,8 +66,8 @@ def undocumented(source: str) -> list[str]:
 @pytest.mark.parametrize("module", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
 def test_functions_with_many_parameters_document_each(module: Path) -> None:
     name = module.relative_to(PACKAGE).as_posix()
-    if name in COMMANDS or name.startswith(EXCEPTIONS):
-        pytest.skip("documented by the help of the options" if name in COMMANDS else "not yet documented")
+    if name in COMMANDS:
+        pytest.skip("documented by the help of the options")
     assert undocumented(module.read_text()) == []
 
 
@@ -95,7 +91,7 @@ def test_no_two_classes_share_a_name() -> None:
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.ClassDef):
                 places[node.name].append(path.relative_to(PACKAGE).as_posix())
-    shared = {name: paths for name, paths in places.items() if len(paths) > 1 and name not in SHARED_CLASSES}
+    shared = {name: paths for name, paths in places.items() if len(paths) > 1}
     assert shared == {}
 
 

@@ -1,12 +1,13 @@
-"""Convex hulls of swept volumes and the size of what a ball makes of them, flat and thin sets included.
+"""Convex hulls, their volume with a ball around every point, and polytopes that enclose a set along fixed directions.
 
-Polytopes around swept sets from how far the sets reach along fixed directions: always the same number of corners.
+Hulls and volumes are defined for flat and thin sets too, because what a segment sweeps need not be a solid.
 
-The directions are the corners of triangles around the unit sphere. For numbers that are nowhere below a set's support
-function, each triangle gives one corner: the point that is as far along its three directions as the numbers say. Any
-direction u lies over a triangle (a, b, c), so u = k a + l b + m c with weights >= 0, and no point of the set is further
-along u than k h(a) + l h(b) + m h(c): where the corner is. So the hull of the corners holds the set, whether or not
-every number is reached.
+The polytope is for sets with too many points: given how far a set reaches along the directions, it always has the same
+number of corners. The directions are the corners of triangles around the unit sphere. For numbers that are nowhere
+below a set's support function, each triangle gives one corner: the point that is as far along its three directions as
+the numbers say. Any direction u lies over a triangle (a, b, c), so u = k a + l b + m c with weights >= 0, and no point
+of the set is further along u than k h(a) + l h(b) + m h(c): where the corner is. So the hull of the corners holds the
+set, whether or not every number is reached.
 
 How far a point gets along a direction while it turns about an axis is exact, so here no arc is widened to triangles.
 """
@@ -189,6 +190,14 @@ def reach_turning(points: Floats, count: int, axis: int, low: float, high: float
     """Raises far (directions,) to how far points get that turn by low to high [rad] about a coordinate axis [m].
 
     Across the axis a point gets as far as its circle where it passes the direction, else as far as at the nearer end.
+
+    Args:
+        points: (m, 3), of which the first ``count`` are turned [m].
+        count: Number of points.
+        axis: 0, 1, 2 for x, y, z.
+        low: Smallest angle [rad].
+        high: Largest angle [rad].
+        far: (directions,) largest extent yet along each of DIRECTIONS, raised in place [m].
     """
     i, j = (axis + 1) % 3, (axis + 2) % 3
     middle, half = 0.5 * (low + high), min(0.5 * (high - low), np.pi)

@@ -48,7 +48,15 @@ def working(H: Floats, g: Floats, most: int) -> Working:
 
 @njit(cache=True, error_model="numpy")
 def add(work: Working, i: int, row: Floats, sign: float, high: float) -> None:
-    """Row i: ``sign * row @ w <= high``; inf where it has no bound."""
+    """Row i: ``sign * row @ w <= high``; inf where it has no bound.
+
+    Args:
+        work: Receives the row.
+        i: Index of the row, less than ``most`` of ``working``.
+        row: (n,) its coefficients.
+        sign: 1 for an upper bound; -1 for a lower bound, which is given as ``high = -low``.
+        high: Right-hand side, in the unit of ``row @ w``.
+    """
     for k in range(len(row)):
         work.A[i, k] = sign * row[k]
     work.high[i] = work.h[i] = high

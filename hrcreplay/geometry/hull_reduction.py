@@ -1,11 +1,8 @@
-"""Which points of a set can be corners of its convex hull: a reduction that never drops a true one.
+"""Reduction of a point set to those points that may be corners of its convex hull, by an incremental hull.
 
-A hull is grown point by point as a closed surface of triangles. Its arithmetic is only trusted where that can be
-proven: a point goes when it is on the inner side of every triangle by more than the rounding error of that test.
-Such a point sees the whole closed surface from inside, so it is inside the hull of the surface's corners, however
-badly shaped or dented the surface may be. Everything else stays, corner or not. So does every point of a flat set.
-
-A closed surface of triangles that grows point by point: the working part of ``corners``.
+A point is dropped only when it is on the inner side of every triangle of a closed surface by more than the rounding
+error of that test. Such a point sees the whole closed surface from inside, so it is inside the hull of the surface's
+corners, however badly shaped or dented the surface may be. All others stay, corner or not, and all of a flat set.
 """
 
 from __future__ import annotations
@@ -54,8 +51,13 @@ def surface() -> Surface:
 
 
 @njit(cache=True)
-def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:
-    """Whether a point is proven to be inside of all triangles."""
+def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:  # noqa: D417
+    """Whether a point is proven to be inside of all triangles.
+
+    Args:
+        x, y, z: The point [m].
+        count, planes: Number of triangles, and the surface's planes.
+    """
     outside = 0
     for f in range(count):
         height = planes[NX, f] * x + planes[NY, f] * y + planes[NZ, f] * z - planes[OFFSET, f]
@@ -64,8 +66,13 @@ def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:
 
 
 @njit(cache=True)
-def look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s) -> tuple[int, int]:
-    """For how many triangles a point is not proven to be inside, and how many it sees from clearly outside."""
+def look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s) -> tuple[int, int]:  # noqa: D417
+    """For how many triangles a point is not proven to be inside, and how many it sees from clearly outside.
+
+    Args:
+        x, y, z: The point [m].
+        count, planes, faces: Number of triangles, and the surface; row SEEN of ``faces`` is written.
+    """
     outside, beyond = 0, 0
     for f in range(count):
         height = planes[NX, f] * x + planes[NY, f] * y + planes[NZ, f] * z - planes[OFFSET, f]
@@ -76,8 +83,13 @@ def look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s
 
 
 @njit(cache=True)
-def set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, faces: Int32s) -> None:
-    """Writes triangle f with corners in slots i, j, k, without joining it to its neighbours."""
+def set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, faces: Int32s) -> None:  # noqa: D417
+    """Writes triangle f with corners in slots i, j, k, without joining it to its neighbours.
+
+    Args:
+        f, i, j, k: The triangle, and its corners counterclockwise seen from outside.
+        size, planes, faces: Largest absolute coordinate of the points [m], and the surface; column f is written.
+    """
     x, y, z = planes[X, i], planes[Y, i], planes[Z, i]
     ux, uy, uz = planes[X, j] - x, planes[Y, j] - y, planes[Z, j] - z
     vx, vy, vz = planes[X, k] - x, planes[Y, k] - y, planes[Z, k] - z
@@ -92,8 +104,12 @@ def set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, faces
 
 
 @njit(cache=True)
-def join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:
-    """Makes triangle f the owner of its edges."""
+def join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D417
+    """Makes triangle f the owner of its edges.
+
+    Args:
+        f, width, faces, owner: The triangle, the number of slots in a row of ``owner``, and the surface.
+    """
     i, j, k = faces[A, f], faces[B, f], faces[C, f]
     owner[i * width + j] = f
     owner[j * width + k] = f
@@ -111,8 +127,13 @@ def hide(count: int, faces: Int32s) -> int:
 
 
 @njit(cache=True)
-def outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:
-    """Lists the edges between seen and unseen triangles; returns how many."""
+def outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
+    """Lists the edges between seen and unseen triangles; returns how many.
+
+    Args:
+        hidden, width: Number of triangles seen, and of slots in a row of ``owner``.
+        faces, owner: The surface; rows START and END of ``faces`` are written.
+    """
     n = 0
     for h in range(hidden):
         f = faces[HIDDEN, h]
@@ -144,8 +165,14 @@ def is_loop(edges: int, faces: Int32s) -> bool:
 
 
 @njit(cache=True)
-def fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: Floats, faces: Int32s) -> bool:
-    """Adds triangles from the edges to the point in a slot, not joined yet; returns whether all face outward."""
+def fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: Floats, faces: Int32s) -> bool:  # noqa: D417
+    """Adds triangles from the edges to the point in a slot, not joined yet; returns whether all face outward.
+
+    Args:
+        inner, size: A point inside the surface, and the largest absolute coordinate of the points [m].
+        count, edges, slot: Number of triangles before, number of edges, and the slot of the point.
+        planes, faces: The surface; columns from ``count`` on are written.
+    """
     inward = 0
     for n in range(edges):
         f = count + n
@@ -156,16 +183,26 @@ def fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: F
 
 
 @njit(cache=True)
-def join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) -> None:
-    """Joins new triangles to their neighbours."""
+def join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D417
+    """Joins new triangles to their neighbours.
+
+    Args:
+        start, end: The first of the new triangles, and the one after the last.
+        width, faces, owner: Number of slots in a row of ``owner``, and the surface.
+    """
     for f in range(start, end):
         faces[SEEN, f] = 0
         join(f, width, faces, owner)
 
 
 @njit(cache=True)
-def fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owner: Int32s) -> int:
-    """Moves the last triangles into the places of those no longer needed; returns the number of triangles."""
+def fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
+    """Moves the last triangles into the places of those no longer needed; returns the number of triangles.
+
+    Args:
+        hidden, end: Number of triangles no longer needed, and of all triangles, these included.
+        width, planes, faces, owner: Number of slots in a row of ``owner``, and the surface.
+    """
     for h in range(hidden):
         hole = faces[HIDDEN, h]
         while end > hole and faces[SEEN, end - 1]:

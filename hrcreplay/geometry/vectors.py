@@ -1,9 +1,4 @@
-"""Rotations as matrices, quaternions and rotation vectors.
-
-Vectors of three numbers inside the kernels.
-
-Small products that kernels need without an array in between.
-"""
+"""Products of small vectors without temporary arrays, for kernels; rotations as matrices, quaternions and vectors."""
 
 from __future__ import annotations
 

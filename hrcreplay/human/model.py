@@ -1,14 +1,12 @@
-"""The human model of Eq. (37): limits and forward kinematics.
+"""The human model of Eq. (37): limits, forward kinematics, and which of two equal triples of shoulder angles is used.
 
 World: z up, floor at z = 0. Human base: on the floor under the pelvis, x forward, y left.
 
-One posture, two names: which triple (alpha_1, alpha_2, alpha_3) an arm goes by.
-
-The shoulder's three axes are a spherical wrist: (a1, a2, a3) and (a1 + pi, pi - a2, a3 + pi) are the same posture.
-The *canonical* name has alpha_1 in the half-turn from -20 to 160 degrees, which holds all of (34a), and the other
-angles in the turn around the middle of what (34) allows. So every posture inside (34) has its own angles as canonical
-name. At the ends of the half-turn, an arm far across the back or steeply raised, the angles jump although the arm
-does not, and whoever follows angles through time takes the name ``nearest`` to where it was.
+The shoulder's three axes are a spherical wrist, so (a1, a2, a3) and (a1 + pi, pi - a2, a3 + pi) are the same posture,
+here called two names of it. The *canonical* name has alpha_1 in the half-turn from -20 to 160 degrees, which holds all
+of (34a), and the other angles in the turn around the middle of what (34) allows. So every posture inside (34) has its
+own angles as canonical name. At the ends of the half-turn, an arm far across the back or steeply raised, the angles
+jump although the arm does not, and whoever follows angles through time takes the name ``nearest`` to where it was.
 """
 
 from __future__ import annotations
@@ -110,6 +108,12 @@ def arm_directions(alpha_1: float, alpha_2: float, alpha_3: float, alpha_4: floa
     """Unit vectors shoulder to elbow and elbow to wrist in the torso's frame, of a left arm (s = +1).
 
     Those of a right arm are their mirror images in y, so the kernels of both arms are one.
+
+    Args:
+        alpha_1: First angle of the shoulder [rad].
+        alpha_2: Second angle of the shoulder [rad].
+        alpha_3: Third angle of the shoulder [rad].
+        alpha_4: Angle of the elbow, pi for a straight arm [rad].
     """
     c1, s1, c2, s2 = np.cos(alpha_1), np.sin(alpha_1), np.cos(alpha_2), np.sin(alpha_2)
     c3, s3, c4, s4 = np.cos(alpha_3), np.sin(alpha_3), np.cos(alpha_4), np.sin(alpha_4)
@@ -133,6 +137,12 @@ def alpha_3_bounds(low_1: float, high_1: float, low_2: float, high_2: float) -> 
     """Eq. (34c) over a box of alpha_1 and alpha_2: the widest bounds of alpha_3 found there [rad].
 
     The bounds are bilinear, so their extremes are at the box's corners.
+
+    Args:
+        low_1: Smallest alpha_1 [rad].
+        high_1: Largest alpha_1 [rad].
+        low_2: Smallest alpha_2 [rad].
+        high_2: Largest alpha_2 [rad].
     """
     lowest, highest = np.inf, -np.inf
     for a1 in (low_1 / _DEGREE, high_1 / _DEGREE):
@@ -161,7 +171,16 @@ def _clamp_rows(p: Floats, p_min: Floats, p_max: Floats, coupled: bool) -> None:
 
 @njit(cache=True)
 def clamp_row(p: Floats, p_min: Floats, p_max: Floats, coupled: bool, low: Floats, high: Floats) -> None:
-    """Eq. (62) for one posture (12,) in place; writes the bounds that held for it into low, high (12,)."""
+    """Eq. (62) for one posture (12,) in place; writes the bounds that held for it into low, high (12,).
+
+    Args:
+        p: (12,) JOINTS [m, m, rad...].
+        p_min: (12,) of ``LimitSet`` [m, m, rad...].
+        p_max: (12,) of ``LimitSet`` [m, m, rad...].
+        coupled: Whether alpha_2 and alpha_3 obey Eq. (34b), (34c).
+        low: (12,) receives the lower bounds [m, m, rad...].
+        high: (12,) receives the upper bounds [m, m, rad...].
+    """
     for j in range(12):
         low[j], high[j] = p_min[j], p_max[j]
         if j == 2:  # Table 1's +-pi is a wrap, not a stop

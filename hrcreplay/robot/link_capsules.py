@@ -1,11 +1,7 @@
-"""Capsules around the collision shapes of a URDF's links.
+"""Link segments: the capsules that stand for a robot's links, the smallest around the collision shapes of its URDF.
 
 Shapes are read here and not by pinocchio's geometry model: its parser knows no <capsule>, and a shape that it cannot
-read is left out with a line on the terminal and no error. It reads the meshes (see ``model``).
-
-Link segments: the capsules that stand for a robot's links.
-
-The smallest capsule around a set of points.
+read is left out with a line on the terminal and no error. It reads the meshes (see ``robot.model``).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Fusion of several cameras into one moving person, Alg. 3; corrections to the paper: docs/paper.md.
+"""Fusion of several cameras into one moving person, Alg. 3, and an offline smoother; corrections: docs/paper.md.
 
-Offline reference: the fused person once more, knowing what came after (Rauch, Tung, Striebel).
+The smoother (Rauch, Tung, Striebel) also uses the measurements after a tick: a reference for what was fused in time.
 """
 
 from __future__ import annotations
@@ -84,10 +84,10 @@ def fuse(
     """Alg. 3: one tick after another, each with the frames that arrived in (previous tick, tick].
 
     The filter is that of Eq. (42)-(57) with Eq. (44) corrected: per joint p, v, a, j under Eq. (43), per length a
-    constant; rows that are not valid are switched off in H. After each tick the state is saturated by Eq. (62)-(65)
-    and fed back; P is not changed by it. Where ``delay`` is compensated, a row measures p - d v + d^2/2 a - d^3/6 j,
-    d the age of the frame at the tick. Each arm is measured by the name nearest to the estimate (see branches), heading
-    by the nearest turn, so neither jumps. A joint unseen for ``coast_s`` has its derivatives damped and its covariance
+    constant; rows that are not valid are switched off in H. After each tick the state is saturated by Eq. (62)-(65) and
+    fed back; P is not changed by it. Where ``delay`` is compensated, a row measures p - d v + d^2/2 a - d^3/6 j, d the
+    age of the frame at the tick. Each arm is measured by the name nearest to the estimate (``human.model``), heading by
+    the nearest turn, so neither jumps. A joint unseen for ``coast_s`` has its derivatives damped and its covariance
     growing; unseen for ``memory_s`` it is lost and starts anew from its next valid row. All is finite from the first
     valid row on: joints not yet seen stand at a neutral posture with a large standard deviation. How far the body is
     from its model, and for how long a limb has not been seen, is kept beside the filter and changes nothing in it.
@@ -111,12 +111,33 @@ def fuse(
 def fuse_traced(
     state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: Fusion, limits: LimitSet
 ) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
-    """``fuse``, and the covariances that ``smooth`` needs (1.5 kB a tick)."""
+    """``fuse``, and the covariances that ``smooth`` needs (1.5 kB a tick).
+
+    Args:
+        state: From ``start`` or the previous call. It is not changed.
+        ticks_ns: (n,) instants, after those of the previous call.
+        measurements: Rows in order of arrival, none after ``ticks_ns[-1]`` and none given before.
+        settings: Of the filter.
+        limits: Bounds for the saturation.
+
+    Returns:
+        The filter after the last tick, the states and the counts of ``fuse``, and the trace of the n ticks.
+    """
     return _fuse(state, ticks_ns, measurements, settings, limits, traced=True)
 
 
 def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats:
-    """Diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds."""
+    """Diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds.
+
+    Args:
+        settings: Of the filter.
+        j: Index into JOINTS.
+        dt: Length of the step [s].
+        damping: Factor on the derivatives over the step; 1 unless the joint is unseen.
+
+    Returns:
+        Variances that the step adds to p, v, a, j [m^2 or rad^2, and these per s^2, s^4, s^6].
+    """
     sigma = _sigma(settings)[j]
     return np.array([process_variance(a, dt, damping, sigma, _REST_STD[j]) for a in range(4)])
 
@@ -226,7 +247,7 @@ _UNIT_S = 0.05
 def smooth(states: HumanStates, trace: Trace, settings: Fusion) -> HumanStates:
     """Every tick given all measurements of the run, by filterpy's smoother joint by joint.
 
-    The arms are followed under one name through the run (see branches) and keep it: a smoothed angle does not jump.
+    The arms are followed under one name through the run (``human.model``) and keep it: a smoothed angle does not jump.
     Lengths are constants, so the last estimate is the best for all ticks. About 0.5 ms a tick; memory 1.5 kB a tick
     for the trace and as much again for one joint at a time.
 

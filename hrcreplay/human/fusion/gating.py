@@ -39,7 +39,16 @@ _UNKNOWN_M = 0.1
 
 @njit(cache=True)
 def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
-    """Which rows of a new frame are valid, 4.1.2 and Eq. (58), and which limbs it shows whole."""
+    """Which rows of a new frame are valid, 4.1.2 and Eq. (58), and which limbs it shows whole.
+
+    Args:
+        filter_: Holds the frame. ``valid`` and ``shows`` of the camera are written, and the ticks at which points and
+            lengths last agreed; the variance of a length that starts anew is set.
+        c: Index of the camera.
+        now: The tick [ns].
+        rules: Settings of the filter.
+        track: Counts the points that do not agree with the filter.
+    """
     trusted = np.ones(len(filter_.point_ns), dtype=np.bool_)
     if filter_.started[0]:
         trusted = _agreeing(filter_, c, now, rules) & _whole(filter_, c, now, rules)

@@ -65,7 +65,7 @@ def inverse(points_m: Floats) -> tuple[Floats, Floats]:
             measured neck stands in for it only where one shoulder is missing, and then no length rests on it.
 
     Returns:
-        Angles (n, 12) JOINTS [m, m, rad...], arms by their canonical names (see branches), and lengths (n, 8)
+        Angles (n, 12) JOINTS [m, m, rad...], arms by their canonical names (``human.model``), and lengths (n, 8)
         LENGTHS [m]. NaN where a point is missing, or where the two ends of a bone are in one place. At a singular
         posture the angle that cannot be observed is 0.
     """

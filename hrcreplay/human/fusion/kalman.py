@@ -1,14 +1,13 @@
-"""The arrays that the kernels of the fusion share.
+"""The Kalman filter of one joint with the states p, v, a, j, Eq. (42)-(57); corrections: docs/paper.md.
 
-The Kalman filter of one joint: four states p, v, a, j, Eq. (42)-(57); corrections: docs/paper.md.
+The arrays that the kernels of the fusion share are defined here too.
 
-How uncertain the fused state truly is: the variances that the filter tells, times what innovations say of them.
-
-P of Eq. (49) follows from the sigmas alone, which must do for the liveliest motion and the worst camera. To multiply
-R and G by one number leaves every gain, and so the estimate, as it is, and multiplies P: the variance of unit weight of
-the calculus of observations. Each joint has its own, from its innovations squared over their variance: the mean of the
-last few, held at its highest and forgotten slowly. At rest it is small; when a joint sets off, the first innovations
-raise it at once, and it outlasts the motion.
+The variances that are handed on are those of the filter, scaled by the normalised innovations squared. P of Eq. (49)
+follows from the sigmas alone, which must do for the liveliest motion and the worst camera. To multiply R and G by one
+number leaves every gain, and so the estimate, as it is, and multiplies P: the variance of unit weight of the calculus
+of observations. Each joint has its own, from its innovations squared over their variance: the mean of the last few,
+held at its highest and forgotten slowly. At rest it is small; when a joint sets off, the first innovations raise it at
+once, and it outlasts the motion.
 """
 
 from __future__ import annotations
@@ -110,7 +109,14 @@ class Track(NamedTuple):
 
 @njit(cache=True)
 def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
-    """Age of the frame held for a camera [s]; 0 where delays are ignored."""
+    """Age of the frame held for a camera [s]; 0 where delays are ignored.
+
+    Args:
+        filter_: Holds the frame.
+        c: Index of the camera.
+        now: The tick [ns].
+        rules: Whether delays are compensated, and the largest [s].
+    """
     if not rules.compensate:
         return 0.0
     return max(0.0, min((now - filter_.capture_ns[c]) * 1e-9, rules.delay_max_s))
@@ -123,6 +129,14 @@ def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, r
     x, y and heading are joints like the others, with world velocities of their own: the linear model of Eq. (31).
     F is upper triangular, so that each row is done before the rows it needs change. With a damping below 1 the
     derivatives also forget: towards rest, give or take ``rest_std`` (3,).
+
+    Args:
+        mean: (4,) p, v, a, j [m or rad, and these per s, s^2, s^3].
+        P: (4, 4) its covariance.
+        dt: Length of the step [s].
+        damping: Factor on the derivatives over the step, in (0, 1].
+        sigma: (4,) of Eq. (44) for p, v, a, j [m or rad per s^2, s^2.5, s^3, s^3.5].
+        rest_std: (3,) standard deviations of v, a, j of an unseen joint [m or rad per s, s^2, s^3].
     """
     taylor = (1.0, dt, dt**2 / 2.0, dt**3 / 6.0)  # F of Eq. (43), corrected: s is p, v, a, j
     for a in range(4):
@@ -152,6 +166,13 @@ def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
     """Eq. (52)-(57) for one joint and one scalar row; returns the innovation squared over its variance.
 
     A row whose innovation has no variance, or none that a number can hold, tells nothing: it changes nothing.
+
+    Args:
+        mean: (4,) p, v, a, j [m or rad, and these per s, s^2, s^3], changed in place.
+        P: (4, 4) its covariance, changed in place.
+        h: (4,) row of H of Eq. (45), (46).
+        z: The measured value [m or rad].
+        R: Its variance [m^2 or rad^2].
     """
     Ph = np.empty(4)
     for a in range(4):
@@ -169,7 +190,15 @@ def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
 
 @njit(cache=True)
 def process_variance(a: int, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> float:
-    """Entry a of the diagonal of G of Eq. (44), corrected; with a damping, also of what is forgotten."""
+    """Entry a of the diagonal of G of Eq. (44), corrected; with a damping, also of what is forgotten.
+
+    Args:
+        a: 0, 1, 2, 3 for p, v, a, j.
+        dt: Length of the step [s].
+        damping: Factor on the derivatives over the step, in (0, 1].
+        sigma: (4,) of Eq. (44) for p, v, a, j [m or rad per s^2, s^2.5, s^3, s^3.5].
+        rest_std: (3,) standard deviations of v, a, j of an unseen joint [m or rad per s, s^2, s^3].
+    """
     remainder = (dt**4 / 24.0, dt**3 / 6.0, dt**2 / 2.0, dt)
     forgotten = (1.0 - damping**2) * rest_std[a - 1] ** 2 if a > 0 else 0.0
     return sigma[a] ** 2 * remainder[a] + forgotten
@@ -193,7 +222,15 @@ _NEWEST = 0.25
 
 @njit(cache=True)
 def enter(filter_: Filter, j: int, squared: float, now: int, rules: Rules) -> None:
-    """Takes an innovation of joint j in, squared over its variance; ``row_ns`` still tells of the one before."""
+    """Takes an innovation of joint j in, squared over its variance; ``row_ns`` still tells of the one before.
+
+    Args:
+        filter_: ``surprise`` and ``spread`` of the joint are changed.
+        j: Index into JOINTS.
+        squared: The innovation squared over its variance.
+        now: The tick [ns].
+        rules: Memory of the factor [s].
+    """
     filter_.surprise[j] += _NEWEST * (squared - filter_.surprise[j])
     kept = np.exp(-(now - filter_.row_ns[j]) * 1e-9 / rules.spread_memory_s)
     filter_.spread[j] = max(kept * filter_.spread[j], filter_.surprise[j])

@@ -1,6 +1,6 @@
-"""One tick of Alg. 3 on plain arrays. The filter of Eq. (42)-(57) is 12 filters of four states and 8 of one.
+"""One tick of Alg. 3 on plain arrays, with the bounds on the fused state, Eq. (62)-(65).
 
-Bounds on the fused state, Eq. (62)-(65).
+The filter of Eq. (42)-(57) is 12 filters of four states, one a joint, and 8 of one state, one a length.
 """
 
 from __future__ import annotations
@@ -24,6 +24,13 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
     """Alg. 3 over the ticks, changing the filter in place. Frames must have arrived by the last tick.
 
     Without a valid row the a-priori estimate stays as it is, Eq. (50), (51).
+
+    Args:
+        ticks_ns: (n,) instants.
+        frames: In order of arrival.
+        filter_: The filter before the first tick; after the call, that after the last.
+        rules: Settings and limits.
+        track: Room for n ticks; receives the states and the counts of events.
     """
     damping = np.ones(12)
     seen = 0

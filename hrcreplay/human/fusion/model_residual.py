@@ -1,6 +1,6 @@
 """How far people are from their model, limb by limb, and for how long a limb has not been seen.
 
-People bend sideways, twist and lift their shoulders; twelve joints do not (ERRATA, 'The human model'). A sample of a
+People bend sideways, twist and lift their shoulders; twelve joints do not (docs/paper.md). A sample of a
 limb's residual is the largest distance of its measured points from those of the fused model at the frame's capture
 time, where the delay is compensated. It is taken after the tick's update and saturation, so it is about the state that
 is handed on, from frames that show the limb and all that carries it with enough confidence and without an outlier.
@@ -54,7 +54,14 @@ _BELOW = np.array([POINTS.index(f"{part}_{side}") for part in ("knee", "ankle", 
 
 @njit(cache=True)
 def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
-    """Takes the samples of the cameras' new frames in, and the quantiles of those limbs anew."""
+    """Takes the samples of the cameras' new frames in, and the quantiles of those limbs anew.
+
+    Args:
+        filter_: After the tick's update and saturation; the residuals' samples and quantiles are changed.
+        fresh: (c,) whether the frame held for a camera is new.
+        now: The tick [ns].
+        rules: Settings of the filter.
+    """
     model = np.empty_like(filter_.points[0])
     for c in np.flatnonzero(fresh):
         skeleton_row(ago(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths, model)

@@ -19,14 +19,29 @@ Stops = tuple[float, float, float, float]
 
 @njit(cache=True)
 def saturation_s(v: float, top: float, gain: float, brake: float) -> float:
-    """When the fastest velocity profile reaches its bound [s]; inf where it never does."""
+    """When the fastest velocity profile reaches its bound [s]; inf where it never does.
+
+    Args:
+        v: Largest initial velocity [m/s or rad/s].
+        top: Velocity bound [m/s or rad/s].
+        gain: Largest acceleration, >= 0 [m/s^2 or rad/s^2].
+        brake: Smallest acceleration, <= 0 [m/s^2 or rad/s^2].
+    """
     a = gain if v <= top else brake
     return np.inf if a == 0.0 else (top - v) / a
 
 
 @njit(cache=True)
 def fastest(v: float, top: float, gain: float, brake: float, t: float) -> float:
-    """The largest velocity at time t of motions that start with at most v."""
+    """The largest velocity at time t of motions that start with at most v.
+
+    Args:
+        v: Largest initial velocity [m/s or rad/s].
+        top: Velocity bound [m/s or rad/s].
+        gain: Largest acceleration, >= 0 [m/s^2 or rad/s^2].
+        brake: Smallest acceleration, <= 0 [m/s^2 or rad/s^2].
+        t: Time since the start [s].
+    """
     if v <= top:
         return min(v + gain * t, top)
     return max(v + brake * t, top)
@@ -68,6 +83,13 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
 
     A stop outside of all of them holds always; one inside of all may be where the joint is stopped. The coupled ones,
     Eq. (34b), (34c), are monotonic or bilinear: their extremes are at the corners.
+
+    Args:
+        j: Index into JOINTS.
+        bounds: (6, 12) of ``reachable_sets.bounds_of``.
+        coupled: Whether Eq. (34b), (34c) hold.
+        low: (12,) lower ends of the joints' reachable intervals [m, m, rad...].
+        high: (12,) their upper ends.
     """
     if not coupled or j not in (5, 6, 9, 10):
         return bounds[0, j], bounds[0, j], bounds[1, j], bounds[1, j]

@@ -38,7 +38,7 @@ def reachable(
     Both hold the angles within their limits, with Eq. (34b), (34c) taken over the reachable interval of what they
     depend on; a posture that is itself outside stays included. An arm joint that nobody ever measured may be
     anywhere within its limits, whatever the method. ``sound``: every motion under the limits from every likely state,
-    at all times until the horizon and the latency are over; x and y are those of a polygon, see ``stroll``.
+    at all times until the horizon and the latency are over; x and y are those of a polygon, see ``walking_reach``.
 
     Args:
         states: The fused person.
@@ -113,6 +113,17 @@ def reach_row(
     """Writes the reachable interval of every joint from p, v (12,) into low, high (12,); ``never`` was it measured.
 
     Alg. 1 and its clipping to Eq. (34), (35); walking is Eq. (18)-(30).
+
+    Args:
+        p: (12,) JOINTS [m, m, rad...].
+        v: (12,) their velocities [m/s, m/s, rad/s...].
+        never: (12,) whether no camera has ever shown the joint.
+        bounds: (6, 12) of ``bounds_of``.
+        coupled: Whether Eq. (34b), (34c) hold.
+        horizon: Braking time T_s of the robot [s].
+        method: Index into METHODS of one of PRINTED.
+        low: (12,) receives the lower ends [m, m, rad...].
+        high: (12,) receives the upper ends [m, m, rad...].
     """
     _walk(p, v, bounds, horizon, method, low, high)
     for j in range(3, 12):

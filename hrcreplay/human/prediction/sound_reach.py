@@ -1,6 +1,7 @@
-"""What a person can reach under ``sound``: intervals of all joints, and a polygon of pelvis positions.
+"""Reachable sets under ``sound``: intervals of all joints, and a polygon that encloses the positions of the pelvis.
 
-What ``sound`` adds to the model's motions so that real people stay inside too.
+They start from a box of likely states, not from the estimate alone, and a joint that has not been seen for long may
+have moved since: so real people stay inside, whose states are never known exactly.
 """
 
 from __future__ import annotations
@@ -52,6 +53,17 @@ def enclose_row(
 
     A joint unseen for longer than its memory may since have had any velocity within the bounds; its horizon starts
     when it was last seen. Its estimate has coasted from there, for at most the memory.
+
+    Args:
+        i: Row of ``at``.
+        at: Where people may be.
+        bounds: (6, 12) of ``reachable_sets.bounds_of``.
+        coupled: Whether Eq. (34b), (34c) hold.
+        horizon: Horizon and latency [s].
+        memory: How long the filter goes on without a measurement [s].
+        low: (12,) receives the lower ends [m, m, rad...]; NaN where the state is.
+        high: (12,) receives the upper ends.
+        corners: (SIDES, 2) receives the corners, world [m]; NaN where the state is.
     """
     _walk(i, at, bounds, horizon, memory, low, high, corners)
     for j in range(3, 12):

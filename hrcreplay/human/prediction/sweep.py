@@ -1,15 +1,12 @@
-"""The last sweeps of Alg. 2, heading and place, in one: only copies that can be corners of the result.
-
-All copies of a point are at its height. A copy is no corner of the result when it lies between another copy and a
-point of its own set, that is: when the point can take a small step away from where the other copy is, and stay inside.
-The steps are proven on the surface around the set, so nothing is dropped that is not inside the hull of the rest.
-
-Which rotations carry a limb: from its end points to the human base.
-
-Swept volumes of point sets, one degree of freedom at a time: the two strategies of Alg. 2.
+"""Swept volumes of point sets, one degree of freedom at a time, and the rotations that carry each limb: Alg. 2.
 
 Every sweep maps the whole set by a few fixed linear maps. So the hull of a swept set is the swept hull: points that
 are not corners of the hull may be dropped before any sweep without changing what comes out at the end.
+
+The last sweeps, heading and place, are done in one, and only copies that can be corners of the result are written. All
+copies of a point are at its height. A copy is no corner of the result when it lies between another copy and a point of
+its own set, that is: when the point can take a small step away from where the other copy is, and stay inside. The
+steps are proven on the surface around the set, so nothing is dropped that is not inside the hull of the rest.
 """
 
 from __future__ import annotations
@@ -29,6 +26,12 @@ def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tu
 
     A row of the chain is: axis, smallest and largest angle [rad], then the origin of its frame in the next (3,) [m].
     What follows is walking. The thorax also spans the shoulder line, whose midpoint is the neck.
+
+    Args:
+        limb: Index into LIMBS.
+        low: (12,) lower ends of the joints' reachable intervals [m, m, rad...].
+        high: (12,) their upper ends.
+        lengths: (8,) LENGTHS [m].
     """
     pelvis_height, torso, head, half_shoulder = lengths[0], lengths[1], lengths[2], lengths[3]
     turn_rho = (_Y, low[3], high[3], 0.0, 0.0, pelvis_height)
@@ -116,6 +119,13 @@ def turns(low: float, high: float, cosines: Floats, sines: Floats, widest: float
     """The maps of a rotational sweep: rotations, for an apex stretched by 1 / cos(half the piece).
 
     Writes the first columns (cos, sin) of their matrices, and returns how many there are.
+
+    Args:
+        low: Smallest angle [rad].
+        high: Largest angle [rad].
+        cosines: (>= copies(low, high, widest),) receives the first elements.
+        sines: Of the same shape, receives the second elements.
+        widest: Largest angle of a triangle [rad].
     """
     if low == high:
         cosines[0], sines[0] = np.cos(low), np.sin(low)

@@ -1,28 +1,27 @@
-"""Swept volumes that enclose every motion of Eq. (25) with the stops of Eq. (34), at all times, from all likely states.
+"""Swept volumes of the limbs within the horizon: Alg. 2, or under ``sound`` what encloses every motion of Eq. (25).
 
-Why no motion leaves them, step by step:
+Why no motion with the stops of Eq. (34) leaves those of ``sound``, at any time and from any likely state:
 
 1. States. Each joint's position and velocity are within ``sigmas`` deviations of the estimate, whatever their
    correlation: a box around it. World velocities are turned into the body's frame over all headings of the box.
-2. Joints. Heading, torso and arm joints stay in the intervals of ``excursion`` at all times; stops that depend on
+2. Joints. Heading, torso and arm joints stay in the intervals of ``joint_reach`` at all times; stops that depend on
    other joints are taken over the intervals of those.
-3. Walking. The pelvis stays in the convex polygon of ``stroll`` at all times.
+3. Walking. The pelvis stays in the convex polygon of ``walking_reach`` at all times.
 4. Limbs. A limb at any instant is a chain of rotations, each by an angle of its interval, then a displacement of the
    polygon. Sweeping a convex set by all angles of a joint and by all displacements, each regardless of the others,
    holds all combinations, among them those that occur. A swept set is kept as points whose hull holds it: rotations
    are linear, so the hull of the swept points holds the swept hull. Arcs are in triangles with their apexes outside,
-   and points are only dropped where they are proven to be inside the rest (``sweep``, ``walk``, ``corners``). Where
-   that leaves too many, the polytope of ``outer`` takes their place, which holds them all. It may be cut back to the
-   ball that no point of the limb can leave, because a direction's number may be any that is not below the truth.
+   and points are only dropped where they are proven to be inside the rest (``sweep``, ``hull_reduction``).
+   Where that leaves too many, the polytope of ``convex_hull`` takes their place, which holds them all. It may be cut
+   back to the ball that no point of the limb can leave, because a direction's number may be any that is not below the
+   truth.
 5. Lengths. A limb is drawn as long as it may be: its far end goes out along a line through the near one. An unknown
    length further up the chain displaces the limb by no more than its error, which is added to the radius.
 6. Rounding. The steps are exact in real numbers; in floating point they are off by less than 1e-12 m for people within
    a kilometre of the origin. Radii are larger by ``ROUNDING_M``. That is no tolerance for motions outside.
 
 The lower body is the line from the floor to the pelvis with its own radius, walking along: that of people who stand, or
-as far out as cameras have seen hips, knees and feet lately (``residual``).
-
-The space that the person can reach within the horizon, limb by limb: Alg. 2.
+as far out as cameras have seen hips, knees and feet lately (``model_residual``).
 """
 
 from __future__ import annotations

@@ -32,7 +32,14 @@ Range = tuple[float, float]
 
 @njit(cache=True)
 def turned_range(x: float, y: float, low: float, high: float) -> Range:
-    """Range of x cos(phi) + y sin(phi) for phi in [low, high]."""
+    """Range of x cos(phi) + y sin(phi) for phi in [low, high].
+
+    Args:
+        x: Coefficient, in the unit of the result.
+        y: Coefficient, in the same unit.
+        low: Smallest phi [rad].
+        high: Largest phi [rad].
+    """
     middle, half = 0.5 * (low + high), min(0.5 * (high - low), np.pi)
     c, s = np.cos(middle), np.sin(middle)
     along, across, radius = c * x + s * y, c * y - s * x, np.sqrt(x * x + y * y)
@@ -64,7 +71,7 @@ def walked(heading: Range, velocity: tuple[Range, Range, Range], bounds: Floats,
     Args:
         heading: Initial headings [rad].
         velocity: Initial v, v_perp and omega [m/s, m/s, rad/s].
-        bounds: (6, 12) of ``reach.bounds_of``.
+        bounds: (6, 12) of ``reachable_sets.bounds_of``.
         horizon: [s].
         far: Receives the sums.
     """
@@ -96,7 +103,14 @@ def _turn(omega: Range, bounds: Floats, t: float) -> Range:
 
 @njit(cache=True)
 def turned(heading: Range, omega: Range, bounds: Floats, horizon: float) -> Range:
-    """All headings at any time in [0, horizon] [rad]."""
+    """All headings at any time in [0, horizon] [rad].
+
+    Args:
+        heading: Initial headings [rad].
+        omega: Initial angular velocities [rad/s].
+        bounds: (6, 12) of ``reachable_sets.bounds_of``.
+        horizon: [s].
+    """
     turn = _turn(omega, bounds, horizon)
     return heading[0] - turn[0], heading[1] + turn[1]
 

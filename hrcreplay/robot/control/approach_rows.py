@@ -1,6 +1,7 @@
-"""Speed limits on the robot's links from the swept volumes, Eq. (12)-(16); corrections: docs/paper.md.
+"""Speed limits on the robot's links from the swept volumes, Eq. (12)-(16), and the minimiser of Eq. (66) under them.
 
-The minimiser of Eq. (66) over all rows, found with few of them.
+Corrections: docs/paper.md. The rows join in one at a time, where a candidate breaks them, because every vertex of every
+limb has rows and the minimiser lies on few of them.
 """
 
 from __future__ import annotations
@@ -30,7 +31,14 @@ class Approach(NamedTuple):
 
 
 def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, stop_s: float) -> Approach:
-    """The approach rows of a tick, none of them written down."""
+    """The approach rows of a tick, none of them written down.
+
+    Args:
+        pose: The robot.
+        obstacles: The swept volumes, all known.
+        room_m2: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2].
+        stop_s: T_s of Eq. (70) [s].
+    """
     hulls = obstacles
     return Approach(pose.ends_m, pose.J_ends, hulls.vertices_m, hulls.offsets, hulls.boxes_m, room_m2, stop_s)
 

@@ -1,6 +1,6 @@
-"""What goes into one tick of a controller, and what comes out. Corrections to the paper: docs/paper.md.
+"""Input and output of one tick of a controller, and what every controller computes first: how near the people are.
 
-What a controller sees in one tick before it decides: how near the people are, or why that is not known.
+Corrections to the paper: docs/paper.md.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Sight:
     distance_m: float  #: surface to surface, smallest over all pairs; NaN where there is none [m]
     limb: int
     link: int
-    reason: int  #: index into ``stepping.REASONS``; 0 where nothing is wrong
+    reason: int  #: index into ``REASONS``; 0 where nothing is wrong
 
     def step(self, state: RobotState, dq_next: Floats, dt_s: float, status: int, reason: int = 0) -> Step:
         """What the controller decided.
@@ -106,7 +106,7 @@ class Sight:
             dq_next: (nv,) one tick later [rad/s].
             dt_s: Length of the tick [s].
             status: Index into ``records.STATUSES``.
-            reason: Index into ``stepping.REASONS``.
+            reason: Index into ``REASONS``.
         """
         u, after = integrate(state, dq_next, dt_s)
         return Step(self.pose, u, after, self.distance_m, self.limb, self.link, status, reason)

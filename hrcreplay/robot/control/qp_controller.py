@@ -1,12 +1,8 @@
-"""The trajectory generator: Eq. (66), or else the stop of Eq. (67). The only module that imports proxsuite.
+"""The trajectory generator: the quadratic program of Eq. (66), or else the stop of Eq. (67).
 
-What is corrected in the printed equations, and why: docs/paper.md.
-
-Limits of the axes and of the TCP, Eq. (66d)-(66h), as bounds on the joint velocity of the next tick.
-
-The cost of the trajectory generator, Eq. (66a)-(66c).
-
-The trajectory generator's quadratic program, Eq. (66), of one tick.
+The variable is the joint velocity of the next tick: it has the cost of Eq. (66a)-(66c), the limits of the axes and of
+the TCP, Eq. (66d)-(66h), as bounds, and the approach rows of Eq. (66i). The only module that imports proxsuite. What is
+corrected in the printed equations, and why: docs/paper.md.
 """
 
 from __future__ import annotations
@@ -216,7 +212,18 @@ def problem(
     pairs: Separation,
     settings: PlanSettings,
 ) -> Problem:
-    """Eq. (66) at one instant; building it is separate from solving it. Arguments as of ``controller.step``."""
+    """Eq. (66) at one instant; building it is separate from solving it.
+
+    Args:
+        robot: The manipulator.
+        state: At the tick.
+        pose: Of the robot in that state.
+        T_world_ref: (4, 4) reference of the TCP one tick later.
+        twist_ref: (6,) its velocity, linear first, world frame [m/s, rad/s].
+        obstacles: The swept volumes of the tick.
+        pairs: Distances between links and limbs.
+        settings: Weights and limits.
+    """
     dt_s, J, dJdq = settings.dt_s, pose.J_tcp, pose.dJdq_tcp
     H, g = tracking_cost(
         pose_error(pose.T_world_tcp, T_world_ref),

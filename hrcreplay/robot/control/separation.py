@@ -1,8 +1,6 @@
-"""Distances between the robot's links and the swept volumes. The only module that imports coal.
+"""Distances between the robot's links and the swept volumes of one tick. The only module that imports coal.
 
 The right-hand side of the safety constraints is corrected as docs/paper.md says.
-
-The swept volumes of one tick, as every controller of that tick uses them.
 """
 
 from __future__ import annotations

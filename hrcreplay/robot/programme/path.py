@@ -1,6 +1,7 @@
-"""Where references come from: a programmed task, or joint positions that a log recorded.
+"""Paths that references follow: of a programmed task, of joint positions that a log recorded, and to a path's start.
 
-One move from standstill to standstill on a regular time grid, within the limits of the axes and of the TCP.
+Every move of a task goes from standstill to standstill on a regular time grid, within the limits of the axes and of the
+TCP.
 """
 
 from __future__ import annotations
@@ -43,14 +44,14 @@ class Pace:
 
 
 @dataclass(frozen=True)
-class Track:
+class JointTrajectory:
     """Joint positions and velocities on the time grid, first and last at rest."""
 
     q: Floats  #: (n, nv) [rad]
     dq: Floats  #: (n, nv) [rad/s]
 
 
-def joint_move(model: RobotModel, start: Floats, end: Floats, pace: Pace) -> Track:
+def joint_move(model: RobotModel, start: Floats, end: Floats, pace: Pace) -> JointTrajectory:
     """Every axis at the same share of its way, so that all start and stop together.
 
     Args:
@@ -61,17 +62,17 @@ def joint_move(model: RobotModel, start: Floats, end: Floats, pace: Pace) -> Tra
     """
     way = end - start
     if not np.any(way):
-        return Track(start[None], np.zeros_like(start)[None])
+        return JointTrajectory(start[None], np.zeros_like(start)[None])
     with np.errstate(divide="ignore"):
         speed, acceleration = (float((limit / np.abs(way)).min()) for limit in (pace.dq_max, pace.ddq_max))
 
-    def along(share: Floats, rate: Floats) -> Track:
-        return Track(start + np.outer(share, way), np.outer(rate, way))
+    def along(share: Floats, rate: Floats) -> JointTrajectory:
+        return JointTrajectory(start + np.outer(share, way), np.outer(rate, way))
 
     return _paced(model, pace, along, 1.0, speed, acceleration, "")
 
 
-def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pace, where: str) -> Track:
+def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pace, where: str) -> JointTrajectory:
     """The TCP on a straight line, turning evenly about one axis.
 
     Args:
@@ -89,10 +90,10 @@ def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pac
     turn_rad = to_vector(T_world_end[:3, :3] @ T_start[:3, :3].T)
     length = max(float(np.linalg.norm(way_m)), float(np.linalg.norm(turn_rad)) / TURN_RAD_PER_M)
     if length < 1e-9:
-        return Track(start[None], np.zeros_like(start)[None])
+        return JointTrajectory(start[None], np.zeros_like(start)[None])
     twist_per_m = np.concatenate([way_m, turn_rad]) / length
 
-    def along(s_m: Floats, rate: Floats) -> Track:
+    def along(s_m: Floats, rate: Floats) -> JointTrajectory:
         q, dq = np.empty((len(s_m), model.nv)), np.zeros((len(s_m), model.nv))
         now = start
         T = np.eye(4)
@@ -107,7 +108,7 @@ def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pac
                 )
             q[i] = now
             dq[i] = np.linalg.pinv(model.pose(now, np.zeros(model.nv)).J_tcp, rcond=1e-9) @ twist_per_m * rate[i]
-        return Track(q, dq)
+        return JointTrajectory(q, dq)
 
     return _paced(model, pace, along, length, pace.tcp_speed, pace.tcp_acceleration, where)
 
@@ -115,12 +116,12 @@ def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pac
 def _paced(
     model: RobotModel,
     pace: Pace,
-    along: Callable[[Floats, Floats], Track],
+    along: Callable[[Floats, Floats], JointTrajectory],
     length: float,
     speed: float,
     acceleration: float,
     where: str,
-) -> Track:
+) -> JointTrajectory:
     """A path run by a jerk-limited profile as fast as the axes and the TCP allow.
 
     The profile's own speed and acceleration are lowered by what its axes exceed. Where that does not help against an
@@ -160,7 +161,7 @@ def _profile(length: float, speed: float, acceleration: float, step_s: float) ->
     return np.clip(s, 0.0, length), ds / stretch
 
 
-def _excess(model: RobotModel, track: Track, pace: Pace) -> tuple[float, float]:
+def _excess(model: RobotModel, track: JointTrajectory, pace: Pace) -> tuple[float, float]:
     """By which factors the path's speed and its acceleration exceed what axes and TCP allow."""
     way, first, last = np.diff(track.q, axis=0) / pace.step_s, track.dq[:-1], track.dq[1:]
     speeds = np.concatenate([track.dq, 1.5 * way - 0.25 * (first + last)])  # of the cubics between grid points
@@ -285,16 +286,18 @@ def _check(
         )
 
 
-def _steps(tracks: list[Track]) -> int:
+def _steps(tracks: list[JointTrajectory]) -> int:
     return sum(len(track.q) - 1 for track in tracks)
 
 
-def _stand(q: Floats, dwell_s: float) -> Track:
+def _stand(q: Floats, dwell_s: float) -> JointTrajectory:
     rows = np.repeat(q[None], round(dwell_s / STEP_S) + 1, axis=0)
-    return Track(rows, np.zeros_like(rows))
+    return JointTrajectory(rows, np.zeros_like(rows))
 
 
-def _move(model: RobotModel, task: Task, index: int, now: Floats, where: str, goal: Floats | None = None) -> Track:
+def _move(
+    model: RobotModel, task: Task, index: int, now: Floats, where: str, goal: Floats | None = None
+) -> JointTrajectory:
     """The move to a waypoint, and for the way back to the first, to the joint positions it started with."""
     waypoint = task.waypoints[index]
     at = f"{where}: {task.label(index)}"
