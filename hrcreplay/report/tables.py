@@ -108,7 +108,7 @@ FUSION = (
     ("RMSE of y", "rmse_y"),
 )
 
-#: What happened at the ticks at which the robot braked, by the reason that its record gives (``stepping.REASONS``).
+#: What happened at the ticks at which the robot braked, by the reason that its record gives (``control_step.REASONS``).
 REASONS = {
     "no human state": "it was not known where the person is: no camera had shown them lately, or none yet",
     "no solution": "no motion satisfied all constraints",
