@@ -87,7 +87,7 @@ def half(*_args: object, out: Path, **_named: object) -> Path:
 @pytest.mark.parametrize(
     ("planted", "wrong"),
     [
-        (bug, ["exit code 1", "traceback: ZeroDivisionError: put there by a test (cli.py:"]),
+        (bug, ["exit code 1", "traceback: ZeroDivisionError: put there by a test (cli/app.py:"]),
         (leftovers, ["left behind: ['out.partial']", "no line that says why"]),
         (half, ["a run folder in spite of the error"]),
     ],

@@ -93,7 +93,7 @@ def _words(command: str, log: Path, out: Path) -> list[str]:
 def _run(found: Trial, words: list[str], folder: Path) -> None:
     with (
         mock.patch.object(sys, "argv", ["hrcreplay", *words]),
-        mock.patch.object(session, "warm"),  # the kernels are warm after the first
+        mock.patch.object(session, "compile_kernels"),  # the kernels are warm after the first
         warnings.catch_warnings(record=True) as remarks,
         _captured(folder / "stderr") as captured,
     ):
