@@ -1,7 +1,8 @@
 """The robot's kinematics in the world frame. The only module that imports pinocchio.
 
 It opens no file itself, but pinocchio does where a URDF has meshes: its geometry model takes their paths, not their
-bytes. That happens once, when a robot is made.
+bytes. That happens once, when a robot is made. Shapes, their places and the joints that are held are pinocchio's; what
+it does not tell of a URDF is read in ``robot.urdf``.
 """
 
 from __future__ import annotations
@@ -188,15 +189,8 @@ def from_urdf(
         SettingsError: The URDF, a mesh, a segment's body or the number of accelerations cannot be used.
     """
     robot = describe(xml, tcp_frame, base_frame)
-    ddq_max = np.array(acceleration, dtype=float) if len(acceleration) else robot.dq_max / stop_s
-    if ddq_max.shape != robot.dq_max.shape:
-        raise SettingsError(
-            f"robot.acceleration: found {len(acceleration)} values; {robot.name} has {len(robot.joints)} axes"
-        )
-    try:
-        whole = pin.buildModelFromXML(robot.text)
-    except ValueError as error:
-        raise SettingsError(f"robot: the URDF of {robot.name} cannot be read ({error}); check its numbers") from error
+    ddq_max = _accelerations(robot, acceleration, stop_s)
+    whole = _whole(robot)
     segments = tuple(segments) or capsules(robot.shapes, _extents(whole, robot, meshes or {}))
     model = _chain(whole, robot.joints)
     _place_base(model, robot.base, pin.SE3(T_world_base))
@@ -217,16 +211,29 @@ def from_urdf(
         segments=segments,
         T_world_base=np.array(T_world_base, dtype=float),
         shoulder_m=np.array(model.jointPlacements[1].translation),
-        reach_m=sum(
-            float(np.linalg.norm(link.translation))
-            for link in (*model.jointPlacements[2:], model.frames[tcp].placement)
-        ),
+        reach_m=_reach_m(model, tcp),
         base_frame=robot.base,
         tcp_frame=robot.tcp,
         locked=robot.locked,
         tcp_outside_m=_outside(model, segments, points, tcp),
         _kinematics=_Kinematics(model, points, tcp),
     )
+
+
+def _accelerations(robot: Description, given: Sequence[float], stop_s: float) -> Floats:
+    """(nv,) limits, which a URDF does not have [rad/s^2]."""
+    ddq_max = np.array(given, dtype=float) if len(given) else robot.dq_max / stop_s
+    if ddq_max.shape != robot.dq_max.shape:
+        raise SettingsError(f"robot.acceleration: found {len(given)} values; {robot.name} has {len(robot.joints)} axes")
+    return ddq_max
+
+
+def _whole(robot: Description) -> Any:
+    """Pinocchio's model of every joint, those off the chain too."""
+    try:
+        return pin.buildModelFromXML(robot.text)
+    except ValueError as error:
+        raise SettingsError(f"robot: the URDF of {robot.name} cannot be read ({error}); check its numbers") from error
 
 
 def _extents(whole: Any, robot: Description, meshes: Mapping[str, str]) -> dict[str, Extent]:
@@ -300,6 +307,12 @@ def _body(model: Any, body: str, where: str) -> Any:
     if body not in known:
         raise SettingsError(f"{where}: the robot has no link {body!r}; it has {', '.join(sorted(known))}")
     return model.frames[known[body]]
+
+
+def _reach_m(model: Any, tcp: int) -> float:
+    """The arm stretched: the offsets from the second joint to the TCP one after another [m]."""
+    links = (*model.jointPlacements[2:], model.frames[tcp].placement)
+    return sum(float(np.linalg.norm(link.translation)) for link in links)
 
 
 def _shift(offset_m: Vector) -> Any:

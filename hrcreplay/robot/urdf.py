@@ -1,4 +1,9 @@
-"""What hrcreplay needs from a URDF: the chain of axes between base and tool, its limits, the links that it moves."""
+"""What hrcreplay needs from a URDF before pinocchio reads it: the chain from base to tool, its limits, its meshes.
+
+pinocchio's parser has one sentence for every wrong file, refuses a limit without an effort, forgets which joint mimics
+another, sorts the joints by name, and must have the paths of the meshes. So the tree and the limits are read here, and
+pinocchio gets a text that it can read: without shapes, or with those whose capsules are wanted.
+"""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ CELL = Cell(
     T_world_camera={"left": T, 'a "b".c': np.eye(4)},
     clock_offset_s={"left": 0.0, 'a "b".c': -0.0123},
     T_world_base=np.asarray(np.linalg.inv(T)),
-    residuals=(Residual("left", 'a "b".c', 0.02, 0.1, 1000, 0.05),),
+    residuals=(Residual(a="left", b='a "b".c', median_m=0.02, p95_m=0.1, points=1000, mirrored=0.05),),
     notes=("up is known to about 8 degrees only",),
 )
 
