@@ -110,7 +110,10 @@ def write_cell(cell: Cell, path: Path) -> None:
 
 
 def pose_from_position(position_m: Floats, yaw_rad: float) -> Floats:
-    """T_world_x (4, 4) of something at a place (3,) [m], turned about z by yaw [rad]."""
+    """T_world_x (4, 4) of something at a place (3,) [m], turned about z by yaw [rad].
+
+    scipy's ``Rotation`` goes by half the angle, and its last bits would reach the cell file.
+    """
     T = np.eye(4)
     T[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
     T[:3, 3] = position_m

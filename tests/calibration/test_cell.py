@@ -86,6 +86,10 @@ def test_refuses_to_overwrite(tmp_path: Path) -> None:
         ("T_world_base = { position_m = [1, 2, 3], yaw_deg = inf }", r"T_world_base\.yaw_deg: found inf"),
         ("[[residuals]]\na = 'x'", "residuals: found .* would be right: tables with a, b, median_m"),
         ("residuals = 5", "residuals: found 5"),
+        (
+            "[[residuals]]\na='x'\nb='y'\nmedian_m='far'\np95_m=0.1\npoints=9\nmirrored=0.0",
+            "residuals: found .*'far'.* would be right: tables with a, b, median_m",
+        ),
         ("notes = 'x'", "notes: found 'x'; would be right: a list of texts"),
     ],
 )
