@@ -97,18 +97,23 @@ def run(
                 print_note(f"{log['log']}: {note}")
         _write_escapes(found, writer)
         writer.close_tables()
-        writer.text("audit.json", run_folder.to_json(found))
         meta = _meta(jobs, began)
-        folder = writer.partial / "figures"
-        draw_all(found, folder)
-        metrics = headline_metrics(found)
-        writer.text("metrics.json", run_folder.to_json(metrics))
-        writer.text("report.html", page.render(found, metrics, meta, folder))
+        _write_report(found, meta, writer)
         writer.timing.update(watch.summary(1.0 / AUDIT_HZ))
         writer.finish(meta)
         for line in _summary(found):
             print_note(line)
         return writer.folder
+
+
+def _write_report(found: dict[str, Any], meta: dict[str, Any], writer: RunWriter) -> None:
+    """audit.json, metrics.json, the figures, and the page that shows them."""
+    writer.text("audit.json", run_folder.to_json(found))
+    folder = writer.partial / "figures"
+    draw_all(found, folder)
+    metrics = headline_metrics(found)
+    writer.text("metrics.json", run_folder.to_json(metrics))
+    writer.text("report.html", page.render(found, metrics, meta, folder))
 
 
 def _summary(found: dict[str, Any]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -248,7 +248,7 @@ def _residuals(
             T_a_b = np.linalg.inv(found[a].T_a_b) @ found[b].T_a_b
             rest = disagreement(tracks[a], tracks[b], Registration(T_a_b, found[b].offset_s - found[a].offset_s))
             if rest is not None:
-                rests.append(Residual(cameras[a], cameras[b], rest.median_m, rest.p95_m, rest.points, rest.mirrored))
+                rests.append(Residual(a=cameras[a], b=cameras[b], **asdict(rest)))
     return tuple(rests)
 
 

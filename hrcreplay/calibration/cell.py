@@ -5,31 +5,35 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, ValidationError
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
 from hrcreplay.store.run_folder import write_whole
 
 _TOLERANCE = 1e-6
-_KEYS = ("cameras", "T_world_base", "residuals", "notes")
+_STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _POSE = "4 rows of 4 numbers, a rotation and a place [m], last row 0 0 0 1"
 
 
-@dataclass(frozen=True)
-class Residual:
+class Residual(BaseModel):
     """How far two cameras are apart about the same person once calibrated, outliers included."""
+
+    model_config = _STRICT
 
     a: str
     b: str
     median_m: float
     p95_m: float
-    points: int  #: point pairs it rests on
-    mirrored: float  #: share of frames in which the two see left and right exchanged
+    points: int
+    """Point pairs it rests on."""
+    mirrored: float
+    """Share of frames in which the two see left and right exchanged."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class Cell:
         if self.T_world_base is not None:
             cell["T_world_base"] = self.T_world_base.tolist()
         if self.residuals:
-            cell["residuals"] = [asdict(residual) for residual in self.residuals]
+            cell["residuals"] = [residual.model_dump() for residual in self.residuals]
         if self.notes:
             cell["notes"] = list(self.notes)
         return cell
@@ -65,23 +69,19 @@ class Cell:
         Raises:
             SettingsError: A key or value is not as it should be.
         """
-        _known(table, _KEYS, where)
-        cameras = _table(table.get("cameras", {}), f"{where}: cameras")
-        poses, offsets = {}, {}
-        for name, entry in cameras.items():
-            place = f"{where}: cameras.{name}"
-            _known(_table(entry, place), ("T_world_camera", "clock_offset_s"), place)
-            if "T_world_camera" not in entry:
-                raise SettingsError(f"{place}: no T_world_camera; would be right: {_POSE}")
-            poses[name] = _pose(entry["T_world_camera"], f"{place}.T_world_camera")
-            offsets[name] = _number(entry.get("clock_offset_s", 0.0), f"{place}.clock_offset_s")
-        base = table.get("T_world_base")
+        try:
+            file = _CellFile.model_validate(dict(table))
+        except ValidationError as error:
+            raise SettingsError(_first_problem(error, table, where)) from error
+        base = file.T_world_base
+        if isinstance(base, _Upright):
+            base = pose_from_position(np.array(base.position_m), np.radians(base.yaw_deg)).tolist()
         return cls(
-            T_world_camera=poses,
-            clock_offset_s=offsets,
-            T_world_base=None if base is None else _base(base, f"{where}: T_world_base"),
-            residuals=_residuals(table.get("residuals", []), f"{where}: residuals"),
-            notes=_notes(table.get("notes", []), f"{where}: notes"),
+            T_world_camera={name: np.array(camera.T_world_camera) for name, camera in file.cameras.items()},
+            clock_offset_s={name: camera.clock_offset_s for name, camera in file.cameras.items()},
+            T_world_base=None if base is None else np.array(base),
+            residuals=tuple(file.residuals),
+            notes=tuple(file.notes),
         )
 
 
@@ -110,7 +110,10 @@ def write_cell(cell: Cell, path: Path) -> None:
 
 
 def pose_from_position(position_m: Floats, yaw_rad: float) -> Floats:
-    """T_world_x (4, 4) of something at a place (3,) [m], turned about z by yaw [rad]."""
+    """T_world_x (4, 4) of something at a place (3,) [m], turned about z by yaw [rad].
+
+    scipy's ``Rotation`` goes by half the angle, and its last bits would reach the cell file.
+    """
     T = np.eye(4)
     T[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
     T[:3, 3] = position_m
@@ -141,61 +144,90 @@ def _matrix(rows: list[list[float]]) -> str:
     return "[\n" + "".join(f"  [{', '.join(repr(value) for value in row)}],\n" for row in rows) + "]"
 
 
-def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
-    unknown = [key for key in table if key not in keys]
-    if unknown:
-        raise SettingsError(f"{where}: found {unknown[0]!r}; would be right: {', '.join(keys)}")
+def _check_rows(rows: Any) -> Any:
+    """Before the rows themselves, so that a matrix of another size is shown whole."""
+    if not isinstance(rows, list) or len(rows) != 4:
+        raise ValueError(f"found {rows!r}; would be right: {_POSE}")
+    return rows
 
 
-def _table(value: Any, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise SettingsError(f"{where}: found {value!r}; would be right: a table")
-    return value
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise SettingsError(f"{where}: found {value!r}; would be right: a finite number")
-    return float(value)
-
-
-def _numbers(value: Any, count: int, where: str, right: str) -> list[float]:
-    if not isinstance(value, list) or len(value) != count:
-        raise SettingsError(f"{where}: found {value!r}; would be right: {right}")
-    return [_number(item, where) for item in value]
-
-
-def _pose(value: Any, where: str) -> Floats:
-    if not isinstance(value, list) or len(value) != 4:
-        raise SettingsError(f"{where}: found {value!r}; would be right: {_POSE}")
-    T = np.array([_numbers(row, 4, where, _POSE) for row in value])
+def _check_pose(rows: list[list[float]]) -> list[list[float]]:
+    T = np.array(rows)
     if (T[3] != [0, 0, 0, 1]).any():
-        raise SettingsError(f"{where}: found the last row {T[3].tolist()}; would be right: 0 0 0 1")
+        raise ValueError(f"found the last row {T[3].tolist()}; would be right: 0 0 0 1")
     off = float(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max())
     if off > _TOLERANCE:
-        raise SettingsError(f"{where}: found axes off by {off:.2g}; would be right: a rotation, to {_TOLERANCE:g}")
+        raise ValueError(f"found axes off by {off:.2g}; would be right: a rotation, to {_TOLERANCE:g}")
     if np.linalg.det(T[:3, :3]) < 0:
-        raise SettingsError(f"{where}: found a mirror image (determinant -1); would be right: a rotation")
-    return T
+        raise ValueError("found a mirror image (determinant -1); would be right: a rotation")
+    return rows
 
 
-def _base(value: Any, where: str) -> Floats:
-    if not isinstance(value, dict):
-        return _pose(value, where)
-    _known(value, ("position_m", "yaw_deg"), where)
-    position = _numbers(value.get("position_m"), 3, f"{where}.position_m", "[x, y, z] in the world [m]")
-    return pose_from_position(np.array(position), np.radians(_number(value.get("yaw_deg", 0.0), f"{where}.yaw_deg")))
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Row = Annotated[list[_Number], Field(min_length=4, max_length=4)]
+_Pose = Annotated[list[_Row], BeforeValidator(_check_rows), AfterValidator(_check_pose)]
 
 
-def _residuals(value: Any, where: str) -> tuple[Residual, ...]:
-    try:
-        return tuple(Residual(**entry) for entry in value)
-    except TypeError as error:
-        right = ", ".join(Residual.__dataclass_fields__)
-        raise SettingsError(f"{where}: found {value!r}; would be right: tables with {right}") from error
+class _Camera(BaseModel):
+    model_config = _STRICT
+    T_world_camera: _Pose
+    clock_offset_s: _Number = 0.0
 
 
-def _notes(value: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(note, str) for note in value):
-        raise SettingsError(f"{where}: found {value!r}; would be right: a list of texts")
-    return tuple(value)
+class _Upright(BaseModel):
+    """A base whose z axis is the world's."""
+
+    model_config = _STRICT
+    position_m: Annotated[list[_Number], Field(min_length=3, max_length=3)]
+    yaw_deg: _Number = 0.0
+
+
+_Base = Annotated[
+    Annotated[_Upright, Tag("upright")] | Annotated[_Pose, Tag("pose")],
+    Discriminator(lambda value: "upright" if isinstance(value, dict) else "pose"),
+]
+
+
+class _CellFile(BaseModel):
+    model_config = _STRICT
+    cameras: dict[str, _Camera] = {}
+    T_world_base: _Base | None = None
+    residuals: list[Residual] = []
+    notes: list[str] = []
+
+
+#: What would be right, by the name of the key; for a number, a finite one.
+_RIGHT = {
+    "cameras": "a table",
+    "T_world_camera": _POSE,
+    "T_world_base": _POSE,
+    "position_m": "[x, y, z] in the world [m]",
+    "residuals": f"tables with {', '.join(Residual.model_fields)}",
+    "notes": "a list of texts",
+}
+
+
+def _first_problem(error: ValidationError, table: Mapping[str, Any], where: str) -> str:
+    problems = error.errors()
+    # An unknown key is told first: it may be a missing one with another name.
+    problem = next((one for one in problems if one["type"] == "extra_forbidden"), problems[0])
+    kind, loc, found = problem["type"], list(problem["loc"]), problem["input"]
+    if loc[0] in ("residuals", "notes"):
+        kind, loc, found = "value", loc[:1], table[str(loc[0])]
+    elif loc[0] == "T_world_base":
+        del loc[1]  # the tag
+    keys = [str(key) for key in loc if not isinstance(key, int)]
+    at = f"{where}: {'.'.join(keys)}"
+    right = "a table" if keys[0] == "cameras" and len(keys) == 2 else _RIGHT.get(keys[-1])
+    if kind == "extra_forbidden":
+        models: dict[str, type[BaseModel]] = {"cameras": _Camera, "T_world_base": _Upright}
+        model = models[keys[0]] if len(keys) > 1 else _CellFile
+        above = ": ".join([where, *filter(None, [".".join(keys[:-1])])])
+        return f"{above}: found {keys[-1]!r}; would be right: {', '.join(model.model_fields)}"
+    if kind == "value_error":
+        return f"{at}: {problem['ctx']['error']}"
+    if kind == "missing" and keys[-1] == "T_world_camera":
+        return f"{where}: {'.'.join(keys[:-1])}: no T_world_camera; would be right: {right}"
+    if kind in ("float_type", "finite_number"):
+        right = "a finite number"
+    return f"{at}: found {None if kind == 'missing' else found!r}; would be right: {right}"

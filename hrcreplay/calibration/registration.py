@@ -61,6 +61,8 @@ class Disagreement:
 def kabsch(source_m: Floats, target_m: Floats, weight: Floats) -> Floats:
     """Rigid transform that takes the source points to the target points in weighted least squares.
 
+    scipy's ``Rotation.align_vectors`` agrees to 1e-14 in 2.6 times the time, and its last bits reach the cell file.
+
     Args:
         source_m: (m, 3) [m].
         target_m: (m, 3) [m].

@@ -66,7 +66,7 @@ def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:
 
 
 @njit(cache=True)
-def look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s) -> tuple[int, int]:  # noqa: D417
+def _look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s) -> tuple[int, int]:  # noqa: D417
     """For how many triangles a point is not proven to be inside, and how many it sees from clearly outside.
 
     Args:
@@ -83,7 +83,7 @@ def look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s
 
 
 @njit(cache=True)
-def set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, faces: Int32s) -> None:  # noqa: D417
+def _set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, faces: Int32s) -> None:  # noqa: D417
     """Writes triangle f with corners in slots i, j, k, without joining it to its neighbours.
 
     Args:
@@ -104,7 +104,7 @@ def set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, faces
 
 
 @njit(cache=True)
-def join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D417
+def _join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D417
     """Makes triangle f the owner of its edges.
 
     Args:
@@ -117,7 +117,7 @@ def join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D41
 
 
 @njit(cache=True)
-def hide(count: int, faces: Int32s) -> int:
+def _hide(count: int, faces: Int32s) -> int:
     """Lists the triangles that the last point looked at sees; returns how many."""
     hidden = 0
     for f in range(count):
@@ -127,7 +127,7 @@ def hide(count: int, faces: Int32s) -> int:
 
 
 @njit(cache=True)
-def outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
+def _outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
     """Lists the edges between seen and unseen triangles; returns how many.
 
     Args:
@@ -165,7 +165,7 @@ def is_loop(edges: int, faces: Int32s) -> bool:
 
 
 @njit(cache=True)
-def fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: Floats, faces: Int32s) -> bool:  # noqa: D417
+def _fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: Floats, faces: Int32s) -> bool:  # noqa: D417
     """Adds triangles from the edges to the point in a slot, not joined yet; returns whether all face outward.
 
     Args:
@@ -176,14 +176,14 @@ def fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: F
     inward = 0
     for n in range(edges):
         f = count + n
-        set_plane(f, faces[START, n], faces[END, n], slot, size, planes, faces)
+        _set_plane(f, faces[START, n], faces[END, n], slot, size, planes, faces)
         height = planes[NX, f] * inner[0] + planes[NY, f] * inner[1] + planes[NZ, f] * inner[2] - planes[OFFSET, f]
         inward += height >= -planes[THIN, f]
     return inward == 0
 
 
 @njit(cache=True)
-def join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D417
+def _join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D417
     """Joins new triangles to their neighbours.
 
     Args:
@@ -192,11 +192,11 @@ def join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) -> 
     """
     for f in range(start, end):
         faces[SEEN, f] = 0
-        join(f, width, faces, owner)
+        _join(f, width, faces, owner)
 
 
 @njit(cache=True)
-def fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
+def _fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
     """Moves the last triangles into the places of those no longer needed; returns the number of triangles.
 
     Args:
@@ -210,7 +210,7 @@ def fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owner
         if end > hole:
             end -= 1
             _move(end, hole, planes, faces)
-            join(hole, width, faces, owner)
+            _join(hole, width, faces, owner)
     return end
 
 
@@ -297,20 +297,20 @@ def _grow(points: Floats, count: int, work: Surface, keep: Bools) -> tuple[int, 
     for n in range(count):
         i = order[n]
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        outside, beyond = look(x, y, z, faces, planes, triangles)
+        outside, beyond = _look(x, y, z, faces, planes, triangles)
         if outside == 0:
             keep[i] = False
         elif beyond > 0 and slots < MOST_SLOTS:
             triangles[POINT, slots] = i
             planes[X, slots], planes[Y, slots], planes[Z, slots] = x, y, z
-            hidden = hide(faces, triangles)
-            edges = outline(hidden, width, triangles, owner)
+            hidden = _hide(faces, triangles)
+            edges = _outline(hidden, width, triangles, owner)
             end = faces + edges
             if edges == 0 or end > MOST_FACES or not is_loop(edges, triangles):
                 continue
-            if fan(inner, size, faces, edges, slots, planes, triangles):
-                join_all(faces, end, width, triangles, owner)
-                faces = fill(hidden, end, width, planes, triangles, owner)
+            if _fan(inner, size, faces, edges, slots, planes, triangles):
+                _join_all(faces, end, width, triangles, owner)
+                faces = _fill(hidden, end, width, planes, triangles, owner)
                 slots += 1
     _drop_inner(points, count, faces, planes, triangles, keep)
     return faces, slots
@@ -379,8 +379,8 @@ def _simplex(points: Floats, order: Ints, size: float, width: int, work: Surface
     for slot in range(4):
         planes[X, slot], planes[Y, slot], planes[Z, slot] = points[p[slot], 0], points[p[slot], 1], points[p[slot], 2]
     for f, (i, j, k) in enumerate(((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))):
-        set_plane(f, i, j, k, size, planes, faces)
-        join(f, width, faces, owner)
+        _set_plane(f, i, j, k, size, planes, faces)
+        _join(f, width, faces, owner)
     return 4
 
 

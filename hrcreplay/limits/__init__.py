@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds
@@ -18,6 +19,15 @@ _HERE = Path(__file__).parent
 NAMES = ("paper", "human", "people")
 _QUANTITIES = ("position", "velocity", "acceleration")
 _COUPLED = ("ar2", "ar3", "al2", "al3")
+_STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
+_PAIR = "[low, high] with low <= high"
+_ROW = f"a row with {', '.join(_QUANTITIES)}"
+#: What to write instead, by the key.
+_RIGHT = {
+    "coupled": "true or false",
+    "joints": "a table with a row for each joint",
+    "provenance": "a table, or leave it out",
+}
 
 
 def load_limits(name_or_path: str | Path) -> LimitSet:
@@ -44,16 +54,12 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path}: not TOML ({error})") from error
-    _known(table, ("coupled", "joints", "provenance"), str(path))
-    if not isinstance(table.get("provenance", {}), dict):
-        raise SettingsError(f"{path}: provenance: found {table['provenance']!r}; write a table, or leave it out")
-    coupled, joints = table.get("coupled"), table.get("joints")
-    if not isinstance(coupled, bool):
-        raise SettingsError(f"{path}: coupled: found {coupled!r}; write true or false")
-    if not isinstance(joints, dict):
-        raise SettingsError(f"{path}: joints: found {joints!r}; write a table with a row for each joint")
-    _known(joints, JOINTS, f"{path}: joints")
-    bounds = np.array([_joint(joints.get(joint), joint, f"{path}: joints.{joint}", coupled) for joint in JOINTS])
+    try:
+        file = _LimitFile.model_validate(table).model_dump()
+    except ValidationError as error:
+        raise SettingsError(_first_problem(error, table, str(path))) from error
+    rows, coupled = file["joints"], file["coupled"]
+    bounds = np.array([_bounds(rows[joint], joint, f"{path}: joints.{joint}", coupled) for joint in JOINTS])
     if coupled:
         _enclose(bounds)
     p, v, a = (np.ascontiguousarray(bounds[:, k].T) for k in range(len(_QUANTITIES)))
@@ -105,41 +111,62 @@ def _value(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _known(table: dict[str, Any], keys: tuple[str, ...], where: str) -> None:
-    for key in table:
-        if key not in keys:
-            raise SettingsError(f"{where}: unknown key {key!r}; known here: {', '.join(keys)}")
+def _ordered(pair: list[float]) -> list[float]:
+    if not pair[0] <= pair[1]:
+        raise ValueError
+    return pair
 
 
-def _joint(row: Any, joint: str, where: str, coupled: bool) -> list[tuple[float, float]]:
+_Pair = Annotated[list[float], Field(min_length=2, max_length=2), AfterValidator(_ordered)]
+
+
+class _Row(BaseModel):
+    model_config = _STRICT
+    position: _Pair | None = None
+    velocity: _Pair
+    acceleration: _Pair
+
+
+_rows: Any = dict.fromkeys(JOINTS, (_Row, ...))
+_Joints = create_model("_Joints", __config__=_STRICT, **_rows)
+_LimitFile = create_model(
+    "_LimitFile", __config__=_STRICT, coupled=(bool, ...), joints=(_Joints, ...), provenance=(dict[str, Any], {})
+)
+
+
+def _first_problem(error: ValidationError, table: dict[str, Any], where: str) -> str:
+    problems = error.errors()
+    # An unknown key is told first: it may be a missing one with another name.
+    problem = next((one for one in problems if one["type"] == "extra_forbidden"), problems[0])
+    keys = [str(key) for key in problem["loc"][:3]]  # a bound inside a pair is shown with its pair
+    if problem["type"] == "extra_forbidden":
+        known = (_LimitFile.model_fields, JOINTS, _QUANTITIES)[len(keys) - 1]
+        above = ".".join(keys[:-1])
+        return f"{where}{above and ': '}{above}: unknown key {keys[-1]!r}; known here: {', '.join(known)}"
+    found: Any = table
+    for key in keys:
+        found = found.get(key)
+    return f"{where}: {'.'.join(keys)}: found {found!r}; write {_RIGHT.get(keys[-1], _PAIR if len(keys) > 2 else _ROW)}"
+
+
+def _bounds(row: dict[str, Any], joint: str, where: str, coupled: bool) -> list[list[float]]:
     """The three pairs of bounds of one joint; a position that (34) gives is left for ``_enclose``."""
-    if not isinstance(row, dict):
-        raise SettingsError(f"{where}: found {row!r}; write a row with {', '.join(_QUANTITIES)}")
-    _known(row, _QUANTITIES, where)
-    pairs = []
-    for quantity in _QUANTITIES:
-        if quantity == "position" and coupled and joint in _COUPLED:
-            if quantity in row:
-                raise SettingsError(f"{where}: found a position; Eq. (34) gives it where coupled = true, leave it out")
-            pairs.append((0.0, 0.0))
-        else:
-            pairs.append(_pair(row.get(quantity), f"{where}.{quantity}"))
-    if joint == "theta" and pairs[0] != (-np.inf, np.inf):
-        raise SettingsError(f"{where}.position: found {list(pairs[0])}; heading has no stop, write [-inf, inf]")
+    enclosed = coupled and joint in _COUPLED
+    position = row["position"]
+    if enclosed and position is not None:
+        raise SettingsError(f"{where}: found a position; Eq. (34) gives it where coupled = true, leave it out")
+    if not enclosed and position is None:
+        raise SettingsError(f"{where}.position: found None; write {_PAIR}")
+    pairs = [position or [0.0, 0.0], row["velocity"], row["acceleration"]]
+    if joint == "theta" and pairs[0] != [-np.inf, np.inf]:
+        raise SettingsError(f"{where}.position: found {pairs[0]}; heading has no stop, write [-inf, inf]")
     if joint not in JOINTS[:3] and not np.isfinite(pairs[0]).all():
-        raise SettingsError(f"{where}.position: found {list(pairs[0])}; an angle of the body needs finite bounds")
+        raise SettingsError(f"{where}.position: found {pairs[0]}; an angle of the body needs finite bounds")
     if not np.isfinite(pairs[1:]).all():
         raise SettingsError(f"{where}: found an infinite rate; velocity and acceleration need finite bounds")
     if not (pairs[1][0] <= 0 <= pairs[1][1] and pairs[2][0] < 0 < pairs[2][1]):
         raise SettingsError(f"{where}: found rates without 0; a person must be able to stand still and to change speed")
     return pairs
-
-
-def _pair(value: Any, where: str) -> tuple[float, float]:
-    numbers = isinstance(value, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
-    if not numbers or len(value) != 2 or not value[0] <= value[1]:
-        raise SettingsError(f"{where}: found {value!r}; write [low, high] with low <= high")
-    return float(value[0]), float(value[1])
 
 
 def _enclose(bounds: Floats) -> None:

@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.text_rows import (
@@ -181,14 +182,11 @@ class Pivot:
 
 
 def rotations(quaternions: Floats) -> Floats:
-    """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x y z w."""
-    x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.moveaxis(np.array(rows), 2, 0)
+    """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x y z w; NaN where one is not finite."""
+    known = np.asarray(np.isfinite(quaternions).all(axis=1))  # scipy refuses NaN: a target not seen
+    matrices = Rotation.from_quat(np.where(known[:, None], quaternions, (0.0, 0.0, 0.0, 1.0))).as_matrix()
+    matrices[~known] = np.nan
+    return np.asarray(matrices)
 
 
 def find_pivot(turns_a: Floats, places_a: Floats, turns_b: Floats, places_b: Floats) -> Pivot | None:

@@ -89,10 +89,26 @@ def draw_all(
     """
     folder.mkdir(parents=True, exist_ok=True)
     t0_ns = start_ns(run)
-    motion, state = run.motion, run.state
+    makers = _of_robot(run, metrics, t0_ns, near_m, stationary_m_per_s, robot)
+    makers |= _of_human(run, metrics, t0_ns, gap_s, volumes)
+    for name, make in makers.items():
+        with drawing.style():
+            drawing.save(make(), folder, name)
+    return tuple(makers)
+
+
+def _of_robot(
+    run: Run,
+    metrics: Mapping[str, Metric],
+    t0_ns: int,
+    near_m: float,
+    stationary_m_per_s: float,
+    robot: LinkPose | None,
+) -> dict[str, Callable[[], Figure]]:
+    """The figures of the plan and of the robot by their names; the arguments are those of ``draw_all``."""
     makers: dict[str, Callable[[], Figure]] = {}
-    if motion is not None and len(motion) > 1:
-        plan = motion
+    if run.motion is not None and len(run.motion) > 1:
+        plan = run.motion
         if metrics["plan_deviation_max_m"]["value"] is not None:
             makers["fig13_path"] = lambda: figures_robot.path(plan, run.occupancy, t0_ns, run.T_world_base)
         makers["fig14_speed"] = lambda: figures_robot.speed(plan, t0_ns, near_m)
@@ -108,6 +124,15 @@ def draw_all(
     if robot is not None and run.T_world_base is not None:
         pose, base = robot, run.T_world_base
         makers["robot_links"] = lambda: figures_robot.links(pose, t0_ns, base)
+    return makers
+
+
+def _of_human(
+    run: Run, metrics: Mapping[str, Metric], t0_ns: int, gap_s: float, volumes: Sequence[Instant]
+) -> dict[str, Callable[[], Figure]]:
+    """The figures of the person by their names; the arguments are those of ``draw_all``."""
+    makers: dict[str, Callable[[], Figure]] = {}
+    state = run.state
     if state is not None and volumes:
         fused = state
         makers["fig17_volumes"] = lambda: figures_human.volumes(volumes, fused, t0_ns)
@@ -118,7 +143,4 @@ def draw_all(
         makers["joint_angles"] = lambda: figures_human.joint_angles(run, t0_ns, gap_s)
     if metrics["fusion_angle_rmse"]["value"] is not None:
         makers["fusion_error"] = lambda: figures_human.fusion_error(metrics, cameras(run))
-    for name, make in makers.items():
-        with drawing.style():
-            drawing.save(make(), folder, name)
-    return tuple(makers)
+    return makers

@@ -6,6 +6,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path, PurePath
 from typing import Any
@@ -110,36 +111,11 @@ def _subtitle(run: Run, metrics: Mapping[str, Metric]) -> str:
 def _parts(
     run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: Sequence[PageTable]
 ) -> tuple[PageSection, ...]:
-    def figures(*names: str) -> tuple[PageFigure, ...]:
-        found = [name for name in names if (figures_dir / f"{name}.svg").is_file()]
-        return tuple(PageFigure(name, CAPTIONS[name], inline_svg(figures_dir / f"{name}.svg", name)) for name in found)
-
-    plans = {"this plan": "plan", **{name: f"baseline_{name}" for name in sorted(run.baselines)}}
-    planned = run.motion is not None
-    no_plan = "" if planned else "Not in this run: it moved no robot. Run plan or report on the same log."
+    figures = partial(_figures, figures_dir)
     seen = cameras(run)
     with_truth = metrics["fusion_angle_rmse"]["value"] is not None
     return (
-        PageSection(
-            "safety",
-            "Safety",
-            "How fast the robot moved, how near to what the person could reach, and what held it.",
-            figures("fig14_speed", "status"),
-            (compare("Safety, per method on the same volumes", metrics, plans, PLAN_SAFETY), *_reasons(metrics, plans))
-            if planned
-            else (),
-            no_plan,
-        ),
-        PageSection(
-            "cost",
-            "Cost to the task",
-            "How often it stood, how far it left its path, and how much time that took.",
-            figures("stationary_share", "fig13_path"),
-            (compare("Cost, per method on the same volumes", metrics, plans, PLAN_COST, _papers(metrics)),)
-            if planned
-            else (),
-            no_plan,
-        ),
+        *_plan(run, metrics, figures_dir),
         *_robot(run, figures("robot_links")),
         PageSection(
             "prediction",
@@ -169,6 +145,41 @@ def _parts(
                 *_limbs(metrics),
                 *_counters(run),
             ),
+        ),
+    )
+
+
+def _figures(folder: Path, *names: str) -> tuple[PageFigure, ...]:
+    """Those of the figures that were drawn."""
+    found = [name for name in names if (folder / f"{name}.svg").is_file()]
+    return tuple(PageFigure(name, CAPTIONS[name], inline_svg(folder / f"{name}.svg", name)) for name in found)
+
+
+def _plan(run: Run, metrics: Mapping[str, Metric], figures_dir: Path) -> tuple[PageSection, ...]:
+    """The sections of what the plan and its baselines did: safety, and cost to the task."""
+    plans = {"this plan": "plan", **{name: f"baseline_{name}" for name in sorted(run.baselines)}}
+    planned = run.motion is not None
+    no_plan = "" if planned else "Not in this run: it moved no robot. Run plan or report on the same log."
+    return (
+        PageSection(
+            "safety",
+            "Safety",
+            "How fast the robot moved, how near to what the person could reach, and what held it.",
+            _figures(figures_dir, "fig14_speed", "status"),
+            (compare("Safety, per method on the same volumes", metrics, plans, PLAN_SAFETY), *_reasons(metrics, plans))
+            if planned
+            else (),
+            no_plan,
+        ),
+        PageSection(
+            "cost",
+            "Cost to the task",
+            "How often it stood, how far it left its path, and how much time that took.",
+            _figures(figures_dir, "stationary_share", "fig13_path"),
+            (compare("Cost, per method on the same volumes", metrics, plans, PLAN_COST, _papers(metrics)),)
+            if planned
+            else (),
+            no_plan,
         ),
     )
 

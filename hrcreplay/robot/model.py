@@ -1,11 +1,13 @@
 """The robot's kinematics in the world frame. The only module that imports pinocchio.
 
 It opens no file itself, but pinocchio does where a URDF has meshes: its geometry model takes their paths, not their
-bytes. That happens once, when a robot is made.
+bytes. That happens once, when a robot is made. Shapes, their places and the joints that are held are pinocchio's; what
+it does not tell of a URDF is read in ``robot.urdf``.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,8 +20,8 @@ from numba import njit
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Bools, Floats
 from hrcreplay.robot import irb140 as irb140_data
-from hrcreplay.robot.link_capsules import Segment, Vector, capsules, distance_m
-from hrcreplay.robot.urdf import Description, describe, with_meshes
+from hrcreplay.robot.link_capsules import Extent, Segment, Shape, Vector, capsules, distance_m
+from hrcreplay.robot.urdf import Description, describe, no_size, unreadable, with_shapes
 
 __all__ = ["RobotModel", "RobotPose", "Segment", "from_urdf", "irb140"]
 
@@ -187,16 +189,9 @@ def from_urdf(
         SettingsError: The URDF, a mesh, a segment's body or the number of accelerations cannot be used.
     """
     robot = describe(xml, tcp_frame, base_frame)
-    ddq_max = np.array(acceleration, dtype=float) if len(acceleration) else robot.dq_max / stop_s
-    if ddq_max.shape != robot.dq_max.shape:
-        raise SettingsError(
-            f"robot.acceleration: found {len(acceleration)} values; {robot.name} has {len(robot.joints)} axes"
-        )
-    try:
-        whole = pin.buildModelFromXML(robot.text)
-    except ValueError as error:
-        raise SettingsError(f"robot: the URDF of {robot.name} cannot be read ({error}); check its numbers") from error
-    segments = tuple(segments) or capsules(robot.shapes, _vertices(whole, robot, meshes or {}))
+    ddq_max = _accelerations(robot, acceleration, stop_s)
+    whole = _whole(robot)
+    segments = tuple(segments) or capsules(robot.shapes, _extents(whole, robot, meshes or {}))
     model = _chain(whole, robot.joints)
     _place_base(model, robot.base, pin.SE3(T_world_base))
     offset = pin.SE3(np.eye(3), np.array([0.0, 0.0, tool_m])) * pin.SE3(np.eye(4) if T_tool_tcp is None else T_tool_tcp)
@@ -216,10 +211,7 @@ def from_urdf(
         segments=segments,
         T_world_base=np.array(T_world_base, dtype=float),
         shoulder_m=np.array(model.jointPlacements[1].translation),
-        reach_m=sum(
-            float(np.linalg.norm(link.translation))
-            for link in (*model.jointPlacements[2:], model.frames[tcp].placement)
-        ),
+        reach_m=_reach_m(model, tcp),
         base_frame=robot.base,
         tcp_frame=robot.tcp,
         locked=robot.locked,
@@ -228,25 +220,55 @@ def from_urdf(
     )
 
 
-def _vertices(whole: Any, robot: Description, meshes: Mapping[str, str]) -> dict[str, Floats]:
-    """The vertices of each collision mesh, scaled, in its link's frame, by the name of the shape: each (n, 3) [m]."""
-    text, names = with_meshes(robot, meshes)
+def _accelerations(robot: Description, given: Sequence[float], stop_s: float) -> Floats:
+    """(nv,) limits, which a URDF does not have [rad/s^2]."""
+    ddq_max = np.array(given, dtype=float) if len(given) else robot.dq_max / stop_s
+    if ddq_max.shape != robot.dq_max.shape:
+        raise SettingsError(f"robot.acceleration: found {len(given)} values; {robot.name} has {len(robot.joints)} axes")
+    return ddq_max
+
+
+def _whole(robot: Description) -> Any:
+    """Pinocchio's model of every joint, those off the chain too."""
+    try:
+        return pin.buildModelFromXML(robot.text)
+    except ValueError as error:
+        raise SettingsError(f"robot: the URDF of {robot.name} cannot be read ({error}); check its numbers") from error
+
+
+def _extents(whole: Any, robot: Description, meshes: Mapping[str, str]) -> dict[str, Extent]:
+    """What each collision shape takes up in its link's frame, by the shape's name."""
+    text, names = with_shapes(robot, meshes)
     if not names:
         return {}
     try:
         geometry = pin.buildGeomFromUrdfString(whole, text, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
         raise SettingsError(f"robot: a mesh of {robot.name} cannot be read ({error}); give robot.links") from error
-    found = {shape.name: shape for shape in geometry.geometryObjects}
-    vertices = {}
-    for name, called in names.items():
-        if called not in found:
-            raise SettingsError(f"robot: the mesh of {name} cannot be read; check the numbers of its <collision>")
-        shape = found[called]
-        T_link_shape = whole.frames[shape.parentFrame].placement.inverse() * shape.placement
-        points = np.asarray(shape.geometry.vertices())
-        vertices[name] = points @ T_link_shape.rotation.T + T_link_shape.translation
-    return vertices
+    found = {one.name: one for one in geometry.geometryObjects}
+    extents = {}
+    for shape in robot.shapes:
+        if names[shape.name] not in found:  # pinocchio leaves out what it cannot read, and raises nothing
+            raise unreadable(shape)
+        one = found[names[shape.name]]
+        T_link_shape = whole.frames[one.parentFrame].placement.inverse() * one.placement
+        points_m, radius_m = _own_extent(shape, one.geometry)
+        extents[shape.name] = Extent(points_m @ T_link_shape.rotation.T + T_link_shape.translation, radius_m)
+    return extents
+
+
+def _own_extent(shape: Shape, geometry: Any) -> tuple[Floats, float]:
+    """The points and the radius of an Extent in the shape's own frame."""
+    if shape.kind == "mesh":
+        return np.asarray(geometry.vertices()), 0.0
+    if shape.kind == "box":
+        if not (geometry.halfSide > 0).all():
+            raise no_size(shape)
+        return np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * geometry.halfSide, 0.0
+    half_m = 0.0 if shape.kind == "sphere" else float(geometry.halfLength)
+    if not (geometry.radius > 0 and half_m >= 0):
+        raise no_size(shape)
+    return np.array([[0.0, 0.0, -half_m], [0.0, 0.0, half_m]]), float(geometry.radius)
 
 
 def _chain(whole: Any, joints: Sequence[str]) -> Any:
@@ -285,6 +307,12 @@ def _body(model: Any, body: str, where: str) -> Any:
     if body not in known:
         raise SettingsError(f"{where}: the robot has no link {body!r}; it has {', '.join(sorted(known))}")
     return model.frames[known[body]]
+
+
+def _reach_m(model: Any, tcp: int) -> float:
+    """The arm stretched: the offsets from the second joint to the TCP one after another [m]."""
+    links = (*model.jointPlacements[2:], model.frames[tcp].placement)
+    return sum(float(np.linalg.norm(link.translation)) for link in links)
 
 
 def _shift(offset_m: Vector) -> Any:

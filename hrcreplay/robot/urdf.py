@@ -1,4 +1,9 @@
-"""What hrcreplay needs from a URDF: the chain of axes between base and tool, its limits, the links that it moves."""
+"""What hrcreplay needs from a URDF before pinocchio reads it: the chain from base to tool, its limits, its meshes.
+
+pinocchio's parser has one sentence for every wrong file, refuses a limit without an effort, forgets which joint mimics
+another, sorts the joints by name, and must have the paths of the meshes. So the tree and the limits are read here, and
+pinocchio gets a text that it can read: without shapes, or with those whose capsules are wanted.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,7 @@ import numpy as np
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
-from hrcreplay.robot.link_capsules import Shape, shapes
+from hrcreplay.robot.link_capsules import KINDS, Shape, shapes
 
 _TURNING = ("revolute", "continuous")
 
@@ -77,36 +82,62 @@ def describe(xml: str, tcp_frame: str | None = None, base_frame: str | None = No
     )
 
 
-def with_meshes(robot: Description, paths: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """The URDF with the meshes among its shapes and no other shape.
+def with_shapes(robot: Description, paths: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """The URDF with its collision shapes in the words of pinocchio's parser.
+
+    It finds no package:// and knows no <capsule>, but a cylinder has the same measures.
 
     Args:
         robot: As described.
         paths: File that a mesh names -> its path.
 
     Returns:
-        URDF text, and the name of each mesh's shape -> what pinocchio's geometry model calls it.
+        URDF text, and the name of each shape -> what pinocchio's geometry model calls it.
 
     Raises:
-        SettingsError: The path of a mesh is not known.
+        SettingsError: A shape of a kind that URDF does not have, or a mesh whose path is not known.
     """
     root = ET.fromstring(robot.text)  # noqa: S314  our own text
     links = {str(link.get("name")): link for link in root.findall("link")}
     names = {}
     for shape in robot.shapes:
-        if shape.mesh is None:
-            continue
-        if shape.mesh not in paths:
-            raise SettingsError(
-                f"robot: the collision shape of link {shape.link!r} is the mesh {shape.mesh!r}, whose file is not "
-                "known; name the directory of its package in robot.packages, or give robot.links"
-            )
+        _check(shape, paths)
         collision = copy.deepcopy(shape.collision)
-        for mesh in collision.iter("mesh"):
-            mesh.set("filename", paths[shape.mesh])
+        for geometry in list(collision.iter(shape.kind)):
+            if shape.mesh is not None:
+                geometry.set("filename", paths[shape.mesh])
+            elif shape.kind == "capsule":
+                geometry.tag = "cylinder"
         names[shape.name] = f"{shape.link}_{len(links[shape.link].findall('collision'))}"
         links[shape.link].append(collision)
     return ET.tostring(root, encoding="unicode"), names
+
+
+def unreadable(shape: Shape) -> SettingsError:
+    """What is wrong with a shape that pinocchio's parser left out."""
+    if shape.mesh is None and shape.collision.find("origin") is None:
+        return no_size(shape)
+    return SettingsError(
+        f"robot: the {shape.kind} of {shape.name} cannot be read; check the numbers of its <collision>"
+    )
+
+
+def no_size(shape: Shape) -> SettingsError:
+    """A shape whose measures are missing or not positive."""
+    return SettingsError(f"robot: the {shape.kind} of link {shape.link!r} has no size; give its measures in metres")
+
+
+def _check(shape: Shape, paths: Mapping[str, str]) -> None:
+    if shape.kind not in KINDS:
+        raise SettingsError(
+            f"robot: the collision shape of link {shape.link!r} is {shape.kind}; capsules are derived from "
+            f"{', '.join(KINDS)}, so give robot.links"
+        )
+    if shape.mesh is not None and shape.mesh not in paths:
+        raise SettingsError(
+            f"robot: the collision shape of link {shape.link!r} is the mesh {shape.mesh!r}, whose file is not "
+            "known; name the directory of its package in robot.packages, or give robot.links"
+        )
 
 
 class _Tree:

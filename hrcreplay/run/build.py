@@ -10,10 +10,10 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.geometry.vectors import from_rpy
 from hrcreplay.logs.tracks import Header, JointTrack
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.control_step import PlanSettings
@@ -91,7 +91,7 @@ def robot(job: Job, T_world_base: Floats) -> RobotModel:
     """
     settings, stop_s, files = job.settings.robot, job.settings.occupancy.stop_s, read_urdf(job.settings.robot)
     T_tool_tcp = np.eye(4)
-    T_tool_tcp[:3, :3] = from_rpy(np.radians(settings.tcp_offset.rpy_deg))
+    T_tool_tcp[:3, :3] = Rotation.from_euler("xyz", settings.tcp_offset.rpy_deg, degrees=True).as_matrix()
     T_tool_tcp[:3, 3] = settings.tcp_offset.position_m
     if files is None:
         other = [key for key in ("links", "tcp_frame", "base_frame", "packages") if getattr(settings, key)]

@@ -85,12 +85,7 @@ def run(
             found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth)
         base = build.known_robot_base(job, log)
         writer.close_tables()
-        notes = [*found["notes"], *_unmeasured(writer.partial, known, found["notes"])]
-        if "plan" in job.stages:
-            robot = build.robot(job, build.robot_base(job, log))
-            notes += tables.remarks(robot)
-            found["robot"] = tables.summary(robot)
-        found["notes"] = list(dict.fromkeys(notes))
+        found |= _about_results(job, log, writer.partial, known, found["notes"])
         for line in defect_notes(found["counts"], found["notes"]):
             print_note(line)
         meta = {
@@ -144,6 +139,28 @@ def run_stages(
         for _ in flow:
             pass
     return _findings(job, log, sink, reused)
+
+
+def _about_results(job: Job, log: Log, folder: Path, meta: dict[str, Any], told: list[str]) -> dict[str, Any]:
+    """What run.json says beside what the stages found: more remarks, and the robot where there is a plan.
+
+    Args:
+        job: What was asked for.
+        log: Log of the job.
+        folder: Tables of the run.
+        meta: What is known of the run so far.
+        told: Remarks so far.
+
+    Returns:
+        ``notes``, those told before among them, and ``robot``.
+    """
+    notes = [*told, *_unmeasured(folder, meta, told)]
+    found: dict[str, Any] = {}
+    if "plan" in job.stages:
+        robot = build.robot(job, build.robot_base(job, log))
+        notes += tables.remarks(robot)
+        found["robot"] = tables.summary(robot)
+    return found | {"notes": list(dict.fromkeys(notes))}
 
 
 def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str]:

@@ -20,7 +20,7 @@ CELL = Cell(
     T_world_camera={"left": T, 'a "b".c': np.eye(4)},
     clock_offset_s={"left": 0.0, 'a "b".c': -0.0123},
     T_world_base=np.asarray(np.linalg.inv(T)),
-    residuals=(Residual("left", 'a "b".c', 0.02, 0.1, 1000, 0.05),),
+    residuals=(Residual(a="left", b='a "b".c', median_m=0.02, p95_m=0.1, points=1000, mirrored=0.05),),
     notes=("up is known to about 8 degrees only",),
 )
 
@@ -86,6 +86,10 @@ def test_refuses_to_overwrite(tmp_path: Path) -> None:
         ("T_world_base = { position_m = [1, 2, 3], yaw_deg = inf }", r"T_world_base\.yaw_deg: found inf"),
         ("[[residuals]]\na = 'x'", "residuals: found .* would be right: tables with a, b, median_m"),
         ("residuals = 5", "residuals: found 5"),
+        (
+            "[[residuals]]\na='x'\nb='y'\nmedian_m='far'\np95_m=0.1\npoints=9\nmirrored=0.0",
+            "residuals: found .*'far'.* would be right: tables with a, b, median_m",
+        ),
         ("notes = 'x'", "notes: found 'x'; would be right: a list of texts"),
     ],
 )

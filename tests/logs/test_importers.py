@@ -173,9 +173,12 @@ def test_no_pivot_without_a_swing() -> None:
     assert find_pivot(turns[:5], places[:5], turns[:5], places[:5]) is None
 
 
-def test_rotations_are_those_of_scipy() -> None:
+def test_a_target_that_was_not_seen_has_no_rotation() -> None:
     quaternions = np.random.default_rng(4).normal(size=(20, 4))
-    np.testing.assert_allclose(rotations(quaternions), Rotation.from_quat(quaternions).as_matrix(), atol=1e-12)
+    expected = Rotation.from_quat(quaternions).as_matrix()
+    quaternions[3], quaternions[7, 2] = np.nan, np.inf
+    expected[[3, 7]] = np.nan
+    np.testing.assert_array_equal(rotations(quaternions), expected)
 
 
 def _azure(path: Path, out: Path) -> None:

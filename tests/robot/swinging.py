@@ -8,8 +8,8 @@ from typing import NamedTuple
 import daqp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hrcreplay.geometry.vectors import from_vector
 from hrcreplay.records import Floats, SweptVolumes
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, observe
 from hrcreplay.robot.control.qp_controller import Problem, problem, step
@@ -108,7 +108,7 @@ def random_tick(robot: RobotModel, rng: np.random.Generator) -> Asked:
     pose = robot.pose(q, state.dq)
     T = pose.T_world_tcp.copy()
     T[:3, 3] += rng.normal(size=3) * 0.02
-    T[:3, :3] = from_vector(rng.normal(size=3) * 0.05) @ T[:3, :3]
+    T[:3, :3] = Rotation.from_rotvec(rng.normal(size=3) * 0.05).as_matrix() @ T[:3, :3]
     centre = pose.T_world_tcp[:3, 3] + rng.normal(size=3) * 0.6
     limbs = [cloud(rng, 40, rng.uniform(0.02, 0.3, 3)) + centre + rng.normal(size=3) * 0.25 for _ in range(6)]
     twist = pose.J_tcp @ (state.dq + rng.normal(size=6) * 0.1)

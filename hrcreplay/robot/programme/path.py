@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, Trajectory
 from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.geometry.vectors import from_quaternion, from_rpy, from_vector, to_vector
+from hrcreplay.geometry.vectors import to_vector
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.inverse_kinematics import Missed, descend, solve
@@ -99,7 +100,7 @@ def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pac
         T = np.eye(4)
         for i, s in enumerate(s_m):
             T[:3, 3] = T_start[:3, 3] + s / length * way_m
-            T[:3, :3] = from_vector(s / length * turn_rad) @ T_start[:3, :3]
+            T[:3, :3] = Rotation.from_rotvec(s / length * turn_rad).as_matrix() @ T_start[:3, :3]
             now, error = descend(model, T, now)
             if np.abs(error).max() > 1e-6:
                 raise SettingsError(
@@ -346,9 +347,10 @@ def _target(model: RobotModel, waypoint: Waypoint, at: str) -> Floats:
     T_base_tcp = np.eye(4)
     T_base_tcp[:3, 3] = waypoint.position_m
     if waypoint.rpy_deg is not None:
-        T_base_tcp[:3, :3] = from_rpy(np.radians(waypoint.rpy_deg))
+        turn = Rotation.from_euler("xyz", waypoint.rpy_deg, degrees=True)
     else:
-        T_base_tcp[:3, :3] = from_quaternion(np.array(waypoint.quaternion_wxyz, dtype=float))
+        turn = Rotation.from_quat(waypoint.quaternion_wxyz, scalar_first=True)
+    T_base_tcp[:3, :3] = turn.as_matrix()
     T_world_tcp = model.T_world_base @ T_base_tcp
     distance_m = float(np.linalg.norm(T_world_tcp[:3, 3] - model.shoulder_m))
     if distance_m > model.reach_m:

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hrcreplay.geometry.vectors import from_vector
 from hrcreplay.robot.control.qp_controller import pose_error, tracking_cost
 from hrcreplay.robot.model import irb140
 from tests.geometry.quadratic import minimiser
@@ -37,6 +37,8 @@ def test_the_error_in_pose_is_what_leads_back() -> None:
     for _ in range(20):
         way, turn = rng.uniform(-1.7, 1.7, (2, 3))  # a turn of less than pi has one rotation vector
         T_ref, T = np.eye(4), np.eye(4)
-        T_ref[:3, :3], T_ref[:3, 3] = from_vector(rng.normal(size=3)), rng.normal(size=3)
-        T[:3, :3], T[:3, 3] = from_vector(turn) @ T_ref[:3, :3], T_ref[:3, 3] + way
+        T_ref[:3, :3] = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+        T_ref[:3, 3] = rng.normal(size=3)
+        T[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ T_ref[:3, :3]
+        T[:3, 3] = T_ref[:3, 3] + way
         np.testing.assert_allclose(pose_error(T, T_ref), [*way, *turn], atol=1e-12)
