@@ -212,7 +212,10 @@ class Motion(Table):
     limb: Ints  #: (n,) index into ``limbs`` of the nearest pair; -1 without one
     link: Ints  #: (n,) index into ``links`` of the nearest pair; -1 without one
     status: Ints  #: (n,) index into STATUSES
-    reason: Ints  #: (n,) index into ``reasons``: why it braked, 0 where it did not
+    reason: Ints  #: (n,) index into ``reasons``: why it braked or stood, 0 where it did neither
+    horizon_s: Floats  #: (n,) until when the volumes hold that the tick was decided with, from the tick on [s]
+    tau_s: Floats  #: (n,) how long the stop from the tick's velocity takes [s]
+    certified: Bools  #: (n,) whether this tick's step, or the stop it continues, has a certificate that holds
     limbs: tuple[str, ...]
     links: tuple[str, ...]
     reasons: tuple[str, ...]

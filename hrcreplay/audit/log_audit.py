@@ -225,7 +225,7 @@ def volumes(prediction_stage: PredictionStage, window: RecordedFuture, method: s
             hand_m=prediction_stage.occupancy.hand_m,
             method=method,
         )
-    return prediction_stage.volumes(window.states, method)
+    return prediction_stage.volumes(window.states, method=method)
 
 
 def scale_rates(limits: LimitSet, factor: float) -> LimitSet:

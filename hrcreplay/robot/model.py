@@ -58,6 +58,7 @@ class RobotModel:
     tcp_frame: str  #: link that carries the tool
     locked: tuple[str, ...]  #: joints off the chain, held at zero or the end of their range next to it
     tcp_outside_m: float  #: how far the TCP is from the capsules of the last link; 0 inside one, NaN without one [m]
+    axis_reach_m: Floats  #: (nv, s) no point of a segment's axis is ever further than this from an axis of rotation [m]
     _kinematics: _Kinematics = field(repr=False, compare=False)
 
     @property
@@ -75,6 +76,10 @@ class RobotModel:
             dq: (nv,) [rad/s].
         """
         return self._kinematics.pose(q, dq)
+
+    def ends_m(self, q: Floats) -> Floats:
+        """(s, 2, 3) ends of the segments in the world [m], for joint positions (nv,) [rad]."""
+        return self._kinematics.ends_m(q)
 
 
 class _Kinematics:
@@ -97,6 +102,10 @@ class _Kinematics:
         J_tcp, dJdq, J_points = _jacobians(self._J, self._dJ, dq, T[:3, 3].copy(), points, self._moves)
         shape = (len(points) // 2, 2, 3)
         return RobotPose(T, J_tcp, dJdq, points.reshape(shape), J_points.reshape((*shape, self._model.nv)))
+
+    def ends_m(self, q: Floats) -> Floats:
+        pin.framesForwardKinematics(self._model, self._data, q)
+        return np.array(self._points).reshape(-1, 2, 3)
 
 
 @njit(cache=True)
@@ -216,6 +225,7 @@ def from_urdf(
         tcp_frame=robot.tcp,
         locked=robot.locked,
         tcp_outside_m=_outside(model, segments, points, tcp),
+        axis_reach_m=_axis_reach_m(model, points),
         _kinematics=_Kinematics(model, points, tcp),
     )
 
@@ -313,6 +323,26 @@ def _reach_m(model: Any, tcp: int) -> float:
     """The arm stretched: the offsets from the second joint to the TCP one after another [m]."""
     links = (*model.jointPlacements[2:], model.frames[tcp].placement)
     return sum(float(np.linalg.norm(link.translation)) for link in links)
+
+
+def _axis_reach_m(model: Any, points: Sequence[int]) -> Floats:
+    """(nv, s) largest distance of each segment from each axis, however the axes between them stand [m].
+
+    The offset next to an axis turns about it, so only its part across the axis counts; those further out may point
+    anywhere. The distance from a line is convex, so it is largest at an end of the segment.
+    """
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    reach = np.zeros((model.nv, len(points)))
+    for i, point in enumerate(points):
+        frame = model.frames[point]
+        joint, far, offset = frame.parentJoint, 0.0, frame.placement.translation
+        while joint > 0:
+            axis = data.oMi[joint].actInv(pin.Motion(data.J[:, joint - 1])).angular
+            reach[joint - 1, i] = far + np.linalg.norm(offset - axis * (axis @ offset))
+            far, offset = far + float(np.linalg.norm(offset)), model.jointPlacements[joint].translation
+            joint = model.parents[joint]
+    return reach.reshape(model.nv, -1, 2).max(axis=2)
 
 
 def _shift(offset_m: Vector) -> Any:

@@ -21,7 +21,7 @@ from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.programme.path import programmed, recorded
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.robot.programme.task import parse_task
-from hrcreplay.run.followers import Planner, QpFollower, ScalingFollower
+from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
 from hrcreplay.run.stages import FusionStage, PredictionStage
 
@@ -153,11 +153,11 @@ def planners(job: Job, log: LogLike, start_ns: int) -> dict[str, Planner]:
     """Stage 3: the chosen method and its baselines, each with a robot of its own."""
     plan, model = job.settings.plan, robot(job, robot_base(job, log))
     path, begin_ns = reference(job, log, model)
-    settings = plan_settings(job, 1.0 / job.settings.fusion.rate_hz)
+    dt_s = 1.0 / job.settings.fusion.rate_hz
     s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
 
     def planner(name: str) -> Planner:
-        follower = make_follower(name, model, path, settings, s_s)
+        follower = make_follower(name, model, path, plan_settings(job, dt_s, name), s_s)
         return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
@@ -177,23 +177,27 @@ def robot_base(job: Job, log: LogLike) -> Floats:
     return T_world_base
 
 
-def plan_settings(job: Job, dt_s: float) -> PlanSettings:
-    """Section 5 for ticks of ``dt_s`` [s]."""
-    return PlanSettings(job.settings.plan, dt_s=dt_s, stop_s=job.settings.occupancy.stop_s)
+def plan_settings(job: Job, dt_s: float, method: str) -> PlanSettings:
+    """Section 5 for ticks of ``dt_s`` [s] by a method."""
+    plan, occupancy = job.settings.plan, prediction_stage(job).occupancy
+    return PlanSettings(
+        plan,
+        dt_s=dt_s,
+        stop_s=occupancy.stop_s,
+        latency_s=occupancy.latency_s,
+        spare_ticks=int(job.command == "live"),
+        certified=plan.certify and method != "none",
+    )
 
 
-def make_follower(
-    method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float
-) -> QpFollower | ScalingFollower:
+def make_follower(method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float) -> Follower:
     """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on.
 
     Args:
-        method: ``scaling`` for the baseline [24]; every other one is the trajectory generator.
+        method: One of ``plan.method``.
         model: Robot that follows.
         path: Programmed path.
         settings: Section 5 for the length of a tick.
         s_s: Programmed time at the start [s].
     """
-    if method == "scaling":
-        return ScalingFollower(model, path, settings, s_s)
-    return QpFollower(model, path, settings, s_s)
+    return FOLLOWERS[method](model, path, settings, s_s)

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.records import HumanStates, Motion, SweptVolumes
-from hrcreplay.robot.control import control_step, qp_controller, scaling_controller
-from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step
-from hrcreplay.robot.control.scaling_controller import PathState
+from hrcreplay.records import HumanStates, Motion
+from hrcreplay.robot.control import control_step, path_controller, qp_controller
+from hrcreplay.robot.control.certificate import NO_PLANES
+from hrcreplay.robot.control.control_step import (
+    NOT_FINITE,
+    TOO_NEAR,
+    PlanSettings,
+    Proposal,
+    RobotState,
+    Sight,
+    Step,
+    observe,
+)
+from hrcreplay.robot.control.decision import decide, made, stands
 from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.stopping import Stop, at_rest
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.reference import Reference, ReferencePoint, advance
 
@@ -28,62 +41,134 @@ class FollowerTick(NamedTuple):
     step: Step
 
 
+#: The swept volumes of a tick that hold until so many seconds after it.
+Predict = Callable[[float], Obstacles]
+
+
 @dataclass
-class QpFollower:
+class Follower(ABC):
+    """A robot that follows a reference by a method: it takes a step that is certified, or its last stop goes on."""
+
+    robot: RobotModel
+    reference: Reference
+    settings: PlanSettings
+    s_s: float = 0.0  #: programmed time of the reference [s]
+
+    def __post_init__(self) -> None:
+        self.point = self.reference.sample(self.s_s)
+        self.take_over(at_rest(self.point.q, np.array([self.s_s, 0.0])))
+
+    @property
+    def state(self) -> RobotState:
+        """Where the robot is."""
+        return RobotState(self.stop.q[0], self.stop.dq[0])
+
+    def take_over(self, stop: Stop) -> None:
+        """Goes on from where another follower has brought the robot: with the stop that was certified."""
+        self.stop = stop
+        self.u = np.zeros(self.robot.nv)
+        self.planes = NO_PLANES
+
+    def step(self, predict: Predict) -> FollowerTick:
+        """One tick."""
+        settings, going = self.settings, self.stop
+        state, point, now_s = self.state, self.point, self.s_s
+        horizon_s = settings.horizon_s(going)
+        with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
+            around = predict(horizon_s)
+            pose = self.robot.pose(state.q, state.dq)
+            sight = observe(self.robot, state, around, settings.plan.clearance_m, pose)
+            wanted = self._propose(sight, around, horizon_s, predict)
+            taken, self.planes = decide(self.robot, going, wanted, around, horizon_s, self.planes, settings)
+        step = made(sight, going, taken, horizon_s, settings.dt_s)
+        self.stop, self.u = step.stop, step.u
+        self._move_on()
+        return FollowerTick(state, point, now_s, step)
+
+    @abstractmethod
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> Proposal | int:
+        """What the method would do, or the reason why it does nothing."""
+
+    @abstractmethod
+    def _move_on(self) -> None:
+        """Takes over the reference of the tick that follows."""
+
+
+class QpFollower(Follower):
     """The trajectory generator of Section 5 along a reference that waits for it or not."""
 
-    robot: RobotModel
-    reference: Reference
-    settings: PlanSettings
-    s_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.point = self.reference.sample(self.s_s)
-        self.state = RobotState(self.point.q, np.zeros(self.robot.nv))
-
-    def step(self, volumes: Obstacles) -> FollowerTick:
-        """One tick of the trajectory generator."""
-        state, point, now_s = self.state, self.point, self.s_s
-        pose = self.robot.pose(state.q, state.dq)
-        error_m = float(np.linalg.norm(pose.T_world_tcp[:3, 3] - point.T_world_tcp[:3, 3]))
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> Proposal | int:
+        error_m = float(np.linalg.norm(sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3]))
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
-        step = qp_controller.step(
-            self.robot, state, self.point.T_world_tcp, rate * self.point.twist, volumes, self.settings, pose
+        if reason := stands(sight, self.settings):
+            return reason
+        reference = self.point.T_world_tcp, rate * self.point.twist
+        return qp_controller.propose(self.robot, self.state, self.u, reference, sight, around, horizon_s, self.settings)
+
+    def _move_on(self) -> None:
+        """The reference has moved already: the program is solved for where it will be."""
+
+
+class PathFollower(Follower):
+    """A robot that stays on the programmed path: the baselines of ``path_controller``."""
+
+    #: Whether the method looks at people at all, and whether the rows of Eq. (66i) bound its rate.
+    careful, by_rows = True, False
+
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> Proposal | int:
+        reason = stands(sight, self.settings) if self.careful else 0
+        if reason or sight.reason == NOT_FINITE:
+            return reason or sight.reason
+        rows = around if self.by_rows else None
+        return path_controller.propose(self.robot, self.reference, self.stop, sight, rows, horizon_s, self.settings)
+
+    def _move_on(self) -> None:
+        self.s_s = float(self.stop.along[0, 0])
+        self.point = self.reference.sample(self.s_s)
+
+
+class ScalingFollower(PathFollower):
+    """The baseline [24]: the largest share of the programmed speed that meets the constraints."""
+
+    by_rows = True
+
+
+class BlindFollower(PathFollower):
+    """The programme, whoever is there."""
+
+    careful = False
+
+
+class SsmFollower(PathFollower):
+    """Speed and separation monitoring, ISO/TS 15066: goes while the protective separation distance is kept."""
+
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> Proposal | int:
+        wanted = super()._propose(sight, around, horizon_s, predict)
+        if isinstance(wanted, int):
+            return wanted
+        present = observe(self.robot, self.state, predict(0.0), self.settings.plan.clearance_m, sight.pose)
+        needed_m = path_controller.protective_distance_m(
+            sight.pose, wanted.stop, self.settings.plan.human_speed, self.settings.latency_s, self.settings.dt_s
         )
-        self.state = step.next
-        return FollowerTick(state, point, now_s, step)
+        return wanted if present.distance_m >= needed_m else TOO_NEAR
 
 
-@dataclass
-class ScalingFollower:
-    """The baseline [24]: the robot stays on the programmed path, and its speed along it is scaled."""
-
-    robot: RobotModel
-    reference: Reference
-    settings: PlanSettings
-    s_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.along = PathState(self.s_s, 0.0)
-        self.state = RobotState(self.reference.sample(self.s_s).q, np.zeros(self.robot.nv))
-
-    def step(self, volumes: Obstacles) -> FollowerTick:
-        """One tick of the baseline."""
-        state, now_s = self.state, self.along.s_s
-        point = self.reference.sample(now_s)
-        step, self.along = scaling_controller.step(
-            self.robot, self.reference, self.along, volumes, self.settings, point
-        )
-        self.state = step.next
-        return FollowerTick(state, point, now_s, step)
+#: Method -> how it follows.
+FOLLOWERS: dict[str, type[Follower]] = {
+    "qp": QpFollower,
+    "scaling": ScalingFollower,
+    "shield": PathFollower,
+    "ssm": SsmFollower,
+    "none": BlindFollower,
+}
 
 
 @dataclass
 class Planner:
     """One method beside the people of each tick; brakes when nobody has seen them for too long."""
 
-    follower: QpFollower | ScalingFollower
+    follower: Follower
     chosen: bool  #: the run's method, not a baseline
     memory_s: float  #: without a camera for longer than this the person counts as lost [s]
     seen_ns: int | None = None
@@ -93,15 +178,15 @@ class Planner:
         """The time between two ticks [s]."""
         return self.follower.settings.dt_s
 
-    def follow(self, states: HumanStates, volumes: SweptVolumes, around: Sequence[Obstacles]) -> Motion:
-        """The motion of a batch of ticks, beside the obstacles that the volumes of each are."""
+    def follow(self, states: HumanStates, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
+        """The motion of a batch of ticks, beside the volumes that are predicted for each."""
         robot = self.follower.robot
         seen = np.any(states.valid, axis=1)
-        rows = [self._tick(around[i], int(t), bool(seen[i])) for i, t in enumerate(volumes.t_ns)]
+        rows = [self._tick(around[i], int(t), bool(seen[i])) for i, t in enumerate(states.t_ns)]
         found, points, steps = ([getattr(row, name) for row in rows] for name in ("state", "point", "step"))
         poses = [step.pose for step in steps]
         return Motion(
-            t_ns=volumes.t_ns,
+            t_ns=states.t_ns,
             q=np.array([state.q for state in found]),
             dq=np.array([state.dq for state in found]),
             u=np.array([step.u for step in steps]),
@@ -117,17 +202,24 @@ class Planner:
             link=np.array([step.link for step in steps]),
             status=np.array([step.status for step in steps]),
             reason=np.array([step.reason for step in steps]),
-            limbs=volumes.limbs,
+            horizon_s=np.array([step.horizon_s for step in steps]),
+            tau_s=np.array([step.tau_s for step in steps]),
+            certified=np.array([step.certified for step in steps]),
+            limbs=limbs,
             links=tuple(segment.name for segment in robot.segments),
             reasons=control_step.REASONS,
         )
 
-    def _tick(self, around: Obstacles, t_ns: int, seen: bool) -> FollowerTick:
+    def _tick(self, around: Predict, t_ns: int, seen: bool) -> FollowerTick:
         if seen:
             self.seen_ns = t_ns
-        if self.seen_ns is None or t_ns - self.seen_ns > self.memory_s * 1e9:
-            around = replace(around, known=False)
-        return self.follower.step(around)
+        lost = self.seen_ns is None or t_ns - self.seen_ns > self.memory_s * 1e9
+        return self.follower.step(partial(_unknown, around) if lost else around)
+
+
+def _unknown(predict: Predict, horizon_s: float) -> Obstacles:
+    """Volumes that may not be relied on."""
+    return replace(predict(horizon_s), known=False)
 
 
 @dataclass

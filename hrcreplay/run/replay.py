@@ -120,11 +120,11 @@ def run_stages(
     else:
         states = read_states(sink.run.partial / "state.parquet", size)
     flow: Iterable[Any] = states
-    if "predict" in todo or "plan" in todo:
-        people = stages.predicted(states, build.prediction_stage(job), _store_every(job), sink, keep="predict" in todo)
-        flow = people
-        if "plan" in todo:
-            flow = stages.planned(people, build.planners(job, log, int(ticks_ns[0])), sink)
+    if "plan" in todo:
+        chosen = build.planners(job, log, int(ticks_ns[0]))
+        flow = stages.planned(states, build.prediction_stage(job), chosen, _store_every(job), sink)
+    elif "predict" in todo:
+        flow = stages.predicted(states, build.prediction_stage(job), _store_every(job), sink)
     if todo:
         for _ in flow:
             pass

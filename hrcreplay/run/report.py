@@ -70,7 +70,7 @@ def _instants(prediction_stage: PredictionStage, run: Run) -> list[Instant]:
         return []
     states = _states(run, wanted)
     methods = dict.fromkeys(("paper", "positions", prediction_stage.method))
-    by_method = {method: prediction_stage.volumes(states, method) for method in methods}
+    by_method = {method: prediction_stage.volumes(states, method=method) for method in methods}
 
     return [
         (int(t), {method: _hulls(volumes, row) for method, volumes in by_method.items()})

@@ -9,6 +9,7 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from types import TracebackType
 from typing import Self
 
@@ -26,7 +27,7 @@ from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
-from hrcreplay.robot.control.separation import obstacles
+from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.run.followers import InitialOverlap, Planner
 from hrcreplay.settings.sections import Fusion, Occupancy
 from hrcreplay.store.columns import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
@@ -89,6 +90,11 @@ class PredictionStage:
         """How the volumes are predicted."""
         return self.occupancy.method
 
+    @property
+    def limbs(self) -> tuple[str, ...]:
+        """Limbs that have volumes."""
+        return swept_volumes.limbs_of(self.occupancy)
+
     def by(self, method: str) -> PredictionStage:
         """The same by another method."""
         return replace(self, occupancy=self.occupancy.model_copy(update={"method": method}))
@@ -99,13 +105,39 @@ class PredictionStage:
             states, self.limits, self.occupancy, horizon_s=self.horizon_s, memory_s=self.memory_s
         )
 
-    def volumes(self, states: HumanStates, method: str | None = None) -> SweptVolumes:
-        """Swept volumes of every tick, by this or another method."""
+    def volumes(
+        self, states: HumanStates, horizon_s: float | None = None, *, method: str | None = None
+    ) -> SweptVolumes:
+        """Swept volumes of every tick: the one call by which replay, live and audit ask for them.
+
+        Args:
+            states: The fused person.
+            horizon_s: Until when after each tick they hold; None: the braking time T_s [s].
+            method: None: that of the settings.
+        """
         if method is not None:
-            return self.by(method).volumes(states)
-        return swept_volumes.predict(
-            states, self.limits, self.occupancy, horizon_s=self.horizon_s, memory_s=self.memory_s
-        )
+            return self.by(method).volumes(states, horizon_s)
+        horizon_s = self.horizon_s if horizon_s is None else horizon_s
+        return swept_volumes.predict(states, self.limits, self.occupancy, horizon_s=horizon_s, memory_s=self.memory_s)
+
+
+@dataclass
+class Forecast:
+    """The volumes of a batch of ticks at any horizon."""
+
+    stage: PredictionStage
+    states: HumanStates
+
+    @cached_property
+    def full(self) -> SweptVolumes:
+        """Those of all ticks that hold for the braking time T_s."""
+        return self.stage.volumes(self.states)
+
+    def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
+        """Those of one tick that hold for ``horizon_s`` [s]."""
+        if horizon_s == self.stage.horizon_s:
+            return obstacles(self.full, tick)
+        return obstacles(self.stage.volumes(self.states.rows(slice(tick, tick + 1)), horizon_s), 0)
 
 
 def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
@@ -251,38 +283,49 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
 
 
 def predicted(
-    states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink, *, keep: bool
-) -> Iterator[tuple[HumanStates, SweptVolumes]]:
-    """Stage 2: the swept volumes of every tick; where ``keep``, writes those of one tick in ``store_every``.
+    states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink
+) -> Iterator[HumanStates]:
+    """Stage 2 alone: writes the volumes that hold for the braking time T_s, of one tick in ``store_every``.
 
     Args:
         states: Batches of the fused person.
         prediction_stage: Settings of the stage.
         store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole.
         sink: Where rows and times go.
-        keep: Whether volumes are stored at all.
     """
     done = 0
     for batch in states:
+        stored = stored_ticks(done, len(batch), store_every)
         with sink.watch.stage("predict", len(batch)):
             volumes = prediction_stage.volumes(batch)
-        if keep:
-            number = np.arange(done, done + len(batch))
-            stored = np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
-            with sink.watch.stage("hulls", len(stored)):
-                store_volumes(volumes, stored, sink.run)
+        with sink.watch.stage("hulls", len(stored)):
+            store_volumes(volumes, stored, np.full(len(batch), prediction_stage.horizon_s), sink.run)
         done += len(batch)
         sink.progress("predict", len(batch))
-        yield batch, volumes
+        yield batch
 
 
-def store_volumes(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
-    """Writes hull vertices and size of some ticks' volumes; a tick without a person has none."""
+def stored_ticks(first: int, count: int, store_every: float) -> Ints:
+    """Which of ``count`` ticks from the ``first`` of a run on have their volumes stored: one in ``store_every``."""
+    number = np.arange(first, first + count)
+    return np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
+
+
+def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, run: RunWriter) -> None:
+    """Writes hull vertices and size of some ticks' volumes; a tick without a person has none.
+
+    Args:
+        volumes: Of any ticks.
+        ticks: Rows of ``volumes`` to write.
+        horizon_s: (n,) how long after its tick each row holds [s].
+        run: Where they go.
+    """
     t_ns: list[int] = []
     limbs: list[str] = []
     radii: list[float] = []
     sizes: list[float] = []
     hulls: list[Floats] = []
+    horizons: list[float] = []
     for tick in ticks.tolist():
         for i, limb in enumerate(volumes.limbs):
             vertices = volumes.vertices(tick, i)
@@ -295,24 +338,49 @@ def store_volumes(volumes: SweptVolumes, ticks: Ints, run: RunWriter) -> None:
             radii.append(radius)
             sizes.append(convex_hull.sphere_swept_volume_m3(corners, radius, faces))
             hulls.append(corners)
+            horizons.append(float(horizon_s[tick]))
     if t_ns:
-        run.table("occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls))
+        run.table("occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls, horizons))
 
 
 def planned(
-    people: Iterable[tuple[HumanStates, SweptVolumes]], planners: dict[str, Planner], sink: Sink
+    states: Iterable[HumanStates],
+    prediction_stage: PredictionStage,
+    planners: dict[str, Planner],
+    store_every: float,
+    sink: Sink,
 ) -> Iterator[None]:
-    """Stage 3: what the robot would have done by each method; writes a motion for each."""
-    beside = InitialOverlap(next(iter(planners.values())).dt_s)
-    for states, volumes in people:
-        around = [obstacles(volumes, tick) for tick in range(len(volumes))]
+    """Stages 2 and 3: what the robot would have done by each method; each asks for the volumes that it needs.
+
+    Writes a motion for each, and the volumes of the chosen method, of one tick in ``store_every``.
+
+    Args:
+        states: Batches of the fused person.
+        prediction_stage: Settings of stage 2.
+        planners: Method -> its robot; the chosen one is first.
+        store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole.
+        sink: Where rows and times go.
+    """
+    beside, done = InitialOverlap(next(iter(planners.values())).dt_s), 0
+    limbs = prediction_stage.limbs
+    for batch in states:
+        forecast = Forecast(prediction_stage, batch)
+        with sink.watch.stage("predict", len(batch)):
+            around = [partial(forecast.obstacles, tick) for tick in range(len(batch))]
         for name, planner in planners.items():
-            with sink.watch.stage(f"plan {name}", len(volumes)):
-                motion = planner.follow(states, volumes, around)
+            with sink.watch.stage(f"plan {name}", len(batch)):
+                motion = planner.follow(batch, around, limbs)
             sink.run.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
             if planner.chosen:
-                beside.add(states, motion)
-        sink.progress("plan", len(volumes))
+                beside.add(batch, motion)
+                stored = stored_ticks(done, len(batch), store_every)
+                with sink.watch.stage("hulls", len(stored)):
+                    for tick in stored.tolist():
+                        row = slice(tick, tick + 1)
+                        volumes = prediction_stage.volumes(batch.rows(row), float(motion.horizon_s[tick]))
+                        store_volumes(volumes, np.zeros(1, np.int64), motion.horizon_s[row], sink.run)
+        done += len(batch)
+        sink.progress("plan", len(batch))
         yield
     remark = beside.remark()
     if remark is not None:

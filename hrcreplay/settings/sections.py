@@ -211,10 +211,31 @@ class Robot(Section):
 class Plan(Section):
     """Section 5: the trajectory generator."""
 
-    method: Literal["qp", "scaling"] = "qp"
-    """qp: Eq. (66); scaling: the largest factor on the programmed speed that meets the same constraints [24]."""
-    baselines: tuple[Literal["qp", "scaling"], ...] = ("scaling",)
-    """Methods run beside it on the same volumes, for comparison."""
+    method: Literal["qp", "scaling", "shield", "ssm", "none"] = "qp"
+    """qp: Eq. (66); scaling: the largest factor on the programmed speed that meets the same constraints [24];
+    shield: the programmed speed while the next stop is certified; ssm: stop and go by the protective separation
+    distance of ISO/TS 15066; none: the programme, whoever is there."""
+    baselines: tuple[Literal["qp", "scaling", "shield", "ssm", "none"], ...] = ("scaling", "none")
+    """Methods run beside it, for comparison."""
+    horizon: Literal["adaptive", "fixed"] = "adaptive"
+    """adaptive: the volumes reach to the end of the stop that would follow; fixed: always to occupancy.stop_s."""
+    certify: bool = True
+    """Whether a step is taken only if it and the stop after it keep clear of every volume; else the stop that was found
+    clear before goes on. False: as printed, where Eq. (67) brakes when Eq. (66) has no solution."""
+    rows: Literal["soft", "hard"] = "soft"
+    """qp: whether Eq. (66i) may be broken at a cost, so that there is always a solution, or not."""
+    room: Literal["product", "square"] = "product"
+    """Right-hand side of Eq. (14): distance (distance - clearance), or (distance - clearance)^2 as printed."""
+    lead_s: NotNegative = 0.1
+    """The rows of Eq. (66i) look this much further ahead than the horizon, so that the robot slows down early [s]."""
+    give_way_m: NotNegative = 0.03
+    """qp: the robot moves away from a volume that is nearer than this [m]."""
+    jerk_s: NotNegative = 0.02
+    """qp: time from no acceleration to the largest; 0: any change within a tick [s]."""
+    smooth_s: NotNegative = 0.04
+    """qp: time constant with which the velocity approaches the best one; 0: as fast as the limits allow [s]."""
+    human_speed: Positive = 1.6
+    """ssm: speed at which a person may approach, ISO 13855 [m/s]."""
     task: Path | None = None
     """Task file (TOML); none: the one inside the log, else the joint track inside the log."""
     reference: Literal["time", "path"] = "path"

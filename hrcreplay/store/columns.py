@@ -92,7 +92,13 @@ def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
 
 
 def occupancy_columns(
-    t_ns: Ints, limbs: list[str], method: str, radius_m: list[float], volume_m3: list[float], hulls: list[Floats]
+    t_ns: Ints,
+    limbs: list[str],
+    method: str,
+    radius_m: list[float],
+    volume_m3: list[float],
+    hulls: list[Floats],
+    horizon_s: list[float],
 ) -> Columns:
     """A row per stored tick and limb; ``hulls`` are (m, 3) hull vertices in the world [m], before the radius.
 
@@ -103,6 +109,7 @@ def occupancy_columns(
         radius_m: Radius of the ball around each hull [m].
         volume_m3: Volume of each hull with its ball [m^3].
         hulls: (m, 3) hull vertices of each row, before the radius, world [m].
+        horizon_s: How long after the tick they hold, of each row [s].
     """
     return {
         "t_ns": t_ns,
@@ -110,6 +117,7 @@ def occupancy_columns(
         "method": _text([method] * len(limbs)),
         "radius_m": np.array(radius_m, dtype=float),
         "volume_m3": np.array(volume_m3, dtype=float),
+        "horizon_s": np.array(horizon_s, dtype=float),
         "vertices": pa.array([np.ascontiguousarray(hull).ravel() for hull in hulls], type=pa.list_(pa.float64())),
     }
 
@@ -132,6 +140,9 @@ def motion_columns(motion: Motion) -> Columns:
         "link": _names(motion.link, motion.links),
         "status": _names(motion.status, STATUSES),
         "reason": _names(motion.reason, motion.reasons),
+        "horizon_s": motion.horizon_s,
+        "tau_s": motion.tau_s,
+        "certified": motion.certified,
     }
 
 

@@ -60,6 +60,11 @@ def limb_radii(occupancy: Occupancy) -> Floats:
     return np.array([occupancy.radius_head_m, occupancy.radius_thorax_m, upper, lower, upper, lower])
 
 
+def limbs_of(occupancy: Occupancy) -> tuple[str, ...]:
+    """Limbs that have volumes under these settings."""
+    return BODY if code_of(occupancy.method) == SOUND and occupancy.legs else LIMBS
+
+
 def predict(
     states: HumanStates,
     limits: LimitSet,
@@ -88,9 +93,13 @@ def predict(
     code, radius = code_of(occupancy.method), limb_radii(occupancy)
     if code == SOUND:
         vertices, offsets = sweep_sound(states, limits, occupancy, horizon_s + occupancy.latency_s, memory_s)
-        limbs = BODY if occupancy.legs else LIMBS
         return SweptVolumes(
-            states.t_ns, offsets, vertices, sound_radii(states, radius, occupancy), limbs, occupancy.method
+            states.t_ns,
+            offsets,
+            vertices,
+            sound_radii(states, radius, occupancy),
+            limbs_of(occupancy),
+            occupancy.method,
         )
     vertices, offsets = _predict_rows(
         np.ascontiguousarray(states.p),

@@ -1,7 +1,6 @@
-"""Speed limits on the robot's links from the swept volumes, Eq. (12)-(16), and the minimiser of Eq. (66) under them.
+"""Speed limits on the robot's links from the swept volumes, Eq. (12)-(16).
 
-Corrections: docs/paper.md. The rows join in one at a time, where a candidate breaks them, because every vertex of every
-limb has rows and the minimiser lies on few of them.
+Corrections: docs/paper.md. Every vertex of every limb has rows; none is written down before a velocity breaks it.
 """
 
 from __future__ import annotations
@@ -11,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hrcreplay.geometry.dual_active_set_qp import Working, add, settle, solution, working
-from hrcreplay.geometry.vectors import dot3, norm_n
+from hrcreplay.geometry.vectors import dot3
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotPose
@@ -27,20 +25,27 @@ class Approach(NamedTuple):
     offsets: Ints  #: (l + 1,) where each limb's vertices begin
     boxes_m: Floats  #: (l, 2, 3) around each limb's vertices [m]
     room_m2: Floats  #: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2]
-    stop_s: float  #: T_s of Eq. (70) [s]
+    per_speed: Floats  #: (s, l) what a link approaching at 1 m/s adds to the left-hand side of Eq. (14) [m s]
+    stop_s: float  #: T_s of Eq. (70), or how far ahead the rows look [s]
 
 
-def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, stop_s: float) -> Approach:
+#: A link and a limb that are nearer count as this far apart where a speed is made of a row [m].
+LEAST_M = 1e-3
+
+
+def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, distance_m: Floats, stop_s: float) -> Approach:
     """The approach rows of a tick, none of them written down.
 
     Args:
         pose: The robot.
         obstacles: The swept volumes, all known.
         room_m2: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2].
-        stop_s: T_s of Eq. (70) [s].
+        distance_m: (s, l) between the link's axis and the limb's hull [m].
+        stop_s: T_s of Eq. (70), or how far ahead the rows look [s].
     """
-    hulls = obstacles
-    return Approach(pose.ends_m, pose.J_ends, hulls.vertices_m, hulls.offsets, hulls.boxes_m, room_m2, stop_s)
+    per_speed = stop_s * np.maximum(distance_m, LEAST_M)
+    around = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
+    return Approach(pose.ends_m, pose.J_ends, *around, room_m2, per_speed, stop_s)
 
 
 @njit(cache=True)
@@ -60,7 +65,7 @@ def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, 
         For the n broken ones: ``which`` (n, 4) link, limb, row of Eq. (12), row of ``vertices_m``; ``A`` (n, nv)
         [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2].
     """
-    ends, J_ends, vertices, offsets, boxes, room, stop_s = rows
+    ends, J_ends, vertices, offsets, boxes, room, _, stop_s = rows
     links, limbs = room.shape
     which = np.empty((2 * links * limbs, 4), dtype=np.int64)
     A, values = np.empty((len(which), len(dq_next))), np.empty(len(which))
@@ -117,119 +122,3 @@ def _times(J: Floats, dq: Floats) -> Floats:
         for j in range(len(dq)):
             v[i] += J[i, j] * dq[j]
     return v
-
-
-#: Approach rows that may join in before the problem counts as unsolved.
-MOST = 200
-#: What came of it; SOLVED must be the first.
-OUTCOMES = ("solved", "not finite", "infeasible", "residual", "too many rows")
-SOLVED, NOT_FINITE, INFEASIBLE, RESIDUAL, UNFINISHED = range(5)
-
-
-class Limits(NamedTuple):
-    """Bounds that do not depend on people."""
-
-    low: Floats  #: (nv,) Eq. (66d)-(66f) [rad/s]
-    high: Floats  #: (nv,) [rad/s]
-    J: Floats  #: (6, nv) of the TCP
-    J_low: Floats  #: (6,) Eq. (66g), (66h): bounds on ``J @ w`` [m/s, rad/s]
-    J_high: Floats  #: (6,) [m/s, rad/s]
-
-
-class Optimum(NamedTuple):
-    """A candidate, and the rows that it was found with."""
-
-    outcome: int  #: index into ``OUTCOMES``
-    w: Floats  #: (nv,) [rad/s]
-    A: Floats  #: (m, nv) ``A @ w <= high``
-    high: Floats  #: (m,)
-    z: Floats  #: (m,) multipliers
-    fixed: int  #: rows of ``Limits``, which come first
-
-
-@njit(cache=True)
-def optimum(H: Floats, g: Floats, limits: Limits, rows: Approach, above_m2: float) -> Optimum:
-    """Minimiser of ``w @ H @ w / 2 + g @ w`` within limits and clear of people.
-
-    Beginning with the minimiser without approach rows, the row that the candidate breaks most joins in and the search
-    goes on, until all rows of all links, limbs and vertices hold. A minimiser over some of the rows that breaks none of
-    the others is the minimiser over all of them.
-
-    Args:
-        H: (nv, nv) positive definite.
-        g: (nv,).
-        limits: Of axes and TCP.
-        rows: Of the people.
-        above_m2: Approach rows broken by no more than this hold [m^2].
-    """
-    n = len(g)
-    work = working(H, g, 2 * n + 12 + MOST)
-    which = np.empty((MOST, 4), dtype=np.int64)
-    fixed = m = _limit(work, limits)
-    count, outcome = settle(work, m, 0), UNFINISHED
-    for _ in range(MOST):
-        if count < 0:
-            outcome = INFEASIBLE
-            break
-        w, _ = _candidate(work, m, limits)
-        if not np.isfinite(w.sum()):
-            outcome = NOT_FINITE
-            break
-        before = m
-        m, clear = _join(work, which, fixed, m, rows, w, above_m2)
-        if m == before:
-            outcome = SOLVED if clear else RESIDUAL
-            break
-        count = settle(work, m, count)
-    w, z = _candidate(work, m, limits)
-    return Optimum(outcome, w, work.A[:m].copy(), work.high[:m].copy(), z, fixed)
-
-
-@njit(cache=True)
-def _candidate(work: Working, m: int, limits: Limits) -> tuple[Floats, Floats]:
-    """What it has settled on, rounded into the axes' bounds, and the multipliers."""
-    w, z = solution(work, m)
-    return np.minimum(np.maximum(w, limits.low), limits.high), z
-
-
-@njit(cache=True)
-def _limit(work: Working, limits: Limits) -> int:
-    """Adds the rows of axes and TCP; returns how many."""
-    n, m = len(limits.low), 0
-    axes = np.eye(n)
-    for i in range(n):
-        add(work, m, axes[i], 1.0, limits.high[i])
-        add(work, m + 1, axes[i], -1.0, -limits.low[i])
-        m += 2
-    for i in range(len(limits.J)):
-        add(work, m, limits.J[i], 1.0, limits.J_high[i])
-        add(work, m + 1, limits.J[i], -1.0, -limits.J_low[i])
-        m += 2
-    return m
-
-
-@njit(cache=True)
-def _join(work: Working, which: Ints, fixed: int, m: int, rows: Approach, w: Floats, above: float) -> tuple[int, bool]:
-    """Adds the approach row that a velocity breaks most of those not there yet; rows then, and whether all hold."""
-    keys, A, values = worst_rows(rows, w, above)
-    worst, most = -1, 0.0
-    for b in range(len(keys)):
-        broken = (values[b] - rows.room_m2[keys[b, 0], keys[b, 1]]) / norm_n(A[b])
-        if broken > most and not _among(which, m - fixed, keys[b]):
-            worst, most = b, broken
-    if worst >= 0:
-        which[m - fixed] = keys[worst]
-        add(work, m, A[worst], 1.0, rows.room_m2[keys[worst, 0], keys[worst, 1]])
-        m += 1
-    return m, len(keys) == 0
-
-
-@njit(cache=True)
-def _among(which: Ints, count: int, key: Ints) -> bool:
-    found = False
-    for i in range(count):
-        same = True
-        for k in range(len(key)):
-            same = same and which[i, k] == key[k]
-        found = found or same
-    return found

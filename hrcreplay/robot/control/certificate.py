@@ -10,7 +10,6 @@ with the distances of the rows of Eq. (66i), so that a fault in them is no fault
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import coal
 import numpy as np
@@ -36,91 +35,93 @@ _NO_FACE = coal.StdVec_Triangle()
 _NO_FACE.append(coal.Triangle(0, 0, 0))  # a polytope must have one; the search over points does not look at it
 
 
-@dataclass
-class Certifier:
-    """Certifies the motions of one robot; remembers the planes of the tick before, which seldom turn by much."""
+#: Planes between links and limbs before any was found.
+NO_PLANES: Floats = np.zeros((0, 0, 3))
 
-    robot: RobotModel
-    clearance_m: float  #: beyond limb radius + link radius [m]
-    dt_s: float  #: length of a tick [s]
-    measured: int = 0  #: distances that coal has measured so far
-    _normals: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)), repr=False)
 
-    def __post_init__(self) -> None:
-        self._radius_m = np.array([segment.radius_m for segment in self.robot.segments])
+def clear(
+    robot: RobotModel, going: Stop, stop: Stop, obstacles: Obstacles, clearance_m: float, dt_s: float, planes: Floats
+) -> tuple[bool, Floats]:
+    """Whether a step and the stop after it keep every link clear of every volume at all times.
 
-    def clear(self, state_q: Floats, state_dq: Floats, stop: Stop, obstacles: Obstacles) -> bool:
-        """Whether a step and the stop after it keep every link clear of every volume at all times.
+    Args:
+        robot: The manipulator.
+        going: Its row 0 is where the step begins.
+        stop: From the end of the step on.
+        obstacles: The swept volumes, valid until the stop has ended.
+        clearance_m: Beyond limb radius + link radius [m].
+        dt_s: Length of a tick [s].
+        planes: (s, l, 3) directions from link to limb of the tick before, which seldom turn by much; or NO_PLANES.
 
-        Args:
-            state_q: (nv,) where the step begins [rad].
-            state_dq: (nv,) velocity there [rad/s].
-            stop: From the end of the step on.
-            obstacles: The swept volumes, valid until the stop has ended.
-
-        Returns:
-            False as well where a number is not finite, a limit of an axis would be passed, or coal finds no distance.
-        """
-        if not obstacles.known:
-            return False
-        q, dq = np.vstack((state_q, stop.q)), np.vstack((state_dq, stop.dq))
-        last = stop.q[-1]
-        if not (np.isfinite(q.sum() + dq.sum()) and np.all((self.robot.q_min <= last) & (last <= self.robot.q_max))):
-            return False
-        travel = _travel(np.abs(dq), self.robot.axis_reach_m, self.dt_s)
-        ends = self.robot.ends_m(state_q)
-        shape = (len(self._radius_m), len(obstacles.radius_m))
-        if self._normals.shape[:2] != shape:
-            self._normals = np.zeros((*shape, 3))
-        keep_m = self._radius_m[:, None] + obstacles.radius_m + (self.clearance_m + MARGIN_M)
-        far = travel[-1][:, None] + keep_m
-        open_ = _undecided(ends, obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m, self._normals, far)
-        return all(
-            self._pair(int(link), int(limb), q, travel[:, link], keep_m[link, limb], obstacles) for link, limb in open_
-        )
-
-    def _pair(self, link: int, limb: int, q: Floats, travel: Floats, keep_m: float, obstacles: Obstacles) -> bool:
-        """Conservative advancement of one link towards one limb."""
+    Returns:
+        The verdict, False as well where a number is not finite, the stop would leave the range of an axis, or coal
+        finds no distance; and the planes for the next tick.
+    """
+    q, dq = np.vstack((going.q[:1], stop.q)), np.vstack((going.dq[:1], stop.dq))
+    last = stop.q[-1]
+    within = np.all((robot.q_min <= last) & (last <= robot.q_max))
+    if not (obstacles.known and within and math.isfinite(q.sum() + dq.sum())):
+        return False, planes
+    radius = np.array([segment.radius_m for segment in robot.segments])
+    keep_m = radius[:, None] + obstacles.radius_m + (clearance_m + MARGIN_M)
+    if planes.shape[:2] != keep_m.shape:
+        planes = np.zeros((*keep_m.shape, 3))
+    travel = _travel(q, dq, robot.axis_reach_m, dt_s)
+    far, hulls = travel[-1][:, None] + keep_m, (obstacles.vertices_m, obstacles.offsets)
+    undecided = _undecided(robot.ends_m(q[0]), *hulls, obstacles.boxes_m, planes, far)
+    if len(undecided):
+        planes = planes.copy()
+    for link, limb in undecided.tolist():
         vertices = obstacles.vertices_m[obstacles.offsets[limb] : obstacles.offsets[limb + 1]]
-        row, last = 0, len(q) - 1
-        while True:
-            a, b = self.robot.ends_m(q[row])[link]
-            gap = _gap(a, b, self._normals[link, limb], vertices) - keep_m
-            if gap <= travel[last] - travel[row]:  # the plane of before does not do
-                self.measured += 1
-                normal = separating_normal(a, b, vertices)
-                if normal is None:
-                    return False
-                self._normals[link, limb] = normal
-                gap = _gap(a, b, normal, vertices) - keep_m
-            if not gap > 0.0:
+        if not _keeps_off(robot, link, q, travel[:, link], vertices, keep_m[link, limb], planes[link, limb]):
+            return False, planes
+    return True, planes
+
+
+def _keeps_off(
+    robot: RobotModel, link: int, q: Floats, travel: Floats, vertices: Floats, keep_m: float, plane: Floats
+) -> bool:
+    """Conservative advancement of one link towards one limb; writes the last plane between them."""
+    row, last = 0, len(q) - 1
+    while True:
+        a, b = robot.ends_m(q[row])[link]
+        gap = _gap(a, b, plane, vertices) - keep_m
+        if not gap > travel[last] - travel[row]:  # the plane of before does not do
+            normal = separating_normal(a, b, vertices)
+            if normal is None:
                 return False
-            if row == last or gap > travel[last] - travel[row]:
-                return True
-            there = int(np.searchsorted(travel, travel[row] + gap, side="left")) - 1
-            if there <= row:
-                return False
-            row = there
+            plane[:] = normal
+            gap = _gap(a, b, plane, vertices) - keep_m
+        if not gap > 0.0:
+            return False
+        if row == last or gap > travel[last] - travel[row]:
+            return True
+        there = int(np.searchsorted(travel, travel[row] + gap, side="left")) - 1
+        if there <= row:
+            return False
+        row = there
 
 
 @njit(cache=True)
-def _travel(speed: Floats, reach: Floats, dt_s: float) -> Floats:
+def _travel(q: Floats, dq: Floats, reach: Floats, dt_s: float) -> Floats:
     """(n, s) how far a point of each link can have moved until each row of a motion [m].
 
     Within a tick an axis does not turn by more than the larger of the speeds at its ends allows.
 
     Args:
-        speed: (n, nv) of the axes [rad/s].
+        q: (n, nv) [rad].
+        dq: (n, nv) [rad/s].
         reach: (nv, s) largest distance of each link from each axis [m].
         dt_s: Length of a tick [s].
     """
-    travel = np.zeros((len(speed), reach.shape[1]))
-    for i in range(1, len(speed)):
+    travel = np.zeros((len(q), reach.shape[1]))
+    for i in range(1, len(q)):
+        for j in range(q.shape[1]):
+            turned = max(abs(q[i, j] - q[i - 1, j]), dt_s * max(abs(dq[i - 1, j]), abs(dq[i, j])))
+            for s in range(reach.shape[1]):
+                travel[i, s] += turned * reach[j, s]
         for s in range(reach.shape[1]):
-            way = 0.0
-            for j in range(speed.shape[1]):
-                way += max(speed[i - 1, j], speed[i, j]) * reach[j, s]
-            travel[i, s] = travel[i - 1, s] + dt_s * way
+            travel[i, s] += travel[i - 1, s]
     return travel
 
 

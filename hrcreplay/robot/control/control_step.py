@@ -6,18 +6,28 @@ Corrections to the paper: docs/paper.md.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.separation import Obstacles, Separation, separation
+from hrcreplay.robot.control.stopping import Stop
 from hrcreplay.robot.model import RobotModel, RobotPose
 from hrcreplay.settings.sections import Plan
 
-#: Why a robot braked. The first stands for ticks in which it did not.
-REASONS = ("", "no human state", "no solution", "separation failed", "not finite")
-NO_HUMAN, NO_SOLUTION, NO_DISTANCE, NOT_FINITE = 1, 2, 3, 4
+#: Why a robot braked, or stood where it was. The first is that of ticks in which it did neither.
+REASONS = (
+    "",
+    "no human state",
+    "no solution",
+    "separation failed",
+    "not finite",
+    "not certified",
+    "inside a volume",
+    "too near",
+)
+NO_HUMAN, NO_SOLUTION, NO_DISTANCE, NOT_FINITE, NOT_CERTIFIED, INSIDE, TOO_NEAR = range(1, 8)
 
 #: Indices into ``records.STATUSES``.
 TRACKING, LIMITED, BRAKING = 0, 1, 2
@@ -38,6 +48,35 @@ class PlanSettings:
     plan: Plan
     dt_s: float  #: length of a tick [s]
     stop_s: float  #: T_s of Eq. (70) [s]
+    latency_s: float = 0.0  #: from the newest capture to the robot's reaction [s]
+    spare_ticks: int = 0  #: ticks for which the volumes of a tick must serve beyond their own
+    certified: bool = True  #: whether a step must be certified
+
+    def horizon_s(self, stop: Stop) -> float:
+        """Until when the volumes of a tick must hold: the end of the stop that would follow the step [s].
+
+        Beside the stop from the present velocity that is the step itself, and the tick more that a stop takes from
+        the velocity it may have gained.
+
+        Args:
+            stop: From the present velocity.
+        """
+        needed = (stop.ticks + 2 + self.spare_ticks) * self.dt_s
+        if self.plan.horizon == "adaptive":
+            return needed
+        return max(self.stop_s, needed) if self.certified else self.stop_s
+
+    def without_jerk(self) -> PlanSettings:
+        """The same where the acceleration may change by any amount in a tick."""
+        return replace(self, plan=self.plan.model_copy(update={"jerk_s": 0.0}))
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """A step that a method would like to take."""
+
+    stop: Stop  #: the stop after it; its row 0 is where the step leads
+    status: int  #: index into ``records.STATUSES``
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,39 +91,10 @@ class Step:
     link: int  #: of the nearest pair; -1 without one
     status: int  #: index into ``records.STATUSES``
     reason: int  #: index into ``REASONS``
-
-
-def integrate(state: RobotState, dq_next: Floats, dt_s: float) -> tuple[Floats, RobotState]:
-    """Acceleration that leads to a velocity within one tick, and the state it leads to, Eq. (68), (69).
-
-    Args:
-        state: Now.
-        dq_next: (nv,) one tick later [rad/s]. It is taken over as it is, so that a robot at rest is exactly at rest.
-        dt_s: Length of the tick [s].
-
-    Returns:
-        ``u`` (nv,) [rad/s^2] and the next state. An axis of unknown velocity counts as standing.
-    """
-    dq = np.where(np.isfinite(state.dq), state.dq, 0.0)
-    u = (dq_next - dq) / dt_s
-    q_next = state.q + dt_s * dq + 0.5 * dt_s**2 * u
-    return u, RobotState(q_next, dq_next)
-
-
-def braked(state: RobotState, ddq_max: Floats, dt_s: float) -> Floats:
-    """Next velocity of a robot that stops as fast as each axis can, Eq. (67).
-
-    Args:
-        state: Now.
-        ddq_max: (nv,) [rad/s^2].
-        dt_s: Length of the tick [s].
-
-    Returns:
-        (nv,) [rad/s]; exactly 0 for an axis that comes to rest within the tick, and for one of unknown velocity.
-    """
-    speed = np.abs(state.dq)
-    slower = np.sign(state.dq) * (speed - ddq_max * dt_s)
-    return np.where(np.isfinite(speed) & (speed > ddq_max * dt_s), slower, 0.0)
+    horizon_s: float  #: until when the volumes held that it was decided with [s]
+    tau_s: float  #: how long the stop from the velocity of the tick takes [s]
+    certified: bool  #: whether the step, or the stop that it continues, was found clear of volumes that still hold
+    stop: Stop  #: what goes on from the next tick where no better step is certified
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,19 +107,6 @@ class Sight:
     limb: int
     link: int
     reason: int  #: index into ``REASONS``; 0 where nothing is wrong
-
-    def step(self, state: RobotState, dq_next: Floats, dt_s: float, status: int, reason: int = 0) -> Step:
-        """What the controller decided.
-
-        Args:
-            state: At the tick.
-            dq_next: (nv,) one tick later [rad/s].
-            dt_s: Length of the tick [s].
-            status: Index into ``records.STATUSES``.
-            reason: Index into ``REASONS``.
-        """
-        u, after = integrate(state, dq_next, dt_s)
-        return Step(self.pose, u, after, self.distance_m, self.limb, self.link, status, reason)
 
 
 def observe(

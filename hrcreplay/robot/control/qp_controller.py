@@ -1,35 +1,30 @@
-"""The trajectory generator: the quadratic program of Eq. (66), or else the stop of Eq. (67).
+"""The trajectory generator: the quadratic program of Eq. (66).
 
 The variable is the joint velocity of the next tick: it has the cost of Eq. (66a)-(66c), the limits of the axes and of
-the TCP, Eq. (66d)-(66h), as bounds, and the approach rows of Eq. (66i). The only module that imports proxsuite. What is
-corrected in the printed equations, and why: docs/paper.md.
+the TCP, Eq. (66d)-(66h), as bounds, and the approach rows of Eq. (66i). What is corrected in the printed equations, and
+why: docs/paper.md.
+
+What is proposed here is not yet safe: (66i) bounds speeds at the present posture and says nothing of the stop. The
+certificate decides. So the rows may be soft, and look further ahead than the stop takes (``plan.lead_s``): a robot that
+brakes early seldom has to stop.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
-import proxsuite
 from numba import njit
 
 from hrcreplay.geometry.vectors import to_vector
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.approach_rows import (
-    OUTCOMES,
-    SOLVED,
-    Approach,
-    Limits,
-    Optimum,
-    optimum,
-    tick_rows,
-    worst_rows,
-)
-from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, observe
-from hrcreplay.robot.control.separation import Obstacles, Separation
-from hrcreplay.robot.model import RobotModel, RobotPose
+from hrcreplay.robot.control.approach_rows import tick_rows
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, Sight
+from hrcreplay.robot.control.minimiser import Limits, Problem, Solution, minimise
+from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.stopping import axis_by_axis, straight
+from hrcreplay.robot.model import RobotModel
 
 #: Bound on the rotation of the TCP for each unit of the bound on its translation [rad/m].
 RAD_PER_M = 2 * math.pi / 2.5
@@ -185,172 +180,108 @@ def tracking_cost(
     return H, g
 
 
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """Minimise ``w @ H @ w / 2 + g @ w`` over the next joint velocity w [rad/s], within limits and clear of people."""
-
-    H: Floats  #: (nv, nv)
-    g: Floats  #: (nv,)
-    limits: Limits
-    rows: Approach  #: Eq. (66i)
-
-    def keeps(self, w: Floats, within: float) -> bool:
-        """Whether a velocity breaks no row by more than ``within`` [m^2; m/s, rad/s]."""
-        low, high, J, J_low, J_high = self.limits
-        twist = J @ w
-        fits = np.all((low <= w) & (w <= high)) and np.all((J_low - within <= twist) & (twist <= J_high + within))
-        return bool(fits) and not len(worst_rows(self.rows, w, within)[0])
-
-
 def problem(
     robot: RobotModel,
     state: RobotState,
-    pose: RobotPose,
-    T_world_ref: Floats,
-    twist_ref: Floats,
+    u_before: Floats,
+    reference: tuple[Floats, Floats],
+    sight: Sight,
     obstacles: Obstacles,
-    pairs: Separation,
+    horizon_s: float,
     settings: PlanSettings,
 ) -> Problem:
     """Eq. (66) at one instant; building it is separate from solving it.
 
+    Beside what is printed the velocity may be smoothed: the cost is that of the velocities' weighted mean with the
+    present one, by which the velocity approaches the best one with a time constant (``plan.smooth_s``), and the
+    acceleration changes by a share of its limit in a tick (``plan.jerk_s``).
+
     Args:
         robot: The manipulator.
         state: At the tick.
-        pose: Of the robot in that state.
-        T_world_ref: (4, 4) reference of the TCP one tick later.
-        twist_ref: (6,) its velocity, linear first, world frame [m/s, rad/s].
+        u_before: (nv,) acceleration of the tick before [rad/s^2].
+        reference: Pose (4, 4) of the reference one tick later, and its velocity (6,), world frame [m/s, rad/s].
+        sight: The robot's pose, and its distances from people.
         obstacles: The swept volumes of the tick.
-        pairs: Distances between links and limbs.
+        horizon_s: Until when they hold [s].
         settings: Weights and limits.
     """
-    dt_s, J, dJdq = settings.dt_s, pose.J_tcp, pose.dJdq_tcp
+    plan, dt_s, pose = settings.plan, settings.dt_s, sight.pose
+    J, dJdq = pose.J_tcp, pose.dJdq_tcp
     H, g = tracking_cost(
-        pose_error(pose.T_world_tcp, T_world_ref),
+        pose_error(pose.T_world_tcp, reference[0]),
         J,
         dJdq,
         state.dq,
-        twist_ref,
-        settings.plan.q_p,
-        settings.plan.q_v,
-        settings.plan.path_gain_per_s,
+        reference[1],
+        plan.q_p,
+        plan.q_v,
+        plan.path_gain_per_s,
         dt_s,
     )
+    inertia = plan.smooth_s / dt_s
+    g = g - inertia * (H @ state.dq)
+    H = (1.0 + inertia) * H
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
-    J_low, J_high = cartesian_bounds(
-        J, dJdq, state.dq, settings.plan.tcp_speed_max, settings.plan.tcp_acceleration_max, dt_s
+    if plan.jerk_s > dt_s:
+        low, high = smooth_bounds(low, high, state.dq + dt_s * u_before, dt_s**2 / plan.jerk_s * robot.ddq_max)
+    J_low, J_high = cartesian_bounds(J, dJdq, state.dq, plan.tcp_speed_max, plan.tcp_acceleration_max, dt_s)
+    pairs = sight.pairs
+    if pairs is None:
+        raise ValueError("problem: the distances from people are not known")
+    rows = tick_rows(
+        pose, obstacles, pairs.room_m2(plan.room, plan.give_way_m), pairs.distance_m, horizon_s + plan.lead_s
     )
-    rows = tick_rows(pose, obstacles, pairs.room_m2(), settings.stop_s)
-    return Problem(H, g, Limits(low, high, J, J_low, J_high), rows)
+    return Problem(H, g, Limits(low, high, J, J_low, J_high), rows, plan.rows == "soft")
 
 
-#: Largest residual with which a row counts as held [m^2; m/s, rad/s].
-HELD = 1e-11
+@njit(cache=True)
+def smooth_bounds(low: Floats, high: Floats, steady: Floats, change: Floats) -> tuple[Floats, Floats]:
+    """Bounds within which the acceleration changes little, but for what the limits of the axes ask for.
 
-#: Multiplier above which a row holds the robot back.
-BINDING = 1e-9
-
-#: Largest gradient left, and product of a multiplier and its row's slack, with which multipliers prove a solution.
-PROVEN = 1e-9
-
-#: How far proxqp's solution may be from the proven one [rad/s].
-AGREED = 1e-7
-
-_dense = proxsuite.proxqp.dense
-_SOLVED = proxsuite.proxqp.QPSolverOutput.PROXQP_SOLVED
-
-
-@dataclass(frozen=True, slots=True)
-class Solution:
-    """The minimiser of Eq. (66); every row has been checked."""
-
-    dq_next: Floats  #: (nv,) [rad/s]
-    held: bool  #: whether an approach row holds the robot back
+    Args:
+        low: (nv,) lower bounds on the next velocity [rad/s].
+        high: (nv,) upper bounds [rad/s].
+        steady: (nv,) next velocity at the acceleration of the tick before [rad/s].
+        change: (nv,) how far it may be from there [rad/s].
+    """
+    near_low, near_high = np.empty_like(low), np.empty_like(high)
+    for j in range(len(low)):
+        near_low[j] = min(max(low[j], steady[j] - change[j]), high[j])
+        near_high[j] = max(min(high[j], steady[j] + change[j]), low[j])
+    return near_low, near_high
 
 
-@dataclass(frozen=True, slots=True)
-class Unsolved:
-    """No minimiser that could be checked: the robot brakes."""
-
-    status: str  #: what went wrong
-
-
-def step(
+def propose(
     robot: RobotModel,
     state: RobotState,
-    T_world_ref: Floats,
-    twist_ref: Floats,
+    u_before: Floats,
+    reference: tuple[Floats, Floats],
+    sight: Sight,
     obstacles: Obstacles,
+    horizon_s: float,
     settings: PlanSettings,
-    pose: RobotPose | None = None,
-) -> Step:
-    """One tick of Section 5: the acceleration of Eq. (66), or that of Eq. (67) where there is none.
-
-    Never raises for numbers: a robot whose state, reference or people are not known brakes with a reason.
+) -> Proposal | int:
+    """One tick of Section 5: the step that Eq. (66) finds best, and the stop after it; a reason where there is none.
 
     Args:
         robot: The manipulator.
         state: At the tick.
-        T_world_ref: (4, 4) reference of the TCP one tick later.
-        twist_ref: (6,) its velocity, linear first, world frame [m/s, rad/s].
+        u_before: (nv,) acceleration of the tick before [rad/s^2].
+        reference: Pose (4, 4) of the reference one tick later, and its velocity (6,), world frame [m/s, rad/s].
+        sight: The robot's pose, and its distances from people.
         obstacles: The swept volumes of the tick.
+        horizon_s: Until when they hold [s].
         settings: Weights and limits.
-        pose: Of the robot in that state, where it has been computed already.
     """
-    with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
-        sight = observe(robot, state, obstacles, settings.plan.clearance_m, pose)
-        reason = sight.reason
-        if sight.pairs is not None:
-            task = problem(robot, state, sight.pose, T_world_ref, twist_ref, obstacles, sight.pairs, settings)
-            solution = solve(task)
-            if isinstance(solution, Solution):
-                status = control_step.LIMITED if solution.held else control_step.TRACKING
-                return sight.step(state, solution.dq_next, settings.dt_s, status)
-            reason = control_step.NOT_FINITE if solution.status == "not finite" else control_step.NO_SOLUTION
-        return sight.step(
-            state, control_step.braked(state, robot.ddq_max, settings.dt_s), settings.dt_s, control_step.BRAKING, reason
-        )
-
-
-def solve(task: Problem) -> Solution | Unsolved:
-    """The minimiser over all rows, proven; found as ``optimum`` does, and by proxqp where rows hold it."""
-    found = optimum(task.H, task.g, task.limits, task.rows, HELD)
-    if found.outcome != SOLVED:
-        return Unsolved(OUTCOMES[found.outcome])
-    if not task.keeps(found.w, HELD):
-        return Unsolved("residual")
-    if not _proven(task, found):
-        return Unsolved("unproven")
-    w = _by_proxqp(task, found) if np.any(found.z) else found.w
-    return Solution(w, bool(np.any(found.z[found.fixed :] > BINDING)))
-
-
-def _proven(task: Problem, found: Optimum) -> bool:
-    """Whether the multipliers prove a minimiser: the gradient must vanish, and only rows at their bound carry one."""
-    gradient = task.H @ found.w + task.g + found.z @ found.A
-    unused = found.z * np.minimum(found.high - found.A @ found.w, 1.0)
-    most = PROVEN * max(1.0, np.abs(task.g).max())
-    return bool(np.abs(gradient).max() <= most and np.abs(unused).max() <= most and found.z.min() >= 0.0)
-
-
-def _by_proxqp(task: Problem, known: Optimum) -> Floats:
-    """The solution as proxqp returns it from a proven one, or that one where proxqp loses it.
-
-    From elsewhere proxqp 0.8 misses or denies the solutions of about one problem in a hundred near people, claims a
-    few that are none, and needs 15 times as long as `optimum`. So it begins at the solution and its multipliers, with
-    the rows that hold it, and what it returns must keep all rows.
-    """
-    holding = np.flatnonzero(known.z)
-    A, high, w = known.A[holding], known.high[holding], known.w
-    cost, norms = 1.0 / task.H.diagonal().max(), 1.0 / np.linalg.norm(A, axis=1)  # its tolerances are absolute
-    # the last bits of what its other backend returns depend on where its memory happens to lie
-    qp = _dense.QP(len(w), 0, len(holding), False, _dense.HessianType.Dense, _dense.DenseBackend.PrimalLDLT)
-    qp.settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START
-    qp.settings.eps_abs, qp.settings.eps_rel = 1e-10, 0.0
-    qp.settings.max_iter, qp.settings.max_iter_in = 5, 5
-    low = np.full(len(holding), -np.inf)
-    qp.init(task.H * cost, task.g * cost, None, None, A * norms[:, None], low, high * norms)
-    qp.solve(w, None, cost * known.z[holding] / norms)
-    found = np.clip(qp.results.x, task.limits.low, task.limits.high)
-    kept = qp.results.info.status == _SOLVED and np.abs(found - w).max() <= AGREED
-    return found if kept and task.keeps(found, HELD) else w
+    task = problem(robot, state, u_before, reference, sight, obstacles, horizon_s, settings)
+    found = minimise(task)
+    if not isinstance(found, Solution) and settings.plan.jerk_s > 0.0:  # a limit may ask for a sudden change
+        calm = settings.without_jerk()
+        found = minimise(problem(robot, state, u_before, reference, sight, obstacles, horizon_s, calm))
+    if not isinstance(found, Solution):
+        return control_step.NOT_FINITE if found.status == "not finite" else control_step.NO_SOLUTION
+    q_next = state.q + 0.5 * settings.dt_s * (state.dq + found.dq_next)  # Eq. (68), (69)
+    brake = straight if settings.certified else axis_by_axis
+    stop = brake(q_next, found.dq_next, robot.ddq_max, settings.dt_s)
+    return Proposal(stop, control_step.LIMITED if found.held else control_step.TRACKING)

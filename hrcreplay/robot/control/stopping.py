@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.records import Floats
+from hrcreplay.robot.programme.reference import Grid, place
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,99 @@ def _straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floa
             rows_dq[i, j] = left * dq[j]
             rows_q[i, j] = rows_q[i - 1, j] + 0.5 * dt_s * (rows_dq[i - 1, j] + rows_dq[i, j])  # Eq. (68), (69)
     return rows_q, rows_dq
+
+
+def axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
+    """The stop of Eq. (67): every axis comes to rest as soon as it can.
+
+    Args:
+        q: (nv,) where it begins [rad].
+        dq: (nv,) velocity there; an axis of unknown velocity counts as standing [rad/s].
+        ddq_max: (nv,) [rad/s^2].
+        dt_s: Length of a tick [s].
+    """
+    rows_q, rows_dq = _axis_by_axis(q, np.where(np.isfinite(dq), dq, 0.0), ddq_max, dt_s)
+    return Stop(rows_q, rows_dq, np.full((len(rows_q), 2), math.nan))
+
+
+@njit(cache=True)
+def _axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floats, Floats]:
+    ticks = 0
+    for j in range(len(q)):
+        ticks = max(ticks, math.ceil(abs(dq[j]) / (ddq_max[j] * dt_s)))
+    rows_q, rows_dq = np.empty((ticks + 1, len(q))), np.zeros((ticks + 1, len(q)))
+    rows_q[0], rows_dq[0] = q, dq
+    for i in range(1, ticks + 1):
+        for j in range(len(q)):
+            before, gain = rows_dq[i - 1, j], ddq_max[j] * dt_s
+            if i < ticks and abs(before) > gain:
+                rows_dq[i, j] = before - math.copysign(gain, before)
+            rows_q[i, j] = rows_q[i - 1, j] + 0.5 * dt_s * (before + rows_dq[i, j])  # Eq. (68), (69)
+    return rows_q, rows_dq
+
+
+#: Ticks after which a stop along a path counts as none: the path allows no lower rate.
+MOST_TICKS = 2000
+#: Rounds of looking for a rate, and how near the limit of an axis it must be found.
+_ROUNDS, _SHARE = 30, 1e-9
+
+
+def along_path(grid: Grid, s_s: float, rate: float, ddq_max: Floats, dt_s: float) -> Stop | None:
+    """The stop of a robot that stays on its path: its rate falls as fast as the axes' limits allow.
+
+    Args:
+        grid: The path.
+        s_s: Programmed time where it begins [s].
+        rate: Share of the programmed speed there, in [0, 1].
+        ddq_max: (nv,) [rad/s^2].
+        dt_s: Length of a tick [s].
+
+    Returns:
+        None where the path does not let the robot come to rest.
+    """
+    q, dq, along, ticks = _along_path(grid, s_s, rate, ddq_max * dt_s, dt_s)
+    return Stop(q[: ticks + 1], dq[: ticks + 1], along[: ticks + 1]) if ticks < MOST_TICKS else None
+
+
+@njit(cache=True)
+def _along_path(grid: Grid, s_s: float, rate: float, gain: Floats, dt_s: float) -> tuple[Floats, Floats, Floats, int]:
+    nv = grid.q.shape[1]
+    rows_q, rows_dq, along = np.empty((128, nv)), np.empty((128, nv)), np.empty((128, 2))
+    q, towards, _ = place(grid, s_s)
+    rows_q[0], rows_dq[0], along[0, 0], along[0, 1] = q, rate * towards, s_s, rate
+    i = 0
+    while i < MOST_TICKS and rows_dq[i].any():
+        if i + 1 == len(rows_q):
+            rows_q, rows_dq = np.concatenate((rows_q, rows_q)), np.concatenate((rows_dq, rows_dq))
+            along = np.concatenate((along, along))
+        before, at = along[i, 1], along[i, 0]
+        slower = 0.0
+        for _ in range(_ROUNDS):
+            there = at + 0.5 * dt_s * (before + slower)
+            q, towards, _ = place(grid, there)
+            least = _least_rate(towards, rows_dq[i], gain)
+            if least <= slower + _SHARE:
+                break
+            slower = least
+        slower = min(slower, before)  # the path may bend so much that no lower rate keeps the limits
+        there = at + 0.5 * dt_s * (before + slower)
+        q, towards, _ = place(grid, there)
+        i += 1
+        rows_q[i], rows_dq[i], along[i, 0], along[i, 1] = q, slower * towards, there, slower
+    along[i, 1] = 0.0
+    return rows_q, rows_dq, along, i
+
+
+@njit(cache=True)
+def _least_rate(towards: Floats, dq: Floats, gain: Floats) -> float:
+    """Smallest rate, 0 or more, with which no axis loses more than ``gain`` of its velocity."""
+    least = 0.0
+    for j in range(len(dq)):
+        if towards[j] > 0.0:
+            least = max(least, (dq[j] - gain[j]) / towards[j])
+        elif towards[j] < 0.0:
+            least = max(least, (dq[j] + gain[j]) / towards[j])
+    return least
 
 
 def at_rest(q: Floats, along: Floats | None = None) -> Stop:

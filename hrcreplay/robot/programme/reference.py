@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -25,6 +26,15 @@ class ReferencePoint:
     ddq: Floats  #: (nv,) [rad/s^2]
     T_world_tcp: Floats  #: (4, 4)
     twist: Floats  #: (6,) linear and angular velocity of the TCP [m/s, rad/s]
+
+
+class Grid(NamedTuple):
+    """A path over time on the grid; see ``Reference``."""
+
+    q: Floats  #: (n, nv) [rad]
+    dq: Floats  #: (n, nv) [rad/s]
+    end: int  #: grid point of the last waypoint
+    duration_s: float  #: from the start to the end of the last cycle [s]
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,11 @@ class Reference:
         """From the start to the end of the last cycle; inf when it repeats [s]."""
         return (self.cycles - 1) * self.cycle_s + self.end * STEP_S
 
+    @property
+    def grid(self) -> Grid:
+        """The path without the robot, for kernels."""
+        return Grid(self.q, self.dq, self.end, self.duration_s)
+
     def next_waypoint(self, s_s: float) -> float:
         """Programmed time of the first arrival at a waypoint that is not before ``s_s``; inf after the last [s]."""
         if not self.waypoints_s or s_s > self.duration_s:
@@ -71,15 +86,20 @@ class Reference:
         position and velocity: each is exactly the derivative of the one before. Before the start and after the end
         it stands.
         """
-        if not 0.0 <= s_s < self.duration_s:
-            q = self.q[0] if s_s < 0.0 else self.q[self.end]
-            dq = ddq = np.zeros(self.model.nv)
-        else:
-            at = s_s % self.cycle_s / STEP_S
-            i = min(int(at), len(self.q) - 2)
-            q, dq, ddq = _cubic(self.q[i], self.q[i + 1], self.dq[i], self.dq[i + 1], at - i, STEP_S)
+        q, dq, ddq = place(self.grid, s_s)
         pose = self.model.pose(q, dq)
         return ReferencePoint(q, dq, ddq, pose.T_world_tcp, pose.J_tcp @ dq)
+
+
+@njit(cache=True)
+def place(grid: Grid, s_s: float) -> tuple[Floats, Floats, Floats]:
+    """Position, velocity and acceleration (nv,) each, ``s_s`` seconds of programmed time after a path's start."""
+    if not 0.0 <= s_s < grid.duration_s:
+        row = 0 if s_s < 0.0 else grid.end
+        return grid.q[row].copy(), np.zeros(grid.q.shape[1]), np.zeros(grid.q.shape[1])
+    at = s_s % ((len(grid.q) - 1) * STEP_S) / STEP_S
+    i = min(int(at), len(grid.q) - 2)
+    return _cubic(grid.q[i], grid.q[i + 1], grid.dq[i], grid.dq[i + 1], at - i, STEP_S)
 
 
 @njit(cache=True)

@@ -1,0 +1,190 @@
+"""Methods that stay on the programmed path and choose the speed along it: the baselines of the trajectory generator.
+
+- ``scaling`` [24]: the largest share of the programmed speed that meets the rows of Eq. (66i).
+- ``shield``: the programmed speed while the next stop is certified, else the stop.
+- ``ssm``: stop and go by the protective separation distance of ISO/TS 15066, 5.5.4.
+- ``none``: the programmed speed, whoever is there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.records import Floats
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.approach_rows import tick_rows, worst_rows
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Sight
+from hrcreplay.robot.control.qp_controller import cartesian_bounds
+from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.stopping import Stop, along_path
+from hrcreplay.robot.model import RobotModel, RobotPose
+from hrcreplay.robot.programme.reference import Reference, place
+
+#: Rates that differ by no more are one.
+SAME = 1e-7
+
+#: Largest residual of an approach row that counts as held [m^2].
+HELD = 1e-11
+
+#: Rounds of looking for a rate.
+ROUNDS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class PathState:
+    """How far along its programmed path the robot is, and the share of the programmed speed it moves with."""
+
+    s_s: float  #: programmed time [s]
+    rate: float  #: in [0, 1]
+
+
+def propose(
+    robot: RobotModel,
+    reference: Reference,
+    going: Stop,
+    sight: Sight,
+    obstacles: Obstacles | None,
+    horizon_s: float,
+    settings: PlanSettings,
+) -> Proposal | int:
+    """One tick: the largest rate in [0, 1] that meets the limits of the robot and, where asked for, Eq. (66i).
+
+    The robot is where the path is, to the last bit: position and velocity one tick later are those of the path, and
+    ``u`` leads from this tick's velocity to that one, so the safety rows hold for ``dq + dt u`` as they do for the
+    QP; Eq. (69) then gives the next position but for the third order in dt. Rates change as fast as the axes'
+    acceleration limits allow along the path.
+
+    Args:
+        robot: The manipulator.
+        reference: The programmed path.
+        going: The stop that goes on where nothing else is taken; its row 0 is where the robot is.
+        sight: The robot's pose, and its distances from people.
+        obstacles: The swept volumes of the tick, whose rows bound the rate; None: nothing but the robot does.
+        horizon_s: Until when they hold [s].
+        settings: Limits; weights are not used.
+
+    Returns:
+        The step and the stop after it, along the path; a reason where there is none.
+    """
+    state, slowest = PathState(*going.along[0].tolist()), going.rest().along[0, 1]
+    fastest, slowed = _fastest(robot, reference, state, sight, obstacles, horizon_s, settings)
+    if fastest is None or fastest.rate < slowest - SAME:
+        return control_step.NO_SOLUTION
+    stop = along_path(reference.grid, fastest.s_s, fastest.rate, robot.ddq_max, settings.dt_s)
+    if stop is None:
+        return control_step.NO_SOLUTION
+    return Proposal(stop, control_step.LIMITED if slowed else control_step.TRACKING)
+
+
+def protective_distance_m(pose: RobotPose, stop: Stop, human_speed: float, latency_s: float, dt_s: float) -> float:
+    """S_p of ISO/TS 15066, Eq. (3): what the person and the robot cover until the robot stands [m].
+
+    S_h + S_r + S_s with the present speed of the robot. C, Z_d and Z_r are in the distance it is compared with, which
+    is that to the person's present volume, hand and uncertainties of the measurement included.
+
+    Args:
+        pose: Of the robot.
+        stop: From the end of the step.
+        human_speed: At which the person may approach [m/s].
+        latency_s: Reaction time T_r beside the tick [s].
+        dt_s: Length of a tick [s].
+    """
+    speed = float(np.linalg.norm(pose.J_ends @ stop.dq[0], axis=2).max())
+    reaction_s, stop_s = latency_s + dt_s, stop.ticks * dt_s
+    return human_speed * (reaction_s + stop_s) + speed * reaction_s + 0.5 * speed * stop_s
+
+
+def _fastest(
+    robot: RobotModel,
+    reference: Reference,
+    state: PathState,
+    sight: Sight,
+    obstacles: Obstacles | None,
+    horizon_s: float,
+    settings: PlanSettings,
+) -> tuple[PathState | None, bool]:
+    """The largest rate that meets all constraints, and whether an approach row is what bounds it.
+
+    Every bound is linear in the next velocity, which is the rate times the path's direction where it leads to.
+    """
+    dt_s, gain, pose, grid = settings.dt_s, robot.ddq_max * settings.dt_s, sight.pose, reference.grid
+    dq = state.rate * place(grid, state.s_s)[1]
+    low, high = np.maximum(-robot.dq_max, dq - gain), np.minimum(robot.dq_max, dq + gain)
+    J_low, J_high = cartesian_bounds(
+        pose.J_tcp, pose.dJdq_tcp, dq, settings.plan.tcp_speed_max, settings.plan.tcp_acceleration_max, dt_s
+    )
+    slowed = False
+
+    def ahead(rate: float) -> float:
+        return state.s_s + 0.5 * dt_s * (state.rate + rate)
+
+    def most(rate: float) -> float:
+        nonlocal slowed
+        towards = place(grid, ahead(rate))[1]
+        free = min(1.0, rates(towards, low, high)[1], rates(pose.J_tcp @ towards, J_low, J_high)[1])
+        safe = free
+        if obstacles is not None and free >= 0.0:
+            safe = _safe_rate(sight, obstacles, towards, free, horizon_s + settings.plan.lead_s, settings)
+        slowed = safe < free
+        return safe
+
+    rate = _largest(1.0, most)
+    return (None, True) if rate is None else (PathState(ahead(rate), rate), slowed)
+
+
+def _largest(top: float, bound: Callable[[float], float]) -> float | None:
+    """Largest x in [0, top] with ``x <= bound(x)``, for a bound that changes little with x; or none."""
+    found, low, high, x = None, -1.0, top, top
+    for _ in range(ROUNDS):
+        most = bound(x)
+        if x <= most:
+            found = low = x
+            if x == top or most - x <= SAME * top:
+                break
+        else:
+            high = x
+            if not x > 0.0:
+                break
+        guess = max(0.0, most)
+        x = guess if low < guess < high else max(0.0, 0.5 * (low + high))
+    return found
+
+
+def _safe_rate(
+    sight: Sight, obstacles: Obstacles, towards: Floats, rate: float, ahead_s: float, settings: PlanSettings
+) -> float:
+    """The largest rate up to a given one with which all approach rows hold, Eq. (16)."""
+    pairs = sight.pairs
+    if pairs is None:
+        return math.nan
+    room = pairs.room_m2(settings.plan.room)
+    rows = tick_rows(sight.pose, obstacles, room, pairs.distance_m, ahead_s)
+    for _ in range(ROUNDS):
+        which, _, values = worst_rows(rows, rate * towards, HELD)
+        if not len(which):
+            return rate
+        rate *= float((rows.room_m2[which[:, 0], which[:, 1]] / values).min())
+    return math.nan
+
+
+@njit(cache=True)
+def rates(towards: Floats, low: Floats, high: Floats) -> tuple[float, float]:
+    """Smallest and largest factor with ``low <= factor * towards <= high``; empty where the first is larger.
+
+    Args:
+        towards: (m,).
+        low: (m,).
+        high: (m,).
+    """
+    least, most = -np.inf, np.inf
+    for i in range(len(towards)):
+        if towards[i] > 0.0:
+            least, most = max(least, low[i] / towards[i]), min(most, high[i] / towards[i])
+        elif towards[i] < 0.0:
+            least, most = max(least, high[i] / towards[i]), min(most, low[i] / towards[i])
+    return least, most
