@@ -118,13 +118,31 @@ class Measurements(Table):
     capture_ns: Ints  #: (n,)
     arrival_ns: Ints  #: (n,)
     camera: Ints  #: (n,) index into ``cameras``
-    angles: Floats  #: (n, 12) JOINTS [m, m, rad...]; NaN where not observable
-    angles_std: Floats  #: (n, 12) sigma_z of Eq. (47) [m, m, rad...]; NaN where the angle is
-    lengths_m: Floats  #: (n, 8) LENGTHS [m]; NaN where not observable
-    lengths_std_m: Floats  #: (n, 8) [m]
+    z: Floats  #: (n, 20) JOINTS, then LENGTHS [m, m, rad..., m...]; NaN where not observable
+    z_std: Floats  #: (n, 20) sigma_z of Eq. (47), in the same units; NaN where ``z`` is
     points_m: Floats  #: (n, 20, 3) POINTS in the world [m]
     confidence: Floats  #: (n, 20) in [0, 1]
     cameras: tuple[str, ...]
+
+    @property
+    def angles(self) -> Floats:
+        """(n, 12) JOINTS [m, m, rad...]."""
+        return self.z[:, : len(JOINTS)]
+
+    @property
+    def angles_std(self) -> Floats:
+        """(n, 12) standard deviation of ``angles``."""
+        return self.z_std[:, : len(JOINTS)]
+
+    @property
+    def lengths_m(self) -> Floats:
+        """(n, 8) LENGTHS [m]."""
+        return self.z[:, len(JOINTS) :]
+
+    @property
+    def lengths_std_m(self) -> Floats:
+        """(n, 8) standard deviation of ``lengths_m`` [m]."""
+        return self.z_std[:, len(JOINTS) :]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import pyarrow as pa
@@ -30,7 +30,7 @@ from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.records import LIMBS
 from hrcreplay.run import build
-from hrcreplay.run.job import Job, resolve
+from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.stages import PredictionStage, print_note
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
@@ -47,16 +47,7 @@ _ESCAPES = pa.schema(
 SEED = 3
 
 
-def run(
-    sources: Sequence[Path],
-    *,
-    out: Path | None = None,
-    config: Path | None = None,
-    overrides: tuple[str, ...] = (),
-    cell_file: Path | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
-) -> Path:
+def run(sources: Sequence[Path], *, out: Path | None = None, **options: Unpack[JobOptions]) -> Path:
     """Audits logs, or the logs of earlier runs with the settings and cells of those runs.
 
     The total counts every audited tick of every log once, so a long log weighs more than a short one: it is the share
@@ -66,11 +57,7 @@ def run(
     Args:
         sources: Logs, or run folders of earlier commands.
         out: Run folder to make; None: ``reports/<log>/<UTC>-audit``.
-        config: Settings file, or none.
-        overrides: ``section.key=value`` of the command line, which win over the file.
-        cell_file: Poses of cameras and robot; None: those of the earlier run, else of the log.
-        start_s: Start of the span, from the log's first message [s]; None: as the earlier run, else its beginning.
-        end_s: End of the span, from the log's first message [s]; None: as the earlier run, else its end.
+        **options: Settings, cell and span, as ``job.resolve`` takes them.
 
     Returns:
         The run folder: audit.json, audit.parquet (a row per tick, method and limb), escapes.parquet (a row per
@@ -81,10 +68,7 @@ def run(
         LogError: A log cannot be read, is shorter than the horizon, or shows nobody.
     """
     began = datetime.now(UTC)
-    jobs = [
-        resolve("audit", source, config=config, overrides=overrides, cell_file=cell_file, start_s=start_s, end_s=end_s)
-        for source in sources
-    ]
+    jobs = [resolve("audit", source, **options) for source in sources]
     _alike(jobs)
     with RunWriter(out or Path("reports") / jobs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-audit") as writer:
         watch = Stopwatch(time.perf_counter_ns)

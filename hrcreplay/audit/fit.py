@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
 from hrcreplay.run import build
-from hrcreplay.run.job import Job, resolve
+from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.stages import NS, PredictionStage, ProgressBar, tick_times
 
 
@@ -176,13 +176,9 @@ def run(
     *,
     out: Path,
     coverage: float = 0.99,
-    config: Path | None = None,
-    overrides: tuple[str, ...] = (),
-    cell_file: Path | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
     held_back: float = 0.3,
     cover: str = "joints",
+    **options: Unpack[JobOptions],
 ) -> list[str]:
     """Fits velocity and acceleration bounds to logs and writes them as a limit set.
 
@@ -193,14 +189,10 @@ def run(
         logs: Logs, or run folders whose logs, settings and cells are taken.
         out: Limit set to write (TOML), with provenance.
         coverage: Share of the ticks in which all fitted joints shall stay inside their intervals.
-        config: Settings file.
-        overrides: ``section.key=value``.
-        cell_file: Poses of the cameras.
-        start_s: First second of every log.
-        end_s: Last one.
         held_back: Share of every log's time, its end.
         cover: ``joints``: of ticks with all fitted joints in their intervals of Alg. 1. ``limbs``: of ticks with
             all limbs that were seen, the lower body too, in the volumes of ``occupancy.method``, margins and all.
+        **options: Settings, cell and span, as ``job.resolve`` takes them.
 
     Returns:
         What the user should know, line by line.
@@ -210,8 +202,7 @@ def run(
         LogError: A log cannot be read, is too short, or shows no arm motion.
     """
     _refuse(logs, out, coverage, held_back, cover)
-    shared = {"config": config, "overrides": overrides, "cell_file": cell_file, "start_s": start_s, "end_s": end_s}
-    jobs = [resolve("fit-limits", log, **shared) for log in logs]  # type: ignore[arg-type]
+    jobs = [resolve("fit-limits", log, **options) for log in logs]
     horizon_s = _horizon_s(jobs)
     samples = [_sample(job, horizon_s, held_back) for job in jobs]
     found = _fit(samples, coverage, horizon_s)

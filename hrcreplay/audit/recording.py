@@ -111,8 +111,8 @@ def _fuse(
             measured = measured.rows(slice(0, 0))
         else:
             continue
-        state, states, events, trace = fuse.fuse_traced(
-            state, ticks, measured, fusion_stage.filter, fusion_stage.limits
+        state, states, events, trace = fuse.fuse(
+            state, ticks, measured, fusion_stage.filter, fusion_stage.limits, traced=True
         )
         counts.update(events)
         yield measured, states, trace

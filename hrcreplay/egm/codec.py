@@ -17,16 +17,14 @@ from google.protobuf.message import DecodeError
 
 from hrcreplay.egm import motion_link_pb2 as messages
 from hrcreplay.records import Floats
+from hrcreplay.robot import irb140
 
-#: The IRB 140, an axis a row: what lies before it [m], and the direction it turns about; both at zero, x forward, z up.
-_BEFORE_M = ((0, 0, 0.352), (0.070, 0, 0), (0, 0, 0.360), (0.380, 0, 0), (0, 0, 0), (0.065, 0, 0))
-_ABOUT = (2, 1, 1, 0, 1, 0)
 #: The flange's z points out of it, along the last axis: a quarter turn about y.
 _FLANGE = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 
 
 def flange_pose(q: Floats) -> Floats:
-    """Pose of the flange in the robot's base.
+    """Pose of the flange of an IRB 140 in the robot's base.
 
     Args:
         q: (6,) joints by the controller's zero and signs [rad].
@@ -36,11 +34,11 @@ def flange_pose(q: Floats) -> Floats:
     """
     x = y = z = 0.0
     turn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
-    for (dx, dy, dz), about, angle in zip(_BEFORE_M, _ABOUT, q.tolist(), strict=True):
-        sx, sy, sz = _turned(turn, (dx, dy, dz))
+    for axis, angle in zip(irb140.AXES, q.tolist(), strict=True):
+        sx, sy, sz = _turned(turn, axis.offset_m)
         x, y, z = x + sx, y + sy, z + sz
         half = [math.cos(angle / 2), 0.0, 0.0, 0.0]
-        half[1 + about] = math.sin(angle / 2)
+        half[1 + axis.direction.index(1)] = math.sin(angle / 2)
         turn = _product(turn, tuple(half))
     turn = _product(turn, _FLANGE)
     sign = math.copysign(1.0, turn[0])
@@ -144,6 +142,16 @@ class Correction:
     dq: Floats
 
 
+def _parsed(kind: Any, data: bytes) -> Any:
+    """The message of that kind. Raises BadPacket."""
+    if not data:
+        raise BadPacket("empty datagram")
+    try:
+        return kind.FromString(data)
+    except DecodeError:
+        raise BadPacket(f"garbage: {len(data)} bytes that are no message") from None
+
+
 def decode_robot(data: bytes) -> RobotPacket:
     """Read one datagram of the robot, of any edition.
 
@@ -152,12 +160,7 @@ def decode_robot(data: bytes) -> RobotPacket:
     Raises:
         BadPacket: Empty, garbage, another kind of message, not six joints, or a joint that is no finite number.
     """
-    if not data:
-        raise BadPacket("empty datagram")
-    try:
-        message = messages.RobotMessage.FromString(data)
-    except DecodeError:
-        raise BadPacket(f"garbage: {len(data)} bytes that are no message") from None
+    message = _parsed(messages.RobotMessage, data)
     header, feedback, planned = message.header, message.feed_back, message.planned
     if header.mtype not in (messages.TYPE_DATA, messages.TYPE_UNDEFINED):
         raise BadPacket(f"message type {header.mtype}: a robot sends {messages.TYPE_DATA}")
@@ -203,12 +206,7 @@ def decode_correction(data: bytes) -> Correction:
     Raises:
         BadPacket: Empty, garbage, a robot's own message, not six joints, or a joint that is no finite number.
     """
-    if not data:
-        raise BadPacket("empty datagram")
-    try:
-        message = messages.SensorMessage.FromString(data)
-    except DecodeError:
-        raise BadPacket(f"garbage: {len(data)} bytes that are no message") from None
+    message = _parsed(messages.SensorMessage, data)
     header, speed = message.header, message.speed_reference
     if header.mtype == messages.TYPE_DATA:
         raise BadPacket(f"message type {header.mtype}: a guide sends {messages.TYPE_CORRECTION}")

@@ -47,12 +47,15 @@ class OwnDecoder:
 
     def rows(self, message: Message) -> list[RawSkeleton]:
         """The one row of a message."""
-        skeleton = message.read()
-        confidence = np.array(skeleton.confidence, dtype=np.float64)
-        if len(confidence) != len(POINTS):
-            raise Undecodable(f"{self.topic}: a skeleton of {len(confidence)} confidences; {len(POINTS)} are right")
-        points = points_of(skeleton.points, self.topic)
-        return [RawSkeleton(skeleton.capture_ns, self.cameras[0], skeleton.body, points, confidence)]
+        return [own_row(message.read(), self.cameras[0], self.topic)]
+
+
+def own_row(skeleton: Any, camera: str, topic: str) -> RawSkeleton:
+    """The row of a camera that a Skeleton message of our own is. Raises Undecodable, with its topic."""
+    confidence = np.array(skeleton.confidence, dtype=np.float64)
+    if len(confidence) != len(POINTS):
+        raise Undecodable(f"{topic}: a skeleton of {len(confidence)} confidences; {len(POINTS)} are right")
+    return RawSkeleton(skeleton.capture_ns, camera, skeleton.body, points_of(skeleton.points, topic), confidence)
 
 
 def points_of(values: Any, topic: str) -> Floats:

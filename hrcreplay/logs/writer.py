@@ -140,19 +140,21 @@ class LogWriter:
     def _add(self, topic: str, message: Any, log_ns: int, publish_ns: int) -> None:
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._writer.register_channel(topic, "protobuf", self._schema(message))
+            schema = register_schema(self._writer, self._schemas, type(message))
+            channel = self._writer.register_channel(topic, "protobuf", schema)
             self._channels[topic] = channel
         data = message.SerializeToString(deterministic=True)
         self._writer.add_message(channel, log_time=log_ns, publish_time=publish_ns, data=data)
 
-    def _schema(self, message: Any) -> int:
-        name = message.DESCRIPTOR.full_name
-        if name not in self._schemas:
-            files = FileDescriptorSet()
-            message.DESCRIPTOR.file.CopyToProto(files.file.add())
-            data = files.SerializeToString(deterministic=True)
-            self._schemas[name] = self._writer.register_schema(name, "protobuf", data)
-        return self._schemas[name]
+
+def register_schema(writer: Writer, known: dict[str, int], kind: Any) -> int:
+    """The id of a protobuf message's schema in a log; registered, and put down in ``known``, at its first use."""
+    name = kind.DESCRIPTOR.full_name
+    if name not in known:
+        files = FileDescriptorSet()
+        kind.DESCRIPTOR.file.CopyToProto(files.file.add())
+        known[name] = writer.register_schema(name, "protobuf", files.SerializeToString(deterministic=True))
+    return known[name]
 
 
 def _refuse_existing(path: Path) -> None:

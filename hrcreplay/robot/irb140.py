@@ -1,22 +1,34 @@
 """The ABB IRB 140: axes of the product specification 3HAC041346-001, link capsules of our own.
 
 Zero is the controller's: upper arm up, forearm level; so are the signs. Nothing here is taken from a community URDF.
+The only definition of that robot: the controller's model, the EGM codec and the robot double read it, so this module
+imports nothing that is slow to load.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from hrcreplay.robot.link_capsules import Segment
+Vector = tuple[float, float, float]
 
-#: Axis: offset from the axis before it, at zero [m]; direction at zero; range [deg]; top speed [deg/s].
-_AXES = (
-    ((0.0, 0.0, 0.352), (0, 0, 1), (-180, 180), 200),
-    ((0.070, 0.0, 0.0), (0, 1, 0), (-90, 110), 200),
-    ((0.0, 0.0, 0.360), (0, 1, 0), (-230, 50), 260),
-    ((0.380, 0.0, 0.0), (1, 0, 0), (-200, 200), 360),
-    ((0.0, 0.0, 0.0), (0, 1, 0), (-115, 115), 360),
-    ((0.065, 0.0, 0.0), (1, 0, 0), (-400, 400), 450),
+
+class Axis(NamedTuple):
+    """One revolute axis."""
+
+    offset_m: Vector  #: from the axis before it, at zero [m]
+    direction: tuple[int, int, int]  #: at zero, x forward, z up
+    range_deg: tuple[int, int]
+    speed_deg_per_s: int  #: top speed
+
+
+AXES = (
+    Axis((0.0, 0.0, 0.352), (0, 0, 1), (-180, 180), 200),
+    Axis((0.070, 0.0, 0.0), (0, 1, 0), (-90, 110), 200),
+    Axis((0.0, 0.0, 0.360), (0, 1, 0), (-230, 50), 260),
+    Axis((0.380, 0.0, 0.0), (1, 0, 0), (-200, 200), 360),
+    Axis((0.0, 0.0, 0.0), (0, 1, 0), (-115, 115), 360),
+    Axis((0.065, 0.0, 0.0), (1, 0, 0), (-400, 400), 450),
 )
 
 
@@ -24,7 +36,7 @@ def urdf() -> str:
     """The robot as URDF text: links ``base``, ``link_1`` to ``link_6`` and ``flange`` (z out of the flange)."""
     rows = ["<robot name='irb140'>", "<link name='base'/>", "<link name='flange'/>"]
     parent = "base"
-    for number, (offset_m, axis, range_deg, speed_deg_per_s) in enumerate(_AXES, start=1):
+    for number, (offset_m, axis, range_deg, speed_deg_per_s) in enumerate(AXES, start=1):
         lower, upper, speed = (math.radians(value) for value in (*range_deg, speed_deg_per_s))
         rows += [
             f"<link name='link_{number}'/>",
@@ -41,18 +53,18 @@ def urdf() -> str:
     return "\n".join(rows)
 
 
-def segments(tool_m: float) -> tuple[Segment, ...]:
+def capsules(tool_m: float) -> tuple[tuple[str, str, Vector, Vector, float], ...]:
     """Its link capsules; the last reaches from the flange to the TCP, ``tool_m`` beyond it [m].
 
     The base column does not move and needs none.
     """
     zero = (0.0, 0.0, 0.0)
     return (
-        Segment("shoulder", "link_1", zero, (0.070, 0.0, 0.0), 0.219),
-        Segment("upper_arm", "link_2", zero, (0.0, 0.0, 0.360), 0.152),
-        Segment("forearm", "link_3", zero, (0.380, 0.0, 0.0), 0.118),
-        Segment("wrist", "link_5", zero, (0.065, 0.0, 0.0), 0.077),
-        Segment("tool", "flange", zero, (0.0, 0.0, tool_m), 0.045),
+        ("shoulder", "link_1", zero, AXES[1].offset_m, 0.219),
+        ("upper_arm", "link_2", zero, AXES[2].offset_m, 0.152),
+        ("forearm", "link_3", zero, AXES[3].offset_m, 0.118),
+        ("wrist", "link_5", zero, AXES[5].offset_m, 0.077),
+        ("tool", "flange", zero, (0.0, 0.0, tool_m), 0.045),
     )
 
 

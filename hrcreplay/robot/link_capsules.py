@@ -21,7 +21,10 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Segment:
-    """A capsule around one link, whose axis is that of Eq. (4). Both ends are on one body, as Eq. (5) needs."""
+    """A capsule around one link, whose axis is that of Eq. (4). Both ends are on one body, as Eq. (5) needs.
+
+    The settings give one as ``LinkSettings``; here it also knows the collision shape that it was fitted to.
+    """
 
     name: str
     body: str  #: URDF link or joint whose frame the ends are given in

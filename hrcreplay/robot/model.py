@@ -153,7 +153,7 @@ def irb140(
         tcp_frame="flange",
         tool_m=tool_m,
         T_tool_tcp=T_tool_tcp,
-        segments=irb140_data.segments(tool_m),
+        segments=[Segment(*capsule) for capsule in irb140_data.capsules(tool_m)],
         acceleration=acceleration,
     )
 

@@ -104,10 +104,7 @@ def robot(job: Job, T_world_base: Floats) -> RobotModel:
             T_tool_tcp=T_tool_tcp,
             acceleration=settings.acceleration,
         )
-    segments = tuple(
-        Segment(name=link.name, body=link.body, start_m=link.start_m, end_m=link.end_m, radius_m=link.radius_m)
-        for link in settings.links
-    )
+    segments = tuple(Segment(**dict(link)) for link in settings.links)
     return from_urdf(
         files.text,
         T_world_base,

@@ -44,12 +44,12 @@ class QpFollower:
     def step(self, volumes: Obstacles) -> FollowerTick:
         """One tick of the trajectory generator."""
         state, point, now_s = self.state, self.point, self.s_s
-        tcp_m = self.robot.pose(state.q, state.dq).T_world_tcp[:3, 3]
-        error_m = float(np.linalg.norm(tcp_m - point.T_world_tcp[:3, 3]))
+        pose = self.robot.pose(state.q, state.dq)
+        error_m = float(np.linalg.norm(pose.T_world_tcp[:3, 3] - point.T_world_tcp[:3, 3]))
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
         step = qp_controller.step(
-            self.robot, state, self.point.T_world_tcp, rate * self.point.twist, volumes, self.settings
+            self.robot, state, self.point.T_world_tcp, rate * self.point.twist, volumes, self.settings, pose
         )
         self.state = step.next
         return FollowerTick(state, point, now_s, step)
@@ -72,7 +72,9 @@ class ScalingFollower:
         """One tick of the baseline."""
         state, now_s = self.state, self.along.s_s
         point = self.reference.sample(now_s)
-        step, self.along = scaling_controller.step(self.robot, self.reference, self.along, volumes, self.settings)
+        step, self.along = scaling_controller.step(
+            self.robot, self.reference, self.along, volumes, self.settings, point
+        )
         self.state = step.next
         return FollowerTick(state, point, now_s, step)
 

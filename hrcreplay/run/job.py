@@ -11,7 +11,7 @@ import tomllib
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell, load_cell
@@ -161,15 +161,25 @@ def versions() -> dict[str, str]:
     return {"hrcreplay": __version__, **{name: metadata.version(name) for name in PACKAGES}}
 
 
+class JobOptions(TypedDict, total=False):
+    """Arguments of ``resolve`` that the commands hand on to it."""
+
+    config: Path | None
+    overrides: tuple[str, ...]
+    cell_file: Path | None
+    start_s: float | None
+    end_s: float | None
+
+
 def resolve(
     command: str,
     source: Path,
     *,
-    config: Path | None,
-    overrides: tuple[str, ...],
-    cell_file: Path | None,
-    start_s: float | None,
-    end_s: float | None,
+    config: Path | None = None,
+    overrides: tuple[str, ...] = (),
+    cell_file: Path | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
 ) -> Job:
     """The job that a command line asks for.
 

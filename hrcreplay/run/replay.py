@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from fnmatch import fnmatch
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import pyarrow.parquet as pq
 
@@ -25,7 +25,7 @@ from hrcreplay.report import limbs, tables
 from hrcreplay.report.story import defect_notes
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import LogLike
-from hrcreplay.run.job import TABLES, Job, plain_limits, resolve, urdf_digest, versions
+from hrcreplay.run.job import TABLES, Job, JobOptions, plain_limits, resolve, urdf_digest, versions
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
 from hrcreplay.store import run_folder
@@ -40,13 +40,9 @@ def run(
     source: Path,
     *,
     out: Path | None = None,
-    config: Path | None = None,
-    overrides: tuple[str, ...] = (),
-    cell_file: Path | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
     smooth: bool = False,
     chunk_ticks: int = 250,
+    **options: Unpack[JobOptions],
 ) -> Path:
     """Runs the stages up to that of ``command`` on a log or an earlier run.
 
@@ -54,13 +50,9 @@ def run(
         command: ``fuse``, ``predict``, ``plan`` or ``report``.
         source: A log, or the run folder of an earlier command.
         out: Run folder to make; None: ``reports/<log>/<UTC>-<command>``.
-        config: Settings file, or none.
-        overrides: ``section.key=value`` of the command line, which win over the file.
-        cell_file: Poses of cameras and robot; None: those of the earlier run, else of the log.
-        start_s: Start of the span, from the log's first message [s]; None: as the earlier run, else its beginning.
-        end_s: End of the span, from the log's first message [s]; None: as the earlier run, else its end.
         smooth: Whether to write the smoothed person too (smooth.parquet).
         chunk_ticks: Ticks of a batch; changes no result.
+        **options: Settings, cell and span, as ``job.resolve`` takes them.
 
     Returns:
         The run folder.
@@ -70,9 +62,7 @@ def run(
         LogError: The log cannot be read, or lacks what a stage needs.
     """
     began = datetime.now(UTC)
-    job = resolve(
-        command, source, config=config, overrides=overrides, cell_file=cell_file, start_s=start_s, end_s=end_s
-    )
+    job = resolve(command, source, **options)
     known = job.meta()
     with RunWriter(out or _folder(job, began)) as writer:
         log = open_log(job.log, job.settings.logs)

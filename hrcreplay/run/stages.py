@@ -174,13 +174,11 @@ def fused(
             for stand, c in zip(stands, range(len(stands)), strict=True):
                 stand.add(measured.points_m[measured.camera == c])
         with sink.watch.stage("fuse", len(ticks)):
-            if smooth:
-                state, states, events, trace = fuse.fuse_traced(
-                    state, ticks, measured, fusion_stage.filter, fusion_stage.limits
-                )
-                passed.append((states, trace))
-            else:
-                state, states, events = fuse.fuse(state, ticks, measured, fusion_stage.filter, fusion_stage.limits)
+            state, states, events, trace = fuse.fuse(
+                state, ticks, measured, fusion_stage.filter, fusion_stage.limits, traced=smooth
+            )
+        if smooth:
+            passed.append((states, trace))
         sink.counts.update(events)
         ever = ever or bool(states.valid.any())
         sink.run.table("state", state_columns(states))
@@ -229,10 +227,8 @@ def no_frames(cameras: tuple[str, ...]) -> Measurements:
         capture_ns=np.zeros(0, np.int64),
         arrival_ns=np.zeros(0, np.int64),
         camera=np.zeros(0, np.int64),
-        angles=np.zeros((0, 12)),
-        angles_std=np.zeros((0, 12)),
-        lengths_m=np.zeros((0, 8)),
-        lengths_std_m=np.zeros((0, 8)),
+        z=np.zeros((0, inverse_kinematics.ROWS)),
+        z_std=np.zeros((0, inverse_kinematics.ROWS)),
         points_m=np.zeros((0, 20, 3)),
         confidence=np.zeros((0, 20)),
         cameras=cameras,

@@ -46,8 +46,7 @@ def dense_us_per_tick(measurements: Measurements, ticks: Ints) -> float:
     Q = np.diag(np.repeat([0.0, 1e-4, 0.0, 0.0, 0.0], [12, 12, 12, 12, 8]))
     H = np.zeros((20, 56))
     H[:12, :12], H[12:, 48:] = np.eye(12), np.eye(8)
-    z = np.hstack([measurements.angles, measurements.lengths_m])
-    R = np.hstack([measurements.angles_std, measurements.lengths_std_m]) ** 2
+    z, R = measurements.z, measurements.z_std**2
     begun, seen = time.perf_counter(), 0
     for now in ticks:
         dense.predict(F=F, Q=Q)
@@ -69,7 +68,7 @@ def test_fuse_a_recording(benchmark: Any) -> None:
 def test_fuse_one_tick(benchmark: Any) -> None:
     """A live tick: a table of one row, with everything Python does around it."""
     measurements = measured()
-    state, _, _ = fuse(start(CAMERAS), TICKS[:-1], measurements, Fusion(), LIMITS)
+    state, _, _, _ = fuse(start(CAMERAS), TICKS[:-1], measurements, Fusion(), LIMITS)
     none = measurements.rows(slice(0, 0))
     benchmark(lambda: fuse(state, TICKS[-1:], none, Fusion(), LIMITS))
 

@@ -62,7 +62,7 @@ class MadeController:
     def answer(self, event: TickEvent) -> Decision:
         """Every byte of every datagram moves the robot."""
         self.q += 1e-6 * sum(sum(data) for data in event.datagrams) + 1e-9 * self.p[:6] + 1e-4 * self.silences
-        row = MotionRow(self.q - 0.01, self.q.copy(), self.q / 2, self.q / 3, self.q[:3], self.q[3:], np.full(4, 0.25))
+        row = MotionRow(self.q - 0.01, self.q.copy(), self.q / 2, self.q / 3, self.q[:3], self.q[3:], *[0.25] * 4)
         numbers = (self.q * 10).tolist()
         reply = egm.SensorMessage(planned=egm.Planned(joints=egm.Joints(joints=numbers))).SerializeToString()
         reason = "Ctrl-C" if Signal.INTERRUPT in event.signals else ""

@@ -44,11 +44,9 @@ def _without_task(path: Path, **joints: Any) -> Path:
 
 def test_another_urdf_with_given_links_moves_as_the_built_in_robot(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(irb140.urdf())
-    names = {s.name: s for s in irb140.segments(0.10)}
     links = ", ".join(
-        f'{{name = "{s.name}", body = "{s.body}", start_m = {list(s.start_m)}, end_m = {list(s.end_m)}, '
-        f"radius_m = {s.radius_m}}}"
-        for s in names.values()
+        f'{{name = "{name}", body = "{body}", start_m = {list(start_m)}, end_m = {list(end_m)}, radius_m = {radius_m}}}'
+        for name, body, start_m, end_m, radius_m in irb140.capsules(0.10)
     )
     mine = _plan(replay.demo_log(), tmp_path / "mine", f"robot.urdf={tmp_path / 'arm.urdf'}", f"robot.links=[{links}]")
     built_in = _plan(replay.demo_log(), tmp_path / "built_in")

@@ -14,6 +14,7 @@ import numpy as np
 from hrcreplay.egm.codec import Correction
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
+from hrcreplay.robot import irb140
 
 #: Time between two packets of a real controller [ns].
 PERIOD_NS = 4_032_000
@@ -36,14 +37,12 @@ class Axes:
     """Top acceleration, either way [deg/s^2]."""
 
 
-_TOP_DEG_PER_S = (200.0, 200.0, 260.0, 360.0, 360.0, 450.0)
-
 #: Range and speed of the product specification. No acceleration is published: full speed to rest in 0.15 s is ours.
 IRB140 = Axes(
-    low_deg=(-180.0, -90.0, -230.0, -200.0, -115.0, -400.0),
-    high_deg=(180.0, 110.0, 50.0, 200.0, 115.0, 400.0),
-    speed_deg_per_s=_TOP_DEG_PER_S,
-    acceleration_deg_per_s2=tuple(speed / 0.15 for speed in _TOP_DEG_PER_S),
+    low_deg=tuple(float(axis.range_deg[0]) for axis in irb140.AXES),
+    high_deg=tuple(float(axis.range_deg[1]) for axis in irb140.AXES),
+    speed_deg_per_s=tuple(float(axis.speed_deg_per_s) for axis in irb140.AXES),
+    acceleration_deg_per_s2=tuple(axis.speed_deg_per_s / 0.15 for axis in irb140.AXES),
 )
 
 

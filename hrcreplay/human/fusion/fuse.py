@@ -11,20 +11,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
+from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, process_variance
 from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
 from hrcreplay.human.model import LimitSet, nearest
-from hrcreplay.records import BODY, JOINTS, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
+from hrcreplay.records import BODY, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
-ROWS = len(JOINTS) + len(LENGTHS)
 _NEVER_NS = -(2**62)
 #: A person nobody has measured: upright, arms hanging; and how wrong that may be [m, m, rad...].
 _NEUTRAL = (0.0, 0.0, 0.0, 0.1, 0.1, 0.3, 0.0, 2.6, 0.1, 0.3, 0.0, 2.6)
 _NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2)
-#: Median man (upper arm 0.36 m, shoulders at 1.44 m), and how wrong that may be [m].
-_LENGTHS_M = (0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
+#: LENGTHS of the median man (upper arm 0.36 m, shoulders at 1.44 m), and how wrong that may be [m].
+MEDIAN_LENGTHS_M = (0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
 _LENGTHS_STD_M = 0.1
 #: How fast a joint may be moving that nobody sees: v, a, j of x and y [m/s...], of an angle [rad/s...].
 _REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10)
@@ -38,7 +38,7 @@ FusionState = Filter
 class Trace:
     """What a smoother needs beside the states: P of every tick, and how it was reached."""
 
-    cov: Floats  #: (n, 12, 4, 4) covariance of p, v, a, j
+    cov: Floats  #: (n, 12, 4, 4) covariance of p, v, a, j; no rows where the ticks were not traced
     damping: Floats  #: (n, 12) of the derivatives on the way to the tick; 1 unless the joint was unseen
 
 
@@ -54,7 +54,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         started=np.zeros(1, dtype=np.bool_),
         mean=mean,
         cov=cov,
-        lengths=np.array(_LENGTHS_M),
+        lengths=np.array(MEDIAN_LENGTHS_M),
         lengths_var=np.full(len(LENGTHS), _LENGTHS_STD_M**2),
         row_ns=np.full(ROWS, _NEVER_NS),
         acquired_ns=np.full(ROWS, _NEVER_NS),
@@ -79,8 +79,14 @@ def start(cameras: tuple[str, ...]) -> FusionState:
 
 
 def fuse(
-    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: Fusion, limits: LimitSet
-) -> tuple[FusionState, HumanStates, Counter[str]]:
+    state: FusionState,
+    ticks_ns: Ints,
+    measurements: Measurements,
+    settings: Fusion,
+    limits: LimitSet,
+    *,
+    traced: bool = False,
+) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
     """Alg. 3: one tick after another, each with the frames that arrived in (previous tick, tick].
 
     The filter is that of Eq. (42)-(57) with Eq. (44) corrected: per joint p, v, a, j under Eq. (43), per length a
@@ -98,63 +104,14 @@ def fuse(
         measurements: Rows in order of arrival, none after ``ticks_ns[-1]`` and none given before.
         settings: Of the filter.
         limits: Bounds for the saturation.
+        traced: Whether to keep what ``smooth`` needs, 1.5 kB a tick; changes no state.
 
     Returns:
-        The filter after the last tick, the states (n ticks; NaN before the first valid row), and counts of events:
+        The filter after the last tick, the states (n ticks; NaN before the first valid row), counts of events:
         ``outlier_points_<camera>``, ``superseded_frames_<camera>`` (a newer frame had come), ``joints_reacquired``,
-        ``ticks_saturated``. The bits of the states do not depend on how ticks are cut into calls.
+        ``ticks_saturated``, and the trace of the n ticks, which has no rows unless ``traced``. The bits of the states
+        do not depend on how ticks are cut into calls.
     """
-    after, states, counts, _ = _fuse(state, ticks_ns, measurements, settings, limits, traced=False)
-    return after, states, counts
-
-
-def fuse_traced(
-    state: FusionState, ticks_ns: Ints, measurements: Measurements, settings: Fusion, limits: LimitSet
-) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
-    """``fuse``, and the covariances that ``smooth`` needs (1.5 kB a tick).
-
-    Args:
-        state: From ``start`` or the previous call. It is not changed.
-        ticks_ns: (n,) instants, after those of the previous call.
-        measurements: Rows in order of arrival, none after ``ticks_ns[-1]`` and none given before.
-        settings: Of the filter.
-        limits: Bounds for the saturation.
-
-    Returns:
-        The filter after the last tick, the states and the counts of ``fuse``, and the trace of the n ticks.
-    """
-    return _fuse(state, ticks_ns, measurements, settings, limits, traced=True)
-
-
-def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats:
-    """Diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds.
-
-    Args:
-        settings: Of the filter.
-        j: Index into JOINTS.
-        dt: Length of the step [s].
-        damping: Factor on the derivatives over the step; 1 unless the joint is unseen.
-
-    Returns:
-        Variances that the step adds to p, v, a, j [m^2 or rad^2, and these per s^2, s^4, s^6].
-    """
-    sigma = _sigma(settings)[j]
-    return np.array([process_variance(a, dt, damping, sigma, _REST_STD[j]) for a in range(4)])
-
-
-def _sigma(settings: Fusion) -> Floats:
-    return np.array((settings.sigma_position, settings.sigma_angle))[_KIND]
-
-
-def _fuse(
-    state: FusionState,
-    ticks_ns: Ints,
-    measurements: Measurements,
-    settings: Fusion,
-    limits: LimitSet,
-    *,
-    traced: bool,
-) -> tuple[FusionState, HumanStates, Counter[str], Trace]:
     after = Filter._make([array.copy() for array in state])
     track = _track(len(ticks_ns), len(measurements.cameras), traced=traced)
     run(np.array(ticks_ns), _frames(measurements), after, _rules(settings, limits), track)
@@ -182,13 +139,34 @@ def _fuse(
     return after, states, counts, Trace(cov=track.cov, damping=track.damping)
 
 
+def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats:
+    """Diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds.
+
+    Args:
+        settings: Of the filter.
+        j: Index into JOINTS.
+        dt: Length of the step [s].
+        damping: Factor on the derivatives over the step; 1 unless the joint is unseen.
+
+    Returns:
+        Variances that the step adds to p, v, a, j [m^2 or rad^2, and these per s^2, s^4, s^6].
+    """
+    sigma = _sigma(settings)[j]
+    return np.array([process_variance(a, dt, damping, sigma, _REST_STD[j]) for a in range(4)])
+
+
+def _sigma(settings: Fusion) -> Floats:
+    return np.array((settings.sigma_position, settings.sigma_angle))[_KIND]
+
+
 def _frames(measurements: Measurements) -> Frames:
+    """The measurements as the kernel takes them: in arrays of its own, for those of a record are read-only."""
     return Frames(
         capture_ns=np.array(measurements.capture_ns),
         arrival_ns=np.array(measurements.arrival_ns),
         camera=np.array(measurements.camera),
-        z=np.concatenate((measurements.angles, measurements.lengths_m), axis=1),
-        z_var=np.concatenate((measurements.angles_std, measurements.lengths_std_m), axis=1) ** 2,
+        z=np.array(measurements.z),
+        z_var=measurements.z_std**2,
         points=np.array(measurements.points_m),
         confidence=np.array(measurements.confidence),
     )
@@ -253,7 +231,7 @@ def smooth(states: HumanStates, trace: Trace, settings: Fusion) -> HumanStates:
 
     Args:
         states: Of one whole run.
-        trace: Of the same ticks, from ``fuse_traced``.
+        trace: Of the same ticks, from ``fuse``.
         settings: Those of the run.
 
     Returns:

@@ -92,15 +92,12 @@ def measure(frames: CameraFrames, T_world_camera: Floats, settings: Fusion) -> M
     _measure_rows(
         frames.camera, frames.points_m, frames.confidence, np.array(T_world_camera), noise, points, rows, variances
     )
-    std = np.sqrt(variances)
     return Measurements(
         capture_ns=frames.capture_ns,
         arrival_ns=frames.arrival_ns,
         camera=frames.camera,
-        angles=rows[:, :12].copy(),
-        angles_std=std[:, :12].copy(),
-        lengths_m=rows[:, 12:].copy(),
-        lengths_std_m=std[:, 12:].copy(),
+        z=rows,
+        z_std=np.sqrt(variances),
         points_m=points,
         confidence=frames.confidence,
         cameras=frames.cameras,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import SHOWN_BY, LimitSet, alpha_2_bounds, alpha_3_bounds
-from hrcreplay.human.prediction.sound_reach import enclose, likely
+from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, likely
 from hrcreplay.records import Bools, Floats, HumanStates, Ints, Table
 from hrcreplay.settings.sections import Occupancy
 
@@ -26,6 +27,15 @@ class Reach(Table):
     t_ns: Ints  #: (n,)
     low: Floats  #: (n, 12) JOINTS [m, m, rad...]; NaN where the state is
     high: Floats  #: (n, 12)
+
+
+class MotionLimits(NamedTuple):
+    """What bounds the motions that a printed method predicts from."""
+
+    bounds: Floats  #: (6, 12) of ``bounds_of``
+    coupled: bool  #: whether Eq. (34b), (34c) hold
+    horizon: float  #: braking time T_s of the robot [s]
+    method: int  #: index into METHODS of one of PRINTED
 
 
 def reachable(
@@ -52,12 +62,13 @@ def reachable(
     """
     code = code_of(occupancy.method)
     if code == SOUND:
-        at, span_s = likely(states, occupancy, memory_s), horizon_s + occupancy.latency_s
-        low, high = enclose(at, bounds_of(limits), limits.coupled, span_s, memory_s)
+        within = SoundMotionLimits(bounds_of(limits), limits.coupled, horizon_s + occupancy.latency_s, memory_s)
+        low, high = enclose(likely(states, occupancy, memory_s), within)
         return Reach(states.t_ns, low, high)
     low, high = np.empty_like(states.p), np.empty_like(states.p)
     p, v = np.ascontiguousarray(states.p), np.ascontiguousarray(states.v)
-    _reach_rows(p, v, never_measured(states), bounds_of(limits), limits.coupled, horizon_s, code, low, high)
+    allowed = MotionLimits(bounds_of(limits), limits.coupled, horizon_s, code)
+    _reach_rows(p, v, never_measured(states), allowed, low, high)
     return Reach(states.t_ns, low, high)
 
 
@@ -83,33 +94,13 @@ def bounds_of(limits: LimitSet) -> Floats:
 
 
 @njit(cache=True)
-def _reach_rows(
-    p: Floats,
-    v: Floats,
-    never: Bools,
-    bounds: Floats,
-    coupled: bool,
-    horizon: float,
-    method: int,
-    low: Floats,
-    high: Floats,
-) -> None:
+def _reach_rows(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Floats, high: Floats) -> None:
     for i in range(len(p)):
-        reach_row(p[i], v[i], never[i], bounds, coupled, horizon, method, low[i], high[i])
+        reach_row(p[i], v[i], never[i], within, low[i], high[i])
 
 
 @njit(cache=True)
-def reach_row(
-    p: Floats,
-    v: Floats,
-    never: Bools,
-    bounds: Floats,
-    coupled: bool,
-    horizon: float,
-    method: int,
-    low: Floats,
-    high: Floats,
-) -> None:
+def reach_row(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Floats, high: Floats) -> None:
     """Writes the reachable interval of every joint from p, v (12,) into low, high (12,); ``never`` was it measured.
 
     Alg. 1 and its clipping to Eq. (34), (35); walking is Eq. (18)-(30).
@@ -118,13 +109,11 @@ def reach_row(
         p: (12,) JOINTS [m, m, rad...].
         v: (12,) their velocities [m/s, m/s, rad/s...].
         never: (12,) whether no camera has ever shown the joint.
-        bounds: (6, 12) of ``bounds_of``.
-        coupled: Whether Eq. (34b), (34c) hold.
-        horizon: Braking time T_s of the robot [s].
-        method: Index into METHODS of one of PRINTED.
+        within: What bounds the motions.
         low: (12,) receives the lower ends [m, m, rad...].
         high: (12,) receives the upper ends [m, m, rad...].
     """
+    bounds, coupled, horizon, method = within
     _walk(p, v, bounds, horizon, method, low, high)
     for j in range(3, 12):
         if method == PAPER:

@@ -30,6 +30,15 @@ class Likely(NamedTuple):
     unseen_s: Floats  #: (n, 12) for how long a joint has not been seen, 0 within its memory [s]
 
 
+class SoundMotionLimits(NamedTuple):
+    """What bounds the motions that ``sound`` encloses."""
+
+    bounds: Floats  #: (6, 12) of ``reachable_sets.bounds_of``
+    coupled: bool  #: whether Eq. (34b), (34c) hold
+    horizon: float  #: horizon and latency [s]
+    memory: float  #: how long the filter goes on without a measurement [s]
+
+
 def likely(states: HumanStates, occupancy: Occupancy, memory_s: float) -> Likely:
     """The states that ``sound`` starts from; a limb unseen for longer than ``memory_s`` [s] may have moved since."""
     unseen = np.where(states.unseen_s > memory_s, states.unseen_s, 0.0)[:, SHOWN_BY]
@@ -38,17 +47,7 @@ def likely(states: HumanStates, occupancy: Occupancy, memory_s: float) -> Likely
 
 
 @njit(cache=True)
-def enclose_row(
-    i: int,
-    at: Likely,
-    bounds: Floats,
-    coupled: bool,
-    horizon: float,
-    memory: float,
-    low: Floats,
-    high: Floats,
-    corners: Floats,
-) -> None:
+def enclose_row(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high: Floats, corners: Floats) -> None:
     """Writes the intervals (12,) of row i, and the corners (SIDES, 2) of the polygon around the pelvis [m].
 
     A joint unseen for longer than its memory may since have had any velocity within the bounds; its horizon starts
@@ -57,25 +56,23 @@ def enclose_row(
     Args:
         i: Row of ``at``.
         at: Where people may be.
-        bounds: (6, 12) of ``reachable_sets.bounds_of``.
-        coupled: Whether Eq. (34b), (34c) hold.
-        horizon: Horizon and latency [s].
-        memory: How long the filter goes on without a measurement [s].
+        within: What bounds their motions.
         low: (12,) receives the lower ends [m, m, rad...]; NaN where the state is.
         high: (12,) receives the upper ends.
         corners: (SIDES, 2) receives the corners, world [m]; NaN where the state is.
     """
-    _walk(i, at, bounds, horizon, memory, low, high, corners)
+    _walk(i, at, within, low, high, corners)
     for j in range(3, 12):
-        limit = stops(j, bounds, coupled, low, high)
+        limit = stops(j, within.bounds, within.coupled, low, high)
         if at.unseen_s[i, j] == np.inf:
             low[j], high[j] = limit[0], limit[3]
         else:
-            low[j], high[j] = _joint(i, j, at, bounds, limit, horizon, memory)
+            low[j], high[j] = _joint(i, j, at, within, limit)
 
 
 @njit(cache=True)
-def _joint(i: int, j: int, at: Likely, bounds: Floats, limit: Stops, horizon: float, memory: float) -> Range:
+def _joint(i: int, j: int, at: Likely, within: SoundMotionLimits, limit: Stops) -> Range:
+    bounds, _, horizon, memory = within
     p, off, unseen = at.p[i, j], at.p_off[i, j], at.unseen_s[i, j]
     if np.isnan(p + off + at.v[i, j] + at.v_off[i, j]):
         return np.nan, np.nan
@@ -89,16 +86,8 @@ def _joint(i: int, j: int, at: Likely, bounds: Floats, limit: Stops, horizon: fl
 
 
 @njit(cache=True)
-def _walk(
-    i: int,
-    at: Likely,
-    bounds: Floats,
-    horizon: float,
-    memory: float,
-    low: Floats,
-    high: Floats,
-    corners: Floats,
-) -> None:
+def _walk(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high: Floats, corners: Floats) -> None:
+    bounds, _, horizon, memory = within
     p, off, v, v_off = at.p[i, :3], at.p_off[i, :3], at.v[i, :3], at.v_off[i, :3]
     low[:3], high[:3], corners[:] = np.nan, np.nan, np.nan
     span = horizon + at.unseen_s[i, :3].max()
@@ -125,28 +114,15 @@ def _walk(
     low[2], high[2] = turned(heading, velocity[2], bounds, span)
 
 
-def enclose(at: Likely, bounds: Floats, coupled: bool, span_s: float, memory_s: float) -> tuple[Floats, Floats]:
-    """Reachable intervals of all rows.
-
-    Args:
-        at: Where people may be.
-        bounds: (6, 12) of ``reachable_sets.bounds_of``.
-        coupled: Whether (34b), (34c) hold.
-        span_s: Horizon and latency [s].
-        memory_s: How long the filter goes on without a measurement [s].
-
-    Returns:
-        Lower and upper ends, (n, 12) each [m, m, rad...].
-    """
+def enclose(at: Likely, within: SoundMotionLimits) -> tuple[Floats, Floats]:
+    """Reachable intervals of all rows: lower and upper ends, (n, 12) each [m, m, rad...]."""
     low, high = np.empty_like(at.p), np.empty_like(at.p)
-    _enclose_rows(at, bounds, coupled, span_s, memory_s, low, high)
+    _enclose_rows(at, within, low, high)
     return low, high
 
 
 @njit(cache=True)
-def _enclose_rows(
-    at: Likely, bounds: Floats, coupled: bool, horizon: float, memory: float, low: Floats, high: Floats
-) -> None:
+def _enclose_rows(at: Likely, within: SoundMotionLimits, low: Floats, high: Floats) -> None:
     corners = np.empty((SIDES, 2))
     for i in range(len(at.p)):
-        enclose_row(i, at, bounds, coupled, horizon, memory, low[i], high[i], corners)
+        enclose_row(i, at, within, low[i], high[i], corners)

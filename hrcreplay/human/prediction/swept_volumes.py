@@ -32,8 +32,8 @@ from numba import njit
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.prediction.reachable_sets import SOUND, bounds_of, code_of, never_measured, reach_row
-from hrcreplay.human.prediction.sound_reach import Likely, enclose_row, likely
+from hrcreplay.human.prediction.reachable_sets import SOUND, MotionLimits, bounds_of, code_of, never_measured, reach_row
+from hrcreplay.human.prediction.sound_reach import Likely, SoundMotionLimits, enclose_row, likely
 from hrcreplay.human.prediction.sweep import (
     MOST_COPIES,
     TRIANGLE_RAD,
@@ -97,10 +97,7 @@ def predict(
         np.ascontiguousarray(states.v),
         never_measured(states),
         np.ascontiguousarray(states.lengths_m),
-        bounds_of(limits),
-        limits.coupled,
-        horizon_s,
-        code,
+        MotionLimits(bounds_of(limits), limits.coupled, horizon_s, code),
         surface(),
     )
     return SweptVolumes(states.t_ns, offsets, vertices, np.tile(radius, (len(states), 1)), LIMBS, occupancy.method)
@@ -108,15 +105,7 @@ def predict(
 
 @njit(cache=True)
 def _predict_rows(
-    p: Floats,
-    v: Floats,
-    never: Bools,
-    lengths: Floats,
-    bounds: Floats,
-    coupled: bool,
-    horizon: float,
-    method: int,
-    work: Surface,
+    p: Floats, v: Floats, never: Bools, lengths: Floats, within: MotionLimits, work: Surface
 ) -> tuple[Floats, Ints]:
     limbs = 6
     offsets = np.zeros(len(p) * limbs + 1, np.int64)
@@ -124,17 +113,24 @@ def _predict_rows(
     low, high = np.empty(12), np.empty(12)
     n = 0
     for i in range(len(p)):
-        reach_row(p[i], v[i], never[i], bounds, coupled, horizon, method, low, high)
+        reach_row(p[i], v[i], never[i], within, low, high)
         for limb in range(limbs):
             swept, count = _sweep_limb(limb, low, high, lengths[i], work)
-            if n + count > len(vertices):
-                roomier = np.empty((2 * (n + count), 3))
-                roomier[:n] = vertices[:n]
-                vertices = roomier
-            vertices[n : n + count] = swept[:count]
+            vertices = _append(vertices, n, swept, count)
             n += count
             offsets[i * limbs + limb + 1] = n
     return vertices[:n].copy(), offsets
+
+
+@njit(cache=True)
+def _append(vertices: Floats, n: int, swept: Floats, count: int) -> Floats:
+    """The vertices with the first ``count`` of ``swept`` behind their first n rows, in a larger array if need be."""
+    if n + count > len(vertices):
+        roomier = np.empty((2 * (n + count), 3))
+        roomier[:n] = vertices[:n]
+        vertices = roomier
+    vertices[n : n + count] = swept[:count]
+    return vertices
 
 
 @njit(cache=True)
@@ -195,10 +191,7 @@ def sweep_sound(
         likely(states, occupancy, memory_s),
         np.ascontiguousarray(states.lengths_m),
         np.ascontiguousarray(occupancy.sigmas * states.lengths_std_m),
-        bounds_of(limits),
-        limits.coupled,
-        span_s,
-        memory_s,
+        SoundMotionLimits(bounds_of(limits), limits.coupled, span_s, memory_s),
         occupancy.hand_m,
         len(LIMBS) + occupancy.legs,
         surface(),
@@ -242,10 +235,7 @@ def _sweep_rows(
     at: Likely,
     lengths: Floats,
     lengths_off: Floats,
-    bounds: Floats,
-    coupled: bool,
-    horizon: float,
-    memory: float,
+    within: SoundMotionLimits,
     hand: float,
     limbs: int,
     work: Surface,
@@ -255,17 +245,13 @@ def _sweep_rows(
     low, high, corners = np.empty(12), np.empty(12), np.empty((SIDES, 2))
     n = 0
     for i in range(len(at.p)):
-        enclose_row(i, at, bounds, coupled, horizon, memory, low, high, corners)
+        enclose_row(i, at, within, low, high, corners)
         for limb in range(limbs):
             if limb == _LEGS:
                 swept, count = _legs(corners, lengths[i, 0] + lengths_off[i, 0])
             else:
                 swept, count = _limb(limb, low, high, corners, lengths[i], lengths_off[i], hand, work)
-            if n + count > len(vertices):
-                roomier = np.empty((2 * (n + count), 3))
-                roomier[:n] = vertices[:n]
-                vertices = roomier
-            vertices[n : n + count] = swept[:count]
+            vertices = _append(vertices, n, swept, count)
             n += count
             offsets[i * limbs + limb + 1] = n
     return vertices[:n].copy(), offsets

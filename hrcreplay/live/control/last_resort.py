@@ -148,7 +148,7 @@ def _record(
     u = (np.radians(brake.dq) - dq) / brake.cycle_s
     where = np.full(len(q), np.nan) if measured is None else np.radians(measured)
     unknown = np.full(3, np.nan)
-    row = MotionRow(where, q, dq, u, unknown, unknown, np.full(4, np.nan))
+    row = MotionRow(where, q, dq, u, unknown, unknown, *[np.nan] * 4)
     phase = codec.HOLDING if brake.at_rest else codec.STOPPING
     answer = Decision(t_ns, 0, data, phase, BRAKING, watchdog.FAULT, -1, -1, row)
     loop.recorder.send(codec.encode_decision(answer, Signal.NONE, len(datagrams), 0))

@@ -1,4 +1,9 @@
-"""Stages 1 and 2 of a live session: skeletons in, fused person and swept volumes out, one update at a time."""
+"""Stages 1 and 2 of a live session: skeletons in, fused person and swept volumes out, one update at a time.
+
+The bytes that are decoded here are those that are recorded, and they are cleaned as a reader of the log will clean
+them. What the process of the person has cleaned before is not enough: the message rounds to 32 bits, by which a
+skeleton may become that of the frame before it, and a capture is judged by the session's clock only here.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +15,10 @@ from google.protobuf.message import DecodeError
 
 from hrcreplay.human.fusion import fuse
 from hrcreplay.live.record.codec import Perception
-from hrcreplay.logs import skeleton_pb2
 from hrcreplay.logs.clean import Cleaner, PersonMemory
-from hrcreplay.logs.decoders import points_of
-from hrcreplay.logs.messages import RawSkeleton, Undecodable
+from hrcreplay.logs.decoders import own_row
+from hrcreplay.logs.messages import Undecodable
+from hrcreplay.logs.skeleton_pb2 import Skeleton
 from hrcreplay.records import CameraFrames
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.run.stages import NS, FusionStage, PredictionStage, no_frames
@@ -50,7 +55,7 @@ class Observer:
             for camera, capture_ns in zip(measured.camera.tolist(), measured.capture_ns.tolist(), strict=True):
                 self.newest_ns[self._cameras[camera]] = capture_ns
         ticks = np.array([t_ns])
-        self._fusion, states, events = fuse.fuse(
+        self._fusion, states, events, _ = fuse.fuse(
             self._fusion, ticks, measured, self._fusion_stage.filter, self._fusion_stage.limits
         )
         self.counts.update(events)
@@ -64,7 +69,8 @@ class Observer:
     def _frames(self, t_ns: int, skeletons: Sequence[bytes]) -> CameraFrames | None:
         for data in skeletons:
             try:
-                row = _row(data)
+                skeleton = Skeleton.FromString(data)
+                row = own_row(skeleton, skeleton.camera, skeleton.camera)
             except (DecodeError, Undecodable):
                 self.counts["skeletons_unreadable"] += 1
                 continue
@@ -74,13 +80,3 @@ class Observer:
             # a camera whose clock is ahead has seen nothing of the future
             self._cleaner.add(row._replace(capture_ns=min(row.capture_ns or t_ns, t_ns)), t_ns)
         return self._cleaner.flush()
-
-
-def _row(data: bytes) -> RawSkeleton:
-    skeleton = skeleton_pb2.Skeleton.FromString(data)
-    points = points_of(skeleton.points, skeleton.camera)
-    if len(skeleton.confidence) != len(points):
-        raise Undecodable(f"{skeleton.camera}: {len(skeleton.confidence)} confidences")
-    return RawSkeleton(
-        skeleton.capture_ns, skeleton.camera, skeleton.body, points, np.array(skeleton.confidence, np.float64)
-    )

@@ -234,6 +234,15 @@ def _decoded(data: bytes) -> RobotPacket | None:
 
 def _row(measured: Floats, before: MotionState, result: MotionStep) -> MotionRow:
     pose, state = result.step.pose, before.state
-    speed = float(np.linalg.norm(pose.J_tcp[:3] @ state.dq))
-    rest = np.array([speed, result.reference_speed, result.after.programme_s, result.step.distance_m])
-    return MotionRow(measured, state.q, state.dq, result.step.u, result.reference_m, pose.T_world_tcp[:3, 3], rest)
+    return MotionRow(
+        q_measured=measured,
+        q=state.q,
+        dq=state.dq,
+        u=result.step.u,
+        ref_m=result.reference_m,
+        tcp_m=pose.T_world_tcp[:3, 3],
+        tcp_speed=float(np.linalg.norm(pose.J_tcp[:3] @ state.dq)),
+        ref_speed=result.reference_speed,
+        programme_s=result.after.programme_s,
+        distance_m=result.step.distance_m,
+    )

@@ -19,6 +19,7 @@ from hrcreplay.calibration.cell import Cell
 from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_robot
 from hrcreplay.egm.protocol import EgmSession
 from hrcreplay.errors import SettingsError
+from hrcreplay.human.fusion.fuse import MEDIAN_LENGTHS_M
 from hrcreplay.human.model import LimitSet, skeleton
 from hrcreplay.live.control.motion import ControlSetup, Follower
 from hrcreplay.live.control.perception import Observer
@@ -61,9 +62,8 @@ def live_job(
         SettingsError: A setting or the cell cannot be used, or there is no camera.
         LogError: The recording cannot be read.
     """
-    span: dict[str, Any] = {"start_s": None, "end_s": None}
     if human is not None:
-        job = resolve("live", human, config=config, overrides=overrides, cell_file=cell_file, **span)
+        job = resolve("live", human, config=config, overrides=overrides, cell_file=cell_file)
         return job, open_log(job.log, job.settings.logs).header
     settings = load_settings(config, overrides)
     cameras = tuple(sorted(settings.live.zenoh.keys))
@@ -219,9 +219,6 @@ _TICKS = 400
 _TICK_NS = 4_032_000
 _FRAME_EVERY = 8
 
-#: Lengths of somebody, in the order of LENGTHS [m].
-_LENGTHS_M = np.array([[0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
-
 
 def compile_kernels(start: dict[str, Any]) -> None:
     """Compiles every kernel by a simulated session of 1.6 s with a person who walks up to the robot."""
@@ -249,7 +246,7 @@ def compile_kernels(start: dict[str, Any]) -> None:
 def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int) -> bytes:
     """Somebody at a place, arms half bent."""
     joints = np.array([[place_m[0], place_m[1], np.pi, 0.1, 0.1, 0.5, 0.0, 1.8, 0.1, 0.5, 0.0, 1.8]])
-    points = skeleton(joints, _LENGTHS_M)[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
+    points = skeleton(joints, np.array([MEDIAN_LENGTHS_M]))[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
     message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=1)
     message.points.extend(points.ravel().tolist())
     message.confidence.extend(np.isfinite(points[:, 0]).astype(float).tolist())

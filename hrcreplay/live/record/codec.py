@@ -62,7 +62,7 @@ class TickEvent:
 
 @dataclass(frozen=True, slots=True)
 class MotionRow:
-    """The commanded motion of one answer. Angles in rad, positions in the world in m."""
+    """The commanded motion of one answer. Angles in rad, positions in the world in m; recorded in this order."""
 
     q_measured: Floats  #: (6,) where it said it was
     q: Floats  #: (6,) commanded position at the tick
@@ -70,20 +70,25 @@ class MotionRow:
     u: Floats  #: (6,) acceleration applied from the tick on
     ref_m: Floats  #: (3,) programmed TCP position
     tcp_m: Floats  #: (3,) TCP position at ``q``
-    rest: Floats  #: (4,) TCP speed, reference's speed [m/s], programmed time [s], separation [m]
+    tcp_speed: float  #: [m/s]
+    ref_speed: float  #: of the reference [m/s]
+    programme_s: float  #: programmed time [s]
+    distance_m: float  #: separation [m]
 
     def flat(self) -> Floats:
         """(34,) all numbers one after another."""
-        return np.concatenate((self.q_measured, self.q, self.dq, self.u, self.ref_m, self.tcp_m, self.rest))
+        numbers = (self.tcp_speed, self.ref_speed, self.programme_s, self.distance_m)
+        return np.concatenate((self.q_measured, self.q, self.dq, self.u, self.ref_m, self.tcp_m, numbers))
 
     @classmethod
     def of(cls, flat: Floats) -> MotionRow:
         """The inverse of ``flat``."""
-        return cls(*np.split(flat, np.cumsum(WIDTHS)[:-1]))
+        q_measured, q, dq, u, ref_m, tcp_m, numbers = np.split(flat, np.cumsum(_WIDTHS))
+        return cls(q_measured, q, dq, u, ref_m, tcp_m, *numbers.tolist())
 
 
-#: Of the fields of a MotionRow.
-WIDTHS = (AXES, AXES, AXES, AXES, 3, 3, 4)
+#: Of the vectors of a MotionRow, which its numbers follow.
+_WIDTHS = (AXES, AXES, AXES, AXES, 3, 3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,12 +120,10 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
 def _motion(answers: list[codec.RecordedDecision], limbs: tuple[str, ...], links: tuple[str, ...]) -> Columns:
     rows = [row for answered in answers if (row := codec.motion_row(answered)) is not None]
     column: dict[str, Floats] = {f.name: np.array([getattr(row, f.name) for row in rows]) for f in fields(MotionRow)}
-    rest = dict(zip(("tcp_speed", "ref_speed", "programme_s", "distance_m"), column["rest"].T, strict=True))
     reasons = ("", *sorted({answered.reason for answered in answers} - {""}))
     motion = Motion(
         t_ns=np.array([answered.t_ns for answered in answers]),
-        **{name: column[name] for name in ("q", "dq", "u", "ref_m", "tcp_m")},
-        **rest,
+        **{name: values for name, values in column.items() if name != "q_measured"},
         limb=np.array([answered.limb for answered in answers]),
         link=np.array([answered.link for answered in answers]),
         status=np.array([answered.status for answered in answers]),

@@ -22,7 +22,6 @@ from threading import Event, Thread
 from typing import IO, Any
 
 import numpy as np
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 from mcap.writer import CompressionType, Writer
 
@@ -30,6 +29,7 @@ from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.live.record import codec, topics
 from hrcreplay.logs import messages as own
 from hrcreplay.logs import skeleton_pb2 as pb
+from hrcreplay.logs.writer import register_schema
 
 READY = b"K"
 FLUSH_S = 0.2
@@ -100,19 +100,11 @@ class SessionLogWriter:
         channel = self._channels.get(topic)
         if channel is None:
             encoding = "json" if topic == topics.EVENT else topics.ENCODING if kind is None else "protobuf"
-            channel = self._writer.register_channel(topic, encoding, 0 if kind is None else self._schema(kind))
+            schema = 0 if kind is None else register_schema(self._writer, self._schemas, kind)
+            channel = self._writer.register_channel(topic, encoding, schema)
             self._channels[topic] = channel
         self._writer.add_message(channel, log_time=t_ns, publish_time=publish_ns, data=data, sequence=self._count)
         self._count = (self._count + 1) % (1 << 32)
-
-    def _schema(self, kind: Any) -> int:
-        name = kind.DESCRIPTOR.full_name
-        if name not in self._schemas:
-            files = FileDescriptorSet()
-            kind.DESCRIPTOR.file.CopyToProto(files.file.add())
-            data = files.SerializeToString(deterministic=True)
-            self._schemas[name] = self._writer.register_schema(name, "protobuf", data)
-        return self._schemas[name]
 
 
 def _flat(pose: list[list[float]] | None) -> list[float]:

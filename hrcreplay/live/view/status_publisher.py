@@ -75,7 +75,6 @@ class StatusPublisher:
         found = loop.reply_times.quantiles_us(0.5, 0.99, 0.999)
         answer = loop.last
         row = None if answer is None else answer.row
-        rest = [math.nan] * 4 if row is None else row.rest.tolist()
         return Status(
             t_s=(now_ns - loop.start_ns) / 1e9,
             phase=PHASES[controller.phase],
@@ -83,10 +82,10 @@ class StatusPublisher:
             robot=loop.robot,
             rate_hz=self._rates.get("", 0.0),
             latency_us=None if found is None else Latency(p50=found[0], p99=found[1], p99_9=found[2]),
-            distance_m=_known(rest[3]),
+            distance_m=None if row is None else _known(row.distance_m),
             limb=None if answer is None or answer.limb < 0 else self._names["limbs"][answer.limb],
             link=None if answer is None or answer.link < 0 else self._names["links"][answer.link],
-            tcp_speed=_known(rest[0]),
+            tcp_speed=None if row is None else _known(row.tcp_speed),
             status=None if row is None or answer is None or not controller.connected else STATUSES[answer.status],
             reason=controller.stop or controller.waiting or ("" if answer is None else answer.reason),
             cameras=[self._camera(name, now_ns) for name in self._names["cameras"]],

@@ -112,7 +112,9 @@ class Sight:
         return Step(self.pose, u, after, self.distance_m, self.limb, self.link, status, reason)
 
 
-def observe(robot: RobotModel, state: RobotState, obstacles: Obstacles, clearance_m: float) -> Sight:
+def observe(
+    robot: RobotModel, state: RobotState, obstacles: Obstacles, clearance_m: float, pose: RobotPose | None = None
+) -> Sight:
     """Pose of the robot and nearest pair of link and limb.
 
     The clearance of Eq. (1), (2) of a pair is the limb's radius, Eq. (41), plus the link's, plus ``clearance_m``.
@@ -122,8 +124,9 @@ def observe(robot: RobotModel, state: RobotState, obstacles: Obstacles, clearanc
         state: At the tick.
         obstacles: The swept volumes of the tick.
         clearance_m: Clearance beyond limb radius + link radius [m].
+        pose: Of the robot in that state, where it has been computed already.
     """
-    pose = robot.pose(state.q, state.dq)
+    pose = robot.pose(state.q, state.dq) if pose is None else pose
     finite = math.isfinite(state.q.sum()) and math.isfinite(pose.J_tcp.sum() + pose.dJdq_tcp.sum())
     if not finite or not obstacles.known:
         return Sight(pose, None, math.nan, -1, -1, NO_HUMAN if finite else NOT_FINITE)

@@ -282,6 +282,7 @@ def step(
     twist_ref: Floats,
     obstacles: Obstacles,
     settings: PlanSettings,
+    pose: RobotPose | None = None,
 ) -> Step:
     """One tick of Section 5: the acceleration of Eq. (66), or that of Eq. (67) where there is none.
 
@@ -294,9 +295,10 @@ def step(
         twist_ref: (6,) its velocity, linear first, world frame [m/s, rad/s].
         obstacles: The swept volumes of the tick.
         settings: Weights and limits.
+        pose: Of the robot in that state, where it has been computed already.
     """
     with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
-        sight = observe(robot, state, obstacles, settings.plan.clearance_m)
+        sight = observe(robot, state, obstacles, settings.plan.clearance_m, pose)
         reason = sight.reason
         if sight.pairs is not None:
             task = problem(robot, state, sight.pose, T_world_ref, twist_ref, obstacles, sight.pairs, settings)

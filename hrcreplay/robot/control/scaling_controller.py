@@ -46,7 +46,12 @@ class _Try:
 
 
 def step(
-    robot: RobotModel, reference: Reference, state: PathState, obstacles: Obstacles, settings: PlanSettings
+    robot: RobotModel,
+    reference: Reference,
+    state: PathState,
+    obstacles: Obstacles,
+    settings: PlanSettings,
+    now: ReferencePoint | None = None,
 ) -> tuple[Step, PathState]:
     """One tick of the baseline: the largest rate in [0, 1] that meets the constraints of Section 5.
 
@@ -62,12 +67,13 @@ def step(
         state: At the tick.
         obstacles: The swept volumes of the tick.
         settings: Limits; weights are not used.
+        now: The reference at ``state``, where it has been computed already.
 
     Returns:
         What was decided, and the state one tick later.
     """
     with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
-        now = reference.sample(state.s_s)
+        now = reference.sample(state.s_s) if now is None else now
         axes = RobotState(now.q, state.rate * now.dq)
         sight = observe(robot, axes, obstacles, settings.plan.clearance_m)
         if sight.reason == control_step.NOT_FINITE:

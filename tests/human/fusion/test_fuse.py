@@ -87,9 +87,9 @@ def test_it_is_the_dense_filter_over_the_whole_state(stale: Any, delay: Any) -> 
     m = random_measurements(150, seed=1)
     t = np.sort(np.random.default_rng(2).choice(ticks(2.0), 300, replace=False))
     first = int(np.searchsorted(t, m.arrival_ns[20]))
-    state, _, _ = fuse(start(CAMERAS), t[:first], until(m, int(t[first - 1])), settings, FREE)
+    state, _, _, _ = fuse(start(CAMERAS), t[:first], until(m, int(t[first - 1])), settings, FREE)
     dense = Dense(state, settings)
-    z, std = np.hstack([m.angles, m.lengths_m]), np.hstack([m.angles_std, m.lengths_std_m])
+    z, std = m.z, m.z_std
     confident = np.stack([m.confidence[:, row].prod(axis=1) >= settings.confidence_min for row in rows_of_points()], 1)
     frames = [
         {"camera": int(m.camera[i]), "capture_ns": m.capture_ns[i], "arrival_ns": m.arrival_ns[i], "z": z[i]}
@@ -102,7 +102,7 @@ def test_it_is_the_dense_filter_over_the_whole_state(stale: Any, delay: Any) -> 
             newest[frame["camera"]] = frame
     dense.held = {c: f | {"uses": int(state.uses[c])} for c, f in newest.items()}
     rest = m.rows(m.arrival_ns > t[first - 1])
-    _, states, _ = fuse(state, t[first:], until(rest, int(t[-1])), settings, FREE)
+    _, states, _, _ = fuse(state, t[first:], until(rest, int(t[-1])), settings, FREE)
     for k in range(first, len(t)):
         dense.predict((t[k] - t[k - 1]) * 1e-9)
         arrived: dict[int, dict[str, Any]] = {}
@@ -123,12 +123,12 @@ def test_it_is_the_dense_filter_over_the_whole_state(stale: Any, delay: Any) -> 
 @pytest.mark.parametrize("stale", ["skip", "reuse"])
 def test_one_tick_at_a_time_gives_the_same_bits_as_all_at_once(stale: Any) -> None:
     settings, m, t = Fusion(stale=stale), random_measurements(120, seed=3, missing=0.5), ticks(1.5)
-    _, whole, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), settings, WIDE)
+    _, whole, counts, _ = fuse(start(CAMERAS), t, until(m, int(t[-1])), settings, WIDE)
     for size in (1, 7):
         state, parts, total, last = start(CAMERAS), [], type(counts)(), -1
         for chunk in (t[i : i + size] for i in range(0, len(t), size)):
             mine = m.rows((m.arrival_ns > last) & (m.arrival_ns <= chunk[-1]))
-            state, part, events = fuse(state, chunk, mine, settings, WIDE)
+            state, part, events, _ = fuse(state, chunk, mine, settings, WIDE)
             parts.append(part)
             total.update(events)
             last = int(chunk[-1])
@@ -205,7 +205,7 @@ def test_an_arm_crossing_the_chest_is_followed_although_its_angles_change_name()
 def test_frames_that_a_newer_one_overtook_are_counted() -> None:
     m = standing(1.0, cameras=(0,))
     t = ticks(1.0, rate_hz=10.0)
-    _, _, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), Fusion(), WIDE)
+    _, _, counts, _ = fuse(start(CAMERAS), t, until(m, int(t[-1])), Fusion(), WIDE)
     used = len(np.unique(np.searchsorted(t, until(m, int(t[-1])).arrival_ns)))
     assert counts["superseded_frames_left"] == len(until(m, int(t[-1]))) - used
 
@@ -223,7 +223,7 @@ def test_the_state_obeys_the_limits_in_the_body_frame() -> None:
     m = measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01))
     t = ticks(2.9)
     limits = load_limits("paper")
-    _, states, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), Fusion(), limits)
+    _, states, counts, _ = fuse(start(CAMERAS), t, until(m, int(t[-1])), Fusion(), limits)
     assert counts["ticks_saturated"] > 100
     for rate, low, high in ((states.v, limits.v_min, limits.v_max), (states.a, limits.a_min, limits.a_max)):
         body = rate.copy()

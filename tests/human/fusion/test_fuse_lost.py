@@ -22,7 +22,7 @@ def test_an_outlier_is_kept_out_and_counted() -> None:
     frames = frames_of(points, m.camera, m.capture_ns, 20_000_000)
     bad = measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01))
     t = ticks(2.0)
-    _, states, counts = fuse(start(CAMERAS), t, until(bad, int(t[-1])), Fusion(), WIDE)
+    _, states, counts, _ = fuse(start(CAMERAS), t, until(bad, int(t[-1])), Fusion(), WIDE)
     assert counts["outlier_points_left"] == 1
     assert counts["outlier_points_right"] == 0
     after = states.t_ns >= m.arrival_ns[k]
@@ -48,7 +48,7 @@ def test_a_person_who_jumped_is_taken_up_again_after_the_memory_and_not_before()
     moved[:2] += 1.5
     m = Measurements.join([standing(1.0), standing(3.0, moved, start_s=1.0)])
     t = ticks(3.0)
-    _, states, counts = fuse(start(CAMERAS), t, until(m, int(t[-1])), Fusion(memory_s=0.5), WIDE)
+    _, states, counts, _ = fuse(start(CAMERAS), t, until(m, int(t[-1])), Fusion(memory_s=0.5), WIDE)
     seconds = t * 1e-9
     np.testing.assert_allclose(states.p[seconds < 1.45][-50:, :2], np.tile(NEUTRAL[:2], (50, 1)), atol=0.05)
     np.testing.assert_allclose(states.p[-1], moved, atol=5e-3)
@@ -70,9 +70,9 @@ def test_a_person_lost_for_long_comes_to_rest_and_stays_finite() -> None:
 
 def test_joints_nobody_has_seen_stand_at_a_neutral_posture_with_a_large_std() -> None:
     m = standing(1.0)
-    angles, stds = m.angles.copy(), m.angles_std.copy()
-    angles[:, 4:8], stds[:, 4:8] = np.nan, np.nan
-    states = fused(replace(m, angles=angles, angles_std=stds), ticks(1.0), Fusion())
+    z, stds = m.z.copy(), m.z_std.copy()
+    z[:, 4:8], stds[:, 4:8] = np.nan, np.nan
+    states = fused(replace(m, z=z, z_std=stds), ticks(1.0), Fusion())
     live = states.t_ns >= m.arrival_ns[0]
     assert np.isfinite(states.p[live]).all()
     assert (states.p_std[live][:, 4:8] > 0.5).all()

@@ -155,8 +155,7 @@ def test_a_missing_point_takes_only_what_rests_on_it(missing: str) -> None:
     found = measure(
         frames_of(points, np.zeros(1, np.int64), np.zeros(1, np.int64)), np.tile(np.eye(4), (2, 1, 1)), NOISE
     )
-    rows = np.concatenate([found.angles[0], found.lengths_m[0]])
-    std = np.concatenate([found.angles_std[0], found.lengths_std_m[0]])
+    rows, std = found.z[0], found.z_std[0]
     gone = DEPENDS[:, AT[missing]].copy()
     if missing.startswith("shoulder"):
         gone[[2, 3, 8, 9, 10, 11]] = False

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hrcreplay.human.fusion.fuse import fuse, start
 from hrcreplay.human.fusion.fuse import fuse as fuse_all
-from hrcreplay.human.fusion.fuse import fuse_traced, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
@@ -48,7 +48,7 @@ def measured(frames: CameraFrames, std_m: float = 0.02) -> Measurements:
 
 def factors(m: Measurements, t: Ints, settings: Fusion | None = None) -> Floats:
     """(n, 12) what the variances of v that are told are, over those of P."""
-    _, states, _, trace = fuse_traced(start(("one",)), t, m, settings or Fusion(), HUMAN)
+    _, states, _, trace = fuse(start(("one",)), t, m, settings or Fusion(), HUMAN, traced=True)
     return np.asarray(states.v_std**2 / trace.cov[:, :, 1, 1])
 
 
@@ -97,7 +97,7 @@ def test_a_marker_that_jumps_off_the_bone_is_no_measurement() -> None:
     points = frames.points_m.copy()
     points[100:300, POINTS.index("wrist_l")] = wrist[100:300] + 0.7 * (wrist - elbow)[100:300]  # within 0.2 m
     t = ticks(7.9)
-    _, states, counts = fuse_all(start(("one",)), t, measured(replace(frames, points_m=points)), Fusion(), HUMAN)
+    _, states, counts, _ = fuse_all(start(("one",)), t, measured(replace(frames, points_m=points)), Fusion(), HUMAN)
     assert counts["outlier_points_one"] == 200
     forearm = LENGTHS.index("pi_forearm_l")
     assert states.lengths_m[-1, forearm] == pytest.approx(0.26, abs=2e-3)
@@ -110,7 +110,9 @@ def test_a_length_that_was_learnt_wrong_is_learnt_anew() -> None:
     short[LENGTHS.index("pi_forearm_l")] = 0.08
     frames, wrong = frames_of(np.tile(POSE, (700, 1))), frames_of(np.tile(POSE, (700, 1)), lengths_m=short)
     points = np.concatenate([wrong.points_m[:100], frames.points_m[100:]])
-    _, states, _ = fuse_all(start(("one",)), ticks(13.9), measured(replace(frames, points_m=points)), Fusion(), HUMAN)
+    _, states, _, _ = fuse_all(
+        start(("one",)), ticks(13.9), measured(replace(frames, points_m=points)), Fusion(), HUMAN
+    )
     forearm = states.lengths_m[:, LENGTHS.index("pi_forearm_l")]
     assert forearm[round(6.5 * RATE_HZ)] == pytest.approx(0.08, abs=0.02)
     assert forearm[-1] == pytest.approx(0.26, abs=0.02)

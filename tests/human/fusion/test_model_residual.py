@@ -115,7 +115,7 @@ def test_chunks_of_any_size_give_the_same_bits(demo: tuple[Measurements, Ints]) 
         state, parts, last = start(m.cameras), [], -1
         for chunk in (t[i : i + size] for i in range(0, len(t), size)):
             mine = m.rows((m.arrival_ns > last) & (m.arrival_ns <= chunk[-1]))
-            state, part, _ = fuse(state, chunk, mine, Fusion(), WIDE)
+            state, part, _, _ = fuse(state, chunk, mine, Fusion(), WIDE)
             parts.append(part)
             last = int(chunk[-1])
         joined = HumanStates.join(parts)

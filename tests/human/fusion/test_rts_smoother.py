@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hrcreplay.human.fusion.fuse import fuse, fuse_traced, smooth, start
+from hrcreplay.human.fusion.fuse import fuse, smooth, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
@@ -43,7 +43,7 @@ def test_it_is_the_least_squares_estimate_given_all_measurements() -> None:
         frames_of(points + rng.normal(0, 0.01, points.shape), capture * 0, capture), T, Fusion(point_std_m=0.01)
     )
     t = np.arange(0, 400_000_000, 10_000_000)
-    _, states, _, trace = fuse_traced(start(CAMERAS), t, m.rows(m.arrival_ns <= t[-1]), settings, LIMITS)
+    _, states, _, trace = fuse(start(CAMERAS), t, m.rows(m.arrival_ns <= t[-1]), settings, LIMITS, traced=True)
     smoothed = smooth(states, trace, settings)
     dt, n = 0.01, len(t)
     F = sum(np.eye(4, k=k) * dt**k / (1, 1, 2, 6)[k] for k in range(4))
@@ -77,7 +77,7 @@ def test_it_is_nearer_to_the_truth_than_the_filter_and_surer() -> None:
     t = np.arange(0, 4_000_000_000, 10_000_000)
     settings = Fusion(spread_least=1.0, spread_most=1.0)
     m = measure(frames, T, Fusion(point_std_m=0.015))
-    _, states, _, trace = fuse_traced(start(CAMERAS), t, m.rows(m.arrival_ns <= t[-1]), settings, LIMITS)
+    _, states, _, trace = fuse(start(CAMERAS), t, m.rows(m.arrival_ns <= t[-1]), settings, LIMITS, traced=True)
     smoothed = smooth(states, trace, settings)
     truth = moving(t * 1e-9)
     live = np.isfinite(states.p[:, 0])
@@ -98,7 +98,7 @@ def test_it_follows_an_arm_that_changes_its_name() -> None:
     points = skeleton(p, np.tile(LENGTHS_M, (len(p), 1)))
     m = measure(frames_of(points, capture * 0, capture), T, Fusion(point_std_m=0.01))
     settings = Fusion()
-    _, states, _, trace = fuse_traced(start(CAMERAS), capture, m, settings, LIMITS)
+    _, states, _, trace = fuse(start(CAMERAS), capture, m, settings, LIMITS, traced=True)
     assert np.abs(np.diff(states.p[:, 8])).max() > 3.0
     smoothed = smooth(states, trace, settings)
     assert np.abs(np.diff(smoothed.p[:, 8])).max() < 0.1
@@ -110,6 +110,6 @@ def test_without_anybody_there_is_nothing_to_smooth() -> None:
     points = skeleton(NEUTRAL[None], LENGTHS_M[None])
     none = measure(frames_of(points, np.zeros(1, np.int64), np.zeros(1, np.int64)), T, Fusion())
     none = replace(none).rows(slice(0, 0))
-    _, states, _, trace = fuse_traced(start(CAMERAS), t, none, Fusion(), LIMITS)
+    _, states, _, trace = fuse(start(CAMERAS), t, none, Fusion(), LIMITS, traced=True)
     assert np.isnan(smooth(states, trace, Fusion()).p).all()
     assert np.isnan(fuse(start(CAMERAS), t, none, Fusion(), LIMITS)[1].p).all()

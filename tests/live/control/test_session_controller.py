@@ -159,7 +159,7 @@ def test_a_person_in_the_way_stops_the_motion_but_not_the_session() -> None:
     assert not flight.controller.stops
     held = [answer for answer in flight.answers if STATUSES[answer.status] != "tracking" and answer.row is not None]
     assert len(held) > 100
-    assert np.nanmin([answer.row.rest[3] for answer in held if answer.row is not None]) < 0.05
+    assert np.nanmin([answer.row.distance_m for answer in held if answer.row is not None]) < 0.05
     tracked = [answer for answer in flight.answers[-100:] if STATUSES[answer.status] == "tracking"]
     assert len(tracked) == 100
     assert moved(flight, after=-100)
@@ -191,7 +191,8 @@ def test_looks_are_the_replay_tick_by_tick() -> None:
     _, measured, _ = fusion_stage.measure(
         CameraFrames.join([frame for frame in frames if frame is not None]), PersonMemory()
     )
-    _, states, _ = fuse.fuse(fuse.start(observer._cameras), ticks, measured, fusion_stage.filter, fusion_stage.limits)
+    before = fuse.start(observer._cameras)
+    states = fuse.fuse(before, ticks, measured, fusion_stage.filter, fusion_stage.limits)[1]
     live = HumanStates.join(flight.states)
     for name in ("p", "v", "a", "j", "p_std", "v_std", "lengths_m", "residual_m", "unseen_s", "valid"):
         assert_array_equal(getattr(live, name), getattr(states, name), err_msg=name)

@@ -99,7 +99,7 @@ def test_motions_are_those_of_the_session(run: Path, flight: Flight) -> None:
         wanted = np.array([getattr(row, column) for _, row in rows])
         np.testing.assert_array_equal(table[[f"{column}{i}" for i in range(1, 7)]], wanted)
     np.testing.assert_array_equal(table[["tcp_x", "tcp_y", "tcp_z"]], [row.tcp_m for _, row in rows])
-    np.testing.assert_array_equal(table["distance_m"], [row.rest[3] for _, row in rows])
+    np.testing.assert_array_equal(table["distance_m"], [row.distance_m for _, row in rows])
     assert table["phase"].tolist() == [PHASES[answer.phase] for answer, _ in rows]
     assert table["status"].tolist() == [STATUSES[answer.status] for answer, _ in rows]
     assert table["reason"].tolist() == [answer.reason for answer, _ in rows]
