@@ -12,15 +12,24 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import hrcreplay
+import hrcreplay  # noqa: F401  # names the folder of compiled kernels
 
 if TYPE_CHECKING:
     from hrcreplay.store.run_folder import Run
 
-#: Whole runs of the demo that more than one file looks at: their tests stay in one process, which makes them once.
-SHARED = ("demo_folder", "printed")
-#: Files whose sessions run in real time, in several processes each: never two of these files at once.
-SESSIONS = ("test_killed.py", "test_session.py", "test_zenoh_session.py")
+#: Files of which one process runs all: sessions in real time, never two of these files at once, and looks at whole runs
+#: of the demo, which that process makes once. These groups take longest and come first.
+GROUPS = {
+    "sessions": ("tests/live/test_killed.py", "tests/live/test_session.py", "tests/live/test_zenoh_session.py"),
+    "demo": ("tests/run/test_replay.py", "tests/readme/test_readme.py"),
+}
+WHOLE_RUNS = {"demo_folder", "printed"}
+
+
+def group_of(nodeid: str) -> str:
+    """Name of the group of a test: one of ``GROUPS``, else its file."""
+    file = nodeid.partition("::")[0]
+    return next((name for name, files in GROUPS.items() if file in files), file)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -40,30 +49,34 @@ def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
 
 
 def _kernels_of(worker: str) -> Path:
-    """Folder of the compiled kernels of a process; hrcreplay itself names that of the first."""
-    assert hrcreplay.__version__
+    """Folder of the compiled kernels of a process, within that of the first, which hrcreplay names on its import."""
     return Path(os.environ["NUMBA_CACHE_DIR"]) / worker
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Names the group of each test, of which one process runs all: those of a shared run, of the sessions, of a file.
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Hands whole groups to the processes, in the order of the tests.
 
-    A process takes the next group as soon as it has run its last, so the long groups come first.
+    ``--dist loadgroup`` would do the same by marks, but pytest-xdist 3.8 does not see them with pytest 9.2.
     """
-    order = {name: number for number, name in enumerate(("sessions", *SHARED))}
-    groups = [_group(item) for item in items]
-    for item, group in zip(items, groups, strict=True):
-        item.add_marker(pytest.mark.xdist_group(group))
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Scheduler(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(nodeid)
+
+    config.option.loadscopereorder = False
+    return Scheduler(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the long groups first where several processes share the tests."""
+    for item in items:
+        if WHOLE_RUNS & set(getattr(item, "fixturenames", ())) and group_of(item.nodeid) != "demo":
+            raise pytest.UsageError(f"{item.nodeid} looks at a whole run of the demo: name its file in GROUPS")
     if "PYTEST_XDIST_WORKER" in os.environ:
-        places = sorted(range(len(items)), key=lambda i: order.get(groups[i], len(order)))
-        items[:] = [items[i] for i in places]
-
-
-def _group(item: pytest.Item) -> str:
-    if item.path.name in SESSIONS:
-        return "sessions"
-    used = getattr(item, "fixturenames", ())
-    return next((name for name in SHARED if name in used), str(item.path.relative_to(item.config.rootpath)))
+        order = {name: number for number, name in enumerate(GROUPS)}
+        items.sort(key=lambda item: order.get(group_of(item.nodeid), len(order)))
 
 
 @pytest.fixture(scope="session")

@@ -32,7 +32,7 @@ def test_a_client_of_others_drives_the_double_without_a_gap(library: str, odd_st
         assert client.stdout is not None
         assert client.stdout.readline() == "ready\n"
         report = run_twin("127.0.0.1", port, duration_s=SECONDS)
-        answered = int(client.communicate(timeout=20)[0])
+        answered = int(client.communicate(timeout=600)[0])
     answers = report.answers
     assert (answers.before_first, answers.missed, answers.doubled, answers.garbage) == (0, 0, 0, 0)
     assert answers.answered == answers.packets == answered
