@@ -97,7 +97,7 @@ class Follower(ABC):
 class QpFollower(Follower):
     """The trajectory generator of Section 5 along a reference that waits for it or not."""
 
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> Proposal | int:
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> Proposal | int:
         error_m = float(np.linalg.norm(sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3]))
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
@@ -116,7 +116,7 @@ class PathFollower(Follower):
     #: Whether the method looks at people at all, and whether the rows of Eq. (66i) bound its rate.
     careful, by_rows = True, False
 
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> Proposal | int:
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> Proposal | int:
         reason = stands(sight, self.settings) if self.careful else 0
         if reason or sight.reason == NOT_FINITE:
             return reason or sight.reason
