@@ -46,7 +46,7 @@ class FallbackBrake:
     seqno: int  #: of the last reply
     stop: list[
         tuple[list[float], list[float]]
-    ]  #: what is left of the stop: joints [deg], speeds [deg/s], a row a cycle
+    ]  #: what is left of it: joints [deg], speeds [deg/s], a row a cycle
 
     @property
     def at_rest(self) -> bool:
