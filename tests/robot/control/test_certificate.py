@@ -1,0 +1,134 @@
+"""Certified motions against a brute force that shares nothing with the certificate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+from hrcreplay.records import Floats
+from hrcreplay.robot.control import certificate
+from hrcreplay.robot.control.approach_rows import tick_rows, worst_rows
+from hrcreplay.robot.control.certificate import NO_PLANES, clear, separating_normal
+from hrcreplay.robot.control.control_step import RobotState, observe
+from hrcreplay.robot.control.stopping import Stop, at_rest, axis_by_axis, straight
+from hrcreplay.robot.model import RobotModel, irb140
+from tests.robot.control.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, run
+
+#: STOP.md's case: joint velocities at which the stop (67) was found to enter deepest [rad/s].
+FAST = np.radians([200.0, -34.0, -50.0, -360.0, -360.0, 450.0])
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return irb140(np.eye(4), stop_s=0.377, tool_m=TOOL_M)
+
+
+def test_no_certified_stop_ever_enters() -> None:
+    found = run(20_000, seed=7)
+    assert found.entered == 0, found
+    assert found.deepest_m > -0.002, "stops near the volumes are among them"
+    assert found.refused_in_vain < 0.1 * (found.certified + found.refused), "nor does it refuse what is clear"
+
+
+def _ball(centre_m: Floats, radius_m: float = 0.05) -> Box:
+    return Box(centre_m, np.eye(3), np.zeros(3), radius_m)
+
+
+def test_the_stop_that_the_rows_allow_and_that_enters_is_refused(robot: RobotModel) -> None:
+    """Every row of (2) holds with 30 mm between wrist and ball, and the stop (67) ends far inside it."""
+    rng, worst = np.random.default_rng(3), -np.inf
+    for _ in range(3000):
+        q = rng.uniform(robot.q_min, robot.q_max) * np.array([1.0, 0.8, 0.5, 1.0, 1.0, 1.0])
+        if np.abs(q[3]) > np.pi or np.abs(q[5]) > np.pi:
+            continue
+        stop = axis_by_axis(q, FAST, robot.ddq_max, DT_S)
+        if np.any(stop.q[-1] < robot.q_min) or np.any(stop.q[-1] > robot.q_max):
+            continue
+        start, end = link_points(q[None])[0, 3], link_points(stop.q[-1:])[0, 3]
+        away = end[-1] - start[-1]
+        if np.linalg.norm(away) < 0.2:
+            continue
+        ball = _ball(start[-1] + away / np.linalg.norm(away) * (0.077 + 0.05 + 0.03))
+        seen = as_obstacles([ball])
+        sight = observe(robot, RobotState(q, FAST), seen, 0.0)
+        assert sight.pairs is not None
+        rows = tick_rows(sight.pose, seen, sight.pairs.room_m2("square"), sight.pairs.distance_m, 0.377)
+        if sight.distance_m < 0.02 or len(worst_rows(rows, FAST, 0.0)[0]):
+            continue
+        going = Stop(q[None], FAST[None], np.full((1, 2), np.nan))
+        depth = deepest_m(going, stop, [ball])
+        worst = max(worst, depth)
+        for brake in (axis_by_axis, straight):
+            made = brake(q, FAST, robot.ddq_max, DT_S)
+            ok, _ = clear(robot, going, made, seen, 0.0, DT_S, NO_PLANES)
+            assert not (ok and deepest_m(going, made, [ball]) > 0.0)
+    assert worst > 0.03, "the rows alone let the robot in"
+
+
+def test_a_robot_at_rest_is_certified_outside_and_refused_inside(robot: RobotModel) -> None:
+    q = np.array([0.1, 0.2, -0.3, 0.0, 0.8, 0.0])
+    tip = link_points(q[None])[0, 4, -1]
+    for gap_m, expected in ((1e-6, True), (-1e-6, False)):
+        seen = as_obstacles([_ball(tip + np.array([0.0, 0.0, -(0.045 + 0.05 + gap_m)]))])
+        below = clear(robot, at_rest(q), at_rest(q), seen, 0.0, DT_S, NO_PLANES)[0]
+        nearest = deepest_m(at_rest(q), at_rest(q), [_ball(tip + np.array([0.0, 0.0, -(0.095 + gap_m)]))])
+        assert below == (nearest < 0.0)
+        if nearest == pytest.approx(-gap_m, abs=1e-9):
+            assert below == expected
+        assert not clear(robot, at_rest(q), at_rest(q), seen, 0.05, DT_S, NO_PLANES)[0], "nor with more clearance"
+
+
+def test_what_is_not_known_or_not_finite_is_refused(robot: RobotModel) -> None:
+    from dataclasses import replace
+
+    q, far = np.zeros(6), as_obstacles([_ball(np.array([5.0, 5.0, 5.0]))])
+    assert clear(robot, at_rest(q), at_rest(q), far, 0.0, DT_S, NO_PLANES)[0]
+    assert not clear(robot, at_rest(q), at_rest(q), replace(far, known=False), 0.0, DT_S, NO_PLANES)[0]
+    assert not clear(robot, at_rest(q), at_rest(np.full(6, np.nan)), far, 0.0, DT_S, NO_PLANES)[0]
+    beyond = np.where(np.arange(6) == 2, robot.q_max + 1e-6, 0.0)
+    assert not clear(robot, at_rest(q), at_rest(beyond), far, 0.0, DT_S, NO_PLANES)[0]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, ValueError])
+def test_where_coal_fails_the_motion_is_refused(
+    robot: RobotModel, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
+) -> None:
+    q = np.zeros(6)
+    near = as_obstacles([_ball(link_points(q[None])[0, 4, -1] + np.array([0.12, 0.0, 0.0]))])
+    assert clear(robot, at_rest(q), at_rest(q), near, 0.0, DT_S, NO_PLANES)[0]
+
+    def fails(*_: object) -> None:
+        raise error("GJK did not converge")
+
+    monkeypatch.setattr(certificate, "_gjk", fails)
+    assert not clear(robot, at_rest(q), at_rest(q), near, 0.0, DT_S, NO_PLANES)[0]
+
+
+def test_the_verdict_does_not_depend_on_planes_that_are_wrong(robot: RobotModel) -> None:
+    rng = np.random.default_rng(5)
+    q = np.array([0.1, 0.2, -0.3, 0.0, 0.8, 0.0])
+    box = Box(link_points(q[None])[0, 4, -1] + np.array([0.3, 0.0, 0.0]), np.eye(3), np.full(3, 0.05), 0.05)
+    wrong = rng.normal(size=(5, 1, 3))
+    wrong /= np.linalg.norm(wrong, axis=2, keepdims=True)
+    for planes in (NO_PLANES, wrong, np.zeros((5, 1, 3))):
+        ok, kept = clear(robot, at_rest(q), at_rest(q), as_obstacles([box]), 0.0, DT_S, planes)
+        assert ok
+        assert kept.shape == (5, 1, 3)
+    np.testing.assert_array_equal(wrong, wrong.copy())
+
+
+def test_the_separating_normal_is_that_of_least_squares() -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(300):
+        points = rng.normal(size=(int(rng.integers(1, 60)), 3)) * rng.uniform(0.0, 0.3, 3)
+        a, b = rng.normal(size=(2, 3)) * 0.5
+        differences = np.concatenate([points - a, points - b])
+        weights, _ = nnls(np.vstack([differences.T, np.full(len(differences), 1e3)]), np.array([0, 0, 0, 1e3]))
+        expected = float(np.linalg.norm(weights / weights.sum() @ differences))
+        normal = separating_normal(a, b, points)
+        if expected < 1e-3:
+            continue
+        assert normal is not None
+        gap = (points @ normal).min() - max(a @ normal, b @ normal)
+        assert expected - 2e-3 <= gap <= expected + 1e-6
