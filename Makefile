@@ -9,11 +9,13 @@ PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 demo: $(VENV)/made
 	@$(BIN)/hrcreplay demo
 
+# By two processes, for two cores; see tests/conftest.py.
+PROCESSES ?= 2
 test: $(VENV)/made
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses $(PROCESSES)
 
 bench: $(VENV)/made
 	$(BIN)/pytest tests/benchmarks --benchmark-only

@@ -1,17 +1,89 @@
+"""Runs that several tests share, and how two processes share the tests (``make test`` runs them by pytest-xdist).
+
+Nothing of hrcreplay with compiled kernels is imported before ``pytest_configure`` has said where these are kept.
+"""
+
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from hrcreplay.run import replay
-from hrcreplay.store import run_folder
-from hrcreplay.store.run_folder import Run
+import hrcreplay  # noqa: F401  # names the folder of compiled kernels
+
+if TYPE_CHECKING:
+    from hrcreplay.store.run_folder import Run
+
+#: Files of which one process runs all: sessions in real time, never two of these files at once, and looks at whole runs
+#: of the demo, which that process makes once. These groups take longest and come first.
+GROUPS = {
+    "sessions": ("tests/live/test_killed.py", "tests/live/test_session.py", "tests/live/test_zenoh_session.py"),
+    "demo": ("tests/run/test_replay.py", "tests/readme/test_readme.py"),
+}
+WHOLE_RUNS = {"demo_folder", "printed"}
+
+
+def group_of(nodeid: str) -> str:
+    """Name of the group of a test: one of ``GROUPS``, else its file."""
+    file = nodeid.partition("::")[0]
+    return next((name for name, files in GROUPS.items() if file in files), file)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Gives every process but the first compiled kernels of its own, as numba does not lock its files."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
+    if worker != "gw0":
+        os.environ["NUMBA_CACHE_DIR"] = str(_kernels_of(worker))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
+    """Lets the other processes begin with the kernels of the first, before any of them runs."""
+    for spec in specs:
+        folder = _kernels_of(spec.id)
+        if spec.id != "gw0" and folder.parent.exists() and not folder.exists():
+            shutil.copytree(folder.parent, folder, ignore=shutil.ignore_patterns("gw*"))
+
+
+def _kernels_of(worker: str) -> Path:
+    """Folder of the compiled kernels of a process, within that of the first, which hrcreplay names on its import."""
+    return Path(os.environ["NUMBA_CACHE_DIR"]) / worker
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Hands whole groups to the processes, in the order of the tests.
+
+    ``--dist loadgroup`` would do the same by marks, but pytest-xdist 3.8 does not see them with pytest 9.2.
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Scheduler(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(nodeid)
+
+    config.option.loadscopereorder = False
+    return Scheduler(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the long groups first where several processes share the tests."""
+    for item in items:
+        if WHOLE_RUNS & set(getattr(item, "fixturenames", ())) and group_of(item.nodeid) != "demo":
+            raise pytest.UsageError(f"{item.nodeid} looks at a whole run of the demo: name its file in GROUPS")
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        order = {name: number for number, name in enumerate(GROUPS)}
+        items.sort(key=lambda item: order.get(group_of(item.nodeid), len(order)))
 
 
 @pytest.fixture(scope="session")
 def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report on the shipped log, every tick's volumes stored."""
+    from hrcreplay.run import replay
+
     out = tmp_path_factory.mktemp("demo") / "run"
     return replay.run("report", replay.demo_log(), out=out, overrides=("occupancy.store_hz=all",))
 
@@ -19,6 +91,9 @@ def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def printed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The plan on the shipped log by the paper's own prediction, with which the robot meets the person at speed."""
+    from hrcreplay.run import replay
+    from hrcreplay.store import run_folder
+
     overrides = ("occupancy.store_hz=all", "occupancy.method=paper", "limits.prediction=paper")
     return run_folder.read(
         replay.run("plan", replay.demo_log(), out=tmp_path_factory.mktemp("printed") / "run", overrides=overrides)
@@ -27,4 +102,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="session")
 def demo(demo_folder: Path) -> Run:
+    """The same report, read."""
+    from hrcreplay.store import run_folder
+
     return run_folder.read(demo_folder)

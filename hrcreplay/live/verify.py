@@ -125,6 +125,7 @@ LOG = "log.mcap"
 _ROW = (
     *(f"{name}{axis}" for name in ("q_measured", "q", "dq", "u") for axis in range(1, AXES + 1)),
     *("ref_x", "ref_y", "ref_z", "tcp_x", "tcp_y", "tcp_z", "tcp_speed", "ref_speed", "programme_s", "distance_m"),
+    *("horizon_s", "tau_s", "certified"),
 )  #: the numbers of a MotionRow, named as in motion.parquet
 
 
@@ -304,10 +305,11 @@ class SessionRecomputation:
         suspect, self._suspect = self._suspect, ""
         if self._perception is None:
             return _both("volumes", "some", "none")
-        volumes = self._perception.volumes
-        if codec.encode_volumes(volumes) == message:
+        volumes, horizon_s = self._perception.volumes, self._perception.horizon_s
+        if codec.encode_volumes(volumes, horizon_s) == message:
             return suspect or None
-        return _volume(codec.decode_volumes(message, volumes.limbs, volumes.method), volumes) or suspect or None
+        recorded, held_s = codec.decode_volumes(message, volumes.limbs, volumes.method)
+        return _first(["horizon_s"], [held_s], [horizon_s]) or _volume(recorded, volumes) or suspect or None
 
     def _answer(self, message: bytes) -> str | None:
         datagrams, self._datagrams = tuple(self._datagrams), []

@@ -1,5 +1,7 @@
 """A guide made of another EGM client: ``guide_client.py LIBRARY PORT SECONDS`` sways axis 1, prints its answers.
 
+It goes on until its standard input is closed and nothing more comes.
+
 In a process of its own: two schemas of the same name cannot live in one.
 """
 
@@ -7,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import select
 import sys
 import time
 
@@ -21,9 +24,12 @@ def main(library: str, port: int, seconds: float) -> None:
     sys.stdout.flush()
     begun_s, start, answers = 0.0, np.zeros(6), 0
     while True:
-        heard, state = client.receive_from_robot(timeout=0.5 if answers else 20.0)
+        over = select.select([sys.stdin], [], [], 0.0)[0]
+        heard, state = client.receive_from_robot(timeout=0.5)
         if not heard:
-            break
+            if over:
+                break
+            continue
         if not answers:
             begun_s, start = time.monotonic(), np.array(state.joint_angles)
         phase = math.pi * (time.monotonic() - begun_s) / seconds

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from hrcreplay.logs import skeleton_pb2 as pb
 
-PATIENCE_S = 60.0  # only a process that hangs takes so long
+PATIENCE_S = 600.0  # only a process that hangs takes so long
 
 
 class Human:

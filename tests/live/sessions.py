@@ -19,7 +19,7 @@ from hrcreplay.egm.robot_double.faults import KINDS
 from tests.live.crashing import BUG
 from tests.live.flights import DEMO
 
-PATIENCE_S = 120.0  # only a process that hangs takes so long
+PATIENCE_S = 900.0  # only a process that hangs takes so long
 #: The processes beside control, and the modules that they run.
 HELPERS = {"person": "person.source", "recorder": "record.recorder", "screen": "view.screen"}
 

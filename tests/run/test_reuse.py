@@ -324,12 +324,10 @@ def test_another_base_takes_over_the_person_and_comes_out_like_a_fresh_run(
 def test_only_what_a_setting_touches_is_computed_again(
     reported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], override: str, again: str
 ) -> None:
-    other = replay.run("report", reported, out=tmp_path / "other", overrides=(override,))
+    other = replay.run("plan", reported, out=tmp_path / "other", overrides=(override,))
     said = capsys.readouterr().err
     assert [stage for stage in STAGES if f"{stage}: taken over" not in said] == [again]
-    fresh = replay.run(
-        "report", replay.demo_log(), out=tmp_path / "fresh", overrides=(override,), start_s=9.0, end_s=9.6
-    )
+    fresh = replay.run("plan", replay.demo_log(), out=tmp_path / "fresh", overrides=(override,), start_s=9.0, end_s=9.6)
     assert _same(other, fresh)
 
 

@@ -31,7 +31,10 @@ _COUNTER = 2**32
 
 @dataclass
 class FallbackBrake:
-    """Brakes each axis as fast as it can, Eq. (67), starting from the last reply; positions stay within limits."""
+    """Goes on with the stop that was certified with the last reply, and where that is not known brakes by Eq. (67).
+
+    Positions of Eq. (67) stay within limits; those of the stop do.
+    """
 
     ddq_max: Sequence[float]  #: [deg/s^2]
     q_min: Sequence[float]  #: [deg]
@@ -41,6 +44,7 @@ class FallbackBrake:
     q: list[float]  #: told last [deg]
     dq: list[float]  #: told last [deg/s]
     seqno: int  #: of the last reply
+    stop: list[tuple[list[float], list[float]]]  #: what is left of it: joints [deg], speeds [deg/s], a row a cycle
 
     @property
     def at_rest(self) -> bool:
@@ -50,15 +54,14 @@ class FallbackBrake:
     def update_position(self, measured: Sequence[float]) -> None:
         """Takes the measured joints [deg]; starts again from them where they are too far from the last reply."""
         if max(abs(m - q) for m, q in zip(measured, self.q, strict=True)) > self.tracking:
-            self.q, self.dq = list(measured), [0.0] * len(measured)
+            self.q, self.dq, self.stop = list(measured), [0.0] * len(measured), []
 
     def step(self, tm_ms: int) -> bytes:
         """The reply of one cycle, with our own stamp [ms]."""
-        for axis, (q, dq) in enumerate(zip(self.q, self.dq, strict=True)):
-            slower = math.copysign(max(0.0, abs(dq) - self.ddq_max[axis] * self.cycle_s), dq)
-            there = q + 0.5 * self.cycle_s * (dq + slower)
-            held = min(max(there, min(self.q_min[axis], q)), max(self.q_max[axis], q))
-            self.q[axis], self.dq[axis] = held, slower if held == there else 0.0
+        if self.stop:
+            self.q, self.dq = self.stop.pop(0)
+        else:
+            self._brake_each_axis()
         self.seqno = (self.seqno + 1) % _COUNTER
         message = messages.SensorMessage()
         message.header.seqno, message.header.tm = self.seqno, tm_ms % _COUNTER
@@ -66,6 +69,13 @@ class FallbackBrake:
         message.planned.joints.joints.extend(self.q)
         message.speed_reference.joints.joints.extend(self.dq)
         return bytes(message.SerializeToString())
+
+    def _brake_each_axis(self) -> None:
+        for axis, (q, dq) in enumerate(zip(self.q, self.dq, strict=True)):
+            slower = math.copysign(max(0.0, abs(dq) - self.ddq_max[axis] * self.cycle_s), dq)
+            there = q + 0.5 * self.cycle_s * (dq + slower)
+            held = min(max(there, min(self.q_min[axis], q)), max(self.q_max[axis], q))
+            self.q[axis], self.dq[axis] = held, slower if held == there else 0.0
 
 
 def bring_to_rest(loop: Loop, why: str) -> None:
@@ -119,7 +129,10 @@ def _brake(loop: Loop) -> FallbackBrake | None:
     ddq_max, q_min, q_max = (np.degrees(bound).tolist() for bound in (robot.ddq_max, robot.q_min, robot.q_max))
     q, dq = list(told.planned.joints.joints), list(told.speed_reference.joints.joints)
     tracking = math.degrees(setup.bounds.tracking_rad)
-    return FallbackBrake(ddq_max, q_min, q_max, setup.plan.dt_s, tracking, q, dq, told.header.seqno)
+    stop: list[tuple[list[float], list[float]]] = []
+    if loop.stop is not None:
+        stop = list(zip(np.degrees(loop.stop.q[1:]).tolist(), np.degrees(loop.stop.dq[1:]).tolist(), strict=True))
+    return FallbackBrake(ddq_max, q_min, q_max, setup.plan.dt_s, tracking, q, dq, told.header.seqno, stop)
 
 
 def _measured(data: bytes) -> list[float] | None:
@@ -148,8 +161,8 @@ def _record(
     u = (np.radians(brake.dq) - dq) / brake.cycle_s
     where = np.full(len(q), np.nan) if measured is None else np.radians(measured)
     unknown = np.full(3, np.nan)
-    row = MotionRow(where, q, dq, u, unknown, unknown, *[np.nan] * 4)
+    row = MotionRow(where, q, dq, u, unknown, unknown, *[np.nan] * 7)
     phase = codec.HOLDING if brake.at_rest else codec.STOPPING
-    answer = Decision(t_ns, 0, data, phase, BRAKING, watchdog.FAULT, -1, -1, row)
+    answer = Decision(t_ns, 0, data, phase, BRAKING, watchdog.FAULT, -1, -1, row, None)
     loop.recorder.send(codec.encode_decision(answer, Signal.NONE, len(datagrams), 0))
     loop.recorder.send(codec.encode_reply(t_ns, data, sent=True))

@@ -18,6 +18,7 @@ from hrcreplay.live.control.watchdog import REFUSED
 from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Signal, TickEvent
+from hrcreplay.robot.control.stopping import Stop
 
 _BIN_NS = 5_000
 _BINS = 20_000  # up to 0.1 s; the last one holds all that took longer
@@ -90,6 +91,7 @@ class Loop:
     robot: str | None = None
     last: Decision | None = None
     sent: bytes | None = None  #: the latest reply that went to the robot
+    stop: Stop | None = None  #: what goes on after it
     sender: Address | None = None  #: where the robot's packets come from
     pending: Received | None = None  #: what is not answered yet
     stored: bytes | None = None  #: the latest swept volumes that were recorded complete
@@ -133,7 +135,7 @@ class Loop:
         answer = self.controller.answer(event)
         if answer.datagram is not None and self.settings.sending:
             self.link.answer(answer.datagram, received.sender)
-            self.sent, self.sender = answer.datagram, received.sender
+            self.sent, self.sender, self.stop = answer.datagram, received.sender, answer.stop
         self.pending = None
         took_ns = self.now_ns() - event.t_ns
         self._late = took_ns > self.settings.overrun_s * 1e9
@@ -159,7 +161,7 @@ class Loop:
         self.recorder.send(codec.encode_perception(perception.states, perception.volumes, len(skeletons)))
         if t_ns - self._stored_ns >= self.settings.store_every_s * 1e9:
             self._stored_ns = t_ns
-            self.stored = codec.encode_volumes(perception.volumes)
+            self.stored = codec.encode_volumes(perception.volumes, perception.horizon_s)
             self.recorder.send(self.stored)
 
     def _receive_skeletons(self) -> list[bytes]:

@@ -19,8 +19,8 @@ from hrcreplay.logs.clean import Cleaner, PersonMemory
 from hrcreplay.logs.decoders import own_row
 from hrcreplay.logs.messages import Undecodable
 from hrcreplay.logs.skeleton_pb2 import Skeleton
-from hrcreplay.records import CameraFrames
-from hrcreplay.robot.control.separation import obstacles
+from hrcreplay.records import CameraFrames, HumanStates
+from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.run.stages import NS, FusionStage, PredictionStage, no_frames
 
 
@@ -40,12 +40,13 @@ class Observer:
         self._cleaner = Cleaner(cameras, gap_s, self.counts)
         self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
 
-    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes], horizon_s: float) -> Perception:
         """Fused person and swept volumes at ``t_ns``, which must be later than that of the update before.
 
         Args:
             t_ns: By the session's clock; the arrival of all skeletons of this update [ns].
             skeletons: Serialised Skeleton messages. What cannot be read is counted and left out.
+            horizon_s: Until when the volumes must hold, the latency aside [s].
         """
         frames = self._frames(t_ns, skeletons)
         measured = self._nothing
@@ -59,8 +60,12 @@ class Observer:
             self._fusion, ticks, measured, self._fusion_stage.filter, self._fusion_stage.limits
         )
         self.counts.update(events)
-        volumes = self._prediction_stage.volumes(states)
-        return Perception(t_ns, states, volumes, obstacles(volumes, 0))
+        volumes = self._prediction_stage.volumes(states, horizon_s)
+        return Perception(t_ns, states, volumes, obstacles(volumes, 0), horizon_s)
+
+    def present(self, states: HumanStates) -> Obstacles:
+        """Where the person may be now, for ``ssm``, which does not look ahead."""
+        return obstacles(self._prediction_stage.volumes(states, 0.0), 0)
 
     def age_s(self, t_ns: int) -> float:
         """How old the newest frame of the person is; inf before the first [s]."""

@@ -24,6 +24,7 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.stopping import at_rest
 
 #: Obstacles before the first perception update: nothing is known, so the robot stands.
 _UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=False)
@@ -74,7 +75,7 @@ class SessionController:
         """Stages 1 and 2 up to ``t_ns`` [ns, session clock]; None where they failed, which stops the robot."""
         self._ready = None
         try:
-            self.perception = self.observer.update_perception(t_ns, skeletons)
+            self.perception = self.observer.update_perception(t_ns, skeletons, self._horizon_s())
             if self._motion is not None:
                 self._ready = self._motion, self._step(self._motion)
         except Exception as error:  # whatever it is, the robot must go on being answered
@@ -105,7 +106,7 @@ class SessionController:
         look_ns = self.perception.t_ns if self.perception is not None else 0
         if packet is None:
             self._refuse(event.t_ns, packet_status)
-            return Decision(event.t_ns, look_ns, None, self.phase, control_step.BRAKING, self.stop, -1, -1, None)
+            return Decision(event.t_ns, look_ns, None, self.phase, control_step.BRAKING, self.stop, -1, -1, None, None)
         measured = packet.q[:AXES]
         self._heard_ns = event.t_ns
         if packet_status.fresh or self._motion is None:
@@ -117,13 +118,16 @@ class SessionController:
         phase = self.phase
         reply = self._session.reply(result.step.next.q, result.step.next.dq, event.t_ns)
         told = RobotState(reply.q, reply.dq)  # which is an echo while the robot may not move
-        self._motion = replace(result.after, state=told)
+        stop = result.after.stop
+        if not (np.array_equal(told.q, stop.q[0]) and np.array_equal(told.dq, stop.dq[0])):
+            stop = self.setup.stop_from(told)
+        self._motion = replace(result.after, state=told, stop=stop)
         self._programme_s = result.after.programme_s
         self._settle()
         step, row = result.step, _row(measured, before, result)
         reason = (self.stop or self.waiting) if result.after.follower is None else control_step.REASONS[step.reason]
         return Decision(
-            event.t_ns, look_ns, encode_correction(reply), phase, step.status, reason, step.limb, step.link, row
+            event.t_ns, look_ns, encode_correction(reply), phase, step.status, reason, step.limb, step.link, row, stop
         )
 
     def _settle(self) -> None:
@@ -155,7 +159,7 @@ class SessionController:
 
     def _begin_session(self, measured: Floats) -> None:
         """Starts a new session of the robot from its measured joints, whatever was commanded before."""
-        self._motion = MotionState(RobotState(measured, _STILL), self._programme_s)
+        self._motion = MotionState(RobotState(measured, _STILL), self._programme_s, at_rest(measured))
         self.phase = codec.ECHO
 
     def _apply_watchdog(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> None:
@@ -212,17 +216,25 @@ class SessionController:
         """The stop of a robot whose step cannot be taken; once, however often it fails while the robot brakes."""
         if not self.stop or self.phase in (codec.APPROACH, codec.FOLLOWING):
             self._stop(self._heard_ns or 0, why)
-        return brake(self.setup, motion, _UNSEEN)
+        return brake(self.setup, motion, lambda _: _UNSEEN)
 
     def _step(self, motion: MotionState) -> MotionStep:
-        return (brake if motion.follower is None else follow)(self.setup, motion, self._obstacles())
+        return (brake if motion.follower is None else follow)(self.setup, motion, self._obstacles)
 
-    def _obstacles(self) -> Obstacles:
-        """Swept volumes to keep clear of; unknown where nobody has been seen for too long."""
+    def _horizon_s(self) -> float:
+        """Until when the volumes of the next look must hold."""
+        return self.setup.plan.horizon_s(self._motion.stop if self._motion is not None else at_rest(_STILL))
+
+    def _obstacles(self, horizon_s: float) -> Obstacles:
+        """Swept volumes to keep clear of; unknown where nobody has been seen for too long.
+
+        Those of ``ssm`` for no horizon are predicted anew; all others are those of the look.
+        """
         if self.perception is None:
             return _UNSEEN
         seen = self.observer.age_s(self.perception.t_ns) <= self.setup.memory_s
-        return self.perception.obstacles if seen else replace(self.perception.obstacles, known=False)
+        found = self.perception.obstacles if horizon_s else self.observer.present(self.perception.states)
+        return found if seen else replace(found, known=False)
 
 
 def _decoded(data: bytes) -> RobotPacket | None:
@@ -245,4 +257,7 @@ def _row(measured: Floats, before: MotionState, result: MotionStep) -> MotionRow
         ref_speed=result.reference_speed,
         programme_s=result.after.programme_s,
         distance_m=result.step.distance_m,
+        horizon_s=result.step.horizon_s,
+        tau_s=result.step.tau_s,
+        certified=float(result.step.certified),
     )

@@ -21,7 +21,7 @@ from hrcreplay.egm.protocol import EgmSession
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.fusion.fuse import MEDIAN_LENGTHS_M
 from hrcreplay.human.model import LimitSet, skeleton
-from hrcreplay.live.control.motion import ControlSetup, Follower
+from hrcreplay.live.control.motion import ControlSetup
 from hrcreplay.live.control.perception import Observer
 from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.record import codec
@@ -32,6 +32,7 @@ from hrcreplay.logs.tracks import Header, JointTrack
 from hrcreplay.records import Floats
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.run import build
+from hrcreplay.run.followers import Follower
 from hrcreplay.run.job import Job, job_without_log, resolve
 from hrcreplay.settings.load import Settings, load_settings
 
@@ -107,16 +108,14 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         raise SettingsError(
             f"{header.path}: no task; a live robot needs one: name a task file with --set plan.task=FILE"
         )
+    if job.settings.plan.method == "none":
+        raise SettingsError("plan.method: none looks at nobody; a live robot needs qp, scaling, shield or ssm")
     known, scene = job.meta(), HeaderOnlyLog(header)
     T_world_base, fusion_stage = build.robot_base(job, scene), build.fusion_stage(job, scene)
     robot = build.robot(job, T_world_base)
     if robot.nv != AXES:
         raise SettingsError(f"robot.urdf: {robot.name} has {robot.nv} axes; live drives robots of {AXES} over EGM")
-    volumes = (
-        Observer(fusion_stage, build.prediction_stage(job), header.cameras, job.settings.logs.gap_s)
-        .update_perception(0, ())
-        .volumes
-    )
+    predicted = build.prediction_stage(job)
     return {
         "hrcreplay": __version__,
         "settings": known["settings"],
@@ -127,8 +126,8 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         "T_world_base": T_world_base.tolist(),
         "task": task,
         "sending": sending,
-        "limbs": list(volumes.limbs),
-        "method": volumes.method,
+        "limbs": list(predicted.limbs),
+        "method": predicted.method,
         "links": [segment.name for segment in robot.segments],
     }
 
@@ -185,7 +184,7 @@ def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
     live, plan = job.settings.live, job.settings.plan
     robot = build.robot(job, build.robot_base(job, scene))
     programme, _ = build.reference(job, scene, robot)
-    settings = build.plan_settings(job, live.cycle_s)
+    settings = build.plan_settings(job, live.cycle_s, plan.method)
 
     def follow(path: Reference, s_s: float) -> Follower:
         return build.make_follower(plan.method, robot, path, settings, s_s)
@@ -240,7 +239,7 @@ def compile_kernels(start: dict[str, Any]) -> None:
             raise controller.fault
         if perception is not None:
             codec.encode_perception(perception.states, perception.volumes, len(seen))
-            codec.encode_volumes(perception.volumes)
+            codec.encode_volumes(perception.volumes, perception.horizon_s)
 
 
 def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int) -> bytes:

@@ -29,6 +29,7 @@ import numpy as np
 from hrcreplay.egm.codec import AXES
 from hrcreplay.records import Floats, HumanStates, SweptVolumes
 from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.stopping import Stop
 
 #: Where a session is: nobody may move yet, the first answers, on the way to the programme, the programme itself,
 #: braking for a reason of the watchdog, standing because of one.
@@ -74,10 +75,14 @@ class MotionRow:
     ref_speed: float  #: of the reference [m/s]
     programme_s: float  #: programmed time [s]
     distance_m: float  #: separation [m]
+    horizon_s: float  #: until when the volumes held that it was decided with [s]
+    tau_s: float  #: how long the stop from the velocity of the tick takes [s]
+    certified: float  #: 1 where the step, or the stop that it continues, has a certificate that still holds, else 0
 
     def flat(self) -> Floats:
-        """(34,) all numbers one after another."""
-        numbers = (self.tcp_speed, self.ref_speed, self.programme_s, self.distance_m)
+        """(37,) all numbers one after another."""
+        where = (self.tcp_speed, self.ref_speed, self.programme_s, self.distance_m)
+        numbers = (*where, self.horizon_s, self.tau_s, self.certified)
         return np.concatenate((self.q_measured, self.q, self.dq, self.u, self.ref_m, self.tcp_m, numbers))
 
     @classmethod
@@ -104,6 +109,7 @@ class Decision:
     limb: int  #: of the nearest pair, index into the volumes' limbs; -1 without one
     link: int  #: of the nearest pair; -1 without one
     row: MotionRow | None  #: None where no reply was due
+    stop: Stop | None  #: what goes on after the reply if nobody decides any more; not recorded
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +119,8 @@ class Perception:
     t_ns: int
     states: HumanStates  #: one row
     volumes: SweptVolumes  #: one row
-    obstacles: Obstacles
+    obstacles: Obstacles  #: the same
+    horizon_s: float  #: how long after ``t_ns`` they hold, the latency aside [s]
 
 
 ROBOT, REPLY, SKELETON, PERCEPTION, VOLUMES, DECISION, TIMEOUT, EVENT = (b"R", b"C", b"F", b"L", b"V", b"A", b"S", b"E")
@@ -121,7 +128,7 @@ ROBOT, REPLY, SKELETON, PERCEPTION, VOLUMES, DECISION, TIMEOUT, EVENT = (b"R", b
 _HEAD = struct.Struct("<cq")
 _REPLY = struct.Struct("<cqB")
 _LOOK = struct.Struct("<cqHHHH")
-_VOLUMES = struct.Struct("<cqHI")
+_VOLUMES = struct.Struct("<cqHId")
 _ANSWER = struct.Struct("<cqqIIBBhhH")
 _SILENCE = struct.Struct("<cqI")
 _DIGEST = 8
@@ -228,22 +235,22 @@ def volume_digest(volumes: SweptVolumes, limb: int) -> bytes:
     return what.digest()
 
 
-def encode_volumes(volumes: SweptVolumes) -> bytes:
-    """Encodes the swept volumes of one perception update."""
-    head = _VOLUMES.pack(VOLUMES, int(volumes.t_ns[0]), len(volumes.limbs), len(volumes.vertices_m))
+def encode_volumes(volumes: SweptVolumes, horizon_s: float) -> bytes:
+    """Encodes the swept volumes of one perception update, which hold for ``horizon_s`` [s]."""
+    head = _VOLUMES.pack(VOLUMES, int(volumes.t_ns[0]), len(volumes.limbs), len(volumes.vertices_m), horizon_s)
     return b"".join([head, volumes.offsets.tobytes(), volumes.radius_m.tobytes(), volumes.vertices_m.tobytes()])
 
 
-def decode_volumes(message: bytes, limbs: tuple[str, ...], method: str) -> SweptVolumes:
-    """Decodes swept volumes; the names of their limbs and their method are in the session's start event."""
-    _, t_ns, count, vertices = _VOLUMES.unpack_from(message)
+def decode_volumes(message: bytes, limbs: tuple[str, ...], method: str) -> tuple[SweptVolumes, float]:
+    """Decodes swept volumes, and how long they hold [s]; names of limbs and method are in the session's start event."""
+    _, t_ns, count, vertices, horizon_s = _VOLUMES.unpack_from(message)
     at = _VOLUMES.size
     offsets = np.frombuffer(message, "<i8", count + 1, at)
     at += 8 * (count + 1)
     radius = np.frombuffer(message, "<f8", count, at)[None]
     at += 8 * count
     points = np.frombuffer(message, "<f8", 3 * vertices, at).reshape(-1, 3)
-    return SweptVolumes(np.array([t_ns]), offsets, points, radius, limbs, method)
+    return SweptVolumes(np.array([t_ns]), offsets, points, radius, limbs, method), horizon_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +267,7 @@ class RecordedDecision:
     limb: int
     link: int
     datagrams: int  #: the ROBOT messages right before it
-    row: Floats | None  #: (34,) of a MotionRow
+    row: Floats | None  #: (37,) of a MotionRow
 
 
 def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: int) -> bytes:

@@ -55,7 +55,8 @@ class SessionTables:
         if kind == codec.PERCEPTION:
             self._looks.append(codec.decode_perception(message))
         elif kind == codec.VOLUMES:
-            store_volumes(codec.decode_volumes(message, self.limbs, self.method), np.zeros(1, np.int64), self.run)
+            volumes, horizon_s = codec.decode_volumes(message, self.limbs, self.method)
+            store_volumes(volumes, np.zeros(1, np.int64), np.array([horizon_s]), self.run)
         elif kind == codec.DECISION:
             self._answered(codec.decode_decision(message))
         elif kind == codec.EVENT:
@@ -123,7 +124,8 @@ def _motion(answers: list[codec.RecordedDecision], limbs: tuple[str, ...], links
     reasons = ("", *sorted({answered.reason for answered in answers} - {""}))
     motion = Motion(
         t_ns=np.array([answered.t_ns for answered in answers]),
-        **{name: values for name, values in column.items() if name != "q_measured"},
+        **{name: values for name, values in column.items() if name not in ("q_measured", "certified")},
+        certified=column["certified"] != 0.0,
         limb=np.array([answered.limb for answered in answers]),
         link=np.array([answered.link for answered in answers]),
         status=np.array([answered.status for answered in answers]),

@@ -101,4 +101,4 @@ def unpack(data: bytes, limbs: tuple[str, ...]) -> Scene:
     at += points.nbytes
     ends = np.frombuffer(data, "<f8", 6 * segments, at).reshape(-1, 2, 3)
     at += ends.nbytes
-    return Scene(t_ns, points, ends, codec.decode_volumes(data[at:], limbs, ""))
+    return Scene(t_ns, points, ends, codec.decode_volumes(data[at:], limbs, "")[0])

@@ -131,7 +131,7 @@ def test_reading_that_is_too_slow_is_told_once_and_nothing_waits_for_it() -> Non
 
     def reading() -> Iterator[Item]:
         yield Opened(("left",), 0, 100)
-        gate.wait(60.0)
+        gate.wait(600.0)
         yield [Frame(10, pb.Skeleton(capture_ns=5, camera="left"))]
         yield Note("that was all")
         yield None
@@ -262,7 +262,7 @@ def test_the_process_plays_a_log_and_ends_with_control(tmp_path: Path) -> None:
         came_ns = [t for t, message in human.heard if message[:1] in b"fF"]
         assert all(came >= due for came, due in zip(came_ns, (frames.arrival_ns + shift_ns).tolist(), strict=True))
         human.socket.close()
-        assert human.process.wait(60.0) == 0
+        assert human.process.wait(600.0) == 0
 
 
 def test_the_process_plays_a_ros2_bag(tmp_path: Path) -> None:
@@ -279,4 +279,4 @@ def test_the_process_tells_why_it_cannot_play(tmp_path: Path) -> None:
     with Human("--log", str(tmp_path / "none.mcap")) as human:
         (told,) = human.until(b"N", text=b"failed")
         assert b"there is no such file" in told
-        assert human.process.wait(60.0) == LogError.exit_code
+        assert human.process.wait(600.0) == LogError.exit_code

@@ -261,7 +261,7 @@ def test_settings_that_cannot_be_used_are_told(change: dict[str, Any], told: byt
     with Human("--zenoh", json.dumps(settings)) as human:
         (text,) = human.until(b"N", text=b"failed")
         assert text.startswith(told)
-        assert human.process.wait(60.0) == SettingsError.exit_code
+        assert human.process.wait(600.0) == SettingsError.exit_code
 
 
 def test_it_ends_in_order_while_frames_pour_in() -> None:
@@ -283,7 +283,7 @@ def test_it_ends_in_order_while_frames_pour_in() -> None:
             try:
                 human.until(b"F", 50)
                 human.socket.close()
-                assert human.process.wait(60.0) == 0
+                assert human.process.wait(600.0) == 0
             finally:
                 over.set()
                 pouring.join()

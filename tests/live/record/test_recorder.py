@@ -99,7 +99,7 @@ class Process:
 
     def end(self) -> tuple[int, str]:
         """Exit code and what was said, after it has ended by itself."""
-        said = self.popen.communicate(timeout=20)[1]
+        said = self.popen.communicate(timeout=600)[1]
         return self.popen.returncode, said
 
 

@@ -114,7 +114,7 @@ def run(*arguments: str, send: list[Status]) -> subprocess.CompletedProcess[str]
     with theirs:
         command = [sys.executable, "-m", "hrcreplay.live.view.screen", "--fd", str(theirs.fileno()), *arguments]
         return subprocess.run(
-            command, pass_fds=(theirs.fileno(),), capture_output=True, text=True, timeout=60.0, check=True
+            command, pass_fds=(theirs.fileno(),), capture_output=True, text=True, timeout=600.0, check=True
         )
 
 
@@ -139,7 +139,7 @@ def test_the_process_draws_on_a_terminal() -> None:
         command = [sys.executable, "-m", "hrcreplay.live.view.screen", "--fd", str(theirs.fileno())]
         environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
         process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stderr=follower, env=environment)
-        assert process.wait(60.0) == 0
+        assert process.wait(600.0) == 0
     os.close(follower)
     drawn = os.read(leader, 1 << 16).decode()
     os.close(leader)
