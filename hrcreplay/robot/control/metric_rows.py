@@ -1,8 +1,8 @@
 """The quadratic program of Eq. (66) in the metric of its cost, where a solver has the least trouble with it.
 
-With ``H = L @ L.T`` and ``y = L.T @ x`` the cost is ``y @ y / 2 + y @ b``, and every row is scaled to length 1. x is the
-next joint velocity w [rad/s] and, where the approach rows are soft, the slack [m/s]. The eigenvalues of H may differ by
-a factor of 10^6 (a stretched wrist); here a residual of the size r means an error of about r.
+With ``H = L @ L.T`` and ``y = L.T @ x`` the cost is ``y @ y / 2 + y @ b``, and every row is scaled to length 1. x is
+the next joint velocity w [rad/s] and, where the approach rows are soft, the slack [m/s]. The eigenvalues of H may
+differ by a factor of 10^6 (a stretched wrist); here a residual of the size r means an error of about r.
 """
 
 from __future__ import annotations
@@ -242,10 +242,10 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
 
 @njit(cache=True)
 def _among(known: Ints, key: Ints) -> bool:
+    found = False
     for i in range(len(known)):
-        if np.all(known[i] == key):
-            return True
-    return False
+        found = found or np.all(known[i] == key)
+    return found
 
 
 @njit(cache=True, error_model="numpy")

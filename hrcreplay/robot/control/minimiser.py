@@ -69,10 +69,11 @@ MOST = 200
 BINDING = 1e-8
 #: Largest residual, in the metric, with which multipliers prove a solution; proxqp is asked for a tenth.
 PROVEN = 1e-9
-#: Sweeps of coordinate descent before proxqp begins.
-SWEEPS = 50
-#: Inverse penalties of proxqp, one try after the other.
-PENALTIES = (1e-6, 1e-4, 1e-2)
+#: Tries of proxqp, one after the other: sweeps of coordinate descent before it begins, its inverse penalty, and how
+#: many times it may change the multipliers. Which, and in which order, was tried on replays.
+TRIES = ((50, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-3, 40), (0, 1e-7, 40))
+#: Newton steps between them.
+INNER = 20
 
 _dense = proxsuite.proxqp.dense
 
@@ -119,18 +120,18 @@ def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] 
         z: (m,) multipliers to begin with.
         limits: Of axes and TCP.
     """
-    start, status = descend(problem, z, SWEEPS), ""
-    for penalty in PENALTIES:
-        y, z, status = _by_proxqp(problem, *start, penalty)
+    status = ""
+    for sweeps, penalty, rounds in TRIES:
+        y, z, status = _by_proxqp(problem, *descend(problem, z, sweeps), penalty, rounds)
         if residual(problem, y, z) <= PROVEN:  # false for NaN
             return y, z
         if denied(problem, z, limits):
             return Unsolved("infeasible")
-        start = -problem.b, np.zeros(len(z))
+        z = np.zeros(len(z))
     return Unsolved(status)
 
 
-def _by_proxqp(problem: Metric, y: Floats, z: Floats, penalty: float) -> tuple[Floats, Floats, str]:
+def _by_proxqp(problem: Metric, y: Floats, z: Floats, penalty: float, rounds: int) -> tuple[Floats, Floats, str]:
     """What proxqp finds, and what it says of it."""
     n, m = len(y), len(z)
     # the last bits of what its other backend returns depend on where its memory happens to lie
@@ -139,7 +140,7 @@ def _by_proxqp(problem: Metric, y: Floats, z: Floats, penalty: float) -> tuple[F
     settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START
     settings.eps_abs, settings.eps_rel = 0.1 * PROVEN, 0.0
     settings.eps_primal_inf = settings.eps_dual_inf = 0.0  # with its own tests it denies problems that have solutions
-    settings.max_iter, settings.max_iter_in = 40, 60
+    settings.max_iter, settings.max_iter_in = rounds, INNER
     qp.init(np.eye(n), problem.b, None, None, problem.E, problem.low, problem.high, False, mu_in=penalty)
     qp.solve(y, None, z)
     results = qp.results
