@@ -76,7 +76,7 @@ def known_numbers(H: Floats, g: Floats, limits: Limits, rows: Approach) -> bool:
     """Whether nothing is NaN, and nothing infinite but for bounds that do not exist."""
     total = H.sum() + g.sum() + limits.J.sum() + rows.ends_m.sum() + rows.J_ends.sum() + rows.vertices_m.sum()
     total += rows.per_speed.sum() + rows.stop_s
-    known = math.isfinite(total) and not np.isnan(rows.room_m2.min())
+    known = math.isfinite(total) and not np.isnan(rows.room_m2.sum())
     for bounds in (limits.low, limits.high, limits.J_low, limits.J_high):
         known = known and not np.isnan(bounds.sum())
     return known
@@ -244,7 +244,7 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
 def _among(known: Ints, key: Ints) -> bool:
     found = False
     for i in range(len(known)):
-        found = found or np.all(known[i] == key)
+        found = found or bool(np.all(known[i] == key))
     return found
 
 

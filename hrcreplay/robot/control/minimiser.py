@@ -122,7 +122,8 @@ def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] 
     """
     status = ""
     for sweeps, penalty, rounds in TRIES:
-        y, z, status = _by_proxqp(problem, *descend(problem, z, sweeps), penalty, rounds)
+        y, z = descend(problem, z, sweeps)
+        y, z, status = _by_proxqp(problem, y, z, penalty, rounds)
         if residual(problem, y, z) <= PROVEN:  # false for NaN
             return y, z
         if denied(problem, z, limits):
