@@ -19,15 +19,15 @@ from hrcreplay.robot.control.approach_rows import Approach, worst_rows
 
 #: Stands for a bound that there is none.
 NONE = 1e20
-#: Rows broken by less than this speed hold [m/s].
-HELD = 1e-7
+#: Rows broken by no more than this hold, in the metric; and where a row does not depend on the velocity [m/s].
+HELD = 1e-9
 #: Length in the metric below which a row does not depend on the velocity.
 EMPTY = 1e-9
 #: By how much a combination of rows must be broken everywhere to prove that there is no solution.
 DENIED = 1e-9
 
-#: What `next_row` finds: no broken row; one that is new; broken ones that are all known; one that nothing can help.
-CLEAR, NEW, KNOWN, HOPELESS = range(4)
+#: What `next_row` finds: no broken row; broken ones that are all known; one that is new; one that nothing can help.
+CLEAR, KNOWN, NEW, HOPELESS = range(4)
 
 
 class Limits(NamedTuple):
@@ -63,7 +63,7 @@ class Metric(NamedTuple):
 class Found(NamedTuple):
     """What a candidate breaks."""
 
-    outcome: int  #: CLEAR, NEW, KNOWN or HOPELESS
+    outcome: int  #: CLEAR, KNOWN, NEW or HOPELESS
     w: Floats  #: (nv,) the candidate, within the axes' bounds [rad/s]
     slack: float  #: [m/s]
     row: Floats  #: (n,) the row that it breaks most of those that are new
@@ -75,7 +75,7 @@ class Found(NamedTuple):
 def known_numbers(H: Floats, g: Floats, limits: Limits, rows: Approach) -> bool:
     """Whether nothing is NaN, and nothing infinite but for bounds that do not exist."""
     total = H.sum() + g.sum() + limits.J.sum() + rows.ends_m.sum() + rows.J_ends.sum() + rows.vertices_m.sum()
-    total += rows.per_speed.sum() + rows.stop_s
+    total += rows.boxes_m.sum() + rows.per_speed.sum() + rows.stop_s
     known = math.isfinite(total) and not np.isnan(rows.room_m2.sum())
     for bounds in (limits.low, limits.high, limits.J_low, limits.J_high):
         known = known and not np.isnan(bounds.sum())
@@ -218,10 +218,10 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
     x = _backward(L, y)
     w = np.minimum(np.maximum(x[:nv], limits.low), limits.high)
     slack = max(0.0, x[nv]) if n > nv else 0.0
-    loose = rows.room_m2 + rows.per_speed * (slack + HELD)
+    loose = rows.room_m2 + rows.per_speed * slack
     ends, J_ends, vertices, offsets, boxes, _, per_speed, stop_s = rows
-    which, A, _ = worst_rows(Approach(ends, J_ends, vertices, offsets, boxes, loose, per_speed, stop_s), w, 0.0)
-    outcome, best, most = (KNOWN if len(which) else CLEAR), -1, 0.0
+    which, A, values = worst_rows(Approach(ends, J_ends, vertices, offsets, boxes, loose, per_speed, stop_s), w, 0.0)
+    outcome, best, most = CLEAR, -1, HELD
     found, high, row = np.zeros(n), 0.0, np.zeros(n)
     for i in range(len(which)):
         pair = which[i, 0], which[i, 1]
@@ -231,12 +231,17 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
         e = _forward(L, row)
         length = norm_n(e)
         if not length > EMPTY:
-            outcome = HOPELESS
-            break
+            if values[i] > loose[pair] + per_speed[pair] * HELD:
+                outcome = HOPELESS
+                break
+            continue
         bound = rows.room_m2[pair] / per_speed[pair] / length
         broken = dot_n(e, y) / length - bound
-        if (best < 0 or broken > most) and not _among(known, which[i]):
-            outcome, best, most, found, high = NEW, i, broken, e / length, bound
+        if broken > most:
+            if _among(known, which[i]):
+                outcome = max(outcome, KNOWN)
+            else:
+                outcome, best, most, found, high = NEW, i, broken, e / length, bound
     return Found(outcome, w, slack, found, high, which[best].copy() if best >= 0 else np.zeros(4, dtype=np.int64))
 
 

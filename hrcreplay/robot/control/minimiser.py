@@ -20,7 +20,6 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.control.approach_rows import Approach
 from hrcreplay.robot.control.metric_rows import (
     CLEAR,
-    HELD,
     HOPELESS,
     KNOWN,
     Limits,
@@ -68,7 +67,9 @@ MOST = 200
 #: Multiplier, in the metric, above which a row holds the robot back.
 BINDING = 1e-8
 #: Largest residual, in the metric, with which multipliers prove a solution; proxqp is asked for a tenth.
-PROVEN = 1e-9
+PROVEN = 2e-10
+#: Bounds of the TCP broken by no more than this hold [m/s, rad/s].
+KEPT = 1e-8
 #: Tries of proxqp, one after the other: sweeps of coordinate descent before it begins, its inverse penalty, and how
 #: many times it may change the multipliers. Which, and in which order, was tried on replays.
 TRIES = ((50, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-3, 40), (0, 1e-7, 40))
@@ -109,7 +110,7 @@ def minimise(task: Problem) -> Solution | Unsolved:
 def _keeps(limits: Limits, w: Floats) -> bool:
     """Whether a velocity, rounded into the axes' bounds, also keeps those of the TCP."""
     twist = limits.J @ w
-    return bool(np.all((limits.J_low - HELD <= twist) & (twist <= limits.J_high + HELD)))
+    return bool(np.all((limits.J_low - KEPT <= twist) & (twist <= limits.J_high + KEPT)))
 
 
 def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] | Unsolved:

@@ -25,7 +25,7 @@ FREE = Limits(-WIDE, WIDE, np.zeros((6, 3)), np.full(6, -1.0), np.ones(6))
 def people(A: Floats, high: Floats, per_speed: float = 1.0) -> Approach:
     """Rows ``A @ w <= high`` of three velocities as a link that is a point, and limbs of one vertex each."""
     J_ends, m = np.zeros((1, 2, 3, 3)), len(A)
-    J_ends[0, 0] = np.eye(3)
+    J_ends[0, :] = np.eye(3)
     boxes = np.stack([A, A], axis=1)
     per = np.full((1, m), per_speed)
     return Approach(np.zeros((1, 2, 3)), J_ends, A, np.arange(m + 1), boxes, high[None], per, 1.0)
@@ -186,7 +186,9 @@ def test_a_cost_that_is_not_convex_has_no_minimiser() -> None:
 @pytest.mark.parametrize("soft", [False, True])
 def test_no_number_makes_it_raise(robot: RobotModel, soft: bool, bad: float) -> None:
     task = replace(random_tick(robot, np.random.default_rng(5)).task, soft=soft)
-    limits, rows = task.limits, task.rows
+    limits = Limits(*(np.array(field) for field in task.limits))
+    rows = Approach(*(np.array(field) if isinstance(field, np.ndarray) else field for field in task.rows))
+    task = replace(task, H=task.H.copy(), g=task.g.copy(), limits=limits, rows=rows)
     fields = [task.H, task.g, *limits, *(field for field in rows[:-1] if field.dtype == float)]
     for field in fields:
         before = field.copy()
