@@ -15,13 +15,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import proxsuite
+from scipy.optimize import nnls
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.approach_rows import Approach
 from hrcreplay.robot.control.metric_rows import (
     CLEAR,
+    EMPTY,
     HOPELESS,
     KNOWN,
+    NONE,
     Limits,
     Metric,
     denied,
@@ -71,8 +74,9 @@ PROVEN = 2e-10
 #: Bounds of the TCP broken by no more than this hold [m/s, rad/s].
 KEPT = 1e-8
 #: Tries of proxqp, one after the other: sweeps of coordinate descent before it begins, its inverse penalty, and how
-#: many times it may change the multipliers. Which, and in which order, was tried on replays.
-TRIES = ((50, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-3, 40), (0, 1e-7, 40))
+#: many times it may change the multipliers. Which, and in which order, was tried on replays. The last one (-1) begins
+#: at what non-negative least squares find: deep inside people rows nearly repeat each other, and proxqp is at a loss.
+TRIES = ((50, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-3, 40), (0, 1e-7, 40), (-1, 1e-6, 6))
 #: Newton steps between them.
 INNER = 20
 
@@ -123,7 +127,7 @@ def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] 
     """
     status = ""
     for sweeps, penalty, rounds in TRIES:
-        y, z = descend(problem, z, sweeps)
+        y, z = descend(problem, z, sweeps) if sweeps >= 0 else _least_distance(problem)
         y, z, status = _by_proxqp(problem, y, z, penalty, rounds)
         if residual(problem, y, z) <= PROVEN:  # false for NaN
             return y, z
@@ -131,6 +135,29 @@ def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] 
             return Unsolved("infeasible")
         z = np.zeros(len(z))
     return Unsolved(status)
+
+
+def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
+    """The minimiser as the point nearest to -b, by non-negative least squares (Lawson and Hanson).
+
+    Where it finds none: -b itself.
+    """
+    _, b, E, low, high = problem
+    n, m = len(b), len(E)
+    above, below = high < NONE, low > -NONE
+    G = np.concatenate((-E[above], E[below]))
+    f = np.concatenate((-(high + E @ b)[above], (low + E @ b)[below]))
+    try:
+        pull, _ = nnls(np.vstack((G.T, f)), np.append(np.zeros(n), 1.0))
+    except (RuntimeError, ValueError):
+        return -b, np.zeros(m)
+    left = 1.0 - f @ pull
+    if not left > EMPTY:
+        return -b, np.zeros(m)
+    z = np.zeros(m)
+    z[above] += pull[: np.count_nonzero(above)] / left
+    z[below] -= pull[np.count_nonzero(above) :] / left
+    return -b - z @ E, z
 
 
 def _by_proxqp(problem: Metric, y: Floats, z: Floats, penalty: float, rounds: int) -> tuple[Floats, Floats, str]:

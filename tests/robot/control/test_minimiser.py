@@ -14,7 +14,7 @@ from hrcreplay.robot.control.approach_rows import Approach
 from hrcreplay.robot.control.metric_rows import Limits, Metric
 from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, Unsolved, minimise
 from hrcreplay.robot.model import RobotModel
-from tests.robot.swinging import dense, random_tick, robot
+from tests.robot.swinging import STOP_S, dense, random_tick, robot
 
 __all__ = ["robot"]  # the fixture
 
@@ -85,8 +85,10 @@ def test_small_problems_are_solved_as_by_trying_every_set_of_rows() -> None:
 def test_soft_ticks_are_those_of_another_solver_with_all_rows(robot: RobotModel) -> None:
     rng = np.random.default_rng(2)
     slack = []
-    for _ in range(300):
+    for _ in range(500):
         tick = random_tick(robot, rng)
+        if tick.task.rows.per_speed.min() < STOP_S * 0.01:  # inside people a speed of approach has no meaning
+            continue
         tick = tick._replace(task=replace(tick.task, soft=True))
         found, (expected, feasible) = minimise(tick.task), dense(robot, tick)
         assert isinstance(found, Solution) == feasible
@@ -205,7 +207,7 @@ def test_no_number_makes_it_raise(robot: RobotModel, soft: bool, bad: float) -> 
 def test_a_solver_that_says_solved_is_not_believed(
     robot: RobotModel, monkeypatch: pytest.MonkeyPatch, failing: int
 ) -> None:
-    """Nearly the minimiser is not enough; where a try fails the next one counts."""
+    """Nearly the minimiser is not enough; where a try fails another counts."""
     rng = np.random.default_rng(6)
     tasks = [random_tick(robot, rng).task for _ in range(40)]
     before, really = [minimise(task) for task in tasks], minimiser._by_proxqp

@@ -6,11 +6,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hrcreplay.robot.control.scaling_controller import PathState, rates, step
 
 from hrcreplay.records import Floats, SweptVolumes
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, Step
-from hrcreplay.robot.control.scaling_controller import PathState, rates, step
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.programme.path import programmed
