@@ -4,6 +4,7 @@ import itertools
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -189,9 +190,8 @@ def test_a_cost_that_is_not_convex_has_no_minimiser() -> None:
 def test_no_number_makes_it_raise(robot: RobotModel, soft: bool, bad: float) -> None:
     task = replace(random_tick(robot, np.random.default_rng(5)).task, soft=soft)
     limits = Limits(*(np.array(field) for field in task.limits))
-    rows = task.rows._replace(
-        **{name: np.array(field) for name, field in task.rows._asdict().items() if name != "stop_s"}
-    )
+    own: dict[str, Any] = {name: np.array(field) for name, field in task.rows._asdict().items() if name != "stop_s"}
+    rows = task.rows._replace(**own)
     task = replace(task, H=task.H.copy(), g=task.g.copy(), limits=limits, rows=rows)
     fields = [task.H, task.g, *limits, *(field for field in rows[:-1] if field.dtype == float)]
     for field in fields:
