@@ -42,7 +42,7 @@ MAY_IMPORT = {
 ALONE = {
     "pinocchio": "robot/model.py",
     "coal": "robot/control/separation.py",
-    "proxsuite": "robot/control/qp_controller.py",
+    "proxsuite": "robot/control/minimiser.py",
 }
 #: Modules of these rooms open no file, read no clock, draw no random number, print and log nothing.
 PURE = ("geometry", "human", "robot")

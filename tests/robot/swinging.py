@@ -11,9 +11,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.records import Floats, SweptVolumes
+from hrcreplay.robot.control.certificate import NO_PLANES
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, observe
-from hrcreplay.robot.control.qp_controller import Problem, problem, step
-from hrcreplay.robot.control.separation import Obstacles, Separation, obstacles
+from hrcreplay.robot.control.decision import decide, made, stands
+from hrcreplay.robot.control.minimiser import SLACK, Problem
+from hrcreplay.robot.control.qp_controller import problem, propose
+from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.stopping import axis_by_axis
 from hrcreplay.robot.model import RobotModel, RobotPose, irb140
 from hrcreplay.settings.sections import Plan
 from tests.robot.distances import by_coal
@@ -21,7 +25,11 @@ from tests.robot.people import cloud, volumes
 from tests.robot.plain_rows import approach_rows, link_segment
 
 STOP_S, DT_S = 0.377, 0.004
-SETTINGS = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)
+#: The paper as printed.
+PRINTED = Plan(
+    horizon="fixed", certify=False, rows="hard", room="square", lead_s=0.0, give_way_m=0.0, jerk_s=0.0, smooth_s=0.0
+)
+SETTINGS = PlanSettings(PRINTED, dt_s=DT_S, stop_s=STOP_S, certified=False)
 HOME = np.deg2rad([10.0, 20.0, -20.0, 0.0, 60.0, 0.0])
 
 
@@ -43,6 +51,21 @@ def swing(robot: RobotModel, t_s: float) -> tuple[Floats, Floats]:
     return T, np.array([0.0, 0.45 * np.cos(1.5 * t_s), 0.0, 0.0, 0.0, 0.0])
 
 
+def step(
+    robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles, settings: PlanSettings = SETTINGS
+) -> Step:
+    """One tick without a past: the acceleration before was 0, and where nothing is proposed Eq. (67) brakes."""
+    going = axis_by_axis(state.q, state.dq, robot.ddq_max, DT_S)
+    horizon_s = settings.horizon_s(going)
+    with np.errstate(all="ignore"):
+        sight = observe(robot, state, seen, settings.plan.clearance_m)
+        wanted = stands(sight, settings) or propose(
+            robot, state, np.zeros(6), (T, twist), sight, seen, horizon_s, settings
+        )
+        taken, _ = decide(robot, going, wanted, seen, horizon_s, NO_PLANES, settings)
+    return made(sight, going, taken, horizon_s, DT_S)
+
+
 def run(
     robot: RobotModel, people: SweptVolumes, settings: PlanSettings = SETTINGS
 ) -> Iterator[tuple[RobotState, Step]]:
@@ -62,10 +85,10 @@ class Asked(NamedTuple):
 
 
 def all_rows(robot: RobotModel, tick: Asked) -> tuple[Floats, Floats, Floats]:
-    """Every row of Eq. (66g)-(66i), written down."""
+    """Every row of Eq. (66g)-(66i), written down; the last column is that of the slack."""
     task, pose, seen = tick
     limits = task.limits
-    A, low, high = [limits.J], [limits.J_low], [limits.J_high]
+    A, low, high = [np.hstack([limits.J, np.zeros((6, 1))])], [limits.J_low], [limits.J_high]
     distance, offsets = by_coal(pose, seen), seen.offsets
     for link, segment in enumerate(robot.segments):
         for limb, radius in enumerate(seen.radius_m):
@@ -77,27 +100,33 @@ def all_rows(robot: RobotModel, tick: Asked) -> tuple[Floats, Floats, Floats]:
                 clearance_m=segment.radius_m + radius,
                 stop_s=STOP_S,
             )
-            A.append(rows.A)
+            speed = np.full((len(rows.A), 1), -STOP_S * max(distance[link, limb], 1e-3))
+            A.append(np.hstack([rows.A, speed]))
             high.append(rows.b)
             low.append(np.full(len(rows.b), -1e30))
     every: Floats = np.concatenate(A)
     every[np.abs(every) < 1e-13] = 0.0  # rounding errors of axes that do not move the link: daqp scales them up to rows
-    return np.ascontiguousarray(every), np.concatenate(low), np.concatenate(high)
+    return every, np.concatenate(low), np.concatenate(high)
 
 
 def dense(robot: RobotModel, tick: Asked) -> tuple[Floats, bool]:
-    """The same problem with all rows, by another solver."""
+    """The same problem with all rows, by another solver; where they are soft, the slack follows the velocities."""
     A, low, high = all_rows(robot, tick)
     task = tick.task
-    upper, lower = np.concatenate([task.limits.high, high]), np.concatenate([task.limits.low, low])
-    found = daqp.solve(task.H, task.g, A, upper, lower, primal_tol=1e-11, dual_tol=1e-12)
+    top, bottom, H, g = task.limits.high, task.limits.low, task.H, task.g
+    if task.soft:
+        top, bottom, g = np.append(top, 1e30), np.append(bottom, 0.0), np.append(g, 0.0)
+        H = np.zeros((7, 7))
+        H[:6, :6], H[6, 6] = task.H, SLACK
+    upper, lower = np.concatenate([top, high]), np.concatenate([bottom, low])
+    found = daqp.solve(H, g, np.ascontiguousarray(A[:, : len(g)]), upper, lower, primal_tol=1e-11, dual_tol=1e-12)
     return found[0], found[2] == 1
 
 
 def asked(robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles) -> Asked:
-    pose, pairs = robot.pose(state.q, state.dq), observe(robot, state, seen, 0.0).pairs
-    assert isinstance(pairs, Separation)
-    return Asked(problem(robot, state, pose, T, twist, seen, pairs, SETTINGS), pose, seen)
+    sight = observe(robot, state, seen, 0.0)
+    task = problem(robot, state, np.zeros(6), (T, twist), sight, seen, STOP_S, SETTINGS)
+    return Asked(task, sight.pose, seen)
 
 
 def random_tick(robot: RobotModel, rng: np.random.Generator) -> Asked:

@@ -1,29 +1,39 @@
 """The minimiser of Eq. (66) under its rows, by proxqp. The only user of proxsuite.
 
-Every vertex of every limb has rows and the minimiser lies on few of them, so rows join in while the candidate breaks
-any. Where the rows are soft, one slack [m/s] loosens all of them, so that there is always a solution.
+Every vertex of every limb has rows and the minimiser lies on few of them, so rows join in one at a time while the
+candidate breaks any. Where the rows are soft, one slack [m/s] loosens all of them, so that the people leave a solution.
+
+Proxqp claims solutions that are none and misses others, in about one tick in a hundred near people. So it works in the
+metric of the cost, begins near the solution, is asked again with other penalties where it fails, and what it finds
+counts only when its multipliers prove it.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import proxsuite
+from scipy.optimize import nnls
 
-from hrcreplay.records import Floats, Ints
-from hrcreplay.robot.control.approach_rows import Approach, worst_rows
-
-
-class Limits(NamedTuple):
-    """Bounds that do not depend on people."""
-
-    low: Floats  #: (nv,) Eq. (66d)-(66f) [rad/s]
-    high: Floats  #: (nv,) [rad/s]
-    J: Floats  #: (6, nv) of the TCP
-    J_low: Floats  #: (6,) Eq. (66g), (66h): bounds on ``J @ w`` [m/s, rad/s]
-    J_high: Floats  #: (6,) [m/s, rad/s]
+from hrcreplay.records import Floats
+from hrcreplay.robot.control.approach_rows import Approach
+from hrcreplay.robot.control.metric_rows import (
+    CLEAR,
+    EMPTY,
+    HOPELESS,
+    KNOWN,
+    NONE,
+    Limits,
+    Metric,
+    denied,
+    descend,
+    in_metric,
+    known_numbers,
+    next_row,
+    residual,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,64 +60,117 @@ class Solution:
 class Unsolved:
     """There is no minimiser, or none was found."""
 
-    status: str  #: what went wrong
+    status: str  #: what went wrong: "not finite", "infeasible" (proven), or how the search for a solution ended
 
 
 #: Weight of the squared slack: a row is broken by 1 mm/s rather than that the TCP is slower by 1 m/s.
 SLACK = 1000.0
-#: Rows broken by less than this speed hold [m/s].
-HELD = 1e-7
-#: Rounds in which rows may join in.
-ROUNDS = 30
-#: Multiplier above which a row holds the robot back.
-BINDING = 1e-9
+#: Approach rows that may join in before the problem counts as unsolved.
+MOST = 200
+#: Multiplier, in the metric, above which a row holds the robot back.
+BINDING = 1e-8
+#: Largest residual, in the metric, with which multipliers prove a solution; proxqp is asked for a tenth.
+PROVEN = 2e-10
+#: Bounds of the TCP broken by no more than this hold [m/s, rad/s].
+KEPT = 1e-8
+#: Tries of proxqp, one after the other: sweeps of coordinate descent before it begins, its inverse penalty, and how
+#: many times it may change the multipliers. Which, and in which order, was tried on replays. The last one (-1) begins
+#: at what non-negative least squares find: deep inside people rows nearly repeat each other, and proxqp is at a loss.
+TRIES = ((50, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-3, 40), (0, 1e-7, 40), (-1, 1e-6, 6))
+#: Newton steps between them.
+INNER = 20
 
 _dense = proxsuite.proxqp.dense
-_SOLVED = proxsuite.proxqp.QPSolverOutput.PROXQP_SOLVED
 
 
 def minimise(task: Problem) -> Solution | Unsolved:
-    """The minimiser over all rows."""
-    low, high, J, J_low, J_high = task.limits
-    if not np.isfinite(task.H.sum() + task.g.sum() + low.sum() + high.sum() + J_low.sum() + J_high.sum()):
+    """The minimiser over all rows. Never raises for numbers."""
+    limits, rows = task.limits, task.rows
+    if not known_numbers(task.H, task.g, limits, rows):
         return Unsolved("not finite")
-    nv = len(task.g)
-    n = nv + task.soft
-    scale = 1.0 / task.H.diagonal().max()
-    H, g = np.zeros((n, n)), np.zeros(n)
-    H[:nv, :nv], g[:nv] = scale * task.H, scale * task.g
-    A, bounds = np.zeros((nv + 6, n)), (np.concatenate((low, J_low)), np.concatenate((high, J_high)))
-    A[:nv, :nv], A[nv:, :nv] = np.eye(nv), J
-    if task.soft:
-        H[nv, nv] = scale * SLACK
-    known: set[tuple[int, ...]] = set()
-    x, z = np.zeros(n), np.zeros(len(A))
-    for _ in range(ROUNDS):
-        qp = _dense.QP(n, 0, len(A), False, _dense.HessianType.Dense, _dense.DenseBackend.PrimalLDLT)
-        qp.settings.eps_abs, qp.settings.eps_rel = 1e-9, 0.0
-        qp.settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START
-        qp.init(H, g, None, None, A, *bounds)
-        qp.solve(x, None, z)
-        if qp.results.info.status != _SOLVED:
-            return Unsolved(str(qp.results.info.status))
-        x, z = np.array(qp.results.x), np.array(qp.results.z)
-        w, slack = np.clip(x[:nv], low, high), max(0.0, float(x[nv])) if task.soft else 0.0
-        which, new, room = _broken(task.rows, w, slack)
-        if not len(which):
-            return Solution(w, bool(np.any(z[nv + 6 :] > scale * BINDING)), slack)
-        fresh = [i for i, key in enumerate(map(tuple, which.tolist())) if key not in known]
-        if not fresh:
+    problem = in_metric(task.H, task.g, limits, task.soft, SLACK)
+    if not math.isfinite(problem.b.sum() + problem.E.sum()):
+        return Unsolved("not finite")
+    if np.any(problem.low > problem.high):
+        return Unsolved("infeasible")
+    fixed, known = len(problem.E), np.empty((0, 4), dtype=np.int64)
+    z = np.zeros(fixed)
+    for _ in range(MOST):
+        solved = _solve(problem, z, limits)
+        if isinstance(solved, Unsolved):
+            return solved
+        y, z = solved
+        found = next_row(problem, y, limits, rows, known)
+        if found.outcome == HOPELESS:
+            return Unsolved("infeasible")
+        if found.outcome == KNOWN or not _keeps(limits, found.w):
             return Unsolved("residual")
-        known |= {tuple(which[i].tolist()) for i in fresh}
-        rows = np.hstack((new[fresh], np.full((len(fresh), int(task.soft)), -1.0)))
-        A, z = np.vstack((A, rows)), np.concatenate((z, np.zeros(len(fresh))))
-        bounds = np.concatenate((bounds[0], np.full(len(fresh), -1e20))), np.concatenate((bounds[1], room[fresh]))
+        if found.outcome == CLEAR:
+            return Solution(found.w, bool(np.any(z[fixed:] > BINDING)), found.slack)
+        problem, known, z = problem.with_row(found.row, found.high), np.vstack((known, found.key)), np.append(z, 0.0)
     return Unsolved("too many rows")
 
 
-def _broken(rows: Approach, w: Floats, slack: float) -> tuple[Ints, Floats, Floats]:
-    """Rows that a velocity breaks by more than the slack: which, (m, nv) and (m,) as speeds of approach [m/s]."""
-    loose = rows._replace(room_m2=rows.room_m2 + rows.per_speed * (slack + HELD))
-    which, A, _ = worst_rows(loose, w, 0.0)
-    speed = rows.per_speed[which[:, 0], which[:, 1]]
-    return which, A / speed[:, None], rows.room_m2[which[:, 0], which[:, 1]] / speed
+def _keeps(limits: Limits, w: Floats) -> bool:
+    """Whether a velocity, rounded into the axes' bounds, also keeps those of the TCP."""
+    twist = limits.J @ w
+    return bool(np.all((limits.J_low - KEPT <= twist) & (twist <= limits.J_high + KEPT)))
+
+
+def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] | Unsolved:
+    """The minimiser in the metric and the rows' multipliers, proven by them.
+
+    Args:
+        problem: In its metric.
+        z: (m,) multipliers to begin with.
+        limits: Of axes and TCP.
+    """
+    status = ""
+    for sweeps, penalty, rounds in TRIES:
+        y, z = descend(problem, z, sweeps) if sweeps >= 0 else _least_distance(problem)
+        y, z, status = _by_proxqp(problem, y, z, penalty, rounds)
+        if residual(problem, y, z) <= PROVEN:  # false for NaN
+            return y, z
+        if denied(problem, z, limits):
+            return Unsolved("infeasible")
+        z = np.zeros(len(z))
+    return Unsolved(status)
+
+
+def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
+    """The minimiser as the point nearest to -b, by non-negative least squares (Lawson and Hanson).
+
+    Where it finds none: -b itself.
+    """
+    _, b, E, low, high = problem
+    n, m = len(b), len(E)
+    above, below = high < NONE, low > -NONE
+    G = np.concatenate((-E[above], E[below]))
+    f = np.concatenate((-(high + E @ b)[above], (low + E @ b)[below]))
+    try:
+        pull, _ = nnls(np.vstack((G.T, f)), np.append(np.zeros(n), 1.0))
+    except (RuntimeError, ValueError):
+        return -b, np.zeros(m)
+    left = 1.0 - f @ pull
+    if not left > EMPTY:
+        return -b, np.zeros(m)
+    z = np.zeros(m)
+    z[above] += pull[: np.count_nonzero(above)] / left
+    z[below] -= pull[np.count_nonzero(above) :] / left
+    return -b - z @ E, z
+
+
+def _by_proxqp(problem: Metric, y: Floats, z: Floats, penalty: float, rounds: int) -> tuple[Floats, Floats, str]:
+    """What proxqp finds, and what it says of it."""
+    n, m = len(y), len(z)
+    # the last bits of what its other backend returns depend on where its memory happens to lie
+    qp = _dense.QP(n, 0, m, False, _dense.HessianType.Dense, _dense.DenseBackend.PrimalLDLT)
+    settings = qp.settings
+    settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START
+    settings.eps_abs, settings.eps_rel = 0.1 * PROVEN, 0.0
+    settings.eps_primal_inf = settings.eps_dual_inf = 0.0  # with its own tests it denies problems that have solutions
+    settings.max_iter, settings.max_iter_in = rounds, INNER
+    qp.init(np.eye(n), problem.b, None, None, problem.E, problem.low, problem.high, False, mu_in=penalty)
+    qp.solve(y, None, z)
+    results = qp.results
+    return np.array(results.x), np.array(results.z), str(results.info.status)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.approach_rows import tick_rows, worst_rows
-from hrcreplay.robot.control.control_step import RobotState, braked, integrate
+from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.control.qp_controller import RAD_PER_M, cartesian_bounds, joint_bounds
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel, irb140
@@ -58,7 +58,9 @@ def test_worst_rows_are_the_worst_of_all_rows(robot: RobotModel) -> None:
         limbs = [cloud(rng, 25, rng.uniform(0.02, 0.3, 3)) + rng.normal(size=3) * 0.5 for _ in range(4)]
         seen = obstacles(volumes(limbs), 0)
         distance = by_coal(pose, seen)
-        which, A, values = worst_rows(tick_rows(pose, seen, np.maximum(0.0, distance - 0.1) ** 2, STOP_S), dq, 0.0)
+        which, A, values = worst_rows(
+            tick_rows(pose, seen, np.maximum(0.0, distance - 0.1) ** 2, distance, STOP_S), dq, 0.0
+        )
         found = {
             tuple(key[:3]): (key[3], row, value) for key, row, value in zip(which.tolist(), A, values, strict=True)
         }
@@ -78,6 +80,10 @@ def test_worst_rows_are_the_worst_of_all_rows(robot: RobotModel) -> None:
                     assert value == pytest.approx(left.max(), abs=1e-13)
 
 
+def integrated(state: RobotState, dq_next: Floats) -> RobotState:
+    return RobotState(state.q + 0.5 * DT_S * (state.dq + dq_next), dq_next)  # Eq. (68), (69)
+
+
 def admissible(robot: RobotModel, rng: np.random.Generator) -> RobotState:
     """A state that a robot can get into: reached by driving from rest somewhere towards a limit."""
     q = rng.uniform(robot.q_min, robot.q_max)
@@ -92,7 +98,7 @@ def drive(robot: RobotModel, state: RobotState, rng: np.random.Generator, ticks:
         wish = np.where(rng.random(robot.nv) < 0.02, 1 - wish, wish)
         low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, DT_S)
         assert np.all(low <= high)
-        _, state = integrate(state, np.where(wish == 1, high, low), DT_S)
+        state = integrated(state, np.where(wish == 1, high, low))
         states.append(state)
     return states
 
@@ -113,7 +119,7 @@ def test_axes_reach_their_limits(robot: RobotModel) -> None:
     state = RobotState(np.zeros(6), np.zeros(6))
     for _ in range(3000):
         high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, DT_S)[1]
-        _, state = integrate(state, high, DT_S)
+        state = integrated(state, high)
     np.testing.assert_allclose(state.q, robot.q_max, atol=1e-9)
     np.testing.assert_allclose(state.dq, 0.0, atol=1e-7)
 
@@ -126,7 +132,7 @@ def test_the_braking_step_is_always_allowed(seed: int) -> None:
     wild = RobotState(rng.uniform(robot.q_min, robot.q_max) * 1.2, rng.normal(size=6) * robot.dq_max)
     state = admissible(robot, rng) if seed % 2 else wild
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, DT_S)
-    stop = braked(state, robot.ddq_max, DT_S)
+    stop = state.dq - np.clip(state.dq, -DT_S * robot.ddq_max, DT_S * robot.ddq_max)  # Eq. (67)
     assert np.all(low <= stop + 1e-12)
     assert np.all(stop <= high + 1e-12)
 
