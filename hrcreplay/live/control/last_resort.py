@@ -44,9 +44,7 @@ class FallbackBrake:
     q: list[float]  #: told last [deg]
     dq: list[float]  #: told last [deg/s]
     seqno: int  #: of the last reply
-    stop: list[
-        tuple[list[float], list[float]]
-    ]  #: what is left of it: joints [deg], speeds [deg/s], a row a cycle
+    stop: list[tuple[list[float], list[float]]]  #: what is left of it: joints [deg], speeds [deg/s], a row a cycle
 
     @property
     def at_rest(self) -> bool:
