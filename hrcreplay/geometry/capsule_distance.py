@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hrcreplay.geometry.vectors import dot3
 from hrcreplay.records import Floats, Ints
 
 
@@ -46,7 +45,6 @@ def nearest_pair(first_m: Floats, first_radius_m: Floats, second_m: Floats, seco
 def _nearest_rows(
     first: Floats, first_radius: Floats, second: Floats, second_radius: Floats, found: NearestPair
 ) -> None:
-    on_first, on_second = np.empty(3), np.empty(3)
     for i in range(len(first)):
         least = np.inf
         for a in range(first.shape[1]):
@@ -55,68 +53,64 @@ def _nearest_rows(
             for b in range(second.shape[1]):
                 if not _is_finite(second[i, b]):
                     continue
-                gap = segment_distance(first[i, a], second[i, b], on_first, on_second)
+                gap, share, other = segment_distance(first[i, a], second[i, b])
                 gap -= first_radius[a] + second_radius[b]
                 if gap < least:
                     least = gap
                     found.distance_m[i], found.first[i], found.second[i] = gap, a, b
-                    found.at_first_m[i], found.at_second_m[i] = on_first, on_second
+                    for k in range(3):
+                        found.at_first_m[i, k] = _at(first[i, a], share, k)
+                        found.at_second_m[i, k] = _at(second[i, b], other, k)
 
 
 @njit(cache=True)
 def _is_finite(ends: Floats) -> bool:
+    total = 0.0
     for k in range(3):
-        if not (math.isfinite(ends[0, k]) and math.isfinite(ends[1, k])):
-            return False
-    return True
+        total += abs(ends[0, k]) + abs(ends[1, k])
+    return math.isfinite(total)
 
 
 @njit(cache=True)
-def segment_distance(first: Floats, second: Floats, on_first: Floats, on_second: Floats) -> float:
-    """The distance between two segments (2, 3); writes the nearest points (3,) [m].
+def _at(ends: Floats, share: float, k: int) -> float:
+    return ends[0, k] + share * (ends[1, k] - ends[0, k])
+
+
+@njit(cache=True)
+def segment_distance(first: Floats, second: Floats) -> tuple[float, float, float]:
+    """The distance between two segments (2, 3) [m], and the shares of the way along each to the nearest points.
 
     It is least at an end of one of them, or between the feet of the common perpendicular where both lie inside.
     """
-    least = np.inf
-    for k in range(2):
-        share = _foot(second, first[k])
-        least = _shorter(first, second, float(k), share, least, on_first, on_second)
-        share = _foot(first, second[k])
-        least = _shorter(first, second, share, float(k), least, on_first, on_second)
-    u, v, w = first[1] - first[0], second[1] - second[0], first[0] - second[0]
-    uu, uv, vv, uw, vw = dot3(u, u), dot3(u, v), dot3(v, v), dot3(u, w), dot3(v, w)
-    across = uu * vv - uv * uv  # 0 for parallel ones, whose distance is found at an end
-    if across > 0.0:
-        share, other = (uv * vw - vv * uw) / across, (uu * vw - uv * uw) / across
-        if 0.0 < share < 1.0 and 0.0 < other < 1.0:
-            least = _shorter(first, second, share, other, least, on_first, on_second)
-    return least
+    uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0  # products of both directions and of what is between starts
+    for k in range(3):
+        u, v, w = first[1, k] - first[0, k], second[1, k] - second[0, k], first[0, k] - second[0, k]
+        uu, uv, vv = uu + u * u, uv + u * v, vv + v * v
+        uw, vw = uw + u * w, vw + v * w
+    least, share, other = np.inf, 0.0, 0.0
+    for k in range(5):
+        if k < 2:
+            s = float(k)
+            t = _clipped(vw + s * uv, vv)
+        elif k < 4:
+            t = float(k - 2)
+            s = _clipped(t * uv - uw, uu)
+        else:
+            across = uu * vv - uv * uv  # 0 for parallel ones, whose distance is found at an end
+            if across <= 0.0:
+                break
+            s, t = (uv * vw - vv * uw) / across, (uu * vw - uv * uw) / across
+            if not (0.0 < s < 1.0 and 0.0 < t < 1.0):
+                break
+        gap2 = 0.0
+        for i in range(3):
+            gap2 += (_at(first, s, i) - _at(second, t, i)) ** 2
+        if gap2 < least:
+            least, share, other = gap2, s, t
+    return math.sqrt(least), share, other
 
 
 @njit(cache=True)
-def _foot(segment: Floats, point: Floats) -> float:
-    """Share of the way along a segment (2, 3) at which it is nearest to a point (3,)."""
-    along = segment[1] - segment[0]
-    length2 = dot3(along, along)
-    if length2 <= 0.0:
-        return 0.0
-    return min(1.0, max(0.0, dot3(point - segment[0], along) / length2))
-
-
-@njit(cache=True)
-def _shorter(
-    first: Floats, second: Floats, share: float, other: float, least: float, on_first: Floats, on_second: Floats
-) -> float:
-    """The smaller of ``least`` and the distance between two points of the segments, which are written if they win."""
-    gap2 = 0.0
-    for k in range(3):
-        a = first[0, k] + share * (first[1, k] - first[0, k])
-        b = second[0, k] + other * (second[1, k] - second[0, k])
-        gap2 += (a - b) ** 2
-    gap = math.sqrt(gap2)
-    if gap >= least:
-        return least
-    for k in range(3):
-        on_first[k] = first[0, k] + share * (first[1, k] - first[0, k])
-        on_second[k] = second[0, k] + other * (second[1, k] - second[0, k])
-    return gap
+def _clipped(along: float, length2: float) -> float:
+    """Share of the way along a segment at which it is nearest to a point."""
+    return min(1.0, max(0.0, along / length2)) if length2 > 0.0 else 0.0

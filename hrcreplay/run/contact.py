@@ -23,13 +23,16 @@ from hrcreplay.records import Bools, Floats, HumanStates, Ints
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
-from hrcreplay.run.recorded_person import RecordedPerson, recorded_person
+from hrcreplay.run.recorded_person import recorded_person
 from hrcreplay.run.stages import PredictionStage
 from hrcreplay.store.columns import Columns, contact_columns, read_states
 from hrcreplay.store.run_folder import RunWriter
 
 #: Part of the body -> limb whose volume it has to be in.
 VOLUME_OF = {part: "LEGS" if part in LEG_PARTS else part for part in PARTS}
+
+#: Of the ticks until a horizon, the last and one in so many are looked at: people do not tremble that fast.
+_EVERY = 4
 
 #: Limb -> vertices (m, 3) and radius of the volume around them [m].
 Volumes = Mapping[str, tuple[Floats, float]]
@@ -57,7 +60,7 @@ def write_contact(job: Job, log: Log, writer: RunWriter, T_world_base: Floats) -
         if method != "none":
             found.by_volume_m[:] = by_volume(motion, found, body, predicted)
         if path.stem == "motion":
-            found.left_m[:] = left_m(motion["t_ns"].to_numpy(), body, stored_volumes(writer, occupancy.stop_s))
+            mark_left(found, motion["t_ns"].to_numpy(), body, stored_volumes(writer, occupancy.stop_s))
         names = tuple(segment.name for segment in robot.segments)
         writer.table("contact", _columns(motion, method, body.source, found, names))
     writer.close_tables()
@@ -86,6 +89,7 @@ class Contact:
     by_volume_m: Floats
     #: (n,) how far, at most, a part left the stored volume of this tick until its horizon; NaN without one [m]
     left_m: Floats
+    left_part: Ints  #: (n,) index into PARTS of that part; -1 without one
 
 
 def _columns(motion: pd.DataFrame, method: str, person: str, found: Contact, links: tuple[str, ...]) -> Columns:
@@ -98,7 +102,8 @@ def _columns(motion: pd.DataFrame, method: str, person: str, found: Contact, lin
         part=(found.part, PARTS),
         link=(found.link, links),
         speeds=(motion["tcp_speed"].to_numpy(dtype=float), found.speed),
-        outside_m=(found.by_volume_m, found.left_m),
+        outside_m=found.by_volume_m,
+        left=(found.left_m, found.left_part, PARTS),
     )
 
 
@@ -121,7 +126,14 @@ def compare(robot: RobotModel, motion: pd.DataFrame, body: Body) -> Contact:
     nothing = np.full(len(motion), np.nan)
     moving = np.asarray((dq != 0.0).any(axis=1))
     return Contact(
-        pair.distance_m, pair.first, pair.second, moving, links.speed(pair.first, at_m), nothing, nothing.copy()
+        pair.distance_m,
+        pair.first,
+        pair.second,
+        moving,
+        links.speed(pair.first, at_m),
+        nothing,
+        nothing.copy(),
+        np.full(len(motion), -1),
     )
 
 
@@ -194,25 +206,26 @@ def stored_volumes(writer: RunWriter, stop_s: float) -> Iterator[tuple[int, floa
         yield int(t_ns[first]), float(horizon_s[first]), solids
 
 
-def left_m(t_ns: Ints, body: Body, volumes: Iterator[tuple[int, float, Volumes]]) -> Floats:
-    """``Contact.left_m``.
+def mark_left(found: Contact, t_ns: Ints, body: Body, volumes: Iterator[tuple[int, float, Volumes]]) -> None:
+    """Writes ``left_m`` and ``left_part`` of a contact.
 
     Args:
+        found: Its rows are the ticks.
         t_ns: (n,) ticks of the motion [ns].
         body: At the same ticks.
         volumes: Instant [ns], horizon [s] and volumes of the stored ticks.
     """
-    outside_m = np.full(len(t_ns), np.nan)
     for at_ns, horizon_s, solids in volumes:
         first = int(np.searchsorted(t_ns, at_ns, side="left"))
         last = int(np.searchsorted(t_ns, at_ns + round(horizon_s * 1e9), side="right"))
-        worst = [outside_m[first]] if first < last else []
+        if first >= last:
+            continue
+        ticks = np.unique(np.append(np.arange(first, last, _EVERY), last - 1))
         for part, name in enumerate(PARTS):
-            axes_m = body.axes_m[first:last, part]
+            axes_m = body.axes_m[ticks, part]
             axes_m = axes_m[np.isfinite(axes_m).all(axis=(1, 2))]
-            if VOLUME_OF[name] in solids and len(axes_m):
-                worst.append(protrusion_m(axes_m, float(body.radius_m[part]), *solids[VOLUME_OF[name]]).max())
-        known = [value for value in worst if np.isfinite(value)]
-        if known:
-            outside_m[first] = max(known)
-    return outside_m
+            if VOLUME_OF[name] not in solids or not len(axes_m):
+                continue
+            out_m = float(protrusion_m(axes_m, float(body.radius_m[part]), *solids[VOLUME_OF[name]]).max())
+            if not out_m <= found.left_m[first]:  # the first one meets NaN
+                found.left_m[first], found.left_part[first] = out_m, part

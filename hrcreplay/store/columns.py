@@ -78,7 +78,7 @@ COLUMNS = {
     ),
     "contact": (
         *("t_ns", "method", "person", "moving", "distance_m", "limb", "link", "tcp_speed", "contact_speed"),
-        *("outside_m", "left_m"),
+        *("outside_m", "left_m", "left_limb"),
     ),
 }
 
@@ -172,7 +172,8 @@ def contact_columns(
     part: tuple[Ints, tuple[str, ...]],
     link: tuple[Ints, tuple[str, ...]],
     speeds: tuple[Floats, Floats],
-    outside_m: tuple[Floats, Floats],
+    outside_m: Floats,
+    left: tuple[Floats, Ints, tuple[str, ...]],
 ) -> Columns:
     """A row a tick of a method: robot against recorded person.
 
@@ -185,8 +186,10 @@ def contact_columns(
         part: (n,) indices of the nearest part of the body, -1 without one, and the names of all parts.
         link: (n,) indices of the nearest link, -1 without one, and the names of all links.
         speeds: (n,) each: of the TCP, and of the link's surface where it is nearest to the body [m/s].
-        outside_m: (n,) each: how far the touched part was outside the volume by which the motion had been certified,
-            and how far at most a part left the stored volume of the tick until its horizon; NaN: not known [m].
+        outside_m: (n,) how far the touched part was outside the volume by which the motion had been certified; NaN
+            where nothing moving was in contact, or nothing predicted [m].
+        left: (n,) how far at most a part left the stored volume of the tick until its horizon, NaN without one [m];
+            (n,) indices of that part, -1 without one, and the names of all parts.
     """
     return {
         "t_ns": t_ns,
@@ -198,8 +201,9 @@ def contact_columns(
         "link": _names(*link),
         "tcp_speed": speeds[0],
         "contact_speed": speeds[1],
-        "outside_m": outside_m[0],
-        "left_m": outside_m[1],
+        "outside_m": outside_m,
+        "left_m": left[0],
+        "left_limb": _names(left[1], left[2]),
     }
 
 
