@@ -16,9 +16,12 @@ _NOT_COMPARED = "the run has no table of contact"
 
 
 def method_prefixes(run: Run) -> dict[str, str]:
-    """Method -> prefix of its metrics, the run's own first."""
+    """Method -> prefix of its metrics; the run's own first, the programme run blind last."""
     own = str(run.meta.get("settings", {}).get("plan", {}).get("method", "qp"))
-    return {own: "plan", **{name: f"baseline_{name}" for name in sorted(run.baselines)}}
+    return {
+        own: "plan",
+        **{name: f"baseline_{name}" for name in sorted(run.baselines, key=lambda name: (name == "none", name))},
+    }
 
 
 def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:

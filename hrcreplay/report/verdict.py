@@ -57,8 +57,8 @@ def _touched(metrics: Metrics) -> str:
         return f"{_HAD}the robot would not have moved while the person was there, and a robot at rest touches nobody."
     return (
         f"{_HAD}no moving part of the robot would have touched the person: the smallest distance was "
-        f"{text_of(metrics['plan_body_distance_min_moving_m'])}, between its {_pair(metrics)}, at "
-        f"{text_of(metrics['plan_body_distance_min_moving_contact_speed_m_per_s'])} {_when(metrics)}."
+        f"{text_of(metrics['plan_body_distance_min_moving_m'])}, between its {_pair(metrics)}, {_when(metrics)}; that "
+        f"link then moved at {text_of(metrics['plan_body_distance_min_moving_contact_speed_m_per_s'])}."
     )
 
 
@@ -115,18 +115,23 @@ def _table(run: Run, metrics: Metrics) -> PageTable:
         speeds = [text_of(metrics[f"{near}_{of}_speed_m_per_s"]) for of in ("contact", "tcp")]
         rows.append(
             (
-                f"{method} (this plan)" if prefix == "plan" else method,
+                method + (" (this plan)" if prefix == "plan" else "") + (" (run blind)" if method == "none" else ""),
                 _ticks(metrics[f"{prefix}_touch_moving_ticks"]),
                 text_of(metrics[f"{prefix}_touch_contact_speed_max_m_per_s"]),
-                text_of(metrics[f"{near}_m"]),
+                _signed(metrics[f"{near}_m"]),
                 " / ".join(speed.removesuffix(" m/s") for speed in speeds) + (" m/s" if "m/s" in speeds[0] else ""),
-                text_of(metrics[f"{prefix}_body_distance_min_rest_m"]),
+                _signed(metrics[f"{prefix}_body_distance_min_rest_m"]),
                 percent(metrics[f"{prefix}_progress_share"]),
                 percent(metrics[f"{prefix}_stationary_share"]),
                 percent(metrics[f"{prefix}_full_stop_share"]),
             )
         )
     return PageTable("Robot against the recorded person", _COLUMNS, tuple(rows), _note(run, metrics))
+
+
+def _signed(metric: Metric) -> str:
+    """A number with the minus that is as wide as a digit."""
+    return text_of(metric).replace("-", "\u2212")
 
 
 def _ticks(metric: Metric) -> str:
@@ -163,7 +168,9 @@ def _left(metrics: Metrics) -> str:
         f" The person left the predicted volumes before their horizon at {left} of {checked} ticks with stored volumes"
     )
     if left:
-        words += f", by up to {text_of(metrics['volumes_left_max_m'])} ({metrics['volumes_left_limbs']['value']})"
+        parts = [found.split(" ") for found in str(metrics["volumes_left_limbs"]["value"]).split(", ")]
+        names = ", ".join(f"{part_name_text(part)} {count}" for part, count in parts)
+        words += f", by up to {text_of(metrics['volumes_left_max_m'])} ({names})"
     return words + "."
 
 

@@ -369,7 +369,7 @@ def _axis_reach_m(model: Any, points: Sequence[int]) -> Floats:
         frame = model.frames[point]
         joint, far, offset = frame.parentJoint, 0.0, frame.placement.translation
         while joint > 0:
-            axis = data.oMi[joint].actInv(pin.Motion(data.J[:, joint - 1])).angular
+            axis = data.oMi[joint].actInv(pin.Motion(data.J.reshape(6, model.nv)[:, joint - 1])).angular
             reach[joint - 1, i] = far + np.linalg.norm(offset - axis * (axis @ offset))
             far, offset = far + float(np.linalg.norm(offset)), model.jointPlacements[joint].translation
             joint = model.parents[joint]
