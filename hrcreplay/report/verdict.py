@@ -27,18 +27,18 @@ _COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ContactSummary:
     """Two sentences on the chosen method, and all methods beside each other."""
 
     sentences: tuple[str, ...]
     table: PageTable
 
 
-def verdict(run: Run, metrics: Metrics) -> Verdict | None:
+def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
     """What the comparison with the recorded body says; None where there is none."""
     if run.motion is None or metrics["contact_person"]["value"] is None:
         return None
-    return Verdict((_touched(metrics), _cost(run, metrics)), _table(run, metrics))
+    return ContactSummary((_touched(metrics), _cost(run, metrics)), _table(run, metrics))
 
 
 def _touched(metrics: Metrics) -> str:
