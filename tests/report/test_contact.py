@@ -37,7 +37,7 @@ def contact_table(run: Run, method: str, touching: range, *, person: str = "trut
             "contact_speed": 0.002 * tick,
             "outside_m": np.where(touch & (tick >= 100), np.where(tick % 3 == 0, -0.02, 0.01), np.nan),
             "left_m": np.where(tick % 10 == 0, np.where(tick == 500, 0.04, -0.05), np.nan),
-            "left_limb": np.where(tick % 10 == 0, "ULA", None),
+            "left_limb": ["ULA" if k % 10 == 0 else None for k in tick],
         }
     )
 
