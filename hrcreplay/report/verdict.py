@@ -56,10 +56,18 @@ def _touched(metrics: Metrics) -> str:
     if metrics["plan_body_distance_min_moving_m"]["value"] is None:
         return f"{_HAD}the robot would not have moved while the person was there, and a robot at rest touches nobody."
     return (
-        f"{_HAD}no moving part of the robot would have touched the person: the smallest distance was "
+        f"{_HAD}{_as_measured(metrics)}no moving part of the robot would have touched the person: the smallest distance was "
         f"{text_of(metrics['plan_body_distance_min_moving_m'])}, between its {_pair(metrics)}, {_when(metrics)}; that "
         f"link then moved at {text_of(metrics['plan_body_distance_min_moving_contact_speed_m_per_s'])}."
     )
+
+
+def _as_measured(metrics: Metrics) -> str:
+    """What must stand before 'nobody was touched': limbs that nobody saw are only where the model supposes them."""
+    never = unmeasured(metrics)[0]
+    if not never or metrics["contact_person"]["value"] == PERSONS["truth"]:
+        return ""
+    return f"as far as the person was measured (never: {', '.join(part_name_text(limb) for limb in never)}), "
 
 
 def _pair(metrics: Metrics) -> str:

@@ -157,6 +157,20 @@ def test_the_smoothed_person_has_no_legs(run: Run) -> None:
     assert "of the legs nothing is known" in found.table.note
 
 
+def test_a_limb_that_nobody_measured_is_said_before_all_else(run: Run) -> None:
+    assert run.contact is not None
+    metrics = metrics_of(dataclasses.replace(run, contact=run.contact.assign(person="smoothed")))
+    metrics["limb_LRA_unmeasured_share"] = {"value": 1.0, "unit": "1", "meaning": "made up"}
+    found = verdict.verdict(run, metrics)
+    assert found is not None
+    begin = "Had this controller been running, as far as the person was measured (never: right lower arm), no moving "
+    assert found.sentences[0].startswith(begin)
+    assert "never measured, so not known: the right lower arm" in found.table.note
+    truth = verdict.verdict(run, metrics | {"contact_person": metrics_of(run)["contact_person"]})
+    assert truth is not None
+    assert "as far as" not in truth.sentences[0]
+
+
 def test_a_person_who_is_not_known_is_not_said_to_be_safe(run: Run) -> None:
     assert run.contact is not None
     unknown = dataclasses.replace(run, contact=run.contact.assign(distance_m=np.nan, outside_m=np.nan, left_m=np.nan))
