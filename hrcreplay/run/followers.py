@@ -86,7 +86,7 @@ class Follower(ABC):
         return FollowerTick(state, point, now_s, step)
 
     @abstractmethod
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> Proposal | int:
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
         """What the method would do, or the reason why it does nothing."""
 
     @abstractmethod
@@ -97,7 +97,7 @@ class Follower(ABC):
 class QpFollower(Follower):
     """The trajectory generator of Section 5 along a reference that waits for it or not."""
 
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> Proposal | int:
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
         error_m = float(np.linalg.norm(sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3]))
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
@@ -115,13 +115,17 @@ class PathFollower(Follower):
 
     #: Whether the method looks at people at all, and whether the rows of Eq. (66i) bound its rate.
     careful, by_rows = True, False
+    #: Ways to go from the stop's next rate to the largest, tried in this order until one is certified.
+    shares: tuple[float, ...] = (1.0,)
 
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> Proposal | int:
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
         reason = stands(sight, self.settings) if self.careful else 0
         if reason or sight.reason == NOT_FINITE:
             return reason or sight.reason
         rows = around if self.by_rows else None
-        return path_controller.propose(self.robot, self.reference, self.stop, sight, rows, horizon_s, self.settings)
+        return path_controller.propose(
+            self.robot, self.reference, self.stop, sight, rows, horizon_s, self.settings, self.shares
+        )
 
     def _move_on(self) -> None:
         self.s_s = float(self.stop.along[0, 0])
@@ -132,6 +136,7 @@ class ScalingFollower(PathFollower):
     """The baseline [24]: the largest share of the programmed speed that meets the constraints."""
 
     by_rows = True
+    shares = (1.0, 0.5, 0.25)
 
 
 class BlindFollower(PathFollower):
@@ -143,13 +148,13 @@ class BlindFollower(PathFollower):
 class SsmFollower(PathFollower):
     """Speed and separation monitoring, ISO/TS 15066: goes while the protective separation distance is kept."""
 
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> Proposal | int:
+    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
         wanted = super()._propose(sight, around, horizon_s, predict)
         if isinstance(wanted, int):
             return wanted
         present = observe(self.robot, self.state, predict(0.0), self.settings.plan.clearance_m, sight.pose)
         needed_m = path_controller.protective_distance_m(
-            sight.pose, wanted.stop, self.settings.plan.human_speed, self.settings.latency_s, self.settings.dt_s
+            sight.pose, wanted[0].stop, self.settings.plan.human_speed, self.settings.latency_s, self.settings.dt_s
         )
         return wanted if present.distance_m >= needed_m else TOO_NEAR
 

@@ -215,24 +215,24 @@ class Plan(Section):
     """qp: Eq. (66); scaling: the largest factor on the programmed speed that meets the same constraints [24];
     shield: the programmed speed while the next stop is certified; ssm: stop and go by the protective separation
     distance of ISO/TS 15066; none: the programme, whoever is there."""
-    baselines: tuple[Literal["qp", "scaling", "shield", "ssm", "none"], ...] = ("scaling", "none")
+    baselines: tuple[Literal["qp", "scaling", "shield", "ssm", "none"], ...] = ("scaling",)
     """Methods run beside it, for comparison."""
-    horizon: Literal["adaptive", "fixed"] = "adaptive"
+    horizon: Literal["adaptive", "fixed"] = "fixed"
     """adaptive: the volumes reach to the end of the stop that would follow; fixed: always to occupancy.stop_s."""
-    certify: bool = True
+    certify: bool = False
     """Whether a step is taken only if it and the stop after it keep clear of every volume; else the stop that was found
     clear before goes on. False: as printed, where Eq. (67) brakes when Eq. (66) has no solution."""
-    rows: Literal["soft", "hard"] = "soft"
+    rows: Literal["soft", "hard"] = "hard"
     """qp: whether Eq. (66i) may be broken at a cost, so that there is always a solution, or not."""
-    room: Literal["product", "square"] = "product"
+    room: Literal["product", "square"] = "square"
     """Right-hand side of Eq. (14): distance (distance - clearance), or (distance - clearance)^2 as printed."""
-    lead_s: NotNegative = 0.1
+    lead_s: NotNegative = 0.0
     """The rows of Eq. (66i) look this much further ahead than the horizon, so that the robot slows down early [s]."""
-    give_way_m: NotNegative = 0.03
+    give_way_m: NotNegative = 0.0
     """qp: the robot moves away from a volume that is nearer than this [m]."""
-    jerk_s: NotNegative = 0.02
+    jerk_s: NotNegative = 0.0
     """qp: time from no acceleration to the largest; 0: any change within a tick [s]."""
-    smooth_s: NotNegative = 0.04
+    smooth_s: NotNegative = 0.0
     """qp: time constant with which the velocity approaches the best one; 0: as fast as the limits allow [s]."""
     human_speed: Positive = 1.6
     """ssm: speed at which a person may approach, ISO 13855 [m/s]."""

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.geometry.segment_hull_distance import distances
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.separation import axis_distance
 from tests.geometry.exact import exact_distance
+from tests.robot.distances import axis_distance
 
 PAIRS = 10_000
 

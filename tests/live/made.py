@@ -57,17 +57,17 @@ class MadeController:
         vertices = np.arange(6 * 4 * 3).reshape(-1, 3) + np.tanh(self.p[0])
         offsets = np.arange(0, 4 * len(LIMBS) + 1, 4)
         volumes = SweptVolumes(np.array([t_ns]), offsets, vertices, np.full((1, 6), 0.1), LIMBS, "positions")
-        return Perception(t_ns, states, volumes, obstacles(volumes, 0))
+        return Perception(t_ns, states, volumes, obstacles(volumes, 0), 0.1)
 
     def answer(self, event: TickEvent) -> Decision:
         """Every byte of every datagram moves the robot."""
         self.q += 1e-6 * sum(sum(data) for data in event.datagrams) + 1e-9 * self.p[:6] + 1e-4 * self.silences
-        row = MotionRow(self.q - 0.01, self.q.copy(), self.q / 2, self.q / 3, self.q[:3], self.q[3:], *[0.25] * 4)
+        row = MotionRow(self.q - 0.01, self.q.copy(), self.q / 2, self.q / 3, self.q[:3], self.q[3:], *[0.25] * 7)
         numbers = (self.q * 10).tolist()
         reply = egm.SensorMessage(planned=egm.Planned(joints=egm.Joints(joints=numbers))).SerializeToString()
         reason = "Ctrl-C" if Signal.INTERRUPT in event.signals else ""
         status = 2 if reason else 0
-        return Decision(event.t_ns, self.looked_ns, reply, codec.FOLLOWING, status, reason, 1, -1, row)
+        return Decision(event.t_ns, self.looked_ns, reply, codec.FOLLOWING, status, reason, 1, -1, row, None)
 
     def silence(self, t_ns: int, signals: Signal) -> None:  # noqa: ARG002 - part of what a controller is
         """A silence moves the robot too."""
@@ -110,7 +110,7 @@ def session(ticks: int, *, controller: MadeController | None = None) -> Iterator
         perception = controller.update_perception(look_ns, skeletons)
         yield codec.encode_perception(perception.states, perception.volumes, len(skeletons))
         if k % 10 == 0:
-            yield codec.encode_volumes(perception.volumes)
+            yield codec.encode_volumes(perception.volumes, perception.horizon_s)
     yield codec.encode_event(START_NS + (ticks + 2) * TICK_NS, {"what": "end", "reason": "Ctrl-C"})
 
 

@@ -26,8 +26,8 @@ from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.verify import SessionRecomputation
 from hrcreplay.live.view import status_publisher
-from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control import stopping
+from hrcreplay.robot.control.stopping import axis_by_axis
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run.followers import QpFollower
 from tests.live.counted import Cable, CountedLoop, counted
@@ -100,12 +100,11 @@ def test_a_bug_anywhere_in_control_brakes_a_moving_robot_to_rest(
     found = Sent(place, MOVING_S, tmp_path, monkeypatch)
     robot, replies = found.flight.robot, found.after()
     assert np.abs(replies[0].dq).max() > 3.0, "it was fast"
-    state = RobotState(replies[0].q, replies[0].dq)
-    for reply in replies[1:]:
-        state = control_step.integrate(state, control_step.braked(state, robot.ddq_max, CYCLE_S), CYCLE_S)[1]
-        np.testing.assert_allclose(reply.q, state.q, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(reply.dq, state.dq, rtol=0, atol=1e-12)
-        state = RobotState(reply.q, reply.dq)
+    stop = axis_by_axis(replies[0].q, replies[0].dq, robot.ddq_max, CYCLE_S)
+    assert len(replies) > stop.ticks
+    for row, reply in enumerate(replies):
+        np.testing.assert_allclose(reply.q, stop.q[min(row, stop.ticks)], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(reply.dq, stop.dq[min(row, stop.ticks)], rtol=0, atol=1e-12)
     assert not any(np.any(reply.dq) for reply in replies[-FINAL_ANSWERS:])
     assert all((two.seqno - one.seqno) % 2**32 == 1 for one, two in pairwise(replies))
     assert [why for _, why in found.flight.controller.stops] == [watchdog.FAULT]
@@ -131,17 +130,17 @@ def test_a_bug_is_one_line_and_a_traceback_in_the_folder(
 
 def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
     try:
-        control_step.braked("nonsense", np.ones(6), 0.004)  # type: ignore[arg-type]
-    except AttributeError as error:
+        stopping.at_rest({})  # type: ignore[arg-type]
+    except KeyError as error:
         said = processes.describe_exception(error)
-    lines = Path(control_step.__file__).read_text().splitlines()
-    number = next(i for i, line in enumerate(lines, 1) if "speed = np.abs(state.dq)" in line)
-    place = f"hrcreplay/robot/control/control_step.py:{number}, in braked"
-    assert said == f"AttributeError: 'str' object has no attribute 'dq' ({place})"
+    lines = Path(stopping.__file__).read_text().splitlines()
+    number = next(i for i, line in enumerate(lines, 1) if "return Stop(q[None]" in line)
+    place = f"hrcreplay/robot/control/stopping.py:{number}, in at_rest"
+    assert said == f"KeyError: None ({place})"
 
 
 def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
-    brake = last_resort.FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7)
+    brake = last_resort.FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7, [])
     brake.update_position([9.0] * 6)  # it lags
     assert brake.dq == [20.0] * 6
     brake.update_position([11.0] * 6)
@@ -153,7 +152,7 @@ def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
 
 def test_a_brake_stays_within_the_joints_limits() -> None:
     brake = last_resort.FallbackBrake(
-        [360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0
+        [360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0, []
     )
     said = [decode_correction(brake.step(0)) for _ in range(20)]
     assert brake.at_rest

@@ -217,7 +217,7 @@ def _handed(job: Job, log: Log) -> dict[str, str]:
     reading = job.settings.logs.model_dump(exclude={"joints_topic"})
     first = repr((fusion_stage, reading, _ticks(job, log).tolist()))
     second = repr((prediction_stage, replay._store_every(job)))
-    return {"fuse": first, "predict": second, "plan": repr(build.plan_settings(job, 0.004))}
+    return {"fuse": first, "predict": second, "plan": repr(build.plan_settings(job, 0.004, job.settings.plan.method))}
 
 
 @pytest.mark.parametrize("name", STALE)

@@ -13,7 +13,7 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step
 from hrcreplay.robot.control.decision import Taken, made
-from hrcreplay.robot.control.stopping import Stop, straight
+from hrcreplay.robot.control.stopping import Stop, axis_by_axis, straight
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.path import approach
 from hrcreplay.robot.programme.reference import Reference
@@ -37,7 +37,8 @@ class ControlSetup:
 
     def stop_from(self, state: RobotState) -> Stop:
         """The stop of a robot whose last one ended elsewhere: it was held at a limit, or only echoed."""
-        return straight(state.q, state.dq, self.robot.ddq_max, self.plan.dt_s)
+        brake = straight if self.plan.certified else axis_by_axis
+        return brake(state.q, state.dq, self.robot.ddq_max, self.plan.dt_s)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -71,8 +72,7 @@ class PlanSettings:
         return replace(self, plan=self.plan.model_copy(update={"jerk_s": 0.0}))
 
 
-@dataclass(frozen=True, slots=True)
-class Proposal:
+class Proposal(NamedTuple):
     """A step that a method would like to take."""
 
     stop: Stop  #: the stop after it; its row 0 is where the step leads

@@ -7,6 +7,7 @@ that would follow (``PlanSettings.horizon_s``), so a stop under way was certifie
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +56,7 @@ def stands(sight: Sight, settings: PlanSettings) -> int:
 def decide(
     robot: RobotModel,
     going: Stop,
-    wanted: Proposal | int,
+    wanted: Sequence[Proposal] | int,
     around: Obstacles,
     horizon_s: float,
     planes: Floats,
@@ -66,7 +67,7 @@ def decide(
     Args:
         robot: The manipulator.
         going: The stop that goes on where nothing else is taken; its row 0 is where the robot is.
-        wanted: The proposal of the method, or the reason why there is none.
+        wanted: The proposals of the method, the one it would like best first; or the reason why there is none.
         around: The swept volumes of the tick.
         horizon_s: Until when they hold [s].
         planes: (s, l, 3) planes between links and limbs, of the tick before.
@@ -76,14 +77,15 @@ def decide(
         What is executed, and the planes for the next tick.
     """
     certify = settings.certified
-    if isinstance(wanted, Proposal):
-        in_time = (wanted.stop.ticks + 1) * settings.dt_s <= horizon_s + 1e-9
-        if not certify:
-            return Taken(wanted.stop, wanted.status, 0, not wanted.stop.ticks and not going.ticks), planes
-        if in_time:
-            ok, planes = clear(robot, going, wanted.stop, around, settings.plan.clearance_m, settings.dt_s, planes)
+    if not isinstance(wanted, int):
+        for stop, status in wanted:
+            if not certify:
+                return Taken(stop, status, 0, not stop.ticks and not going.ticks), planes
+            if (stop.ticks + 1) * settings.dt_s > horizon_s + 1e-9:
+                continue
+            ok, planes = clear(robot, going, stop, around, settings.plan.clearance_m, settings.dt_s, planes)
             if ok:
-                return Taken(wanted.stop, wanted.status, 0, certified=True), planes
+                return Taken(stop, status, 0, certified=True), planes
         wanted = NOT_CERTIFIED
     held = not going.ticks and wanted not in (NO_HUMAN, NOT_FINITE)
     return Taken(going.rest(), LIMITED if held else BRAKING, wanted, certify or not going.ticks), planes

@@ -261,7 +261,7 @@ def propose(
     obstacles: Obstacles,
     horizon_s: float,
     settings: PlanSettings,
-) -> Proposal | int:
+) -> list[Proposal] | int:
     """One tick of Section 5: the step that Eq. (66) finds best, and the stop after it; a reason where there is none.
 
     Args:
@@ -284,4 +284,4 @@ def propose(
     q_next = state.q + 0.5 * settings.dt_s * (state.dq + found.dq_next)  # Eq. (68), (69)
     brake = straight if settings.certified else axis_by_axis
     stop = brake(q_next, found.dq_next, robot.ddq_max, settings.dt_s)
-    return Proposal(stop, control_step.LIMITED if found.held else control_step.TRACKING)
+    return [Proposal(stop, control_step.LIMITED if found.held else control_step.TRACKING)]

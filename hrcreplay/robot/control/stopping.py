@@ -129,20 +129,19 @@ def _along_path(grid: Grid, s_s: float, rate: float, gain: Floats, dt_s: float) 
             rows_q, rows_dq = np.concatenate((rows_q, rows_q)), np.concatenate((rows_dq, rows_dq))
             along = np.concatenate((along, along))
         before, at = along[i, 1], along[i, 0]
-        slower = 0.0
+        slower, tried = before, 0.0  # the path may bend so much that no lower rate keeps the limits
         for _ in range(_ROUNDS):
-            there = at + 0.5 * dt_s * (before + slower)
-            q, towards, _ = place(grid, there)
+            _, towards, _ = place(grid, at + 0.5 * dt_s * (before + tried))
             least = _least_rate(towards, rows_dq[i], gain)
-            if least <= slower + _SHARE:
+            if least <= tried + _SHARE:
+                slower = min(slower, tried)
+            if abs(least - tried) <= _SHARE or not least < before:
                 break
-            slower = least
-        slower = min(slower, before)  # the path may bend so much that no lower rate keeps the limits
+            tried = least
         there = at + 0.5 * dt_s * (before + slower)
         q, towards, _ = place(grid, there)
         i += 1
         rows_q[i], rows_dq[i], along[i, 0], along[i, 1] = q, slower * towards, there, slower
-    along[i, 1] = 0.0
     return rows_q, rows_dq, along, i
 
 

@@ -28,7 +28,7 @@ class Stored(Flight):
         super()._update_perception(t_ns)
         perception = self.controller.perception
         if perception is not None and len(self.states) % 10 == 1:
-            self.messages.append(codec.encode_volumes(perception.volumes))
+            self.messages.append(codec.encode_volumes(perception.volumes, perception.horizon_s))
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_motions_are_those_of_the_session(run: Path, flight: Flight) -> None:
 
 def test_volumes_are_those_that_were_stored(run: Path, messages: list[bytes]) -> None:
     table = pd.read_parquet(run / "occupancy.parquet")
-    stored = [codec.decode_volumes(m, BODY, "") for m in messages if codec.kind(m) == codec.VOLUMES]
+    stored = [codec.decode_volumes(m, BODY, "")[0] for m in messages if codec.kind(m) == codec.VOLUMES]
     known = [volumes for volumes in stored if np.isfinite(volumes.vertices_m).all()]
     assert sorted(set(table["t_ns"])) == [int(volumes.t_ns[0]) for volumes in known]
     last = table[table["t_ns"] == known[-1].t_ns[0]]

@@ -45,7 +45,7 @@ def scene(t_ns: int = 1_800_000_000_123_456_789) -> Scene:
 
 
 def packed(now: Scene) -> bytes:
-    return pack(now.t_ns, now.points_m, now.ends_m, codec.encode_volumes(now.volumes))
+    return pack(now.t_ns, now.points_m, now.ends_m, codec.encode_volumes(now.volumes, 0.1))
 
 
 def test_a_scene_comes_out_as_it_went_in() -> None:

@@ -11,8 +11,8 @@ from scipy.optimize import nnls
 from hrcreplay.geometry.segment_hull_distance import EXACT_M, distances
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import separation as module
-from hrcreplay.robot.control.separation import axis_distance, obstacles, separation
-from tests.robot.distances import by_coal
+from hrcreplay.robot.control.separation import obstacles, separation
+from tests.robot.distances import axis_distance, by_coal
 from tests.robot.people import cloud, volumes
 
 
@@ -123,31 +123,6 @@ def test_a_limb_that_is_not_finite_or_empty_is_not_known(bad: float) -> None:
     limbs = [np.zeros((3, 3)), np.full((1, 3), bad)]
     assert not obstacles(volumes(limbs), 0).known
     assert not obstacles(volumes([np.zeros((3, 3)), np.zeros((0, 3))]), 0).known
-
-
-def broken(*_: Any) -> tuple[float, Floats]:
-    raise RuntimeError("GJK did not converge")
-
-
-@pytest.mark.parametrize(("name", "stub"), [("_gjk", broken), ("_gjk", lambda *_: (np.nan, np.full(3, np.nan)))])
-def test_where_coal_finds_no_distance_ours_is_proven_all_the_same(
-    monkeypatch: pytest.MonkeyPatch, name: str, stub: Any
-) -> None:
-    seen, pose = obstacles(volumes([np.ones((3, 3)), np.full((3, 3), 2.0)]), 0), arm(np.zeros((2, 3)))
-    monkeypatch.setattr(module, name, stub)
-    surface, *pair = separation(pose, seen, np.zeros((1, 2))).nearest()
-    assert surface == pytest.approx(np.sqrt(3.0), abs=1e-12)
-    assert pair == [0, 0]
-
-
-@pytest.mark.parametrize(("by_coal", "counts"), [(1.5, 1.5), (0.0, 0.0), (1.8, np.sqrt(3.0))])
-def test_of_two_distances_of_the_nearest_pair_the_smaller_counts(
-    monkeypatch: pytest.MonkeyPatch, by_coal: float, counts: float
-) -> None:
-    seen, pose = obstacles(volumes([np.ones((3, 3)), np.full((3, 3), 2.0)]), 0), arm(np.zeros((2, 3)))
-    monkeypatch.setattr(module, "axis_distance", lambda *_: by_coal)
-    found = separation(pose, seen, np.zeros((1, 2)))
-    np.testing.assert_allclose(found.distance_m, [[counts, np.sqrt(12.0)]])
 
 
 def test_a_pair_whose_bounds_do_not_meet_counts_with_the_lower_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,12 +10,14 @@ import pytest
 from hrcreplay.records import Floats, SweptVolumes
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, Step
-from hrcreplay.robot.control.scaling_controller import PathState, rates, step
-from hrcreplay.robot.control.separation import obstacles
+from hrcreplay.robot.control.path_controller import PathState, rates
+from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.stopping import along_path
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.programme.path import programmed
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.run.followers import ScalingFollower
 from hrcreplay.settings.sections import Plan
 from tests.robot.checker import violation
 from tests.robot.distances import by_coal
@@ -42,6 +44,18 @@ def reference(robot: RobotModel) -> Reference:
     places = [{"joints_deg": [40, 20, -10, 0, 60, 0]}, {"joints_deg": [-40, 30, -20, 0, 70, 0], "dwell_s": 0.2}]
     task = {"name": "to and fro", "repeat": True, "speed": 0.6, "acceleration": 0.5, "waypoints": places}
     return programmed(parse_task(task), robot)
+
+
+def step(
+    robot: RobotModel, reference: Reference, state: PathState, seen: Obstacles, settings: PlanSettings
+) -> tuple[Step, PathState]:
+    """One tick from a given state of the path."""
+    follower = ScalingFollower(robot, reference, settings)
+    going = along_path(reference.grid, state.s_s, state.rate, robot.ddq_max, settings.dt_s)
+    assert going is not None
+    follower.stop = going
+    made = follower.step(lambda _: seen).step
+    return made, PathState(*follower.stop.along[0].tolist())
 
 
 def run(robot: RobotModel, reference: Reference, people: SweptVolumes) -> Iterator[tuple[PathState, Step]]:
@@ -144,14 +158,6 @@ def test_a_tcp_limit_scales_the_speed(robot: RobotModel, reference: Reference) -
         fastest = max(fastest, np.abs(made.pose.J_tcp @ made.next.dq)[:3].max())
         assert made.status == control_step.TRACKING
     assert fastest == pytest.approx(0.2, rel=1e-2)
-
-
-def test_a_state_that_is_not_a_number_stands(robot: RobotModel, reference: Reference) -> None:
-    nobody = obstacles(volumes([np.full((1, 3), 50.0)]), 0)
-    made, _ = step(robot, reference, PathState(0.5, np.nan), nobody, SETTINGS)
-    assert (made.status, made.reason) == (control_step.BRAKING, control_step.NOT_FINITE)
-    assert np.all(made.next.dq == 0.0)
-    assert np.all(made.u == 0.0)
 
 
 def test_rates_bound_a_multiple() -> None:
