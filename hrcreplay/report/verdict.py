@@ -56,7 +56,8 @@ def _touched(metrics: Metrics) -> str:
     if metrics["plan_body_distance_min_moving_m"]["value"] is None:
         return f"{_HAD}the robot would not have moved while the person was there, and a robot at rest touches nobody."
     return (
-        f"{_HAD}{_as_measured(metrics)}no moving part of the robot would have touched the person: the smallest distance was "
+        f"{_HAD}{_as_measured(metrics)}no moving part of the robot would have touched the person: the smallest "
+        "distance was "
         f"{text_of(metrics['plan_body_distance_min_moving_m'])}, between its {_pair(metrics)}, {_when(metrics)}; that "
         f"link then moved at {text_of(metrics['plan_body_distance_min_moving_contact_speed_m_per_s'])}."
     )
