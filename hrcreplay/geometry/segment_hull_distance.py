@@ -192,3 +192,22 @@ def _edge(on: Carriers, i: int) -> bool:
     for c in range(3):
         e[c] /= on.triangle[i, i]
     return True
+
+
+def protrusion_m(axes: Floats, radius_m: float, vertices: Floats, ball_m: float) -> Floats:
+    """How far capsules stand out of the convex hull of points with a ball around each; negative: deep inside the ball.
+
+    The distance from a convex set is convex, so no point of an axis is further away than one of its ends.
+
+    Args:
+        axes: (k, 2, 3) ends of the capsules' axes, finite [m].
+        radius_m: Radius of the capsules [m].
+        vertices: (m, 3) at least one [m].
+        ball_m: Radius of the ball [m].
+
+    Returns:
+        (k,) [m]; no less than ``radius_m - ball_m``, which is that of an axis inside the hull.
+    """
+    points = np.repeat(np.ascontiguousarray(axes).reshape(-1, 1, 3), 2, axis=1)
+    _, high, _ = distances(points, np.ascontiguousarray(vertices), np.array([0, len(vertices)]))
+    return np.asarray(high.reshape(-1, 2).max(axis=1) + radius_m - ball_m)

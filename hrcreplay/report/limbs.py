@@ -30,6 +30,9 @@ NAMES = {
     "LLA": "left lower arm",
 }
 
+#: What people call the parts of a recorded body that are no LIMBS.
+LEG_NAMES = {"THIGH_R": "right thigh", "SHANK_R": "right shank", "THIGH_L": "left thigh", "SHANK_L": "left shank"}
+
 #: Joints that place a limb beside those that carry it; a part of an arm has been seen when one of its two has.
 OWN_JOINTS = {
     "HD": JOINTS[:4],
@@ -89,6 +92,11 @@ def _never_measured(measurements: pd.DataFrame | None) -> frozenset[str]:
     if measurements is None or not len(measurements):
         return frozenset()
     return frozenset(joint for joint in JOINTS if not np.isfinite(measurements[joint].to_numpy(dtype=float)).any())
+
+
+def part_name_text(part: str) -> str:
+    """A part of a recorded body as a reader calls it."""
+    return NAMES.get(part) or LEG_NAMES.get(part, part)
 
 
 def limb_names_text(limbs: list[str]) -> str:

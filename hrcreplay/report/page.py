@@ -33,6 +33,7 @@ from hrcreplay.report.tables import (
     robot_table,
     text_of,
 )
+from hrcreplay.report.verdict import verdict
 from hrcreplay.store.run_folder import Run
 
 #: Suffixes of the metrics of each limb.
@@ -81,6 +82,7 @@ def render(
     return template.render(
         title=title or (inputs[0]["name"] if inputs else "a session"),
         subtitle=_subtitle(run, metrics),
+        verdict=verdict(run, metrics),
         answers=story.answers(run, metrics),
         cards=story.cards(run, metrics),
         parts=_parts(run, metrics, figures_dir, tables),
@@ -120,7 +122,7 @@ def _parts(
         PageSection(
             "prediction",
             "Prediction",
-            "What the person could reach within the robot's stopping time, and the bounds that this rests on.",
+            "What the person could reach until the robot would have stopped, and the bounds that this rests on.",
             figures("fig17_volumes"),
             (*_volumes(metrics), *tables),
             ""
@@ -203,9 +205,11 @@ def _papers(metrics: Mapping[str, Metric]) -> str:
 
 
 def _reasons(metrics: Mapping[str, Metric], plans: Mapping[str, str]) -> tuple[PageTable, ...]:
-    mark = "_braking_share_"
-    found = sorted({name.split(mark)[1] for name in metrics if mark in name})
-    rows = [(slug.replace("_", " "), f"braking_share_{slug}") for slug in found]
+    rows = []
+    for what in ("braking", "standing"):
+        mark = f"_{what}_share_"
+        found = sorted({name.split(mark)[1] for name in metrics if mark in name})
+        rows += [(f"{what}: {slug.replace('_', ' ')}", f"{what}_share_{slug}") for slug in found]
     body = [
         (
             label,
@@ -216,7 +220,7 @@ def _reasons(metrics: Mapping[str, Metric], plans: Mapping[str, str]) -> tuple[P
         )
         for label, suffix in rows
     ]
-    return (PageTable("Why it braked, share of all ticks", ("", *plans), tuple(body)),) if body else ()
+    return (PageTable("Why it braked or stood, share of all ticks", ("", *plans), tuple(body)),) if body else ()
 
 
 def _volumes(metrics: Mapping[str, Metric]) -> tuple[PageTable, ...]:
@@ -224,7 +228,9 @@ def _volumes(metrics: Mapping[str, Metric]) -> tuple[PageTable, ...]:
     columns = {method: f"occupancy_{method}" for method in methods}
     rows = [(limb, f"{limb}_m3") for limb in LIMBS]
     rows += [("sum of the six", "sum_m3"), ("LEGS", "LEGS_m3")]
-    table = compare("Mean swept volume", metrics, columns, rows, "Limb radius included.")
+    table = compare(
+        "Mean swept volume", metrics, columns, rows, "Limb radius included; over the horizon of each stored tick."
+    )
     return (table,) if methods else ()
 
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hrcreplay.logs.clean import DEFECTS
+from hrcreplay.report import verdict
 from hrcreplay.report.limbs import limb_names_text, unmeasured
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
@@ -54,14 +55,14 @@ class Card:
 
 @dataclass(frozen=True)
 class Answer:
-    """One of the two questions, the answer in a few words, and what stands behind it: a paragraph a line."""
+    """One of two questions, the answer in a few words, and what stands behind it: a paragraph a line."""
 
     question: str
     short: str
     words: str
 
 
-SAFE = "Had this controller been running, would the person have been safe?"
+SAFE = "Could the robot always have stopped before it reached the person?"
 COST = "What would it have cost the task?"
 
 
@@ -93,6 +94,47 @@ def _with_unmeasured(safe: Answer, metrics: Mapping[str, Metric]) -> Answer:
 
 
 def _safety(run: Run, metrics: Mapping[str, Metric]) -> Answer:
+    if metrics["plan_uncertified_moving_ticks"]["value"] is None or not _certifies(run):
+        answer = _by_inequality(metrics)
+    else:
+        answer = _by_certificate(metrics)
+    more = (_nearest(run, metrics), _braked(metrics))
+    return Answer(SAFE, answer[0], "\n".join(part for part in (answer[1], *more) if part))
+
+
+def _certifies(run: Run) -> bool:
+    """Whether the plan took certified steps only."""
+    plan = run.meta.get("settings", {}).get("plan", {})
+    return bool(plan.get("certify")) and plan.get("method") != "none"
+
+
+def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
+    """The answer in short and in words, where every step had to be certified."""
+    ticks, moving = text_of(metrics["plan_ticks"]), text_of(metrics["plan_moving_ticks"])
+    if not metrics["plan_moving_ticks"]["value"]:
+        return "The robot never moved.", f"It stood at all {ticks} ticks."
+    without = metrics["plan_uncertified_moving_ticks"]["value"]
+    kept = (
+        "its step and the stop after it were clear of all that the person was predicted to reach until that stop had "
+        "ended: as long as people stay within that, no moving link touches them"
+    )
+    stops = (
+        f"It was in a full stop at {text_of(metrics['plan_braking_moving_ticks'])} ticks "
+        f"({percent(metrics['plan_full_stop_share'])}), each of them certified before it began."
+    )
+    if without:
+        short = (
+            f"Not at every tick: {text_of(metrics['plan_uncertified_moving_ticks'])} of {moving} had no certificate."
+        )
+        return short, f"At the other ticks at which it moved, {kept}."
+    return (
+        "At every tick of this replay, and certified.",
+        f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}. {stops}",
+    )
+
+
+def _by_inequality(metrics: Mapping[str, Metric]) -> tuple[str, str]:
+    """The answer in short and in words, where inequality (2) is all that there is."""
     ticks, moving = text_of(metrics["plan_ticks"]), text_of(metrics["plan_moving_ticks"])
     late = metrics["plan_braking_moving_ticks"]["value"]
     kept = (
@@ -114,7 +156,7 @@ def _safety(run: Run, metrics: Mapping[str, Metric]) -> Answer:
             f"At {share:.2f} % of the ticks at which the robot moved it was still braking, as hard as its joints can. "
             f"At the other ticks, {kept}."
         )
-    return Answer(SAFE, short, "\n".join(part for part in (words, _nearest(run, metrics), _braked(metrics)) if part))
+    return short, words
 
 
 def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
@@ -122,8 +164,7 @@ def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
     nearest, late = metrics["plan_separation_min_moving_m"], metrics["plan_braking_moving_separation_min_m"]
     if nearest["value"] is None:
         return ""
-    stop_s = run.meta.get("settings", {}).get("occupancy", {}).get("stop_s")
-    within = "the stopping time" if stop_s is None else f"T_s = {stop_s:g} s"
+    within = _horizon(run, metrics)
     words = (
         f"The smallest distance while it moved was {text_of(nearest)}: from the surface of a link to the surface of "
         f"all that the person could reach within {within}, not to the body"
@@ -131,20 +172,36 @@ def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
     if late["value"] is not None:
         words += f"; while it was still braking, {text_of(late)}"
     words += "."
-    if nearest["value"] < 0.0005:
+    if nearest["value"] < 0.0005 and not _certifies(run):
         words += " At 0 the constraint lets a link move along that space or away from it, but not into it."
     return words
 
 
+def _horizon(run: Run, metrics: Mapping[str, Metric]) -> str:
+    """How far ahead the person was predicted."""
+    settings = run.meta.get("settings", {})
+    median, most = metrics["plan_horizon_median_s"], metrics["plan_horizon_max_s"]
+    if settings.get("plan", {}).get("horizon") == "adaptive" and median["value"] is not None:
+        return f"the horizon of the tick (median {text_of(median)}, at most {text_of(most)})"
+    stop_s = settings.get("occupancy", {}).get("stop_s")
+    return "the stopping time" if stop_s is None else f"T_s = {stop_s:g} s"
+
+
 def _braked(metrics: Mapping[str, Metric]) -> str:
-    """What happened at the ticks at which it braked, the most frequent reason first."""
-    mark = "plan_braking_ticks_"
+    """What happened at the ticks at which it braked, and at which it stood held; the most frequent reason first."""
+    mark, stood = "plan_braking_ticks_", "plan_standing_share_"
+    held = [(m["value"], name.removeprefix(stood)) for name, m in metrics.items() if name.startswith(stood)]
+    why = [
+        f"{100 * share:.1f} % of the ticks {reason_text(slug.replace('_', ' '))}"
+        for share, slug in sorted(held, key=lambda part: (-part[0], part[1]))
+    ]
+    rest = f" Why it stood at rest: at {'; at '.join(why)}." if why else ""
     found = [(m["value"], name.removeprefix(mark)) for name, m in metrics.items() if name.startswith(mark)]
     parts = [
         f"at {text_of(metrics[mark + slug])} tick{'' if count == 1 else 's'} {reason_text(slug.replace('_', ' '))}"
         for count, slug in sorted(found, key=lambda part: (-part[0], part[1]))
     ]
-    return f"Why it braked, moving or standing: {'; '.join(parts)}." if parts else ""
+    return ((f"Why it braked, moving or standing: {'; '.join(parts)}." if parts else "") + rest).strip()
 
 
 def _cost(run: Run, metrics: Mapping[str, Metric]) -> Answer:
@@ -187,16 +244,23 @@ def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
     )
     stood = ", ".join(f"{n} {percent(metrics[f'baseline_{n}_stationary_share'], 2)}" for n in sorted(run.baselines))
     near, never = text_of(metrics["plan_near_ticks"]), ", ".join(unmeasured(metrics)[0])
+    kept = "ticks with the constraint kept, or the robot standing"
+    if _certifies(run) and metrics["plan_uncertified_moving_ticks"]["value"] is not None:
+        late, kept = (
+            metrics["plan_uncertified_moving_ticks"]["value"],
+            "ticks with a certificate, or the robot standing",
+        )
     return (
         Card(
             _floor_percent(1 - late / ticks) if ticks else "\u2013",
-            "ticks with the constraint kept, or the robot standing",
+            kept,
             f"{text_of(metrics['plan_braking_moving_ticks'])} of {text_of(metrics['plan_ticks'])} ticks still braking"
             + (f"; {never} never measured" if never else ""),
         ),
         Card(
             text_of(metrics["plan_separation_min_moving_m"]),
-            "smallest distance from a link's surface to that of what the person could reach within T_s, while it moved",
+            "smallest distance from a link's surface to that of what the person could reach within "
+            f"{'the horizon' if metrics['plan_horizon_max_s']['value'] else 'T_s'}, while it moved",
             "not to the body"
             + (f"; at all: {text_of(metrics['plan_separation_min_m'])}, {pair[0]} \u2013 {pair[1]}" if pair[0] else ""),
         ),
@@ -264,7 +328,10 @@ def lines(run: Run, metrics: Metrics) -> list[str]:
         plans = {str(metrics["plan_method"]["value"]): "plan", **others}
         found.append("plan: " + "; ".join(f"{name}: {_plan(metrics, prefix)}" for name, prefix in plans.items()))
     if run.meta.get("command") == "report":
-        found.append("report: " + " ".join(answer.short for answer in answers(run, metrics)))
+        touched = verdict.line(run, metrics)
+        found.append(
+            "report: " + " ".join([*([touched] if touched else []), *(a.short for a in answers(run, metrics))])
+        )
     return [line.replace("\u202f", ",") for line in found]  # the page's separator is not in every terminal's font
 
 
@@ -290,7 +357,8 @@ def _predict(run: Run, metrics: Metrics) -> str:
 
 
 def _plan(metrics: Metrics, prefix: str) -> str:
-    words = [f"{text_of(metrics[f'{prefix}_braking_moving_ticks'])} ticks braking while moving"]
+    share = percent(metrics[f"{prefix}_full_stop_share"])
+    words = [f"{text_of(metrics[f'{prefix}_braking_moving_ticks'])} ticks ({share}) in full stops"]
     if metrics[f"{prefix}_stationary_share"]["value"] is not None:
         words.insert(0, f"standing in {percent(metrics[f'{prefix}_stationary_share'])} of the near ticks")
     if metrics[f"{prefix}_progress_share"]["value"] is not None:

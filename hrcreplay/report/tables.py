@@ -19,7 +19,7 @@ from hrcreplay.robot.model import RobotModel
 CAPTIONS = {
     "fig14_speed": (
         "As the paper's Fig. 14. Programmed speed of the TCP; its actual speed, braking shaded; and the smallest "
-        "distance, surface to surface, between the robot and what the person could reach within the stopping time."
+        "distance, surface to surface, between the robot and what the person could reach within the tick's horizon."
     ),
     "status": (
         "What the robot did over time. Limited: held by a safety constraint or a limit. Above each bar, in grey, when "
@@ -65,7 +65,11 @@ PLAN_SAFETY = (
     ("limited", "limited_share"),
     ("braking", "braking_share"),
     ("ticks with the robot moving", "moving_ticks"),
-    ("ticks braking with the robot still moving", "braking_moving_ticks"),
+    ("full stops: ticks braking with the robot still moving", "braking_moving_ticks"),
+    ("full stops, of all ticks", "full_stop_share"),
+    ("ticks moving without a certificate", "uncertified_moving_ticks"),
+    ("horizon of the volumes, median", "horizon_median_s"),
+    ("\u2026 largest", "horizon_max_s"),
     ("ticks moving while touching a swept volume", "contact_moving_ticks"),
     ("smallest separation while moving", "separation_min_moving_m"),
     ("smallest separation at all", "separation_min_m"),
@@ -108,7 +112,8 @@ FUSION = (
     ("RMSE of y", "rmse_y"),
 )
 
-#: What happened at the ticks at which the robot braked, by the reason that its record gives (``control_step.REASONS``).
+#: What happened at the ticks at which the robot braked, or stood where it was, by the reason that its record gives
+#: (``control_step.REASONS``).
 REASONS = {
     "no human state": "it was not known where the person is: no camera had shown them lately, or none yet",
     "no solution": "no motion satisfied all constraints",
@@ -117,11 +122,17 @@ REASONS = {
         "needs it; where the person is was known"
     ),
     "not finite": "the robot's own state, its reference or the constraints held a number that is none",
+    "not certified": (
+        "the step that the method proposed could not be certified: with the stop after it, it came too near to what "
+        "the person could reach"
+    ),
+    "inside a volume": "a link was already where the person could reach, and from there no motion begins",
+    "too near": "the person was nearer than the protective separation distance of ISO/TS 15066",
 }
 
 
 def reason_text(reason: str) -> str:
-    """What happened at a tick with a reason to brake; of a reason without words, the record's own."""
+    """What happened at a tick with a reason to brake or stand; of a reason without words, the record's own."""
     return REASONS.get(reason, f"the record says '{reason}'")
 
 
@@ -129,8 +140,8 @@ def reason_text(reason: str) -> str:
 NOT_CLAIMED = (
     "hrcreplay is a research tool. It is not certified, and no page of it makes a robot cell safe or compliant.",
     (
-        "Only ticks were checked, with the recorded person's actual motion as the log has it. A person who sees a "
-        "robot move differently may move differently too."
+        "Only ticks were checked, for contact with the body too, with the recorded person's actual motion as the log "
+        "has it. A person who sees a robot move differently may move differently too."
     ),
     (
         "The swept volumes follow from a model of twelve joints and assumed bounds. Real people bend sideways, lift "
@@ -140,7 +151,7 @@ NOT_CLAIMED = (
         "The limb's radius is all the room there is for clothes, tools and the cameras' own errors, unless the "
         "settings add clearance."
     ),
-    "The robot is assumed to follow its commands exactly and to brake within the stopping time.",
+    "The robot is assumed to follow its commands exactly, those of a stop among them.",
     "The paper's numbers come from experiments whose logs were never published. They are printed for orientation.",
 )
 

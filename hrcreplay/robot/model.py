@@ -11,14 +11,14 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numba import njit
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.records import Bools, Floats
+from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot import irb140 as irb140_data
 from hrcreplay.robot.link_capsules import Extent, Segment, Shape, Vector, capsules, distance_m
 from hrcreplay.robot.urdf import Description, describe, no_size, unreadable, with_shapes
@@ -35,6 +35,18 @@ class RobotPose:
     dJdq_tcp: Floats  # noqa: N815  #: (6,) acceleration of the TCP at zero joint acceleration [m/s^2, rad/s^2]
     ends_m: Floats  #: (s, 2, 3) ends of the segments [m]
     J_ends: Floats  #: (s, 2, 3, nv) their position Jacobians [m/rad]
+
+
+class LinkMotion(NamedTuple):
+    """Segments at many instants, in the world frame."""
+
+    ends_m: Floats  #: (n, s, 2, 3) ends of the segments [m]
+    twist: Floats  #: (n, s, 6) velocity of the link's point that is now at the world's origin, and angular velocity
+
+    def speed(self, link: Ints, points_m: Floats) -> Floats:
+        """(n,) speed of a point (n, 3) [m] that is fixed on a link, (n,) indices of segments [m/s]."""
+        twist = self.twist[np.arange(len(link)), link]
+        return np.asarray(np.linalg.norm(twist[:, :3] + np.cross(twist[:, 3:], points_m), axis=1))
 
 
 @dataclass(frozen=True)
@@ -81,6 +93,15 @@ class RobotModel:
         """(s, 2, 3) ends of the segments in the world [m], for joint positions (nv,) [rad]."""
         return self._kinematics.ends_m(q)
 
+    def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
+        """Where the segments are and how they move, at many instants.
+
+        Args:
+            q: (n, nv) [rad].
+            dq: (n, nv) [rad/s].
+        """
+        return self._kinematics.link_motion(np.ascontiguousarray(q), np.ascontiguousarray(dq))
+
 
 class _Kinematics:
     """pinocchio's model and data, and views of the data that stay valid as long as it lives."""
@@ -106,6 +127,16 @@ class _Kinematics:
     def ends_m(self, q: Floats) -> Floats:
         pin.framesForwardKinematics(self._model, self._data, q)
         return np.array(self._points).reshape(-1, 2, 3)
+
+    def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
+        moves = self._moves[::2].astype(float)
+        ends, twists = np.empty((len(q), len(moves), 2, 3)), np.empty((len(q), len(moves), 6))
+        for i in range(len(q)):
+            pin.computeJointJacobians(self._model, self._data, q[i])
+            pin.updateFramePlacements(self._model, self._data)
+            ends[i] = np.array(self._points).reshape(-1, 2, 3)
+            twists[i] = (moves * dq[i]) @ self._J.T
+        return LinkMotion(ends, twists)
 
 
 @njit(cache=True)
@@ -338,7 +369,7 @@ def _axis_reach_m(model: Any, points: Sequence[int]) -> Floats:
         frame = model.frames[point]
         joint, far, offset = frame.parentJoint, 0.0, frame.placement.translation
         while joint > 0:
-            axis = data.oMi[joint].actInv(pin.Motion(data.J[:, joint - 1])).angular
+            axis = data.oMi[joint].actInv(pin.Motion(data.J.reshape(6, model.nv)[:, joint - 1])).angular
             reach[joint - 1, i] = far + np.linalg.norm(offset - axis * (axis @ offset))
             far, offset = far + float(np.linalg.norm(offset)), model.jointPlacements[joint].translation
             joint = model.parents[joint]

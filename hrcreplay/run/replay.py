@@ -25,6 +25,7 @@ from hrcreplay.report import limbs, tables
 from hrcreplay.report.story import defect_notes
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import LogLike
+from hrcreplay.run.contact import write_contact
 from hrcreplay.run.job import TABLES, Job, JobOptions, plain_limits, resolve, urdf_digest, versions
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
@@ -72,7 +73,8 @@ def run(
         last = [stage for stage in job.stages if stage not in reused][-1:]
         with ProgressBar(last[0] if last else "", len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
-            found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth)
+            compared = command == "report" and not log.header.has_truth  # then with the smoothed person
+            found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth or compared)
         base = build.known_robot_base(job, log)
         writer.close_tables()
         found |= _about_results(job, log, writer.partial, known, found["notes"])
@@ -88,6 +90,8 @@ def run(
             "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
         }
         if command == "report":
+            with sink.watch.stage("contact", len(ticks_ns)):
+                write_contact(job, log, writer, build.robot_base(job, log))
             with sink.watch.stage("report", len(ticks_ns)):
                 write_report(job, writer, meta)
         writer.timing.update(sink.watch.summary(1.0 / job.settings.fusion.rate_hz))

@@ -14,6 +14,7 @@ from hrcreplay.report.figures_human import Instant
 from hrcreplay.report.figures_robot import LinkPose
 from hrcreplay.report.limbs import add_limbs
 from hrcreplay.report.metrics import Metric, MetricTable
+from hrcreplay.report.metrics_contact import add_contact
 from hrcreplay.report.metrics_data import add_fusion, add_occupancy, add_quality
 from hrcreplay.report.metrics_plan import add_plan
 from hrcreplay.report.story import lines
@@ -88,7 +89,8 @@ def _links(job: Job, prediction_stage: PredictionStage, run: Run) -> LinkPose | 
     if not np.isfinite(q).all():
         return None
     states = _states(run, np.array([row["t_ns"]]))
-    hulls = _hulls(prediction_stage.volumes(states), 0) if len(states) else {}
+    horizon_s = float(row["horizon_s"]) if "horizon_s" in row else None
+    hulls = _hulls(prediction_stage.volumes(states, horizon_s), 0) if len(states) else {}
     return LinkPose(
         t_ns=int(row["t_ns"]),
         distance_m=float(row["distance_m"]),
@@ -136,4 +138,5 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
         stationary_m_per_s=stationary_m_per_s,
         leash_m=float(plan.get("leash_m", 0.25)),
     )
+    add_contact(metrics, run, stationary_m_per_s)
     return metrics.sorted()

@@ -20,7 +20,6 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from hrcreplay.errors import LogError
 from hrcreplay.geometry import convex_hull
 from hrcreplay.human.fusion import fuse, inverse_kinematics
-from hrcreplay.human.fusion import fuse as smoother
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import reachable_sets, swept_volumes
 from hrcreplay.logs.clean import PersonMemory, select_person
@@ -221,13 +220,13 @@ def fused(
         raise _nobody(log, sink.counts)
     sink.notes["fuse"].extend(_oddities(log, stands))
     if smooth:
-        whole = HumanStates.join([states for states, _ in passed])
-        traces = [trace for _, trace in passed]
-        trace = fuse.Trace(
-            cov=np.concatenate([trace.cov for trace in traces]),
-            damping=np.concatenate([trace.damping for trace in traces]),
-        )
-        sink.run.table("smooth", state_columns(smoother.smooth(whole, trace, fusion_stage.filter)))
+        sink.run.table("smooth", state_columns(smoothed(passed, fusion_stage.filter)))
+
+
+def smoothed(passed: list[tuple[HumanStates, fuse.Trace]], settings: Fusion) -> HumanStates:
+    """Every tick given all measurements of the run, from the batches of a whole run in order."""
+    cov, damping = (np.concatenate([getattr(trace, name) for _, trace in passed]) for name in ("cov", "damping"))
+    return fuse.smooth(HumanStates.join([states for states, _ in passed]), fuse.Trace(cov, damping), settings)
 
 
 def _nobody(log: Log, found: Counter[str]) -> LogError:

@@ -265,6 +265,8 @@ class Report(Section):
     """The stationary share counts ticks with a separation of at most this [m]."""
     stationary_m_per_s: Positive = 0.001
     """A TCP slower than this stands [m/s]."""
+    leg_radius_m: NotNegative = 0.08
+    """Radius of thighs and shanks of the recorded person, of which Table 2 says nothing [m]."""
 
 
 class ZenohKey(Section):

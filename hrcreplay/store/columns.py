@@ -10,7 +10,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrcreplay.records import BODY, JOINTS, LENGTHS, LIMBS, STATUSES, Floats, HumanStates, Ints, Measurements, Motion
+from hrcreplay.records import (
+    BODY,
+    JOINTS,
+    LENGTHS,
+    LIMBS,
+    STATUSES,
+    Bools,
+    Floats,
+    HumanStates,
+    Ints,
+    Measurements,
+    Motion,
+)
 
 Columns = dict[str, Any]
 
@@ -63,6 +75,10 @@ COLUMNS = {
         "t_ns",
         *(f"{point}_{axis}" for point in ("ref", "tcp") for axis in "xyz"),
         *("tcp_speed", "ref_speed", "programme_s", "distance_m", "limb", "link", "status", "reason"),
+    ),
+    "contact": (
+        *("t_ns", "method", "person", "moving", "distance_m", "limb", "link", "tcp_speed", "contact_speed"),
+        *("outside_m", "left_m", "left_limb"),
     ),
 }
 
@@ -143,6 +159,51 @@ def motion_columns(motion: Motion) -> Columns:
         "horizon_s": motion.horizon_s,
         "tau_s": motion.tau_s,
         "certified": motion.certified,
+    }
+
+
+def contact_columns(
+    *,
+    t_ns: Ints,
+    method: str,
+    person: str,
+    moving: Bools,
+    distance_m: Floats,
+    part: tuple[Ints, tuple[str, ...]],
+    link: tuple[Ints, tuple[str, ...]],
+    speeds: tuple[Floats, Floats],
+    outside_m: Floats,
+    left: tuple[Floats, Ints, tuple[str, ...]],
+) -> Columns:
+    """A row a tick of a method: robot against recorded person.
+
+    Args:
+        t_ns: (n,) [ns].
+        method: That moved the robot.
+        person: Where the recorded person is from: ``truth`` or ``smoothed``.
+        moving: (n,) whether any axis turns.
+        distance_m: (n,) between the surfaces of robot and body, negative in overlap; NaN: body not known [m].
+        part: (n,) indices of the nearest part of the body, -1 without one, and the names of all parts.
+        link: (n,) indices of the nearest link, -1 without one, and the names of all links.
+        speeds: (n,) each: of the TCP, and of the link's surface where it is nearest to the body [m/s].
+        outside_m: (n,) how far the touched part was outside the volume by which the motion had been certified; NaN
+            where nothing moving was in contact, or nothing predicted [m].
+        left: (n,) how far at most a part left the stored volume of the tick until its horizon, NaN without one [m];
+            (n,) indices of that part, -1 without one, and the names of all parts.
+    """
+    return {
+        "t_ns": t_ns,
+        "method": _text([method] * len(t_ns)),
+        "person": _text([person] * len(t_ns)),
+        "moving": moving,
+        "distance_m": distance_m,
+        "limb": _names(*part),
+        "link": _names(*link),
+        "tcp_speed": speeds[0],
+        "contact_speed": speeds[1],
+        "outside_m": outside_m,
+        "left_m": left[0],
+        "left_limb": _names(left[1], left[2]),
     }
 
 

@@ -56,7 +56,7 @@ def test_plan(run: Run) -> None:
     mine, other = _lines(run)["plan"].split("; ")
     assert mine.startswith("qp: ")
     assert f"standing in {100.0 * stands.sum() / near.sum():.1f} % of the near ticks" in mine
-    assert mine.endswith(f", {late} ticks braking while moving")
+    assert mine.endswith(f", {late} ticks ({100.0 * late / len(motion):.1f} %) in full stops")
     assert other.startswith("scaling: ")
     pace = compute(run, near_m=0.5, stationary_m_per_s=0.001)["plan_progress_share"]["value"]
     assert mine.startswith(f"qp: {100.0 * pace:.1f} % of the programmed pace, ")

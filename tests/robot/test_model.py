@@ -196,6 +196,28 @@ def test_one_axis_keeps_its_two_dimensions() -> None:
     assert robot.ddq_max == pytest.approx([6.0])
 
 
+def test_links_move_as_their_ends_do() -> None:
+    """The speed of points of the links, against finite differences of the segments' ends and of a third point."""
+    robot = irb140(pedestal(), stop_s=STOP_S)
+    rng = np.random.default_rng(8)
+    q, dq = rng.uniform(-1.0, 1.0, (20, 6)), rng.normal(size=(20, 6))
+    found, step = robot.link_motion(q, dq), 1e-6
+    for link in range(len(robot.segments)):
+        index = np.full(20, link)
+        for end in range(2):
+            ahead, behind = (
+                np.array([robot.ends_m(row)[link, end] for row in q + sign * step * dq]) for sign in (1.0, -1.0)
+            )
+            at = np.array([robot.ends_m(row)[link, end] for row in q])
+            assert_allclose(found.ends_m[:, link, end], at)
+            assert_allclose(found.speed(index, at), np.linalg.norm(ahead - behind, axis=1) / (2 * step), atol=1e-7)
+    tool = np.array([robot.pose(row, np.zeros(6)).T_world_tcp for row in q])
+    beside = tool[:, :3, 3] + 0.3 * tool[:, :3, 0]  # off the tool's axis: its own turning counts
+    J = [robot.pose(a, b).J_tcp @ b for a, b in zip(q, dq, strict=True)]
+    expected = [np.linalg.norm(v[:3] + np.cross(v[3:], 0.3 * T[:3, 0])) for v, T in zip(J, tool, strict=True)]
+    assert_allclose(found.speed(np.full(20, len(robot.segments) - 1), beside), expected)
+
+
 def test_capsules_enclose_the_collision_shapes() -> None:
     turned = "<origin xyz='0.1 0.2 0.3' rpy='0.4 -0.5 1.1'/>"
     shapes = (

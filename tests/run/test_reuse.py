@@ -91,6 +91,7 @@ STALE = {
     "plan.tcp_acceleration_max": "plan",
     "report.near_m": "",
     "report.stationary_m_per_s": "",
+    "report.leg_radius_m": "",
     "live.port": "",
     "live.cycle_s": "",
     "live.reaction_s": "",

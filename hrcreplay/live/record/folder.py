@@ -23,6 +23,7 @@ from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Motion
 from hrcreplay.run import build
+from hrcreplay.run.contact import write_contact
 from hrcreplay.run.job import Job
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import store_volumes
@@ -179,6 +180,8 @@ def finish(partial: Path) -> Path:
     writer.close_tables()
     crashes = processes.read_crashes(partial)
     meta = _meta(job, start, tables, log, crashes)
+    if tables.counts["looks"] and tables.counts["answers"]:
+        _compare(job, writer, start)
     write_report(job, writer, meta)
     writer.timing.update(tables.timing())
     writer.finish(meta, complete=not crashes)
@@ -207,6 +210,12 @@ def _measure(job: Job, writer: RunWriter) -> None:
     for frames in log.frames():
         memory, measured, _ = fusion_stage.measure(frames, memory)
         writer.table("measurements", measurement_columns(measured))
+
+
+def _compare(job: Job, writer: RunWriter, start: dict[str, Any]) -> None:
+    """The table of contact: robot against recorded person."""
+    log = open_log(writer.partial / LOG, job.settings.logs, skeletons=False)
+    write_contact(job, log, writer, np.array(start["T_world_base"]))
 
 
 def _meta(

@@ -74,7 +74,7 @@ def test_the_session_is_a_run_like_any_other(run: Path, flight: Flight) -> None:
     assert meta["counts"]["robot_lost"] == 2
     assert meta["counts"]["looks_skipped"] == 3
     assert meta["counts"]["answers"] == len(flight.answers)
-    assert {*meta["outputs"]} >= {"log.mcap", "state.parquet", "motion.parquet", "occupancy.parquet", "report.html"}
+    assert {*meta["outputs"]} >= {"log.mcap", "state.parquet", "motion.parquet", "contact.parquet", "report.html"}
     assert meta["outputs"] == {name: run_folder.sha256(run / name) for name in meta["outputs"]}
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["ticks"]["value"] == len(flight.states)

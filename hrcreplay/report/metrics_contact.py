@@ -1,0 +1,212 @@
+"""Metrics of contact with the recorded body, of what the robot was certified for, and of why it stood."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from hrcreplay.records import Bools, Floats
+from hrcreplay.report.metrics import MetricTable, durations_s, times
+from hrcreplay.report.metrics_plan import is_moving, numeric_column
+from hrcreplay.store.run_folder import Run
+
+#: What contact.parquet calls the recorded person, and what we call it.
+PERSONS = {"truth": "ground truth", "smoothed": "the smoothed person"}
+_NOT_COMPARED = "the run has no table of contact"
+
+
+def method_prefixes(run: Run) -> dict[str, str]:
+    """Method -> prefix of its metrics; the run's own first, the programme run blind last."""
+    own = str(run.meta.get("settings", {}).get("plan", {}).get("method", "qp"))
+    return {
+        own: "plan",
+        **{name: f"baseline_{name}" for name in sorted(run.baselines, key=lambda name: (name == "none", name))},
+    }
+
+
+def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
+    """Contact of robot and recorded body, and the certificates, of the plan and every baseline.
+
+    Args:
+        metrics: Table that the metrics are added to.
+        run: The run's tables.
+        slow_m_per_s: A TCP slower than this stands, where no joint turns [m/s].
+    """
+    person = None if run.contact is None or not len(run.contact) else str(run.contact["person"].iloc[0])
+    metrics.add(
+        "contact_person",
+        None if person is None else PERSONS.get(person, person),
+        "name",
+        "where the body is from with which the robot was compared: the log's ground truth, or the fused person "
+        "smoothed over the whole run, of which no legs are known",
+        reason=_NOT_COMPARED,
+    )
+    if run.motion is None:
+        return
+    for method, prefix in method_prefixes(run).items():
+        what = "the plan" if prefix == "plan" else f"the baseline '{method}'"
+        motion = run.motion if prefix == "plan" else run.baselines[method]
+        _add_stops(metrics, prefix, motion, what, slow_m_per_s)
+        if run.contact is not None:
+            rows = run.contact[run.contact["method"] == method]
+            _add_touch(metrics, prefix, rows, what)
+            _add_nearest(metrics, prefix, rows, what)
+            _add_faults(metrics, prefix, rows, what, blind=method == "none")
+    if run.contact is not None:
+        _add_left(metrics, run.contact)
+
+
+def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
+    """Full stops, ticks without a certificate, horizons, and why the robot stood without braking."""
+    status, moving = motion["status"].astype(str).to_numpy(), is_moving(motion, slow)
+    stops = (status == "braking") & moving
+    metrics.add(
+        f"{prefix}_full_stop_share",
+        float(stops.mean()) if len(stops) else None,
+        "1",
+        f"share of all ticks of {what} in a full stop: braking with the robot still moving",
+    )
+    count = None
+    if "certified" in motion:
+        count = int((moving & ~motion["certified"].to_numpy(dtype=bool)).sum())
+    metrics.add(
+        f"{prefix}_uncertified_moving_ticks",
+        count,
+        "1",
+        f"ticks of {what} with the robot moving without a certificate that its step and the stop after it are clear of "
+        "all that the person was predicted to reach until then",
+        reason="the table of motion does not say",
+    )
+    for kind, number in (("median", np.median), ("max", np.max)):
+        horizon = numeric_column(motion, "horizon_s") if "horizon_s" in motion else np.zeros(0)
+        horizon = horizon[np.isfinite(horizon)]
+        metrics.add(
+            f"{prefix}_horizon_{kind}_s",
+            float(number(horizon)) if len(horizon) else None,
+            "s",
+            f"{kind} over all ticks of {what}: how far ahead the person was predicted",
+            reason="the table of motion does not say",
+        )
+    reasons = motion["reason"].fillna("").astype(str).to_numpy()
+    for reason in sorted(set(reasons[status != "braking"]) - {""}):
+        slug = "_".join("".join(c if c.isalnum() else " " for c in reason.lower()).split())
+        share = float(((reasons == reason) & (status != "braking")).mean())
+        metrics.add(
+            f"{prefix}_standing_share_{slug}",
+            share,
+            "1",
+            f"share of all ticks of {what} that it stood because: {reason}",
+        )
+
+
+def _add_touch(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str) -> None:
+    """How often, how long and how fast the robot touched the body."""
+    distance, moving = numeric_column(rows, "distance_m"), rows["moving"].to_numpy(dtype=bool)
+    known = np.isfinite(distance)
+    touch = known & (distance <= 0.0)
+    metrics.add(f"{prefix}_body_known_ticks", int(known.sum()), "1", f"ticks of {what} at which the body is known")
+    for name, which, state in (("moving", touch & moving, "moving"), ("rest", touch & ~moving, "at rest")):
+        metrics.add(
+            f"{prefix}_touch_{name}_ticks",
+            int(which.sum()) if known.any() else None,
+            "1",
+            f"ticks of {what} with a link of the robot, {state}, in contact with the recorded body",
+            reason="the body is not known at any tick",
+        )
+    metrics.add(
+        f"{prefix}_touch_moving_s",
+        float(durations_s(times(rows))[touch & moving].sum()) if known.any() else None,
+        "s",
+        f"time in which a moving link of {what} was in contact with the recorded body",
+        reason="the body is not known at any tick",
+    )
+    for name, column, of in (("contact", "contact_speed", "the link's surface there"), ("tcp", "tcp_speed", "the TCP")):
+        speed = numeric_column(rows, column)[touch & moving]
+        metrics.add(
+            f"{prefix}_touch_{name}_speed_max_m_per_s",
+            float(speed.max()) if len(speed) else None,
+            "m/s",
+            f"largest speed of {of} at these ticks of {what}",
+            reason="no moving link touched the body",
+        )
+
+
+def _add_nearest(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str) -> None:
+    """The smallest distance while moving and at rest, and what was there."""
+    distance, moving = numeric_column(rows, "distance_m"), rows["moving"].to_numpy(dtype=bool)
+    for name, which, state in (("moving", moving, "moving"), ("rest", ~moving, "at rest")):
+        k = _least(distance, which)
+        stem = f"{prefix}_body_distance_min_{name}"
+        reason = f"no tick with the robot {state} and the body known"
+        metrics.add(
+            f"{stem}_m",
+            None if k is None else float(distance[k]),
+            "m",
+            f"smallest distance between the surfaces of robot ({state}) and recorded body, {what}; negative in overlap",
+            reason=reason,
+        )
+        at_s = None if k is None else float((times(rows)[k] - times(rows)[0]) * 1e-9)
+        metrics.add(f"{stem}_at_s", at_s, "s", f"its first instant, from the first tick of {what}", reason=reason)
+        for part in ("limb", "link"):
+            value = None if k is None else str(rows[part].iloc[k])
+            metrics.add(f"{stem}_{part}", value, "name", f"the {part} of that pair", reason=reason)
+        if name == "moving":
+            for label, column in (("tcp", "tcp_speed"), ("contact", "contact_speed")):
+                speed = None if k is None else float(rows[column].iloc[k])
+                of = "the TCP" if label == "tcp" else "the link's surface where it is nearest to the body"
+                metrics.add(f"{stem}_{label}_speed_m_per_s", speed, "m/s", f"speed of {of} then", reason=reason)
+
+
+def _least(distance: Floats, which: Bools) -> int | None:
+    """The row with the smallest known distance among some; None without one."""
+    known = which & np.isfinite(distance)
+    return int(np.argmin(np.where(known, distance, np.inf))) if known.any() else None
+
+
+def _add_faults(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str, *, blind: bool) -> None:
+    """Of the contacts while moving: was the person where the prediction said?"""
+    touch = (numeric_column(rows, "distance_m") <= 0.0) & rows["moving"].to_numpy(dtype=bool)
+    outside = numeric_column(rows, "outside_m")[touch]
+    for name, which, meaning in (
+        ("inside", outside <= 0.0, "inside the volume by which the motion was certified: the robot is at fault"),
+        ("outside", outside > 0.0, "outside the volume by which the motion was certified: the prediction is at fault"),
+        ("unpredicted", ~np.isfinite(outside), "without a volume by which the motion was certified"),
+    ):
+        metrics.add(
+            f"{prefix}_touch_{name}_ticks",
+            None if blind else int(which.sum()),
+            "1",
+            f"ticks of {what} with a moving link in contact with a part of the body that was {meaning}",
+            reason="the programme run blind heeds no volumes",
+        )
+
+
+def _add_left(metrics: MetricTable, contact: pd.DataFrame) -> None:
+    """How often the body left the stored volumes before their horizon."""
+    left = contact[np.isfinite(numeric_column(contact, "left_m"))]
+    reason = "no tick has stored volumes and a body"
+    out = numeric_column(left, "left_m")
+    metrics.add("volumes_checked_ticks", len(left) or None, "1", "ticks with stored volumes and a body", reason=reason)
+    metrics.add(
+        "volumes_left_ticks",
+        int((out > 0.0).sum()) if len(left) else None,
+        "1",
+        "of those, ticks with a part of the body outside its volume at some instant before the volume's horizon",
+        reason=reason,
+    )
+    metrics.add(
+        "volumes_left_max_m",
+        float(out.max()) if len(left) and out.max() > 0.0 else None,
+        "m",
+        "how far at most a part of the body was outside",
+        reason="the body never left a volume" if len(left) else reason,
+    )
+    limbs = left["left_limb"][out > 0.0].astype(str).value_counts()
+    found = ", ".join(f"{limb} {limbs[limb]}" for limb in sorted(limbs.index))
+    metrics.add(
+        "volumes_left_limbs",
+        found or None,
+        "name",
+        "the part that was furthest outside, and at how many of these ticks",
+        reason="the body never left a volume" if len(left) else reason,
+    )

@@ -1,0 +1,200 @@
+"""What stands first on the page: would the robot have touched the recorded person, and at what cost; a row a method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from hrcreplay.report.limbs import part_name_text, unmeasured
+from hrcreplay.report.metrics import Metric
+from hrcreplay.report.metrics_contact import PERSONS, method_prefixes
+from hrcreplay.report.tables import PageTable, percent, text_of
+from hrcreplay.store.run_folder import Run
+
+Metrics = Mapping[str, Metric]
+_HAD = "Had this controller been running, "
+_COLUMNS = (
+    "",
+    "touched while moving",
+    "fastest touch",
+    "nearest while moving",
+    "link / TCP speed there",
+    "nearest at rest",
+    "pace kept",
+    "standing, of near ticks",
+    "full stops",
+)
+
+
+@dataclass(frozen=True)
+class ContactSummary:
+    """Two sentences on the chosen method, and all methods beside each other."""
+
+    sentences: tuple[str, ...]
+    table: PageTable
+
+
+def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
+    """What the comparison with the recorded body says; None where there is none."""
+    if run.motion is None or metrics["contact_person"]["value"] is None:
+        return None
+    return ContactSummary((_touched(metrics), _cost(run, metrics)), _table(run, metrics))
+
+
+def _touched(metrics: Metrics) -> str:
+    """The first sentence: whether the moving robot would have touched the person."""
+    touch = metrics["plan_touch_moving_ticks"]["value"]
+    if touch is None:
+        return f"{_HAD}it is not known whether the robot would have touched the person: the person is not known."
+    if touch:
+        words = (
+            f"the moving robot would have touched the person for {text_of(metrics['plan_touch_moving_s'])} in all, at "
+            f"up to {text_of(metrics['plan_touch_contact_speed_max_m_per_s'])}; the deepest contact was of its "
+            f"{_pair(metrics)} {_when(metrics)}"
+        )
+        return f"{_HAD}{words}{_fault(metrics)}."
+    if metrics["plan_body_distance_min_moving_m"]["value"] is None:
+        return f"{_HAD}the robot would not have moved while the person was there, and a robot at rest touches nobody."
+    return (
+        f"{_HAD}{_as_measured(metrics)}no moving part of the robot would have touched the person: the smallest "
+        "distance was "
+        f"{text_of(metrics['plan_body_distance_min_moving_m'])}, between its {_pair(metrics)}, {_when(metrics)}; that "
+        f"link then moved at {text_of(metrics['plan_body_distance_min_moving_contact_speed_m_per_s'])}."
+    )
+
+
+def _as_measured(metrics: Metrics) -> str:
+    """What must stand before 'nobody was touched': limbs that nobody saw are only where the model supposes them."""
+    never = unmeasured(metrics)[0]
+    if not never or metrics["contact_person"]["value"] == PERSONS["truth"]:
+        return ""
+    return f"as far as the person was measured (never: {', '.join(part_name_text(limb) for limb in never)}), "
+
+
+def _pair(metrics: Metrics) -> str:
+    link, limb = (metrics[f"plan_body_distance_min_moving_{part}"]["value"] for part in ("link", "limb"))
+    return f"{link} and the person's {part_name_text(limb)}"
+
+
+def _when(metrics: Metrics) -> str:
+    return f"{metrics['plan_body_distance_min_moving_at_s']['value']:.1f} s after the start"
+
+
+def _fault(metrics: Metrics) -> str:
+    """Whose fault the contacts were."""
+    inside, outside, unknown = (
+        metrics[f"plan_touch_{name}_ticks"]["value"] for name in ("inside", "outside", "unpredicted")
+    )
+    if inside is None:
+        return "; it heeds nobody"
+    parts = []
+    if inside:
+        parts.append(f"at {inside} of these ticks the person was where the prediction said, so the robot is at fault")
+    if outside:
+        parts.append(f"at {outside} the person was not where the prediction said, so the prediction is at fault")
+    if unknown:
+        parts.append(f"at {unknown} nothing was predicted")
+    return "; " + "; ".join(parts)
+
+
+def _cost(run: Run, metrics: Metrics) -> str:
+    """The second sentence: what it would have cost, and what the programme run blind would have done."""
+    words = []
+    if metrics["plan_progress_share"]["value"] is not None:
+        words.append(f"kept {percent(metrics['plan_progress_share'])} of the programmed pace")
+    if metrics["plan_stationary_share"]["value"] is not None:
+        words.append(f"stood still in {percent(metrics['plan_stationary_share'])} of the time near the person")
+    cost = f"It would have {' and '.join(words)}" if words else "What it would have cost the task is not known"
+    if "none" not in run.baselines:
+        return f"{cost}."
+    touch, speed = (metrics[f"baseline_none_touch_{name}"] for name in ("moving_s", "contact_speed_max_m_per_s"))
+    if touch["value"]:
+        return (
+            f"{cost}; without any controller the robot would have touched the person for {text_of(touch)} in all, "
+            f"at up to {text_of(speed)}."
+        )
+    return f"{cost}; without any controller the robot would not have touched the person either."
+
+
+def _table(run: Run, metrics: Metrics) -> PageTable:
+    """A row a method."""
+    rows = []
+    for method, prefix in method_prefixes(run).items():
+        near = f"{prefix}_body_distance_min_moving"
+        speeds = [text_of(metrics[f"{near}_{of}_speed_m_per_s"]) for of in ("contact", "tcp")]
+        rows.append(
+            (
+                method + (" (this plan)" if prefix == "plan" else "") + (" (run blind)" if method == "none" else ""),
+                _ticks(metrics[f"{prefix}_touch_moving_ticks"]),
+                text_of(metrics[f"{prefix}_touch_contact_speed_max_m_per_s"]),
+                _signed(metrics[f"{near}_m"]),
+                " / ".join(speed.removesuffix(" m/s") for speed in speeds) + (" m/s" if "m/s" in speeds[0] else ""),
+                _signed(metrics[f"{prefix}_body_distance_min_rest_m"]),
+                percent(metrics[f"{prefix}_progress_share"]),
+                percent(metrics[f"{prefix}_stationary_share"]),
+                percent(metrics[f"{prefix}_full_stop_share"]),
+            )
+        )
+    return PageTable("Robot against the recorded person", _COLUMNS, tuple(rows), _note(run, metrics))
+
+
+def _signed(metric: Metric) -> str:
+    """A number with the minus that is as wide as a digit."""
+    return text_of(metric).replace("-", "\u2212")
+
+
+def _ticks(metric: Metric) -> str:
+    return f"{text_of(metric)} tick{'' if metric['value'] == 1 else 's'}" if metric["value"] is not None else "\u2013"
+
+
+def _note(run: Run, metrics: Metrics) -> str:
+    """Which person and which body it was."""
+    settings = run.meta.get("settings", {})
+    hand_m, leg_m = settings.get("occupancy", {}).get("hand_m"), settings.get("report", {}).get("leg_radius_m")
+    person = metrics["contact_person"]["value"]
+    hand = "" if hand_m is None else f", the forearms prolonged by a hand of {hand_m:g} m"
+    source = "the ground truth of the log" if person == PERSONS["truth"] else "the fused one, smoothed"
+    words = f"The person is {source}: head, trunk and arms with the radii of Table 2{hand}"
+    if person == PERSONS["truth"]:
+        words += ", and thighs and shanks" + ("" if leg_m is None else f" with a radius of {leg_m:g} m") + " where seen"
+    else:
+        words += "; of the legs nothing is known"
+        if never := unmeasured(metrics)[0]:
+            words += f"; never measured, so not known: the {', '.join(part_name_text(limb) for limb in never)}"
+    words += (
+        ". Distances are between surfaces, at the ticks; negative in overlap. Only ticks at which the person is known "
+    )
+    words += f"count: {text_of(metrics['plan_body_known_ticks'])} of {text_of(metrics['plan_ticks'])}."
+    return words + _left(metrics)
+
+
+def _left(metrics: Metrics) -> str:
+    """How often the person left the volumes."""
+    checked, left = metrics["volumes_checked_ticks"]["value"], metrics["volumes_left_ticks"]["value"]
+    if checked is None or left is None:
+        return ""
+    words = (
+        f" The person left the predicted volumes before their horizon at {left} of {checked} ticks with stored volumes"
+    )
+    if left:
+        parts = [found.split(" ") for found in str(metrics["volumes_left_limbs"]["value"]).split(", ")]
+        names = ", ".join(f"{part_name_text(part)} {count}" for part, count in parts)
+        words += f", by up to {text_of(metrics['volumes_left_max_m'])} ({names})"
+    return words + "."
+
+
+def line(run: Run, metrics: Metrics) -> str:
+    """The same in a line for the terminal; empty where there is no comparison."""
+    if run.motion is None or metrics["contact_person"]["value"] is None:
+        return ""
+    parts = []
+    for method, prefix in method_prefixes(run).items():
+        touch, near = metrics[f"{prefix}_touch_moving_ticks"], metrics[f"{prefix}_body_distance_min_moving_m"]
+        if touch["value"]:
+            speed = text_of(metrics[f"{prefix}_touch_contact_speed_max_m_per_s"])
+            parts.append(f"{method} in {_ticks(touch)}, at up to {speed}")
+        elif near["value"] is not None:
+            parts.append(f"{method} never (nearest {text_of(near)})")
+        else:
+            parts.append(f"{method} never moved beside a known person")
+    return f"moving robot touched the recorded person ({metrics['contact_person']['value']}): {'; '.join(parts)}."

@@ -1,0 +1,231 @@
+"""Robot against recorded person: a row a tick and method in contact.parquet.
+
+The links' capsules at the commanded joint positions, and the recorded body's capsules: neither knows of predictions.
+Where they overlap while the robot moves, the row also says whether the part of the body that is touched was inside the
+volume by which the motion had been certified: then the robot is at fault, else the prediction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+
+from hrcreplay.geometry.capsule_distance import nearest_pair
+from hrcreplay.geometry.segment_hull_distance import protrusion_m
+from hrcreplay.human import body_capsules
+from hrcreplay.human.body_capsules import LEG_PARTS, PARTS
+from hrcreplay.logs.reader import Log
+from hrcreplay.records import Bools, Floats, HumanStates, Ints
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.run import build
+from hrcreplay.run.job import Job
+from hrcreplay.run.recorded_person import recorded_person
+from hrcreplay.run.stages import PredictionStage
+from hrcreplay.store.columns import Columns, contact_columns, read_states
+from hrcreplay.store.run_folder import RunWriter
+
+#: Part of the body -> limb whose volume it has to be in.
+VOLUME_OF = {part: "LEGS" if part in LEG_PARTS else part for part in PARTS}
+
+#: Of the ticks until a horizon, the last and one in so many are looked at: people do not tremble that fast.
+_EVERY = 4
+
+#: Limb -> vertices (m, 3) and radius of the volume around them [m].
+Volumes = Mapping[str, tuple[Floats, float]]
+
+
+def write_contact(job: Job, log: Log, writer: RunWriter, T_world_base: Floats) -> None:
+    """Writes contact.parquet for every motion table of a run.
+
+    Args:
+        job: What was asked for.
+        log: Log of the job.
+        writer: Run folder, its tables complete.
+        T_world_base: (4, 4) robot base in the world.
+    """
+    robot, occupancy = build.robot(job, T_world_base), job.settings.occupancy
+    person = recorded_person(job, log, writer)
+    radii_m = body_capsules.part_radii(occupancy, job.settings.report.leg_radius_m)
+    predicted = _Predicted(build.prediction_stage(job), writer)
+    chosen = job.settings.plan.method
+    for path in sorted(writer.partial.glob("motion*.parquet")):
+        method = path.stem.removeprefix("motion").removeprefix("_") or chosen
+        motion = pq.read_table(path).to_pandas()
+        body = Body(person.source, person.part_axes(motion["t_ns"].to_numpy(), occupancy.hand_m), radii_m)
+        found = compare(robot, motion, body)
+        if method != "none":
+            found.by_volume_m[:] = by_volume(motion, found, body, predicted)
+        if path.stem == "motion":
+            mark_left(found, motion["t_ns"].to_numpy(), body, stored_volumes(writer, occupancy.stop_s))
+        names = tuple(segment.name for segment in robot.segments)
+        writer.table("contact", _columns(motion, method, body.source, found, names))
+    writer.close_tables()
+
+
+@dataclass(frozen=True)
+class Body:
+    """The recorded person's capsules at the ticks of a motion."""
+
+    source: str  #: as ``RecordedPerson`` has it
+    axes_m: Floats  #: (n, 10, 2, 3) of PARTS, world [m]; NaN where not known
+    radius_m: Floats  #: (10,) [m]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """What is nearest between robot and body, a row a tick."""
+
+    distance_m: Floats  #: (n,) surface to surface, negative in overlap; NaN where the body is not known [m]
+    link: Ints  #: (n,) index into the robot's segments; -1 where the body is not known
+    part: Ints  #: (n,) index into PARTS; -1 likewise
+    moving: Bools  #: (n,) whether any axis turns
+    speed: Floats  #: (n,) of the link's surface where it is nearest to the body [m/s]
+    #: (n,) how far the part was outside the volume by which the motion had been certified, negative inside; NaN where
+    #: robot and body do not overlap, the robot stands, or nothing was predicted [m]
+    by_volume_m: Floats
+    #: (n,) how far, at most, a part left the stored volume of this tick until its horizon; NaN without one [m]
+    left_m: Floats
+    left_part: Ints  #: (n,) index into PARTS of that part; -1 without one
+
+
+def _columns(motion: pd.DataFrame, method: str, person: str, found: Contact, links: tuple[str, ...]) -> Columns:
+    return contact_columns(
+        t_ns=motion["t_ns"].to_numpy(),
+        method=method,
+        person=person,
+        moving=found.moving,
+        distance_m=found.distance_m,
+        part=(found.part, PARTS),
+        link=(found.link, links),
+        speeds=(motion["tcp_speed"].to_numpy(dtype=float), found.speed),
+        outside_m=found.by_volume_m,
+        left=(found.left_m, found.left_part, PARTS),
+    )
+
+
+def compare(robot: RobotModel, motion: pd.DataFrame, body: Body) -> Contact:
+    """The distance between robot and body at every tick of a motion.
+
+    Args:
+        robot: The manipulator.
+        motion: Rows of a motion table.
+        body: At the same ticks.
+    """
+    q, dq = (motion[[f"{name}{i + 1}" for i in range(robot.nv)]].to_numpy(dtype=float) for name in ("q", "dq"))
+    links = robot.link_motion(q, dq)
+    radius_m = np.array([segment.radius_m for segment in robot.segments])
+    pair = nearest_pair(links.ends_m, radius_m, body.axes_m, body.radius_m)
+    apart = pair.at_second_m - pair.at_first_m
+    length = np.linalg.norm(apart, axis=1, keepdims=True)
+    towards = apart / np.where(length > 0.0, length, np.inf)  # on the axis itself where the axes cross
+    at_m = pair.at_first_m + radius_m[pair.first][:, None] * towards
+    nothing = np.full(len(motion), np.nan)
+    moving = np.asarray((dq != 0.0).any(axis=1))
+    return Contact(
+        pair.distance_m,
+        pair.first,
+        pair.second,
+        moving,
+        links.speed(pair.first, at_m),
+        nothing,
+        nothing.copy(),
+        np.full(len(motion), -1),
+    )
+
+
+@dataclass
+class _Predicted:
+    """The volumes of any tick at any horizon, predicted again from the fused person."""
+
+    stage: PredictionStage
+    writer: RunWriter
+    _states: HumanStates | None = field(default=None, init=False)
+
+    def volumes(self, t_ns: int, horizon_s: float) -> Volumes:
+        """Those of the last state that is not later than ``t_ns``; none where the person was not known."""
+        if self._states is None:
+            self._states = HumanStates.join(list(read_states(self.writer.partial / "state.parquet", 4096)))
+        row = int(np.searchsorted(self._states.t_ns, t_ns, side="right")) - 1
+        if row < 0:
+            return {}
+        volumes = self.stage.volumes(self._states.rows(slice(row, row + 1)), horizon_s)
+        found = {name: (volumes.vertices(0, i), float(volumes.radius_m[0, i])) for i, name in enumerate(volumes.limbs)}
+        return {name: solid for name, solid in found.items() if np.isfinite(solid[0]).all() and np.isfinite(solid[1])}
+
+
+def by_volume(motion: pd.DataFrame, found: Contact, body: Body, predicted: _Predicted) -> Floats:
+    """``Contact.by_volume_m``.
+
+    What moves the robot at a tick was decided at a tick before it: the last that did not only go on braking. Its
+    volumes hold until the stop that was found clear of them has ended.
+
+    Args:
+        motion: Rows of a motion table.
+        found: Distances at the same ticks.
+        body: At the same ticks.
+        predicted: Volumes of any tick.
+    """
+    outside_m = np.full(len(motion), np.nan)
+    t_ns, horizon_s = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float)
+    decided = np.where(motion["status"].astype(str).to_numpy() != "braking", np.arange(len(motion)), -1)
+    decided = np.maximum.accumulate(decided)
+    volumes: Volumes = {}
+    last = -1
+    for i in np.flatnonzero(found.moving & (found.distance_m <= 0.0)).tolist():
+        k = int(decided[i - 1]) if i else -1
+        if k < 0:
+            continue
+        if k != last:
+            volumes, last = predicted.volumes(int(t_ns[k]), float(horizon_s[k])), k
+        part = int(found.part[i])
+        solid = volumes.get(VOLUME_OF[PARTS[part]])
+        if solid is not None:
+            outside_m[i] = protrusion_m(body.axes_m[i : i + 1, part], float(body.radius_m[part]), *solid)[0]
+    return outside_m
+
+
+def stored_volumes(writer: RunWriter, stop_s: float) -> Iterator[tuple[int, float, Volumes]]:
+    """The volumes of occupancy.parquet, tick by tick: instant [ns], horizon [s], volumes."""
+    path = writer.partial / "occupancy.parquet"
+    if not path.exists():
+        return
+    table = pq.read_table(path)
+    t_ns, radius_m, limbs = table["t_ns"].to_numpy(), table["radius_m"].to_numpy(), table["limb"].to_pylist()
+    stored = "horizon_s" in table.column_names
+    horizon_s = table["horizon_s"].to_numpy() if stored else np.full(len(t_ns), stop_s)
+    vertices = table["vertices"].combine_chunks()
+    ends, numbers = vertices.offsets.to_numpy(), vertices.values.to_numpy()
+    starts = np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))
+    for first, last in zip(starts, [*starts[1:], len(t_ns)], strict=True):
+        rows = range(first, last)
+        solids = {limbs[i]: (numbers[ends[i] : ends[i + 1]].reshape(-1, 3), float(radius_m[i])) for i in rows}
+        yield int(t_ns[first]), float(horizon_s[first]), solids
+
+
+def mark_left(found: Contact, t_ns: Ints, body: Body, volumes: Iterator[tuple[int, float, Volumes]]) -> None:
+    """Writes ``left_m`` and ``left_part`` of a contact.
+
+    Args:
+        found: Its rows are the ticks.
+        t_ns: (n,) ticks of the motion [ns].
+        body: At the same ticks.
+        volumes: Instant [ns], horizon [s] and volumes of the stored ticks.
+    """
+    for at_ns, horizon_s, solids in volumes:
+        first = int(np.searchsorted(t_ns, at_ns, side="left"))
+        last = int(np.searchsorted(t_ns, at_ns + round(horizon_s * 1e9), side="right"))
+        if first >= last:
+            continue
+        ticks = np.unique(np.append(np.arange(first, last, _EVERY), last - 1))
+        for part, name in enumerate(PARTS):
+            axes_m = body.axes_m[ticks, part]
+            axes_m = axes_m[np.isfinite(axes_m).all(axis=(1, 2))]
+            if VOLUME_OF[name] not in solids or not len(axes_m):
+                continue
+            out_m = float(protrusion_m(axes_m, float(body.radius_m[part]), *solids[VOLUME_OF[name]]).max())
+            if not out_m <= found.left_m[first]:  # the first one meets NaN
+                found.left_m[first], found.left_part[first] = out_m, part
