@@ -95,10 +95,10 @@ def test_the_checker_is_no_friend_of_anyone(robot: RobotModel) -> None:
     q, dq, u = (np.array(column) for column in zip(*rows, strict=True))
     assert violation(q, dq, u, np.zeros(400), people, base(), dt_s=DT_S, stop_s=STOP_S).metres > 0.05
     for q_k, dq_k in zip(q[::50], dq[::50], strict=True):
-        ends, speeds = links(q_k, dq_k, base(), 0.10)
+        ends, speeds = links(q_k[None], dq_k[None], base(), 0.10)
         pose = robot.pose(q_k, dq_k)
-        np.testing.assert_allclose(ends, pose.ends_m, atol=1e-12)
-        np.testing.assert_allclose(speeds, pose.J_ends @ dq_k, atol=1e-12)
+        np.testing.assert_allclose(ends[0], pose.ends_m, atol=1e-12)
+        np.testing.assert_allclose(speeds[0], pose.J_ends @ dq_k, atol=1e-12)
 
 
 def test_a_free_robot_follows_its_reference(robot: RobotModel) -> None:
