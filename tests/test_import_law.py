@@ -41,7 +41,7 @@ MAY_IMPORT = {
 #: Libraries that one module alone may import.
 ALONE = {
     "pinocchio": "robot/model.py",
-    "coal": "robot/control/separation.py",
+    "coal": "robot/control/certificate.py",
     "proxsuite": "robot/control/minimiser.py",
 }
 #: Modules of these rooms open no file, read no clock, draw no random number, print and log nothing.

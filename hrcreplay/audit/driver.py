@@ -31,7 +31,8 @@ from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.records import LIMBS
 from hrcreplay.run import build
 from hrcreplay.run.job import Job, JobOptions, resolve
-from hrcreplay.run.stages import PredictionStage, print_note
+from hrcreplay.run.prediction import PredictionStage
+from hrcreplay.run.stages import print_note
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 

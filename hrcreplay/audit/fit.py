@@ -26,7 +26,8 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
 from hrcreplay.run import build
 from hrcreplay.run.job import Job, JobOptions, resolve
-from hrcreplay.run.stages import NS, PredictionStage, ProgressBar, tick_times
+from hrcreplay.run.prediction import PredictionStage
+from hrcreplay.run.stages import NS, ProgressBar, tick_times
 
 
 def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) -> list[str]:

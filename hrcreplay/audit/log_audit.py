@@ -22,7 +22,8 @@ from hrcreplay.records import JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates,
 from hrcreplay.report.metrics import difference
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
-from hrcreplay.run.stages import NS, PredictionStage, ProgressBar, tick_times
+from hrcreplay.run.prediction import PredictionStage
+from hrcreplay.run.stages import NS, ProgressBar, tick_times
 from hrcreplay.store.run_folder import Stopwatch
 
 #: Recorded points of a limb. The first two, its ends, must have been seen near the end of the horizon, or the limb is

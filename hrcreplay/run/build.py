@@ -23,7 +23,8 @@ from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.robot.programme.task import parse_task
 from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
-from hrcreplay.run.stages import FusionStage, PredictionStage
+from hrcreplay.run.prediction import PredictionStage
+from hrcreplay.run.stages import FusionStage
 
 
 class LogLike(Protocol):

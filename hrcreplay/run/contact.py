@@ -23,8 +23,8 @@ from hrcreplay.records import Bools, Floats, HumanStates, Ints
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
+from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.run.recorded_person import recorded_person
-from hrcreplay.run.stages import PredictionStage
 from hrcreplay.store.columns import Columns, contact_columns, read_states
 from hrcreplay.store.run_folder import RunWriter
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -126,7 +127,8 @@ def run_stages(
     flow: Iterable[Any] = states
     if "plan" in todo:
         chosen = build.planners(job, log, int(ticks_ns[0]))
-        flow = stages.planned(states, build.prediction_stage(job), chosen, _store_every(job), sink)
+        every = _store_every(job) if "predict" in todo else math.inf
+        flow = stages.planned(states, build.prediction_stage(job), chosen, every, sink)
     elif "predict" in todo:
         flow = stages.predicted(states, build.prediction_stage(job), _store_every(job), sink)
     if todo:
@@ -243,13 +245,23 @@ def demo_log() -> Path:
 #: What the fused person depends on, and the volumes; each stage works on what those before it hand on.
 _PERSON = ("versions", "log", "ticks", "cameras", "settings logs", "settings fusion", "limits.tracking")
 _VOLUMES = (*_PERSON, "settings occupancy", "limits.prediction")
+_PROGRAMME = ("base", "programme", "settings robot", "settings plan")
 #: Stage -> the parts that its tables, counts and notes depend on. The plan takes the volumes of every tick: how many
 #: of them are stored changes nothing for it.
 PARTS = {
     "fuse": (*_PERSON, "logs.gap_s"),
     "predict": (*_VOLUMES, "occupancy.store_hz"),
-    "plan": (*_VOLUMES, "base", "programme", "settings robot", "settings plan"),
+    "plan": (*_VOLUMES, *_PROGRAMME),
 }
+
+
+def parts_of(job: Job, stage: str) -> tuple[str, ...]:
+    """The parts that a stage of a job depends on.
+
+    Volumes that are stored beside a plan reach as far ahead as the chosen robot asked for, so they depend on it.
+    """
+    planned = "plan" in job.stages and job.settings.plan.horizon == "adaptive"
+    return (*PARTS[stage], *_PROGRAMME) if planned and stage == "predict" else PARTS[stage]
 
 
 def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
@@ -295,7 +307,7 @@ def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
 
 def stage_digests(job: Job, found: Mapping[str, str]) -> dict[str, str]:
     """Digest of all that the result of each stage of the job depends on, from those of ``dependencies``."""
-    return {stage: _digest([found[name] for name in PARTS[stage]]) for stage in job.stages}
+    return {stage: _digest([found[name] for name in parts_of(job, stage)]) for stage in job.stages}
 
 
 def stale_stages(job: Job, found: Mapping[str, str]) -> dict[str, str]:
@@ -311,15 +323,17 @@ def stale_stages(job: Job, found: Mapping[str, str]) -> dict[str, str]:
     for stage in job.stages:
         damage = damage or _damage(job.earlier, stage, meta["outputs"])
         if meta.get("stages", {}).get(stage) != mine[stage]:
-            why[stage] = _difference(stage, found, meta, job.earlier)
+            why[stage] = _difference(parts_of(job, stage), found, meta, job.earlier)
         elif damage is not None:
             why[stage] = damage
+    if "predict" in why and "plan" in job.stages and job.settings.plan.horizon == "adaptive":
+        why.setdefault("plan", "the volumes to store are those that it asks for")
     return why
 
 
-def _difference(stage: str, found: Mapping[str, str], meta: Mapping[str, Any], earlier: Path) -> str:
+def _difference(parts: tuple[str, ...], found: Mapping[str, str], meta: Mapping[str, Any], earlier: Path) -> str:
     theirs = meta.get("depends_on", {})
-    different = [name for name in PARTS[stage] if theirs.get(name) != found[name]]
+    different = [name for name in parts if theirs.get(name) != found[name]]
     if not theirs or not different:  # of a live session, or of an earlier version
         return f"{earlier} does not say what its tables depend on"
     return f"{', '.join(different)} {'is' if len(different) == 1 else 'are'} not as in {earlier}"

@@ -20,7 +20,7 @@ from hrcreplay.report.metrics_plan import add_plan
 from hrcreplay.report.story import lines
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
-from hrcreplay.run.stages import PredictionStage
+from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run, RunWriter

@@ -9,7 +9,7 @@ import pytest
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS
 from hrcreplay.run import replay, report
-from hrcreplay.run.stages import PredictionStage
+from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.settings.sections import Occupancy
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run

@@ -21,7 +21,8 @@ from hrcreplay.logs.messages import Undecodable
 from hrcreplay.logs.skeleton_pb2 import Skeleton
 from hrcreplay.records import CameraFrames, HumanStates
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.run.stages import NS, FusionStage, PredictionStage, no_frames
+from hrcreplay.run.prediction import PredictionStage
+from hrcreplay.run.stages import NS, FusionStage, no_frames
 
 
 class Observer:

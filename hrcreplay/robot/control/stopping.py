@@ -38,7 +38,8 @@ def straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
     """The stop in which all axes come to rest together, as soon as the slowest of them can.
 
     The velocity falls by the same share of itself in each of n ticks, so that no axis turns back, none decelerates by
-    more than its limit, and the path is the straight line in joint space of length n dt / 2 times the velocity.
+    more than its limit, and the path is the straight line in joint space of length n dt / 2 times the velocity. Each
+    tick is that of Eq. (68), (69).
 
     Args:
         q: (nv,) where it begins [rad].
