@@ -16,6 +16,9 @@ from pydantic import BaseModel, ValidationError
 from hrcreplay.errors import SettingsError
 from hrcreplay.settings.sections import Fusion, LimitNames, Live, Logs, Occupancy, Plan, Report, Robot, Section
 
+#: Settings files that ship with the package: ``--config paper``.
+SHIPPED = {"paper": Path(__file__).with_name("paper.toml")}
+
 #: Words that TOML takes for something else than a text.
 _WORDS = frozenset({"true", "false", "inf", "nan"})
 
@@ -38,6 +41,11 @@ def load_settings(
 ) -> Settings:
     """Settings from a TOML file and ``section.key=value`` overrides, over those of an earlier run (``base``).
 
+    Args:
+        path: A file, or the name of one of SHIPPED where no such file exists.
+        overrides: ``section.key=value``.
+        base: The settings of an earlier run.
+
     Raises:
         SettingsError: The file cannot be read, or a key or value is not known.
     """
@@ -45,11 +53,12 @@ def load_settings(
     where = "settings"
     if path is not None:
         where = str(path)
+        file = SHIPPED.get(where, path) if not path.exists() else path
         try:
-            for name, section in tomllib.loads(path.read_text()).items():
+            for name, section in tomllib.loads(file.read_text()).items():
                 table[name] = table.get(name, {}) | section if isinstance(section, dict) else section
         except OSError as error:
-            raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a TOML file") from error
+            raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a TOML file, or {", ".join(SHIPPED)}") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise SettingsError(f"{path}: not TOML ({error})") from error
     for override in overrides:

@@ -18,6 +18,16 @@ def test_defaults_are_the_papers() -> None:
     assert (occupancy.radius_upper_arm_m, occupancy.radius_lower_arm_m) == (0.07, 0.07)
 
 
+def test_the_paper_as_printed_is_one_word_and_the_command_line_wins_over_it(tmp_path: Path) -> None:
+    settings = load_settings(Path("paper"), ("plan.rows=soft",))
+    plan = settings.plan
+    assert (settings.occupancy.method, settings.limits.prediction) == ("paper", "paper")
+    assert (plan.horizon, plan.certify, plan.rows, plan.room) == ("fixed", False, "soft", "square")
+    assert (plan.lead_s, plan.give_way_m, plan.jerk_s, plan.smooth_s) == (0.0, 0.0, 0.0, 0.0)
+    with pytest.raises(SettingsError, match="name a TOML file, or paper"):
+        load_settings(tmp_path / "paper")
+
+
 def test_command_line_wins_over_file_and_file_over_defaults(tmp_path: Path) -> None:
     file = tmp_path / "s.toml"
     file.write_text("[fusion]\nrate_hz = 100\noutlier_m = 0.5\n")
