@@ -12,7 +12,9 @@ import typer
 from hrcreplay.errors import SettingsError
 
 Source = Annotated[Path, typer.Argument(metavar="LOG_OR_RUN", help="A log, or the run folder of an earlier stage.")]
-Config = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings file; paper: the paper as printed.")]
+Config = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings file; paper: the paper as printed.")
+]
 Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting; wins over the file. May be repeated."),

@@ -76,6 +76,7 @@ class Follower(ABC):
         horizon_s = settings.horizon_s(going)
         with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
             around = predict(horizon_s)
+            horizon_s = min(horizon_s, around.horizon_s)  # in a live session those of an earlier look may have to do
             pose = self.robot.pose(state.q, state.dq)
             sight = observe(self.robot, state, around, settings.plan.clearance_m, pose)
             wanted = self._propose(sight, around, horizon_s, predict)

@@ -82,8 +82,8 @@ class Forecast:
     def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
         """Those of one tick that hold for ``horizon_s`` [s]."""
         if horizon_s == self.stage.horizon_s:
-            return obstacles(self.full, tick)
-        return obstacles(self.stage.volumes(self.states.rows(slice(tick, tick + 1)), horizon_s), 0)
+            return obstacles(self.full, tick, horizon_s)
+        return obstacles(self.stage.volumes(self.states.rows(slice(tick, tick + 1)), horizon_s), 0, horizon_s)
 
 
 def stored_ticks(first: int, count: int, store_every: float) -> Ints:

@@ -58,7 +58,9 @@ def load_settings(
             for name, section in tomllib.loads(file.read_text()).items():
                 table[name] = table.get(name, {}) | section if isinstance(section, dict) else section
         except OSError as error:
-            raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a TOML file, or {", ".join(SHIPPED)}") from error
+            raise SettingsError(
+                f"{path}: cannot be read ({error.strerror}); name a TOML file, or {', '.join(SHIPPED)}"
+            ) from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise SettingsError(f"{path}: not TOML ({error})") from error
     for override in overrides:

@@ -317,6 +317,8 @@ class Live(Section):
     reaction_s: NotNegative = 0.05
     """From a look at the person to the robot's obedience: up to two cycles until it is used, an answer's delay, a cycle
     and the robot's own lag. The swept volumes of method sound reach this much further than T_s [s]."""
+    look_s: Positive = 0.016
+    """plan.certify: a look at the person older than this is not used for a step; the certified stop goes on [s]."""
     approach_speed: Annotated[float, Field(gt=0, le=1)] = 0.1
     """Share of the axes' top speeds on the way from where the robot stands to its programme."""
     resume: bool = False

@@ -95,6 +95,7 @@ STALE = {
     "live.port": "",
     "live.cycle_s": "",
     "live.reaction_s": "",
+    "live.look_s": "",
     "live.approach_speed": "",
     "live.resume": "",
     "live.resume_s": "",

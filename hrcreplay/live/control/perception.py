@@ -62,7 +62,7 @@ class Observer:
         )
         self.counts.update(events)
         volumes = self._prediction_stage.volumes(states, horizon_s)
-        return Perception(t_ns, states, volumes, obstacles(volumes, 0), horizon_s)
+        return Perception(t_ns, states, volumes, obstacles(volumes, 0, horizon_s), horizon_s)
 
     def present(self, states: HumanStates) -> Obstacles:
         """Where the person may be now, for ``ssm``, which does not look ahead."""

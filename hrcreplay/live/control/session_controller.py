@@ -57,6 +57,7 @@ class SessionController:
         self.standing = 0  #: answers since it stands
         self._motion: MotionState | None = None  # None: no robot is there
         self._ready: tuple[MotionState, MotionStep] | None = None
+        self._late = False  # whether the last look is too old for a certificate
         self._programme_s = 0.0  # of the robot that was there last
         self._heard_ns: int | None = None
         self._clear_ns: int | None = None
@@ -73,7 +74,7 @@ class SessionController:
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
         """Stages 1 and 2 up to ``t_ns`` [ns, session clock]; None where they failed, which stops the robot."""
-        self._ready = None
+        self._ready, self._late = None, False
         try:
             self.perception = self.observer.update_perception(t_ns, skeletons, self._horizon_s())
             if self._motion is not None:
@@ -114,6 +115,7 @@ class SessionController:
         self._apply_watchdog(event, packet_status, measured)
         before = self._motion
         assert before is not None  # noqa: S101 - for the type checker
+        self._look_late(event.t_ns)
         result = self._next_step(before)
         phase = self.phase
         reply = self._session.reply(result.step.next.q, result.step.next.dq, event.t_ns)
@@ -221,6 +223,13 @@ class SessionController:
     def _step(self, motion: MotionState) -> MotionStep:
         return (brake if motion.follower is None else follow)(self.setup, motion, self._obstacles)
 
+    def _look_late(self, t_ns: int) -> None:
+        """Whether the volumes are older than the reaction time allows for: then only the certified stop is."""
+        age_s = math.inf if self.perception is None else (t_ns - self.perception.t_ns) * 1e-9
+        self._late = self.setup.plan.certified and age_s > self.setup.bounds.look_s
+        if self._late:
+            self._ready = None
+
     def _horizon_s(self) -> float:
         """Until when the volumes of the next look must hold."""
         return self.setup.plan.horizon_s(self._motion.stop if self._motion is not None else at_rest(_STILL))
@@ -232,7 +241,7 @@ class SessionController:
         """
         if self.perception is None:
             return _UNSEEN
-        seen = self.observer.age_s(self.perception.t_ns) <= self.setup.memory_s
+        seen = self.observer.age_s(self.perception.t_ns) <= self.setup.memory_s and not self._late
         found = self.perception.obstacles if horizon_s else self.observer.present(self.perception.states)
         return found if seen else replace(found, known=False)
 

@@ -25,21 +25,23 @@ class Obstacles:
     radius_m: Floats  #: (l,) of the balls [m]
     boxes_m: Floats  #: (l, 2, 3) lowest and highest corner around each limb's vertices [m]
     known: bool  #: False where a limb could not be predicted: whoever plans against it must brake
+    horizon_s: float = math.inf  #: until when they hold, from their tick on [s]
 
 
-def obstacles(volumes: SweptVolumes, tick: int) -> Obstacles:
+def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> Obstacles:
     """The obstacles of one tick.
 
     Args:
         volumes: Any number of ticks.
         tick: Row of ``volumes``.
+        horizon_s: Until when they hold, from that tick on [s].
     """
     limbs = len(volumes.limbs)
     offsets = volumes.offsets[tick * limbs : (tick + 1) * limbs + 1]
     vertices, radius = volumes.vertices_m[offsets[0] : offsets[-1]], volumes.radius_m[tick]
     offsets = offsets - offsets[0]
     boxes, known = _boxes(vertices, offsets, radius)
-    return Obstacles(vertices, offsets, radius, boxes, known)
+    return Obstacles(vertices, offsets, radius, boxes, known, horizon_s)
 
 
 @njit(cache=True)
