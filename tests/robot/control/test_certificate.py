@@ -45,11 +45,10 @@ def test_the_stop_that_the_rows_allow_and_that_enters_is_refused(robot: RobotMod
         stop = axis_by_axis(q, FAST, robot.ddq_max, DT_S)
         if np.any(stop.q[-1] < robot.q_min) or np.any(stop.q[-1] > robot.q_max):
             continue
-        start, end = link_points(q[None])[0, 3], link_points(stop.q[-1:])[0, 3]
-        away = end[-1] - start[-1]
-        if np.linalg.norm(away) < 0.2:
-            continue
-        ball = _ball(start[-1] + away / np.linalg.norm(away) * (0.077 + 0.05 + 0.03))
+        start, velocities = link_points(q[None])[0, 3], robot.pose(q, FAST).J_ends[3] @ FAST
+        aside = np.cross(velocities[0], velocities[1])  # neither end moves there at first
+        aside *= np.sign(aside @ (link_points(stop.q[-1:])[0, 3, -1] - start[-1])) / np.linalg.norm(aside)
+        ball = _ball(start[-1] + aside * (0.077 + 0.05 + 0.03))
         seen = as_obstacles([ball])
         sight = observe(robot, RobotState(q, FAST), seen, 0.0)
         assert sight.pairs is not None
@@ -94,8 +93,11 @@ def test_what_is_not_known_or_not_finite_is_refused(robot: RobotModel) -> None:
 def test_where_coal_fails_the_motion_is_refused(
     robot: RobotModel, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
-    q = np.zeros(6)
-    near = as_obstacles([_ball(link_points(q[None])[0, 4, -1] + np.array([0.12, 0.0, 0.0]))])
+    q = np.array([0.3, 0.5, -0.4, 0.5, 0.8, 0.0])
+    forearm = link_points(q[None])[0, 2]
+    across = np.cross(forearm[-1] - forearm[0], [0.0, 1.0, 0.0])
+    beside = forearm.mean(axis=0) + across / np.linalg.norm(across) * (0.118 + 0.05 + 0.001)
+    near = as_obstacles([_ball(beside)])  # too near for the boxes around them to tell
     assert clear(robot, at_rest(q), at_rest(q), near, 0.0, DT_S, NO_PLANES)[0]
 
     def fails(*_: object) -> None:
