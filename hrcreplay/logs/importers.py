@@ -182,8 +182,9 @@ class Pivot:
 
 
 def rotations(quaternions: Floats) -> Floats:
-    """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x y z w; NaN where one is not finite."""
-    known = np.asarray(np.isfinite(quaternions).all(axis=1))  # scipy refuses NaN: a target not seen
+    """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x y z w; NaN where one has no finite length."""
+    length = np.linalg.norm(quaternions, axis=1)
+    known = np.asarray(np.isfinite(length) & (length > 0))  # scipy refuses the others: a target not seen
     matrices = Rotation.from_quat(np.where(known[:, None], quaternions, (0.0, 0.0, 0.0, 1.0))).as_matrix()
     matrices[~known] = np.nan
     return np.asarray(matrices)

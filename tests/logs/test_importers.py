@@ -263,3 +263,9 @@ def test_import_is_deterministic(tmp_path: Path) -> None:
         import_azure({"a": tmp_path / "a.csv"}, tmp_path / name)
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
     assert np.isfinite(_frames(tmp_path / "one").points_m).all()
+
+
+def test_a_quaternion_without_a_length_is_a_rotation_nobody_knows() -> None:
+    found = rotations(np.array([[0, 0, 0, 2.0], [0, 0, 0, 0], [1e-200, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1]]))
+    np.testing.assert_array_equal(found[0], np.eye(3))
+    assert np.isnan(found[1:]).all()

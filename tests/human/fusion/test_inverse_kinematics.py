@@ -112,6 +112,14 @@ def test_the_jacobian_undoes_that_of_the_forward_kinematics() -> None:
         np.testing.assert_allclose(name[:, None] * inverse_rows @ forward, np.eye(20), atol=1e-6)
 
 
+def test_a_row_is_the_joints_and_then_the_lengths_of_the_person_seen() -> None:
+    frames = frames_of(skeleton(NEUTRAL[None], LENGTHS_M[None]), np.zeros(1, np.int64), np.zeros(1, np.int64))
+    found = measure(frames, np.tile(np.eye(4), (2, 1, 1)), NOISE)
+    np.testing.assert_allclose(found.angles[0], canonical(NEUTRAL[None])[0], atol=1e-9)
+    np.testing.assert_allclose(found.lengths_m[0], LENGTHS_M, atol=1e-9)
+    np.testing.assert_array_equal(found.z_std, np.hstack((found.angles_std, found.lengths_std_m)))
+
+
 def test_the_noise_is_that_of_sampled_points() -> None:
     rng = np.random.default_rng(6)
     points = skeleton(NEUTRAL[None], LENGTHS_M[None])
