@@ -81,11 +81,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report on the shipped log, every tick's volumes stored."""
+    """A report on the shipped log, as ``hrcreplay report`` makes it by default."""
     from hrcreplay.run import replay
 
     out = tmp_path_factory.mktemp("demo") / "run"
-    return replay.run("report", replay.demo_log(), out=out, overrides=("occupancy.store_hz=all",))
+    return replay.run("report", replay.demo_log(), out=out)
 
 
 @pytest.fixture(scope="session")
@@ -94,7 +94,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     from hrcreplay.run import replay
     from hrcreplay.store import run_folder
 
-    overrides = ("occupancy.store_hz=all", "occupancy.method=paper", "limits.prediction=paper")
+    overrides = ("occupancy.method=paper", "limits.prediction=paper")
     return run_folder.read(
         replay.run("plan", replay.demo_log(), out=tmp_path_factory.mktemp("printed") / "run", overrides=overrides)
     )
