@@ -122,8 +122,8 @@ def _assert_stored_are(run: Run, volumes: SweptVolumes) -> None:
         assert (t, limb, radius_m) == (t_ns[place[0]], volumes.limbs[place[1]], volumes.radius_m[place])
         vertices, corners = volumes.vertices(*place), np.asarray(stored).reshape(-1, 3)
         assert set(map(bytes, corners)) <= set(map(bytes, vertices))
-        reach = [(points @ directions.T).max(axis=0) for points in (corners, vertices)]
-        np.testing.assert_allclose(*reach, rtol=0, atol=1e-9)
+        reach, expected = ((points @ directions.T).max(axis=0) for points in (corners, vertices))
+        np.testing.assert_allclose(reach, expected, rtol=0, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
