@@ -41,16 +41,29 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
-    """Lets the other processes begin with the kernels of the first, before any of them runs."""
-    for spec in specs:
-        folder = _kernels_of(spec.id)
-        if spec.id != "gw0" and folder.parent.exists() and not folder.exists():
-            shutil.copytree(folder.parent, folder, ignore=shutil.ignore_patterns("gw*"))
+    """Gives every process what any of them has compiled before, as they do not run the same tests each time."""
+    first, *others = (_kernels_of(spec.id) for spec in specs)
+    for folder in others:
+        _add_missing(folder, first)
+    for folder in others:
+        _add_missing(first, folder)
+
+
+def _add_missing(have: Path, lack: Path) -> None:
+    """Copies the kernels of functions of which the other folder has none: an index, and the files it names."""
+    for index in [path for path in have.rglob("*.nbi") if not path.relative_to(have).parts[0].startswith("gw")]:
+        copy = lack / index.relative_to(have)
+        if not copy.exists():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            for kernel in index.parent.glob(f"{index.stem}.*.nbc"):
+                shutil.copy2(kernel, copy.parent)
+            shutil.copy2(index, copy)
 
 
 def _kernels_of(worker: str) -> Path:
-    """Folder of the compiled kernels of a process, within that of the first, which hrcreplay names on its import."""
-    return Path(os.environ["NUMBA_CACHE_DIR"]) / worker
+    """Folder of the compiled kernels of a process: that which hrcreplay names on its import, or one within it."""
+    first = Path(os.environ["NUMBA_CACHE_DIR"])
+    return first if worker == "gw0" else first / worker
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -81,11 +94,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report on the shipped log, every tick's volumes stored."""
+    """A report on the shipped log, as ``hrcreplay report`` makes it by default."""
     from hrcreplay.run import replay
 
     out = tmp_path_factory.mktemp("demo") / "run"
-    return replay.run("report", replay.demo_log(), out=out, overrides=("occupancy.store_hz=all",))
+    return replay.run("report", replay.demo_log(), out=out)
 
 
 @pytest.fixture(scope="session")
@@ -94,7 +107,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     from hrcreplay.run import replay
     from hrcreplay.store import run_folder
 
-    overrides = ("occupancy.store_hz=all", "occupancy.method=paper", "limits.prediction=paper")
+    overrides = ("occupancy.method=paper", "limits.prediction=paper")
     return run_folder.read(
         replay.run("plan", replay.demo_log(), out=tmp_path_factory.mktemp("printed") / "run", overrides=overrides)
     )

@@ -130,10 +130,9 @@ def resample(lengths: Sequence[int], block: int, sample_ticks: float, seed: int,
         size = min(block, n)
         pieces = -(-n // size)
         starts = random.integers(0, n, size=(draws, pieces))
-        last = n - (pieces - 1) * size  # the last stretch is cut so that the log keeps its length
         weights = np.zeros((draws, n))
-        for k in range(pieces):
-            span = (starts[:, k : k + 1] + np.arange(size if k < pieces - 1 else last)) % n
-            np.add.at(weights, (np.arange(draws)[:, None], span), 1.0)
+        for row, first in zip(weights, starts, strict=True):
+            ticks = (first[:, None] + np.arange(size)).ravel()[:n]  # the last stretch is cut: a log keeps its length
+            row[:] = np.bincount(ticks % n, minlength=n)
         parts.append(weights)
     return Resampling(np.concatenate(parts, axis=1) if parts else np.zeros((draws, 0)), block, sample_ticks)

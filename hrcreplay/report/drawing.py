@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial import ConvexHull, QhullError
 
+from hrcreplay.geometry.visible_front import visible_front
 from hrcreplay.records import POINTS, Floats
 
 # Okabe and Ito's palette.
@@ -278,7 +279,7 @@ def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: 
         flat = view.flat(hull.points[hull.vertices])
         rows = slice(*np.searchsorted(v, [flat[:, 1].min(), flat[:, 1].max()]))
         columns = slice(*np.searchsorted(u, [flat[:, 0].min(), flat[:, 0].max()]))
-        depth, light = _front(normals, hull.equations[:, 3], u[None, columns], v[rows, None])
+        depth, light = visible_front(normals, hull.equations[:, 3].copy(), u[columns], v[rows])
         ahead = depth > nearest[rows, columns]
         shade = (0.62 + 0.38 * np.clip(light / np.linalg.norm(sun), 0.0, 1.0))[..., None] * np.asarray(solid.colour)
         nearest[rows, columns][ahead] = depth[ahead]
@@ -296,27 +297,6 @@ def _hull(points: Floats) -> ConvexHull | None:
         return ConvexHull(points)
     except (QhullError, ValueError):  # NaN, or flat
         return None
-
-
-def _front(normals: Floats, offsets: Floats, u: Floats, v: Floats) -> tuple[Floats, Floats]:
-    """Depth of the front of a convex solid at pixels, -inf beside it, and the light on the face there.
-
-    A pixel's ray is inside between the last of the planes that face away and the first of those that face the viewer.
-    """
-    front = np.full(np.broadcast_shapes(u.shape, v.shape), np.inf)
-    back = np.full(front.shape, -np.inf)
-    light = np.zeros(front.shape)
-    for (nu, nv, nt, lit), offset in zip(normals, offsets, strict=True):
-        if abs(nt) < 1e-9:
-            continue
-        depth = (-offset / nt - (nu / nt) * u) - (nv / nt) * v
-        if nt > 0:
-            nearer = depth < front
-            np.copyto(front, depth, where=nearer)
-            np.copyto(light, lit, where=nearer)
-        else:
-            np.maximum(back, depth, out=back)
-    return np.where(front >= back, front, -np.inf), light
 
 
 def bones(points_m: Floats, view: View) -> list[Floats]:

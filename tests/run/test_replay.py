@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -12,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.geometry.convex_hull import hull
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, SweptVolumes
@@ -20,8 +22,10 @@ from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import irb140
 from hrcreplay.robot.programme.path import programmed
 from hrcreplay.robot.programme.task import parse_task
-from hrcreplay.run import replay, stages
+from hrcreplay.run import build, replay, stages
+from hrcreplay.run.job import resolve
 from hrcreplay.store import run_folder
+from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run
 from tests.robot import checker
 from tests.robot.swinging import asked, dense
@@ -95,44 +99,91 @@ def test_stop_share_of_the_qp_is_below_that_of_scaling(demo_folder: Path) -> Non
     assert metrics["plan_stationary_share"]["value"] < metrics["baseline_scaling_stationary_share"]["value"]
 
 
-def _volumes(demo: Run) -> SweptVolumes:
-    """The stored volumes of every tick of the motion; a tick without a person has one NaN vertex a limb."""
-    assert demo.occupancy is not None
-    assert demo.motion is not None
-    by_place = {
-        (t, limb): np.asarray(vertices, dtype=float).reshape(-1, 3)
-        for t, limb, vertices in zip(
-            demo.occupancy["t_ns"], demo.occupancy["limb"], demo.occupancy["vertices"], strict=True
-        )
-    }
-    radii = demo.occupancy.pivot_table(index="t_ns", columns="limb", values="radius_m")
-    limbs = tuple(limb for limb in (*LIMBS, "LEGS") if limb in radii)
-    t_ns = demo.motion["t_ns"].to_numpy()
-    nothing = np.full((1, 3), np.nan)
-    hulls = [by_place.get((t, limb), nothing) for t in t_ns for limb in limbs]
-    offsets = np.concatenate([[0], np.cumsum([len(hull) for hull in hulls])])
-    radius_m = radii[list(limbs)].reindex(t_ns).to_numpy()
-    return SweptVolumes(t_ns, offsets, np.concatenate(hulls), radius_m, limbs, str(demo.occupancy["method"].iloc[0]))
+def _volumes(run: Run) -> SweptVolumes:
+    """The volumes of every tick, predicted anew from the run's own table of states; NaN where nobody is known."""
+    stage = build.prediction_stage(resolve("predict", run.folder))
+    (states,) = read_states(run.folder / "state.parquet", 1_000_000)
+    return stage.volumes(states)
 
 
-def _worst_m(run: Run, name: str) -> float:
-    """The worst violation of inequality (2) [m], by a checker with its own kinematics, from the tables alone."""
+def _assert_stored_are(run: Run, volumes: SweptVolumes) -> None:
+    """The run's stored hulls have corners among the vertices of these volumes, and reach as far in any direction."""
+    assert run.occupancy is not None
+    assert run.motion is not None
+    t_ns = run.motion["t_ns"].to_numpy()
+    np.testing.assert_array_equal(volumes.t_ns, t_ns)
+    known = [k for k in range(0, len(t_ns), 10) if not np.isnan(volumes.vertices(k, 0)).any()]
+    assert len(run.occupancy) == len(known) * len(volumes.limbs)
+    directions = np.random.default_rng(0).normal(size=(50, 3))
+    rows = run.occupancy[["t_ns", "limb", "radius_m", "vertices"]].itertuples(index=False)
+    for place, (t, limb, radius_m, stored) in zip(
+        itertools.product(known, range(len(volumes.limbs))), rows, strict=True
+    ):
+        assert (t, limb, radius_m) == (t_ns[place[0]], volumes.limbs[place[1]], volumes.radius_m[place])
+        vertices, corners = volumes.vertices(*place), np.asarray(stored).reshape(-1, 3)
+        assert set(map(bytes, corners)) <= set(map(bytes, vertices))
+        reach, expected = ((points @ directions.T).max(axis=0) for points in (corners, vertices))
+        np.testing.assert_allclose(reach, expected, rtol=0, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def demo_volumes(demo: Run) -> SweptVolumes:
+    return _volumes(demo)
+
+
+@pytest.fixture(scope="module")
+def printed_volumes(printed: Run) -> SweptVolumes:
+    return _volumes(printed)
+
+
+def test_the_stored_volumes_are_those_of_their_ticks(demo: Run, demo_volumes: SweptVolumes) -> None:
+    _assert_stored_are(demo, demo_volumes)
+
+
+def test_the_stored_volumes_are_those_of_their_ticks_as_printed(printed: Run, printed_volumes: SweptVolumes) -> None:
+    _assert_stored_are(printed, printed_volumes)
+
+
+def test_volumes_of_every_tick_are_stored_where_asked(tmp_path: Path) -> None:
+    folder = replay.run(
+        "predict",
+        replay.demo_log(),
+        out=tmp_path / "run",
+        start_s=8.0,
+        end_s=9.0,
+        overrides=("occupancy.store_hz=all",),
+    )
+    run = run_folder.read(folder)
+    assert run.state is not None
+    assert run.occupancy is not None
+    volumes = _volumes(run)
+    known = [k for k in range(len(volumes)) if not np.isnan(volumes.vertices(k, 0)).any()]
+    assert len(known) > 200
+    assert list(run.occupancy["t_ns"]) == np.repeat(volumes.t_ns[known], len(volumes.limbs)).tolist()
+    for (k, limb), stored in zip(itertools.product(known, range(7)), run.occupancy["vertices"], strict=True):
+        np.testing.assert_array_equal(np.asarray(stored).reshape(-1, 3), hull(volumes.vertices(k, limb))[0])
+
+
+def _worst_m(run: Run, volumes: SweptVolumes, name: str) -> float:
+    """The worst violation of inequality (2) [m], by a checker with its own kinematics, from the run's tables."""
     table = run.motion if name == "qp" else run.baselines[name]
     assert table is not None
     assert run.T_world_base is not None
     status = np.array([STATUSES.index(name) for name in table["status"]])
     q, dq, u = (table[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq", "u"))
-    return checker.violation(q, dq, u, status, _volumes(run), run.T_world_base, dt_s=0.004, stop_s=0.377).metres
+    return checker.violation(q, dq, u, status, volumes, run.T_world_base, dt_s=0.004, stop_s=0.377).metres
 
 
 @pytest.mark.parametrize("name", ["qp", "scaling"])
-def test_every_tick_not_in_braking_keeps_inequality_2(demo: Run, name: str) -> None:
-    assert _worst_m(demo, name) <= 1e-6
+def test_every_tick_not_in_braking_keeps_inequality_2(demo: Run, demo_volumes: SweptVolumes, name: str) -> None:
+    assert _worst_m(demo, demo_volumes, name) <= 1e-6
 
 
 @pytest.mark.parametrize("name", ["qp", "scaling"])
-def test_every_tick_not_in_braking_keeps_inequality_2_as_printed(printed: Run, name: str) -> None:
-    assert _worst_m(printed, name) <= 1e-6
+def test_every_tick_not_in_braking_keeps_inequality_2_as_printed(
+    printed: Run, printed_volumes: SweptVolumes, name: str
+) -> None:
+    assert _worst_m(printed, printed_volumes, name) <= 1e-6
 
 
 @pytest.mark.parametrize("name", ["qp"])
@@ -197,16 +248,16 @@ def test_what_the_volumes_hold_is_the_person(demo: Run) -> None:
     """The fused skeleton's wrist lies in the hull of its own lower arm."""
     assert demo.state is not None
     assert demo.occupancy is not None
-    arm = demo.occupancy[demo.occupancy["limb"] == "LRA"].iloc[::500]
+    arm = demo.occupancy[demo.occupancy["limb"] == "LRA"].iloc[::50]
     state = demo.state.set_index("t_ns")
     for t, vertices in zip(arm["t_ns"], arm["vertices"], strict=True):
         row = state.loc[t]
         wrist = skeleton(row[list(JOINTS)].to_numpy(dtype=float)[None], row[list(LENGTHS)].to_numpy(dtype=float)[None])[
             0, 10
         ]
-        hull = np.asarray(vertices, dtype=float).reshape(-1, 3)
+        corners = np.asarray(vertices, dtype=float).reshape(-1, 3)
         directions = np.random.default_rng(0).normal(size=(200, 3))
-        assert (directions @ wrist <= (directions @ hull.T).max(axis=1) + 1e-9).all()
+        assert (directions @ wrist <= (directions @ corners.T).max(axis=1) + 1e-9).all()
 
 
 def test_nothing_of_a_span_outside_the_log_is_replayed(tmp_path: Path) -> None:
@@ -226,14 +277,14 @@ def test_a_tick_uses_no_frame_that_was_still_on_the_wire(tmp_path: Path) -> None
     assert short.state.equals(longer.state.iloc[: len(short.state)])
 
 
-def test_a_thousand_ticks_of_the_demo_are_those_of_another_solver(printed: Run) -> None:
+def test_a_thousand_ticks_of_the_demo_are_those_of_another_solver(printed: Run, printed_volumes: SweptVolumes) -> None:
     """With all rows, by daqp: every stop with a person in sight, the nearest ticks, and others evenly."""
     assert printed.motion is not None
     assert printed.T_world_base is not None
     task = open_log(replay.demo_log()).header.task
     assert task is not None
     robot = irb140(printed.T_world_base, stop_s=0.377)
-    path, volumes = programmed(parse_task(task), robot), _volumes(printed)
+    path, volumes = programmed(parse_task(task), robot), printed_volumes
     q, dq, u = (printed.motion[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq", "u"))
     s, status = printed.motion["programme_s"].to_numpy(), printed.motion["status"].to_numpy()
     known = np.flatnonzero(printed.motion["distance_m"].notna().to_numpy()[:-1])
