@@ -220,13 +220,13 @@ def problem(
         plan.path_gain_per_s,
         dt_s,
     )
-    inertia = plan.smooth_s / dt_s
-    g = g - inertia * (H @ state.dq)
-    H = (1.0 + inertia) * H
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
     if plan.jerk_s > dt_s:
         low, high = smooth_bounds(low, high, state.dq + dt_s * u_before, dt_s**2 / plan.jerk_s * robot.ddq_max)
     J_low, J_high = cartesian_bounds(J, dJdq, state.dq, plan.tcp_speed_max, plan.tcp_acceleration_max, dt_s)
+    further, twist = 1.0 + plan.smooth_s / dt_s, J @ state.dq
+    low, high = state.dq + further * (low - state.dq), state.dq + further * (high - state.dq)
+    J_low, J_high = twist + further * (J_low - twist), twist + further * (J_high - twist)
     pairs = sight.pairs
     if pairs is None:
         raise ValueError("problem: the distances from people are not known")
@@ -282,7 +282,8 @@ def propose(
         found = minimise(problem(robot, state, u_before, reference, sight, obstacles, horizon_s, calm))
     if not isinstance(found, Solution):
         return control_step.NOT_FINITE if found.status == "not finite" else control_step.NO_SOLUTION
-    q_next = state.q + 0.5 * settings.dt_s * (state.dq + found.dq_next)  # Eq. (68), (69)
+    dq_next = state.dq + (found.dq_next - state.dq) / (1.0 + settings.plan.smooth_s / settings.dt_s)
+    q_next = state.q + 0.5 * settings.dt_s * (state.dq + dq_next)  # Eq. (68), (69)
     brake = straight if settings.certified else axis_by_axis
-    stop = brake(q_next, found.dq_next, robot.ddq_max, settings.dt_s)
+    stop = brake(q_next, dq_next, robot.ddq_max, settings.dt_s)
     return [Proposal(stop, control_step.LIMITED if found.held else control_step.TRACKING)]
