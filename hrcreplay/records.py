@@ -192,7 +192,7 @@ class SweptVolumes:
 
 
 #: What a tick of the plan was: free tracking, held by a safety constraint or a limit, or Eq. (67).
-STATUSES = ("tracking", "limited", "braking")
+STATUSES = ("tracking", "limited", "braking", "retreating")
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,10 @@ from hrcreplay.records import Floats
 
 PEDESTAL_M = 0.65
 
-#: An IRB 140 on its pedestal, looking along the world's x.
-T_WORLD_BASE = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, PEDESTAL_M], [0.0, 0.0, 0.0, 1.0]])
+#: An IRB 140 on its pedestal, looking along the world's x, so near that it would hit a worker it does not know of.
+T_WORLD_BASE = np.array(
+    [[1.0, 0.0, 0.0, 0.15], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, PEDESTAL_M], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 def look_at(eye_m: tuple[float, float, float], target_m: tuple[float, float, float]) -> Floats:

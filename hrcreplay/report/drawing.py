@@ -33,7 +33,7 @@ GRID = "#dfe5ea"
 
 NOMINAL, ACTUAL, FUSED, TRUTH = BLUE, VERMILLION, BLUE, INK
 CAMERAS = (ORANGE, GREEN, PURPLE, SKY)
-STATUS = {"tracking": SKY, "limited": ORANGE, "braking": VERMILLION}
+STATUS = {"tracking": SKY, "limited": ORANGE, "braking": VERMILLION, "retreating": PURPLE}
 LIMBS = {"HD": PURPLE, "THX": "#9aa5b1", "URA": BLUE, "LRA": SKY, "ULA": GREEN, "LLA": ORANGE, "LEGS": YELLOW}
 
 STYLE: dict[str, Any] = {

@@ -64,6 +64,7 @@ PLAN_SAFETY = (
     ("tracking freely", "tracking_share"),
     ("limited", "limited_share"),
     ("braking", "braking_share"),
+    ("retreating", "retreating_share"),
     ("ticks with the robot moving", "moving_ticks"),
     ("full stops: ticks braking with the robot still moving", "braking_moving_ticks"),
     ("full stops, of all ticks", "full_stop_share"),

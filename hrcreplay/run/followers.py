@@ -104,8 +104,8 @@ class QpFollower(Follower):
         self.point = self.reference.sample(self.s_s)
         if reason := stands(sight, self.settings):
             return reason
-        reference = self.point.T_world_tcp, rate * self.point.twist
-        return qp_controller.propose(self.robot, self.state, self.u, reference, sight, around, horizon_s, self.settings)
+        target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q)
+        return qp_controller.propose(self.robot, self.state, self.u, target, sight, around, horizon_s, self.settings)
 
     def _move_on(self) -> None:
         """The reference has moved already: the program is solved for where it will be."""
@@ -116,17 +116,13 @@ class PathFollower(Follower):
 
     #: Whether the method looks at people at all, and whether the rows of Eq. (66i) bound its rate.
     careful, by_rows = True, False
-    #: Ways to go from the stop's next rate to the largest, tried in this order until one is certified.
-    shares: tuple[float, ...] = (1.0,)
 
     def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
         reason = stands(sight, self.settings) if self.careful else 0
         if reason or sight.reason == NOT_FINITE:
             return reason or sight.reason
         rows = around if self.by_rows else None
-        return path_controller.propose(
-            self.robot, self.reference, self.stop, sight, rows, horizon_s, self.settings, self.shares
-        )
+        return path_controller.propose(self.robot, self.reference, self.stop, sight, rows, horizon_s, self.settings)
 
     def _move_on(self) -> None:
         self.s_s = float(self.stop.along[0, 0])
@@ -137,7 +133,6 @@ class ScalingFollower(PathFollower):
     """The baseline [24]: the largest share of the programmed speed that meets the constraints."""
 
     by_rows = True
-    shares = (1.0, 0.5, 0.25)
 
 
 class BlindFollower(PathFollower):

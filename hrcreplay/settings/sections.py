@@ -215,25 +215,31 @@ class Plan(Section):
     """qp: Eq. (66); scaling: the largest factor on the programmed speed that meets the same constraints [24];
     shield: the programmed speed while the next stop is certified; ssm: stop and go by the protective separation
     distance of ISO/TS 15066; none: the programme, whoever is there."""
-    baselines: tuple[Literal["qp", "scaling", "shield", "ssm", "none"], ...] = ("scaling",)
+    baselines: tuple[Literal["qp", "scaling", "shield", "ssm", "none"], ...] = ("scaling", "none")
     """Methods run beside it, for comparison."""
-    horizon: Literal["adaptive", "fixed"] = "fixed"
+    horizon: Literal["adaptive", "fixed"] = "adaptive"
     """adaptive: the volumes reach to the end of the stop that would follow; fixed: always to occupancy.stop_s."""
-    certify: bool = False
+    certify: bool = True
     """Whether a step is taken only if it and the stop after it keep clear of every volume; else the stop that was found
     clear before goes on. False: as printed, where Eq. (67) brakes when Eq. (66) has no solution."""
-    rows: Literal["soft", "hard"] = "hard"
+    rows: Literal["soft", "hard"] = "soft"
     """qp: whether Eq. (66i) may be broken at a cost, so that there is always a solution, or not."""
-    room: Literal["product", "square"] = "square"
+    room: Literal["product", "square"] = "product"
     """Right-hand side of Eq. (14): distance (distance - clearance), or (distance - clearance)^2 as printed."""
-    lead_s: NotNegative = 0.0
+    lead_s: NotNegative = 0.05
     """The rows of Eq. (66i) look this much further ahead than the horizon, so that the robot slows down early [s]."""
-    give_way_m: NotNegative = 0.0
+    give_way_m: NotNegative = 0.03
     """qp: the robot moves away from a volume that is nearer than this [m]."""
-    jerk_s: NotNegative = 0.0
+    jerk_s: NotNegative = 0.03
     """qp: time from no acceleration to the largest; 0: any change within a tick [s]."""
-    smooth_s: NotNegative = 0.0
-    """qp: time constant with which the velocity approaches the best one; 0: as fast as the limits allow [s]."""
+    smooth_s: NotNegative = 0.08
+    """qp: time constant with which the velocity approaches the best one that keeps the rows; 0: as fast as the limits
+    allow [s]."""
+    retreat_m: NotNegative = 0.05
+    """qp: a robot that is inside a volume by no more than this moves out of it, at 0.25 m/s at most, if no point of it
+    comes nearer to any point of the volume; deeper inside, or with 0, it stands [m]."""
+    posture: NotNegative = 0.01
+    """qp: weight of the way back to the programmed joint positions, relative to the cost as printed."""
     human_speed: Positive = 1.6
     """ssm: speed at which a person may approach, ISO 13855 [m/s]."""
     task: Path | None = None

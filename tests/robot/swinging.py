@@ -15,7 +15,7 @@ from hrcreplay.robot.control.certificate import NO_PLANES
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, observe
 from hrcreplay.robot.control.decision import decide, made, stands
 from hrcreplay.robot.control.minimiser import SLACK, Problem
-from hrcreplay.robot.control.qp_controller import problem, propose
+from hrcreplay.robot.control.qp_controller import Target, problem, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.control.stopping import axis_by_axis
 from hrcreplay.robot.model import RobotModel, RobotPose, irb140
@@ -27,7 +27,16 @@ from tests.robot.plain_rows import approach_rows, link_segment
 STOP_S, DT_S = 0.377, 0.004
 #: The paper as printed.
 PRINTED = Plan(
-    horizon="fixed", certify=False, rows="hard", room="square", lead_s=0.0, give_way_m=0.0, jerk_s=0.0, smooth_s=0.0
+    horizon="fixed",
+    certify=False,
+    rows="hard",
+    room="square",
+    lead_s=0.0,
+    give_way_m=0.0,
+    jerk_s=0.0,
+    smooth_s=0.0,
+    retreat_m=0.0,
+    posture=0.0,
 )
 SETTINGS = PlanSettings(PRINTED, dt_s=DT_S, stop_s=STOP_S, certified=False)
 HOME = np.deg2rad([10.0, 20.0, -20.0, 0.0, 60.0, 0.0])
@@ -60,7 +69,7 @@ def step(
     with np.errstate(all="ignore"):
         sight = observe(robot, state, seen, settings.plan.clearance_m)
         wanted = stands(sight, settings) or propose(
-            robot, state, np.zeros(6), (T, twist), sight, seen, horizon_s, settings
+            robot, state, np.zeros(6), Target(T, twist, HOME), sight, seen, horizon_s, settings
         )
         taken, _ = decide(robot, going, wanted, seen, horizon_s, NO_PLANES, settings)
     return made(sight, going, taken, horizon_s, DT_S)
@@ -125,7 +134,7 @@ def dense(robot: RobotModel, tick: Asked) -> tuple[Floats, bool]:
 
 def asked(robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles) -> Asked:
     sight = observe(robot, state, seen, 0.0)
-    task = problem(robot, state, np.zeros(6), (T, twist), sight, seen, STOP_S, SETTINGS)
+    task = problem(robot, state, np.zeros(6), Target(T, twist, HOME), sight, seen, STOP_S, SETTINGS)
     return Asked(task, sight.pose, seen)
 
 

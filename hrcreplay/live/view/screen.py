@@ -26,7 +26,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.live.view.status_messages import CameraStatus, Status
 
-_COLOUR = {"tracking": "green", "limited": "yellow", "braking": "bold red"}
+_COLOUR = {"tracking": "green", "limited": "yellow", "braking": "bold red", "retreating": "magenta"}
 _STALE_S = 0.2  # as logs.gap_s: a camera silent for longer has a gap
 _WIDTH = 84
 

@@ -20,6 +20,9 @@ from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.stopping import Stop
 from hrcreplay.robot.model import RobotModel
 
+#: Rounding that moving away allows for [m^2/s].
+AWAY = 1e-9
+
 #: Distance that a motion must keep beyond what it needs: more than all rounding on the way [m].
 MARGIN_M = 1e-9
 
@@ -39,10 +42,28 @@ _NO_FACE.append(coal.Triangle(0, 0, 0))  # a polytope must have one; the search 
 NO_PLANES: Floats = np.zeros((0, 0, 3))
 
 
+#: What `clear` finds: not certified; clear of every volume; away from those that a link is inside of, and clear of all
+#: others.
+REFUSED, CLEAR, OPENING = range(3)
+
+#: Speed at which a robot may leave a volume that it is inside of: the reduced speed of ISO 10218 [m/s].
+RETREAT_SPEED = 0.25
+
+
 def clear(
-    robot: RobotModel, going: Stop, stop: Stop, obstacles: Obstacles, clearance_m: float, dt_s: float, planes: Floats
-) -> tuple[bool, Floats]:
+    robot: RobotModel,
+    going: Stop,
+    stop: Stop,
+    obstacles: Obstacles,
+    clearance_m: float,
+    dt_s: float,
+    planes: Floats,
+    retreat_m: float = 0.0,
+) -> tuple[int, Floats]:
     """Whether a step and the stop after it keep every link clear of every volume at all times.
+
+    A link that begins inside a volume may move if no point of it comes nearer to any point of the volume, wherever the
+    person is inside it.
 
     Args:
         robot: The manipulator.
@@ -52,16 +73,17 @@ def clear(
         clearance_m: Beyond limb radius + link radius [m].
         dt_s: Length of a tick [s].
         planes: (s, l, 3) directions from link to limb of the tick before, which seldom turn by much; or NO_PLANES.
+        retreat_m: A link that begins inside a volume by no more than this may move out of it [m].
 
     Returns:
-        The verdict, False as well where a number is not finite, the stop would leave the range of an axis, or coal
+        The verdict, REFUSED as well where a number is not finite, the stop would leave the range of an axis, or coal
         finds no distance; and the planes for the next tick.
     """
     q, dq = np.vstack((going.q[:1], stop.q)), np.vstack((going.dq[:1], stop.dq))
     last = stop.q[-1]
     within = np.all((robot.q_min <= last) & (last <= robot.q_max))
     if not (obstacles.known and within and math.isfinite(q.sum() + dq.sum())):
-        return False, planes
+        return REFUSED, planes
     radius = np.array([segment.radius_m for segment in robot.segments])
     keep_m = radius[:, None] + obstacles.radius_m + (clearance_m + MARGIN_M)
     if planes.shape[:2] != keep_m.shape:
@@ -71,11 +93,32 @@ def clear(
     undecided = _undecided(robot.ends_m(q[0]), *hulls, obstacles.boxes_m, planes, far)
     if len(undecided):
         planes = planes.copy()
+    verdict = CLEAR
     for link, limb in undecided.tolist():
         vertices = obstacles.vertices_m[obstacles.offsets[limb] : obstacles.offsets[limb + 1]]
-        if not _keeps_off(robot, link, q, travel[:, link], vertices, keep_m[link, limb], planes[link, limb]):
-            return False, planes
-    return True, planes
+        if _keeps_off(robot, link, q, travel[:, link], vertices, keep_m[link, limb], planes[link, limb]):
+            continue
+        a, b = robot.ends_m(q[0])[link]
+        gap = _gap(a, b, planes[link, limb], vertices) - keep_m[link, limb]
+        if not (-retreat_m < gap <= 0.0 and _moves_away(robot, link, q, dq, vertices)):
+            return REFUSED, planes
+        verdict = OPENING
+    return verdict, planes
+
+
+def _moves_away(robot: RobotModel, link: int, q: Floats, dq: Floats, vertices: Floats) -> bool:
+    """Whether no point of a link's axis comes nearer to a point of a hull at any tick of a motion, and none is fast.
+
+    (r - p) @ v <= 0 for a point p of the axis with velocity v and every vertex r; it is linear along the axis, Eq.
+    (11), and in r, so the ends and the vertices speak for all. Between two ticks the link moves by 1 mm at most.
+    """
+    motion = robot.link_motion(q, dq)
+    for ends, twist in zip(motion.ends_m[:, link], motion.twist[:, link], strict=True):
+        for end in ends:
+            v = twist[:3] + np.cross(twist[3:], end)
+            if not (float((vertices @ v).max() - end @ v) <= AWAY and math.sqrt(v @ v) <= RETREAT_SPEED):
+                return False
+    return True
 
 
 def _keeps_off(

@@ -31,7 +31,7 @@ REASONS = (
 NO_HUMAN, NO_SOLUTION, NO_DISTANCE, NOT_FINITE, NOT_CERTIFIED, INSIDE, TOO_NEAR = range(1, 8)
 
 #: Indices into ``records.STATUSES``.
-TRACKING, LIMITED, BRAKING = 0, 1, 2
+TRACKING, LIMITED, BRAKING, RETREATING = range(4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +52,7 @@ class PlanSettings:
     latency_s: float = 0.0  #: from the newest capture to the robot's reaction [s]
     spare_ticks: int = 0  #: ticks for which the volumes of a tick must serve beyond their own
     certified: bool = True  #: whether a step must be certified
+    retreat_m: float = 0.0  #: a robot that is inside a volume by no more than this may move out of it [m]
 
     def horizon_s(self, stop: Stop) -> float:
         """Until when the volumes of a tick must hold: the end of the stop that would follow the step [s].
@@ -107,6 +108,7 @@ class Sight:
     limb: int
     link: int
     reason: int  #: index into ``REASONS``; 0 where nothing is wrong
+    overlap_m: float = 0.0  #: how deep the link is inside the volume, as far as their radii go [m]
 
 
 def observe(
@@ -134,4 +136,4 @@ def observe(
     surface, link, limb = pairs.nearest()
     if math.isnan(surface):
         return Sight(pose, None, math.nan, -1, -1, NO_DISTANCE)
-    return Sight(pose, pairs, max(0.0, surface), limb, link, 0)
+    return Sight(pose, pairs, max(0.0, surface), limb, link, 0, max(0.0, -surface))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.certificate import clear
+from hrcreplay.robot.control.certificate import CLEAR, OPENING, clear
 from hrcreplay.robot.control.control_step import (
     BRAKING,
     INSIDE,
@@ -21,6 +21,7 @@ from hrcreplay.robot.control.control_step import (
     NO_HUMAN,
     NOT_CERTIFIED,
     NOT_FINITE,
+    RETREATING,
     PlanSettings,
     Proposal,
     RobotState,
@@ -50,7 +51,7 @@ def stands(sight: Sight, settings: PlanSettings) -> int:
     """
     if sight.reason:
         return sight.reason
-    return INSIDE if settings.certified and sight.distance_m <= 0.0 else 0
+    return INSIDE if settings.certified and sight.overlap_m >= settings.retreat_m and sight.distance_m <= 0.0 else 0
 
 
 def decide(
@@ -76,17 +77,22 @@ def decide(
     Returns:
         What is executed, and the planes for the next tick.
     """
-    certify = settings.certified
+    certify, inside = settings.certified, False
     if not isinstance(wanted, int):
         for stop, status in wanted:
             if not certify:
                 return Taken(stop, status, 0, not stop.ticks and not going.ticks), planes
             if (stop.ticks + 1) * settings.dt_s > horizon_s + 1e-9:
                 continue
-            ok, planes = clear(robot, going, stop, around, settings.plan.clearance_m, settings.dt_s, planes)
-            if ok:
+            verdict, planes = clear(
+                robot, going, stop, around, settings.plan.clearance_m, settings.dt_s, planes, settings.retreat_m
+            )
+            if verdict == CLEAR:
                 return Taken(stop, status, 0, certified=True), planes
-        wanted = NOT_CERTIFIED
+            if verdict == OPENING and (stop.ticks or going.ticks):
+                return Taken(stop, RETREATING, 0, certified=True), planes
+            inside = inside or verdict == OPENING
+        wanted = INSIDE if inside else NOT_CERTIFIED
     held = not going.ticks and wanted not in (NO_HUMAN, NOT_FINITE)
     return Taken(going.rest(), LIMITED if held else BRAKING, wanted, certify or not going.ticks), planes
 

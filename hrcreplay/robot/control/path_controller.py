@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,7 +51,6 @@ def propose(
     obstacles: Obstacles | None,
     horizon_s: float,
     settings: PlanSettings,
-    shares: Sequence[float] = (1.0,),
 ) -> list[Proposal] | int:
     """One tick: the largest rate in [0, 1] that meets the limits of the robot and, where asked for, Eq. (66i).
 
@@ -68,23 +67,18 @@ def propose(
         obstacles: The swept volumes of the tick, whose rows bound the rate; None: nothing but the robot does.
         horizon_s: Until when they hold [s].
         settings: Limits; weights are not used.
-        shares: Proposals to make: shares of the way from the stop's next rate to the largest.
 
     Returns:
-        Steps and the stops after them, along the path; a reason where there is none.
+        The step and the stop after it, along the path; a reason where there is none.
     """
     state, slowest = PathState(*going.along[0].tolist()), going.rest().along[0, 1]
     fastest, slowed = _fastest(robot, reference, state, sight, obstacles, horizon_s, settings)
     if fastest is None or fastest.rate < slowest - SAME:
         return control_step.NO_SOLUTION
-    found = []
-    for share in shares:
-        rate = slowest + share * (fastest.rate - slowest)
-        s_s = state.s_s + 0.5 * settings.dt_s * (state.rate + rate)
-        stop = along_path(reference.grid, s_s, rate, robot.ddq_max, settings.dt_s)
-        if stop is not None:
-            found.append(Proposal(stop, control_step.LIMITED if slowed or share < 1.0 else control_step.TRACKING))
-    return found or control_step.NO_SOLUTION
+    stop = along_path(reference.grid, fastest.s_s, fastest.rate, robot.ddq_max, settings.dt_s)
+    if stop is None:
+        return control_step.NO_SOLUTION
+    return [Proposal(stop, control_step.LIMITED if slowed else control_step.TRACKING)]
 
 
 def protective_distance_m(pose: RobotPose, stop: Stop, human_speed: float, latency_s: float, dt_s: float) -> float:

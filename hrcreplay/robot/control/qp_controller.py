@@ -2,7 +2,8 @@
 
 The variable is the joint velocity of the next tick: it has the cost of Eq. (66a)-(66c), the limits of the axes and of
 the TCP, Eq. (66d)-(66h), as bounds, and the approach rows of Eq. (66i). What is corrected in the printed equations, and
-why: docs/paper.md.
+why: docs/paper.md. With ``plan.smooth_s`` it is the velocity that the robot heads for, and the next tick's is a share
+of the way there: the swept volumes tremble by millimetres, and a robot that followed at once would tremble with them.
 
 What is proposed here is not yet safe: (66i) bounds speeds at the present posture and says nothing of the stop. The
 certificate decides. So the rows may be soft, and look further ahead than the stop takes (``plan.lead_s``): a robot that
@@ -12,6 +13,7 @@ brakes early seldom has to stop.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,6 +22,7 @@ from hrcreplay.geometry.vectors import to_vector
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.approach_rows import tick_rows
+from hrcreplay.robot.control.certificate import RETREAT_SPEED
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, Sight
 from hrcreplay.robot.control.metric_rows import Limits
 from hrcreplay.robot.control.minimiser import Problem, Solution, minimise
@@ -118,6 +121,14 @@ def cartesian_bounds(
 DAMPING = 1e-6
 
 
+class Target(NamedTuple):
+    """Where the robot is to be one tick later."""
+
+    T_world_tcp: Floats  #: (4, 4)
+    twist: Floats  #: (6,) velocity in the world, linear first [m/s, rad/s]
+    q: Floats  #: (nv,) joint positions that the programme has there [rad]
+
+
 def pose_error(T_world_tcp: Floats, T_world_ref: Floats) -> Floats:
     """(6,) from the reference to the TCP: way [m], then rotation vector in the world [rad]."""
     turn = to_vector(T_world_tcp[:3, :3] @ T_world_ref[:3, :3].T)
@@ -181,11 +192,28 @@ def tracking_cost(
     return H, g
 
 
+@njit(cache=True)
+def with_posture(H: Floats, g: Floats, away: Floats, weight: float) -> tuple[Floats, Floats]:
+    """The cost with a weight on the velocities that lead back to the programmed posture, at 1/s of the way.
+
+    A TCP that detours around people past a stretched wrist may come back with the wrist turned over; axis 4 then winds
+    up to its limit, where the robot stands. The programme knows in which posture it is to be.
+
+    Args:
+        H: (nv, nv) of `tracking_cost`.
+        g: (nv,) likewise.
+        away: (nv,) joint positions minus those of the reference [rad].
+        weight: Relative to the mean curvature of the cost.
+    """
+    mean = max(np.trace(H) / len(g), 1e-6)
+    return H + weight * mean * np.eye(len(g)), g + weight * mean * away
+
+
 def problem(
     robot: RobotModel,
     state: RobotState,
     u_before: Floats,
-    reference: tuple[Floats, Floats],
+    target: Target,
     sight: Sight,
     obstacles: Obstacles,
     horizon_s: float,
@@ -193,15 +221,16 @@ def problem(
 ) -> Problem:
     """Eq. (66) at one instant; building it is separate from solving it.
 
-    Beside what is printed the velocity may be smoothed: the cost is that of the velocities' weighted mean with the
-    present one, by which the velocity approaches the best one with a time constant (``plan.smooth_s``), and the
-    acceleration changes by a share of its limit in a tick (``plan.jerk_s``).
+    Beside what is printed the posture counts a little (`with_posture`), and the acceleration may be bound to change by
+    a share of its limit in a tick (``plan.jerk_s``). Where the variable is the velocity that the robot heads for
+    (``plan.smooth_s``), cost and rows are as printed, and the bounds lie further out by as much as it goes beyond the
+    next tick's velocity (`dq_after`).
 
     Args:
         robot: The manipulator.
         state: At the tick.
         u_before: (nv,) acceleration of the tick before [rad/s^2].
-        reference: Pose (4, 4) of the reference one tick later, and its velocity (6,), world frame [m/s, rad/s].
+        target: The reference one tick later.
         sight: The robot's pose, and its distances from people.
         obstacles: The swept volumes of the tick.
         horizon_s: Until when they hold [s].
@@ -209,24 +238,19 @@ def problem(
     """
     plan, dt_s, pose = settings.plan, settings.dt_s, sight.pose
     J, dJdq = pose.J_tcp, pose.dJdq_tcp
-    H, g = tracking_cost(
-        pose_error(pose.T_world_tcp, reference[0]),
-        J,
-        dJdq,
-        state.dq,
-        reference[1],
-        plan.q_p,
-        plan.q_v,
-        plan.path_gain_per_s,
-        dt_s,
-    )
+    error = pose_error(pose.T_world_tcp, target.T_world_tcp)
+    H, g = tracking_cost(error, J, dJdq, state.dq, target.twist, plan.q_p, plan.q_v, plan.path_gain_per_s, dt_s)
+    H, g = with_posture(H, g, state.q - target.q, plan.posture)
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
     if plan.jerk_s > dt_s:
         low, high = smooth_bounds(low, high, state.dq + dt_s * u_before, dt_s**2 / plan.jerk_s * robot.ddq_max)
-    J_low, J_high = cartesian_bounds(J, dJdq, state.dq, plan.tcp_speed_max, plan.tcp_acceleration_max, dt_s)
-    further, twist = 1.0 + plan.smooth_s / dt_s, J @ state.dq
-    low, high = state.dq + further * (low - state.dq), state.dq + further * (high - state.dq)
-    J_low, J_high = twist + further * (J_low - twist), twist + further * (J_high - twist)
+    speed_max = min(plan.tcp_speed_max, RETREAT_SPEED) if sight.overlap_m else plan.tcp_speed_max
+    J_low, J_high = cartesian_bounds(J, dJdq, state.dq, speed_max, plan.tcp_acceleration_max, dt_s)
+    twist, further = J @ state.dq, 1.0 + plan.smooth_s / dt_s
+    low, high, J_low, J_high = (
+        now + further * (bound - now)
+        for bound, now in ((low, state.dq), (high, state.dq), (J_low, twist), (J_high, twist))
+    )
     pairs = sight.pairs
     if pairs is None:
         raise ValueError("problem: the distances from people are not known")
@@ -234,6 +258,12 @@ def problem(
         pose, obstacles, pairs.room_m2(plan.room, plan.give_way_m), pairs.distance_m, horizon_s + plan.lead_s
     )
     return Problem(H, g, Limits(low, high, J, J_low, J_high), rows, plan.rows == "soft")
+
+
+def dq_after(dq: Floats, aim: Floats, settings: PlanSettings) -> Floats:
+    """(nv,) velocity one tick later of a robot at ``dq`` that heads for ``aim`` [rad/s]."""
+    smooth_s = settings.plan.smooth_s
+    return dq + (aim - dq) / (1.0 + smooth_s / settings.dt_s) if smooth_s else aim
 
 
 @njit(cache=True)
@@ -257,7 +287,7 @@ def propose(
     robot: RobotModel,
     state: RobotState,
     u_before: Floats,
-    reference: tuple[Floats, Floats],
+    target: Target,
     sight: Sight,
     obstacles: Obstacles,
     horizon_s: float,
@@ -269,21 +299,25 @@ def propose(
         robot: The manipulator.
         state: At the tick.
         u_before: (nv,) acceleration of the tick before [rad/s^2].
-        reference: Pose (4, 4) of the reference one tick later, and its velocity (6,), world frame [m/s, rad/s].
+        target: The reference one tick later.
         sight: The robot's pose, and its distances from people.
         obstacles: The swept volumes of the tick.
         horizon_s: Until when they hold [s].
         settings: Weights and limits.
     """
-    task = problem(robot, state, u_before, reference, sight, obstacles, horizon_s, settings)
+    task = problem(robot, state, u_before, target, sight, obstacles, horizon_s, settings)
     found = minimise(task)
     if not isinstance(found, Solution) and settings.plan.jerk_s > 0.0:  # a limit may ask for a sudden change
         calm = settings.without_jerk()
-        found = minimise(problem(robot, state, u_before, reference, sight, obstacles, horizon_s, calm))
+        found = minimise(problem(robot, state, u_before, target, sight, obstacles, horizon_s, calm))
     if not isinstance(found, Solution):
-        return control_step.NOT_FINITE if found.status == "not finite" else control_step.NO_SOLUTION
-    dq_next = state.dq + (found.dq_next - state.dq) / (1.0 + settings.plan.smooth_s / settings.dt_s)
+        if found.status == "not finite":
+            return control_step.NOT_FINITE
+        return control_step.INSIDE if sight.overlap_m else control_step.NO_SOLUTION  # too fast for a retreat
+    dq_next = dq_after(state.dq, found.dq_next, settings)
     q_next = state.q + 0.5 * settings.dt_s * (state.dq + dq_next)  # Eq. (68), (69)
-    brake = straight if settings.certified else axis_by_axis
-    stop = brake(q_next, dq_next, robot.ddq_max, settings.dt_s)
-    return [Proposal(stop, control_step.LIMITED if found.held else control_step.TRACKING)]
+    status = control_step.LIMITED if found.held else control_step.TRACKING
+    stops = (
+        (straight, axis_by_axis) if settings.certified else (axis_by_axis,)
+    )  # a straight one may leave an axis' range
+    return [Proposal(stop(q_next, dq_next, robot.ddq_max, settings.dt_s), status) for stop in stops]
