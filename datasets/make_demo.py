@@ -9,14 +9,19 @@ import numpy as np
 
 from datasets.recipe import cameras, scene, worker
 from hrcreplay.logs.writer import LogWriter
+from hrcreplay.records import Floats
 
 SEED = 2024
 START_NS = 1_600_000_000_000_000_000  #: no clock is read
 TRUTH_EVERY = 2  #: rows of the simulation: 100 Hz
 
 
-def make(path: Path) -> None:
+def make(path: Path, T_world_base: Floats = scene.T_WORLD_BASE) -> None:
     """Simulates the session and writes it.
+
+    Args:
+        path: Log to make.
+        T_world_base: (4, 4) where the robot stands; the worker does not mind.
 
     Raises:
         SettingsError: The file exists, or its folder cannot be written.
@@ -28,7 +33,7 @@ def make(path: Path) -> None:
     with LogWriter(path) as log:
         for sensor in cameras.SENSORS:
             log.camera(sensor.name, np.round(sensor.T_world_camera, 9))
-        log.base(scene.T_WORLD_BASE)
+        log.base(T_world_base)
         log.task(scene.TASK)
         for second in range(int(t_s[-1]) + 1):  # side by side in the file, as in time
             first, last = START_NS + second * 10**9, START_NS + (second + 1) * 10**9

@@ -73,7 +73,14 @@ class Found(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def known_numbers(H: Floats, g: Floats, limits: Limits, rows: Approach) -> bool:
-    """Whether nothing is NaN, and nothing infinite but for bounds that do not exist."""
+    """Whether nothing is NaN, and nothing infinite but for bounds that do not exist.
+
+    Args:
+        H: (nv, nv).
+        g: (nv,).
+        limits: Of axes and TCP.
+        rows: Of people.
+    """
     total = H.sum() + g.sum() + limits.J.sum() + rows.ends_m.sum() + rows.J_ends.sum() + rows.vertices_m.sum()
     total += rows.boxes_m.sum() + rows.per_speed.sum() + rows.stop_s
     known = math.isfinite(total) and not np.isnan(rows.room_m2.sum())

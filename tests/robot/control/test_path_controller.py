@@ -23,9 +23,10 @@ from tests.robot.checker import violation
 from tests.robot.distances import by_coal
 from tests.robot.people import person, volumes
 from tests.robot.plain_rows import approach_rows, link_segment
+from tests.robot.swinging import PRINTED
 
 STOP_S, DT_S = 0.377, 0.004
-SETTINGS = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)
+SETTINGS = PlanSettings(PRINTED, dt_s=DT_S, stop_s=STOP_S)
 
 
 def base() -> Floats:

@@ -117,5 +117,5 @@ def test_deeper_inside_or_without_retreat_the_robot_stands_and_says_why(
 def test_a_link_that_begins_clear_is_never_called_opening(robot: RobotModel) -> None:
     q = np.array([0.1, 0.5, -0.3, 0.0, 0.8, 0.0])
     tip = link_points(q[None])[0, 4, -1]
-    away = Box(tip + [0.3, 0.0, 0.0], np.eye(3), np.full(3, 0.05), 0.05)
+    away = Box(tip + np.array([0.3, 0.0, 0.0]), np.eye(3), np.full(3, 0.05), 0.05)
     assert clear(robot, at_rest(q), at_rest(q), as_obstacles([away]), 0.0, DT_S, NO_PLANES, 0.05)[0] == CLEAR
