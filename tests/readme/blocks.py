@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from tests.readme.measurements import DEMO_RUNS, MARGINS, RECORDINGS, Figures
+from tests.readme.measurements import BASELINES, MARGINS, PLACES, PREDICTIONS, RECORDINGS, Figures
 
 Facts = Mapping[str, Any]
 Row = Iterable[str]
@@ -27,39 +27,44 @@ def fill(text: str, facts: Facts) -> str:
 
 
 def demo(facts: Facts) -> str:
-    """The demo log by what is enclosed, and what is to be said of it."""
-    runs = [_of(facts, f"demo, {method}, {limits}") for method, limits in DEMO_RUNS]
-    audits = [(_of(facts, f"audit demo, {limits}"), method) for method, limits in DEMO_RUNS]
+    """The demo log by method, and what is to be said of it."""
+    run, printed = _of(facts, "demo"), _of(facts, "demo, as printed")
+    columns = [("`qp` (default)", run, "plan")]
+    columns += [(f"`{name}`", run, f"baseline_{name}") for name in BASELINES]
+    columns.append(("as printed (`--config paper`)", printed, "plan"))
 
-    def both(name: str) -> list[str]:
-        return [f"{100 * r[f'plan_{name}']:.1f} / {100 * r[f'baseline_scaling_{name}']:.1f} %" for r in runs]
+    def row(title: str, name: str, text: Callable[[Any], str]) -> list[str]:
+        return [title, *(text(of[f"{prefix}_{name}"]) for _, of, prefix in columns)]
 
-    late = [f"{r['plan_braking_moving_ticks']:,} / {r['baseline_scaling_braking_moving_ticks']:,}" for r in runs]
-    head = [f"`{method}`, `{limits}`" for method, limits in DEMO_RUNS]
-    head[0] += " (default)"
-    head[-1] += " (as printed)"
     rows = [
-        [
-            "space the person could reach, all limbs; `sound` has a lower body (`audit`)",
-            *(_m3(a[f"{method}_union_m3"]) for a, method in audits),
-        ],
-        ["ticks in which every limb stayed inside it", *(_share(a[f"{method}_share"]) for a, method in audits)],
-        ["standing still, of the ticks with at most 0.5 m of separation", *both("stationary_share")],
-        ["pace, of the programmed", *both("progress_share")],
-        ["largest deviation from the programmed path, QP", *(f"{r['plan_deviation_max_m']:.2f} m" for r in runs)],
-        [f"of {runs[0]['plan_ticks']:,} ticks, those braking while still moving", *late],
+        row("ticks moving in contact with the worker", "touch_moving_ticks", lambda n: f"{n:,}"),
+        row("fastest contact", "touch_contact_speed_max_m_per_s", lambda v: "\u2013" if v is None else f"{v:.2f} m/s"),
+        row("nearest to the worker while moving", "body_distance_min_moving_m", _cm),
+        row("pace, of the programmed", "progress_share", _share),
+        row("standing still, of the ticks with at most 0.5 m of separation", "stationary_share", _share),
+        row("full stops: ticks braking while still moving", "full_stop_share", _share),
+        row("ticks moving without a certificate", "uncertified_moving_ticks", lambda n: f"{n:,}"),
     ]
-    left = 1.0 - audits[-1][0]["paper_share"]
-    paper = [f"{100 * runs[0][f'paper_stationary_share_{name}']:.2f} %" for name in ("qp", "scaling")]
+    places = {0.15: run, **{x: _of(facts, f"demo, base at {x} m") for x in PLACES if x != 0.15}}
+    others = [
+        f"at x = {x} m `qp` keeps {_share(of['plan_progress_share'])} of the pace and stands in "
+        f"{_share(of['plan_stationary_share'])} of the near ticks, `scaling` "
+        f"{_share(of['baseline_scaling_progress_share'])} and {_share(of['baseline_scaling_stationary_share'])}"
+        for x, of in sorted(places.items())
+        if x != 0.15
+    ]
+    paper = [f"{100 * run[f'paper_stationary_share_{name}']:.2f} %" for name in ("qp", "scaling")]
     words = (
-        "The worker reaches into the robot's workspace all the time: what is safe there is slow. The printed "
-        f"prediction is fast because the worker leaves it in {_share(left)} of the ticks. The paper reports that the "
-        f"robot stood in {paper[0]} (QP) and {paper[1]} (scaling) of the time near people, in experiments whose logs "
-        "were never published: compare in kind only. Against ground truth the error (RMSE) of the fused joint angles "
-        f"is {runs[0]['fusion_angle_rmse_ratio']:.2f} of that of the better camera's raw angles, and the error of the "
-        f"angular velocities {runs[0]['fusion_velocity_rmse_ratio']:.2f} of that of its differenced angles."
+        "The worker reaches into the robot's workspace all the time. The person was predicted for "
+        f"{1000 * run['plan_horizon_median_s']:.0f} ms in the median and {1000 * run['plan_horizon_max_s']:.0f} ms at "
+        "most: as long as the stop from the speed of the tick takes. The same worker beside another base: "
+        f"{'; '.join(others)} (the log has x = 0.15 m). The paper reports that the robot stood in {paper[0]} (QP) and "
+        f"{paper[1]} (scaling) of the time near people, in experiments whose logs were never published: compare in "
+        "kind only. Against ground truth the error (RMSE) of the fused joint angles "
+        f"is {run['fusion_angle_rmse_ratio']:.2f} of that of the better camera's raw angles, and the error of the "
+        f"angular velocities {run['fusion_velocity_rmse_ratio']:.2f} of that of its differenced angles."
     )
-    return f"{_table(['', *head], rows)}\n\n{_wrapped(words)}"
+    return f"{_table(['', *(title for title, *_ in columns)], rows)}\n\n{_wrapped(words)}"
 
 
 _ENCLOSES = {
@@ -103,7 +108,7 @@ def recordings(facts: Facts) -> str:
         pairs = [(people, "sound"), (paper, "sound"), (people, "paper"), (paper, "paper"), (people, "v2_a50")]
         cells = [f"{_share(of[f'{method}_share'])}, {_m3(of[f'{method}_union_m3'])}" for of, method in pairs]
         rows.append([name, *cells, _share(people["legs_share"])])
-    head = ["recording", *(f"`{method}`, `{limits}`" for method, limits in DEMO_RUNS)]
+    head = ["recording", *(f"`{method}`, `{limits}`" for method, limits in PREDICTIONS)]
     return _table([*head, "capsules of v \u2264 2 m/s, a \u2264 50 m/s\u00b2", "lower body, `sound`"], rows)
 
 
@@ -166,6 +171,11 @@ def _share(value: float | None) -> str:
     if value in (0.0, 1.0):
         return f"{100 * value:.0f} %"
     return f"{min(99.9, max(0.1, 100 * value)):.1f} %"
+
+
+def _cm(value: float | None) -> str:
+    """A distance between surfaces; negative in overlap."""
+    return "\u2013" if value is None else f"{100 * value:.0f} cm".replace("-", "\u2212")
 
 
 def _m3(value: float | None) -> str:

@@ -17,21 +17,26 @@ ROOT = Path(__file__).parents[2]
 PEOPLE = ROOT / "hrcreplay" / "limits" / "people.toml"
 DEMO = "datasets/demo.mcap"
 
-#: Title of a column of the demo's table -> settings of the run.
+#: Predictions that are compared: method and limit set.
+PREDICTIONS = (("sound", "people"), ("sound", "paper"), ("paper", "people"), ("paper", "paper"))
+#: Baselines of the demo's table.
+BASELINES = ("scaling", "shield", "ssm", "none")
+#: Base of the robot: further away, as in the log, and nearer [m].
+PLACES = (0.0, 0.15, 0.25)
+_CELL = "[T_world_base]\nposition_m = [{x}, 0, 0.65]\n"
+#: Run of the demo log -> options; and which one's speeds the README shows.
 DEMO_RUNS = {
-    ("sound", "people"): "",
-    ("sound", "paper"): "--limits paper",
-    ("paper", "people"): "--set occupancy.method=paper",
-    ("paper", "paper"): "--set occupancy.method=paper --limits paper",
+    "demo": f"--set 'plan.baselines={json.dumps(BASELINES)}'",
+    "demo, as printed": "--config paper",
+    **{f"demo, base at {x} m": "--cell {tmp}/cell.toml" for x in PLACES if x != 0.15},
 }
-#: The run whose speeds the README shows.
-PICTURE = ("paper", "paper")
+PICTURE = "demo"
 #: What of metrics.json the README tells.
-_PLAN = ("stationary_share", "progress_share", "deviation_max_m", "braking_moving_ticks", "ticks")
+_PLAN = ("stationary_share", "progress_share", "full_stop_share", "uncertified_moving_ticks")
+_TOUCH = ("touch_moving_ticks", "touch_contact_speed_max_m_per_s", "body_distance_min_moving_m")
 REPORT_KEYS = (
-    *(f"{prefix}_{name}" for prefix in ("plan", "baseline_scaling") for name in _PLAN),
-    *("paper_stationary_share_qp", "paper_stationary_share_scaling"),
-    *("fusion_angle_rmse_ratio", "fusion_velocity_rmse_ratio"),
+    *("paper_stationary_share_qp", "paper_stationary_share_scaling", "plan_deviation_max_m", "plan_ticks"),
+    *("fusion_angle_rmse_ratio", "fusion_velocity_rmse_ratio", "plan_horizon_median_s", "plan_horizon_max_s"),
 )
 #: Part of an audit: every limb that was checked, with the lower body where a method has a volume for it.
 _PART = "all"
@@ -88,8 +93,13 @@ class Measurement:
 
 
 def of_report(metrics: Mapping[str, Any]) -> Figures:
-    """What is kept of a report's metrics."""
-    return {name: metrics[name]["value"] for name in REPORT_KEYS}
+    """What is kept of a report's metrics: of the plan and all baselines that ran."""
+    found = {name: metrics[name]["value"] for name in REPORT_KEYS}
+    names = _PLAN + _TOUCH if metrics["contact_person"]["value"] else _PLAN
+    for prefix in ("plan", *(f"baseline_{method}" for method in BASELINES)):
+        if f"{prefix}_progress_share" in metrics:
+            found |= {f"{prefix}_{name}": metrics[f"{prefix}_{name}"]["value"] for name in names}
+    return found
 
 
 def of_audit(metrics: Mapping[str, Any]) -> Figures:
@@ -119,10 +129,11 @@ def of_people() -> Figures:
 def measurements() -> list[Measurement]:
     """All of them, the quick ones first."""
     found = [_audit(f"audit demo, {limits}", (f"{DEMO} --limits {limits}",), {}) for limits in ("people", "paper")]
-    for (method, limits), options in DEMO_RUNS.items():
-        command = f"hrcreplay report {DEMO} {options} --out {{tmp}}/run".replace("  ", " ")
-        picture = "run/figures/fig14_speed.png" if (method, limits) == PICTURE else ""
-        found.append(Measurement(f"demo, {method}, {limits}", (command,), "run/metrics.json", of_report, {}, picture))
+    for name, options in DEMO_RUNS.items():
+        command = f"hrcreplay report {DEMO} {options} --out {{tmp}}/run"
+        files = {"cell.toml": _CELL.format(x=name.split()[-2])} if "--cell" in options else {}
+        picture = "run/figures/fig14_speed.png" if name == PICTURE else ""
+        found.append(Measurement(name, (command,), "run/metrics.json", of_report, files, picture))
     found += [
         _audit(f"audit excerpt, {name}", (f"{EXCERPT} {options}".strip(),), {}) for name, options in MARGINS.items()
     ]

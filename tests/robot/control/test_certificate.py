@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import certificate
 from hrcreplay.robot.control.approach_rows import tick_rows, worst_rows
-from hrcreplay.robot.control.certificate import NO_PLANES, clear, separating_normal
+from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, clear, separating_normal
 from hrcreplay.robot.control.control_step import RobotState, observe
 from hrcreplay.robot.control.stopping import Stop, at_rest, axis_by_axis, straight
 from hrcreplay.robot.model import RobotModel, irb140
@@ -36,33 +36,29 @@ def _ball(centre_m: Floats, radius_m: float = 0.05) -> Box:
 
 
 def test_the_stop_that_the_rows_allow_and_that_enters_is_refused(robot: RobotModel) -> None:
-    """Every row of (2) holds with 30 mm between wrist and ball, and the stop (67) ends far inside it."""
-    rng, worst = np.random.default_rng(3), -np.inf
-    for _ in range(3000):
-        q = rng.uniform(robot.q_min, robot.q_max) * np.array([1.0, 0.8, 0.5, 1.0, 1.0, 1.0])
-        if np.abs(q[3]) > np.pi or np.abs(q[5]) > np.pi:
-            continue
-        stop = axis_by_axis(q, FAST, robot.ddq_max, DT_S)
-        if np.any(stop.q[-1] < robot.q_min) or np.any(stop.q[-1] > robot.q_max):
-            continue
-        start, velocities = link_points(q[None])[0, 3], robot.pose(q, FAST).J_ends[3] @ FAST
-        aside = np.cross(velocities[0], velocities[1])  # neither end moves there at first
-        aside *= np.sign(aside @ (link_points(stop.q[-1:])[0, 3, -1] - start[-1])) / np.linalg.norm(aside)
-        ball = _ball(start[-1] + aside * (0.077 + 0.05 + 0.03))
-        seen = as_obstacles([ball])
-        sight = observe(robot, RobotState(q, FAST), seen, 0.0)
-        assert sight.pairs is not None
-        rows = tick_rows(sight.pose, seen, sight.pairs.room_m2("square"), sight.pairs.distance_m, 0.377)
-        if sight.distance_m < 0.02 or len(worst_rows(rows, FAST, 0.0)[0]):
-            continue
-        going = Stop(q[None], FAST[None], np.full((1, 2), np.nan))
-        depth = deepest_m(going, stop, [ball])
-        worst = max(worst, depth)
-        for brake in (axis_by_axis, straight):
-            made = brake(q, FAST, robot.ddq_max, DT_S)
-            ok, _ = clear(robot, going, made, seen, 0.0, DT_S, NO_PLANES)
-            assert not (ok and deepest_m(going, made, [ball]) > 0.0)
-    assert worst > 0.03, "the rows alone let the robot in"
+    """Every row of (2) holds with 30 mm between wrist and ball, and the stop (67) ends nearly 5 cm inside it."""
+    q = np.array([-0.54, -0.349, -1.529, -1.409, 2.005, 1.335])  # the worst that a search of a minute found
+    stop = axis_by_axis(q, FAST, robot.ddq_max, DT_S)
+    start, velocities = link_points(q[None])[0, 3], robot.pose(q, FAST).J_ends[3] @ FAST
+    along = velocities[1] / np.linalg.norm(velocities[1])
+    way = link_points(stop.q[-1:])[0, 3, -1] - start[-1]
+    aside = way - (way @ along) * along  # the wrist does not move there at first
+    aside /= np.linalg.norm(aside)
+    aside = np.cos(0.085) * aside + np.sin(0.085) * np.cross(along, aside)
+    ball = _ball(start[-1] + aside * (0.077 + 0.05 + 0.03))
+    seen = as_obstacles([ball])
+    sight = observe(robot, RobotState(q, FAST), seen, 0.0)
+    assert sight.pairs is not None
+    assert sight.distance_m == pytest.approx(0.03, abs=1e-3)
+    rows = tick_rows(sight.pose, seen, sight.pairs.room_m2("square"), sight.pairs.distance_m, 0.377)
+    assert not len(worst_rows(rows, FAST, 0.0)[0]), "all rows hold"
+    assert np.all(np.abs(FAST) <= robot.dq_max)
+    going = Stop(q[None], FAST[None], np.full((1, 2), np.nan))
+    assert deepest_m(going, stop, [ball]) > 0.045
+    assert clear(robot, going, stop, seen, 0.0, DT_S, NO_PLANES)[0] == REFUSED
+    together = straight(q, FAST, robot.ddq_max, DT_S)
+    entered = deepest_m(going, together, [ball])
+    assert (clear(robot, going, together, seen, 0.0, DT_S, NO_PLANES)[0] == CLEAR) <= (entered <= 0.0)
 
 
 def test_a_robot_at_rest_is_certified_outside_and_refused_inside(robot: RobotModel) -> None:
