@@ -107,10 +107,8 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     from hrcreplay.run import replay
     from hrcreplay.store import run_folder
 
-    overrides = ("occupancy.method=paper", "limits.prediction=paper")
-    return run_folder.read(
-        replay.run("plan", replay.demo_log(), out=tmp_path_factory.mktemp("printed") / "run", overrides=overrides)
-    )
+    out = tmp_path_factory.mktemp("printed") / "run"
+    return run_folder.read(replay.run("plan", replay.demo_log(), out=out, config=Path("paper")))
 
 
 @pytest.fixture(scope="session")

@@ -65,6 +65,7 @@ def render(found: Mapping[str, Any], metrics: Mapping[str, Metric], meta: Mappin
     return template.render(
         title="Audit: " + ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else ""),
         subtitle=f"{total['ticks']} ticks at {found['audit_hz']:g} Hz, horizon {found['horizon_s']:g} s",
+        verdict=None,  # there is no robot
         answers=(_answer(found),),
         cards=_cards(found),
         parts=(_coverage(found, figures_dir), _limbs(found, figures_dir), _joints(found, figures_dir), _data(found)),
