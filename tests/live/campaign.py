@@ -16,6 +16,7 @@ import numpy as np
 from hrcreplay.egm.codec import BadPacket, decode_robot
 from hrcreplay.egm.robot_double.faults import KINDS, Fault, random_faults
 from hrcreplay.live.record.codec import PHASES
+from hrcreplay.records import Floats
 from tests.live.flights import CYCLE_S, Flight, steps_keep_the_limits
 
 SECONDS = 6.0
@@ -46,7 +47,7 @@ def violations(flight: Flight) -> list[str]:
 
 
 def _motion_after_stops(flight: Flight) -> list[str]:
-    """Whether each stop is Eq. (67) to standstill, within T_s and two cycles."""
+    """Whether each stop is a certified one to standstill, straight or Eq. (67), within T_s and two cycles."""
     found = []
     stop_s = flight.start["settings"]["occupancy"]["stop_s"]
     ddq_max, dt_s = flight.robot.ddq_max, flight.controller.setup.plan.dt_s
@@ -60,12 +61,20 @@ def _motion_after_stops(flight: Flight) -> list[str]:
         moving = [speed for speed in speeds if np.any(speed)]
         if len(moving) * CYCLE_S > stop_s + 2 * CYCLE_S:
             found.append(f"{reason}: moves for {len(moving) * CYCLE_S:.3f} s")
-        for now, then in pairwise(speeds):
-            braked = np.sign(now) * np.maximum(np.abs(now) - ddq_max * dt_s, 0.0)
-            if np.any(then) and not np.allclose(then, braked, atol=1e-12):
-                found.append(f"{reason}: moves after the stop")
-                break
+        braked = [
+            (then, np.sign(now) * np.maximum(np.abs(now) - ddq_max * dt_s, 0.0)) for now, then in pairwise(speeds)
+        ]
+        straight = [(then, speeds[0] * (1.0 - (i + 1) / max(1, len(moving)))) for i, then in enumerate(speeds[1:])]
+        if not any(_alike(pairs) for pairs in (braked, straight)):
+            found.append(f"{reason}: moves after the stop")
+        if any(np.any(answer.row.dq) and not answer.row.certified for answer in rows if answer.row is not None):
+            found.append(f"{reason}: a stop that was not certified")
     return found
+
+
+def _alike(pairs: list[tuple[Floats, Floats]]) -> bool:
+    """Whether velocities are as expected while the robot moves."""
+    return all(not np.any(found) or np.allclose(found, expected, atol=1e-9) for found, expected in pairs)
 
 
 def _unanswered(flight: Flight) -> list[str]:

@@ -265,7 +265,7 @@ def test_a_stage_takes_over_an_earlier_run_or_says_why_not(tmp_path: Path, capsy
     assert _meta(planned)["counts"] == _meta(whole)["counts"]
     other = replay.run("plan", planned, out=tmp_path / "other", overrides=("plan.clearance_m=0.1",))
     said = capsys.readouterr().err
-    assert "predict: taken over" in said
+    assert "fuse: taken over" in said
     assert f"plan: settings plan is not as in {planned}; computed again" in said
     mine, theirs = _meta(other)["outputs"], _meta(planned)["outputs"]
     assert mine["state.parquet"] == theirs["state.parquet"]
