@@ -14,6 +14,7 @@ from hrcreplay.records import HumanStates, Motion
 from hrcreplay.robot.control import control_step, path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES
 from hrcreplay.robot.control.control_step import (
+    NO_SOLUTION,
     NOT_FINITE,
     TOO_NEAR,
     PlanSettings,
@@ -65,7 +66,7 @@ class Follower(ABC):
 
     def take_over(self, stop: Stop) -> None:
         """Goes on from where another follower has brought the robot: with the stop that was certified."""
-        self.stop = stop
+        self.stop = stop if stop.ticks else at_rest(stop.q[0], np.array([self.s_s, 0.0]))
         self.u = np.zeros(self.robot.nv)
         self.planes = NO_PLANES
 
@@ -121,11 +122,16 @@ class PathFollower(Follower):
         reason = stands(sight, self.settings) if self.careful else 0
         if reason or sight.reason == NOT_FINITE:
             return reason or sight.reason
+        if np.isnan(self.stop.along[0, 0]):
+            return NO_SOLUTION  # the stop of another method goes on
         rows = around if self.by_rows else None
         return path_controller.propose(self.robot, self.reference, self.stop, sight, rows, horizon_s, self.settings)
 
     def _move_on(self) -> None:
-        self.s_s = float(self.stop.along[0, 0])
+        if np.isnan(self.stop.along[0, 0]):
+            self.take_over(self.stop)
+        else:
+            self.s_s = float(self.stop.along[0, 0])
         self.point = self.reference.sample(self.s_s)
 
 

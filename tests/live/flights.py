@@ -156,3 +156,19 @@ def steps_keep_the_limits(flight: Flight) -> None:
         assert np.all(np.abs(two.q - one.q) <= robot.dq_max * CYCLE_S * (1 + 1e-9))
         assert np.all(np.abs(two.dq - one.dq) <= robot.ddq_max * CYCLE_S * (1 + 1e-9))
         assert np.all((two.q >= robot.q_min - 1e-9) & (two.q <= robot.q_max + 1e-9))
+
+
+def is_a_stop(speeds: Floats, ddq_max: Floats, dt_s: float) -> bool:
+    """Whether velocities (n, 6), a row a tick, are what is left of a stop: straight, or that of Eq. (67).
+
+    Of a robot that may not move at all the reply is where it is, at any time.
+    """
+    count = int(np.count_nonzero(np.any(speeds, axis=1)))
+    together = speeds[:1] * np.clip(1.0 - np.arange(len(speeds)) / max(1, count), 0.0, 1.0)[:, None]
+    alone = np.sign(speeds[:-1]) * np.maximum(np.abs(speeds[:-1]) - ddq_max * dt_s, 0.0)
+    stands = ~np.any(speeds[1:], axis=1)
+    if np.any(stands[:-1] & ~stands[1:]) or np.any(np.abs(np.diff(speeds, axis=0)[~stands]) > ddq_max * dt_s + 1e-9):
+        return False
+    return any(
+        np.all(stands | np.all(np.abs(speeds[1:] - expected) < 1e-9, axis=1)) for expected in (together[1:], alone)
+    )

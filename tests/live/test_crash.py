@@ -27,7 +27,7 @@ from hrcreplay.live.record import codec, folder
 from hrcreplay.live.verify import SessionRecomputation
 from hrcreplay.live.view import status_publisher
 from hrcreplay.robot.control import stopping
-from hrcreplay.robot.control.stopping import axis_by_axis
+from hrcreplay.robot.control.stopping import straight
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run.followers import QpFollower
 from tests.live.counted import Cable, CountedLoop, counted
@@ -100,7 +100,7 @@ def test_a_bug_anywhere_in_control_brakes_a_moving_robot_to_rest(
     found = Sent(place, MOVING_S, tmp_path, monkeypatch)
     robot, replies = found.flight.robot, found.after()
     assert np.abs(replies[0].dq).max() > 3.0, "it was fast"
-    stop = axis_by_axis(replies[0].q, replies[0].dq, robot.ddq_max, CYCLE_S)
+    stop = straight(replies[0].q, replies[0].dq, robot.ddq_max, CYCLE_S)
     assert len(replies) > stop.ticks
     for row, reply in enumerate(replies):
         np.testing.assert_allclose(reply.q, stop.q[min(row, stop.ticks)], rtol=0, atol=1e-12)

@@ -88,8 +88,8 @@ def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messa
         (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * 79, "pi_forearm_r: recorded "),
         (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 17, "dq6: recorded "),
         (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
-        (codec.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
-        (codec.VOLUMES, 1, struct.calcsize("<cqHI") + 8 * (7 + 5), "radius of LLA: recorded 1.1, again 0.1"),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 5), "radius of LLA: recorded 1.1, again 0.1"),
     ],
 )
 def test_changed_numbers_are_named(

@@ -30,6 +30,10 @@ MARGIN_M = 1e-9
 #: on a line or all in one are as good as any.
 MOST_POINTS = 32
 
+#: What an axis may turn beyond its velocities at the ends of a tick [rad], and share of its acceleration limit that it
+#: may need: a path bends within a tick.
+LEAP_RAD, LEAP = 1e-4, 1.05
+
 #: A plane is as good as it gets when it proves all but this of the distance that coal found [m].
 ENOUGH_M = 1e-3
 
@@ -76,13 +80,13 @@ def clear(
         retreat_m: A link that begins inside a volume by no more than this may move out of it [m].
 
     Returns:
-        The verdict, REFUSED as well where a number is not finite, the stop would leave the range of an axis, or coal
-        finds no distance; and the planes for the next tick.
+        The verdict, REFUSED as well where a number is not finite, the stop would leave the range of an axis, an axis
+        would have to leap, or coal finds no distance; and the planes for the next tick.
     """
     q, dq = np.vstack((going.q[:1], stop.q)), np.vstack((going.dq[:1], stop.dq))
     last = stop.q[-1]
     within = np.all((robot.q_min <= last) & (last <= robot.q_max))
-    if not (obstacles.known and within and math.isfinite(q.sum() + dq.sum())):
+    if not (obstacles.known and within and _can_be_done(q, dq, robot.ddq_max * dt_s, dt_s)):
         return REFUSED, planes
     radius = np.array([segment.radius_m for segment in robot.segments])
     keep_m = radius[:, None] + obstacles.radius_m + (clearance_m + MARGIN_M)
@@ -143,6 +147,24 @@ def _keeps_off(
         if there <= row:
             return False
         row = there
+
+
+@njit(cache=True)
+def _can_be_done(q: Floats, dq: Floats, gain: Floats, dt_s: float) -> bool:
+    """Whether no axis leaps from a row of a motion to the next; false where a number is not finite.
+
+    Args:
+        q: (n, nv) [rad].
+        dq: (n, nv) [rad/s].
+        gain: (nv,) change of velocity that an axis manages in a tick [rad/s].
+        dt_s: Length of a tick [s].
+    """
+    for i in range(1, len(q)):
+        for j in range(q.shape[1]):
+            turned, most = abs(q[i, j] - q[i - 1, j]), dt_s * max(abs(dq[i - 1, j]), abs(dq[i, j]))
+            if not (turned <= most + LEAP_RAD and abs(dq[i, j] - dq[i - 1, j]) <= LEAP * gain[j]):
+                return False
+    return True
 
 
 @njit(cache=True)

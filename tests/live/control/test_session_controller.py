@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.records import STATUSES, CameraFrames, HumanStates
 from hrcreplay.run.followers import QpFollower
-from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, far_away, start, steps_keep_the_limits
+from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, far_away, is_a_stop, start, steps_keep_the_limits
 
 
 def moved(flight: Flight, after: int = 0) -> bool:
@@ -78,7 +77,7 @@ STOPS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("reason", STOPS)
-def test_every_reason_of_the_watchdog_brakes_by_67_and_holds(reason: str) -> None:
+def test_every_reason_of_the_watchdog_goes_on_with_the_certified_stop_and_holds(reason: str) -> None:
     flight = Flight(**STOPS[reason]).fly(5.0)
     assert [why for _, why in flight.controller.stops] == [reason]
     stopped_ns = flight.controller.stops[0][0]
@@ -86,10 +85,8 @@ def test_every_reason_of_the_watchdog_brakes_by_67_and_holds(reason: str) -> Non
     later = [answer for answer in flight.answers if answer.t_ns >= stopped_ns and answer.row is not None]
     assert any(np.any(answer.row.dq) for answer in flight.answers if answer.row is not None)  # it was moving
     speeds = np.array([answer.row.dq for answer in later if answer.row is not None])
-    for now, then in pairwise(speeds):
-        braked = np.sign(now) * np.maximum(np.abs(now) - robot.ddq_max * dt_s, 0.0)  # Eq. (67), written again
-        echoed = not np.any(then)  # of a robot that may not move at all, the reply is where it is
-        assert echoed or np.allclose(then, braked, atol=1e-12)
+    assert is_a_stop(speeds, robot.ddq_max, dt_s)
+    assert all(answer.row.certified for answer in later if answer.row is not None)
     still = np.flatnonzero(~np.any(speeds, axis=1))
     assert still[0] * CYCLE_S <= flight.start["settings"]["occupancy"]["stop_s"] + 2 * CYCLE_S
     assert not np.any(speeds[still[0] :])  # and does not move again
@@ -197,9 +194,9 @@ def test_looks_are_the_replay_tick_by_tick() -> None:
     for name in ("p", "v", "a", "j", "p_std", "v_std", "lengths_m", "residual_m", "unseen_s", "valid"):
         assert_array_equal(getattr(live, name), getattr(states, name), err_msg=name)
     assert controller.perception is None
-    volumes = prediction_stage.volumes(states)
     last = flight.controller.perception
     assert last is not None
+    volumes = prediction_stage.volumes(states, last.horizon_s)
     for limb in range(len(volumes.limbs)):
         assert_array_equal(last.volumes.vertices(0, limb), volumes.vertices(len(ticks) - 1, limb))
 
@@ -225,3 +222,11 @@ def test_scaling_drives_live_too() -> None:
     assert flight.phases()[-1] == "following"
     steps_keep_the_limits(flight)
     assert moved(flight, after=-200)
+
+
+@pytest.mark.parametrize("method", ["scaling", "shield", "ssm"])
+def test_a_robot_that_stays_on_its_path_takes_over_where_it_stands_and_never_leaps(method: str) -> None:
+    flight = Flight(overrides=(f"plan.method={method}", "live.resume=true"), walk=far_away).fly(3.0)
+    assert not flight.controller.stops
+    steps_keep_the_limits(flight)
+    assert moved(flight)

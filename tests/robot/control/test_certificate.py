@@ -130,3 +130,14 @@ def test_the_separating_normal_is_that_of_least_squares() -> None:
         assert normal is not None
         gap = (points @ normal).min() - max(a @ normal, b @ normal)
         assert expected - 2e-3 <= gap <= expected + 1e-6
+
+
+def test_a_leap_is_refused_however_clear_the_way(robot: RobotModel) -> None:
+    q, far = np.array([0.1, 0.2, -0.3, 0.0, 0.8, 0.0]), as_obstacles([_ball(np.array([5.0, 5.0, 5.0]))])
+    there = q + np.array([0.0, 0.001, 0.0, 0.0, 0.0, 0.0])
+    assert clear(robot, at_rest(q), at_rest(there), far, 0.0, DT_S, NO_PLANES)[0] == REFUSED
+    dq = np.array([0.0, 1.2 * DT_S * robot.ddq_max[1], 0.0, 0.0, 0.0, 0.0])
+    sudden = straight(q + 0.5 * DT_S * dq, dq, robot.ddq_max, DT_S)
+    assert clear(robot, at_rest(q), sudden, far, 0.0, DT_S, NO_PLANES)[0] == REFUSED
+    slow = straight(q + 0.5 * DT_S * dq / 1.2, dq / 1.2, robot.ddq_max, DT_S)
+    assert clear(robot, at_rest(q), slow, far, 0.0, DT_S, NO_PLANES)[0] == CLEAR
