@@ -12,7 +12,7 @@ import argparse
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from numba import njit
 
 from hrcreplay.records import LIMBS, Floats, SweptVolumes
 from hrcreplay.robot.control.certificate import NO_PLANES, clear
@@ -23,23 +23,14 @@ from hrcreplay.robot.model import RobotModel, irb140
 DT_S, TOOL_M = 0.004, 0.10
 INSTANTS, POINTS = 50, 20
 
-#: Offset of each axis from the one before at zero [m], and its direction, as the data sheet has them.
-_AXES = (
-    ((0.0, 0.0, 0.352), (0, 0, 1)),
-    ((0.070, 0.0, 0.0), (0, 1, 0)),
-    ((0.0, 0.0, 0.360), (0, 1, 0)),
-    ((0.380, 0.0, 0.0), (1, 0, 0)),
-    ((0.0, 0.0, 0.0), (0, 1, 0)),
-    ((0.065, 0.0, 0.0), (1, 0, 0)),
-)
+#: Offset of each axis from the one before at zero [m], and which of x, y and z it is, as the data sheet has them.
+_OFFSETS = np.array([[0, 0, 0.352], [0.07, 0, 0], [0, 0, 0.36], [0.38, 0, 0], [0, 0, 0], [0.065, 0, 0]])
+_ABOUT = np.array([2, 1, 1, 0, 1, 0])
 #: Links: axis that carries them, ends in its frame at zero [m], radius [m].
-_LINKS = (
-    (0, (0.0, 0.0, 0.0), (0.070, 0.0, 0.0), 0.219),
-    (1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.360), 0.152),
-    (2, (0.0, 0.0, 0.0), (0.380, 0.0, 0.0), 0.118),
-    (4, (0.0, 0.0, 0.0), (0.065, 0.0, 0.0), 0.077),
-    (5, (0.0, 0.0, 0.0), (TOOL_M, 0.0, 0.0), 0.045),
-)
+_CARRIER = np.array([0, 1, 2, 4, 5])
+_STARTS = np.zeros((5, 3))
+_ENDS = np.array([[0.07, 0, 0], [0, 0, 0.36], [0.38, 0, 0], [0.065, 0, 0], [TOOL_M, 0, 0]])
+RADII_M = np.array([0.219, 0.152, 0.118, 0.077, 0.045])
 
 
 @dataclass
@@ -62,20 +53,40 @@ class Box:
         return np.asarray(np.linalg.norm(outside, axis=1))
 
 
+@njit(cache=True)
+def _turned(turn: Floats, about: int, angle: float) -> Floats:
+    """(3, 3) a rotation followed by one about its own x, y or z."""
+    one, two = (about + 1) % 3, (about + 2) % 3
+    found = turn.copy()
+    for i in range(3):
+        found[i, one] = np.cos(angle) * turn[i, one] + np.sin(angle) * turn[i, two]
+        found[i, two] = np.cos(angle) * turn[i, two] - np.sin(angle) * turn[i, one]
+    return found
+
+
+@njit(cache=True)
 def link_points(q: Floats) -> Floats:
     """(n, 5, POINTS, 3) points on the links' axes, for joint positions (n, 6), base at the origin [m]."""
-    turn, origin = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
-    frames = []
-    for j, (offset, axis) in enumerate(_AXES):
-        origin = origin + turn @ np.array(offset)
-        turn = turn @ Rotation.from_rotvec(q[:, j, None] * np.array(axis)).as_matrix()
-        frames.append((turn, origin))
-    share = np.linspace(0.0, 1.0, POINTS)[:, None]
-    found = np.empty((len(q), len(_LINKS), POINTS, 3))
-    for i, (axis_no, start, end, _) in enumerate(_LINKS):
-        turn, origin = frames[axis_no]
-        along = np.array(start) + share * (np.array(end) - np.array(start))
-        found[:, i] = np.einsum("nij,pj->npi", turn, along) + origin[:, None]
+    found = np.empty((len(q), len(_CARRIER), POINTS, 3))
+    for n in range(len(q)):
+        turn, origin = np.eye(3), np.zeros(3)
+        for axis in range(6):
+            origin = origin + _times(turn, _OFFSETS[axis])
+            turn = _turned(turn, _ABOUT[axis], q[n, axis])
+            for link in range(len(_CARRIER)):
+                if _CARRIER[link] == axis:
+                    for k in range(POINTS):
+                        share = k / (POINTS - 1)
+                        found[n, link, k] = origin + _times(turn, (1 - share) * _STARTS[link] + share * _ENDS[link])
+    return found
+
+
+@njit(cache=True)
+def _times(turn: Floats, v: Floats) -> Floats:
+    found = np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            found[i] += turn[i, k] * v[k]
     return found
 
 
@@ -93,13 +104,33 @@ def instants(going: Stop, stop: Stop) -> Floats:
 def deepest_m(going: Stop, stop: Stop, boxes: list[Box]) -> float:
     """How far a link enters a volume at most during step and stop; negative: how far all stay away [m]."""
     points = link_points(instants(going, stop))
-    radius = np.array([link[3] for link in _LINKS])[:, None, None]
+    return max(_deepest(points, box.centre_m, box.turn, box.half_m, box.radius_m) for box in boxes)
+
+
+@njit(cache=True)
+def _deepest(points: Floats, centre: Floats, turn: Floats, half: Floats, radius: float) -> float:
+    """The same for one box, from its points' coordinates in the box."""
     depth = -np.inf
-    for box in boxes:
-        flat = np.moveaxis(points, 1, 0)
-        away = box.distance_m(flat.reshape(-1, 3)).reshape(flat.shape[:3])
-        depth = max(depth, float((radius + box.radius_m - away).max()))
+    for n in range(points.shape[0]):
+        for link in range(points.shape[1]):
+            for k in range(points.shape[2]):
+                square = 0.0
+                for axis in range(3):
+                    along = 0.0
+                    for i in range(3):
+                        along += (points[n, link, k, i] - centre[i]) * turn[i, axis]
+                    square += max(abs(along) - half[axis], 0.0) ** 2
+                depth = max(depth, RADII_M[link] + radius - np.sqrt(square))
     return depth
+
+
+def random_turn(rng: np.random.Generator) -> Floats:
+    """(3, 3) any rotation: two directions, and the one across them."""
+    one, two = rng.normal(size=(2, 3))
+    one /= np.linalg.norm(one)
+    two -= (two @ one) * one
+    two /= np.linalg.norm(two)
+    return np.column_stack([one, two, np.cross(one, two)])
 
 
 def random_boxes(rng: np.random.Generator, near_m: Floats) -> list[Box]:
@@ -108,7 +139,7 @@ def random_boxes(rng: np.random.Generator, near_m: Floats) -> list[Box]:
     for _ in range(rng.integers(1, 4)):
         half = rng.uniform(0.0, 0.25, 3) * (rng.random(3) < 0.8)
         centre = near_m[rng.integers(len(near_m))] + rng.normal(0.0, 0.4, 3)
-        found.append(Box(centre, Rotation.random(random_state=rng).as_matrix(), half, float(rng.uniform(0.0, 0.2))))
+        found.append(Box(centre, random_turn(rng), half, float(rng.uniform(0.0, 0.2))))
     return found
 
 

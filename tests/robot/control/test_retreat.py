@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from hrcreplay.records import STATUSES, Floats
 from hrcreplay.robot.control import control_step
@@ -18,9 +17,17 @@ from hrcreplay.robot.programme.path import programmed
 from hrcreplay.robot.programme.task import parse_task
 from hrcreplay.run.followers import QpFollower
 from hrcreplay.settings.sections import Plan
-from tests.robot.control.random_stops import DT_S, TOOL_M, Box, as_obstacles, instants, link_points
+from tests.robot.control.random_stops import (
+    DT_S,
+    RADII_M,
+    TOOL_M,
+    Box,
+    as_obstacles,
+    instants,
+    link_points,
+    random_turn,
+)
 
-RADII_M = np.array([0.219, 0.152, 0.118, 0.077, 0.045])
 STATUS = dict(zip(STATUSES, range(len(STATUSES)), strict=True))
 
 
@@ -43,7 +50,7 @@ def test_what_is_called_opening_brings_no_point_of_the_link_nearer_to_any_of_the
         points = link_points(q[None])[0, link]
         normal = rng.normal(size=3)
         normal /= np.linalg.norm(normal)
-        box = Box(np.zeros(3), Rotation.random(random_state=rng).as_matrix(), rng.uniform(0.0, 0.15, 3), 0.06)
+        box = Box(np.zeros(3), random_turn(rng), rng.uniform(0.0, 0.15, 3), 0.06)
         box.centre_m = points[rng.integers(len(points))] + normal * rng.uniform(0.0, 0.5)
         depth = RADII_M[link] + box.radius_m - box.distance_m(points).min()
         if not 0.0 < depth < 0.05:
