@@ -75,9 +75,10 @@ def link_points(q: Floats) -> Floats:
             turn = _turned(turn, _ABOUT[axis], q[n, axis])
             for link in range(len(_CARRIER)):
                 if _CARRIER[link] == axis:
+                    start, way = origin + _times(turn, _STARTS[link]), _times(turn, _ENDS[link] - _STARTS[link])
                     for k in range(POINTS):
-                        share = k / (POINTS - 1)
-                        found[n, link, k] = origin + _times(turn, (1 - share) * _STARTS[link] + share * _ENDS[link])
+                        for i in range(3):
+                            found[n, link, k, i] = start[i] + k / (POINTS - 1) * way[i]
     return found
 
 
