@@ -127,9 +127,16 @@ def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
             f"Not at every tick: {text_of(metrics['plan_uncertified_moving_ticks'])} of {moving} had no certificate."
         )
         return short, f"At the other ticks at which it moved, {kept}."
+    retreat = metrics["plan_retreating_share"]
+    away = (
+        f" But at {percent(retreat)} of all ticks it retreated: a link was already where the person could reach, and "
+        "moved so slowly and in such a way that no point of it came nearer to any point there."
+        if retreat["value"]
+        else ""
+    )
     return (
         "At every tick of this replay, and certified.",
-        f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}. {stops}",
+        f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}.{away} {stops}",
     )
 
 
