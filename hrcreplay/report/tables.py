@@ -127,7 +127,9 @@ REASONS = {
         "the step that the method proposed could not be certified: with the stop after it, it came too near to what "
         "the person could reach"
     ),
-    "inside a volume": "a link was already where the person could reach, and from there no motion begins but a slow retreat",
+    "inside a volume": (
+        "a link was already where the person could reach, and from there no motion begins but a slow retreat"
+    ),
     "too near": "the person was nearer than the protective separation distance of ISO/TS 15066",
 }
 
