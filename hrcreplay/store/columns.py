@@ -70,11 +70,12 @@ COLUMNS = {
         *_RESIDUAL,
         *_UNSEEN,
     ),
-    "occupancy": ("t_ns", "limb", "method", "radius_m", "volume_m3", "vertices"),
+    "occupancy": ("t_ns", "limb", "method", "radius_m", "volume_m3", "vertices", "horizon_s"),
     "motion": (
         "t_ns",
         *(f"{point}_{axis}" for point in ("ref", "tcp") for axis in "xyz"),
         *("tcp_speed", "ref_speed", "programme_s", "distance_m", "limb", "link", "status", "reason"),
+        *("horizon_s", "tau_s", "certified"),
     ),
     "contact": (
         *("t_ns", "method", "person", "moving", "distance_m", "limb", "link", "tcp_speed", "contact_speed"),

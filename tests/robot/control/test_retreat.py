@@ -57,16 +57,17 @@ def test_what_is_called_opening_brings_no_point_of_the_link_nearer_to_any_of_the
             continue
         dq = -np.linalg.pinv(robot.pose(q, np.zeros(6)).J_ends[link, 1]) @ (normal * rng.uniform(0.0, 0.3))
         dq += rng.normal(0.0, 0.05, 6)
-        stop = straight(q + 0.5 * DT_S * dq, dq, robot.ddq_max, DT_S)
-        verdict, _ = clear(robot, at_rest(q), stop, as_obstacles([box]), 0.0, DT_S, NO_PLANES, 0.05)
-        assert clear(robot, at_rest(q), stop, as_obstacles([box]), 0.0, DT_S, NO_PLANES)[0] == REFUSED
+        stop, going = straight(q + DT_S * dq, dq, robot.ddq_max, DT_S), at_rest(q)
+        going.dq[0] = dq
+        verdict, _ = clear(robot, going, stop, as_obstacles([box]), 0.0, DT_S, NO_PLANES, 0.05)
+        assert clear(robot, going, stop, as_obstacles([box]), 0.0, DT_S, NO_PLANES)[0] == REFUSED
         refused += verdict == REFUSED
         if verdict != OPENING:
             assert verdict == REFUSED
             continue
         opening += 1
         targets = inside_of(box, rng, 40)
-        for moved in link_points(instants(at_rest(q), stop)).transpose(1, 0, 2, 3)[[link]]:
+        for moved in link_points(instants(going, stop)).transpose(1, 0, 2, 3)[[link]]:
             apart = np.linalg.norm(moved[:, :, None] - targets, axis=3)  # (instants, points, targets)
             assert np.diff(apart, axis=0).min() > -1e-5
         speed = np.linalg.norm(np.einsum("eij,j->ei", robot.pose(q, dq).J_ends[link], dq), axis=1)
