@@ -15,6 +15,7 @@ import coal
 import numpy as np
 from numba import njit
 
+from hrcreplay.geometry.vectors import dot3, norm_n
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.stopping import Stop
@@ -97,31 +98,50 @@ def clear(
     undecided = _undecided(robot.ends_m(q[0]), *hulls, obstacles.boxes_m, planes, far)
     if len(undecided):
         planes = planes.copy()
-    verdict = CLEAR
+    verdict, motion = CLEAR, None
     for link, limb in undecided.tolist():
         vertices = obstacles.vertices_m[obstacles.offsets[limb] : obstacles.offsets[limb + 1]]
         if _keeps_off(robot, link, q, travel[:, link], vertices, keep_m[link, limb], planes[link, limb]):
             continue
         a, b = robot.ends_m(q[0])[link]
         gap = _gap(a, b, planes[link, limb], vertices) - keep_m[link, limb]
-        if not (-retreat_m < gap <= 0.0 and _moves_away(robot, link, q, dq, vertices)):
+        if not -retreat_m < gap <= 0.0:
+            return REFUSED, planes
+        motion = robot.link_motion(q, dq) if motion is None else motion
+        if not _moves_away(motion.ends_m[:, link], motion.twist[:, link], vertices):
             return REFUSED, planes
         verdict = OPENING
     return verdict, planes
 
 
-def _moves_away(robot: RobotModel, link: int, q: Floats, dq: Floats, vertices: Floats) -> bool:
+@njit(cache=True)
+def _moves_away(ends: Floats, twist: Floats, vertices: Floats) -> bool:
     """Whether no point of a link's axis comes nearer to a point of a hull at any tick of a motion, and none is fast.
 
     (r - p) @ v <= 0 for a point p of the axis with velocity v and every vertex r; it is linear along the axis, Eq.
     (11), and in r, so the ends and the vertices speak for all. Between two ticks the link moves by 1 mm at most.
+
+    Args:
+        ends: (n, 2, 3) of the link's axis at each tick [m].
+        twist: (n, 6) as of `LinkMotion` [m/s, rad/s].
+        vertices: (m, 3) [m].
     """
-    motion = robot.link_motion(q, dq)
-    for ends, twist in zip(motion.ends_m[:, link], motion.twist[:, link], strict=True):
-        for end in ends:
-            v = twist[:3] + np.cross(twist[3:], end)
-            if not (float((vertices @ v).max() - end @ v) <= AWAY and math.sqrt(v @ v) <= RETREAT_SPEED):
+    for i in range(len(ends)):
+        u, w = twist[i, :3], twist[i, 3:]
+        for e in range(2):
+            p = ends[i, e]
+            v = np.array(
+                [
+                    u[0] + w[1] * p[2] - w[2] * p[1],
+                    u[1] + w[2] * p[0] - w[0] * p[2],
+                    u[2] + w[0] * p[1] - w[1] * p[0],
+                ]
+            )
+            if not norm_n(v) <= RETREAT_SPEED:
                 return False
+            for j in range(len(vertices)):
+                if not dot3(vertices[j] - p, v) <= AWAY:
+                    return False
     return True
 
 
