@@ -2,7 +2,9 @@
 
 By induction from standstill: as long as the person stays inside the volumes of each tick until their horizon, no link
 touches the person while the robot moves, whatever the method proposes. The horizon of a tick is the end of the stop
-that would follow (``PlanSettings.horizon_s``), so a stop under way was certified with volumes that still hold.
+that would follow (``PlanSettings.horizon_s``), so a stop under way was certified with volumes that still hold. A robot
+that a volume has reached may retreat (``plan.retreat_m``): then no point of a link comes nearer to any point of it, so
+that a person who touched the robot at rest is let go.
 """
 
 from __future__ import annotations
