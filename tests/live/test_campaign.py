@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
 from hrcreplay.egm.robot_double.faults import KINDS, LINK_FAULTS, Fault
@@ -34,3 +37,8 @@ def test_each_fault_by_itself(kind: str) -> None:
 @pytest.mark.parametrize("seed", range(1000, 1010))
 def test_random_faults(seed: int) -> None:
     assert violations(session(seed, seconds=3.0)) == []
+
+
+def test_nothing_is_compiled_while_a_robot_waits() -> None:
+    done = subprocess.run([sys.executable, "-m", "tests.live.compiled"], capture_output=True, text=True, check=True)
+    assert done.stdout == ""

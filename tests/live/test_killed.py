@@ -150,7 +150,7 @@ def test_without_control_the_robot_stops_by_itself_and_is_echoed_by_the_next_ses
     assert verified(one.session.partial).endswith("the record breaks off: the session or its recorder was killed")
     with ExitStack() as stack:
         group = Group(tmp_path, stack)
-        group.prepare("next", "--send", port=one.session.port, settings=("live.real_time=true",))
+        group.prepare("next", "--send", port=one.session.port)
         following = Flown(group._sessions["next"], one.twin, {})
         following.session.until_phase(*MOVING)
         time.sleep(0.3)

@@ -38,7 +38,8 @@ class ControlSetup:
     def stop_from(self, state: RobotState) -> Stop:
         """The stop of a robot whose last one ended elsewhere: it was held at a limit, or only echoed."""
         brake = straight if self.plan.certified else axis_by_axis
-        return brake(state.q, state.dq, self.robot.ddq_max, self.plan.dt_s)
+        # a copy: for an array that is read-only numba would compile the kernel anew, while the robot waits
+        return brake(state.q.copy(), state.dq.copy(), self.robot.ddq_max, self.plan.dt_s)
 
 
 @dataclass(frozen=True, eq=False)
