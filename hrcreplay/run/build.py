@@ -188,7 +188,7 @@ def plan_settings(job: Job, dt_s: float, method: str) -> PlanSettings:
         latency_s=occupancy.latency_s,
         spare_ticks=int(job.command == "live"),
         certified=plan.certify and method != "none",
-        retreat_m=plan.retreat_m if method == "qp" else 0.0,
+        retreat_m=plan.retreat_m if plan.certify and method == "qp" else 0.0,
     )
 
 

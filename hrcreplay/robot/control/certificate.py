@@ -35,6 +35,9 @@ MOST_POINTS = 32
 #: may need: a path bends within a tick.
 LEAP_RAD, LEAP = 1e-4, 1.05
 
+#: Rows of a motion that a plane must prove at a time, lest coal be asked for a better one.
+FEW = 4
+
 #: A plane is as good as it gets when it proves all but this of the distance that coal found [m].
 ENOUGH_M = 1e-3
 
@@ -95,15 +98,16 @@ def clear(
         planes = np.zeros((*keep_m.shape, 3))
     travel = _travel(q, dq, robot.axis_reach_m, dt_s)
     far, hulls = travel[-1][:, None] + keep_m, (obstacles.vertices_m, obstacles.offsets)
-    undecided = _undecided(robot.ends_m(q[0]), *hulls, obstacles.boxes_m, planes, far)
+    ends = _Ends(robot, q)
+    undecided = _undecided(ends.at(0), *hulls, obstacles.boxes_m, planes, far)
     if len(undecided):
         planes = planes.copy()
     verdict, motion = CLEAR, None
     for link, limb in undecided.tolist():
         vertices = obstacles.vertices_m[obstacles.offsets[limb] : obstacles.offsets[limb + 1]]
-        if _keeps_off(robot, link, q, travel[:, link], vertices, keep_m[link, limb], planes[link, limb]):
+        if _keeps_off(ends, link, travel[:, link], vertices, keep_m[link, limb], planes[link, limb]):
             continue
-        a, b = robot.ends_m(q[0])[link]
+        a, b = ends.at(0)[link]
         gap = _gap(a, b, planes[link, limb], vertices) - keep_m[link, limb]
         if not -retreat_m < gap <= 0.0:
             return REFUSED, planes
@@ -145,28 +149,55 @@ def _moves_away(ends: Floats, twist: Floats, vertices: Floats) -> bool:
     return True
 
 
-def _keeps_off(
-    robot: RobotModel, link: int, q: Floats, travel: Floats, vertices: Floats, keep_m: float, plane: Floats
-) -> bool:
-    """Conservative advancement of one link towards one limb; writes the last plane between them."""
-    row, last = 0, len(q) - 1
+def _keeps_off(ends: _Ends, link: int, travel: Floats, vertices: Floats, keep_m: float, plane: Floats) -> bool:
+    """Conservative advancement of one link towards one limb; writes the last plane between them.
+
+    Args:
+        ends: Of the links at each row of the motion.
+        link: Which one.
+        travel: (n,) of `_travel` [m].
+        vertices: (m, 3) of the limb [m].
+        keep_m: Distance to keep [m].
+        plane: (3,) to begin with.
+    """
+    row, last = 0, len(travel) - 1
     while True:
-        a, b = robot.ends_m(q[row])[link]
-        gap = _gap(a, b, plane, vertices) - keep_m
-        if not gap > travel[last] - travel[row]:  # the plane of before does not do
+        a, b = ends.at(row)[link]
+        there = _proven(travel, row, _gap(a, b, plane, vertices) - keep_m)
+        if there < min(row + FEW, last):  # the plane of before proves little
             normal = separating_normal(a, b, vertices)
             if normal is None:
                 return False
             plane[:] = normal
-            gap = _gap(a, b, plane, vertices) - keep_m
-        if not gap > 0.0:
-            return False
-        if row == last or gap > travel[last] - travel[row]:
+            there = _proven(travel, row, _gap(a, b, plane, vertices) - keep_m)
+        if there == last:
             return True
-        there = int(np.searchsorted(travel, travel[row] + gap, side="left")) - 1
         if there <= row:
             return False
         row = there
+
+
+class _Ends:
+    """Ends of the links along a motion, each row computed when it is first asked for."""
+
+    def __init__(self, robot: RobotModel, q: Floats) -> None:
+        self._robot, self._q = robot, q
+        self._rows: dict[int, Floats] = {}
+
+    def at(self, row: int) -> Floats:
+        """(s, 2, 3) at a row of the motion [m]."""
+        if row not in self._rows:
+            self._rows[row] = self._robot.ends_m(self._q[row])
+        return self._rows[row]
+
+
+@njit(cache=True)
+def _proven(travel: Floats, row: int, gap: float) -> int:
+    """The last row before which a link cannot have bridged a gap that it has at a row; -1 where there is no gap."""
+    there = row if gap > 0.0 else -1
+    while 0 <= there < len(travel) - 1 and travel[there + 1] - travel[row] < gap:
+        there += 1
+    return there
 
 
 @njit(cache=True)

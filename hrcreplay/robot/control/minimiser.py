@@ -1,7 +1,8 @@
 """The minimiser of Eq. (66) under its rows, by proxqp. The only user of proxsuite.
 
-Every vertex of every limb has rows and the minimiser lies on few of them, so rows join in one at a time while the
-candidate breaks any. Where the rows are soft, one slack [m/s] loosens all of them, so that the people leave a solution.
+Every vertex of every limb has rows and the minimiser lies on few of them. So rows join in while a candidate breaks
+any: first while that of coordinate descent does, then while proxqp's does. Where the rows are soft, one slack [m/s]
+loosens all of them, so that the people leave a solution.
 
 Proxqp claims solutions that are none and misses others, in about one tick in a hundred near people. So it works in the
 metric of the cost, begins near the solution, is asked again with other penalties where it fails, and what it finds
@@ -29,6 +30,7 @@ from hrcreplay.robot.control.metric_rows import (
     Metric,
     denied,
     descend,
+    gather,
     in_metric,
     known_numbers,
     next_row,
@@ -65,8 +67,10 @@ class Unsolved:
 
 #: Weight of the squared slack: a row is broken by 1 mm/s rather than that the TCP is slower by 1 m/s.
 SLACK = 1000.0
-#: Approach rows that may join in before the problem counts as unsolved.
-MOST = 200
+#: Rounds of finding rows and solving before the problem counts as unsolved: a late step is worth less than the stop.
+ROUNDS = 16
+#: Sweeps of coordinate descent before a row joins in, and rows that may join in before proxqp is asked again.
+SWEEPS, JOIN = 10, 40
 #: Multiplier, in the metric, above which a row holds the robot back.
 BINDING = 1e-8
 #: Largest residual, in the metric, with which multipliers prove a solution; proxqp is asked for a tenth.
@@ -74,9 +78,9 @@ PROVEN = 2e-10
 #: Bounds of the TCP broken by no more than this hold [m/s, rad/s].
 KEPT = 1e-8
 #: Tries of proxqp, one after the other: sweeps of coordinate descent before it begins, its inverse penalty, and how
-#: many times it may change the multipliers. Which, and in which order, was tried on replays. The last one (-1) begins
+#: many times it may change the multipliers. Which, and in which order, was tried on replays. The second one (-1) begins
 #: at what non-negative least squares find: deep inside people rows nearly repeat each other, and proxqp is at a loss.
-TRIES = ((50, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-3, 40), (0, 1e-7, 40), (-1, 1e-6, 6))
+TRIES = ((100, 1e-6, 6), (-1, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-3, 40), (0, 1e-7, 40))
 #: Newton steps between them.
 INNER = 20
 
@@ -95,7 +99,8 @@ def minimise(task: Problem) -> Solution | Unsolved:
         return Unsolved("infeasible")
     fixed, known = len(problem.E), np.empty((0, 4), dtype=np.int64)
     z = np.zeros(fixed)
-    for _ in range(MOST):
+    for _ in range(ROUNDS):
+        problem, z, known = gather(problem, z, limits, rows, known, SWEEPS, JOIN)
         solved = _solve(problem, z, limits)
         if isinstance(solved, Unsolved):
             return solved
