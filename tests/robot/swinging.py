@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import daqp
@@ -19,25 +20,14 @@ from hrcreplay.robot.control.qp_controller import Target, problem, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.control.stopping import axis_by_axis
 from hrcreplay.robot.model import RobotModel, RobotPose, irb140
-from hrcreplay.settings.sections import Plan
+from hrcreplay.settings.load import load_settings
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
 from tests.robot.plain_rows import approach_rows, link_segment
 
 STOP_S, DT_S = 0.377, 0.004
 #: The paper as printed.
-PRINTED = Plan(
-    horizon="fixed",
-    certify=False,
-    rows="hard",
-    room="square",
-    lead_s=0.0,
-    give_way_m=0.0,
-    jerk_s=0.0,
-    smooth_s=0.0,
-    retreat_m=0.0,
-    posture=0.0,
-)
+PRINTED = load_settings(Path("paper")).plan
 SETTINGS = PlanSettings(PRINTED, dt_s=DT_S, stop_s=STOP_S, certified=False)
 HOME = np.deg2rad([10.0, 20.0, -20.0, 0.0, 60.0, 0.0])
 
@@ -132,9 +122,11 @@ def dense(robot: RobotModel, tick: Asked) -> tuple[Floats, bool]:
     return found[0], found[2] == 1
 
 
-def asked(robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles) -> Asked:
+def asked(
+    robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles, settings: PlanSettings = SETTINGS
+) -> Asked:
     sight = observe(robot, state, seen, 0.0)
-    task = problem(robot, state, np.zeros(6), Target(T, twist, HOME), sight, seen, STOP_S, SETTINGS)
+    task = problem(robot, state, np.zeros(6), Target(T, twist, HOME), sight, seen, STOP_S, settings)
     return Asked(task, sight.pose, seen)
 
 

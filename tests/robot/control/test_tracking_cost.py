@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.robot.control.qp_controller import pose_error, tracking_cost
+from hrcreplay.robot.control.qp_controller import pose_error, tracking_cost, with_posture
 from hrcreplay.robot.model import irb140
 
 DT_S = 0.004
@@ -41,3 +41,22 @@ def test_the_error_in_pose_is_what_leads_back() -> None:
         T[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ T_ref[:3, :3]
         T[:3, 3] = T_ref[:3, 3] + way
         np.testing.assert_allclose(pose_error(T, T_ref), [*way, *turn], atol=1e-12)
+
+
+def test_the_posture_costs_what_its_distance_from_the_way_back_does() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        root, g, away = rng.normal(size=(6, 6)), rng.normal(size=6), rng.normal(size=6)
+        H = root @ root.T
+        H_too, g_too = with_posture(H, g, away, 0.3)
+        w, v = rng.normal(size=(2, 6))
+        curvature = 0.3 * np.linalg.eigvalsh(H).mean()
+        costs = []
+        for x in (w, v):
+            back = x + away  # at 1/s of the way
+            costs.append(0.5 * x @ H @ x + g @ x + 0.5 * curvature * back @ back)
+        mine = (0.5 * w @ H_too @ w + g_too @ w) - (0.5 * v @ H_too @ v + g_too @ v)
+        assert mine == pytest.approx(costs[0] - costs[1], rel=1e-9)
+        as_before = with_posture(H, g, away, 0.0)
+        np.testing.assert_array_equal(as_before[0], H)
+        np.testing.assert_array_equal(as_before[1], g)
