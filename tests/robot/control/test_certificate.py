@@ -13,7 +13,7 @@ from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, clear
 from hrcreplay.robot.control.control_step import RobotState, observe
 from hrcreplay.robot.control.stopping import Stop, at_rest, axis_by_axis, straight
 from hrcreplay.robot.model import RobotModel, irb140
-from tests.robot.control.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, run
+from tests.robot.control.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, random_step, run
 
 #: STOP.md's case: joint velocities at which the stop (67) was found to enter deepest [rad/s].
 FAST = np.radians([200.0, -34.0, -50.0, -360.0, -360.0, 450.0])
@@ -132,10 +132,35 @@ def test_the_separating_normal_is_that_of_least_squares() -> None:
         assert expected - 2e-3 <= gap <= expected + 1e-6
 
 
+def test_a_stop_that_ends_a_little_inside_is_refused(robot: RobotModel) -> None:
+    """The tip ends in the ball by up to 8 mm, or short of it by as much."""
+    rng, short_of, inside = np.random.default_rng(6), [], 0
+    for _ in range(400):
+        going, stop = random_step(rng, robot, together=bool(rng.integers(2)))
+        tips = link_points(np.vstack((going.q[:1], stop.q)))[:, 4, -1]
+        ahead = tips[-1] - tips[0]
+        if not stop.ticks or np.linalg.norm(ahead) < 0.01:
+            continue
+        depth = rng.choice([-0.008, -0.003, 0.001, 0.003, 0.008])
+        ball = _ball(tips[-1] + ahead / np.linalg.norm(ahead) * (0.045 + 0.05 - depth))
+        deepest = deepest_m(going, stop, [ball])
+        verdict = clear(robot, going, stop, as_obstacles([ball]), 0.0, DT_S, NO_PLANES)[0]
+        if deepest > 0.0:
+            inside += 1
+            assert verdict == REFUSED
+        elif deepest < -0.002:
+            short_of.append(verdict == CLEAR)
+    assert inside > 100
+    assert np.mean(short_of) > 0.7
+
+
 def test_a_leap_is_refused_however_clear_the_way(robot: RobotModel) -> None:
     q, far = np.array([0.1, 0.2, -0.3, 0.0, 0.8, 0.0]), as_obstacles([_ball(np.array([5.0, 5.0, 5.0]))])
     there = q + np.array([0.0, 0.001, 0.0, 0.0, 0.0, 0.0])
     assert clear(robot, at_rest(q), at_rest(there), far, 0.0, DT_S, NO_PLANES)[0] == REFUSED
+    dq = np.array([0.0, 0.5 * DT_S * robot.ddq_max[1], 0.0, 0.0, 0.0, 0.0])
+    further = straight(q + 3.0 * DT_S * dq, dq, robot.ddq_max, DT_S)
+    assert clear(robot, at_rest(q), further, far, 0.0, DT_S, NO_PLANES)[0] == REFUSED
     dq = np.array([0.0, 1.2 * DT_S * robot.ddq_max[1], 0.0, 0.0, 0.0, 0.0])
     sudden = straight(q + 0.5 * DT_S * dq, dq, robot.ddq_max, DT_S)
     assert clear(robot, at_rest(q), sudden, far, 0.0, DT_S, NO_PLANES)[0] == REFUSED
