@@ -321,7 +321,12 @@ def _chain(whole: Any, joints: Sequence[str]) -> Any:
         if joint.nq == 1:
             at = joint.idx_q
             q[at] = np.clip(0.0, whole.lowerPositionLimit[at], whole.upperPositionLimit[at])
-    return pin.buildReducedModel(whole, others, q) if others else whole
+    try:
+        return pin.buildReducedModel(whole, others, q) if others else whole
+    except ValueError as error:
+        raise SettingsError(
+            f"robot: the joints off the arm cannot be locked ({error}); a joint and a link of one name must have two"
+        ) from error
 
 
 def _place_base(model: Any, base: str, T_world_base: Any) -> None:

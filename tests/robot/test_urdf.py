@@ -102,6 +102,15 @@ def test_what_lies_before_another_base_is_held_and_the_base_is_where_it_was_put(
         describe(xml, base_frame="hand")
 
 
+def test_a_joint_off_the_arm_with_the_name_of_a_link_is_told() -> None:
+    claw = link("claw", BALL) + joint("claw", "hand", "claw", kind="prismatic")
+    claw += link("tip", BALL) + joint("end", "claw", "tip", kind="fixed")
+    with pytest.raises(
+        SettingsError, match=r"the joints off the arm cannot be locked \(.*claw.*\); a joint and a link"
+    ):
+        from_urdf(arm(claw), AT_ORIGIN, stop_s=0.5)
+
+
 def test_the_tcp_is_beyond_the_flange_by_the_offset_too() -> None:
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
