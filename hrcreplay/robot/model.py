@@ -325,7 +325,7 @@ def _chain(whole: Any, joints: Sequence[str]) -> Any:
         return pin.buildReducedModel(whole, others, q) if others else whole
     except ValueError as error:
         raise SettingsError(
-            f"robot: the joints off the arm cannot be locked ({error}); a joint and a link of one name must have two"
+            f"robot: the joints off the arm cannot be locked ({error}); give joint and link names of their own"
         ) from error
 
 

@@ -106,7 +106,7 @@ def test_a_joint_off_the_arm_with_the_name_of_a_link_is_told() -> None:
     claw = link("claw", BALL) + joint("claw", "hand", "claw", kind="prismatic")
     claw += link("tip", BALL) + joint("end", "claw", "tip", kind="fixed")
     with pytest.raises(
-        SettingsError, match=r"the joints off the arm cannot be locked \(.*claw.*\); a joint and a link"
+        SettingsError, match=r"the joints off the arm cannot be locked \(.*claw.*\); give joint and link"
     ):
         from_urdf(arm(claw), AT_ORIGIN, stop_s=0.5)
 
