@@ -161,10 +161,13 @@ def steps_keep_the_limits(flight: Flight) -> None:
 def is_a_stop(speeds: Floats, ddq_max: Floats, dt_s: float) -> bool:
     """Whether velocities (n, 6), a row a tick, are what is left of a stop: straight, or that of Eq. (67).
 
-    Of a robot that may not move at all the reply is where it is, at any time.
+    Of a robot that may not move at all the reply is where it is, at any time: there a stop may break off.
     """
     count = int(np.count_nonzero(np.any(speeds, axis=1)))
-    together = speeds[:1] * np.clip(1.0 - np.arange(len(speeds)) / max(1, count), 0.0, 1.0)[:, None]
+    axis = int(np.argmax(np.abs(speeds[0])))
+    lost = speeds[0, axis] - speeds[1, axis] if count > 1 else speeds[0, axis]
+    ticks = max(count, round(float(speeds[0, axis] / lost)) if lost else 0)
+    together = speeds[:1] * np.clip(1.0 - np.arange(len(speeds)) / max(1, ticks), 0.0, 1.0)[:, None]
     alone = np.sign(speeds[:-1]) * np.maximum(np.abs(speeds[:-1]) - ddq_max * dt_s, 0.0)
     stands = ~np.any(speeds[1:], axis=1)
     if np.any(stands[:-1] & ~stands[1:]) or np.any(np.abs(np.diff(speeds, axis=0)[~stands]) > ddq_max * dt_s + 1e-9):
