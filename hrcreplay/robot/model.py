@@ -317,16 +317,13 @@ def _chain(whole: Any, joints: Sequence[str]) -> Any:
     others = [i for i in range(1, whole.njoints) if whole.names[i] not in joints]
     q = pin.neutral(whole)
     for i in others:
-        joint = whole.joints[i]
-        if joint.nq == 1:
-            at = joint.idx_q
+        if whole.joints[i].nq == 1:
+            at = whole.joints[i].idx_q
             q[at] = np.clip(0.0, whole.lowerPositionLimit[at], whole.upperPositionLimit[at])
     try:
         return pin.buildReducedModel(whole, others, q) if others else whole
     except ValueError as error:
-        raise SettingsError(
-            f"robot: the joints off the arm cannot be locked ({error}); give joint and link names of their own"
-        ) from error
+        raise SettingsError(f"robot: no joint off the arm can be locked ({error}); rename joint or link") from error
 
 
 def _place_base(model: Any, base: str, T_world_base: Any) -> None:
