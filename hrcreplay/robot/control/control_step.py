@@ -68,6 +68,10 @@ class PlanSettings:
             return needed
         return max(self.stop_s, needed) if self.certified else self.stop_s
 
+    def retreats(self, overlap_m: float) -> bool:
+        """Whether a robot with a link so deep inside a volume may move out of it, slowly [m]."""
+        return 0.0 < overlap_m < self.retreat_m
+
     def without_jerk(self) -> PlanSettings:
         """The same where the acceleration may change by any amount in a tick."""
         return replace(self, plan=self.plan.model_copy(update={"jerk_s": 0.0}))

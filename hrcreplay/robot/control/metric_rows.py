@@ -49,16 +49,6 @@ class Metric(NamedTuple):
     low: Floats  #: (m,)
     high: Floats  #: (m,)
 
-    def with_row(self, row: Floats, high: float) -> Metric:
-        """With one approach row more.
-
-        Args:
-            row: (n,) of length 1.
-            high: Its bound.
-        """
-        E, low = np.concatenate((self.E, row[None])), np.append(self.low, -NONE)
-        return Metric(self.L, self.b, E, low, np.append(self.high, high))
-
 
 class Found(NamedTuple):
     """What a candidate breaks."""
@@ -277,11 +267,23 @@ def gather(
         found = next_row(problem, y, limits, rows, known)
         if found.outcome != NEW:
             break
-        E = np.concatenate((problem.E, found.row.reshape(1, -1)))
-        low, high = np.append(problem.low, -NONE), np.append(problem.high, found.high)
-        problem = Metric(problem.L, problem.b, E, low, high)
-        known, z = np.concatenate((known, found.key.reshape(1, -1))), np.append(z, 0.0)
+        problem, z, known = join(problem, z, known, found)
     return problem, z, known
+
+
+@njit(cache=True)
+def join(problem: Metric, z: Floats, known: Ints, found: Found) -> tuple[Metric, Floats, Ints]:
+    """The problem with the approach row found, its multiplier 0, and which rows it has then.
+
+    Args:
+        problem: In its metric.
+        z: (m,) multipliers.
+        known: (k, 4) which rows the problem has, as of `worst_rows`.
+        found: A row that is new.
+    """
+    E, low = np.concatenate((problem.E, found.row.reshape(1, -1))), np.append(problem.low, -NONE)
+    more = Metric(problem.L, problem.b, E, low, np.append(problem.high, found.high))
+    return more, np.append(z, 0.0), np.concatenate((known, found.key.reshape(1, -1)))
 
 
 @njit(cache=True)

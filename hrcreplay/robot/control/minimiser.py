@@ -32,6 +32,7 @@ from hrcreplay.robot.control.metric_rows import (
     descend,
     gather,
     in_metric,
+    join,
     known_numbers,
     next_row,
     residual,
@@ -112,7 +113,7 @@ def minimise(task: Problem) -> Solution | Unsolved:
             return Unsolved("residual")
         if found.outcome == CLEAR:
             return Solution(found.w, bool(np.any(z[fixed:] > BINDING)), found.slack)
-        problem, known, z = problem.with_row(found.row, found.high), np.vstack((known, found.key)), np.append(z, 0.0)
+        problem, z, known = join(problem, z, known, found)
     return Unsolved("too many rows")
 
 

@@ -244,8 +244,7 @@ def problem(
     low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
     if plan.jerk_s > dt_s:
         low, high = smooth_bounds(low, high, state.dq + dt_s * u_before, dt_s**2 / plan.jerk_s * robot.ddq_max)
-    retreats = settings.retreat_m > 0.0 and sight.overlap_m > 0.0
-    speed_max = min(plan.tcp_speed_max, RETREAT_SPEED) if retreats else plan.tcp_speed_max
+    speed_max = min(plan.tcp_speed_max, RETREAT_SPEED) if settings.retreats(sight.overlap_m) else plan.tcp_speed_max
     J_low, J_high = cartesian_bounds(J, dJdq, state.dq, speed_max, plan.tcp_acceleration_max, dt_s)
     twist, further = J @ state.dq, 1.0 + plan.smooth_s / dt_s
     low, high, J_low, J_high = (
@@ -314,8 +313,8 @@ def propose(
     if not isinstance(found, Solution):
         if found.status == "not finite":
             return control_step.NOT_FINITE
-        too_fast_to_retreat = settings.retreat_m > 0.0 and sight.overlap_m > 0.0
-        return control_step.INSIDE if too_fast_to_retreat else control_step.NO_SOLUTION
+        too_fast = settings.retreats(sight.overlap_m)  # for a retreat
+        return control_step.INSIDE if too_fast else control_step.NO_SOLUTION
     dq_next = dq_after(state.dq, found.dq_next, settings)
     q_next = state.q + 0.5 * settings.dt_s * (state.dq + dq_next)  # Eq. (68), (69)
     status = control_step.LIMITED if found.held else control_step.TRACKING
