@@ -25,7 +25,8 @@ FREE = Limits(-WIDE, WIDE, np.zeros((6, 3)), np.full(6, -1.0), np.ones(6))
 
 def people(A: Floats, high: Floats, per_speed: float = 1.0) -> Approach:
     """Rows ``A @ w <= high`` of three velocities as a link that is a point, and limbs of one vertex each."""
-    J_ends, m = np.zeros((1, 2, 3, 3)), len(A)
+    J_ends, m, A = np.zeros((1, 2, 3, 3)), len(A), A.copy()
+    A.flags.writeable = False  # as vertices are: so the kernels are those that a run has
     J_ends[0, :] = np.eye(3)
     boxes = np.stack([A, A], axis=1)
     per = np.full((1, m), per_speed)
@@ -48,17 +49,18 @@ def solved(task: Problem) -> Solution:
 def enumerated(H: Floats, g: Floats, A: Floats, high: Floats) -> Floats | None:
     """Every set of up to three rows is tried; the best point that keeps all rows is the minimiser."""
     best: Floats | None = None
-    least = np.inf
-    for count in range(len(g) + 1):
-        for rows in itertools.combinations(range(len(A)), count):
-            held = A[list(rows)]
-            K = np.block([[H, held.T], [held, np.zeros((count, count))]])
-            if np.linalg.cond(K) > 1e12:
-                continue
-            w = np.linalg.solve(K, np.concatenate([-g, high[list(rows)]]))[: len(g)]
-            cost = float(0.5 * w @ H @ w + g @ w)
-            if np.all(A @ w <= high + 1e-9) and cost < least:
-                best, least = w, cost
+    least, n = np.inf, len(g)
+    for count in range(n + 1):
+        rows = np.array(list(itertools.combinations(range(len(A)), count)), int)
+        K = np.zeros((len(rows), n + count, n + count))
+        K[:, :n, :n], K[:, n:, :n], K[:, :n, n:] = H, A[rows], A[rows].transpose(0, 2, 1)
+        right = np.hstack([np.tile(-g, (len(rows), 1)), high[rows]])[..., None]
+        solvable = np.linalg.cond(K) <= 1e12
+        w = np.linalg.solve(K[solvable], right[solvable])[:, :n, 0]
+        w = w[np.all(w @ A.T <= high + 1e-9, axis=1)]
+        cost = 0.5 * ((w @ H) * w).sum(axis=1) + w @ g
+        if len(w) and cost.min() < least:
+            best, least = w[np.argmin(cost)], cost.min()
     return best
 
 
@@ -191,9 +193,10 @@ def test_no_number_makes_it_raise(robot: RobotModel, soft: bool, bad: float) -> 
     task = replace(random_tick(robot, np.random.default_rng(5)).task, soft=soft)
     limits = Limits(*(np.array(field) for field in task.limits))
     own: dict[str, Any] = {name: np.array(field) for name, field in task.rows._asdict().items() if name != "stop_s"}
-    rows = task.rows._replace(**own)
+    rows = task.rows._replace(**own | {"vertices_m": own["vertices_m"].view()})
+    rows.vertices_m.flags.writeable = False  # as vertices are: so the kernels are those that a run has
     task = replace(task, H=task.H.copy(), g=task.g.copy(), limits=limits, rows=rows)
-    fields = [task.H, task.g, *limits, *(field for field in rows[:-1] if field.dtype == float)]
+    fields = [task.H, task.g, *limits, *(field for field in own.values() if field.dtype == float)]
     for field in fields:
         before = field.copy()
         field.flat[field.size // 2] = bad
