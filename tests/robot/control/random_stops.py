@@ -26,11 +26,12 @@ INSTANTS, POINTS = 50, 20
 #: Offset of each axis from the one before at zero [m], and which of x, y and z it is, as the data sheet has them.
 _OFFSETS = np.array([[0, 0, 0.352], [0.07, 0, 0], [0, 0, 0.36], [0.38, 0, 0], [0, 0, 0], [0.065, 0, 0]])
 _ABOUT = np.array([2, 1, 1, 0, 1, 0])
-#: Links: axis that carries them, ends in its frame at zero [m], radius [m].
+#: Links: axis that carries them and where they begin, other end in its frame at zero [m], radius [m].
 _CARRIER = np.array([0, 1, 2, 4, 5])
-_STARTS = np.zeros((5, 3))
 _ENDS = np.array([[0.07, 0, 0], [0, 0, 0.36], [0.38, 0, 0], [0.065, 0, 0], [TOOL_M, 0, 0]])
 RADII_M = np.array([0.219, 0.152, 0.118, 0.077, 0.045])
+#: Of the corners of a box.
+_SIGNS = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
 
 
 @dataclass
@@ -44,8 +45,7 @@ class Box:
 
     def corners(self) -> Floats:
         """(8, 3) [m]."""
-        signs = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
-        return self.centre_m + signs * self.half_m @ self.turn.T
+        return self.centre_m + _SIGNS * self.half_m @ self.turn.T
 
     def distance_m(self, points_m: Floats) -> Floats:
         """(n,) from points (n, 3) to the box, without the ball [m]."""
@@ -54,14 +54,13 @@ class Box:
 
 
 @njit(cache=True)
-def _turned(turn: Floats, about: int, angle: float) -> Floats:
-    """(3, 3) a rotation followed by one about its own x, y or z."""
+def _turn(turn: Floats, about: int, angle: float) -> None:
+    """Follows a rotation (3, 3) by one about its own x, y or z."""
     one, two = (about + 1) % 3, (about + 2) % 3
-    found = turn.copy()
+    cos, sin = np.cos(angle), np.sin(angle)
     for i in range(3):
-        found[i, one] = np.cos(angle) * turn[i, one] + np.sin(angle) * turn[i, two]
-        found[i, two] = np.cos(angle) * turn[i, two] - np.sin(angle) * turn[i, one]
-    return found
+        along, across = turn[i, one], turn[i, two]
+        turn[i, one], turn[i, two] = cos * along + sin * across, cos * across - sin * along
 
 
 @njit(cache=True)
@@ -71,24 +70,22 @@ def link_points(q: Floats) -> Floats:
     for n in range(len(q)):
         turn, origin = np.eye(3), np.zeros(3)
         for axis in range(6):
-            origin = origin + _times(turn, _OFFSETS[axis])
-            turn = _turned(turn, _ABOUT[axis], q[n, axis])
+            for i in range(3):
+                origin[i] += _along(turn, i, _OFFSETS[axis])
+            _turn(turn, _ABOUT[axis], q[n, axis])
             for link in range(len(_CARRIER)):
                 if _CARRIER[link] == axis:
-                    start, way = origin + _times(turn, _STARTS[link]), _times(turn, _ENDS[link] - _STARTS[link])
-                    for k in range(POINTS):
-                        for i in range(3):
-                            found[n, link, k, i] = start[i] + k / (POINTS - 1) * way[i]
+                    for i in range(3):
+                        way = _along(turn, i, _ENDS[link])
+                        for k in range(POINTS):
+                            found[n, link, k, i] = origin[i] + k / (POINTS - 1) * way
     return found
 
 
 @njit(cache=True)
-def _times(turn: Floats, v: Floats) -> Floats:
-    found = np.zeros(3)
-    for i in range(3):
-        for k in range(3):
-            found[i] += turn[i, k] * v[k]
-    return found
+def _along(turn: Floats, i: int, v: Floats) -> float:
+    """Coordinate of a vector after a rotation."""
+    return turn[i, 0] * v[0] + turn[i, 1] * v[1] + turn[i, 2] * v[2]
 
 
 def instants(going: Stop, stop: Stop) -> Floats:
@@ -131,7 +128,8 @@ def random_turn(rng: np.random.Generator) -> Floats:
     one /= np.linalg.norm(one)
     two -= (two @ one) * one
     two /= np.linalg.norm(two)
-    return np.column_stack([one, two, np.cross(one, two)])
+    (a, b, c), (d, e, f) = one.tolist(), two.tolist()  # np.cross takes as long as all the rest of a box
+    return np.array([[a, d, b * f - c * e], [b, e, c * d - a * f], [c, f, a * e - b * d]])
 
 
 def random_boxes(rng: np.random.Generator, near_m: Floats) -> list[Box]:
