@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hrcreplay.records import Floats, Ints
-from tests.soundness.compiled import kernel
+from tests.soundness.compiled import copy, kernel
 from tests.soundness.facets import Facets, outside
 from tests.soundness.kinematics import POINTS, body
 from tests.soundness.motion import GROUPS, step
@@ -134,8 +134,7 @@ def _draw_motion(
     family = ORDER[number % len(ORDER)]
     limb = rng.integers(0, len(worst.margin_m))
     if family == MUTATE and np.isfinite(worst.margin_m[limb]):
-        block.q[i], block.v[i], block.lengths[i] = best.q[limb], best.v[limb], best.lengths[limb]
-        block.wish[i], block.cuts[i], block.careful[i] = best.wish[limb], best.cuts[limb], best.careful[limb]
+        _take(best, limb, block, i)
         mutate(rng, bounds, block.wish[i])
         vary_truth(rng, estimate, bounds, block.q[i], block.v[i], block.lengths[i])
         return
@@ -154,6 +153,17 @@ def _draw_motion(
 
 
 @kernel
+def _take(of: Block, k: int, to: Block, i: int) -> None:
+    """Makes the i-th motion of a block what the k-th of another is, before it is followed."""
+    copy(of.q[k], to.q[i])
+    copy(of.v[k], to.v[i])
+    copy(of.lengths[k], to.lengths[i])
+    copy(of.wish[k], to.wish[i])
+    copy(of.cuts[k], to.cuts[i])
+    to.careful[i] = of.careful[k]
+
+
+@kernel
 def _jacobians(estimate: Estimate, hand: float) -> Floats:
     """(POINTS, 3, 12) d point / d q by differences; x and y are forward and left."""
     q, span = estimate.q.copy(), 1e-5
@@ -167,7 +177,7 @@ def _jacobians(estimate: Estimate, hand: float) -> Floats:
         q[j] = estimate.q[j] - span
         body(q, estimate.lengths, hand, behind)
         q[j] = estimate.q[j]
-        jacobians[:, :, j] = (ahead - behind) / (2.0 * span)
+        copy((ahead - behind) / (2.0 * span), jacobians[:, :, j])
     return jacobians
 
 
@@ -180,7 +190,7 @@ def _follow(block: Block, i: int, hand: float, stops: bool, bounds: Floats) -> N
     block.times[:, i] = 0.0
     body(q, block.lengths[i], hand, points)
     for instant in range(INSTANTS):
-        block.points[:, instant, :, i] = points
+        copy(points, block.points[:, instant, :, i])
     t, piece, careful = 0.0, 0, block.careful[i] == 1
     for instant in range(1, INSTANTS):
         before, met = ended.copy(), False
@@ -193,7 +203,7 @@ def _follow(block: Block, i: int, hand: float, stops: bool, bounds: Floats) -> N
                 break
         careful = careful or met
         body(q, block.lengths[i], hand, points)
-        block.points[:, instant, :, i] = points
+        copy(points, block.points[:, instant, :, i])
         block.times[instant, i] = t
         for g in range(len(GROUPS)):
             if ended[g] and not before[g]:
@@ -214,14 +224,13 @@ def _measure(start: int, block: Block, best: Block, worst: Worst, corners: Corne
             _select(block, corners, point, limb, instant, points)
             margins[:] = -np.inf
             outside(facets, limb, points, min(ROUNDING_M, worst.margin_m[limb]), margins)
-            largest[limb] = np.maximum(largest[limb], margins)
+            copy(np.maximum(largest[limb], margins), largest[limb])
             i = int(margins.argmax())
             if margins[i] > worst.margin_m[limb]:
                 worst.margin_m[limb], worst.motion[limb] = margins[i], start + i
-                worst.point_m[limb], worst.time_s[limb] = points[:, i], block.times[instant, i]
-                best.q[limb], best.v[limb], best.lengths[limb] = block.q[i], block.v[i], block.lengths[i]
-                best.wish[limb], best.cuts[limb] = block.wish[i], block.cuts[i]
-                best.careful[limb] = block.careful[i]
+                worst.time_s[limb] = block.times[instant, i]
+                copy(points[:, i], worst.point_m[limb])
+                _take(block, i, best, limb)
     for limb in range(len(worst.margin_m)):
         worst.escapes[limb] += (largest[limb] > ROUNDING_M).sum()
     for i in range(count):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hrcreplay.records import Floats
-from tests.soundness.compiled import kernel
+from tests.soundness.compiled import copy, kernel
 from tests.soundness.motion import GROUPS, allowed, within
 
 
@@ -34,7 +34,9 @@ def draw_truth(
     rng: np.random.Generator, estimate: Estimate, bounds: Floats, q: Floats, v: Floats, lengths: Floats
 ) -> None:
     """Writes an admissible state around the estimate: q (12,), v (12,) in the body's frame, lengths (8,)."""
-    q[:], v[:], lengths[:] = estimate.true_q, estimate.true_v, estimate.true_lengths
+    copy(estimate.true_q, q)
+    copy(estimate.true_v, v)
+    copy(estimate.true_lengths, lengths)
     _vary(rng, estimate, bounds, q, v, lengths, 1.0)
 
 
@@ -63,9 +65,9 @@ def _vary(
     for first, end in GROUPS:
         _clip(new_q, new_v, estimate, bounds, first, end)
         if within(new_q, new_q, first, end, bounds) and _near(new_q, estimate.q, estimate.q_off, first, end):
-            q[first:end] = new_q[first:end]
+            copy(new_q[first:end], q[first:end])
         if _near(new_v, estimate.v_world, estimate.v_off, first, end):
-            v[first:end] = new_v[first:end]
+            copy(new_v[first:end], v[first:end])
     c, s = math.cos(new_q[2]), math.sin(new_q[2])
     new_v[0], new_v[1] = c * new_v[0] + s * new_v[1], c * new_v[1] - s * new_v[0]
     for k in range(3):
@@ -73,7 +75,8 @@ def _vary(
     forward, left = new_v[0], new_v[1]
     world = np.array([c * forward - s * left, s * forward + c * left, new_v[2]])
     if _near(world, estimate.v_world, estimate.v_off, 0, 3):
-        q[:3], v[:3] = new_q[:3], new_v[:3]
+        copy(new_q[:3], q[:3])
+        copy(new_v[:3], v[:3])
 
 
 @kernel
