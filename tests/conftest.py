@@ -17,11 +17,14 @@ import hrcreplay  # noqa: F401  # names the folder of compiled kernels
 if TYPE_CHECKING:
     from hrcreplay.store.run_folder import Run
 
-#: Files of which one process runs all: sessions in real time, never two of these files at once, and looks at whole runs
-#: of the demo, which that process makes once. These groups take longest and come first.
+#: Files of which one process runs all: sessions in real time, never two of these files at once, looks at whole runs of
+#: the demo, which that process makes once, and samples of motions, whose kernels it compiles once. These groups and the
+#: recordings take longest and come first, so that no process has a long one left when the others are done.
 GROUPS = {
     "sessions": ("tests/live/test_killed.py", "tests/live/test_session.py", "tests/live/test_zenoh_session.py"),
     "demo": ("tests/run/test_replay.py", "tests/readme/test_readme.py"),
+    "soundness": ("tests/soundness/test_motion.py", "tests/soundness/test_soundness.py"),
+    "recordings": ("tests/test_recordings.py",),
 }
 WHOLE_RUNS = {"demo_folder", "printed"}
 
