@@ -10,7 +10,6 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 from numba import njit
-from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.errors import SettingsError
@@ -100,6 +99,8 @@ def _corners(points_m: Floats) -> Floats:
 
 
 def _search(shape: tuple[Floats, Floats, Floats, float], simplex: Floats, iterations: int) -> Any:
+    from scipy.optimize import minimize  # takes half a second to import, and a live session's helpers need no meshes
+
     options = {"initial_simplex": simplex, "xatol": 1e-5, "fatol": 0.0, "maxiter": iterations, "maxfev": 2 * iterations}
     return minimize(_volume, simplex[0], shape, "Nelder-Mead", options=options)
 

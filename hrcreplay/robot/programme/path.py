@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, Trajectory
-from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import LogError, SettingsError
@@ -228,6 +227,8 @@ def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
     Raises:
         LogError: Another number of axes, too few rows, or a position or speed that the robot does not have.
     """
+    from scipy.signal import savgol_filter  # takes a second to import, and few logs have a joint track
+
     if q.ndim != 2 or q.shape[1] != model.nv:
         raise LogError(f"joint track: found {q.shape[-1]} joints; {model.name} has {model.nv} axes")
     whole = np.isfinite(q).all(axis=1)
