@@ -134,7 +134,7 @@ def _draw_motion(
     family = ORDER[number % len(ORDER)]
     limb = rng.integers(0, len(worst.margin_m))
     if family == MUTATE and np.isfinite(worst.margin_m[limb]):
-        _take(best, limb, block, i)
+        _take(best, int(limb), block, i)
         mutate(rng, bounds, block.wish[i])
         vary_truth(rng, estimate, bounds, block.q[i], block.v[i], block.lengths[i])
         return

@@ -9,7 +9,6 @@ from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, process_variance
@@ -263,6 +262,8 @@ def _smooth_joint(
     mean: Floats, cov: Floats, dt: Floats, damping: Floats, settings: Fusion, j: int
 ) -> tuple[Floats, Floats]:
     """Smoothed mean (n, 4) and standard deviations of p and v (n, 2) of one joint."""
+    from filterpy.kalman import KalmanFilter  # takes half a second to import, and only smoothing needs it
+
     scale = _UNIT_S ** np.arange(4.0)
     Fs, Qs = np.zeros_like(cov), np.zeros_like(cov)
     for k in range(1, len(dt)):
