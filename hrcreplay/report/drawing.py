@@ -76,6 +76,7 @@ STYLE: dict[str, Any] = {
     "lines.solid_joinstyle": "round",
     "hatch.linewidth": 0.6,
     "path.simplify_threshold": 0.3,
+    "axes.titley": 1.0,
     "svg.fonttype": "none",
     "svg.hashsalt": "hrcreplay",
     "svg.image_inline": True,
