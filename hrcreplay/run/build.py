@@ -6,6 +6,7 @@ The rooms of the stages get plain values and never see a settings model.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import Protocol
 
@@ -20,11 +21,12 @@ from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.programme.path import programmed, recorded
 from hrcreplay.robot.programme.reference import Reference
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.programme.task import Task, parse_task
 from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
 from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.run.stages import FusionStage
+from hrcreplay.settings.sections import Robot
 
 
 class LogLike(Protocol):
@@ -90,7 +92,12 @@ def robot(job: Job, T_world_base: Floats) -> RobotModel:
     Raises:
         SettingsError: The URDF or a robot setting cannot be used.
     """
-    settings, stop_s, files = job.settings.robot, job.settings.occupancy.stop_s, read_urdf(job.settings.robot)
+    settings = job.settings.robot
+    return _robot(settings, read_urdf(settings), job.settings.occupancy.stop_s, T_world_base)
+
+
+def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base: Floats) -> RobotModel:
+    """The same from what of a job it depends on."""
     T_tool_tcp = np.eye(4)
     T_tool_tcp[:3, :3] = Rotation.from_euler("xyz", settings.tcp_offset.rpy_deg, degrees=True).as_matrix()
     T_tool_tcp[:3, 3] = settings.tcp_offset.position_m
@@ -140,7 +147,9 @@ def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int
     own = (log.header.task, f"{log.header.path}: task")
     table, where = (job.task, str(job.settings.plan.task)) if job.task else own
     if table is not None:
-        return programmed(parse_task(table, where), model, where), None
+        parts = job.settings.robot, read_urdf(job.settings.robot), job.settings.occupancy.stop_s
+        path = _programme(parse_task(table, where), where, *parts, model.T_world_base.tobytes())
+        return replace(path, model=model), None
     track = list(log.joints())
     if not track:
         raise SettingsError(
@@ -148,6 +157,15 @@ def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int
         )
     whole = JointTrack.join(track)
     return recorded(whole.t_ns, whole.q, model), int(whole.t_ns.min())
+
+
+@lru_cache(maxsize=4)  # a live session makes its controller twice: to compile the kernels, and to fly
+def _programme(
+    task: Task, where: str, settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base: bytes
+) -> Reference:
+    """The path of a task by the robot of the other arguments, which are those of ``_robot``."""
+    model = _robot(settings, files, stop_s, np.frombuffer(T_world_base).reshape(4, 4))
+    return programmed(task, model, where)
 
 
 def planners(job: Job, log: LogLike, start_ns: int) -> dict[str, Planner]:
