@@ -22,14 +22,16 @@ import json
 import struct
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hrcreplay.egm.codec import AXES
 from hrcreplay.records import Floats, HumanStates, SweptVolumes
-from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import Stop
+
+if TYPE_CHECKING:  # recorder and screen need nothing of the robot, whose imports take three quarters of their start
+    from hrcreplay.robot.control.separation import Obstacles
+    from hrcreplay.robot.control.stopping import Stop
 
 #: Where a session is: nobody may move yet, the first answers, on the way to the programme, the programme itself,
 #: braking for a reason of the watchdog, standing because of one.

@@ -26,6 +26,12 @@ def messages() -> list[bytes]:
     return list(made.session(60))
 
 
+def test_recorder_and_screen_start_without_the_robot() -> None:
+    code = "import sys\nfrom hrcreplay.live.record import recorder\nfrom hrcreplay.live.view import screen\n"
+    code += "sys.exit(3 if {'numba', 'pinocchio', 'pydantic', 'scipy'} & set(sys.modules) else 0)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 def _by_hand(path: Path) -> list[tuple[str, int, int, bytes]]:
     """Topic, log time, publish time and content in file order, by the library's own reader."""
     with path.open("rb") as file:
