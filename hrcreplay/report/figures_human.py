@@ -66,19 +66,21 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
         figure, len(methods), len(instants), left_in=0.5, right_in=0.1, top_in=0.34, bottom_in=0.3, gap_in=(0.12, 0.08)
     )
     centres = [view.flat(points[[POINTS.index("pelvis")]])[0] for points, _ in people]
-    edges = [
-        outline(vertices, radius, view) - centre
+    outlines = [
+        {
+            method: [outline(vertices, radius, view) - centre for vertices, radius in limbs.values()]
+            for method, limbs in found.items()
+        }
         for (_, found), centre in zip(instants, centres, strict=True)
-        for limbs in found.values()
-        for vertices, radius in limbs.values()
     ]
-    corners = np.vstack(edges)
+    corners = np.vstack([edge for found in outlines for edges in found.values() for edge in edges])
     low, high = corners.min(axis=0) - 0.03, corners.max(axis=0) + 0.03
     for row, method in enumerate(methods):
         for column, (t_ns, found) in enumerate(instants):
             ax = grid[row][column]
             drawing.set_window(ax, low.tolist(), high.tolist())
-            _draw_person(ax, found[method], people[column][0], view, centres[column], (low, high))
+            skeleton_m, edges = people[column][0], outlines[column][method]
+            _draw_person(ax, found[method], edges, skeleton_m, view, centres[column], (low, high))
             if row == 0:
                 later = (t_ns - instants[0][0]) * 1e-9
                 ax.set_title(
@@ -104,6 +106,7 @@ def _skeleton_at(state: pd.DataFrame, t_ns: int) -> tuple[Floats, float]:
 def _draw_person(
     ax: Axes,
     limbs: Mapping[str, tuple[Floats, float]],
+    edges: Sequence[Floats],
     points: Floats,
     view: View,
     centre: Floats,
@@ -115,8 +118,7 @@ def _draw_person(
     image[..., 3] *= 0.78
     ax.imshow(image, origin="lower", extent=(low[0], high[0], low[1], high[1]), aspect="auto", interpolation="bilinear")
     drawing.set_window(ax, low.tolist(), high.tolist())
-    for solid in solids:
-        edge = outline(solid.vertices_m, solid.radius_m, view) - centre
+    for solid, edge in zip(solids, edges, strict=True):
         if len(edge):
             ax.add_patch(Polygon(edge, fill=False, edgecolor=solid.colour, lw=0.8, alpha=0.6))
     ax.add_collection(LineCollection([pair - centre for pair in bones(points, view)], colors=drawing.INK, lw=1.6))
