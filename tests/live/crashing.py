@@ -1,6 +1,8 @@
 """Sessions with a bug in one place: stands in for the entry of hrcreplay and for that of its helper processes.
 
 ``$HRCREPLAY_TEST_BUG`` says where: ``part/module:attribute[.attribute]@file``; it strikes as soon as there is the file.
+Where ``$HRCREPLAY_TEST_UNDRAWN`` is set, the run folder has no figures, which take longer than all else after a session
+and at which most tests do not look.
 """
 
 from __future__ import annotations
@@ -8,11 +10,12 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-BUG = "HRCREPLAY_TEST_BUG"
+BUG, UNDRAWN = "HRCREPLAY_TEST_BUG", "HRCREPLAY_TEST_UNDRAWN"
 
 
 def failing(function: Callable[..., Any], fails: Callable[[], bool]) -> Callable[..., Any]:
@@ -41,8 +44,9 @@ def main() -> None:
     """Control where the arguments are a command line; else one of the helpers, of those the one with the bug."""
     from hrcreplay.live import processes
 
-    processes.ENTRY = __spec__.name if __spec__ is not None else ""
     bug = os.environ[BUG]
+    if bug and __spec__ is not None:
+        processes.ENTRY = __spec__.name
     helper = sys.argv[1:2] != ["live"]
     part, _, where = bug.partition("/")
     if part == (sys.argv[2] if helper else processes.CONTROL):
@@ -51,8 +55,10 @@ def main() -> None:
         processes.main()
         return
     from hrcreplay.cli.app import main as command_line
+    from tests.undrawn import undrawn
 
-    command_line()
+    with undrawn() if os.environ[UNDRAWN] else nullcontext():
+        command_line()
 
 
 if __name__ == "__main__":

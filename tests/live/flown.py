@@ -66,9 +66,11 @@ class Group:
         settings: tuple[str, ...] = (),
         port: int | None = None,
         bug: str = "",
+        figures: bool = False,
     ) -> None:
         """Starts a session."""
-        made = Session(self.folder / name, port or free_port(), *arguments, settings=(*QUICK, *settings), bug=bug)
+        changed = (*QUICK, *settings)
+        made = Session(self.folder / name, port or free_port(), *arguments, settings=changed, bug=bug, figures=figures)
         self._sessions[name] = self._stack.enter_context(made)
 
     def robot(self, name: str, *arguments: object) -> Flown:

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from hrcreplay.egm.robot_double.faults import KINDS
-from tests.live.crashing import BUG
+from tests.live.crashing import BUG, UNDRAWN
 from tests.live.flights import DEMO
 
 PATIENCE_S = 900.0  # only a process that hangs takes so long
@@ -85,11 +85,11 @@ def every_fault(folder: Path, seconds: float, begin_s: float = 5.0) -> Path:
 class Command:
     """A command in a process of its own; its lines are read as they come."""
 
-    def __init__(self, *arguments: object, bug: str = "") -> None:
-        """With a bug in one place, as crashing.py has it."""
+    def __init__(self, *arguments: object, bug: str = "", figures: bool = True) -> None:
+        """With a bug in one place or without figures, as crashing.py has it."""
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.live.crashing" if bug else "hrcreplay", *map(str, arguments)],
-            env=os.environ | {BUG: bug},
+            [sys.executable, "-m", "tests.live.crashing" if bug or not figures else "hrcreplay", *map(str, arguments)],
+            env=os.environ | {BUG: bug, UNDRAWN: "" if figures else "1"},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -129,12 +129,14 @@ class Session(Command):
         settings: Sequence[str] = PATIENT,
         human: Path | None = DEMO,
         bug: str = "",
+        figures: bool = True,
     ) -> None:
         self.folder = folder
         self.port = port
         person = () if human is None else ("--human", human)
         sets = [word for setting in settings for word in ("--set", setting)]
-        super().__init__("live", "--json", "--port", port, "--out", folder, *person, *arguments, *sets, bug=bug)
+        words = ("live", "--json", "--port", port, "--out", folder, *person, *arguments, *sets)
+        super().__init__(*words, bug=bug, figures=figures)
 
     @property
     def partial(self) -> Path:

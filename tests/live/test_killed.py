@@ -35,7 +35,8 @@ def moving(group: Group, *names: str) -> dict[str, Flown]:
         kept = ("live.keep_recorder=false",) if name == "kept" else ()
         settings = ("live.silent_s=2.0", "live.tracking_rad=6.0", *kept)
         bug = f"{BUGS[name]}@{group.folder / name}.bug" if name in BUGS else ""
-        group.prepare(name, "--send", "--repeat", settings=settings, bug=bug)
+        # of a record that breaks off, figures too
+        group.prepare(name, "--send", "--repeat", settings=settings, bug=bug, figures=name == "recorder")
     found = {name: group.robot(name) for name in names}
     for one in found.values():
         one.session.until("motion", lambda status: status["phase"] in MOVING and status["tcp_speed"] > 0.0)

@@ -43,12 +43,13 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Flown]
     it."""
     with ExitStack() as stack:
         group = Group(tmp_path_factory.mktemp("flown"), stack)
-        group.prepare("fine", "--send", "--duration", 12, settings=("occupancy.method=sound",))
+        group.prepare("fine", "--send", "--duration", 12, settings=("occupancy.method=sound",), figures=True)
         group.prepare("shadow", "--duration", 12)
         found = {name: group.robot(name) for name in ("shadow", "fine")}
         for one in found.values():
             one.end()
-        group.prepare("faults", "--send", "--repeat", settings=("live.silent_s=0.1", "live.tracking_rad=0.2"))
+        pulled_up = ("live.silent_s=0.1", "live.tracking_rad=0.2")
+        group.prepare("faults", "--send", "--repeat", settings=pulled_up, figures=True)
         script = every_fault(group.folder, 9.5, begin_s=1.0)
         found["faults"] = group.robot("faults", "--faults", script, "--seed", 3)
         faults = found["faults"].session

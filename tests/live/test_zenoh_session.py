@@ -81,7 +81,7 @@ def test_a_publisher_that_dies_stops_the_robot_and_one_that_comes_back_does_not_
     endpoint, port = free_endpoint(), free_port()
     patient = (*PATIENT, f"live.fresh_s={FRESH_S}")
     arguments = [*cell(tmp_path, endpoint), "--send"]
-    with Session(tmp_path / "run", port, *arguments, settings=patient, human=None) as session:
+    with Session(tmp_path / "run", port, *arguments, settings=patient, human=None, figures=False) as session:
         session.until("no frame yet", lambda status: status["phase"] == "waiting")
         with Twin(tmp_path / "twin", port) as twin:
             with worker(endpoint):

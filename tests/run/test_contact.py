@@ -20,6 +20,7 @@ from hrcreplay.run.recorded_person import RecordedPerson, from_states
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
 from tests.robot.test_model import ONE_AXIS
+from tests.undrawn import undrawn
 
 RADII_M = np.full(len(PARTS), 0.05)
 LRA = PARTS.index("LRA")
@@ -161,7 +162,8 @@ def test_nothing_is_known_in_a_gap_of_the_truth() -> None:
 @pytest.fixture(scope="module")
 def with_truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("truth") / "run"
-    return replay.run("report", replay.demo_log(), out=out, start_s=8.0, end_s=9.0)
+    with undrawn():
+        return replay.run("report", replay.demo_log(), out=out, start_s=8.0, end_s=9.0)
 
 
 def test_a_report_compares_every_method_with_the_truth(with_truth: Path) -> None:
@@ -186,8 +188,9 @@ def test_without_truth_it_is_the_smoothed_person(
     header = reader._header
     monkeypatch.setattr(reader, "_header", lambda *a, **k: dataclasses.replace(header(*a, **k), has_truth=False))
     options = {"start_s": 8.0, "end_s": 9.0}
-    fresh = replay.run("report", replay.demo_log(), out=tmp_path / "fresh", **options)  # type: ignore[arg-type]
-    again = replay.run("report", with_truth, out=tmp_path / "again")  # stage 1 taken over: smoothed by itself
+    with undrawn():
+        fresh = replay.run("report", replay.demo_log(), out=tmp_path / "fresh", **options)  # type: ignore[arg-type]
+        again = replay.run("report", with_truth, out=tmp_path / "again")  # stage 1 taken over: smoothed by itself
     for name in ("smooth.parquet", "contact.parquet"):
         assert (fresh / name).read_bytes() == (again / name).read_bytes()
     table = pq.read_table(fresh / "contact.parquet").to_pandas()
