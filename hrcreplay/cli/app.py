@@ -175,6 +175,49 @@ _stage("report", "All stages, then metrics.json, figures and report.html.")
 
 
 @app.command()
+def compare(
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="LOG_OR_RUN...", help="Logs, or run folders of earlier commands.")
+    ],
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            "--methods",
+            metavar="LIST",
+            help="METHOD[:OCCUPANCY[:HORIZON]],... as in none,qp,qp:paper:fixed; default: eight that matter.",
+        ),
+    ] = None,
+    config: Config = None,
+    settings: Set = None,
+    topic: Topic = None,
+    limits: LimitSet = None,
+    cell: CellFile = None,
+    out: Out = None,
+    start: Start = None,
+    end: End = None,
+    chunk_ticks: Chunk = 250,
+    processes: Annotated[
+        int, typer.Option("--processes", min=1, max=2, help="How many plan at once; changes no result.")
+    ] = 2,
+) -> None:
+    """What if another controller had been running: methods side by side on the same recording."""
+    from hrcreplay.run import compare as comparing
+
+    folder = comparing.run(
+        sources,
+        methods=comparing.PRESET if methods is None else methods,
+        out=out,
+        chunk_ticks=chunk_ticks,
+        processes=processes,
+        config=config,
+        overrides=as_overrides(settings, topic, limits),
+        cell_file=cell,
+        **span(start, end),
+    )
+    sys.stdout.write(f"{folder}\n")
+
+
+@app.command()
 def audit(
     sources: Annotated[
         list[Path], typer.Argument(metavar="LOG_OR_RUN...", help="Logs, or run folders of earlier stages.")
