@@ -218,6 +218,25 @@ def compare(
 
 
 @app.command()
+def why(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of plan or report.")],
+    at: Annotated[float, typer.Option("--at", metavar="S", help="Instant, in seconds from the first tick.")],
+    method: Annotated[
+        str | None, typer.Option("--method", metavar="NAME", help="One of the run's baselines; default its own method.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all facts as JSON.")] = False,
+) -> None:
+    """What held the robot at an instant of a run: limb, link, vertex and row, or where its stop was refused."""
+    import json
+
+    from hrcreplay.run import why as explaining
+
+    found = explaining.explain(folder, at, method)
+    lines = [json.dumps(found, indent=2)] if as_json else explaining.sentences(found)
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+@app.command()
 def audit(
     sources: Annotated[
         list[Path], typer.Argument(metavar="LOG_OR_RUN...", help="Logs, or run folders of earlier stages.")
