@@ -93,11 +93,13 @@ def _by_program(follower: QpFollower, moment: Moment) -> tuple[list[Proposal] | 
     given = robot, state, moment.u_before, target, sight, moment.around, moment.horizon_s
     with np.errstate(all="ignore"):
         wanted = qp_controller.propose(*given, settings)
-        for how in (settings, settings.without_jerk()):
-            task = qp_controller.problem(*given, how)
+        task = qp_controller.problem(*given, settings)
+        solved = minimise(task)
+        if not isinstance(solved, Solution) and settings.plan.jerk_s > 0.0:
+            task = qp_controller.problem(*given, settings.without_jerk())
             solved = minimise(task)
-            if isinstance(solved, Solution):
-                return wanted, held_by(task, solved)
+    if isinstance(solved, Solution):
+        return wanted, held_by(task, solved)
     return wanted, {"unsolved": solved.status, "conflict": conflict(all_rows(task))}
 
 

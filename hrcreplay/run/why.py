@@ -50,7 +50,6 @@ class Record:
     job: Job
     log: Log
     motion: pd.DataFrame
-    states: HumanStates
     _q: Floats = field(init=False)
     _dq: Floats = field(init=False)
     _u: Floats = field(init=False)
@@ -61,6 +60,9 @@ class Record:
             self.motion[[f"{name}{i}" for i in axes]].to_numpy(dtype=float) for name in ("q", "dq", "u")
         )
         self._status = self.motion["status"].astype(str).to_numpy()
+        self.states = HumanStates.join(list(read_states(self.folder / "state.parquet", 4096)))
+        plan = self.job.settings.plan.model_copy(update={"method": self.method, "baselines": ()})
+        self.job = replace(self.job, settings=self.job.settings.model_copy(update={"plan": plan}))
 
     @cached_property
     def follower(self) -> Follower:
@@ -163,11 +165,8 @@ def open_record(folder: Path, method: str | None = None) -> Record:
     path = folder / f"{name}.parquet"
     if not path.is_file() or not (folder / "state.parquet").is_file():
         raise SettingsError(f"{folder}: holds no {name}.parquet; give a run folder of plan or report that ran it")
-    plan = job.settings.plan.model_copy(update={"method": method or own, "baselines": ()})
-    job = replace(job, settings=job.settings.model_copy(update={"plan": plan}))
-    states = HumanStates.join(list(read_states(folder / "state.parquet", 4096)))
     log = open_log(job.log, job.settings.logs)
-    return Record(folder, method or own, job, log, pq.read_table(path).to_pandas(), states)
+    return Record(folder, method or own, job, log, pq.read_table(path).to_pandas())
 
 
 def explain(folder: Path, at_s: float, method: str | None = None) -> dict[str, Any]:
