@@ -114,11 +114,11 @@ FIELDS = (
         "checked_ticks",
         "sum",
         "1",
-        "ticks whose volumes were compared with the body until their horizon; without a hand but for sound",
+        "ticks whose volumes were compared with the body until their horizon, with a hand for sound alone",
     ),
-    Field("held_ticks", "sum", "1", "of these, no part of the body left its volume"),
+    Field("held_ticks", "sum", "1", "of these, the line of every limb stayed inside its volume, as audit counts it"),
     Field("coverage", "held_ticks / checked_ticks", "1", "held ticks / checked ticks"),
-    Field("left_max_m", "max", "m", "how far a part of the body left its volume at most"),
+    Field("left_max_m", "max", "m", "how far the line of a limb left its volume at most"),
 )
 #: Where a figure is a metric of the report: its name there, after ``plan_`` but for those of the volumes.
 _METRICS = {

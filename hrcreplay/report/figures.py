@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hrcreplay.records import Ints
@@ -160,60 +159,52 @@ _MARKERS = {"sound": "o", "paper": "s", "positions": "D"}
 
 
 def methods(found: Mapping[str, Any]) -> Figure:
-    """Safety against productivity: the smallest distance while moving over the pace kept, a point a method."""
-    figure = drawing.new_figure(3.9)
-    ((ax,),) = drawing.panels(figure, 1, bottom_in=0.5, top_in=0.3, right_in=0.3)
-    placed = []
+    """Safety against productivity: the smallest distance while moving over the pace kept, a point a method.
+
+    Args:
+        found: The content of compare.json.
+    """
+    figure = drawing.new_figure(3.7)
+    ((ax,),) = drawing.panels(figure, 1, bottom_in=0.5, top_in=0.3, right_in=3.3)
+    several = len(found["logs"]) > 1
     for label, row in found["total"].items():
+        of, alone = found["methods"][label], log_rows(found, label) if several else []
+        colour, marker = _COLOURS[of["method"]], _MARKERS.get(of.get("occupancy", ""), "X")
+        for other in alone:
+            ax.plot(*_place(other), ".", ms=5, color=colour, alpha=0.45)
         if row["pace"] is None or row["nearest_moving_m"] is None:
             continue
-        of = found["methods"][label]
-        at = 100.0 * row["pace"], 100.0 * row["nearest_moving_m"]
-        face = _COLOURS[of["method"]] if of.get("horizon") != "fixed" else "white"
-        marker = _MARKERS.get(of.get("occupancy", ""), "X")
-        ax.plot(*at, marker, ms=8, mfc=face, mec=_COLOURS[of["method"]], mew=1.6, zorder=3, clip_on=False)
-        placed.append((at, label, row))
-    for log in found["logs"] if len(found["logs"]) > 1 else ():
-        for label, row in log["methods"].items():
-            if row["pace"] is not None and row["nearest_moving_m"] is not None:
-                colour = _COLOURS[found["methods"][label]["method"]]
-                ax.plot(100.0 * row["pace"], 100.0 * row["nearest_moving_m"], ".", ms=5, color=colour, alpha=0.45)
-    low, high = ax.get_ylim()
-    low, high = min(low, -2.0) - 0.04 * (high - low), max(high, 2.0)
+        words = label.replace(":", ", ")
+        if row["touch_ticks"]:
+            words += f": {row['touch_ticks']:,} ticks in contact,\nup to {row['touch_speed_m_per_s']:.2f} m/s"
+        face = "white" if of.get("horizon") == "fixed" else colour
+        ax.plot(
+            *_place(row), marker, ms=8, mfc=face, mec=colour, mew=1.6, alpha=0.9, zorder=3, label=words, clip_on=False
+        )
+    ax.set_yscale("symlog", linthresh=20.0, linscale=1.5)
+    ticks = [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200, 500]
+    low, high = min(ax.get_ylim()[0], -12.0), max(ax.get_ylim()[1], 25.0)
+    ax.set_yticks([tick for tick in ticks if low <= tick <= high])
+    ax.yaxis.set_major_formatter("{x:.0f}")
+    ax.minorticks_off()
     ax.set_ylim(low, high)
     ax.set_xlim(0.0, 103.0)
     ax.axhspan(low, 0.0, color=drawing.VERMILLION, alpha=0.08, lw=0)
-    ax.text(1.0, 0.0, "in contact while moving", va="top", ha="left", color=drawing.VERMILLION, fontsize=8.0)
-    _label(ax, placed)
+    ax.text(1.5, 0.0, "in contact while moving", va="top", ha="left", color=drawing.VERMILLION, fontsize=8.0)
+    ax.legend(loc="upper left", bbox_to_anchor=(1.03, 1.0), labelspacing=0.9)
     ax.set_xlabel("pace kept, of the programmed [%]")
     ax.set_ylabel("nearest to the person while moving [cm]")
-    several = f", {len(found['logs'])} logs together; small dots: each log" if len(found["logs"]) > 1 else ""
-    ax.set_title(f"Safety and pace by method{several}. Hollow: fixed horizon; square: paper; diamond: positions")
+    what = f"; {len(found['logs'])} logs, small dots: each" if several else ""
+    ax.set_title(f"Safety and pace by method (hollow: fixed horizon{what})")
     return figure
 
 
-def _label(ax: Axes, placed: Sequence[tuple[tuple[float, float], str, Mapping[str, Any]]]) -> None:
-    """Names the points; those that are close get their names one below the other."""
-    to_points = ax.transData.transform
-    taken: list[tuple[float, float]] = []
-    for (x, y), label, row in sorted(placed, key=lambda item: (-item[0][1], item[0][0], item[1])):
-        px, py = to_points((x, y))
-        right = x < 70.0
-        words = label.replace(":", ", ")
-        if row["touch_ticks"]:
-            words += f": {row['touch_ticks']:,} ticks in contact, up to {row['touch_speed_m_per_s']:.2f} m/s"
-        level = py
-        while any(abs(level - other) < 16.0 and abs(px - at) < 420.0 for at, other in taken):
-            level -= 4.0
-        taken.append((px, level))
-        offset = ((8.0 if right else -8.0), (level - py) * 72.0 / ax.figure.dpi)
-        ax.annotate(
-            words,
-            (x, y),
-            xytext=offset,
-            textcoords="offset points",
-            ha="left" if right else "right",
-            va="center",
-            fontsize=8.0,
-            color=drawing.INK,
-        )
+def log_rows(found: Mapping[str, Any], label: str) -> list[Mapping[str, Any]]:
+    """The figures of a method on each log that can be placed."""
+    rows = [log["methods"][label] for log in found["logs"]]
+    return [row for row in rows if row["pace"] is not None and row["nearest_moving_m"] is not None]
+
+
+def _place(row: Mapping[str, Any]) -> tuple[float, float]:
+    """Pace [%] and smallest distance [cm]."""
+    return 100.0 * row["pace"], 100.0 * row["nearest_moving_m"]

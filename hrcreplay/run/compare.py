@@ -12,8 +12,8 @@ import multiprocessing
 import os
 import shutil
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -178,8 +178,8 @@ def _compare_log(
             Task(variant_job(job, variant), variant, part.partial, person, variant in have, size)
             for variant in variants
         ]
-        with watch.stage(f"plan {name}", len(ticks_ns)):
-            _plan_all(tasks, processes, bar, name)
+        took = _plan_all(tasks, processes, partial(bar.advance, name))
+    writer.timing[f"plan {name}"] = {variant.label: {"seconds": took[variant]} for variant in variants}
     part.partial.rename(part.folder)
     rows = {
         variant: comparison.figures(variant, motion, contact, _report_settings(job))
@@ -242,39 +242,35 @@ def _parts(job: Job, log: Log, ticks_ns: Ints) -> dict[str, str]:
     return {name: found[name] for name in replay.PARTS["plan"]}
 
 
-def _plan_all(tasks: Sequence[Task], processes: int, bar: ProgressBar, stage: str) -> None:
+def _plan_all(tasks: Sequence[Task], processes: int, advance: Callable[[int], None]) -> dict[Variant, float]:
     """Plans every task: a second process takes one after the other, the first takes those that are left.
 
     Args:
         tasks: To do.
         processes: 1 or 2.
-        bar: Shows the ticks done.
-        stage: Of the bar.
+        advance: Called with ticks done.
+
+    Returns:
+        How long each took [s].
     """
     order = sorted(tasks, key=lambda task: (task.ready, -_COST[task.variant.method]))
     if processes < 2 or len(order) < 2:
-        for task in order:
-            plan(task, partial(bar.advance, stage))
-        return
+        return {task.variant: plan(task, advance)[1] for task in order}
+    took = {}
     with _second_process() as pool:
         futures = [pool.submit(plan, task) for task in order]
         try:
             for task, future in zip(order, futures, strict=True):
                 if future.cancel():
-                    plan(task, partial(bar.advance, stage))
-                else:
-                    future.add_done_callback(partial(_done, bar, stage))
-            for future in futures:
+                    took[task.variant] = plan(task, advance)[1]
+            for task, future in zip(order, futures, strict=True):
                 if not future.cancelled():
-                    future.result()
+                    ticks, took[task.variant] = future.result()
+                    advance(ticks)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-
-
-def _done(bar: ProgressBar, stage: str, future: Future[int]) -> None:
-    if not future.cancelled() and future.exception() is None:
-        bar.advance(stage, future.result())
+    return took
 
 
 def _second_process() -> ProcessPoolExecutor:
@@ -290,14 +286,15 @@ def _second_process() -> ProcessPoolExecutor:
     return pool
 
 
-def plan(task: Task, progress: Any = None) -> int:
-    """Motion and contact of a variant, into its folder; returns the number of ticks.
+def plan(task: Task, progress: Callable[[int], None] | None = None) -> tuple[int, float]:
+    """Motion and contact of a variant, into its folder; returns the number of ticks and the time that it took [s].
 
     Args:
         task: What to do.
         progress: Called with the ticks of each batch done; or None.
     """
     job, slug = task.job, task.variant.slug
+    began_s = time.perf_counter()
     log = open_log(job.log, job.settings.logs)
     stage, states = build.prediction_stage(job), task.folder / "state.parquet"
     done = 0
@@ -317,11 +314,11 @@ def plan(task: Task, progress: Any = None) -> int:
     robot = build.robot(job, build.robot_base(job, log))
     predicted = Predicted(stage, states)
     volumes = iter(()) if task.variant.method == "none" else _used(motion, predicted, job)
-    hand_m = None if stage.method == "sound" else 0.0  # the others know of no hand
+    hand_m = job.settings.occupancy.hand_m if stage.method == "sound" else 0.0  # the others know of no hand
     rows = contact_table(job, robot, task.variant.method, motion, task.person, predicted, volumes, hand_m)
     writer.table(f"contact_{slug}", rows)
     writer.close_tables()
-    return done
+    return done, time.perf_counter() - began_s
 
 
 class _TablesOf(RunWriter):

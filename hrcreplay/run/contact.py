@@ -68,7 +68,7 @@ def contact_table(
     person: RecordedPerson,
     predicted: Predicted,
     volumes: Iterator[tuple[int, float, Volumes]],
-    hand_m: float | None = None,
+    lines_m: float | None = None,
 ) -> Columns:
     """The rows of contact.parquet for one motion.
 
@@ -80,7 +80,8 @@ def contact_table(
         person: As recorded.
         predicted: Volumes of any tick.
         volumes: Instant [ns], horizon [s] and volumes of the ticks at which the person may be found to have left them.
-        hand_m: Length of the hand that they ought to hold; None: of the settings [m].
+        lines_m: None: the parts with their radii leave them; else the lines of the parts, with a hand of this length, as
+            an audit counts it [m].
     """
     radii_m = body_capsules.part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
     t_ns = motion["t_ns"].to_numpy()
@@ -88,8 +89,8 @@ def contact_table(
     found = compare(robot, motion, body)
     if method != "none":
         found.by_volume_m[:] = by_volume(motion, found, body, predicted)
-    if hand_m is not None:
-        body = Body(person.source, person.part_axes(t_ns, hand_m), radii_m)
+    if lines_m is not None:
+        body = Body(person.source, person.part_axes(t_ns, lines_m), np.zeros(len(radii_m)))
     mark_left(found, t_ns, body, volumes)
     return _columns(motion, method, body.source, found, tuple(segment.name for segment in robot.segments))
 
