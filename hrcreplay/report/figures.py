@@ -165,7 +165,7 @@ def methods(found: Mapping[str, Any]) -> Figure:
         found: The content of compare.json.
     """
     figure = drawing.new_figure(3.7)
-    ((ax,),) = drawing.panels(figure, 1, bottom_in=0.5, top_in=0.3, right_in=3.3)
+    ((ax,),) = drawing.panels(figure, 1, bottom_in=0.5, top_in=0.3, right_in=2.7)
     several = len(found["logs"]) > 1
     for label, row in found["total"].items():
         of, alone = found["methods"][label], log_rows(found, label) if several else []
@@ -190,7 +190,7 @@ def methods(found: Mapping[str, Any]) -> Figure:
     ax.set_ylim(low, high)
     ax.set_xlim(0.0, 103.0)
     ax.axhspan(low, 0.0, color=drawing.VERMILLION, alpha=0.08, lw=0)
-    ax.text(1.5, 0.0, "in contact while moving", va="top", ha="left", color=drawing.VERMILLION, fontsize=8.0)
+    ax.text(1.5, 0.97 * low, "in contact while moving", va="bottom", ha="left", color=drawing.VERMILLION, fontsize=8.0)
     ax.legend(loc="upper left", bbox_to_anchor=(1.03, 1.0), labelspacing=0.9)
     ax.set_xlabel("pace kept, of the programmed [%]")
     ax.set_ylabel("nearest to the person while moving [cm]")

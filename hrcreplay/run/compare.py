@@ -25,11 +25,14 @@ import pyarrow.parquet as pq
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import Log, open_log
-from hrcreplay.records import Ints
+from hrcreplay.records import Floats, Ints
 from hrcreplay.report import comparison
 from hrcreplay.report.comparison import Variant
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.run import build, replay
 from hrcreplay.run.contact import Predicted, Volumes, contact_table
+from hrcreplay.run.followers import Planner
 from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.prediction import Forecast, stored_ticks
 from hrcreplay.run.recorded_person import RecordedPerson, recorded_person
@@ -48,6 +51,19 @@ _COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3}
 
 
 @dataclass(frozen=True)
+class Programme:
+    """What the robot is to do, and where; found once for all variants."""
+
+    T_world_base: Floats  #: (4, 4)
+    path: Reference
+    start_s: float  #: programmed time at the first tick [s]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Goes to another process without the robot, which is made again there."""
+        return Programme, (self.T_world_base, replace(self.path, model=None), self.start_s)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
 class Task:
     """One variant on one log."""
 
@@ -55,6 +71,7 @@ class Task:
     variant: Variant
     folder: Path  #: with state.parquet; gets motion and contact
     person: RecordedPerson
+    programme: Programme
     ready: bool  #: whether the motion is there already
     size: int  #: ticks of a batch
 
@@ -174,8 +191,9 @@ def _compare_log(
         person = recorded_person(job, log, part)
         part.close_tables()
         have = _motions(job, log, variants, ticks_ns, part)
+        programme = _programme(job, log, int(ticks_ns[0]))
         tasks = [
-            Task(variant_job(job, variant), variant, part.partial, person, variant in have, size)
+            Task(variant_job(job, variant), variant, part.partial, person, programme, variant in have, size)
             for variant in variants
         ]
         took = _plan_all(tasks, processes, partial(bar.advance, name))
@@ -189,6 +207,12 @@ def _compare_log(
     return comparison.LogResult(
         name, job.log_sha256, person.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, tuple(found["notes"]), rows
     )
+
+
+def _programme(job: Job, log: Log, start_ns: int) -> Programme:
+    base = build.robot_base(job, log)
+    path, begin_ns = build.reference(job, log, build.robot(job, base))
+    return Programme(base, path, 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9)
 
 
 def _silent(_stage: str, _ticks: int) -> None:
@@ -293,16 +317,12 @@ def plan(task: Task, progress: Callable[[int], None] | None = None) -> tuple[int
         task: What to do.
         progress: Called with the ticks of each batch done; or None.
     """
-    job, slug = task.job, task.variant.slug
-    began_s = time.perf_counter()
-    log = open_log(job.log, job.settings.logs)
-    stage, states = build.prediction_stage(job), task.folder / "state.parquet"
-    done = 0
-    writer = _TablesOf(task.folder)
+    began_s, job, slug = time.perf_counter(), task.job, task.variant.slug
+    stage, states, writer = build.prediction_stage(job), task.folder / "state.parquet", _TablesOf(task.folder)
+    robot = build.robot(job, task.programme.T_world_base)
+    done, planner = 0, None if task.ready else _planner(task, robot)
     for batch in read_states(states, task.size):
-        if not task.ready:
-            if not done:
-                (planner,) = build.planners(job, log, int(batch.t_ns[0])).values()
+        if planner is not None:
             forecast = Forecast(stage, batch)
             around = [partial(forecast.obstacles, tick) for tick in range(len(batch))]
             writer.table(f"motion_{slug}", motion_columns(planner.follow(batch, around, stage.limbs)))
@@ -311,7 +331,6 @@ def plan(task: Task, progress: Callable[[int], None] | None = None) -> tuple[int
             progress(len(batch))
     writer.close_tables()
     motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
-    robot = build.robot(job, build.robot_base(job, log))
     predicted = Predicted(stage, states)
     volumes = iter(()) if task.variant.method == "none" else _used(motion, predicted, job)
     hand_m = job.settings.occupancy.hand_m if stage.method == "sound" else 0.0  # the others know of no hand
@@ -319,6 +338,15 @@ def plan(task: Task, progress: Callable[[int], None] | None = None) -> tuple[int
     writer.table(f"contact_{slug}", rows)
     writer.close_tables()
     return done, time.perf_counter() - began_s
+
+
+def _planner(task: Task, robot: RobotModel) -> Planner:
+    """The variant's method at the start of the programme."""
+    job, programme = task.job, task.programme
+    settings = build.plan_settings(job, 1.0 / job.settings.fusion.rate_hz, task.variant.method)
+    path = replace(programme.path, model=robot)
+    follower = build.make_follower(task.variant.method, robot, path, settings, programme.start_s)
+    return Planner(follower, chosen=True, memory_s=job.settings.fusion.memory_s)
 
 
 class _TablesOf(RunWriter):

@@ -80,8 +80,7 @@ def contact_table(
         person: As recorded.
         predicted: Volumes of any tick.
         volumes: Instant [ns], horizon [s] and volumes of the ticks at which the person may be found to have left them.
-        lines_m: None: the parts with their radii leave them; else the lines of the parts, with a hand of this length, as
-            an audit counts it [m].
+        lines_m: None: the parts with their radii leave them; else their lines, with a hand of this length [m].
     """
     radii_m = body_capsules.part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
     t_ns = motion["t_ns"].to_numpy()
