@@ -24,7 +24,7 @@ from hrcreplay.report import figures as drawn
 from hrcreplay.report.metrics import Metric, MetricTable, times, true_runs
 from hrcreplay.report.metrics_contact import PERSONS, add_contact
 from hrcreplay.report.metrics_plan import PAPER, add_plan, is_moving, numeric_column
-from hrcreplay.report.tables import PageTable, percent, text_of
+from hrcreplay.report.tables import PageTable
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
 
@@ -272,33 +272,26 @@ _PAPER = (
     "were never published: to be compared in kind only"
 )
 
-_COLUMNS: tuple[tuple[str, str], ...] = (
-    ("ticks moving in contact", "touch_ticks"),
-    ("fastest contact", "touch_speed_m_per_s"),
-    ("nearest moving", "nearest_moving_m"),
-    ("at rest", "nearest_rest_m"),
-    ("pace", "pace"),
-    ("cycles", "cycles"),
-    ("standing near", "standing_share"),
-    ("no speed near, as the paper", "null_speed_share"),
-    ("off the path, most", "deviation_max_m"),
-    ("brakings", "braking_events"),
-    ("jerk RMS, rad/s\u00b3", "jerk_rms_rad_per_s3"),
-    ("inside its volumes", "coverage"),
+#: Heading with its unit, figure, factor and decimals.
+_COLUMNS = (
+    ("ticks in\ncontact", "touch_ticks", 1, 0),
+    ("fastest\nm/s", "touch_speed_m_per_s", 1, 2),
+    ("nearest\nmoving m", "nearest_moving_m", 1, 3),
+    ("nearest\nat rest m", "nearest_rest_m", 1, 3),
+    ("pace\n%", "pace", 100, 1),
+    ("\ncycles", "cycles", 1, 0),
+    ("stands\nnear %", "standing_share", 100, 1),
+    ("no speed\nnear %", "null_speed_share", 100, 1),
+    ("off path\nm", "deviation_max_m", 1, 3),
+    ("\nbrakings", "braking_events", 1, 0),
+    ("jerk\nrad/s\u00b3", "jerk_rms_rad_per_s3", 1, 0),
+    ("held in\nvolumes %", "coverage", 100, 1),
 )
-_UNITS = {field.name: field.unit for field in FIELDS}
-_SHARES = {"pace", "standing_share", "null_speed_share", "coverage"}
 
 
-def _cell(row: Mapping[str, Any], name: str) -> str:
+def _cell(value: float | None, factor: int, decimals: int) -> str:
     """A figure as a reader wants it."""
-    value = row[name]
-    metric: Metric = {"value": value, "unit": _UNITS[name]}
-    if name in _SHARES:
-        return percent(metric)
-    if _UNITS[name] == "rad/s^3":
-        return "\u2013" if value is None else f"{value:.0f}"
-    return text_of(metric).replace("-", "\u2212")
+    return "\u2013" if value is None else f"{factor * value:,.{decimals}f}".replace("-", "\u2212")
 
 
 def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
@@ -312,10 +305,10 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
     for log, methods in logs:
         for label, row in methods.items():
             head = (log, label) if len(logs) > 1 else (label,)
-            rows.append((*head, *(_cell(row, name) for _, name in _COLUMNS)))
+            rows.append((*head, *(_cell(row[name], *how) for _, name, *how in _COLUMNS)))
             by_cause = row["braking_events_by_cause"]
             brakings.append((*head, *(str(by_cause.get(cause, 0)) for cause in causes)))
-    tables = [PageTable("Methods", (*lead, *(label for label, _ in _COLUMNS)), tuple(rows), _note(found))]
+    tables = [PageTable("Methods", (*lead, *(column[0] for column in _COLUMNS)), tuple(rows), _note(found))]
     if causes:
         named = tuple(cause or "unnamed" for cause in causes)
         note = "Times that a moving robot began to brake, by the reason at that tick."
@@ -337,8 +330,10 @@ def _note(found: Mapping[str, Any]) -> str:
         else ""
     )
     return (
-        f"The person is {' or '.join(persons)}, known at {known:,} of {ticks:,} ticks.{fault} The paper's robot stood "
-        f"in {scaling} (scaling) and {qp} (QP) of the ticks near people, on its own data: compare in kind only."
+        f"The person is {' or '.join(persons)}, known at {known:,} of {ticks:,} ticks. Contact counts while the robot "
+        f"moves.{fault} Near: at most report.near_m from the volumes. Stands near: though its programme moves; no "
+        f"speed near, as the paper counts: whatever the programme does. The paper's robot stood in {scaling} (scaling) and "
+        f"{qp} (QP) of the ticks near people, on its own data: compare in kind only."
     )
 
 
@@ -346,12 +341,11 @@ def print_tables(found: Mapping[str, Any]) -> None:
     """The tables on standard error, where they do not mix with the result."""
     console = Console(stderr=True, markup=False, emoji=False, highlight=False)
     if not console.is_terminal:
-        console.width = 200
+        console.width = 150
     for table in page_tables(found):
-        shown = Table(title=table.title, box=box.SIMPLE_HEAD, title_justify="left")
+        shown = Table(title=table.title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
         for column in table.columns:
-            text = column in ("log", "method")
-            shown.add_column(column, justify="left" if text else "right", no_wrap=text)
+            shown.add_column(column, justify="left" if column in ("log", "method") else "right", no_wrap=True)
         for row in table.rows:
             shown.add_row(*row)
         console.print(shown)
@@ -390,6 +384,11 @@ def as_markdown(found: Mapping[str, Any]) -> str:
     """The tables of the terminal."""
     parts = []
     for table in page_tables(found):
-        head = [f"## {table.title}", "", f"| {' | '.join(table.columns)} |", f"|{'---|' * len(table.columns)}"]
+        head = [
+            f"## {table.title}",
+            "",
+            f"| {' | '.join(' '.join(column.split()) for column in table.columns)} |",
+            f"|{'---|' * len(table.columns)}",
+        ]
         parts.append("\n".join([*head, *(f"| {' | '.join(row)} |" for row in table.rows), "", table.note, ""]))
     return "\n".join(parts)

@@ -29,9 +29,11 @@ from hrcreplay.run.followers import Follower, PathFollower, Predict, QpFollower,
 #: A row whose link could approach faster by no more than this is one that the solution lies on [m/s].
 ACTIVE = 1e-6
 #: A row whose multiplier is smaller does not hold the robot back, of the largest.
-SHARE = 1e-6
+SHARE = 1e-3
 #: By how much rows must contradict each other, each scaled to length 1.
 APART = 1e-9
+#: Weight on the multipliers themselves, relative to the rows.
+RIDGE = 1e-6
 #: Rows told beside those that hold.
 NEXT = 3
 
@@ -135,28 +137,43 @@ def held_by(task: Problem, solved: Solution) -> dict[str, Any]:
         solved: Its minimiser.
     """
     w, slack = solved.dq_next, solved.slack
-    margins = margins_of(task.rows, w, slack)
-    active = [row for row in margins if row["margin_m_per_s"] <= ACTIVE]
-    rows = [_written(task.rows, row) for row in active]
-    limits = [(a, name) for a, b, name in zip(*_limits(task), strict=True) if b - a @ w <= ACTIVE]
-    columns = [*(np.append(a, -1.0) for a in rows), *(np.append(a, 0.0) for a, _ in limits)]
-    if slack <= ACTIVE:
-        columns.append(np.append(np.zeros(len(w)), -1.0))
-    pull = np.append(task.H @ w + task.g, SLACK * slack) if task.soft else task.H @ w + task.g
-    A = np.array([column[: len(pull)] for column in columns]).reshape(-1, len(pull))
-    weights = nnls(A.T, -pull)[0] if len(A) else np.zeros(0)
-    least = SHARE * max(weights[: len(active)], default=0.0)
-    binding = [
-        {**row, "multiplier": float(weight)}
-        for row, weight in zip(active, weights[: len(active)], strict=True)
-        if solved.held and weight > least
-    ]
+    every, margins = all_rows(task), margins_of(task.rows, w, slack)
+    loose = np.array([name["kind"] == "approach" for name in every.names], dtype=float)
+    active = np.flatnonzero(every.b + slack * loose - every.A @ w <= ACTIVE)
+    A, pull = every.A[active], task.H @ w + task.g
+    if task.soft:
+        A, pull = np.column_stack([A, -loose[active]]), np.append(pull, SLACK * slack)
+        if slack <= ACTIVE:  # which is no less than 0
+            A = np.vstack([A, -np.eye(len(pull))[-1]])
+    weights = _least_weights(A, -pull)[: len(active)] if len(A) else np.zeros(0)
+    limits, weight_of, vertex_of = [], dict[tuple[int, int, int], float](), dict[tuple[int, int, int], Any]()
+    for i, weight in zip(active.tolist(), weights.tolist(), strict=True):
+        name = every.names[i]
+        if name["kind"] != "approach":
+            limits += [name] if weight > ACTIVE * np.abs(pull).max() else []
+        elif solved.held and weight > 0.0:
+            key = name["link"], name["limb"], name["end"]
+            vertex_of[key] = max(vertex_of.get(key, (-1.0, name)), (weight, name), key=lambda found: found[0])
+            weight_of[key] = weight_of.get(key, 0.0) + weight
+    least = SHARE * max(weight_of.values(), default=0.0)
+    binding, others = [], []
+    for row in margins:
+        key = row["link"], row["limb"], row["end"]
+        if weight_of.get(key, 0.0) > least:
+            binding.append({**row, **vertex_of[key][1], "multiplier": weight_of[key]})
+        else:
+            others.append(row)
     binding.sort(key=lambda row: -row["multiplier"])
-    holding = weights[len(active) : len(active) + len(limits)]
-    kept = [name for (_, name), weight in zip(limits, holding, strict=True) if weight > ACTIVE * np.abs(pull).max()]
-    pairs = {(row["link"], row["limb"], row["end"]) for row in binding}
-    others = [row for row in margins if (row["link"], row["limb"], row["end"]) not in pairs]
-    return {"binding": binding, "limits": kept, "next": others[:NEXT], "slack_m_per_s": slack}
+    return {"binding": binding, "limits": limits, "next": others[:NEXT], "slack_m_per_s": slack}
+
+
+def _least_weights(A: Floats, pull: Floats) -> Floats:
+    """(m,) the smallest multipliers, 0 or more, of rows (m, n) that add up to a pull (n,).
+
+    Of rows that repeat each other there are many; these are unique.
+    """
+    small = RIDGE * np.abs(A).max()
+    return np.asarray(nnls(np.vstack([A.T, small * np.eye(len(A))]), np.append(pull, np.zeros(len(A))))[0])
 
 
 def margins_of(rows: Approach, w: Floats, slack: float) -> list[dict[str, Any]]:
@@ -182,15 +199,6 @@ def margins_of(rows: Approach, w: Floats, slack: float) -> list[dict[str, Any]]:
                     | {"vertex_m": rows.vertices_m[vertex].tolist(), "margin_m_per_s": float(margin)}
                 )
     return sorted(found, key=lambda row: (row["margin_m_per_s"], row["link"], row["limb"], row["end"]))
-
-
-def _written(rows: Approach, row: dict[str, Any]) -> Floats:
-    """(nv,) a row of Eq. (12) as a speed of approach [m/rad]."""
-    link, limb, vertex = row["link"], row["limb"], np.array(row["vertex_m"])
-    a, b = rows.ends_m[link]
-    J_a, J_b = rows.J_ends[link]
-    written = (vertex - a) @ J_a if row["end"] == 0 else (vertex - a) @ J_b - (b - a) @ J_a
-    return np.asarray(rows.stop_s * written / rows.per_speed[link, limb])
 
 
 def _limits(task: Problem) -> tuple[Floats, Floats, tuple[dict[str, Any], ...]]:

@@ -104,7 +104,7 @@ def test_terminal_files_hold_the_same_numbers(folder: Path) -> None:
             value = found["logs"][0]["methods"][row["variant"]][field.name]
             assert (None if row[field.name] == "" else float(row[field.name])) == value
     lines = [line for line in (folder / "compare.md").read_text().splitlines() if line.startswith("| qp:sound")]
-    assert f"{100 * found['total']['qp:sound:adaptive']['pace']:.1f} %" in lines[0]
+    assert f"| {100 * found['total']['qp:sound:adaptive']['pace']:.1f} |" in lines[0]
 
 
 def points_of_truth(t_ns: Floats) -> Floats:
