@@ -330,10 +330,10 @@ def _note(found: Mapping[str, Any]) -> str:
         else ""
     )
     return (
-        f"The person is {' or '.join(persons)}, known at {known:,} of {ticks:,} ticks. Contact counts while the robot "
+        f"The person is {' or '.join(persons)}, known at {known:,} of {ticks:,} ticks. Contact: while the robot "
         f"moves.{fault} Near: at most report.near_m from the volumes. Stands near: though its programme moves; no "
-        f"speed near, as the paper counts: whatever the programme does. The paper's robot stood in {scaling} (scaling) and "
-        f"{qp} (QP) of the ticks near people, on its own data: compare in kind only."
+        "speed near, as the paper counts: whatever the programme does. The paper's robot stood in "
+        f"{scaling} (scaling) and {qp} (QP) of the ticks near people, on its own data: compare in kind only."
     )
 
 

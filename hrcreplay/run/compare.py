@@ -51,7 +51,7 @@ _COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3}
 
 
 @dataclass(frozen=True)
-class Programme:
+class PlacedProgramme:
     """What the robot is to do, and where; found once for all variants."""
 
     T_world_base: Floats  #: (4, 4)
@@ -60,18 +60,18 @@ class Programme:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Goes to another process without the robot, which is made again there."""
-        return Programme, (self.T_world_base, replace(self.path, model=None), self.start_s)  # type: ignore[arg-type]
+        return PlacedProgramme, (self.T_world_base, replace(self.path, model=None), self.start_s)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
-class Task:
+class VariantTask:
     """One variant on one log."""
 
     job: Job  #: its settings are those of the variant
     variant: Variant
     folder: Path  #: with state.parquet; gets motion and contact
     person: RecordedPerson
-    programme: Programme
+    programme: PlacedProgramme
     ready: bool  #: whether the motion is there already
     size: int  #: ticks of a batch
 
@@ -193,7 +193,7 @@ def _compare_log(
         have = _motions(job, log, variants, ticks_ns, part)
         programme = _programme(job, log, int(ticks_ns[0]))
         tasks = [
-            Task(variant_job(job, variant), variant, part.partial, person, programme, variant in have, size)
+            VariantTask(variant_job(job, variant), variant, part.partial, person, programme, variant in have, size)
             for variant in variants
         ]
         took = _plan_all(tasks, processes, partial(bar.advance, name))
@@ -209,10 +209,10 @@ def _compare_log(
     )
 
 
-def _programme(job: Job, log: Log, start_ns: int) -> Programme:
+def _programme(job: Job, log: Log, start_ns: int) -> PlacedProgramme:
     base = build.robot_base(job, log)
     path, begin_ns = build.reference(job, log, build.robot(job, base))
-    return Programme(base, path, 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9)
+    return PlacedProgramme(base, path, 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9)
 
 
 def _silent(_stage: str, _ticks: int) -> None:
@@ -266,7 +266,7 @@ def _parts(job: Job, log: Log, ticks_ns: Ints) -> dict[str, str]:
     return {name: found[name] for name in replay.PARTS["plan"]}
 
 
-def _plan_all(tasks: Sequence[Task], processes: int, advance: Callable[[int], None]) -> dict[Variant, float]:
+def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[int], None]) -> dict[Variant, float]:
     """Plans every task: a second process takes one after the other, the first takes those that are left.
 
     Args:
@@ -310,7 +310,7 @@ def _second_process() -> ProcessPoolExecutor:
     return pool
 
 
-def plan(task: Task, progress: Callable[[int], None] | None = None) -> tuple[int, float]:
+def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tuple[int, float]:
     """Motion and contact of a variant, into its folder; returns the number of ticks and the time that it took [s].
 
     Args:
@@ -340,7 +340,7 @@ def plan(task: Task, progress: Callable[[int], None] | None = None) -> tuple[int
     return done, time.perf_counter() - began_s
 
 
-def _planner(task: Task, robot: RobotModel) -> Planner:
+def _planner(task: VariantTask, robot: RobotModel) -> Planner:
     """The variant's method at the start of the programme."""
     job, programme = task.job, task.programme
     settings = build.plan_settings(job, 1.0 / job.settings.fusion.rate_hz, task.variant.method)

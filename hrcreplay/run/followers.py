@@ -89,7 +89,14 @@ class Follower(ABC):
 
     @abstractmethod
     def propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
-        """What the method would do, or the reason why it does nothing."""
+        """What the method would do, or the reason why it does nothing.
+
+        Args:
+            sight: The robot's pose, and its distances from people.
+            around: The swept volumes of the tick.
+            horizon_s: Until when they hold [s].
+            predict: The volumes of the tick for any horizon.
+        """
 
     @abstractmethod
     def _move_on(self) -> None:
@@ -100,7 +107,14 @@ class QpFollower(Follower):
     """The trajectory generator of Section 5 along a reference that waits for it or not."""
 
     def propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
-        """See Follower."""
+        """The step that Eq. (66) finds best, and the stop after it.
+
+        Args:
+            sight: The robot's pose, and its distances from people.
+            around: The swept volumes of the tick.
+            horizon_s: Until when they hold [s].
+            _: The volumes of the tick for any horizon.
+        """
         error_m = float(np.linalg.norm(sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3]))
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
@@ -120,7 +134,14 @@ class PathFollower(Follower):
     careful, by_rows = True, False
 
     def propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
-        """See Follower."""
+        """The largest rate along the path that is allowed, and the stop after it.
+
+        Args:
+            sight: The robot's pose, and its distances from people.
+            around: The swept volumes of the tick.
+            horizon_s: Until when they hold [s].
+            _: The volumes of the tick for any horizon.
+        """
         reason = stands(sight, self.settings) if self.careful else 0
         if reason or sight.reason == NOT_FINITE:
             return reason or sight.reason
@@ -153,7 +174,14 @@ class SsmFollower(PathFollower):
     """Speed and separation monitoring, ISO/TS 15066: goes while the protective separation distance is kept."""
 
     def propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
-        """See Follower."""
+        """The same, while the protective separation distance is kept.
+
+        Args:
+            sight: The robot's pose, and its distances from people.
+            around: The swept volumes of the tick.
+            horizon_s: Until when they hold [s].
+            predict: The volumes of the tick for any horizon.
+        """
         wanted = super().propose(sight, around, horizon_s, predict)
         if isinstance(wanted, int):
             return wanted

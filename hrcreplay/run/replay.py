@@ -193,7 +193,14 @@ def _findings(job: Job, log: Log, sink: Sink, reused: tuple[str, ...]) -> dict[s
 
 
 def take_over(job: Job, parts: Mapping[str, str], writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
-    """Copies the tables of the earlier run's stages that would come out the same, and says which those are."""
+    """Copies the tables of the earlier run's stages that would come out the same, and says which those are.
+
+    Args:
+        job: What was asked for.
+        parts: What ``dependencies`` found.
+        writer: Run folder.
+        smooth: Whether the smoothed person is asked for, too.
+    """
     if job.earlier is None:
         return ()
     stale = stale_stages(job, parts)
