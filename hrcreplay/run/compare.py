@@ -42,9 +42,9 @@ from hrcreplay.settings.sections import Occupancy, Plan
 from hrcreplay.store.columns import motion_columns, read_states
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
-#: The eight that matter: everything beside the person blind, with the sound volumes of the tick's own stop, with those
-#: of a fixed horizon, and with the volumes and the horizon of the paper and of the scaling before it.
-PRESET = "none,ssm,shield,scaling,qp,qp:sound:fixed,qp:paper:fixed,scaling:positions:fixed"
+#: The eight that matter: the programme run blind, four methods with the sound volumes of each tick's own stop, the same
+#: to a fixed horizon, and the paper's two methods with its volumes and its horizon.
+PRESET = "none,ssm,shield,scaling,qp,qp:sound:fixed,qp:paper:fixed,scaling:paper:fixed"
 
 #: What a tick of a method costs beside that of another, about: long ones are begun first.
 _COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3}
@@ -292,6 +292,8 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
                     ticks, took[task.variant] = future.result()
                     advance(ticks)
         except BaseException:
+            for process in multiprocessing.active_children():  # it would go on to the end of its task
+                process.terminate()
             pool.shutdown(cancel_futures=True)
             raise
     return took
