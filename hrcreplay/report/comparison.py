@@ -307,7 +307,7 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
             head = (log, label) if len(logs) > 1 else (label,)
             rows.append((*head, *(_cell(row[name], *how) for _, name, *how in _COLUMNS)))
             by_cause = row["braking_events_by_cause"]
-            brakings.append((*head, *(str(by_cause.get(cause, 0)) for cause in causes)))
+            brakings.append((*head, *(f"{by_cause.get(cause, 0):,}" for cause in causes)))
     tables = [PageTable("Methods", (*lead, *(column[0] for column in _COLUMNS)), tuple(rows), _note(found))]
     if causes:
         named = tuple(cause or "unnamed" for cause in causes)

@@ -367,9 +367,11 @@ def _failure(one: Mapping[str, Any]) -> str:
     """Where a stop is not clear, in words."""
     if "link" not in one:
         return one["why"] + (f", axis {one['axis']}" if "axis" in one else "")
-    gap = f"{1e3 * abs(one['gap_m']):.1f} mm {'deep' if one['gap_m'] <= 0.0 else 'apart'}"
-    moves = f", and may move by {1e3 * one['travel_m']:.1f} mm in a tick" if one["gap_m"] > 0.0 else ""
-    return f"{one['why']}, {1e3 * one['failed_s']:.0f} ms after the tick: {_pair(one)} are {gap}{moves}"
+    when = f"{1e3 * one['failed_s']:.0f} ms after the tick"
+    if one["gap_m"] <= 0.0:
+        return f"{_pair(one)} overlap by {-1e3 * one['gap_m']:.1f} mm {when}"
+    moves = f"may move by {1e3 * one['travel_m']:.1f} mm until the next"
+    return f"{_pair(one)} are {1e3 * one['gap_m']:.1f} mm apart {when}, and {moves}"
 
 
 def stop_table(record: Record, slow_m_per_s: float) -> tuple[PageTable, list[dict[str, Any]]]:
