@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -28,10 +28,11 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import Floats, Ints
 from hrcreplay.report import comparison
 from hrcreplay.report.comparison import Variant
+from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.run import build, replay
-from hrcreplay.run.contact import Predicted, Volumes, contact_table
+from hrcreplay.run.contact import Predicted, Volumes, contact_table, solids
 from hrcreplay.run.followers import Planner
 from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.prediction import Forecast, stored_ticks
@@ -323,20 +324,30 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     stage, states, writer = build.prediction_stage(job), task.folder / "state.parquet", _TablesOf(task.folder)
     robot = build.robot(job, task.programme.T_world_base)
     done, planner = 0, None if task.ready else _planner(task, robot)
+    used: list[tuple[int, float, Volumes]] = []
     for batch in read_states(states, task.size):
         if planner is not None:
             forecast = Forecast(stage, batch)
-            around = [partial(forecast.obstacles, tick) for tick in range(len(batch))]
-            writer.table(f"motion_{slug}", motion_columns(planner.follow(batch, around, stage.limbs)))
+            asked: dict[int, dict[float, Obstacles]] = {tick: {} for tick in _checked(job, done, len(batch))}
+            around = [forecast.asking(tick, asked.get(tick)) for tick in range(len(batch))]
+            made = planner.follow(batch, around, stage.limbs)
+            used += [
+                (int(made.t_ns[i]), horizon_s, solids(found[horizon_s], stage.limbs))
+                for i, found in asked.items()
+                for horizon_s in [float(made.horizon_s[i])]
+            ]
+            writer.table(f"motion_{slug}", motion_columns(made))
         done += len(batch)
         if progress is not None:
             progress(len(batch))
     writer.close_tables()
     motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
     predicted = Predicted(stage, states)
-    volumes = iter(()) if task.variant.method == "none" else _used(motion, predicted, job)
+    if planner is None:
+        used = _predicted_again(motion, predicted, job)
+    volumes = () if task.variant.method == "none" else (part for part in used if part[2])
     hand_m = job.settings.occupancy.hand_m if stage.method == "sound" else 0.0  # the others know of no hand
-    rows = contact_table(job, robot, task.variant.method, motion, task.person, predicted, volumes, hand_m)
+    rows = contact_table(job, robot, task.variant.method, motion, task.person, predicted, iter(volumes), hand_m)
     writer.table(f"contact_{slug}", rows)
     writer.close_tables()
     return done, time.perf_counter() - began_s
@@ -360,14 +371,17 @@ class _TablesOf(RunWriter):
         return self.folder
 
 
-def _used(motion: pd.DataFrame, predicted: Predicted, job: Job) -> Iterator[tuple[int, float, Volumes]]:
-    """The volumes that a motion was decided with, of the ticks whose volumes a run stores."""
-    t_ns, horizon_s = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float)
+def _checked(job: Job, first: int, count: int) -> list[int]:
+    """Of some ticks those at which the person is compared with the volumes: as many as a run stores."""
     every = replay.store_every(job)
-    for i in stored_ticks(0, len(motion), 1.0 if math.isinf(every) else every).tolist():
-        solids = predicted.volumes(int(t_ns[i]), float(horizon_s[i]))
-        if solids:
-            yield int(t_ns[i]), float(horizon_s[i]), solids
+    return stored_ticks(first, count, 1.0 if math.isinf(every) else every).tolist()
+
+
+def _predicted_again(motion: pd.DataFrame, predicted: Predicted, job: Job) -> list[tuple[int, float, Volumes]]:
+    """The volumes that a motion was decided with, of the ticks at which the person is compared with them."""
+    t_ns, horizon_s = motion["t_ns"].tolist(), motion["horizon_s"].tolist()
+    ticks = _checked(job, 0, len(motion))
+    return [(t_ns[i], horizon_s[i], predicted.volumes(t_ns[i], horizon_s[i])) for i in ticks]
 
 
 def _meta(jobs: Sequence[Job], variants: Sequence[Variant], began: datetime) -> dict[str, Any]:

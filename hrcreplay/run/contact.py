@@ -21,6 +21,7 @@ from hrcreplay.human import body_capsules
 from hrcreplay.human.body_capsules import LEG_PARTS, PARTS
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import Bools, Floats, HumanStates, Ints
+from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
@@ -181,8 +182,16 @@ class Predicted:
         if row < 0:
             return {}
         volumes = self.stage.volumes(self._states.rows(slice(row, row + 1)), horizon_s)
-        found = {name: (volumes.vertices(0, i), float(volumes.radius_m[0, i])) for i, name in enumerate(volumes.limbs)}
-        return {name: solid for name, solid in found.items() if np.isfinite(solid[0]).all() and np.isfinite(solid[1])}
+        return solids(obstacles(volumes, 0), volumes.limbs)
+
+
+def solids(around: Obstacles, limbs: tuple[str, ...]) -> Volumes:
+    """Limb -> vertices and radius, of those of one tick that are known."""
+    found = {
+        limb: (around.vertices_m[around.offsets[i] : around.offsets[i + 1]], float(around.radius_m[i]))
+        for i, limb in enumerate(limbs)
+    }
+    return {limb: solid for limb, solid in found.items() if np.isfinite(solid[0]).all() and np.isfinite(solid[1])}
 
 
 def by_volume(motion: pd.DataFrame, found: Contact, body: Body, predicted: Predicted) -> Floats:
