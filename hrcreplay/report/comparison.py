@@ -341,7 +341,7 @@ def print_tables(found: Mapping[str, Any]) -> None:
     """The tables on standard error, where they do not mix with the result."""
     console = Console(stderr=True, markup=False, emoji=False, highlight=False)
     if not console.is_terminal:
-        console.width = 150
+        console.width = 170
     for table in page_tables(found):
         shown = Table(title=table.title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
         for column in table.columns:
