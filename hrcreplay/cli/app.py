@@ -175,6 +175,68 @@ _stage("report", "All stages, then metrics.json, figures and report.html.")
 
 
 @app.command()
+def compare(
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="LOG_OR_RUN...", help="Logs, or run folders of earlier commands.")
+    ],
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            "--methods",
+            metavar="LIST",
+            help="METHOD[:OCCUPANCY[:HORIZON]],... as in none,qp,qp:paper:fixed; default: eight that matter.",
+        ),
+    ] = None,
+    config: Config = None,
+    settings: Set = None,
+    topic: Topic = None,
+    limits: LimitSet = None,
+    cell: CellFile = None,
+    out: Out = None,
+    start: Start = None,
+    end: End = None,
+    chunk_ticks: Chunk = 250,
+    processes: Annotated[
+        int, typer.Option("--processes", min=1, max=2, help="How many plan at once; changes no result.")
+    ] = 2,
+) -> None:
+    """What if another controller had been running: methods side by side on the same recording."""
+    from hrcreplay.run import compare as comparing
+
+    folder = comparing.run(
+        sources,
+        methods=comparing.PRESET if methods is None else methods,
+        out=out,
+        chunk_ticks=chunk_ticks,
+        processes=processes,
+        config=config,
+        overrides=as_overrides(settings, topic, limits),
+        cell_file=cell,
+        **span(start, end),
+    )
+    sys.stdout.write(f"{folder}\n")
+
+
+@app.command()
+def why(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of plan or report.")],
+    at: Annotated[float, typer.Option("--at", metavar="S", help="Instant, in seconds from the first tick.")],
+    method: Annotated[
+        str | None, typer.Option("--method", metavar="NAME", help="One of the run's baselines; default its own method.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all facts as JSON.")] = False,
+) -> None:
+    """What held the robot at an instant of a run: limb, link, vertex and row, or where its stop was refused."""
+    import json
+
+    from hrcreplay.run import why as explaining
+
+    found = explaining.explain(folder, at, method)
+    lines = [json.dumps(found, indent=2)] if as_json else explaining.sentences(found)
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+@app.command()
 def audit(
     sources: Annotated[
         list[Path], typer.Argument(metavar="LOG_OR_RUN...", help="Logs, or run folders of earlier stages.")

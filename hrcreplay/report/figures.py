@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -144,3 +145,66 @@ def _of_human(
     if metrics["fusion_angle_rmse"]["value"] is not None:
         makers["fusion_error"] = lambda: figures_human.fusion_error(metrics, cameras(run))
     return makers
+
+
+#: Method -> colour, and (occupancy, horizon) -> marker.
+_COLOURS = {
+    "qp": drawing.BLUE,
+    "scaling": drawing.ORANGE,
+    "shield": drawing.GREEN,
+    "ssm": drawing.PURPLE,
+    "none": drawing.VERMILLION,
+}
+_MARKERS = {"sound": "o", "paper": "s", "positions": "D"}
+
+
+def methods(found: Mapping[str, Any]) -> Figure:
+    """Safety against productivity: the smallest distance while moving over the pace kept, a point a method.
+
+    Args:
+        found: The content of compare.json.
+    """
+    figure = drawing.new_figure(3.7)
+    ((ax,),) = drawing.panels(figure, 1, bottom_in=0.5, top_in=0.3, right_in=2.7)
+    several = len(found["logs"]) > 1
+    for label, row in found["total"].items():
+        of, alone = found["methods"][label], log_rows(found, label) if several else []
+        colour, marker = _COLOURS[of["method"]], _MARKERS.get(of.get("occupancy", ""), "X")
+        for other in alone:
+            ax.plot(*_place(other), ".", ms=5, color=colour, alpha=0.45)
+        if row["pace"] is None or row["nearest_moving_m"] is None:
+            continue
+        words = label.replace(":", ", ")
+        if row["touch_ticks"]:
+            words += f": {row['touch_ticks']:,} ticks in contact,\nup to {row['touch_speed_m_per_s']:.2f} m/s"
+        face = "white" if of.get("horizon") == "fixed" else colour
+        ax.plot(
+            *_place(row), marker, ms=8, mfc=face, mec=colour, mew=1.6, alpha=0.9, zorder=3, label=words, clip_on=False
+        )
+    ax.set_yscale("symlog", linthresh=20.0, linscale=1.5)
+    ticks = [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200, 500]
+    low, high = min(ax.get_ylim()[0], -12.0), max(ax.get_ylim()[1], 25.0)
+    ax.set_yticks([tick for tick in ticks if low <= tick <= high])
+    ax.yaxis.set_major_formatter("{x:.0f}")
+    ax.minorticks_off()
+    ax.set_ylim(low, high)
+    ax.set_xlim(0.0, 103.0)
+    ax.axhspan(low, 0.0, color=drawing.VERMILLION, alpha=0.08, lw=0)
+    ax.text(1.5, 0.97 * low, "in contact while moving", va="bottom", ha="left", color=drawing.VERMILLION, fontsize=8.0)
+    ax.legend(loc="upper left", bbox_to_anchor=(1.03, 1.0), labelspacing=0.9)
+    ax.set_xlabel("pace kept, of the programmed [%]")
+    ax.set_ylabel("nearest to the person while moving [cm]")
+    what = f"; {len(found['logs'])} logs, small dots: each" if several else ""
+    ax.set_title(f"Safety and pace by method (hollow: fixed horizon{what})")
+    return figure
+
+
+def log_rows(found: Mapping[str, Any], label: str) -> list[Mapping[str, Any]]:
+    """The figures of a method on each log that can be placed."""
+    rows = [log["methods"][label] for log in found["logs"]]
+    return [row for row in rows if row["pace"] is not None and row["nearest_moving_m"] is not None]
+
+
+def _place(row: Mapping[str, Any]) -> tuple[float, float]:
+    """Pace [%] and smallest distance [cm]."""
+    return 100.0 * row["pace"], 100.0 * row["nearest_moving_m"]

@@ -62,7 +62,13 @@ class PageSection:
 
 
 def render(
-    run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: Sequence[PageTable] = (), *, title: str = ""
+    run: Run,
+    metrics: Mapping[str, Metric],
+    figures_dir: Path,
+    tables: Sequence[PageTable] = (),
+    *,
+    stops: Sequence[PageTable] = (),
+    title: str = "",
 ) -> str:
     """The page of a run.
 
@@ -71,6 +77,7 @@ def render(
         metrics: What :func:`hrcreplay.run.report.compute` found.
         figures_dir: Where :func:`hrcreplay.report.figures.draw_all` drew.
         tables: Tables 1 and 2 as used, shown with the prediction.
+        stops: The longest stops, shown with the safety.
         title: Name of the session; none: the name of the first input.
 
     Returns:
@@ -85,7 +92,7 @@ def render(
         verdict=verdict(run, metrics),
         answers=story.answers(run, metrics),
         cards=story.cards(run, metrics),
-        parts=_parts(run, metrics, figures_dir, tables),
+        parts=_parts(run, metrics, figures_dir, tables, stops),
         settings=_settings(run.meta.get("settings", {})),
         inputs=inputs,
         versions=sorted(run.meta.get("versions", {}).items()),
@@ -111,13 +118,17 @@ def _subtitle(run: Run, metrics: Mapping[str, Metric]) -> str:
 
 
 def _parts(
-    run: Run, metrics: Mapping[str, Metric], figures_dir: Path, tables: Sequence[PageTable]
+    run: Run,
+    metrics: Mapping[str, Metric],
+    figures_dir: Path,
+    tables: Sequence[PageTable],
+    stops: Sequence[PageTable],
 ) -> tuple[PageSection, ...]:
     figures = partial(_figures, figures_dir)
     seen = cameras(run)
     with_truth = metrics["fusion_angle_rmse"]["value"] is not None
     return (
-        *_plan(run, metrics, figures_dir),
+        *_plan(run, metrics, figures_dir, stops),
         *_robot(run, figures("robot_links")),
         PageSection(
             "prediction",
@@ -157,7 +168,9 @@ def _figures(folder: Path, *names: str) -> tuple[PageFigure, ...]:
     return tuple(PageFigure(name, CAPTIONS[name], inline_svg(folder / f"{name}.svg", name)) for name in found)
 
 
-def _plan(run: Run, metrics: Mapping[str, Metric], figures_dir: Path) -> tuple[PageSection, ...]:
+def _plan(
+    run: Run, metrics: Mapping[str, Metric], figures_dir: Path, stops: Sequence[PageTable]
+) -> tuple[PageSection, ...]:
     """The sections of what the plan and its baselines did: safety, and cost to the task."""
     plans = {"this plan": "plan", **{name: f"baseline_{name}" for name in sorted(run.baselines)}}
     planned = run.motion is not None
@@ -168,7 +181,11 @@ def _plan(run: Run, metrics: Mapping[str, Metric], figures_dir: Path) -> tuple[P
             "Safety",
             "How fast the robot moved, how near to what the person could reach, and what held it.",
             _figures(figures_dir, "fig14_speed", "status"),
-            (compare("Safety, per method on the same volumes", metrics, plans, PLAN_SAFETY), *_reasons(metrics, plans))
+            (
+                compare("Safety, per method on the same volumes", metrics, plans, PLAN_SAFETY),
+                *_reasons(metrics, plans),
+                *stops,
+            )
             if planned
             else (),
             no_plan,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -20,11 +21,12 @@ from hrcreplay.human import body_capsules
 from hrcreplay.human.body_capsules import LEG_PARTS, PARTS
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import Bools, Floats, HumanStates, Ints
+from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
 from hrcreplay.run.prediction import PredictionStage
-from hrcreplay.run.recorded_person import recorded_person
+from hrcreplay.run.recorded_person import RecordedPerson, recorded_person
 from hrcreplay.store.columns import Columns, contact_columns, read_states
 from hrcreplay.store.run_folder import RunWriter
 
@@ -49,21 +51,48 @@ def write_contact(job: Job, log: Log, writer: RunWriter, T_world_base: Floats) -
     """
     robot, occupancy = build.robot(job, T_world_base), job.settings.occupancy
     person = recorded_person(job, log, writer)
-    radii_m = body_capsules.part_radii(occupancy, job.settings.report.leg_radius_m)
-    predicted = _Predicted(build.prediction_stage(job), writer)
+    predicted = Predicted(build.prediction_stage(job), writer.partial / "state.parquet")
     chosen = job.settings.plan.method
     for path in sorted(writer.partial.glob("motion*.parquet")):
         method = path.stem.removeprefix("motion").removeprefix("_") or chosen
         motion = pq.read_table(path).to_pandas()
-        body = Body(person.source, person.part_axes(motion["t_ns"].to_numpy(), occupancy.hand_m), radii_m)
-        found = compare(robot, motion, body)
-        if method != "none":
-            found.by_volume_m[:] = by_volume(motion, found, body, predicted)
-        if path.stem == "motion":
-            mark_left(found, motion["t_ns"].to_numpy(), body, stored_volumes(writer, occupancy.stop_s))
-        names = tuple(segment.name for segment in robot.segments)
-        writer.table("contact", _columns(motion, method, body.source, found, names))
+        volumes = stored_volumes(writer, occupancy.stop_s) if path.stem == "motion" else iter(())
+        writer.table("contact", contact_table(job, robot, method, motion, person, predicted, volumes))
     writer.close_tables()
+
+
+def contact_table(
+    job: Job,
+    robot: RobotModel,
+    method: str,
+    motion: pd.DataFrame,
+    person: RecordedPerson,
+    predicted: Predicted,
+    volumes: Iterator[tuple[int, float, Volumes]],
+    lines_m: float | None = None,
+) -> Columns:
+    """The rows of contact.parquet for one motion.
+
+    Args:
+        job: What was asked for.
+        robot: At its place in the world.
+        method: That made the motion.
+        motion: Rows of a motion table.
+        person: As recorded.
+        predicted: Volumes of any tick.
+        volumes: Instant [ns], horizon [s] and volumes of the ticks at which the person may be found to have left them.
+        lines_m: None: the parts with their radii leave them; else their lines, with a hand of this length [m].
+    """
+    radii_m = body_capsules.part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
+    t_ns = motion["t_ns"].to_numpy()
+    body = Body(person.source, person.part_axes(t_ns, job.settings.occupancy.hand_m), radii_m)
+    found = compare(robot, motion, body)
+    if method != "none":
+        found.by_volume_m[:] = by_volume(motion, found, body, predicted)
+    if lines_m is not None:
+        body = Body(person.source, person.part_axes(t_ns, lines_m), np.zeros(len(radii_m)))
+    mark_left(found, t_ns, body, volumes)
+    return _columns(motion, method, body.source, found, tuple(segment.name for segment in robot.segments))
 
 
 @dataclass(frozen=True)
@@ -138,26 +167,34 @@ def compare(robot: RobotModel, motion: pd.DataFrame, body: Body) -> Contact:
 
 
 @dataclass
-class _Predicted:
+class Predicted:
     """The volumes of any tick at any horizon, predicted again from the fused person."""
 
     stage: PredictionStage
-    writer: RunWriter
+    states: Path  #: state.parquet
     _states: HumanStates | None = field(default=None, init=False)
 
     def volumes(self, t_ns: int, horizon_s: float) -> Volumes:
         """Those of the last state that is not later than ``t_ns``; none where the person was not known."""
         if self._states is None:
-            self._states = HumanStates.join(list(read_states(self.writer.partial / "state.parquet", 4096)))
+            self._states = HumanStates.join(list(read_states(self.states, 4096)))
         row = int(np.searchsorted(self._states.t_ns, t_ns, side="right")) - 1
         if row < 0:
             return {}
         volumes = self.stage.volumes(self._states.rows(slice(row, row + 1)), horizon_s)
-        found = {name: (volumes.vertices(0, i), float(volumes.radius_m[0, i])) for i, name in enumerate(volumes.limbs)}
-        return {name: solid for name, solid in found.items() if np.isfinite(solid[0]).all() and np.isfinite(solid[1])}
+        return solids(obstacles(volumes, 0), volumes.limbs)
 
 
-def by_volume(motion: pd.DataFrame, found: Contact, body: Body, predicted: _Predicted) -> Floats:
+def solids(around: Obstacles, limbs: tuple[str, ...]) -> Volumes:
+    """Limb -> vertices and radius, of those of one tick that are known."""
+    found = {
+        limb: (around.vertices_m[around.offsets[i] : around.offsets[i + 1]], float(around.radius_m[i]))
+        for i, limb in enumerate(limbs)
+    }
+    return {limb: solid for limb, solid in found.items() if np.isfinite(solid[0]).all() and np.isfinite(solid[1])}
+
+
+def by_volume(motion: pd.DataFrame, found: Contact, body: Body, predicted: Predicted) -> Floats:
     """``Contact.by_volume_m``.
 
     What moves the robot at a tick was decided at a tick before it: the last that did not only go on braking. Its

@@ -80,7 +80,7 @@ class Follower(ABC):
             horizon_s = min(horizon_s, around.horizon_s)  # in a live session those of an earlier look may have to do
             pose = self.robot.pose(state.q, state.dq)
             sight = observe(self.robot, state, around, settings.plan.clearance_m, pose)
-            wanted = self._propose(sight, around, horizon_s, predict)
+            wanted = self.propose(sight, around, horizon_s, predict)
             taken, self.planes = decide(self.robot, going, wanted, around, horizon_s, self.planes, settings)
         step = made(sight, going, taken, horizon_s, settings.dt_s)
         self.stop, self.u = step.stop, step.u
@@ -88,8 +88,15 @@ class Follower(ABC):
         return FollowerTick(state, point, now_s, step)
 
     @abstractmethod
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
-        """What the method would do, or the reason why it does nothing."""
+    def propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
+        """What the method would do, or the reason why it does nothing.
+
+        Args:
+            sight: The robot's pose, and its distances from people.
+            around: The swept volumes of the tick.
+            horizon_s: Until when they hold [s].
+            predict: The volumes of the tick for any horizon.
+        """
 
     @abstractmethod
     def _move_on(self) -> None:
@@ -99,7 +106,15 @@ class Follower(ABC):
 class QpFollower(Follower):
     """The trajectory generator of Section 5 along a reference that waits for it or not."""
 
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
+    def propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
+        """The step that Eq. (66) finds best, and the stop after it.
+
+        Args:
+            sight: The robot's pose, and its distances from people.
+            around: The swept volumes of the tick.
+            horizon_s: Until when they hold [s].
+            _: The volumes of the tick for any horizon.
+        """
         error_m = float(np.linalg.norm(sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3]))
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
@@ -118,7 +133,15 @@ class PathFollower(Follower):
     #: Whether the method looks at people at all, and whether the rows of Eq. (66i) bound its rate.
     careful, by_rows = True, False
 
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
+    def propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
+        """The largest rate along the path that is allowed, and the stop after it.
+
+        Args:
+            sight: The robot's pose, and its distances from people.
+            around: The swept volumes of the tick.
+            horizon_s: Until when they hold [s].
+            _: The volumes of the tick for any horizon.
+        """
         reason = stands(sight, self.settings) if self.careful else 0
         if reason or sight.reason == NOT_FINITE:
             return reason or sight.reason
@@ -150,8 +173,16 @@ class BlindFollower(PathFollower):
 class SsmFollower(PathFollower):
     """Speed and separation monitoring, ISO/TS 15066: goes while the protective separation distance is kept."""
 
-    def _propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
-        wanted = super()._propose(sight, around, horizon_s, predict)
+    def propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
+        """The same, while the protective separation distance is kept.
+
+        Args:
+            sight: The robot's pose, and its distances from people.
+            around: The swept volumes of the tick.
+            horizon_s: Until when they hold [s].
+            predict: The volumes of the tick for any horizon.
+        """
+        wanted = super().propose(sight, around, horizon_s, predict)
         if isinstance(wanted, int):
             return wanted
         present = observe(self.robot, self.state, predict(0.0), self.settings.plan.clearance_m, sight.pose)
@@ -221,10 +252,10 @@ class Planner:
         if seen:
             self.seen_ns = t_ns
         lost = self.seen_ns is None or t_ns - self.seen_ns > self.memory_s * 1e9
-        return self.follower.step(partial(_unknown, around) if lost else around)
+        return self.follower.step(partial(unknown, around) if lost else around)
 
 
-def _unknown(predict: Predict, horizon_s: float) -> Obstacles:
+def unknown(predict: Predict, horizon_s: float) -> Obstacles:
     """Volumes that may not be relied on."""
     return replace(predict(horizon_s), known=False)
 

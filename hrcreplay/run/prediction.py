@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -84,6 +85,17 @@ class Forecast:
         if horizon_s == self.stage.horizon_s:
             return obstacles(self.full, tick, horizon_s)
         return obstacles(self.stage.volumes(self.states.rows(slice(tick, tick + 1)), horizon_s), 0, horizon_s)
+
+    def asking(self, tick: int, asked: dict[float, Obstacles] | None) -> Callable[[float], Obstacles]:
+        """``obstacles`` of one tick; keeps those that are asked for, by their horizon, where they are wanted later."""
+
+        def predict(horizon_s: float) -> Obstacles:
+            found = self.obstacles(tick, horizon_s)
+            if asked is not None:
+                asked[horizon_s] = found
+            return found
+
+        return predict
 
 
 def stored_ticks(first: int, count: int, store_every: float) -> Ints:

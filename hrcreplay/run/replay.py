@@ -68,9 +68,9 @@ def run(
     known = job.meta()
     with RunWriter(out or _folder(job, began)) as writer:
         log = open_log(job.log, job.settings.logs)
-        ticks_ns = _ticks(job, log)
+        ticks_ns = span_ticks(job, log)
         parts = dependencies(job, log, ticks_ns)
-        reused = _take_over(job, parts, writer, smooth=smooth)
+        reused = take_over(job, parts, writer, smooth=smooth)
         last = [stage for stage in job.stages if stage not in reused][-1:]
         with ProgressBar(last[0] if last else "", len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
@@ -127,10 +127,10 @@ def run_stages(
     flow: Iterable[Any] = states
     if "plan" in todo:
         chosen = build.planners(job, log, int(ticks_ns[0]))
-        every = _store_every(job) if "predict" in todo else math.inf
+        every = store_every(job) if "predict" in todo else math.inf
         flow = stages.planned(states, build.prediction_stage(job), chosen, every, sink)
     elif "predict" in todo:
-        flow = stages.predicted(states, build.prediction_stage(job), _store_every(job), sink)
+        flow = stages.predicted(states, build.prediction_stage(job), store_every(job), sink)
     if todo:
         for _ in flow:
             pass
@@ -192,8 +192,15 @@ def _findings(job: Job, log: Log, sink: Sink, reused: tuple[str, ...]) -> dict[s
     return {"counts": _plain(total), "notes": told, "found_by": by_stage}
 
 
-def _take_over(job: Job, parts: Mapping[str, str], writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
-    """Copies the tables of the earlier run's stages that would come out the same, and says which those are."""
+def take_over(job: Job, parts: Mapping[str, str], writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
+    """Copies the tables of the earlier run's stages that would come out the same, and says which those are.
+
+    Args:
+        job: What was asked for.
+        parts: What ``dependencies`` found.
+        writer: Run folder.
+        smooth: Whether the smoothed person is asked for, too.
+    """
     if job.earlier is None:
         return ()
     stale = stale_stages(job, parts)
@@ -211,7 +218,8 @@ def _take_over(job: Job, parts: Mapping[str, str], writer: RunWriter, *, smooth:
     return reused
 
 
-def _ticks(job: Job, log: Log) -> Ints:
+def span_ticks(job: Job, log: Log) -> Ints:
+    """(n,) ticks of a job [ns]."""
     first, last = log.header.start_ns, log.header.end_ns
     if first == last:
         raise LogError(f"{job.log}: holds a single instant; would be right: two frames or more")
@@ -223,7 +231,8 @@ def _ticks(job: Job, log: Log) -> Ints:
     return stages.tick_times(start_ns, end_ns, job.settings.fusion.rate_hz)
 
 
-def _store_every(job: Job) -> float:
+def store_every(job: Job) -> float:
+    """Number of ticks for one whose volumes are stored."""
     store_hz = job.settings.occupancy.store_hz
     return 1.0 if store_hz == "all" else max(1.0, job.settings.fusion.rate_hz / store_hz)
 

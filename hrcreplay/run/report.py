@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hrcreplay.logs.reader import open_log
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report import figures, page, tables
 from hrcreplay.report.figures_human import Instant
@@ -18,9 +19,11 @@ from hrcreplay.report.metrics_contact import add_contact
 from hrcreplay.report.metrics_data import add_fusion, add_occupancy, add_quality
 from hrcreplay.report.metrics_plan import add_plan
 from hrcreplay.report.story import lines
+from hrcreplay.report.tables import PageTable
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
 from hrcreplay.run.prediction import PredictionStage
+from hrcreplay.run.why import Record, stop_table
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run, RunWriter
@@ -31,6 +34,7 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
     near = _bounds(job.settings.model_dump())
     run = run_folder.read(writer.partial, meta)
     found = compute(run, **near)
+    stops = _stops(job, run, near["stationary_m_per_s"], found)
     writer.text("metrics.json", run_folder.to_json(found))
     prediction_stage = build.prediction_stage(job)
     occupancy = prediction_stage.occupancy
@@ -46,7 +50,32 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
         tables.limit_table(job.tracking, use="tracking"),
         tables.radius_table(radii),
     ]
-    writer.text("report.html", page.render(run, found, folder, shown))
+    writer.text("report.html", page.render(run, found, folder, shown, stops=stops))
+
+
+def _stops(job: Job, run: Run, slow_m_per_s: float, found: dict[str, Metric]) -> tuple[PageTable, ...]:
+    """The longest stops of the plan as a table, and among the metrics.
+
+    Args:
+        job: What was asked for.
+        run: The run's tables.
+        slow_m_per_s: A TCP slower than this stands [m/s].
+        found: The metrics so far; gets those of the stops.
+    """
+    if run.motion is None or not len(run.motion):
+        return ()
+    record = Record(run.folder, job.settings.plan.method, job, open_log(job.log, job.settings.logs), run.motion)
+    table, every = stop_table(record, slow_m_per_s)
+    metrics = MetricTable()
+    for i, stop in enumerate(every, start=1):
+        which = f"of the plan's longest stops number {i}"
+        metrics.add(f"plan_stop_{i:02}_at_s", stop["at_s"], "s", f"{which}: its first tick, from the first of the run")
+        metrics.add(f"plan_stop_{i:02}_duration_s", stop["duration_s"], "s", f"{which}: how long it lasted")
+        metrics.add(f"plan_stop_{i:02}_cause", stop["cause"], "name", f"{which}: what held the robot at its first tick")
+    both = {**found, **metrics.sorted()}
+    found.clear()
+    found.update(sorted(both.items()))
+    return (table,) if table.rows else ()
 
 
 def summary(folder: Path) -> list[str]:

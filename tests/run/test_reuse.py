@@ -242,7 +242,7 @@ def _handed(job: Job, log: Log) -> dict[str, str]:
         del limits["name"]
     reading = job.settings.logs.model_dump(exclude={"joints_topic"})
     first = repr((fusion_stage, reading, _ticks(job, log).tolist()))
-    second = repr((prediction_stage, replay._store_every(job)))
+    second = repr((prediction_stage, replay.store_every(job)))
     return {"fuse": first, "predict": second, "plan": repr(build.plan_settings(job, 0.004, job.settings.plan.method))}
 
 

@@ -1,0 +1,397 @@
+"""The command ``compare``: one recording and one programme by several methods, beside the same recorded person.
+
+A variant is a method with an occupancy and a horizon. The person is fused once and recorded once; each variant then
+plans by itself, so two processes share them and the result does not depend on which took which. A motion that an
+earlier run made by the same settings is taken over; what is computed of it is computed again.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, Unpack, get_args
+
+import pandas as pd
+import pyarrow.parquet as pq
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.logs.reader import Log, open_log
+from hrcreplay.records import Floats, Ints
+from hrcreplay.report import comparison
+from hrcreplay.report.comparison import Variant
+from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.programme.reference import Reference
+from hrcreplay.run import build, replay
+from hrcreplay.run.contact import Predicted, Volumes, contact_table, solids
+from hrcreplay.run.followers import Planner
+from hrcreplay.run.job import Job, JobOptions, resolve
+from hrcreplay.run.prediction import Forecast, stored_ticks
+from hrcreplay.run.recorded_person import RecordedPerson, recorded_person
+from hrcreplay.run.stages import ProgressBar, Sink, print_note
+from hrcreplay.settings.load import Settings
+from hrcreplay.settings.sections import Occupancy, Plan
+from hrcreplay.store.columns import motion_columns, read_states
+from hrcreplay.store.run_folder import RunWriter, Stopwatch
+
+#: The eight that matter: the programme run blind, four methods with the sound volumes of each tick's own stop, the same
+#: to a fixed horizon, and the paper's two methods with its volumes and its horizon.
+PRESET = "none,ssm,shield,scaling,qp,qp:sound:fixed,qp:paper:fixed,scaling:paper:fixed"
+
+#: What a tick of a method costs beside that of another, about: long ones are begun first.
+_COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3}
+
+
+@dataclass(frozen=True)
+class PlacedProgramme:
+    """What the robot is to do, and where; found once for all variants."""
+
+    T_world_base: Floats  #: (4, 4)
+    path: Reference
+    start_s: float  #: programmed time at the first tick [s]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Goes to another process without the robot, which is made again there."""
+        return PlacedProgramme, (self.T_world_base, replace(self.path, model=None), self.start_s)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class VariantTask:
+    """One variant on one log."""
+
+    job: Job  #: its settings are those of the variant
+    variant: Variant
+    folder: Path  #: with state.parquet; gets motion and contact
+    person: RecordedPerson
+    programme: PlacedProgramme
+    ready: bool  #: whether the motion is there already
+    size: int  #: ticks of a batch
+
+
+def run(
+    sources: Sequence[Path],
+    *,
+    methods: str = PRESET,
+    out: Path | None = None,
+    chunk_ticks: int = 250,
+    processes: int = 2,
+    **options: Unpack[JobOptions],
+) -> Path:
+    """Compares methods on logs, or on the logs of earlier runs with the settings and cells of those runs.
+
+    Args:
+        sources: Logs, or run folders of earlier commands.
+        methods: ``METHOD[:OCCUPANCY[:HORIZON]]``, commas between; what is left out is as the settings say.
+        out: Run folder to make; None: ``reports/<log>/<UTC>-compare``.
+        chunk_ticks: Ticks of a batch; changes no result.
+        processes: How many plan at the same time, 1 or 2; changes no result.
+        **options: Settings, cell and span, as ``job.resolve`` takes them.
+
+    Returns:
+        The run folder: compare.json, compare.csv, compare.md, figures, and a folder a log with the tables.
+
+    Raises:
+        SettingsError: A setting, a method, a cell, the task or the output folder cannot be used.
+        LogError: A log cannot be read, or lacks what a stage needs.
+    """
+    began = datetime.now(UTC)
+    jobs = [resolve("compare", source, **options) for source in sources]
+    per_job = [parse(methods, job.settings) for job in jobs]
+    if any(variants != per_job[0] for variants in per_job):
+        raise SettingsError(
+            "occupancy.method, plan.horizon: the runs given differ, and one table has one of each; name them in "
+            "--methods, as qp:sound:adaptive"
+        )
+    with RunWriter(out or replay.REPORTS / jobs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-compare") as writer:
+        watch = Stopwatch(time.perf_counter_ns)
+        logs = [
+            _compare_log(job, name, per_job[0], writer, watch, chunk_ticks, processes)
+            for job, name in zip(jobs, _names(jobs), strict=True)
+        ]
+        found = comparison.results(per_job[0], logs)
+        comparison.write(found, writer)
+        comparison.print_tables(found)
+        writer.timing.update(watch.summary(1.0 / jobs[0].settings.fusion.rate_hz))
+        writer.finish(_meta(jobs, per_job[0], began))
+        return writer.folder
+
+
+def parse(text: str, settings: Settings) -> tuple[Variant, ...]:
+    """The variants that a list of methods names, each once.
+
+    Raises:
+        SettingsError: A part of one is not known.
+    """
+    known = {
+        "method": get_args(Plan.model_fields["method"].annotation),
+        "occupancy": get_args(Occupancy.model_fields["method"].annotation),
+        "horizon": get_args(Plan.model_fields["horizon"].annotation),
+    }
+    found = []
+    for word in map(str.strip, text.split(",")):
+        parts = word.split(":")
+        if len(parts) > len(known) or (parts[0] == "none" and len(parts) > 1):
+            why = "none heeds nobody" if parts[0] == "none" else "too many parts"
+            raise SettingsError(
+                f"--methods {word}: {why}; would be right: METHOD[:OCCUPANCY[:HORIZON]], as in {PRESET}"
+            )
+        for part, (what, names) in zip(parts, known.items(), strict=False):
+            if part not in names:
+                raise SettingsError(f"--methods {word}: {part!r} is no {what}; known are {', '.join(names)}")
+        default = (settings.plan.method, settings.occupancy.method, settings.plan.horizon)
+        found.append(Variant(*parts, *default[len(parts) :]))
+    return tuple(dict.fromkeys(found))
+
+
+def _names(jobs: Sequence[Job]) -> list[str]:
+    """A short name for each log; the same name twice gets numbers."""
+    stems = [job.log.stem for job in jobs]
+    return [s if stems.count(s) == 1 else f"{s}-{stems[:i].count(s) + 1}" for i, s in enumerate(stems)]
+
+
+def variant_job(job: Job, variant: Variant) -> Job:
+    """The job that plans a variant and nothing else."""
+    settings = job.settings
+    plan = settings.plan.model_copy(update={"method": variant.method, "baselines": (), "horizon": variant.horizon})
+    occupancy = settings.occupancy.model_copy(update={"method": variant.occupancy})
+    return replace(job, command="plan", settings=settings.model_copy(update={"plan": plan, "occupancy": occupancy}))
+
+
+def _compare_log(
+    job: Job, name: str, variants: Sequence[Variant], writer: RunWriter, watch: Stopwatch, size: int, processes: int
+) -> comparison.LogResult:
+    """All variants on one log; its tables are in the run folder's ``<name>``.
+
+    Args:
+        job: What was asked for.
+        name: Of the log.
+        variants: To run.
+        writer: The run folder.
+        watch: Takes the times.
+        size: Ticks of a batch.
+        processes: How many plan at the same time.
+    """
+    part = RunWriter(writer.partial / name)
+    part.partial.mkdir()
+    log = open_log(job.log, job.settings.logs)
+    ticks_ns, fusing = replay.span_ticks(job, log), replace(job, command="fuse")
+    reused = replay.take_over(fusing, replay.dependencies(fusing, log, ticks_ns), part, smooth=False)
+    with ProgressBar(name, len(ticks_ns) * len(variants)) as bar:
+        sink = Sink(part, watch, _silent)
+        found = replay.run_stages(fusing, log, ticks_ns, size, sink, reused, smooth=not log.header.has_truth)
+        part.close_tables()
+        person = recorded_person(job, log, part)
+        part.close_tables()
+        have = _motions(job, log, variants, ticks_ns, part)
+        programme = _programme(job, log, int(ticks_ns[0]))
+        tasks = [
+            VariantTask(variant_job(job, variant), variant, part.partial, person, programme, variant in have, size)
+            for variant in variants
+        ]
+        took = _plan_all(tasks, processes, partial(bar.advance, name))
+    writer.timing[f"plan {name}"] = {variant.label: {"seconds": took[variant]} for variant in variants}
+    part.partial.rename(part.folder)
+    rows = {
+        variant: comparison.figures(variant, motion, contact, _report_settings(job))
+        for variant in variants
+        for motion, contact in [tables(part.folder, variant)]
+    }
+    return comparison.LogResult(
+        name, job.log_sha256, person.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, tuple(found["notes"]), rows
+    )
+
+
+def _programme(job: Job, log: Log, start_ns: int) -> PlacedProgramme:
+    base = build.robot_base(job, log)
+    path, begin_ns = build.reference(job, log, build.robot(job, base))
+    return PlacedProgramme(base, path, 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9)
+
+
+def _silent(_stage: str, _ticks: int) -> None:
+    """The person is fused in no time."""
+
+
+def tables(folder: Path, variant: Variant) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Motion and contact of a variant."""
+    return tuple(pq.read_table(folder / f"{what}_{variant.slug}.parquet").to_pandas() for what in ("motion", "contact"))
+
+
+def _report_settings(job: Job) -> comparison.Bounds:
+    report, plan = job.settings.report, job.settings.plan
+    return comparison.Bounds(report.near_m, report.stationary_m_per_s, plan.leash_m)
+
+
+def _motions(job: Job, log: Log, variants: Sequence[Variant], ticks_ns: Ints, part: RunWriter) -> set[Variant]:
+    """Takes over the motions that an earlier run made by the same settings, and says which variants those are.
+
+    Args:
+        job: What was asked for.
+        log: Log of the job.
+        variants: To run.
+        ticks_ns: (n,) ticks of the job [ns].
+        part: Folder of the log.
+    """
+    if job.earlier is None:
+        return set()
+    theirs = resolve("plan", job.earlier)
+    ticks = replay.span_ticks(theirs, log)
+    if "plan" in replay.stale_stages(theirs, replay.dependencies(theirs, log, ticks)):
+        return set()
+    have, made = set(), _parts(theirs, log, ticks)
+    for variant in variants:
+        chosen = variant.method == theirs.settings.plan.method
+        if not chosen and variant.method not in theirs.settings.plan.baselines:
+            continue
+        if _parts(variant_job(job, variant), log, ticks_ns) == made:
+            name = "motion.parquet" if chosen else f"motion_{variant.method}.parquet"
+            shutil.copyfile(job.earlier / name, part.partial / f"motion_{variant.slug}.parquet")
+            have.add(variant)
+            print_note(f"{variant.label}: taken over from {job.earlier}")
+    return have
+
+
+def _parts(job: Job, log: Log, ticks_ns: Ints) -> dict[str, str]:
+    """Digests of what the motion of a method depends on beside the method; which methods ran beside it is nothing."""
+    plan = job.settings.plan.model_copy(update={"method": "qp", "baselines": ()})
+    plain = replace(job, command="plan", settings=job.settings.model_copy(update={"plan": plan}))
+    found = replay.dependencies(plain, log, ticks_ns)
+    return {name: found[name] for name in replay.PARTS["plan"]}
+
+
+def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[int], None]) -> dict[Variant, float]:
+    """Plans every task: a second process takes one after the other, the first takes those that are left.
+
+    Args:
+        tasks: To do.
+        processes: 1 or 2.
+        advance: Called with ticks done.
+
+    Returns:
+        How long each took [s].
+    """
+    order = sorted(tasks, key=lambda task: (task.ready, -_COST[task.variant.method]))
+    if processes < 2 or len(order) < 2:
+        return {task.variant: plan(task, advance)[1] for task in order}
+    took = {}
+    with _second_process() as pool:
+        futures = [pool.submit(plan, task) for task in order]
+        try:
+            for task, future in zip(order, futures, strict=True):
+                if future.cancel():
+                    took[task.variant] = plan(task, advance)[1]
+            for task, future in zip(order, futures, strict=True):
+                if not future.cancelled():
+                    ticks, took[task.variant] = future.result()
+                    advance(ticks)
+        except BaseException:
+            for process in multiprocessing.active_children():  # it would go on to the end of its task
+                process.terminate()
+            pool.shutdown(cancel_futures=True)
+            raise
+    return took
+
+
+def _second_process() -> ProcessPoolExecutor:
+    """A process with compiled kernels of its own, since numba does not lock its files."""
+    first = os.environ["NUMBA_CACHE_DIR"]
+    second = Path(first) / "second"
+    pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+    os.environ["NUMBA_CACHE_DIR"] = str(second)  # read when the process begins
+    try:
+        pool.submit(os.getpid).result()
+    finally:
+        os.environ["NUMBA_CACHE_DIR"] = first
+    return pool
+
+
+def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tuple[int, float]:
+    """Motion and contact of a variant, into its folder; returns the number of ticks and the time that it took [s].
+
+    Args:
+        task: What to do.
+        progress: Called with the ticks of each batch done; or None.
+    """
+    began_s, job, slug = time.perf_counter(), task.job, task.variant.slug
+    stage, states, writer = build.prediction_stage(job), task.folder / "state.parquet", _TablesOf(task.folder)
+    robot = build.robot(job, task.programme.T_world_base)
+    done, planner = 0, None if task.ready else _planner(task, robot)
+    used: list[tuple[int, float, Volumes]] = []
+    for batch in read_states(states, task.size):
+        if planner is not None:
+            forecast = Forecast(stage, batch)
+            asked: dict[int, dict[float, Obstacles]] = {tick: {} for tick in _checked(job, done, len(batch))}
+            around = [forecast.asking(tick, asked.get(tick)) for tick in range(len(batch))]
+            made = planner.follow(batch, around, stage.limbs)
+            used += [
+                (int(made.t_ns[i]), horizon_s, solids(found[horizon_s], stage.limbs))
+                for i, found in asked.items()
+                for horizon_s in [float(made.horizon_s[i])]
+            ]
+            writer.table(f"motion_{slug}", motion_columns(made))
+        done += len(batch)
+        if progress is not None:
+            progress(len(batch))
+    writer.close_tables()
+    motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
+    predicted = Predicted(stage, states)
+    if planner is None:
+        used = _predicted_again(motion, predicted, job)
+    volumes = () if task.variant.method == "none" else (part for part in used if part[2])
+    hand_m = job.settings.occupancy.hand_m if stage.method == "sound" else 0.0  # the others know of no hand
+    rows = contact_table(job, robot, task.variant.method, motion, task.person, predicted, iter(volumes), hand_m)
+    writer.table(f"contact_{slug}", rows)
+    writer.close_tables()
+    return done, time.perf_counter() - began_s
+
+
+def _planner(task: VariantTask, robot: RobotModel) -> Planner:
+    """The variant's method at the start of the programme."""
+    job, programme = task.job, task.programme
+    settings = build.plan_settings(job, 1.0 / job.settings.fusion.rate_hz, task.variant.method)
+    path = replace(programme.path, model=robot)
+    follower = build.make_follower(task.variant.method, robot, path, settings, programme.start_s)
+    return Planner(follower, chosen=True, memory_s=job.settings.fusion.memory_s)
+
+
+class _TablesOf(RunWriter):
+    """Tables in a folder that is there already."""
+
+    @property
+    def partial(self) -> Path:
+        """The folder itself."""
+        return self.folder
+
+
+def _checked(job: Job, first: int, count: int) -> list[int]:
+    """Of some ticks those at which the person is compared with the volumes: as many as a run stores."""
+    every = replay.store_every(job)
+    return stored_ticks(first, count, 1.0 if math.isinf(every) else every).tolist()
+
+
+def _predicted_again(motion: pd.DataFrame, predicted: Predicted, job: Job) -> list[tuple[int, float, Volumes]]:
+    """The volumes that a motion was decided with, of the ticks at which the person is compared with them."""
+    t_ns, horizon_s = motion["t_ns"].tolist(), motion["horizon_s"].tolist()
+    ticks = _checked(job, 0, len(motion))
+    return [(t_ns[i], horizon_s[i], predicted.volumes(t_ns[i], horizon_s[i])) for i in ticks]
+
+
+def _meta(jobs: Sequence[Job], variants: Sequence[Variant], began: datetime) -> dict[str, Any]:
+    others = [job.meta() for job in jobs]
+    return {
+        **others[0],
+        "command": "compare",
+        "inputs": [part["inputs"][0] for part in others],
+        "cells": [part["cell"] for part in others],
+        "settings_by_log": [part["settings"] for part in others],
+        "methods": [variant.label for variant in variants],
+        "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
+    }

@@ -1,0 +1,321 @@
+"""What holds a step of the robot: rows that Eq. (66) ends on, rows that leave it nothing, and stops that come too near.
+
+Nothing is taken from the solver but its solution: multipliers come from the rows by non-negative least squares, and
+rows that contradict each other from linear programs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import linprog, nnls
+
+from hrcreplay.geometry.segment_hull_distance import distances
+from hrcreplay.records import Floats
+from hrcreplay.robot.control import qp_controller
+from hrcreplay.robot.control.approach_rows import Approach, tick_rows
+from hrcreplay.robot.control.certificate import MARGIN_M
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, Sight, observe
+from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, minimise
+from hrcreplay.robot.control.path_controller import protective_distance_m
+from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.stopping import Stop
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.programme.reference import advance
+from hrcreplay.run.followers import Follower, PathFollower, Predict, QpFollower, ScalingFollower, SsmFollower
+
+#: A row whose link could approach faster by no more than this is one that the solution lies on [m/s].
+ACTIVE = 1e-6
+#: A row whose multiplier is smaller does not hold the robot back, of the largest.
+SHARE = 1e-3
+#: By how much rows must contradict each other, each scaled to length 1.
+APART = 1e-9
+#: Weight on the multipliers themselves, relative to the rows.
+RIDGE = 1e-6
+#: Rows told beside those that hold.
+NEXT = 3
+
+
+class Moment(NamedTuple):
+    """What a follower has before a tick, and what the tick sees."""
+
+    going: Stop
+    u_before: Floats
+    s_s: float
+    sight: Sight
+    around: Obstacles
+    horizon_s: float
+    predict: Predict
+
+
+class LinearRows(NamedTuple):
+    """Bounds ``A @ w <= b`` on the next joint velocity, each with what it stands for."""
+
+    A: Floats  #: (m, nv)
+    b: Floats  #: (m,)
+    names: tuple[dict[str, Any], ...]
+
+
+def asked(follower: Follower, moment: Moment) -> tuple[list[Proposal] | int, dict[str, Any]]:
+    """What a method proposes at a tick, and what bounds it.
+
+    Args:
+        follower: Its robot, which is brought back to the tick.
+        moment: The tick.
+    """
+    follower.stop, follower.u, follower.s_s = moment.going, moment.u_before, moment.s_s
+    follower.point = follower.reference.sample(moment.s_s)
+    if isinstance(follower, QpFollower):
+        return _by_program(follower, moment)
+    wanted = follower.propose(moment.sight, moment.around, moment.horizon_s, moment.predict)
+    if isinstance(follower, SsmFollower):
+        return wanted, _protective(follower, moment)
+    if isinstance(follower, ScalingFollower):
+        dq = moment.going.rest().dq[0] if isinstance(wanted, int) else wanted[0].stop.dq[0]
+        margins = margins_of(_rows(follower, moment, 0.0), dq, 0.0)
+        broken = [row for row in margins if row["margin_m_per_s"] < -ACTIVE]
+        if isinstance(wanted, int):  # even the hardest braking along the path breaks a row
+            stop = {"kind": "path", "what": "the hardest braking along the path"}
+            return wanted, {"conflict": [*broken[:1], stop], "next": margins[len(broken) :][:NEXT]}
+        active = [row for row in margins if row["margin_m_per_s"] <= 1e-4]
+        return wanted, {"binding": active, "next": margins[len(active) :][:NEXT]}
+    return wanted, {}
+
+
+def _by_program(follower: QpFollower, moment: Moment) -> tuple[list[Proposal] | int, dict[str, Any]]:
+    """The proposals of Eq. (66), the rows that its solution lies on, or those that leave none."""
+    robot, settings, sight = follower.robot, follower.settings, moment.sight
+    error_m = float(np.linalg.norm(sight.pose.T_world_tcp[:3, 3] - follower.point.T_world_tcp[:3, 3]))
+    s_s, rate = advance(follower.reference, moment.s_s, settings.dt_s, error_m, settings.plan)
+    point = follower.reference.sample(s_s)
+    target = qp_controller.Target(point.T_world_tcp, rate * point.twist, point.q)
+    state = RobotState(moment.going.q[0], moment.going.dq[0])
+    given = robot, state, moment.u_before, target, sight, moment.around, moment.horizon_s
+    with np.errstate(all="ignore"):
+        wanted = qp_controller.propose(*given, settings)
+        task = qp_controller.problem(*given, settings)
+        solved = minimise(task)
+        if not isinstance(solved, Solution) and settings.plan.jerk_s > 0.0:
+            task = qp_controller.problem(*given, settings.without_jerk())
+            solved = minimise(task)
+    if isinstance(solved, Solution):
+        return wanted, held_by(task, solved)
+    return wanted, {"unsolved": solved.status, "conflict": conflict(all_rows(task))}
+
+
+def _rows(follower: Follower, moment: Moment, give_way_m: float) -> Approach:
+    """The approach rows of a tick."""
+    pairs, plan = moment.sight.pairs, follower.settings.plan
+    if pairs is None:
+        raise ValueError("why: the distances from people are not known")
+    room = pairs.room_m2(plan.room, give_way_m)
+    return tick_rows(moment.sight.pose, moment.around, room, pairs.distance_m, moment.horizon_s + plan.lead_s)
+
+
+def _protective(follower: SsmFollower, moment: Moment) -> dict[str, Any]:
+    """What speed and separation monitoring compares: the distance now, and the protective one."""
+    settings, sight = follower.settings, moment.sight
+    rows = moment.around
+    wanted = PathFollower.propose(follower, sight, rows, moment.horizon_s, moment.predict)
+    if isinstance(wanted, int):
+        return {}
+    needed_m = protective_distance_m(
+        sight.pose, wanted[0].stop, settings.plan.human_speed, settings.latency_s, settings.dt_s
+    )
+    now = observe(follower.robot, follower.state, moment.predict(0.0), settings.plan.clearance_m, sight.pose)
+    pair = {"link": now.link, "limb": now.limb, "distance_m": now.distance_m}
+    return {"protective": {**pair, "needed_m": needed_m}}
+
+
+def held_by(task: Problem, solved: Solution) -> dict[str, Any]:
+    """The rows of people that a solution lies on, by their multipliers, the limits of the robot, and the next rows.
+
+    Args:
+        task: Eq. (66).
+        solved: Its minimiser.
+    """
+    w, slack = solved.dq_next, solved.slack
+    every, margins = all_rows(task), margins_of(task.rows, w, slack)
+    loose = np.array([name["kind"] == "approach" for name in every.names], dtype=float)
+    active = np.flatnonzero(every.b + slack * loose - every.A @ w <= ACTIVE)
+    A, pull = every.A[active], task.H @ w + task.g
+    if task.soft:
+        A, pull = np.column_stack([A, -loose[active]]), np.append(pull, SLACK * slack)
+        if slack <= ACTIVE:  # which is no less than 0
+            A = np.vstack([A, -np.eye(len(pull))[-1]])
+    weights = _least_weights(A, -pull)[: len(active)] if len(A) else np.zeros(0)
+    limits, weight_of, vertex_of = [], dict[tuple[int, int, int], float](), dict[tuple[int, int, int], Any]()
+    for i, weight in zip(active.tolist(), weights.tolist(), strict=True):
+        name = every.names[i]
+        if name["kind"] != "approach":
+            limits += [name] if weight > ACTIVE * np.abs(pull).max() else []
+        elif solved.held and weight > 0.0:
+            key = name["link"], name["limb"], name["end"]
+            vertex_of[key] = max(vertex_of.get(key, (-1.0, name)), (weight, name), key=lambda found: found[0])
+            weight_of[key] = weight_of.get(key, 0.0) + weight
+    least = SHARE * max(weight_of.values(), default=0.0)
+    binding, others = [], []
+    for row in margins:
+        key = row["link"], row["limb"], row["end"]
+        if weight_of.get(key, 0.0) > least:
+            binding.append({**row, **vertex_of[key][1], "multiplier": weight_of[key]})
+        else:
+            others.append(row)
+    binding.sort(key=lambda row: -row["multiplier"])
+    return {"binding": binding, "limits": limits, "next": others[:NEXT], "slack_m_per_s": slack}
+
+
+def _least_weights(A: Floats, pull: Floats) -> Floats:
+    """(m,) the smallest multipliers, 0 or more, of rows (m, n) that add up to a pull (n,).
+
+    Of rows that repeat each other there are many; these are unique.
+    """
+    small = RIDGE * np.abs(A).max()
+    return np.asarray(nnls(np.vstack([A.T, small * np.eye(len(A))]), np.append(pull, np.zeros(len(A))))[0])
+
+
+def margins_of(rows: Approach, w: Floats, slack: float) -> list[dict[str, Any]]:
+    """For each link, limb and row of Eq. (12): its worst vertex, and by how much faster the link might approach it.
+
+    Args:
+        rows: Of the tick.
+        w: (nv,) next joint velocity [rad/s].
+        slack: By which all rows are loosened [m/s].
+    """
+    found = []
+    for link in range(len(rows.ends_m)):
+        J_a, J_b = rows.J_ends[link]
+        (a, b), v_a = rows.ends_m[link], J_a @ w
+        for end, (v, rest) in enumerate(((v_a, -a @ v_a), (J_b @ w, -a @ (J_b @ w) - (b - a) @ v_a))):
+            for limb in range(len(rows.offsets) - 1):
+                first, last = rows.offsets[limb : limb + 2]
+                vertex = int(first + np.argmax(rows.vertices_m[first:last] @ v))
+                value = rows.stop_s * (rows.vertices_m[vertex] @ v + rest)
+                margin = (rows.room_m2[link, limb] - value) / rows.per_speed[link, limb] + slack
+                found.append(
+                    {"kind": "approach", "link": link, "limb": limb, "end": end, "vertex": vertex - int(first)}
+                    | {"vertex_m": rows.vertices_m[vertex].tolist(), "margin_m_per_s": float(margin)}
+                )
+    return sorted(found, key=lambda row: (row["margin_m_per_s"], row["link"], row["limb"], row["end"]))
+
+
+def _limits(task: Problem) -> tuple[Floats, Floats, tuple[dict[str, Any], ...]]:
+    """The bounds of axes and TCP as rows."""
+    limits = task.limits
+    nv = len(limits.low)
+    A = np.vstack([np.eye(nv), -np.eye(nv), limits.J, -limits.J])
+    b = np.concatenate([limits.high, -limits.low, limits.J_high, -limits.J_low])
+    names = [{"kind": "axis", "axis": j + 1, "side": side} for side in ("upper", "lower") for j in range(nv)]
+    names += [{"kind": "tcp", "direction": j, "side": side} for side in ("upper", "lower") for j in range(6)]
+    kept = np.isfinite(b) & (A.any(axis=1))
+    return A[kept], b[kept], tuple(name for name, keep in zip(names, kept, strict=True) if keep)
+
+
+def all_rows(task: Problem) -> LinearRows:
+    """Every row of Eq. (66), those of all vertices written down."""
+    A, b, names = _limits(task)
+    rows, bounds, named = [A], [b], list(names)
+    of = task.rows
+    for link in range(len(of.ends_m)):
+        (start, stop), (J_a, J_b) = of.ends_m[link], of.J_ends[link]
+        for limb in range(len(of.offsets) - 1):
+            vertices = of.vertices_m[of.offsets[limb] : of.offsets[limb + 1]]
+            scale = of.stop_s / of.per_speed[link, limb]
+            from_a = vertices - start
+            for end, written in ((0, from_a @ J_a), (1, from_a @ J_b - (stop - start) @ J_a)):
+                rows.append(scale * written)
+                bounds.append(np.full(len(vertices), of.room_m2[link, limb] / of.per_speed[link, limb]))
+                named += [
+                    {"kind": "approach", "link": link, "limb": limb, "end": end, "vertex": j, "vertex_m": r.tolist()}
+                    for j, r in enumerate(vertices)
+                ]
+    return LinearRows(np.concatenate(rows), np.concatenate(bounds), tuple(named))
+
+
+def conflict(rows: LinearRows) -> list[dict[str, Any]]:
+    """Rows that no velocity keeps together, none of which can be left out; empty where all can be kept.
+
+    Args:
+        rows: All rows.
+    """
+    length = np.linalg.norm(rows.A, axis=1)
+    empty = length < APART
+    for i in np.flatnonzero(empty & (rows.b < -APART)).tolist():
+        return [rows.names[i]]
+    kept = np.flatnonzero(~empty)
+    A, b = rows.A[kept] / length[kept, None], rows.b[kept] / length[kept]
+    chosen = list(range(len(A)))
+    broken, weights = _least_broken(A, b, chosen)
+    if broken <= APART:
+        return []
+    chosen = [i for i in chosen if weights[i] > 0.0]
+    if _least_broken(A, b, chosen)[0] <= APART:  # the solver's multipliers left out one that counts
+        chosen = list(range(len(A)))
+    for i in list(chosen):
+        fewer = [j for j in chosen if j != i]
+        if fewer and _least_broken(A, b, fewer)[0] > APART:
+            chosen = fewer
+    return [rows.names[kept[i]] for i in chosen]
+
+
+def _least_broken(A: Floats, b: Floats, chosen: Sequence[int]) -> tuple[float, Floats]:
+    """By how much the worst of some rows is broken at least, and the rows' multipliers.
+
+    Args:
+        A: (m, nv) rows of length 1.
+        b: (m,) their bounds.
+        chosen: Which rows.
+    """
+    n = A.shape[1]
+    cost = np.append(np.zeros(n), 1.0)
+    bounds = [(None, None)] * n + [(0.0, None)]
+    left = np.hstack([A[chosen], -np.ones((len(chosen), 1))])
+    found = linprog(cost, A_ub=left, b_ub=b[chosen], bounds=bounds, method="highs-ds")
+    weights = np.zeros(len(A))
+    weights[list(chosen)] = -found.ineqlin.marginals
+    return float(found.fun), weights
+
+
+def refused(
+    robot: RobotModel, going: Stop, proposal: Proposal, around: Obstacles, horizon_s: float, settings: PlanSettings
+) -> dict[str, Any]:
+    """Where the step and the stop after it are not clear: the first instant, and link and limb there.
+
+    Args:
+        robot: The manipulator.
+        going: Its row 0 is where the robot is.
+        proposal: That was not certified.
+        around: The swept volumes of the tick.
+        horizon_s: Until when they hold [s].
+        settings: Of the method.
+    """
+    stop, last = proposal.stop, proposal.stop.q[-1]
+    ends_s = (stop.ticks + 1) * settings.dt_s
+    found: dict[str, Any] = {"stop_s": ends_s}
+    if ends_s > horizon_s + 1e-9:
+        return {**found, "why": "longer than the volumes hold"}
+    beyond = np.flatnonzero((last < robot.q_min) | (last > robot.q_max))
+    if len(beyond):
+        return {**found, "why": "out of range", "axis": int(beyond[0]) + 1}
+    radius = np.array([segment.radius_m for segment in robot.segments])
+    keep_m = radius[:, None] + around.radius_m + settings.plan.clearance_m + MARGIN_M
+    q, dq = np.vstack((going.q[:1], stop.q)), np.abs(np.vstack((going.dq[:1], stop.dq)))
+    turned = np.maximum(np.abs(np.diff(q, axis=0)), settings.dt_s * np.maximum(dq[:-1], dq[1:]))
+    travel_m = np.vstack((turned @ robot.axis_reach_m, np.zeros((1, len(radius)))))
+    worst = np.inf, 0, 0, 0, 0, 0.0
+    for i in range(len(q)):  # a link moves by its travel at most until the next tick
+        low, _, near = distances(robot.ends_m(q[i]), around.vertices_m, around.offsets)
+        left = low - keep_m - travel_m[i][:, None]
+        link, limb = divmod(int(np.argmin(left)), left.shape[1])
+        if left[link, limb] < worst[0]:
+            gap_m = float(low[link, limb] - keep_m[link, limb])
+            worst = float(left[link, limb]), i, link, limb, int(near[link, limb, 0]), gap_m
+        if worst[0] <= 0.0:
+            break
+    left_m, i, link, limb, vertex, gap_m = worst
+    why = "not clear" if gap_m <= 0.0 else "not proven until the next tick" if left_m <= 0.0 else "hardly clear"
+    found |= {"why": why, "failed_s": i * settings.dt_s, "link": link, "limb": limb, "gap_m": gap_m}
+    found["travel_m"] = float(travel_m[i, link])
+    return found | {"vertex_m": around.vertices_m[vertex].tolist()}

@@ -1,0 +1,329 @@
+"""Methods side by side: the same bytes however they were run, and the same numbers by a checker of its own."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.human.model import skeleton
+from hrcreplay.logs.reader import open_log
+from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats
+from hrcreplay.report import comparison
+from hrcreplay.report.comparison import FIELDS, Variant
+from hrcreplay.run import build, compare, replay
+from hrcreplay.run.job import resolve
+from hrcreplay.settings.load import load_settings
+from hrcreplay.store import run_folder
+from hrcreplay.store.columns import read_states
+from tests import bases
+from tests.robot.checker import RADII, links
+from tests.robot.distances import axis_distance
+from tests.test_recordings import TASK
+
+SPAN: dict[str, Any] = {"start_s": 8.0, "end_s": 10.8}
+METHODS = "none,ssm,shield,scaling,qp,qp:paper:fixed"
+#: Axes and radii of the recorded body, Table 2 and the settings: ends, radius [m], whether a hand goes on.
+BODY = (
+    ("neck", "head", 0.12, False),
+    ("pelvis", "neck", 0.15, False),
+    *(("shoulder_" + s, "elbow_" + s, 0.07, False) for s in "rl"),
+    *(("elbow_" + s, "wrist_" + s, 0.07, True) for s in "rl"),
+    *(("hip_" + s, "knee_" + s, 0.08, False) for s in "rl"),
+    *(("knee_" + s, "ankle_" + s, 0.08, False) for s in "rl"),
+)
+HAND_M, TOOL_M, NEAR_M, SLOW = 0.19, 0.10, 0.5, 0.001
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("compare") / "one"
+    return compare.run([replay.demo_log()], methods=METHODS, out=out, processes=1, **SPAN)
+
+
+def outputs(folder: Path) -> dict[str, str]:
+    found: dict[str, str] = run_folder.read_meta(folder)["outputs"]
+    return found
+
+
+def test_two_processes_and_small_batches_give_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    again = compare.run([replay.demo_log()], methods=METHODS, out=tmp_path / "two", processes=2, chunk_ticks=60, **SPAN)
+    assert outputs(again) == outputs(folder)
+    assert {"compare.json", "compare.csv", "compare.md", "figures/compare.png", "demo/motion_none.parquet"} <= set(
+        outputs(folder)
+    )
+    words = (folder / "compare.md").read_text()
+    assert "86.44 % (scaling) and 30.06 % (QP)" in words
+    assert not {str(folder.parent), "nan", "None"} & set(words.replace("|", " ").split())
+
+
+def test_what_a_report_made_is_taken_over(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = replay.run("report", replay.demo_log(), out=tmp_path / "report", **SPAN)
+    capsys.readouterr()
+    again = compare.run([report], methods=METHODS, out=tmp_path / "again", processes=1)
+    said = capsys.readouterr().err
+    assert all(f"{label}: taken over" in said for label in ("none", "qp:sound:adaptive", "scaling:sound:adaptive"))
+    assert "ssm:sound:adaptive: taken over" not in said
+    assert "qp:paper:fixed: taken over" not in said
+    assert outputs(again) == outputs(folder)
+    for name, mine in (("motion", "qp_sound_adaptive"), ("motion_none", "none")):
+        assert (folder / "demo" / f"motion_{mine}.parquet").read_bytes() == (report / f"{name}.parquet").read_bytes()
+    metrics = json.loads((report / "metrics.json").read_text())
+    ours = json.loads((folder / "compare.json").read_text())["logs"][0]["methods"]["qp:sound:adaptive"]
+    assert ours["standing_share"] == metrics["plan_stationary_share"]["value"]
+    assert ours["pace"] == pytest.approx(metrics["plan_progress_share"]["value"], rel=1e-12)
+
+
+def test_another_setting_takes_no_motion_over(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = replay.run("plan", replay.demo_log(), out=tmp_path / "plan", start_s=8.0, end_s=8.4)
+    capsys.readouterr()
+    other = ("plan.lead_s=0.1",)
+    compare.run([plan], methods="none,qp", out=tmp_path / "again", processes=1, overrides=other)
+    said = capsys.readouterr().err
+    assert "fuse: taken over" in said
+    assert "qp:sound:adaptive: taken over" not in said
+
+
+def test_terminal_files_hold_the_same_numbers(folder: Path) -> None:
+    found = json.loads((folder / "compare.json").read_text())
+    with (folder / "compare.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    labels = list(dict.fromkeys(row["variant"] for row in rows))
+    assert [row["variant"] for row in rows] == [*labels, *labels]
+    assert [row["log"] for row in rows] == ["demo"] * len(labels) + ["all"] * len(labels)
+    for row in rows[: len(labels)]:
+        for field in FIELDS:
+            value = found["logs"][0]["methods"][row["variant"]][field.name]
+            assert (None if row[field.name] == "" else float(row[field.name])) == value
+    lines = [line for line in (folder / "compare.md").read_text().splitlines() if line.startswith("| qp:sound")]
+    assert f"| {100 * found['total']['qp:sound:adaptive']['pace']:.1f} |" in lines[0]
+
+
+def points_of_truth(t_ns: Floats) -> Floats:
+    """(n, 20, 3) the ground truth of the demo log between its samples [m]."""
+    log = open_log(replay.demo_log(), load_settings().logs)
+    parts = list(log.truth())
+    at, points = np.concatenate([p.t_ns for p in parts]), np.concatenate([p.points_m for p in parts]).reshape(-1, 60)
+    return np.column_stack([np.interp(t_ns, at, points[:, k]) for k in range(60)]).reshape(-1, 20, 3)
+
+
+def segment_distance(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:
+    """(n,) between segments a-b and c-d: the least of the four ends against the other, and of the lines between."""
+
+    def to_segment(p: Floats, x: Floats, y: Floats) -> Floats:
+        way = y - x
+        share = np.clip(((p - x) * way).sum(1) / np.maximum((way * way).sum(1), 1e-30), 0.0, 1.0)
+        return np.asarray(np.linalg.norm(p - x - share[:, None] * way, axis=1))
+
+    least = np.fmin.reduce([to_segment(a, c, d), to_segment(b, c, d), to_segment(c, a, b), to_segment(d, a, b)])
+    u, v, w = b - a, d - c, a - c
+    uu, uv, vv, uw, vw = ((x * y).sum(1) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    det = uu * vv - uv * uv
+    with np.errstate(all="ignore"):
+        s, t = (uv * vw - vv * uw) / det, (uu * vw - uv * uw) / det
+        between = np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1)
+    inside = (det > 1e-12) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    return np.where(inside, np.fmin(between, least), least)
+
+
+def body_distance(motion: pd.DataFrame, points: Floats, T_world_base: Floats) -> tuple[Floats, Floats, Floats]:
+    """(n,) distance of the surfaces [m], and bounds on the speed of the link's surface there [m/s]."""
+    q, dq = (motion[[f"{name}{i}" for i in range(1, 7)]].to_numpy() for name in ("q", "dq"))
+    ends, speeds = links(q, dq, T_world_base, TOOL_M)
+    best = np.full(len(q), np.inf)
+    slow, fast = np.full(len(q), np.nan), np.full(len(q), np.nan)
+    turning = np.abs(dq).sum(axis=1)
+    for link, radius in enumerate(RADII):
+        for first, last, around, hand in BODY:
+            c, d = (points[:, POINTS.index(name)] for name in (first, last))
+            if hand:
+                d = d + HAND_M * (d - c) / np.linalg.norm(d - c, axis=1, keepdims=True)
+            gap = segment_distance(ends[:, link, 0], ends[:, link, 1], c, d) - radius - around
+            nearer = gap < best
+            best[nearer] = gap[nearer]
+            at_ends = np.linalg.norm(speeds[:, link], axis=2)
+            slow[nearer] = (0.0 - turning * radius)[nearer]
+            fast[nearer] = (at_ends.max(axis=1) + turning * radius)[nearer]
+    return np.where(np.isfinite(best), best, np.nan), slow, fast
+
+
+def checked(motion: pd.DataFrame, points: Floats, T_world_base: Floats) -> dict[str, Any]:
+    """What the table says of a motion, worked out from its table and the person's points alone."""
+    gap, slow, fast = body_distance(motion, points, T_world_base)
+    dq, u = (motion[[f"{name}{i}" for i in range(1, 7)]].to_numpy() for name in ("dq", "u"))
+    turns, known = (dq != 0).any(axis=1), np.isfinite(gap)
+    touch = known & (gap <= 0)
+    speed, near = motion["tcp_speed"].to_numpy(), motion["distance_m"].to_numpy() <= NEAR_M
+    braking = (motion["status"] == "braking").to_numpy()
+    begins = braking & ~np.concatenate([[False], braking[:-1]])
+    moves = (speed >= SLOW) | (np.abs(dq) >= 1e-3).any(axis=1)
+    ref, tcp = (motion[[f"{w}_{axis}" for axis in "xyz"]].to_numpy() for w in ("ref", "tcp"))
+    off = [float(np.linalg.norm(ref - at, axis=1).min()) for at in tcp[::10]]
+    return {
+        "known_ticks": int(known.sum()),
+        "touch_ticks": int((touch & turns).sum()),
+        "touch_rest_ticks": int((touch & ~turns).sum()),
+        "nearest_moving_m": float(gap[known & turns].min()) if (known & turns).any() else None,
+        "nearest_rest_m": float(gap[known & ~turns].min()) if (known & ~turns).any() else None,
+        "near_ticks": int(near.sum()),
+        "null_speed_ticks": int((near & (speed < SLOW)).sum()),
+        "braking_events": int((begins & moves).sum()),
+        "jerk_rms_rad_per_s3": math.sqrt(float((np.diff(u, axis=0) ** 2).mean())) / 0.004,
+        "ran_s": float(motion["programme_s"].iloc[-1] - motion["programme_s"].iloc[0]),
+        "off_m": max(off),
+        "speed": (float(slow[touch & turns].max()), float(fast[touch & turns].max()))
+        if (touch & turns).any()
+        else None,
+    }
+
+
+def assert_agrees(row: dict[str, Any], mine: dict[str, Any], method: str) -> None:
+    for name in ("known_ticks", "near_ticks", "null_speed_ticks", "braking_events"):
+        assert row[name] == mine[name], name
+    for name in ("touch_ticks", "touch_rest_ticks"):
+        assert abs(row[name] - mine[name]) <= 1, name  # a tick may touch by rounding
+    for name, off in (("nearest_moving_m", 1e-6), ("nearest_rest_m", 1e-6), ("jerk_rms_rad_per_s3", 1e-6)):
+        assert row[name] == (None if mine[name] is None else pytest.approx(mine[name], abs=off, rel=1e-9)), name
+    assert row["deviation_max_m"] == pytest.approx(mine["off_m"], abs=0.01)
+    if row["touch_speed_m_per_s"] is not None:
+        assert mine["speed"][0] <= row["touch_speed_m_per_s"] <= mine["speed"][1]
+    if method != "qp":  # who stays on the path is where its reference is
+        assert row["made_s"] == pytest.approx(mine["ran_s"], abs=0.01)
+    else:
+        assert row["made_s"] <= mine["ran_s"] + 1e-6
+    assert sum(row["braking_events_by_cause"].values()) == row["braking_events"]
+
+
+def test_the_table_is_that_of_a_checker_of_its_own(folder: Path) -> None:
+    found = json.loads((folder / "compare.json").read_text())
+    job = resolve("plan", replay.demo_log())
+    base = build.robot_base(job, open_log(job.log, job.settings.logs))
+    rows = found["logs"][0]["methods"]
+    for label, row in rows.items():
+        motion = pq.read_table(folder / "demo" / f"motion_{label.replace(':', '_')}.parquet").to_pandas()
+        assert_agrees(row, checked(motion, points_of_truth(motion["t_ns"].to_numpy()), base), label.split(":")[0])
+    assert rows["none"]["touch_ticks"] > 0
+    assert rows["none"]["coverage"] is None
+    assert all(row["touch_ticks"] == 0 for label, row in rows.items() if label != "none")
+    assert set(run_folder.read_meta(folder)["methods"]) == set(rows)
+
+
+def test_coverage_is_that_of_every_point_against_every_volume(folder: Path) -> None:
+    row = json.loads((folder / "compare.json").read_text())["logs"][0]["methods"]["qp:paper:fixed"]
+    job = compare.variant_job(resolve("plan", replay.demo_log(), **SPAN), Variant("qp", "paper", "fixed"))
+    stage = build.prediction_stage(job)
+    motion = pq.read_table(folder / "demo" / "motion_qp_paper_fixed.parquet").to_pandas()
+    (states,) = read_states(folder / "demo" / "state.parquet", 100_000)
+    t_ns, horizon_s = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy()
+    points = points_of_truth(t_ns)
+    held = []
+    for i in range(0, len(t_ns), 10):
+        until = np.flatnonzero((t_ns >= t_ns[i]) & (t_ns <= t_ns[i] + round(1e9 * horizon_s[i])))
+        volumes = stage.volumes(states.rows(slice(i, i + 1)), float(horizon_s[i]))
+        if np.isnan(volumes.vertices_m).any():
+            continue
+        inside = True
+        for k, (first, last) in enumerate([part[:2] for part in BODY][:2] + [part[:2] for part in BODY][2:6]):
+            limb = ("HD", "THX", "URA", "ULA", "LRA", "LLA")[k]
+            at = volumes.limbs.index(limb)
+            for tick in (*until[:-1:4], until[-1]):
+                for name in (first, last):
+                    point = points[tick, POINTS.index(name)]
+                    gap = axis_distance(point, point, volumes.vertices(0, at), [0]) - volumes.radius_m[0, at]
+                    inside = inside and gap <= 1e-9
+        held.append(inside)
+    assert row["checked_ticks"] == len(held)
+    assert row["held_ticks"] == sum(held)
+
+
+def test_logs_add_up() -> None:
+    one = dict.fromkeys((field.name for field in FIELDS), 2.0) | {"ticks": 100, "braking_events_by_cause": {"a": 1}}
+    two = {**one, "ticks": 300, "nearest_moving_m": -1.0, "touch_speed_m_per_s": None, "deviation_mean_m": 6.0}
+    two |= {"jerk_rms_rad_per_s3": 6.0, "made_s": 1.0, "given_s": 4.0, "braking_events_by_cause": {"a": 2, "b": 5}}
+    both = comparison.total([one, two])
+    assert both["ticks"] == 400
+    assert both["touch_ticks"] == 4.0
+    assert both["nearest_moving_m"] == -1.0
+    assert both["touch_speed_m_per_s"] == 2.0
+    assert both["deviation_mean_m"] == pytest.approx((100 * 2 + 300 * 6) / 400)
+    assert both["jerk_rms_rad_per_s3"] == pytest.approx(math.sqrt((100 * 4 + 300 * 36) / 400))
+    assert both["pace"] == pytest.approx(3.0 / 6.0)
+    assert both["braking_events_by_cause"] == {"a": 3, "b": 5}
+
+
+def test_brakings_are_counted_where_they_begin() -> None:
+    status = ["tracking", "braking", "braking", "limited", "braking", "tracking", "braking"]
+    table = pd.DataFrame(
+        {"status": status, "reason": ["", "x", "y", "", "y", "", "x"], "tcp_speed": [1.0, 1, 0, 1, 0, 1, 1], "dq1": 0.0}
+    )
+    assert comparison.braking_events(table, 0.001) == {"x": 2}  # that of y began at rest
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("fast", r"--methods fast: 'fast' is no method; known are qp, scaling, shield, ssm, none"),
+        ("qp:all", r"'all' is no occupancy; known are paper, positions, sound"),
+        ("qp:sound:long", r"'long' is no horizon; known are adaptive, fixed"),
+        ("none:sound", r"none heeds nobody; would be right: METHOD"),
+        ("qp:sound:fixed:4", r"too many parts"),
+    ],
+)
+def test_a_method_that_is_none_is_refused(text: str, match: str) -> None:
+    with pytest.raises(SettingsError, match=match):
+        compare.parse(text, load_settings())
+
+
+def test_the_preset_is_eight_methods() -> None:
+    found = compare.parse(f"{compare.PRESET}, qp", load_settings())
+    assert len(found) == 8
+    assert found[4] == Variant("qp", "sound", "adaptive")
+
+
+def smoothed_points(folder: Path) -> Floats:
+    """(n, 20, 3) the smoothed person, NaN where no camera saw them lately."""
+    table = pq.read_table(folder / "smooth.parquet").to_pandas()
+    points = skeleton(table[list(JOINTS)].to_numpy(), table[list(LENGTHS)].to_numpy())
+    seen = np.flatnonzero(table[[name for name in table if name.startswith("valid_")]].to_numpy().any(axis=1))
+    t_ns, memory_ns = table["t_ns"].to_numpy(), 0.5e9
+    for i in range(len(table)):
+        before, after = seen[seen <= i], seen[seen >= i]
+        if not len(before) or not len(after) or t_ns[after[0]] - t_ns[before[-1]] > memory_ns:
+            points[i] = np.nan
+    return points
+
+
+@pytest.mark.parametrize("name", ["azure moving", "kinect 2 lines", "exp_box"])
+def test_a_recording_with_the_robot_in_the_way_by_the_same_checker(tmp_path: Path, name: str) -> None:
+    log, cell, config = bases.recorded(name, tmp_path)
+    fused = replay.run("fuse", log, out=tmp_path / "fused", config=config, cell_file=cell, end_s=8.0)
+    (states,) = read_states(fused / "state.parquet", 100_000)
+    task = tmp_path / "task.toml"
+    task.write_text(TASK)
+    place = bases.with_base(cell, next(bases.bases(states)), tmp_path / "base.toml")
+    out = compare.run(
+        [fused],
+        methods="none,scaling,shield,qp",
+        out=tmp_path / "compared",
+        processes=1,
+        cell_file=place,
+        overrides=(f"plan.task={task}",),
+    )
+    found = json.loads((out / "compare.json").read_text())
+    (of_log,) = found["logs"]
+    job = resolve("plan", fused, cell_file=place)
+    base = build.robot_base(job, open_log(job.log, job.settings.logs))
+    points = smoothed_points(out / of_log["log"])
+    for label, row in of_log["methods"].items():
+        motion = pq.read_table(out / of_log["log"] / f"motion_{label.replace(':', '_')}.parquet").to_pandas()
+        assert_agrees(row, checked(motion, points, base), label.split(":")[0])
+        assert label == "none" or row["touch_inside_ticks"] == 0
+        assert row["uncertified_ticks"] == (row["moving_ticks"] if label == "none" else 0)
