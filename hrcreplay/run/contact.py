@@ -25,7 +25,7 @@ from hrcreplay.run import build
 from hrcreplay.run.job import Job
 from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.run.recorded_person import recorded_person
-from hrcreplay.store.columns import Columns, contact_columns, read_states
+from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states
 from hrcreplay.store.run_folder import RunWriter
 
 #: Part of the body -> limb whose volume it has to be in.
@@ -33,6 +33,9 @@ VOLUME_OF = {part: "LEGS" if part in LEG_PARTS else part for part in PARTS}
 
 #: Of the ticks until a horizon, the last and one in so many are looked at: people do not tremble that fast.
 _EVERY = 4
+
+#: Rows of body.parquet a second, for those who draw it.
+_BODY_HZ = 25.0
 
 #: Limb -> vertices (m, 3) and radius of the volume around them [m].
 Volumes = Mapping[str, tuple[Floats, float]]
@@ -60,6 +63,8 @@ def write_contact(job: Job, log: Log, writer: RunWriter, T_world_base: Floats) -
         if method != "none":
             found.by_volume_m[:] = by_volume(motion, found, body, predicted)
         if path.stem == "motion":
+            shown = slice(None, None, max(1, round(job.settings.fusion.rate_hz / _BODY_HZ)))
+            writer.table("body", body_columns(motion["t_ns"].to_numpy()[shown], body.axes_m[shown], PARTS))
             mark_left(found, motion["t_ns"].to_numpy(), body, stored_volumes(writer, occupancy.stop_s))
         names = tuple(segment.name for segment in robot.segments)
         writer.table("contact", _columns(motion, method, body.source, found, names))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hrcreplay.human.body_capsules import PARTS, part_radii
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report import figures, page, tables
 from hrcreplay.report.figures_human import Instant
@@ -17,6 +18,7 @@ from hrcreplay.report.metrics import Metric, MetricTable
 from hrcreplay.report.metrics_contact import add_contact
 from hrcreplay.report.metrics_data import add_fusion, add_occupancy, add_quality
 from hrcreplay.report.metrics_plan import add_plan
+from hrcreplay.report.replay_scene import ReplayScene, replay_scene
 from hrcreplay.report.story import lines
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
@@ -46,7 +48,16 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
         tables.limit_table(job.tracking, use="tracking"),
         tables.radius_table(radii),
     ]
-    writer.text("report.html", page.render(run, found, folder, shown))
+    writer.text("report.html", page.render(run, found, folder, shown, scene=scene_of(job, run)))
+
+
+def scene_of(job: Job, run: Run) -> ReplayScene | None:
+    """What the 3-D replay of a run shows; None where it moved no robot."""
+    if run.motion is None or run.T_world_base is None:
+        return None
+    radii_m = part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
+    parts = dict(zip(PARTS, radii_m.tolist(), strict=True))
+    return replay_scene(run, build.robot(job, run.T_world_base), figures.start_ns(run), parts)
 
 
 def summary(folder: Path) -> list[str]:

@@ -176,6 +176,7 @@ class Run:
     occupancy: pd.DataFrame | None = None
     motion: pd.DataFrame | None = None
     contact: pd.DataFrame | None = None
+    body: pd.DataFrame | None = None
     baselines: dict[str, pd.DataFrame] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -235,6 +236,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
         occupancy=table("occupancy"),
         motion=table("motion"),
         contact=table("contact"),
+        body=table("body"),
         baselines={name: found for name in baselines if (found := table(f"motion_{name}")) is not None},
         counts=meta.get("counts", {}),
         notes=tuple(meta.get("notes", ())),
