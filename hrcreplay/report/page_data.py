@@ -1,7 +1,7 @@
 """The data of the page's 3-D replay: a JSON header and one block of deflated numbers, as small as they can be.
 
-Positions are whole millimetres, joints steps of a ten-thousandth of a turn's half, speeds mm/s: int16, column by column,
-each as the difference from the one before it, low bytes before high bytes. ``static/data.js`` reads it again.
+Positions are whole millimetres, joints 0.1 mrad, speeds mm/s: int16, column by column, each as the difference from the
+one before it, low bytes before high bytes. ``static/data.js`` reads it again.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ _LARGEST = 32767
 #: The block may take so many bytes in base64; the volumes come at the highest of these rates that keeps to it.
 BUDGET_BYTES = 9_000_000
 VOLUME_RATES_HZ = (12.5, 5.0, 2.5, 1.0, 0.5, 0.2)
+#: Hulls are hardly ever deflated below this share.
+_AT_BEST = 0.3
 
 
 class NumberBlock:
@@ -42,7 +44,7 @@ class NumberBlock:
 
         Where a value is too large for 16 bits, all steps are larger.
         """
-        table = np.asarray(values, dtype=float).reshape(len(values), -1)
+        table = np.asarray(values, dtype=float).reshape(len(values), math.prod(values.shape[1:]))
         finite = np.isfinite(table)
         unit = max(unit, float(np.abs(table[finite]).max(initial=0.0)) / _LARGEST)
         counts = np.where(finite, np.round(np.where(finite, table, 0.0) / unit), MISSING).astype(np.int64)
@@ -53,7 +55,7 @@ class NumberBlock:
 
     def deflated(self) -> bytes:
         """All of it as a zlib stream."""
-        return zlib.compress(b"".join(self._parts), 9)
+        return zlib.compress(b"".join(self._parts), 6)
 
 
 def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tuple[str, str]:
@@ -80,7 +82,6 @@ def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tupl
         "entries": volumes.entries,
     }
     header["entries"] = block.entries
-    header["bytes"] = [len(motion), 0]
     packed = volumes.deflated()
     header["bytes"] = [len(motion), len(packed)]
     text = json.dumps(header, sort_keys=True, separators=(",", ":"), allow_nan=False)
@@ -139,10 +140,14 @@ def _add_track(block: NumberBlock, name: str, track: MethodTrack) -> None:
 
 def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, VolumeTrack, float | None]:
     """The volumes at the highest rate that fits into so many deflated bytes; None: at no rate."""
-    for rate_hz in VOLUME_RATES_HZ:
-        hulls = volumes.rows(_at_rate(volumes.t_ns, rate_hz))
+    counts = np.diff(volumes.offsets)
+    for rate_hz in VOLUME_RATES_HZ if len(volumes.t_ns) else ():
+        rows = _at_rate(volumes.t_ns, rate_hz)
+        if _AT_BEST * 6 * counts[rows].sum() > left:
+            continue
+        hulls = volumes.rows(rows)
         block = _hulls(hulls)
-        if len(hulls.t_ns) and len(block.deflated()) <= left:
+        if len(block.deflated()) <= left:
             return block, hulls, rate_hz
     nothing = volumes.rows(np.zeros(0, np.int64))
     return _hulls(nothing), nothing, None

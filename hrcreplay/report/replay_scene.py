@@ -137,8 +137,10 @@ def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, 
     step_ns = round(1e9 / RATE_HZ)
     t_ns = first + step_ns * np.arange((last - first) // step_ns + 1)
     parts = tuple(part for part in radii_m if run.body is not None and f"{part}_0_x" in run.body)
-    tables = {method: run.motion if prefix == "plan" else run.baselines[method] for method, prefix in
-              method_prefixes(run).items()}
+    tables = {
+        method: run.motion if prefix == "plan" else run.baselines[method]
+        for method, prefix in method_prefixes(run).items()
+    }
     slow = float(run.meta.get("settings", {}).get("report", {}).get("stationary_m_per_s", 1e-3))
     return ReplayScene(
         t0_ns=t0_ns,

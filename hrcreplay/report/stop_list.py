@@ -52,8 +52,9 @@ def _stops(motion: pd.DataFrame, t0_ns: int, slow: float) -> list[StopEvent]:
     moving = is_moving(motion, slow)
     braking = motion["status"].astype(str).to_numpy() == "braking"
     speed, distance = (numeric_column(motion, name) for name in ("tcp_speed", "distance_m"))
+    stopping = braking & moving
     found = []
-    for first, last in _merged(braking & moving, t_ns):
+    for first, last in _merged(stopping, t_ns):
         goes_on = np.flatnonzero(moving[last:])
         again = last + int(goes_on[0]) if len(goes_on) else len(t_ns)
         row = motion.iloc[first]
@@ -61,7 +62,7 @@ def _stops(motion: pd.DataFrame, t0_ns: int, slow: float) -> list[StopEvent]:
             StopEvent(
                 kind="stop",
                 at_s=float((t_ns[first] - t0_ns) * 1e-9),
-                moving_s=float(lasts_s[first:last][moving[first:last]].sum()),
+                moving_s=float(lasts_s[first:last][stopping[first:last]].sum()),
                 rest_s=float(lasts_s[last:again].sum()),
                 speed_m_per_s=float(speed[first]),
                 distance_m=float(distance[first]),

@@ -70,14 +70,15 @@ def _cost_in_short(run: Run, metrics: Metrics) -> str:
     cost = "What it would have cost the task is not known"
     if pace is not None:
         cost = f"The task would have run at {100 * pace:.0f} % of its pace"
-        cost += f", {1 / pace:.1f} times as long" if 0.05 < pace < 0.95 else ""
+        if 0.05 < pace < 0.95:
+            cost = f"The task would have taken {1 / pace:.1f} times as long ({100 * pace:.0f} % of its pace)"
     if "none" not in run.baselines:
         return f"{cost}."
     touch = metrics["baseline_none_touch_moving_s"]["value"]
     if not touch:
         return f"{cost}; without a controller the robot would not have touched the person either."
     speed = text_of(metrics["baseline_none_touch_contact_speed_max_m_per_s"])
-    return f"{cost}; without a controller the robot would have hit the person, at up to {speed}."
+    return f"{cost}; without a controller the robot would have hit the person at up to {speed}."
 
 
 def _centimetres(metres: float) -> str:

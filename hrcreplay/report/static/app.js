@@ -54,7 +54,7 @@ export async function start(root) {
       ["status", status + (reason && status !== "tracking" ? ` (${reason})` : "")],
       ["speed", `${number("tcp_speed").toFixed(2)} of ${number("ref_speed").toFixed(2)} m/s`],
       ["to the body", near.body ? `${centimetres(number("body_m"))}: ${near.body.link} – ${near.body.limb}` : "not known"],
-      ["to the reachable", centimetres(number("distance_m"))],
+      ["to the volumes", centimetres(number("distance_m"))],
       ["predicted for", Number.isFinite(number("horizon_s")) ? `${Math.round(1000 * number("horizon_s"))} ms` : "–"],
     ];
     const certified = number("certified");

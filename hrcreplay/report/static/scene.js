@@ -40,6 +40,33 @@ class Capsules {
   }
 }
 
+// A line with a width: a rod for each piece that is long enough to be seen.
+class Way {
+  constructor(most, radius, material) {
+    Object.assign(this, { most, radius });
+    this.mesh = new THREE.InstancedMesh(new THREE.CylinderGeometry(1, 1, 1, 8, 1, true).rotateX(Math.PI / 2), material, most);
+    this.mesh.frustumCulled = false;
+  }
+
+  // ``shortest``: pieces up to this length are joined.
+  show(points, { pairs = false, shortest = 0 } = {}) {
+    const M = new THREE.Matrix4(), turn = new THREE.Quaternion(), along = new THREE.Vector3();
+    let count = 0, last = points[0];
+    for (let k = 1; k < points.length && count < this.most; k += pairs ? 2 : 1) {
+      if (pairs) last = points[k - 1];
+      const length = along.copy(points[k]).sub(last).length();
+      if (!(length > shortest)) continue;
+      turn.setFromUnitVectors(UP, along.divideScalar(length));
+      M.compose(points[k].clone().add(last).multiplyScalar(0.5), turn, new THREE.Vector3(this.radius, this.radius, length));
+      this.mesh.setMatrixAt(count++, M);
+      last = points[k];
+    }
+    this.mesh.count = count;
+    this.mesh.visible = count > 0;
+    this.mesh.instanceMatrix.needsUpdate = true;
+  }
+}
+
 // Directions spread over the unit sphere, and the triangles between them.
 function sphere(detail) {
   const soup = new THREE.IcosahedronGeometry(1, detail).getAttribute("position");
@@ -85,24 +112,6 @@ class Volume {
   }
 }
 
-function line(colour, options = {}) {
-  const Material = options.dashed ? THREE.LineDashedMaterial : THREE.LineBasicMaterial;
-  const dashes = options.dashed ? { dashSize: 0.02, gapSize: 0.015 } : {};
-  const material = new Material({ color: colour, depthTest: !options.onTop, transparent: true, opacity: options.opacity ?? 1, ...dashes });
-  const made = new (options.pieces ? THREE.LineSegments : THREE.Line)(new THREE.BufferGeometry(), material);
-  made.frustumCulled = false;
-  if (options.onTop) made.renderOrder = 10;
-  return made;
-}
-
-function setLine(made, points) {
-  made.visible = points.length > 1;
-  if (!made.visible) return;
-  made.geometry.dispose();
-  made.geometry = new THREE.BufferGeometry().setFromPoints(points);
-  if (made.material.isLineDashedMaterial) made.computeLineDistances();
-}
-
 export class ReplayView {
   constructor(canvas, data, colours) {
     this.data = data;
@@ -118,7 +127,7 @@ export class ReplayView {
     sun.position.set(2, -3, 5);
     this.scene.add(sun);
     const solid = () => new THREE.MeshStandardMaterial({ roughness: 0.65, metalness: 0.05 });
-    const glass = (opacity) => new THREE.MeshStandardMaterial({ roughness: 0.9, transparent: true, opacity, depthWrite: false });
+    const glass = (opacity) => new THREE.MeshStandardMaterial({ roughness: 0.9, transparent: true, opacity, depthWrite: false, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
     this.materials = { robot: solid(), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid() };
     this.robot = new Capsules(header.robot.radius_m, this.materials.robot);
     this.stop = new Capsules(header.robot.radius_m, this.materials.stop);
@@ -128,23 +137,25 @@ export class ReplayView {
     this.volumeGroup = new THREE.Group();
     this.volumes.forEach((volume) => this.volumeGroup.add(volume.mesh));
     const [bx, by, bz] = header.robot.base_m;
-    this.base = new THREE.Mesh(new THREE.CylinderGeometry(0.14, 0.2, Math.max(bz, 0.02), 32).rotateX(Math.PI / 2), this.materials.base);
-    this.base.position.set(bx, by, bz / 2);
-    this.lines = {
-      bones: line(0, { pieces: true, onTop: true }),
-      programmed: line(0, { opacity: 0.9 }),
-      driven: line(0, { opacity: 0.95 }),
-      stopPath: line(0, { onTop: true }),
-      toBody: line(0, { onTop: true }),
-      toVolume: line(0, { onTop: true, dashed: true }),
+    const [first] = header.robot.ends_m[0]; // the pedestal goes up to the first link where that stands above the base
+    const top = Math.max(Math.hypot(first[0] - bx, first[1] - by) < 0.05 ? first[2] : bz, 0.02);
+    this.base = new THREE.Mesh(new THREE.CylinderGeometry(0.13, 0.19, top, 32).rotateX(Math.PI / 2), this.materials.base);
+    this.base.position.set(bx, by, top / 2);
+    const way = (most, radius, onTop) => {
+      const made = new Way(most, radius, new THREE.MeshBasicMaterial({ depthTest: !onTop, transparent: onTop }));
+      if (onTop) made.mesh.renderOrder = 10;
+      return made;
     };
-    this.dots = new THREE.Points(
-      new THREE.BufferGeometry(), new THREE.PointsMaterial({ size: 7, sizeAttenuation: false, depthTest: false }),
-    );
-    this.dots.frustumCulled = false;
-    this.dots.renderOrder = 11;
+    this.lines = {
+      bones: way(header.bones.length, 0.006, true),
+      programmed: way(2000, 0.005, false),
+      driven: way(1000, 0.007, false),
+      stopPath: way(32, 0.006, true),
+      toBody: way(1, 0.006, true),
+      toVolume: way(1, 0.006, true),
+    };
     this.scene.add(
-      this.robot.group, this.stop.group, this.person.group, this.volumeGroup, this.base, this.dots, ...Object.values(this.lines),
+      this.robot.group, this.stop.group, this.person.group, this.volumeGroup, this.base, ...Object.values(this.lines).map((one) => one.mesh),
     );
     this.shown = { person: true, volumes: true, skeleton: true, stop: true, paths: true, distance: true };
     this.paint(colours);
@@ -156,8 +167,7 @@ export class ReplayView {
     const { materials, lines } = this;
     this.scene.background = new THREE.Color(colours.stage);
     for (const [name, material] of Object.entries(materials)) material.color.set(colours[name]);
-    for (const [name, one] of Object.entries(lines)) one.material.color.set(colours[name]);
-    this.dots.material.color.set(colours.toBody);
+    for (const [name, one] of Object.entries(lines)) one.mesh.material.color.set(colours[name]);
     if (this.grid) {
       this.scene.remove(this.grid);
       this.grid.dispose();
@@ -182,13 +192,15 @@ export class ReplayView {
     const base = new THREE.Vector3(...header.robot.base_m);
     box.expandByPoint(base);
     const centre = box.getCenter(new THREE.Vector3());
-    const person = new THREE.Vector3(), size = Math.max(1.6, box.getSize(new THREE.Vector3()).length());
+    const person = new THREE.Vector3(), size = box.getSize(new THREE.Vector3());
     between(body, Math.floor(header.count / 2)).slice(0, 3).forEach((x, i) => person.setComponent(i, x));
     const towards = Number.isFinite(person.x) ? person.sub(base).setZ(0).normalize() : new THREE.Vector3(1, 0, 0);
     const side = new THREE.Vector3(towards.y, -towards.x, 0).addScaledVector(towards, 0.35).normalize();
-    this.controls.target.copy(centre).setZ(Math.max(0.7, centre.z - 0.1));
-    const far = (1.25 * size) / Math.min(1.25, Math.max(0.75, this.camera.aspect));
-    this.camera.position.copy(this.controls.target).addScaledVector(side, far).addScaledVector(UP, 0.42 * far);
+    this.controls.target.copy(centre).setZ(Math.max(0.8, centre.z - 0.15));
+    const tall = 1.25, wide = 0.5 * Math.hypot(size.x, size.y) + 0.25; // what must be seen to all sides [m]
+    const slope = Math.tan((this.camera.fov * Math.PI) / 360);
+    const far = Math.max(tall / slope, wide / (slope * this.camera.aspect));
+    this.camera.position.copy(this.controls.target).addScaledVector(side, 0.92 * far).addScaledVector(UP, 0.38 * far);
     this.controls.update();
   }
 
@@ -211,7 +223,7 @@ export class ReplayView {
     const goes = Math.max(...q.map((x, i) => Math.abs(stopQ[i] - x)));
     this.stop.group.visible = shown.stop && goes > 2e-3;
     if (this.stop.group.visible) this.stop.show(posed(header.robot, stopQ).ends);
-    setLine(lines.stopPath, this.stop.group.visible ? this.wayOfTheStop(q, stopQ) : []);
+    lines.stopPath.show(this.stop.group.visible ? this.wayOfTheStop(q, stopQ) : []);
     const body = this.bodyEnds(at);
     this.person.group.visible = shown.person && body.length > 0;
     if (this.person.group.visible) this.person.show(body);
@@ -239,7 +251,7 @@ export class ReplayView {
     const row = between(this.data.motion("points"), at);
     const points = this.data.header.bones.flat().map((k) => new THREE.Vector3(row[3 * k], row[3 * k + 1], row[3 * k + 2]));
     const known = points.every((point) => Number.isFinite(point.x));
-    setLine(this.lines.bones, this.shown.skeleton && known ? points : []);
+    this.lines.bones.show(this.shown.skeleton && known ? points : [], { pairs: true });
   }
 
   showVolumes(t_s) {
@@ -268,8 +280,9 @@ export class ReplayView {
       }
       return found;
     };
-    setLine(this.lines.programmed, this.shown.paths ? piece("ref_m", at - 8 * rate, at + 8 * rate) : []);
-    setLine(this.lines.driven, this.shown.paths ? piece("tcp_m", at - 8 * rate, at) : []);
+    const seen = { shortest: 0.008 };
+    this.lines.programmed.show(this.shown.paths ? piece("ref_m", at - 8 * rate, at + 8 * rate) : [], seen);
+    this.lines.driven.show(this.shown.paths ? piece("tcp_m", at - 8 * rate, at) : [], seen);
   }
 
   // Lines from the robot's surface to the nearest body part and to the nearest volume.
@@ -294,10 +307,8 @@ export class ReplayView {
       }
     });
     const { toBody, toVolume } = this.lines, on = this.shown.distance;
-    setLine(toBody, on && found.body ? [found.body.from, found.body.to] : []);
-    setLine(toVolume, on && found.volume && found.volume.distance > 0 ? [found.volume.from, found.volume.to] : []);
-    this.dots.visible = toBody.visible;
-    if (toBody.visible) this.dots.geometry.setFromPoints([found.body.from, found.body.to]);
+    toBody.show(on && found.body ? [found.body.from, found.body.to] : []);
+    toVolume.show(on && found.volume && found.volume.distance > 0 ? [found.volume.from, found.volume.to] : []);
     return found;
   }
 
