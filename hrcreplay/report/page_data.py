@@ -19,6 +19,7 @@ import numpy as np
 from hrcreplay.records import Floats, Ints
 from hrcreplay.report.drawing import BONES
 from hrcreplay.report.limbs import part_name_text
+from hrcreplay.report.metrics import seconds_from
 from hrcreplay.report.replay_scene import RATE_HZ, SHOWN_POINTS, MethodTrack, ReplayScene, VolumeTrack
 
 #: Stored for NaN.
@@ -78,7 +79,7 @@ def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tupl
         "limbs": list(scene.volumes.limbs),
         "limb_names": [part_name_text(limb) for limb in scene.volumes.limbs],
         "rate_hz": rate_hz,
-        "at_s": _rounded((hulls.t_ns - scene.t0_ns) * 1e-9),
+        "at_s": [round(at_s, 4) for at_s in seconds_from(hulls.t_ns, scene.t0_ns).tolist()],
         "entries": volumes.entries,
     }
     header["entries"] = block.entries
@@ -174,7 +175,3 @@ def _hulls(hulls: VolumeTrack) -> NumberBlock:
     block.add("radius", hulls.radius_m, 1e-3)
     block.add("horizon", hulls.horizon_s, 1e-3)
     return block
-
-
-def _rounded(values: Floats) -> list[float]:
-    return [round(float(value), 4) for value in values]

@@ -13,7 +13,7 @@ from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
 from hrcreplay.report.drawing import BONES
 from hrcreplay.report.metrics import seconds_from, times
 from hrcreplay.report.metrics_contact import method_prefixes
-from hrcreplay.report.metrics_plan import numeric_column, position_columns
+from hrcreplay.report.metrics_plan import numeric_column
 from hrcreplay.report.stop_list import StopEvent, stop_events
 from hrcreplay.robot.control.stopping import axis_by_axis
 from hrcreplay.robot.model import RobotModel
@@ -196,7 +196,7 @@ def volume_track(occupancy: pd.DataFrame | None) -> VolumeTrack:
     counts = np.array([len(flat) // 3 for flat in occupancy["vertices"]], dtype=np.int64)
     return VolumeTrack(
         t_ns=times(occupancy),
-        limb=occupancy["limb"].astype(str).map({limb: i for i, limb in enumerate(limbs)}).to_numpy(dtype=np.int64),
+        limb=np.array([limbs.index(limb) for limb in occupancy["limb"]], dtype=np.int64),
         radius_m=numeric_column(occupancy, "radius_m"),
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         vertices_m=np.concatenate(list(occupancy["vertices"])).reshape(-1, 3),

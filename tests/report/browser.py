@@ -18,7 +18,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 _OPTIONS = (
     *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader"),
     *("--enable-unsafe-swiftshader", "--remote-debugging-port=0", "--remote-allow-origins=*", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update"),
+    *("--disable-background-networking", "--disable-component-update", "--hide-scrollbars"),
 )
 _KEY_CODES = {" ": ("Space", 32), "Home": ("Home", 36), "End": ("End", 35)}
 _KEY_CODES |= {f"Arrow{name}": (f"Arrow{name}", 37 + i) for i, name in enumerate(("Left", "Up", "Right", "Down"))}
@@ -70,10 +70,14 @@ class Tab:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def open(self, page: Path, width: int, height: int, theme: str = "light") -> None:
-        """Opens a page and waits until its replay stands, or says why it cannot."""
+    def look(self, width: int, height: int, theme: str = "light") -> None:
+        """Gives the window a size, and the system a theme."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
+
+    def open(self, page: Path, width: int, height: int) -> None:
+        """Opens a page and waits until its replay stands, or says why it cannot."""
+        self.look(width, height)
         self.call("Page.navigate", url=page.as_uri())
         ready = "document.querySelector('.replay-ready, .replay-off')"
         self.evaluate(
@@ -83,7 +87,7 @@ class Tab:
 
     def press(self, key: str) -> None:
         """Presses and lets go a key."""
-        code, number = _KEY_CODES.get(key, (f"Key{key.upper()}", ord(key.upper())))
+        code, number = _KEY_CODES[key] if key in _KEY_CODES else (f"Key{key.upper()}", ord(key.upper()))
         text = {"text": key} if len(key) == 1 else {}
         for kind in ("keyDown", "keyUp"):
             self.call(
@@ -105,7 +109,7 @@ def opened(program: str, profile: Path) -> Iterator[Tab]:
         assert process.stderr is not None
         line = next(line for line in process.stderr if "DevTools listening on" in line)
         port = line.split("127.0.0.1:")[1].split("/")[0]
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=30) as answer:  # noqa: S310  our own
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=30) as answer:
             tabs = json.load(answer)
         yield Tab(next(tab["webSocketDebuggerUrl"] for tab in tabs if tab["type"] == "page"))
     finally:

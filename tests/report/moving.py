@@ -31,7 +31,7 @@ def joints(t_s: Floats) -> tuple[Floats, Floats]:
     """(n, 6) joint positions and velocities in closed form [rad, rad/s]."""
     rate, phase = 0.3 + 0.1 * np.arange(6), np.arange(6)
     angle = t_s[:, None] * rate + phase
-    return 0.7 * np.sin(angle), 0.7 * rate * np.cos(angle)
+    return 0.7 * np.sin(angle), np.asarray(0.7 * rate * np.cos(angle), dtype=np.float64)
 
 
 def moving_run(seconds: float = 8.0) -> Run:

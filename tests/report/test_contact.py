@@ -117,10 +117,10 @@ def test_a_reason_to_stand_is_told(run: Run, tmp_path: Path) -> None:
 def test_the_first_sentences_of_a_robot_that_touched_nobody(run: Run, tmp_path: Path) -> None:
     found = verdict.verdict(run, metrics_of(run))
     assert found is not None
-    assert found.sentences == (
-        "With this controller, the moving robot would never have touched the person: it kept 30 cm away or more.",
-        f"{found.sentences[1].split(';')[0]}; without a controller the robot would have hit the person at up to 0.298 m/s.",
+    assert found.sentences[0] == (
+        "With this controller, the moving robot would never have touched the person: it kept 30 cm away or more."
     )
+    assert found.sentences[1].endswith("; without a controller the robot would have hit the person at up to 0.298 m/s.")
     pace = metrics_of(run)["plan_progress_share"]["value"]
     assert found.sentences[1].startswith(
         f"The task would have taken {1 / pace:.1f} times as long ({100 * pace:.0f} % of its pace);"

@@ -126,8 +126,8 @@ export class ReplayView {
     const sun = new THREE.DirectionalLight(0xffffff, 1.6);
     sun.position.set(2, -3, 5);
     this.scene.add(sun);
-    const solid = () => new THREE.MeshStandardMaterial({ roughness: 0.65, metalness: 0.05 });
-    const glass = (opacity) => new THREE.MeshStandardMaterial({ roughness: 0.9, transparent: true, opacity, depthWrite: false, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
+    const solid = () => new THREE.MeshLambertMaterial();
+    const glass = (opacity) => new THREE.MeshLambertMaterial({ transparent: true, opacity, depthWrite: false, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
     this.materials = { robot: solid(), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid() };
     this.robot = new Capsules(header.robot.radius_m, this.materials.robot);
     this.stop = new Capsules(header.robot.radius_m, this.materials.stop);
