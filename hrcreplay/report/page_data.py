@@ -143,7 +143,7 @@ def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, Volum
     """The volumes at the highest rate that fits into so many deflated bytes; None: at no rate."""
     counts = np.diff(volumes.offsets)
     for rate_hz in VOLUME_RATES_HZ if len(volumes.t_ns) else ():
-        rows = _at_rate(volumes.t_ns, rate_hz)
+        rows = at_rate(volumes.t_ns, rate_hz)
         if _AT_BEST * 6 * counts[rows].sum() > left:
             continue
         hulls = volumes.rows(rows)
@@ -154,7 +154,7 @@ def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, Volum
     return _hulls(nothing), nothing, None
 
 
-def _at_rate(t_ns: Ints, rate_hz: float) -> Ints:
+def at_rate(t_ns: Ints, rate_hz: float) -> Ints:
     """Rows of the first stored instant in each period."""
     if not len(t_ns):
         return np.zeros(0, np.int64)
