@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
@@ -120,6 +121,37 @@ def robot_geometry(robot: RobotModel) -> RobotGeometry:
         tcp_m=robot.pose(zero[0], zero[0]).T_world_tcp[:3, 3],
         base_m=robot.T_world_base[:3, 3],
     )
+
+
+def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floats]]:
+    """Where each axis brings what it moves, from the pose with all axes at zero: products of exponentials.
+
+    Args:
+        robot: Its screws.
+        q: (n, nv) [rad].
+
+    Yields:
+        For each axis, from the base on: n rotations and (n, 3) positions [m].
+    """
+    turned, at_m = Rotation.identity(len(q)), np.zeros((len(q), 3))
+    for angle, screw in zip(q.T, robot.screws, strict=True):
+        foot = np.cross(screw[3:], screw[:3])  # the axis' point nearest to the world's origin
+        turn = Rotation.from_rotvec(angle[:, None] * screw[3:])
+        at_m = at_m + turned.apply(foot - turn.apply(foot))
+        turned = turned * turn
+        yield turned, at_m
+
+
+def posed(robot: RobotGeometry, q: Floats) -> Floats:
+    """(n, s, 2, 3) ends of the links' axes in the world at joint positions (n, nv) [rad]; NaN where these are [m]."""
+    known = np.isfinite(q).all(axis=1)
+    ends = np.repeat(robot.ends_m[None], len(q), axis=0)
+    for axis, (turned, at_m) in enumerate(placements(robot, np.where(known[:, None], q, 0.0)), start=1):
+        for i in np.flatnonzero(robot.moved_by == axis).tolist():
+            for end in (0, 1):
+                ends[:, i, end] = turned.apply(robot.ends_m[i, end]) + at_m
+    ends[~known] = np.nan
+    return ends
 
 
 def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, float]) -> ReplayScene | None:

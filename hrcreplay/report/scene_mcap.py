@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 from foxglove import messages
 from mcap.writer import CompressionType, Writer
-from scipy.spatial.transform import Rotation
 
 from hrcreplay.geometry.capsule_distance import nearest_pair
 from hrcreplay.human.model import skeleton
@@ -23,7 +22,7 @@ from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.report import scene_messages as parts
 from hrcreplay.report.metrics import times
 from hrcreplay.report.page_data import at_rate
-from hrcreplay.report.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, RobotGeometry
+from hrcreplay.report.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, placements, posed
 from hrcreplay.report.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
 
 #: Stored volumes a second at most.
@@ -114,25 +113,6 @@ def _frame(method: str, axis: int, suffix: str) -> str:
     return f"{method}{suffix} axis {axis}" if axis else WORLD
 
 
-def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floats]]:
-    """Where each axis brings what it moves, from the pose with all axes at zero: products of exponentials.
-
-    Args:
-        robot: Its screws.
-        q: (n, nv) [rad].
-
-    Yields:
-        For each axis, from the base on: n rotations and (n, 3) positions [m].
-    """
-    turned, at_m = Rotation.identity(len(q)), np.zeros((len(q), 3))
-    for angle, screw in zip(q.T, robot.screws, strict=True):
-        foot = np.cross(screw[3:], screw[:3])  # the axis' point nearest to the world's origin
-        turn = Rotation.from_rotvec(angle[:, None] * screw[3:])
-        at_m = at_m + turned.apply(foot - turn.apply(foot))
-        turned = turned * turn
-        yield turned, at_m
-
-
 def _transforms(scene: ReplayScene) -> Iterator[Message]:
     """The frames of all axes of all methods, an update an instant."""
     frames: list[str] = []
@@ -162,7 +142,7 @@ def _transforms(scene: ReplayScene) -> Iterator[Message]:
                         rotation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw),
                     )
                     for frame, (x, y, z, qx, qy, qz, qw) in zip(frames, rows.tolist(), strict=True)
-                    if x == x  # NaN: the method has no such instant  # noqa: PLR0124
+                    if x == x  # NaN: the method has no such instant
                 ]
             ),
         )
@@ -208,12 +188,7 @@ def _distances(scene: ReplayScene) -> Iterator[Message]:
     if not len(scene.body_parts):
         return
     robot, track = scene.robot, next(iter(scene.methods.values()))
-    ends = np.repeat(robot.ends_m[None], len(scene.t_ns), axis=0)
-    for axis, (turned, at_m) in enumerate(placements(robot, track.q), start=1):
-        for i in np.flatnonzero(robot.moved_by == axis).tolist():
-            for end in (0, 1):
-                ends[:, i, end] = turned.apply(robot.ends_m[i, end]) + at_m
-    pair = nearest_pair(ends, robot.radius_m, scene.body_m, scene.body_radius_m)
+    pair = nearest_pair(posed(robot, track.q), robot.radius_m, scene.body_m, scene.body_radius_m)
     apart = pair.at_second_m - pair.at_first_m
     with np.errstate(invalid="ignore"):
         towards = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-12)

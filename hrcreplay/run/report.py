@@ -19,6 +19,7 @@ from hrcreplay.report.metrics_contact import add_contact
 from hrcreplay.report.metrics_data import add_fusion, add_occupancy, add_quality
 from hrcreplay.report.metrics_plan import add_plan
 from hrcreplay.report.replay_scene import ReplayScene, replay_scene
+from hrcreplay.report.scene_mcap import write_scene
 from hrcreplay.report.story import lines
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
@@ -48,7 +49,10 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
         tables.limit_table(job.tracking, use="tracking"),
         tables.radius_table(radii),
     ]
-    writer.text("report.html", page.render(run, found, folder, shown, scene=scene_of(job, run)))
+    scene = scene_of(job, run)
+    writer.text("report.html", page.render(run, found, folder, shown, scene=scene))
+    if scene is not None:
+        write_scene(writer.partial / "scene.mcap", scene, run.measurements)
 
 
 def scene_of(job: Job, run: Run) -> ReplayScene | None:

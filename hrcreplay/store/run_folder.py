@@ -278,7 +278,7 @@ class Stopwatch:
         return out
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, content: str | bytes) -> None:
     """Writes a new file beside its place and gives it its name when it is complete.
 
     Raises:
@@ -292,8 +292,8 @@ def write_whole(path: Path, text: str) -> None:
         raise SettingsError(f"{path}: cannot be written ({error.strerror}); name a folder that can") from error
     temporary = Path(name)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content.encode() if isinstance(content, str) else content)
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)  # mkstemp's 0600 would hide the file from colleagues

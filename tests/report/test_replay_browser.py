@@ -212,6 +212,7 @@ def test_the_theme_follows_the_system_and_the_switch(tab: Tab) -> None:
     assert tab.evaluate(colour) == light
     tab.evaluate("delete document.documentElement.dataset.theme")
     tab.look(1280, 900, theme="dark")
+    settled(tab)
     assert tab.evaluate(colour) == dark
     assert tab.evaluate("document.getElementById('theme').textContent") == "Light theme"
     assert picture(tab) != drawn
