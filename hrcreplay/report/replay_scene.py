@@ -144,7 +144,7 @@ def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floa
 
 def posed(robot: RobotGeometry, q: Floats) -> Floats:
     """(n, s, 2, 3) ends of the links' axes in the world at joint positions (n, nv) [rad]; NaN where these are [m]."""
-    known = np.isfinite(q).all(axis=1)
+    known = np.asarray(np.isfinite(q).all(axis=1))
     ends = np.repeat(robot.ends_m[None], len(q), axis=0)
     for axis, (turned, at_m) in enumerate(placements(robot, np.where(known[:, None], q, 0.0)), start=1):
         for i in np.flatnonzero(robot.moved_by == axis).tolist():

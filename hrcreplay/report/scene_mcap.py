@@ -20,6 +20,7 @@ from hrcreplay.geometry.capsule_distance import nearest_pair
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.report import scene_messages as parts
+from hrcreplay.report.drawing import BONES
 from hrcreplay.report.metrics import times
 from hrcreplay.report.page_data import at_rate
 from hrcreplay.report.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, placements, posed
@@ -69,7 +70,7 @@ def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | Non
                 channels[topic] = _channel(writer, topic, message)
             data = message.encode() if not isinstance(message, bytes) else message
             writer.add_message(channels[topic], log_time=t_ns, publish_time=t_ns, data=data)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 def _channel(writer: Writer, topic: str, message: Any) -> int:
@@ -102,7 +103,7 @@ def _robots(scene: ReplayScene) -> Iterator[Message]:
                     t_ns,
                     f"{where[1:]} {link}",
                     frame=_frame(name, int(robot.moved_by[i]), suffix),
-                    **capsule(*robot.ends_m[i], float(robot.radius_m[i]), rgba),
+                    **capsule(robot.ends_m[i], float(robot.radius_m[i]), rgba),
                 )
                 for i, link in enumerate(robot.links)
             ]
@@ -120,7 +121,7 @@ def _transforms(scene: ReplayScene) -> Iterator[Message]:
     plan = next(iter(scene.methods))
     for name, track in scene.methods.items():
         for suffix, q in (("", track.q), (" stop", track.stop_q)) if name == plan else (("", track.q),):
-            known = np.isfinite(q).all(axis=1)
+            known = np.asarray(np.isfinite(q).all(axis=1))
             for axis, (turned, at_m) in enumerate(placements(scene.robot, np.where(known[:, None], q, 0.0)), start=1):
                 frames.append(_frame(name, axis, suffix))
                 rows = np.column_stack([np.round(at_m, 5), np.round(turned.as_quat(canonical=True), 6)])
@@ -154,7 +155,7 @@ def _person(scene: ReplayScene) -> Iterator[Message]:
         messages.PackedElementField(name=axis, offset=4 * i, type=messages.PackedElementFieldNumericType.Float32)
         for i, axis in enumerate("xyz")
     ]
-    pairs = [[SHOWN_POINTS.index(a), SHOWN_POINTS.index(b)] for a, b in parts.BONES]
+    pairs = [[SHOWN_POINTS.index(a), SHOWN_POINTS.index(b)] for a, b in BONES]
     shown, body = np.round(scene.points_m, 3), np.round(scene.body_m, 3)
     origin = parts.pose(np.zeros(3))
     for i, t_ns in enumerate(scene.t_ns.tolist()):

@@ -79,8 +79,9 @@ def bones(points_m: Floats, rgba: Rgba = PERSON) -> Any:
     return lines(points_m[pairs], 0.02, rgba)
 
 
-def capsule(a: Floats, b: Floats, radius_m: float, rgba: Rgba) -> dict[str, list[Any]]:
-    """The primitives of a capsule between two (3,) points."""
+def capsule(ends_m: Floats, radius_m: float, rgba: Rgba) -> dict[str, Any]:
+    """The primitives of a capsule between two points, (2, 3) [m]."""
+    a, b = ends_m
     size = 2.0 * radius_m
     ball = messages.Vector3(x=size, y=size, z=size)
     rod = messages.CylinderPrimitive(

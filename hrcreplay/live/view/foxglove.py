@@ -85,7 +85,7 @@ class FoxgloveStream:
 
     def _robot(self, now: Scene) -> list[Any]:
         links = zip(self._cast["links"], self._cast["radii_m"], now.ends_m, strict=True)
-        return [entity(now.t_ns, f"robot {link}", **capsule(*ends, radius_m, ROBOT)) for link, radius_m, ends in links]
+        return [entity(now.t_ns, f"robot {link}", **capsule(ends, radius_m, ROBOT)) for link, radius_m, ends in links]
 
 
 def mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, np.ndarray[Any, Any]]:
