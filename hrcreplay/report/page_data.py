@@ -15,19 +15,28 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hrcreplay.records import Floats, Ints
 from hrcreplay.report.drawing import BONES
 from hrcreplay.report.limbs import part_name_text
 from hrcreplay.report.metrics import seconds_from
-from hrcreplay.report.replay_scene import RATE_HZ, SHOWN_POINTS, MethodTrack, ReplayScene, VolumeTrack
+from hrcreplay.report.replay_scene import (
+    RATE_HZ,
+    SHOWN_POINTS,
+    VOLUME_HZ,
+    MethodTrack,
+    ReplayScene,
+    VolumeTrack,
+    at_rate,
+)
 
 #: Stored for NaN.
 MISSING = -32768
 _LARGEST = 32767
 #: The block may take so many bytes in base64; the volumes come at the highest of these rates that keeps to it.
 BUDGET_BYTES = 9_000_000
-VOLUME_RATES_HZ = (12.5, 5.0, 2.5, 1.0, 0.5, 0.2)
+VOLUME_RATES_HZ = (VOLUME_HZ, 5.0, 2.5, 1.0, 0.5, 0.2)
 #: Hulls are hardly ever deflated below this share.
 _AT_BEST = 0.3
 
@@ -45,18 +54,24 @@ class NumberBlock:
 
         Where a value is too large for 16 bits, all steps are larger.
         """
-        table = np.asarray(values, dtype=float).reshape(len(values), math.prod(values.shape[1:]))
-        finite = np.isfinite(table)
-        unit = max(unit, float(np.abs(table[finite]).max(initial=0.0)) / _LARGEST)
-        counts = np.where(finite, np.round(np.where(finite, table, 0.0) / unit), MISSING).astype(np.int64)
-        steps = np.diff(counts, axis=0, prepend=0).astype(np.uint16).T.ravel()  # modulo 2^16
+        table = np.asarray(values).reshape(len(values), math.prod(values.shape[1:]))
+        largest = max((float(np.abs(column[np.isfinite(column)]).max(initial=0.0)) for column in table.T), default=0.0)
+        unit = max(unit, largest / _LARGEST)
+        steps = np.array([_steps(column, unit) for column in table.T], dtype=np.uint16)
         self._parts += [(steps & 0xFF).astype(np.uint8).tobytes(), (steps >> 8).astype(np.uint8).tobytes()]
         self.entries[name] = {"at": self._at, "rows": len(table), "columns": table.shape[1], "unit": unit}
-        self._at += 2 * len(steps)
+        self._at += 2 * steps.size
 
     def deflated(self) -> bytes:
         """All of it as a zlib stream."""
         return zlib.compress(b"".join(self._parts), 6)
+
+
+def _steps(column: NDArray[Any], unit: float) -> NDArray[np.uint16]:
+    """(n,) the differences of a column's counts, modulo 2^16."""
+    finite = np.isfinite(column)
+    counts = np.where(finite, np.round(np.where(finite, column, 0.0) / unit), MISSING).astype(np.int32)
+    return np.diff(counts, prepend=0).astype(np.uint16)
 
 
 def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tuple[str, str]:
@@ -152,16 +167,6 @@ def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, Volum
             return block, hulls, rate_hz
     nothing = volumes.rows(np.zeros(0, np.int64))
     return _hulls(nothing), nothing, None
-
-
-def at_rate(t_ns: Ints, rate_hz: float) -> Ints:
-    """Rows of the first stored instant in each period."""
-    if not len(t_ns):
-        return np.zeros(0, np.int64)
-    instants = np.unique(t_ns)
-    period = np.floor((instants - instants[0]) * 1e-9 * rate_hz + 1e-6)
-    _, first = np.unique(period, return_index=True)
-    return np.flatnonzero(np.isin(t_ns, instants[first]))
 
 
 def _hulls(hulls: VolumeTrack) -> NumberBlock:

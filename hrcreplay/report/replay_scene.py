@@ -22,6 +22,8 @@ from hrcreplay.store.run_folder import Run
 
 #: Instants of the replay a second.
 RATE_HZ = 25.0
+#: Volumes of the replay a second at most.
+VOLUME_HZ = 12.5
 #: A row of a table that is older than this says nothing of an instant [s].
 _STALE_S = 0.2
 #: Body points of the fused person that are shown.
@@ -219,12 +221,23 @@ def _body(body: pd.DataFrame | None, parts: tuple[str, ...], at_ns: Ints) -> Flo
     return _pick(body, names, at_ns).reshape(len(at_ns), len(parts), 2, 3)
 
 
+def at_rate(t_ns: Ints, rate_hz: float) -> Ints:
+    """Rows of the first stored instant in each period."""
+    if not len(t_ns):
+        return np.zeros(0, np.int64)
+    instants = np.unique(t_ns)
+    period = np.floor((instants - instants[0]) * 1e-9 * rate_hz + 1e-6)
+    _, first = np.unique(period, return_index=True)
+    return np.flatnonzero(np.isin(t_ns, instants[first]))
+
+
 def volume_track(occupancy: pd.DataFrame | None) -> VolumeTrack:
-    """The stored volumes, in order of time."""
+    """The stored volumes, in order of time, at most ``VOLUME_HZ`` of them a second."""
     if occupancy is None or not len(occupancy):
         nothing, none = np.zeros(0), np.zeros(0, np.int64)
         return VolumeTrack(none, none, nothing, np.zeros(1, np.int64), np.zeros((0, 3)), nothing, ())
     limbs = tuple(dict.fromkeys(occupancy["limb"].astype(str)))
+    occupancy = occupancy.iloc[at_rate(times(occupancy), VOLUME_HZ)]
     counts = np.array([len(flat) // 3 for flat in occupancy["vertices"]], dtype=np.int64)
     return VolumeTrack(
         t_ns=times(occupancy),

@@ -5,6 +5,7 @@ The links hang on the frames of the axes that move them, so that each method's r
 
 from __future__ import annotations
 
+import heapq
 import json
 import math
 from collections.abc import Iterator
@@ -22,12 +23,11 @@ from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.report import scene_messages as parts
 from hrcreplay.report.drawing import BONES
 from hrcreplay.report.metrics import times
-from hrcreplay.report.page_data import at_rate
-from hrcreplay.report.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, placements, posed
+from hrcreplay.report.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, at_rate, placements, posed
 from hrcreplay.report.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
 
-#: Stored volumes a second at most.
-VOLUME_HZ = 5.0
+#: Volumes a second at most.
+_VOLUME_HZ = 5.0
 _CHUNK_BYTES = 1024 * 1024
 _STOP: Rgba = (0.80, 0.20, 0.15, 0.35)
 _OTHER: Rgba = (0.45, 0.50, 0.55, 0.35)
@@ -57,10 +57,10 @@ def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | Non
         scene: What moves.
         measurements: Rows of measurements.parquet: the skeletons of the cameras; None without them.
     """
-    found = [*_robots(scene), *_transforms(scene), *_person(scene), *_volumes(scene), *_distances(scene)]
-    found += [message for name, track in scene.methods.items() for message in _series(scene, name, track)]
-    found += _cameras(measurements)
-    found.sort(key=lambda message: message[1])  # stable: of one instant in the order of the topics above
+    streams = [_robots(scene), _transforms(scene), _person(scene), _volumes(scene), _distances(scene)]
+    streams += [_series(scene, name, track) for name, track in scene.methods.items()]
+    streams += _cameras(measurements)
+    found = heapq.merge(*streams, key=lambda message: message[1])  # of one instant in the order of the streams
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start(profile="", library="hrcreplay")  # the library's version would change the bytes
@@ -174,7 +174,7 @@ def _person(scene: ReplayScene) -> Iterator[Message]:
 
 def _volumes(scene: ReplayScene) -> Iterator[Message]:
     """The stored volumes, and none of a limb that is not predicted."""
-    stored = scene.volumes.rows(at_rate(scene.volumes.t_ns, VOLUME_HZ))
+    stored = scene.volumes.rows(at_rate(scene.volumes.t_ns, _VOLUME_HZ))
     for t_ns in np.unique(stored.t_ns).tolist():
         entities = []
         for k in np.flatnonzero(stored.t_ns == t_ns).tolist():
@@ -213,12 +213,16 @@ def _series(scene: ReplayScene, name: str, track: MethodTrack) -> Iterator[Messa
         yield topic, t_ns, json.dumps(row, sort_keys=True, separators=(",", ":")).encode()
 
 
-def _cameras(measurements: pd.DataFrame | None) -> Iterator[Message]:
-    """The skeletons that each camera's frames gave, by arrival."""
+def _cameras(measurements: pd.DataFrame | None) -> list[Iterator[Message]]:
+    """The skeletons that each camera's frames gave, by arrival, a stream a camera."""
     if measurements is None or not set(LENGTHS) <= set(measurements.columns):
-        return
-    for camera, rows in measurements.groupby("camera", sort=True):
-        at = np.round(skeleton(rows[list(JOINTS)].to_numpy(dtype=float), rows[list(LENGTHS)].to_numpy(dtype=float)), 3)
-        for t_ns, found in zip(times(rows, "arrival_ns").tolist(), at, strict=True):
-            shown = entity(t_ns, f"camera {camera}", lines=[bones(found, _CAMERA)])
-            yield f"/camera/{camera}", t_ns, messages.SceneUpdate(entities=[shown])
+        return []
+    return [_camera(str(camera), rows) for camera, rows in measurements.groupby("camera", sort=True)]
+
+
+def _camera(camera: str, rows: pd.DataFrame) -> Iterator[Message]:
+    rows = rows.sort_values("arrival_ns", kind="stable")
+    at = np.round(skeleton(rows[list(JOINTS)].to_numpy(dtype=float), rows[list(LENGTHS)].to_numpy(dtype=float)), 3)
+    for t_ns, found in zip(times(rows, "arrival_ns").tolist(), at, strict=True):
+        shown = entity(t_ns, f"camera {camera}", lines=[bones(found, _CAMERA)])
+        yield f"/camera/{camera}", t_ns, messages.SceneUpdate(entities=[shown])

@@ -224,7 +224,13 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
 
     def table(name: str) -> pd.DataFrame | None:
         path = folder / f"{name}.parquet"
-        return pq.read_table(path).to_pandas() if path.exists() else None
+        found = (
+            pq.read_table(path, pre_buffer=False).to_pandas(split_blocks=True, self_destruct=True)
+            if path.exists()
+            else None
+        )
+        pa.default_memory_pool().release_unused()
+        return found
 
     baselines = sorted(p.stem.removeprefix("motion_") for p in folder.glob("motion_*.parquet"))
     return Run(
