@@ -167,6 +167,8 @@ def test_scrubbing_changes_the_instant(tab: Tab) -> None:
     for kind in ("mousePressed", "mouseReleased"):
         tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
     assert instant(tab) == pytest.approx(0.25 * 7.96, abs=0.02)
+    line = tab.evaluate("document.querySelector('.plot-now').getBoundingClientRect().left")
+    assert line == pytest.approx(x, abs=2.0)
 
 
 def test_keys(tab: Tab, scene: ReplayScene) -> None:

@@ -45,7 +45,12 @@ export async function start(root) {
     plots.mark(state.t_s);
     tell(near);
     const current = lastNotAfter(events().map((event) => event.at_s), state.t_s + 1e-3);
-    root.querySelectorAll(".stops li").forEach((item, k) => item.classList.toggle("now", k === current));
+    if (current === state.current) return;
+    state.current = current;
+    const list = $(".stops ol");
+    [...list.children].forEach((item, k) => item.classList.toggle("now", k === current));
+    const now = list.children[current];
+    if (now) list.scrollTop = now.offsetTop - list.offsetTop - list.clientHeight / 3; // the list alone, not the page
   }
 
   function tell(near) {
@@ -118,6 +123,7 @@ export async function start(root) {
   }
 
   function listStops() {
+    state.current = null;
     const words = (event) => {
       const pair = event.link && event.limb ? `${event.link} – ${event.limb}` : event.link || event.limb;
       if (event.kind === "touch") return `touched: ${pair}, ${event.moving_s.toFixed(2)} s, up to ${event.speed_m_per_s.toFixed(2)} m/s`;

@@ -5,6 +5,8 @@ const PLOTS = [
   { title: "Distance from the robot's surface [m]", series: [["distance_m", "to all the person can reach", "volume"], ["body_m", "to the recorded body", "toBody"]], most: 2 },
 ];
 
+const WINDOW_S = 120; // of a longer log the plots show the part with the instant
+
 export class Plots {
   constructor(root, data, seek) {
     Object.assign(this, { root, data, seek, plots: [] });
@@ -16,6 +18,7 @@ export class Plots {
   show(method, colours, events) {
     this.plots.forEach(({ plot }) => plot.destroy());
     this.root.textContent = "";
+    this.part = null;
     this.plots = PLOTS.map(({ title, series, most }) => {
       const columns = series.map(([name]) => this.data.motion(`${method}/${name}`).values);
       const kept = series.map((one, k) => [one, columns[k]]).filter(([, values]) => values.some(Number.isFinite));
@@ -31,7 +34,7 @@ export class Plots {
         scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), Math.min(most ?? Infinity, (high ?? 1) * 1.05) || 1] } },
         axes: [{ ...axis, values: (_, ticks) => ticks.map((t) => `${t} s`) }, { ...axis, size: 44 }],
         series: [{}, ...kept.map(([[, label, colour]]) => ({ label, stroke: colours[colour], width: 1.4, spanGaps: false }))],
-        hooks: { drawClear: [(u) => shade(u, events, colours)] },
+        hooks: { drawClear: [(u) => shade(u, events, colours)], draw: [() => this.place()] },
       }, [this.seconds, ...kept.map(([, values]) => Array.from(values, (x) => (Number.isNaN(x) ? null : x)))], holder);
       const now = document.createElement("div");
       now.className = "plot-now";
@@ -56,13 +59,25 @@ export class Plots {
   }
 
   resize() {
+    this.part = null; // setSize shows all of it again
     this.plots.forEach(({ plot }) => plot.setSize(this.size()));
     this.mark(this.t_s ?? 0);
   }
 
   mark(t_s) {
     this.t_s = t_s;
-    for (const { plot, now } of this.plots) now.style.transform = `translateX(${plot.valToPos(t_s, "x")}px)`;
+    const first = this.seconds[0], last = this.seconds[this.seconds.length - 1];
+    const part = Math.floor((t_s - first) / WINDOW_S);
+    if (last - first > WINDOW_S && part !== this.part) {
+      this.part = part;
+      const min = Math.min(first + part * WINDOW_S, last - WINDOW_S);
+      for (const { plot } of this.plots) plot.setScale("x", { min, max: min + WINDOW_S });
+    }
+    this.place();
+  }
+
+  place() {
+    for (const { plot, now } of this.plots) now.style.transform = `translateX(${plot.valToPos(this.t_s, "x")}px)`;
   }
 }
 
@@ -70,6 +85,9 @@ export class Plots {
 function shade(u, events, colours) {
   const { ctx, bbox } = u;
   ctx.save();
+  ctx.beginPath();
+  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  ctx.clip();
   for (const { kind, at_s, moving_s } of events) {
     const from = u.valToPos(at_s, "x", true), to = u.valToPos(at_s + moving_s, "x", true);
     ctx.fillStyle = kind === "touch" ? colours.touch : colours.braking;
