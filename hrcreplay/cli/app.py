@@ -171,7 +171,51 @@ def _summarize(folder: Path) -> None:
 _stage("fuse", "Stage 1: merge the cameras' skeletons into one person (state.parquet).")
 _stage("predict", "Stages 1, 2: the space the person can reach within the braking time (occupancy.parquet).")
 _stage("plan", "Stages 1 to 3: what the robot would have done (motion.parquet).")
-_stage("report", "All stages, then metrics.json, figures and report.html.")
+
+
+@app.command()
+def report(
+    source: Source,
+    config: Config = None,
+    settings: Set = None,
+    topic: Topic = None,
+    limits: LimitSet = None,
+    cell: CellFile = None,
+    out: Out = None,
+    start: Start = None,
+    end: End = None,
+    smooth: Smooth = False,
+    chunk_ticks: Chunk = 250,
+    snapshot: Annotated[
+        float | None,
+        typer.Option(
+            "--snapshot",
+            metavar="SECONDS",
+            help="Of a run folder: only a still of its replay at that instant, PNG; --out names the file.",
+        ),
+    ] = None,
+) -> None:
+    """All stages, then metrics.json, figures, report.html with the 3-D replay, and scene.mcap."""
+    if snapshot is not None:
+        from hrcreplay.run.still import take_still
+
+        sys.stdout.write(f"{take_still(source, snapshot, out)}\n")
+        return
+    from hrcreplay.run import replay
+
+    folder = replay.run(
+        "report",
+        source,
+        out=out,
+        config=config,
+        overrides=as_overrides(settings, topic, limits),
+        cell_file=cell,
+        **span(start, end),
+        smooth=smooth,
+        chunk_ticks=chunk_ticks,
+    )
+    _summarize(folder)
+    sys.stdout.write(f"{folder}\n")
 
 
 @app.command()

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.spatial import cKDTree
 
 from hrcreplay.records import STATUSES, Bools, Floats, Ints
 from hrcreplay.report.metrics import MetricTable, durations_s, times
+from hrcreplay.report.path_feet import path_feet
 
 #: Less way than this is rounding [m].
 _ROUNDING_M = 1e-9
@@ -59,12 +59,12 @@ def foot(path: Programme, tcp_m: Floats, ahead_m: float) -> tuple[int, float]:
     Returns:
         The point of the path that was passed last, and the share of the way to the next one.
     """
-    passed, share, before = 0, 0.0, tcp_m[0]
-    for tick, (tcp, reference) in enumerate(zip(tcp_m, path.at.tolist(), strict=True), start=1):
-        waits = tick < len(tcp_m) and ((tcp - before) ** 2).sum() < _STEP_M**2
+    passed, share, before = 0, 0.0, tcp_m[0].tolist()
+    for tick, (here, reference) in enumerate(zip(tcp_m.tolist(), path.at.tolist(), strict=True), start=1):
+        waits = tick < len(tcp_m) and sum((a - b) ** 2 for a, b in zip(here, before, strict=True)) < _STEP_M**2
         if waits or passed == reference:
             continue
-        before = tcp
+        before, tcp = here, tcp_m[tick - 1]
         here_m = path.way_m[passed] + share * (path.way_m[passed + 1] - path.way_m[passed])
         end = min(reference, max(passed + 1, int(np.searchsorted(path.way_m, here_m + ahead_m))))
         start = path.points_m[passed:end]
@@ -152,32 +152,6 @@ def is_moving(motion: pd.DataFrame, slow_m_per_s: float) -> Bools:
     joints = [name for name in motion.columns if name.startswith("dq")]
     turning = (np.abs(motion[joints].to_numpy(dtype=float)) >= 1e-3).any(axis=1)
     return np.asarray((numeric_column(motion, "tcp_speed") >= slow_m_per_s) | turning)
-
-
-def path_feet(points: Floats, path: Floats) -> Floats:
-    """(n, 3) for each of (n, 3) points the nearest one of a (m, 3) polyline, all in one frame [m].
-
-    Searched on the two segments at the nearest vertex, which is exact where vertices are denser than the path bends.
-    """
-    path = path[np.isfinite(path).all(axis=1)]
-    feet = np.full(points.shape, np.nan)
-    known = np.isfinite(points).all(axis=1)
-    if not len(path) or not known.any():
-        return feet
-    at = points[known]
-    _, nearest = cKDTree(path).query(at)
-    best = path[nearest]
-    best_m = np.linalg.norm(at - best, axis=1)
-    for other in (np.maximum(nearest - 1, 0), np.minimum(nearest + 1, len(path) - 1)):
-        along = path[other] - path[nearest]
-        length2 = (along**2).sum(axis=1)
-        share = np.clip(((at - path[nearest]) * along).sum(axis=1) / np.where(length2 > 0, length2, 1.0), 0.0, 1.0)
-        foot = path[nearest] + share[:, None] * along
-        foot_m = np.linalg.norm(at - foot, axis=1)
-        better = foot_m < best_m
-        best, best_m = np.where(better[:, None], foot, best), np.where(better, foot_m, best_m)
-    feet[known] = best
-    return feet
 
 
 def deviation_m(motion: pd.DataFrame) -> Floats:

@@ -19,6 +19,8 @@ from hrcreplay.report import story
 from hrcreplay.report.limbs import limb_names_text
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
+from hrcreplay.report.replay_page import replay_part
+from hrcreplay.report.replay_scene import ReplayScene
 from hrcreplay.report.story import defect_notes
 from hrcreplay.report.tables import (
     CAMERA,
@@ -69,6 +71,7 @@ def render(
     *,
     stops: Sequence[PageTable] = (),
     title: str = "",
+    scene: ReplayScene | None = None,
 ) -> str:
     """The page of a run.
 
@@ -79,9 +82,10 @@ def render(
         tables: Tables 1 and 2 as used, shown with the prediction.
         stops: The longest stops, shown with the safety.
         title: Name of the session; none: the name of the first input.
+        scene: What the 3-D replay shows; None: the page has none.
 
     Returns:
-        HTML without scripts, requests, times or paths.
+        HTML without requests, times or paths.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(resources.files("hrcreplay.report").joinpath("page.html.j2").read_text("utf-8"))
@@ -90,6 +94,7 @@ def render(
         title=title or (inputs[0]["name"] if inputs else "a session"),
         subtitle=_subtitle(run, metrics),
         verdict=verdict(run, metrics),
+        replay=None if scene is None else replay_part(scene),
         answers=story.answers(run, metrics),
         cards=story.cards(run, metrics),
         parts=_parts(run, metrics, figures_dir, tables, stops),

@@ -31,6 +31,7 @@ class ContactSummary:
     """Two sentences on the chosen method, and all methods beside each other."""
 
     sentences: tuple[str, ...]
+    details: tuple[str, ...]  #: the same with places, instants and causes
     table: PageTable
 
 
@@ -38,7 +39,51 @@ def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
     """What the comparison with the recorded body says; None where there is none."""
     if run.motion is None or metrics["contact_person"]["value"] is None:
         return None
-    return ContactSummary((_touched(metrics), _cost(run, metrics)), _table(run, metrics))
+    return ContactSummary(
+        (_safe_in_short(metrics), _cost_in_short(run, metrics)),
+        (_touched(metrics), _cost(run, metrics)),
+        _table(run, metrics),
+    )
+
+
+def _safe_in_short(metrics: Metrics) -> str:
+    """Would the person have been safe? For who has no more time than that."""
+    touch, near = metrics["plan_touch_moving_ticks"]["value"], metrics["plan_body_distance_min_moving_m"]["value"]
+    if touch is None:
+        return "Nobody can say whether the robot would have touched the person: the recording does not show the person."
+    if touch:
+        speed = text_of(metrics["plan_touch_contact_speed_max_m_per_s"])
+        seconds = text_of(metrics["plan_touch_moving_s"])
+        return f"With this controller the moving robot would have touched the person: for {seconds}, at up to {speed}."
+    if near is None:
+        return "With this controller the robot would not have moved while the person was there."
+    known = "as far as the cameras saw the person, " if _as_measured(metrics) else ""
+    return (
+        f"With this controller, {known}the moving robot would never have touched the person: it kept "
+        f"{_centimetres(near)} away or more."
+    )
+
+
+def _cost_in_short(run: Run, metrics: Metrics) -> str:
+    """What would it have cost, and what without a controller?"""
+    pace = metrics["plan_progress_share"]["value"]
+    cost = "What it would have cost the task is not known"
+    if pace is not None:
+        cost = f"The task would have run at {100 * pace:.0f} % of its pace"
+        if 0.05 < pace < 0.95:
+            cost = f"The task would have taken {1 / pace:.1f} times as long ({100 * pace:.0f} % of its pace)"
+    if "none" not in run.baselines:
+        return f"{cost}."
+    touch = metrics["baseline_none_touch_moving_s"]["value"]
+    if not touch:
+        return f"{cost}; without a controller the robot would not have touched the person either."
+    speed = text_of(metrics["baseline_none_touch_contact_speed_max_m_per_s"])
+    return f"{cost}; without a controller the robot would have hit the person at up to {speed}."
+
+
+def _centimetres(metres: float) -> str:
+    """Rounded down: a distance is never made larger than it was."""
+    return f"{int(100 * metres)} cm"
 
 
 def _touched(metrics: Metrics) -> str:

@@ -27,7 +27,7 @@ from hrcreplay.run import build
 from hrcreplay.run.job import Job
 from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.run.recorded_person import RecordedPerson, recorded_person
-from hrcreplay.store.columns import Columns, contact_columns, read_states
+from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states
 from hrcreplay.store.run_folder import RunWriter
 
 #: Part of the body -> limb whose volume it has to be in.
@@ -35,6 +35,9 @@ VOLUME_OF = {part: "LEGS" if part in LEG_PARTS else part for part in PARTS}
 
 #: Of the ticks until a horizon, the last and one in so many are looked at: people do not tremble that fast.
 _EVERY = 4
+
+#: Rows of body.parquet a second, for those who draw it.
+_BODY_HZ = 25.0
 
 #: Limb -> vertices (m, 3) and radius of the volume around them [m].
 Volumes = Mapping[str, tuple[Floats, float]]
@@ -56,7 +59,11 @@ def write_contact(job: Job, log: Log, writer: RunWriter, T_world_base: Floats) -
     for path in sorted(writer.partial.glob("motion*.parquet")):
         method = path.stem.removeprefix("motion").removeprefix("_") or chosen
         motion = pq.read_table(path).to_pandas()
-        volumes = stored_volumes(writer, occupancy.stop_s) if path.stem == "motion" else iter(())
+        volumes: Iterator[tuple[int, float, Volumes]] = iter(())
+        if path.stem == "motion":
+            volumes = stored_volumes(writer, occupancy.stop_s)
+            shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(job.settings.fusion.rate_hz / _BODY_HZ))]
+            writer.table("body", body_columns(shown_ns, person.part_axes(shown_ns, occupancy.hand_m), PARTS))
         writer.table("contact", contact_table(job, robot, method, motion, person, predicted, volumes))
     writer.close_tables()
 

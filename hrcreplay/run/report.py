@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hrcreplay.human.body_capsules import PARTS, part_radii
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report import figures, page, tables
@@ -18,6 +19,8 @@ from hrcreplay.report.metrics import Metric, MetricTable
 from hrcreplay.report.metrics_contact import add_contact
 from hrcreplay.report.metrics_data import add_fusion, add_occupancy, add_quality
 from hrcreplay.report.metrics_plan import add_plan
+from hrcreplay.report.replay_scene import ReplayScene, replay_scene
+from hrcreplay.report.scene_mcap import write_scene
 from hrcreplay.report.story import lines
 from hrcreplay.report.tables import PageTable
 from hrcreplay.run import build
@@ -50,7 +53,19 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
         tables.limit_table(job.tracking, use="tracking"),
         tables.radius_table(radii),
     ]
-    writer.text("report.html", page.render(run, found, folder, shown, stops=stops))
+    scene = scene_of(job, run)
+    writer.text("report.html", page.render(run, found, folder, shown, stops=stops, scene=scene))
+    if scene is not None:
+        write_scene(writer.partial / "scene.mcap", scene, run.measurements)
+
+
+def scene_of(job: Job, run: Run) -> ReplayScene | None:
+    """What the 3-D replay of a run shows; None where it moved no robot."""
+    if run.motion is None or run.T_world_base is None:
+        return None
+    radii_m = part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
+    parts = dict(zip(PARTS, radii_m.tolist(), strict=True))
+    return replay_scene(run, build.robot(job, run.T_world_base), figures.start_ns(run), parts)
 
 
 def _stops(job: Job, run: Run, slow_m_per_s: float, found: dict[str, Metric]) -> tuple[PageTable, ...]:

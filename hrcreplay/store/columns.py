@@ -208,6 +208,12 @@ def contact_columns(
     }
 
 
+def body_columns(t_ns: Ints, axes_m: Floats, parts: tuple[str, ...]) -> Columns:
+    """A row an instant: (n, p, 2, 3) ends of the recorded body's capsules, world [m]; NaN where not known."""
+    names = [f"{part}_{end}_{axis}" for part in parts for end in (0, 1) for axis in "xyz"]
+    return {"t_ns": t_ns, **_spread(axes_m.reshape(len(t_ns), -1), names)}
+
+
 def _spread(array: Floats, names: tuple[str, ...] | list[str], suffix: str = "") -> Columns:
     return {f"{name}{suffix}": np.ascontiguousarray(array[:, i]) for i, name in enumerate(names)}
 

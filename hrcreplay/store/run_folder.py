@@ -176,6 +176,7 @@ class Run:
     occupancy: pd.DataFrame | None = None
     motion: pd.DataFrame | None = None
     contact: pd.DataFrame | None = None
+    body: pd.DataFrame | None = None
     baselines: dict[str, pd.DataFrame] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -223,7 +224,13 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
 
     def table(name: str) -> pd.DataFrame | None:
         path = folder / f"{name}.parquet"
-        return pq.read_table(path).to_pandas() if path.exists() else None
+        found = (
+            pq.read_table(path, pre_buffer=False).to_pandas(split_blocks=True, self_destruct=True)
+            if path.exists()
+            else None
+        )
+        pa.default_memory_pool().release_unused()
+        return found
 
     baselines = sorted(p.stem.removeprefix("motion_") for p in folder.glob("motion_*.parquet"))
     return Run(
@@ -235,6 +242,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
         occupancy=table("occupancy"),
         motion=table("motion"),
         contact=table("contact"),
+        body=table("body"),
         baselines={name: found for name in baselines if (found := table(f"motion_{name}")) is not None},
         counts=meta.get("counts", {}),
         notes=tuple(meta.get("notes", ())),
@@ -276,7 +284,7 @@ class Stopwatch:
         return out
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, content: str | bytes) -> None:
     """Writes a new file beside its place and gives it its name when it is complete.
 
     Raises:
@@ -290,8 +298,8 @@ def write_whole(path: Path, text: str) -> None:
         raise SettingsError(f"{path}: cannot be written ({error.strerror}); name a folder that can") from error
     temporary = Path(name)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content.encode() if isinstance(content, str) else content)
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)  # mkstemp's 0600 would hide the file from colleagues

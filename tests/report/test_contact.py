@@ -117,7 +117,15 @@ def test_a_reason_to_stand_is_told(run: Run, tmp_path: Path) -> None:
 def test_the_first_sentences_of_a_robot_that_touched_nobody(run: Run, tmp_path: Path) -> None:
     found = verdict.verdict(run, metrics_of(run))
     assert found is not None
-    touched, cost = found.sentences
+    assert found.sentences[0] == (
+        "With this controller, the moving robot would never have touched the person: it kept 30 cm away or more."
+    )
+    assert found.sentences[1].endswith("; without a controller the robot would have hit the person at up to 0.298 m/s.")
+    pace = metrics_of(run)["plan_progress_share"]["value"]
+    assert found.sentences[1].startswith(
+        f"The task would have taken {1 / pace:.1f} times as long ({100 * pace:.0f} % of its pace);"
+    )
+    touched, cost = found.details
     assert touched == (
         "Had this controller been running, no moving part of the robot would have touched the person: the smallest "
         "distance was 0.301 m, between its forearm and the person's trunk, 1.0 s after the start; that link then moved "
@@ -130,6 +138,7 @@ def test_the_first_sentences_of_a_robot_that_touched_nobody(run: Run, tmp_path: 
     assert [row[1] for row in found.table.rows] == ["0 ticks", "25 ticks", "50 ticks"]
     assert found.table.rows[1][2:6] == ("0.248 m/s", "\u22120.029 m", "0.248 / 0.124 m/s", "\u22120.004 m")
     html = rendered(run, tmp_path)
+    assert html.index(found.sentences[0]) < html.index(touched[:40])
     assert html.index(touched[:40]) < html.index("Robot against the recorded person") < html.index("What would it have")
     assert "At every tick of this replay, and certified." in html
 
@@ -141,6 +150,9 @@ def test_the_first_sentence_says_whose_fault_a_contact_is(run: Run) -> None:
     found = verdict.verdict(touching, metrics_of(touching))
     assert found is not None
     assert found.sentences[0] == (
+        "With this controller the moving robot would have touched the person: for 250 ms, at up to 0.248 m/s."
+    )
+    assert found.details[0] == (
         "Had this controller been running, the moving robot would have touched the person for 250 ms in all, at up to "
         "0.248 m/s; the deepest contact was of its tool and the person's right lower arm 1.2 s after the start; at 8 "
         "of these ticks the person was where the prediction said, so the robot is at fault; at 17 the person was not "
@@ -164,11 +176,12 @@ def test_a_limb_that_nobody_measured_is_said_before_all_else(run: Run) -> None:
     found = verdict.verdict(run, metrics)
     assert found is not None
     begin = "Had this controller been running, as far as the person was measured (never: right lower arm), no moving "
-    assert found.sentences[0].startswith(begin)
+    assert found.details[0].startswith(begin)
+    assert "as far as the cameras saw the person" in found.sentences[0]
     assert "never measured, so not known: the right lower arm" in found.table.note
     truth = verdict.verdict(run, metrics | {"contact_person": metrics_of(run)["contact_person"]})
     assert truth is not None
-    assert "as far as" not in truth.sentences[0]
+    assert "as far as" not in truth.sentences[0] + truth.details[0]
 
 
 def test_a_person_who_is_not_known_is_not_said_to_be_safe(run: Run) -> None:
@@ -178,7 +191,8 @@ def test_a_person_who_is_not_known_is_not_said_to_be_safe(run: Run) -> None:
     assert metrics["plan_touch_moving_ticks"]["value"] is None
     found = verdict.verdict(unknown, metrics)
     assert found is not None
-    assert "it is not known whether the robot would have touched the person" in found.sentences[0]
+    assert found.sentences[0].startswith("Nobody can say whether the robot would have touched the person")
+    assert "it is not known whether the robot would have touched the person" in found.details[0]
 
 
 def test_the_terminal_says_it_too(run: Run) -> None:

@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from hrcreplay.records import JOINTS
-from hrcreplay.report.metrics_plan import cycles, path_feet, waited_s
+from hrcreplay.report.metrics_plan import cycles, waited_s
+from hrcreplay.report.path_feet import path_feet
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import T0_NS, make_run
@@ -228,6 +229,23 @@ def test_distance_from_a_path_is_to_its_segments() -> None:
     feet = path_feet(points, path)
     assert feet[:3] == pytest.approx(np.array([[0.3, 0, 0], [1, 0.6, 0], [1, 0, 0]]))
     assert np.isnan(feet[3]).all()
+
+
+def test_distance_from_a_path_that_was_driven_many_times() -> None:
+    """Cycles in other phases of one curve, with standing: as near as to all of its segments, one by one.
+
+    The chords of another cycle are off by as much as a chord of 6 mm is off its arc.
+    """
+    rng = np.random.default_rng(5)
+    turn = np.sort(np.concatenate([2 * np.pi * np.arange(900) / 300.7, np.full(50, 2.0)]))
+    path = np.column_stack([np.cos(turn), np.sin(turn), 0.2 * np.sin(2 * turn)]) * 0.3
+    points = rng.normal(scale=0.3, size=(200, 3))
+    start, along = path[:-1], np.diff(path, axis=0)
+    length2 = np.maximum((along**2).sum(axis=1), 1e-300)
+    share = np.clip(((points[:, None] - start) * along).sum(axis=2) / length2, 0.0, 1.0)
+    want = np.linalg.norm(start + share[..., None] * along - points[:, None], axis=2).min(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(path_feet(points, path) - points, axis=1), want, atol=2e-5)
+    np.testing.assert_allclose(path_feet(path, path), path, atol=2e-5)
 
 
 def test_a_reference_waits_where_its_time_stands() -> None:

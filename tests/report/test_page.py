@@ -97,7 +97,7 @@ def html(drawn: Path) -> str:
 def test_page_is_self_contained_and_well_formed(html: str) -> None:
     reader = read(html)
     assert len(html) < 6_000_000
-    assert "script" not in reader.tags
+    assert reader.tags & {"script", "iframe", "img"} == {"script"}  # for the theme; links says that it names no source
     assert all(link.startswith(("#", "data:")) for link in reader.links)
     assert len(reader.ids) == len(set(reader.ids))
     assert {link[1:] for link in reader.links if link.startswith("#")} <= set(reader.ids)
