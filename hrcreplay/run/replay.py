@@ -94,7 +94,7 @@ def run(
             with sink.watch.stage("contact", len(ticks_ns)):
                 write_contact(job, log, writer, build.robot_base(job, log))
             with sink.watch.stage("report", len(ticks_ns)):
-                write_report(job, writer, meta)
+                write_report(job, writer, meta, log)
         writer.timing.update(sink.watch.summary(1.0 / job.settings.fusion.rate_hz))
         writer.finish(meta)
         return writer.folder

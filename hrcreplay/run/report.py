@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.human.body_capsules import PARTS, part_radii
-from hrcreplay.logs.reader import open_log
+from hrcreplay.logs.reader import Log
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report import figures, page, tables
 from hrcreplay.report.figures_human import Instant
@@ -32,12 +32,19 @@ from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run, RunWriter
 
 
-def write_report(job: Job, writer: RunWriter, meta: dict[str, Any]) -> None:
-    """Writes metrics.json, the figures and report.html beside the tables that have just been written."""
+def write_report(job: Job, writer: RunWriter, meta: dict[str, Any], log: Log | None = None) -> None:
+    """Writes metrics.json, the figures, report.html and scene.mcap beside the tables that have just been written.
+
+    Args:
+        job: What was asked for.
+        writer: Run folder.
+        meta: Content of run.json.
+        log: Of a replay, whose ticks can be computed again; None: a live session's are not.
+    """
     near = _bounds(job.settings.model_dump())
     run = run_folder.read(writer.partial, meta)
     found = compute(run, **near)
-    stops = _stops(job, run, near["stationary_m_per_s"], found)
+    stops = _stops(job, log, run, near["stationary_m_per_s"], found) if log else ()
     writer.text("metrics.json", run_folder.to_json(found))
     prediction_stage = build.prediction_stage(job)
     occupancy = prediction_stage.occupancy
@@ -68,18 +75,19 @@ def scene_of(job: Job, run: Run) -> ReplayScene | None:
     return replay_scene(run, build.robot(job, run.T_world_base), figures.start_ns(run), parts)
 
 
-def _stops(job: Job, run: Run, slow_m_per_s: float, found: dict[str, Metric]) -> tuple[PageTable, ...]:
+def _stops(job: Job, log: Log, run: Run, slow_m_per_s: float, found: dict[str, Metric]) -> tuple[PageTable, ...]:
     """The longest stops of the plan as a table, and among the metrics.
 
     Args:
         job: What was asked for.
+        log: That was replayed.
         run: The run's tables.
         slow_m_per_s: A TCP slower than this stands [m/s].
         found: The metrics so far; gets those of the stops.
     """
     if run.motion is None or not len(run.motion):
         return ()
-    record = Record(run.folder, job.settings.plan.method, job, open_log(job.log, job.settings.logs), run.motion)
+    record = Record(run.folder, job.settings.plan.method, job, log, run.motion)
     table, every = stop_table(record, slow_m_per_s)
     metrics = MetricTable()
     for i, stop in enumerate(every, start=1):
