@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from tests.readme.measurements import BASELINES, MARGINS, PLACES, PREDICTIONS, RECORDINGS, Figures
+from tests.readme.measurements import BASELINES, MARGINS, PLACES, PREDICTIONS, RECORDINGS, VARIANTS, Figures
 
 Facts = Mapping[str, Any]
 Row = Iterable[str]
@@ -135,8 +135,25 @@ def margins(facts: Facts) -> str:
     return "\n".join(_wrapped(item, "- ") for item in items)
 
 
+def compare(facts: Facts) -> str:
+    """The demo log by method, occupancy and horizon."""
+    of = _of(facts, "compare")
+    columns: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
+        ("ticks in contact, moving", "touch_ticks", lambda n: f"{n:,}"),
+        ("nearest, moving", "nearest_moving_m", _cm),
+        ("pace", "pace", _share),
+        ("cycles", "cycles", lambda n: f"{n}"),
+        ("stands, of the near ticks", "standing_share", _share),
+        ("person held by the volumes", "coverage", _share),
+        ("joint jerk", "jerk_rms_rad_per_s3", lambda v: f"{v:.0f} rad/s\u00b3"),
+    )
+    rows = [[f"`{name}`", *(text(of[f"{name} {key}"]) for _, key, text in columns)] for name in VARIANTS]
+    return _table(["method:occupancy:horizon", *(title for title, *_ in columns)], rows)
+
+
 BLOCKS: dict[str, Callable[[Facts], str]] = {
     "demo": demo,
+    "compare": compare,
     "soundness": soundness,
     "recordings": recordings,
     "margins": margins,

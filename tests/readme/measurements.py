@@ -38,6 +38,12 @@ REPORT_KEYS = (
     *("paper_stationary_share_qp", "paper_stationary_share_scaling", "plan_deviation_max_m", "plan_ticks"),
     *("fusion_angle_rmse_ratio", "fusion_velocity_rmse_ratio", "plan_horizon_median_s", "plan_horizon_max_s"),
 )
+#: What is compared by default, and what is told of it.
+VARIANTS = (
+    *("none", "ssm:sound:adaptive", "shield:sound:adaptive", "scaling:sound:adaptive", "qp:sound:adaptive"),
+    *("qp:sound:fixed", "qp:paper:fixed", "scaling:paper:fixed"),
+)
+COMPARED = ("touch_ticks", "nearest_moving_m", "pace", "cycles", "standing_share", "coverage", "jerk_rms_rad_per_s3")
 #: Part of an audit: every limb that was checked, with the lower body where a method has a volume for it.
 _PART = "all"
 _AUDITED = ("sound", "paper", "positions", "v2_a50")
@@ -112,6 +118,11 @@ def of_audit(metrics: Mapping[str, Any]) -> Figures:
     return found
 
 
+def of_comparison(found: Mapping[str, Any]) -> Figures:
+    """What is kept of a comparison's total, method by method."""
+    return {f"{name} {key}": found["total"][name][key] for name in VARIANTS for key in COMPARED}
+
+
 def of_sampling(found: Mapping[str, Any]) -> Figures:
     """What is kept of a sampling."""
     return {name: found[name] for name in ("samples", "states", "states_let_out", "share", "worst_mm")}
@@ -137,6 +148,8 @@ def measurements() -> list[Measurement]:
     found += [
         _audit(f"audit excerpt, {name}", (f"{EXCERPT} {options}".strip(),), {}) for name, options in MARGINS.items()
     ]
+    command = f"hrcreplay compare {DEMO} --out {{tmp}}/run"
+    found.append(Measurement("compare", (command,), "run/compare.json", of_comparison, {}))
     for name, key in RECORDINGS.items():
         found += [_recording(name, key, limits) for limits in ("people", "paper")]
     for (method, limits), samples in sorted(SAMPLES.items(), key=lambda item: item[1]):

@@ -20,9 +20,11 @@ from tests.readme import __main__ as readme
 from tests.readme.blocks import BLOCK, BLOCKS, fill
 from tests.readme.measurements import (
     BASELINES,
+    COMPARED,
     DEMO,
     PREDICTIONS,
     ROOT,
+    VARIANTS,
     Measurement,
     load,
     measurements,
@@ -92,9 +94,13 @@ def _made_up() -> dict[str, Any]:
     numbers = iter(np.linspace(0.1, 0.9, 2000).tolist())
     facts: dict[str, Any] = {}
     for measurement in measurements():
-        found = measurement.keep(_Numbers(numbers))
+        found = measurement.keep(_Numbers(numbers) if measurement.name != "compare" else _compared(numbers))
         facts[measurement.name] = {"figures": dict(found)}
     return facts | {"people.toml": {"figures": {"logs": 3, "ticks": 5, "held": 5}}}
+
+
+def _compared(numbers: Any) -> dict[str, Any]:
+    return {"total": {name: {key: next(numbers) for key in COMPARED} for name in VARIANTS}}
 
 
 AUDIT_KEYS = [
@@ -129,6 +135,18 @@ def test_a_column_holds_its_own_method() -> None:
         assert rows[1][column] == f"{run[f'{prefix}_touch_contact_speed_max_m_per_s']:.2f} m/s"
         assert rows[3][column] == f"{100 * run[f'{prefix}_progress_share']:.1f} %"
         assert rows[4][column] == f"{100 * run[f'{prefix}_stationary_share']:.1f} %"
+
+
+def test_a_row_holds_its_own_variant() -> None:
+    facts = _made_up()
+    figures = facts["compare"]["figures"]
+    _, _, *rows = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in BLOCKS["compare"](facts).splitlines()
+    ]
+    assert [row[0] for row in rows] == [f"`{name}`" for name in VARIANTS]
+    for name, row in zip(VARIANTS, rows, strict=True):
+        assert row[3] == f"{100 * figures[f'{name} pace']:.1f} %"
+        assert row[5] == f"{100 * figures[f'{name} standing_share']:.1f} %"
 
 
 def test_a_recording_holds_its_own_predictions() -> None:
