@@ -18,12 +18,14 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-#: Joints of the human model in the order of Eq. (37): right arm before left.
-JOINTS = ("x", "y", "theta", "rho", "ar1", "ar2", "ar3", "ar4", "al1", "al2", "al3", "al4")
+#: Joints of the human model in the order of Eq. (37), right arm before left; then the pelvis's height above the floor,
+#: which the paper counts among the lengths: people squat, sit down and get up.
+JOINTS = ("x", "y", "theta", "rho", "ar1", "ar2", "ar3", "ar4", "al1", "al2", "al3", "al4", "z")
+#: How many they are.
+DOF = len(JOINTS)
 
 #: Limb lengths pi that the filter estimates with the joints [m].
 LENGTHS = (
-    "pi_pelvis_height",
     "pi_torso",
     "pi_head",
     "pi_half_shoulder",
@@ -118,7 +120,7 @@ class Measurements(Table):
     capture_ns: Ints  #: (n,)
     arrival_ns: Ints  #: (n,)
     camera: Ints  #: (n,) index into ``cameras``
-    z: Floats  #: (n, 20) JOINTS, then LENGTHS [m, m, rad..., m...]; NaN where not observable
+    z: Floats  #: (n, 20) JOINTS, then LENGTHS [m, m, rad..., m, m...]; NaN where not observable
     z_std: Floats  #: (n, 20) sigma_z of Eq. (47), in the same units; NaN where ``z`` is
     points_m: Floats  #: (n, 20, 3) POINTS in the world [m]
     confidence: Floats  #: (n, 20) in [0, 1]
@@ -126,22 +128,22 @@ class Measurements(Table):
 
     @property
     def angles(self) -> Floats:
-        """(n, 12) JOINTS [m, m, rad...]."""
+        """(n, 13) JOINTS [m, m, rad..., m]."""
         return self.z[:, : len(JOINTS)]
 
     @property
     def angles_std(self) -> Floats:
-        """(n, 12) standard deviation of ``angles``."""
+        """(n, 13) standard deviation of ``angles``."""
         return self.z_std[:, : len(JOINTS)]
 
     @property
     def lengths_m(self) -> Floats:
-        """(n, 8) LENGTHS [m]."""
+        """(n, 7) LENGTHS [m]."""
         return self.z[:, len(JOINTS) :]
 
     @property
     def lengths_std_m(self) -> Floats:
-        """(n, 8) standard deviation of ``lengths_m`` [m]."""
+        """(n, 7) standard deviation of ``lengths_m`` [m]."""
         return self.z_std[:, len(JOINTS) :]
 
 
@@ -150,14 +152,14 @@ class HumanStates(Table):
     """The fused person, a row a tick. Rows before the first measurement are NaN."""
 
     t_ns: Ints  #: (n,)
-    p: Floats  #: (n, 12) JOINTS [m, m, rad...]; heading is unwrapped
-    v: Floats  #: (n, 12) [m/s, m/s, rad/s...]; x and y in the world frame
-    a: Floats  #: (n, 12) [.../s^2]
-    j: Floats  #: (n, 12) [.../s^3]
-    p_std: Floats  #: (n, 12) standard deviation of ``p``
-    v_std: Floats  #: (n, 12) standard deviation of ``v``
-    lengths_m: Floats  #: (n, 8) LENGTHS [m]
-    lengths_std_m: Floats  #: (n, 8) [m]
+    p: Floats  #: (n, 13) JOINTS [m, m, rad..., m]; heading is unwrapped
+    v: Floats  #: (n, 13) [m/s, m/s, rad/s...]; x and y in the world frame
+    a: Floats  #: (n, 13) [.../s^2]
+    j: Floats  #: (n, 13) [.../s^3]
+    p_std: Floats  #: (n, 13) standard deviation of ``p``
+    v_std: Floats  #: (n, 13) standard deviation of ``v``
+    lengths_m: Floats  #: (n, 7) LENGTHS [m]
+    lengths_std_m: Floats  #: (n, 7) [m]
     valid: Bools  #: (n, c) whether a row of this camera entered the update of this tick
     residual_m: Floats  #: (n, 7) high quantile of how far BODY was from the model lately [m]; NaN until known
     unseen_s: Floats  #: (n, 6) since a camera last saw the joints of LIMBS [s]; inf before the first time

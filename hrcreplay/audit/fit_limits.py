@@ -14,7 +14,7 @@ import numpy as np
 
 from hrcreplay.errors import LogError
 from hrcreplay.human.model import SHOWN_BY, LimitSet, canonical, clamp, nearest
-from hrcreplay.records import Bools, Floats, HumanStates, Ints, Table
+from hrcreplay.records import DOF, Bools, Floats, HumanStates, Ints, Table
 
 #: Share of the velocities that the bounds hold: what is faster is a marker that jumped.
 _FASTEST = 0.999
@@ -34,7 +34,7 @@ def fit_each_side(training: Futures, standard: LimitSet, share: float, horizon_s
         horizon_s: T_s [s].
     """
     excursions = np.array(
-        [count_excursions(training.t_ns, training.moved[:, j] > STIR[j], horizon_s) for j in range(12)]
+        [count_excursions(training.t_ns, training.moved[:, j] > STIR[j], horizon_s) for j in range(DOF)]
     )
     kept = excursions < EXCURSIONS
     v, a = np.stack([-standard.v_min, standard.v_max]), np.stack([-standard.a_min, standard.a_max])
@@ -50,8 +50,8 @@ def fit_each_side(training: Futures, standard: LimitSet, share: float, horizon_s
     return Fit(-v[0], v[1], -a[0], a[1], kept, excursions)
 
 
-#: A joint that moves less than this within a horizon is at rest [m, m, rad...].
-STIR = np.array([0.03] * 2 + [np.radians(5.0)] * 10)
+#: A joint that moves less than this within a horizon is at rest [m, m, rad..., m].
+STIR = np.array([0.03] * 2 + [np.radians(5.0)] * 10 + [0.03])
 #: A joint needs so many horizons with motion, none overlapping; with fewer its bounds cannot be told.
 EXCURSIONS = 10
 #: Bounds are at least this [per second; per second squared], and are rounded up to so many digits.
@@ -61,7 +61,7 @@ _TRIED, _HARDLY = 48, 1.05
 #: The ticks that may be missed are given up in about so many steps, or in steps doubled up to so many times.
 _STEPS, _DOUBLINGS = 40, 6
 #: About how far a joint is from what it moves: makes reaches of different joints comparable [m/m, m/rad].
-_LEVER_M = np.array([1.0, 1.0, 0.5, 0.5] + 2 * [0.6, 0.6, 0.4, 0.4])
+_LEVER_M = np.array([1.0, 1.0, 0.5, 0.5] + 2 * [0.6, 0.6, 0.4, 0.4] + [1.0])
 #: A posture further outside its limits than this is outside [m, m, rad...].
 _OUTSIDE = np.radians(0.1)
 _ROUNDING = 1e-9
@@ -70,7 +70,7 @@ _ARMS = slice(4, 12)
 
 @dataclass(frozen=True)
 class Futures(Table):
-    """What each joint did within the horizon of a tick, seen from the fused state. (n, 12) each.
+    """What each joint did within the horizon of a tick, seen from the fused state. (n, 13) each.
 
     x and y are those of the body frame at the tick: forward, to the left. NaN where not recorded to the end.
     """
@@ -88,7 +88,7 @@ class Futures(Table):
 
 @dataclass(frozen=True)
 class Fit:
-    """Fitted bounds (12,), and how much motion they rest on."""
+    """Fitted bounds (13,), and how much motion they rest on."""
 
     v_min: Floats
     v_max: Floats
@@ -111,7 +111,7 @@ def futures(
         states: The fused person.
         ticks: (n,) rows of ``states``.
         t_ns: (m,) instants of the recorded joints, increasing.
-        joints: (m, 12) recorded JOINTS [m, m, rad...].
+        joints: (m, 13) recorded JOINTS [m, m, rad...].
         horizon_s: T_s [s].
         memory_s: What no camera had seen for longer at the tick says nothing [s].
     """
@@ -130,12 +130,12 @@ def futures(
 
 
 def recently_seen(joints: Floats, unseen_s: Floats, memory_s: float) -> Floats:
-    """Rows of JOINTS (n, 12), NaN where no camera had seen a joint's limb for longer; ``unseen_s`` (n, 6) by LIMBS."""
+    """Rows of JOINTS (n, 13), NaN where no camera had seen a joint's limb for longer; ``unseen_s`` (n, 6) by LIMBS."""
     return np.where((unseen_s <= memory_s)[:, SHOWN_BY], joints, np.nan)
 
 
 def outside_positions(p: Floats, limits: LimitSet) -> Bools:
-    """(n,) whether a posture (n, 12) is outside of the position limits; False where it is unknown."""
+    """(n,) whether a posture (n, 13) is outside of the position limits; False where it is unknown."""
     named = canonical(p)
     return np.asarray((np.abs(clamp(named, limits) - named) > _OUTSIDE).any(axis=1))
 
@@ -161,12 +161,12 @@ def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -
         LogError: No arm moved.
     """
     excursions = np.array(
-        [count_excursions(training.t_ns, training.moved[:, j] > STIR[j], horizon_s) for j in range(12)]
+        [count_excursions(training.t_ns, training.moved[:, j] > STIR[j], horizon_s) for j in range(DOF)]
     )
     if not arms_move(training).any():
         raise LogError(
             f"found no arm motion: within no horizon of {horizon_s:g} s does a joint of an arm move by "
-            f"{np.degrees(STIR[-1]):.0f} deg; limits are fitted to logs of people at work"
+            f"{np.degrees(STIR[_ARMS.start]):.0f} deg; limits are fitted to logs of people at work"
         )
     kept = excursions < EXCURSIONS
     sides = [_Side(training, j, upward, horizon_s) for j in np.flatnonzero(~kept).tolist() for upward in (False, True)]
@@ -181,7 +181,7 @@ def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -
 
 
 def inside_intervals(some: Futures, bounds: Fit | LimitSet, horizon_s: float) -> Floats:
-    """(n, 12) whether each joint stayed in its interval, stops aside: 1, 0, or NaN where not recorded."""
+    """(n, 13) whether each joint stayed in its interval, stops aside: 1, 0, or NaN where not recorded."""
     high = largest_displacement(some.v, bounds.v_max, bounds.a_max, horizon_s)
     low = -largest_displacement(-some.v, -bounds.v_min, -bounds.a_min, horizon_s)
     within = (some.up <= high) & (some.down >= low)
@@ -318,7 +318,7 @@ def count_excursions(t_ns: Ints, moving: Bools, horizon_s: float) -> int:
 
 
 def _turned(rows: Floats, c: Floats, s: Floats) -> Floats:
-    """Rows (n, 12) of JOINTS or their rates with x and y along the body's axes, Eq. (33)."""
+    """Rows (n, 13) of JOINTS or their rates with x and y along the body's axes, Eq. (33)."""
     turned = rows.copy()
     turned[:, 0], turned[:, 1] = c * rows[:, 0] + s * rows[:, 1], c * rows[:, 1] - s * rows[:, 0]
     return turned

@@ -18,7 +18,7 @@ from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.human.prediction.reachable_sets import Reach
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import DOF, JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report.metrics import difference
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
@@ -147,7 +147,7 @@ def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str)
 
 
 def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horizon_s: float) -> Floats:
-    """(n, 12) whether each joint's recorded future stayed in its reachable interval: 1, 0, or NaN where not recorded.
+    """(n, 13) whether each joint's recorded future stayed in its reachable interval: 1, 0, or NaN where not recorded.
 
     Args:
         recording: The log.
@@ -165,14 +165,14 @@ def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horiz
     low, high = reach.low - states.p, reach.high - states.p
     out = ((moved < low[tick] - 1e-9) | (moved > high[tick] + 1e-9)).astype(float)
     known = np.isfinite(moved) & np.isfinite(low[tick])
-    left, seen = np.zeros((len(states), 12)), np.zeros((len(states), 12))
+    left, seen = np.zeros((len(states), DOF)), np.zeros((len(states), DOF))
     np.add.at(left, tick, np.where(known, out, 0.0))
     np.add.at(seen, tick, known.astype(float))
     return np.where(seen > 0.0, (left == 0.0).astype(float), np.nan)
 
 
 def joint_travel(joints: Floats) -> Floats:
-    """(12,) how far each joint went, between the 5th and the 95th percentile of its values [m, m, rad...]."""
+    """(13,) how far each joint went, between the 5th and the 95th percentile of its values [m, m, rad...]."""
     known = joints[np.isfinite(joints).all(axis=1)]
     if len(known) < 2:
         return np.full(joints.shape[1], np.nan)
@@ -187,8 +187,8 @@ AUDIT_HZ, EVERY = 25.0, 5
 #: Factors on the limit set's velocities and accelerations along the curve; ``positions`` grows with their cube.
 _FACTORS = {"positions": (0.25, 0.5, 1.0, 2.0)}
 _STANDARD_FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
-#: A joint that went less than this says little about its bounds [m, m, rad...].
-LITTLE = np.array([0.05] * 2 + [np.radians(10.0)] * 10)
+#: A joint that went less than this says little about its bounds [m, m, rad..., m].
+LITTLE = np.array([0.05] * 2 + [np.radians(10.0)] * 10 + [0.05])
 _BATCH = 100
 
 
@@ -200,7 +200,7 @@ class LogAudit:
     name: str
     recording: Recording
     outcomes: dict[str, Outcome]  #: by method, our own first
-    joints: dict[str, Floats]  #: by method of ours: (n, 12) of ``joints_inside``
+    joints: dict[str, Floats]  #: by method of ours: (n, 13) of ``joints_inside``
     curve: dict[str, dict[float, Outcome]]  #: by method of ours and factor
     points: dict[str, dict[str, int]]  #: limb -> each point beyond its ends -> at how many ticks it was checked
     notes: tuple[str, ...]

@@ -202,8 +202,8 @@ def joint_figures(inside: Floats, travel: Floats, resampling: Resampling) -> dic
     """Per joint: share of ticks whose recorded future stayed inside the reachable interval, and how much it moved.
 
     Args:
-        inside: (n, 12) 1 or 0; NaN where the joint was not recorded.
-        travel: (12,) how far the joint went in the recording, 5th to 95th percentile [m, m, rad...].
+        inside: (n, 13) 1 or 0; NaN where the joint was not recorded.
+        travel: (13,) how far the joint went in the recording, 5th to 95th percentile [m, m, rad...].
         resampling: Of the n ticks.
     """
     return {

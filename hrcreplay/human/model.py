@@ -16,24 +16,26 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from hrcreplay.records import LIMBS, POINTS, Floats
+from hrcreplay.records import DOF, JOINTS, LIMBS, POINTS, Floats
 
 #: First of the four joints of each arm in JOINTS, and s of the kinematics: +1 on the left.
 RIGHT_ARM, LEFT_ARM = 4, 8
+#: The pelvis's height in JOINTS.
+HEIGHT = JOINTS.index("z")
 
 PELVIS, NECK, HEAD = (POINTS.index(name) for name in ("pelvis", "neck", "head"))
 #: Rows: right, left. Columns: shoulder, elbow, wrist.
 ARM_POINTS = tuple(tuple(POINTS.index(f"{name}_{side}") for name in ("shoulder", "elbow", "wrist")) for side in "rl")
 #: Index into LIMBS of the limb whose points show each joint of JOINTS.
 SHOWN_BY = np.array(
-    [LIMBS.index(limb) for limb in ("THX",) * 4 + ("URA",) * 2 + ("LRA",) * 2 + ("ULA",) * 2 + ("LLA",) * 2]
+    [LIMBS.index(limb) for limb in ("THX",) * 4 + ("URA",) * 2 + ("LRA",) * 2 + ("ULA",) * 2 + ("LLA",) * 2 + ("THX",)]
 )
 _DEGREE = np.pi / 180.0
 
 
 @dataclass(frozen=True)
 class LimitSet:
-    """Bounds on the joints of Eq. (37), as in Table 1, (12,) each, [m, m, rad...] and their derivatives.
+    """Bounds on the joints of Eq. (37), as in Table 1, (13,) each, [m, m, rad..., m] and their derivatives.
 
     The velocity and acceleration bounds of x and y bound v (forward) and v_perp (to the left) in the body frame,
     Eq. (18), (25), (26). Heading has no position bound (+-inf). Where ``coupled``, alpha_2 and alpha_3 obey
@@ -54,8 +56,8 @@ def skeleton(p: Floats, lengths_m: Floats) -> Floats:
     """Forward kinematics: where the model puts the body points.
 
     Args:
-        p: (n, 12) JOINTS [m, m, rad...].
-        lengths_m: (n, 8) LENGTHS [m].
+        p: (n, 13) JOINTS [m, m, rad..., m].
+        lengths_m: (n, 7) LENGTHS [m].
 
     Returns:
         (n, 20, 3) POINTS, world [m]; NaN where the model has no say (hands, chest, legs). ``neck`` is the midpoint
@@ -74,24 +76,24 @@ def _skeleton_rows(p: Floats, lengths: Floats, points: Floats) -> None:
 
 @njit(cache=True)
 def skeleton_row(p: Floats, lengths: Floats, points: Floats) -> None:
-    """Writes the model's points of one posture, p (12,) and lengths (8,), into points (20, 3) [m]."""
+    """Writes the model's points of one posture, p (13,) and lengths (7,), into points (20, 3) [m]."""
     R = torso_rotation(p[2], p[3])
     for k in range(3):
-        base = p[k] if k < 2 else lengths[0]
+        base = p[k] if k < 2 else p[HEIGHT]
         points[PELVIS, k] = base
-        points[NECK, k] = base + R[k, 2] * lengths[1]
-        points[HEAD, k] = points[NECK, k] + R[k, 2] * lengths[2]
+        points[NECK, k] = base + R[k, 2] * lengths[0]
+        points[HEAD, k] = points[NECK, k] + R[k, 2] * lengths[1]
     for arm in range(2):
         s = 2.0 * arm - 1.0
         shoulder, elbow, wrist = ARM_POINTS[arm]
         first = RIGHT_ARM + 4 * arm
         upper, fore = arm_directions(p[first], p[first + 1], p[first + 2], p[first + 3])
         for k in range(3):
-            points[shoulder, k] = points[NECK, k] + R[k, 1] * s * lengths[3]
+            points[shoulder, k] = points[NECK, k] + R[k, 1] * s * lengths[2]
             along_upper = R[k, 0] * upper[0] + R[k, 1] * s * upper[1] + R[k, 2] * upper[2]
             along_fore = R[k, 0] * fore[0] + R[k, 1] * s * fore[1] + R[k, 2] * fore[2]
-            points[elbow, k] = points[shoulder, k] + along_upper * lengths[5 - arm]
-            points[wrist, k] = points[elbow, k] + along_fore * lengths[7 - arm]
+            points[elbow, k] = points[shoulder, k] + along_upper * lengths[4 - arm]
+            points[wrist, k] = points[elbow, k] + along_fore * lengths[6 - arm]
 
 
 @njit(cache=True)
@@ -153,7 +155,7 @@ def alpha_3_bounds(low_1: float, high_1: float, low_2: float, high_2: float) -> 
 
 
 def clamp(p: Floats, limits: LimitSet) -> Floats:
-    """The postures inside the limits that Eq. (62) makes of ``p``, (n, 12) [m, m, rad...]; heading is left alone.
+    """The postures inside the limits that Eq. (62) makes of ``p``, (n, 13) [m, m, rad..., m]; heading is left alone.
 
     Where the limits are coupled, alpha_2 is held in the bounds of the clamped alpha_1, and alpha_3 in those of both.
     """
@@ -164,24 +166,24 @@ def clamp(p: Floats, limits: LimitSet) -> Floats:
 
 @njit(cache=True)
 def _clamp_rows(p: Floats, p_min: Floats, p_max: Floats, coupled: bool) -> None:
-    low, high = np.empty(12), np.empty(12)
+    low, high = np.empty(DOF), np.empty(DOF)
     for row in p:
         clamp_row(row, p_min, p_max, coupled, low, high)
 
 
 @njit(cache=True)
 def clamp_row(p: Floats, p_min: Floats, p_max: Floats, coupled: bool, low: Floats, high: Floats) -> None:
-    """Eq. (62) for one posture (12,) in place; writes the bounds that held for it into low, high (12,).
+    """Eq. (62) for one posture (13,) in place; writes the bounds that held for it into low, high (13,).
 
     Args:
-        p: (12,) JOINTS [m, m, rad...].
-        p_min: (12,) of ``LimitSet`` [m, m, rad...].
-        p_max: (12,) of ``LimitSet`` [m, m, rad...].
+        p: (13,) JOINTS [m, m, rad..., m].
+        p_min: (13,) of ``LimitSet`` [m, m, rad..., m].
+        p_max: (13,) of ``LimitSet`` [m, m, rad..., m].
         coupled: Whether alpha_2 and alpha_3 obey Eq. (34b), (34c).
-        low: (12,) receives the lower bounds [m, m, rad...].
-        high: (12,) receives the upper bounds [m, m, rad...].
+        low: (13,) receives the lower bounds [m, m, rad..., m].
+        high: (13,) receives the upper bounds [m, m, rad..., m].
     """
-    for j in range(12):
+    for j in range(DOF):
         low[j], high[j] = p_min[j], p_max[j]
         if j == 2:  # Table 1's +-pi is a wrap, not a stop
             low[j], high[j] = -np.inf, np.inf
@@ -198,14 +200,14 @@ _ROUNDING = 1e-9
 
 
 def canonical(p: Floats) -> Floats:
-    """The same postures with both arms by their canonical names, (n, 12) [m, m, rad...]."""
+    """The same postures with both arms by their canonical names, (n, 13) [m, m, rad..., m]."""
     named = np.array(p, dtype=np.float64, order="C")
     _canonical_rows(named)
     return named
 
 
 def nearest(p: Floats, reference: Floats) -> Floats:
-    """The same postures, each by the name nearest to ``reference``, both (n, 12) [m, m, rad...].
+    """The same postures, each by the name nearest to ``reference``, both (n, 13) [m, m, rad..., m].
 
     Heading goes to the nearest turn, each arm to the nearer of its two names. What is NaN in either stays as it is
     in ``p``. Needed wherever angles of two sources are subtracted.

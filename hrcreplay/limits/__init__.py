@@ -38,8 +38,9 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
     Args:
         name_or_path: ``paper``, ``human``, ``people`` or a file like theirs: ``coupled`` and a table ``joints`` with
             a row ``{ position = [low, high], velocity = [...], acceleration = [...] }`` for each of JOINTS
-            [m, m, rad...; per second; per second squared]. Where coupled, alpha_2 and alpha_3 have no position.
-            A table ``provenance`` may say where the bounds come from; it changes nothing.
+            [m, m, rad..., m; per second; per second squared]. Where coupled, alpha_2 and alpha_3 have no position;
+            without a row ``z``, that of ``human`` holds. A table ``provenance`` may say where the bounds come from;
+            it changes nothing.
 
     Raises:
         SettingsError: The file cannot be read, or a key or a bound is not what it should be.
@@ -59,6 +60,7 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
     except ValidationError as error:
         raise SettingsError(_first_problem(error, table, str(path))) from error
     rows, coupled = file["joints"], file["coupled"]
+    rows["z"] = rows["z"] or tomllib.loads((_HERE / "human.toml").read_text())["joints"]["z"]
     bounds = np.array([_bounds(rows[joint], joint, f"{path}: joints.{joint}", coupled) for joint in JOINTS])
     if coupled:
         _enclose(bounds)
@@ -83,7 +85,7 @@ def write_limits(limits: LimitSet, provenance: dict[str, Any], path: Path) -> No
 def _toml(limits: LimitSet, provenance: dict[str, Any]) -> str:
     pairs = ((limits.p_min, limits.p_max), (limits.v_min, limits.v_max), (limits.a_min, limits.a_max))
     lines = [
-        "# [m, m, rad...; per second; per second squared]; x forward, y to the left",
+        "# [m, m, rad..., m; per second; per second squared]; x forward, y to the left",
         f"coupled = {_value(limits.coupled)}",
         "",
         "[joints]",
@@ -127,7 +129,7 @@ class _Row(BaseModel):
     acceleration: _Pair
 
 
-_rows: Any = dict.fromkeys(JOINTS, (_Row, ...))
+_rows: Any = dict.fromkeys(JOINTS, (_Row, ...)) | {"z": (_Row | None, None)}
 _Joints = create_model("_Joints", __config__=_STRICT, **_rows)
 _LimitFile = create_model(
     "_LimitFile", __config__=_STRICT, coupled=(bool, ...), joints=(_Joints, ...), provenance=(dict[str, Any], {})
@@ -161,7 +163,7 @@ def _bounds(row: dict[str, Any], joint: str, where: str, coupled: bool) -> list[
     if joint == "theta" and pairs[0] != [-np.inf, np.inf]:
         raise SettingsError(f"{where}.position: found {pairs[0]}; heading has no stop, write [-inf, inf]")
     if joint not in JOINTS[:3] and not np.isfinite(pairs[0]).all():
-        raise SettingsError(f"{where}.position: found {pairs[0]}; an angle of the body needs finite bounds")
+        raise SettingsError(f"{where}.position: found {pairs[0]}; an angle or a height of the body needs finite bounds")
     if not np.isfinite(pairs[1:]).all():
         raise SettingsError(f"{where}: found an infinite rate; velocity and acceleration need finite bounds")
     if not (pairs[1][0] <= 0 <= pairs[1][1] and pairs[2][0] < 0 < pairs[2][1]):
@@ -170,7 +172,7 @@ def _bounds(row: dict[str, Any], joint: str, where: str, coupled: bool) -> list[
 
 
 def _enclose(bounds: Floats) -> None:
-    """Writes what Eq. (34b), (34c) allow at most as the position bounds of alpha_2 and alpha_3 into (12, 3, 2)."""
+    """Writes what Eq. (34b), (34c) allow at most as the position bounds of alpha_2 and alpha_3 into (13, 3, 2)."""
     for first in (JOINTS.index("ar1"), JOINTS.index("al1")):
         bounds[first + 1, 0] = alpha_2_bounds(*bounds[first, 0])
         bounds[first + 2, 0] = alpha_3_bounds(*bounds[first, 0], *bounds[first + 1, 0])

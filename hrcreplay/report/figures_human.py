@@ -45,6 +45,7 @@ LABELS = {
     "y": "y",
     "theta": "heading \u03b8",
     "rho": "torso \u03c1",
+    "z": "pelvis height z",
     **{f"a{side}{i}": f"{name} \u03b1{i}" for side, name in (("r", "right"), ("l", "left")) for i in range(1, 5)},
 }
 
@@ -193,12 +194,12 @@ def _span(ax: Axes, run: Run, t0_ns: int) -> None:
 
 
 def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
-    """All twelve joints: what the cameras saw (dots), the fused state and the truth."""
-    figure = drawing.new_figure(5.6)
-    grid = drawing.panels(figure, 4, 3, share_x=True, gap_in=(0.26, 0.55), top_in=0.5, left_in=0.6)
+    """All thirteen joints: what the cameras saw (dots), the fused state and the truth."""
+    figure = drawing.new_figure(6.8)
+    columns = (("x", "y", "z", "theta", "rho"), JOINTS[4:8], JOINTS[8:12])
+    grid = drawing.panels(figure, 5, 3, share_x=True, gap_in=(0.26, 0.55), top_in=0.5, left_in=0.6)
     seen = cameras(run)
-    for k, joint in enumerate(JOINTS):
-        ax = grid[k % 4][k // 4]
+    for ax, joint in ((grid[row][k], joint) for k, joints in enumerate(columns) for row, joint in enumerate(joints)):
         factor = 180 / np.pi if joint in ANGLES else 1.0
         for camera, colour in zip(seen, drawing.CAMERAS * 3, strict=False):
             seconds, values = _seen(run, camera, joint, t0_ns, gap_s)
@@ -214,8 +215,12 @@ def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
             values = _beside_fused(run, joint, times(run.truth), run.truth[joint].to_numpy(dtype=float))
             ax.plot(*envelope(seconds, factor * values, 350), color=drawing.TRUTH, lw=0.7, ls=(0, (4, 2)))
         ax.set_title(f"{LABELS[joint]} [{'deg' if joint in ANGLES else 'm'}]", fontweight="normal", pad=2.5)
-    for column in grid[-1]:
-        column.set_xlabel("time [s]")
+    for k, joints in enumerate(columns):
+        bottom = grid[len(joints) - 1][k]
+        bottom.set_xlabel("time [s]")
+        bottom.tick_params(labelbottom=True)
+        for row in grid[len(joints) :]:
+            row[k].remove()
     _span(grid[-1][0], run, t0_ns)
     handles = [
         Line2D([], [], ls="", marker="o", ms=3, color=c, label=n)

@@ -45,10 +45,10 @@ class MetricTable:
         return dict(sorted(self._metrics.items()))
 
 
-#: The ten angles of Eq. (37); x and y are lengths.
-ANGLES = JOINTS[2:]
+#: The ten angles of Eq. (37).
+ANGLES = JOINTS[2:12]
 
-#: Which columns of a (n, 12) table of JOINTS are angles.
+#: Which columns of a (n, 13) table of JOINTS are angles.
 IS_ANGLE: Bools = np.array([joint in ANGLES for joint in JOINTS])
 
 
@@ -58,13 +58,13 @@ def wrap(angle_rad: Floats) -> Floats:
 
 
 def difference(a: Floats, b: Floats) -> Floats:
-    """``a - b`` of rows of JOINTS, (n, 12) [m, m, rad...]; arms by the same name, angles the short way round."""
+    """``a - b`` of rows of JOINTS, (n, 13) [m, m, rad...]; arms by the same name, angles the short way round."""
     apart = nearest(a, b) - b
     return np.where(IS_ANGLE, wrap(apart), apart)
 
 
 def columns(table: pd.DataFrame, suffix: str = "") -> Floats:
-    """(n, 12) columns of the JOINTS with a suffix."""
+    """(n, 13) columns of the JOINTS with a suffix."""
     return table[[joint + suffix for joint in JOINTS]].to_numpy(dtype=float)
 
 
@@ -83,12 +83,12 @@ def interpolate(t_ns: Ints, values: Floats, at_ns: Ints, *, angles: bool) -> Flo
 
     Args:
         t_ns: (n,) instants of the samples, increasing [ns].
-        values: (n, 12) samples [m, m, rad...].
+        values: (n, 13) samples [m, m, rad...].
         at_ns: (m,) instants asked for [ns].
         angles: The columns of angles are angles, which go the short way round; else they are rates.
 
     Returns:
-        (m, 12); NaN outside the samples' span and where one of the two samples is NaN. An instant that meets a
+        (m, 13); NaN outside the samples' span and where one of the two samples is NaN. An instant that meets a
         sample gets that sample, whatever its neighbours are.
     """
     if len(t_ns) < 2 or not len(at_ns):
@@ -104,7 +104,7 @@ def interpolate(t_ns: Ints, values: Floats, at_ns: Ints, *, angles: bool) -> Flo
 
 
 def central_differences(t_ns: Ints, values: Floats) -> Floats:
-    """(n, 12) rates of rows of JOINTS by central differences [m/s, m/s, rad/s...]; NaN at both ends."""
+    """(n, 13) rates of rows of JOINTS by central differences [m/s, m/s, rad/s...]; NaN at both ends."""
     rate = np.full(values.shape, np.nan)
     if len(t_ns) > 2:
         rate[1:-1] = difference(values[2:], values[:-2]) / ((t_ns[2:] - t_ns[:-2]) * 1e-9)[:, None]

@@ -158,9 +158,9 @@ class Errors:
     """Estimate minus truth of one source, a row a tick or a frame; NaN where one of the two is missing."""
 
     t_ns: Ints  #: (n,) when the position errors hold [ns]
-    position: Floats  #: (n, 12) [m, m, rad...]
+    position: Floats  #: (n, 13) [m, m, rad...]
     velocity_t_ns: Ints  #: (k,) when the velocity errors hold [ns]
-    velocity: Floats  #: (k, 12) [m/s, m/s, rad/s...]
+    velocity: Floats  #: (k, 13) [m/s, m/s, rad/s...]
 
 
 def errors(run: Run, gap_s: float) -> dict[str, Errors]:

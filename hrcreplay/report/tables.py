@@ -175,6 +175,7 @@ SYMBOLS = {
     "y": "y",
     "theta": "\u03b8",
     "rho": "\u03c1",
+    "z": "z",
     **{f"a{side}{i}": f"\u03b1 {side},{i}" for side in "rl" for i in range(1, 5)},
 }
 

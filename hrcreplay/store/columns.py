@@ -26,6 +26,9 @@ from hrcreplay.records import (
 
 Columns = dict[str, Any]
 
+#: The joint ``z`` by the name that it has among the lengths of the paper: readers know it by both.
+_HEIGHT, _AS_LENGTH = JOINTS.index("z"), "pi_pelvis_height"
+
 
 def measurement_columns(measurements: Measurements) -> Columns:
     """A row a frame: what the closed-form inverse kinematics made of it."""
@@ -35,13 +38,15 @@ def measurement_columns(measurements: Measurements) -> Columns:
         "camera": _names(measurements.camera, measurements.cameras),
         **_spread(measurements.angles, JOINTS),
         **_spread(measurements.angles_std, JOINTS, "_std"),
+        _AS_LENGTH: measurements.angles[:, _HEIGHT],
         **_spread(measurements.lengths_m, LENGTHS),
     }
 
 
 def truth_columns(t_ns: Ints, angles: Floats, lengths_m: Floats) -> Columns:
-    """A row an instant of the ground truth: (n, 12) JOINTS and (n, 8) LENGTHS [m] of the noise-free skeleton."""
-    return {"t_ns": t_ns, **_spread(angles, JOINTS), **_spread(lengths_m, LENGTHS)}
+    """A row an instant of the ground truth: (n, 13) JOINTS and (n, 7) LENGTHS [m] of the noise-free skeleton."""
+    heights = {_AS_LENGTH: angles[:, _HEIGHT]}
+    return {"t_ns": t_ns, **_spread(angles, JOINTS), **heights, **_spread(lengths_m, LENGTHS)}
 
 
 _STATE = (("p", ""), ("v", "_vel"), ("a", "_acc"), ("j", "_jerk"), ("p_std", "_std"), ("v_std", "_vel_std"))
@@ -54,7 +59,8 @@ def state_columns(states: HumanStates) -> Columns:
     columns: Columns = {"t_ns": states.t_ns}
     for field, suffix in _STATE:
         columns |= _spread(getattr(states, field), JOINTS, suffix)
-    columns |= _spread(states.lengths_m, LENGTHS) | _spread(states.lengths_std_m, LENGTHS, "_std")
+    columns |= {_AS_LENGTH: states.p[:, _HEIGHT]} | _spread(states.lengths_m, LENGTHS)
+    columns |= {f"{_AS_LENGTH}_std": states.p_std[:, _HEIGHT]} | _spread(states.lengths_std_m, LENGTHS, "_std")
     columns |= _spread(states.residual_m, _RESIDUAL) | _spread(states.unseen_s, _UNSEEN)
     return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
 

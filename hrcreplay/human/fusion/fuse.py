@@ -15,20 +15,20 @@ from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, process_
 from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
 from hrcreplay.human.model import LimitSet, nearest
-from hrcreplay.records import BODY, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
+from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
 _NEVER_NS = -(2**62)
-#: A person nobody has measured: upright, arms hanging; and how wrong that may be [m, m, rad...].
-_NEUTRAL = (0.0, 0.0, 0.0, 0.1, 0.1, 0.3, 0.0, 2.6, 0.1, 0.3, 0.0, 2.6)
-_NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2)
+#: A person nobody has measured: upright, arms hanging; and how wrong that may be [m, m, rad..., m].
+_NEUTRAL = (0.0, 0.0, 0.0, 0.1, 0.1, 0.3, 0.0, 2.6, 0.1, 0.3, 0.0, 2.6, 0.94)
+_NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2, 0.3)
 #: LENGTHS of the median man (upper arm 0.36 m, shoulders at 1.44 m), and how wrong that may be [m].
-MEDIAN_LENGTHS_M = (0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
+MEDIAN_LENGTHS_M = (0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
 _LENGTHS_STD_M = 0.1
-#: How fast a joint may be moving that nobody sees: v, a, j of x and y [m/s...], of an angle [rad/s...].
-_REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10)
-#: Whether a joint is x or y (0) or an angle (1).
-_KIND = np.repeat((0, 1), (2, 10))
+#: How fast a joint may be moving that nobody sees: v, a, j of x, y and z [m/s...], of an angle [rad/s...].
+_REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10 + [[0.3, 2.0, 20.0]])
+#: Whether a joint is x, y or z (0) or an angle (1).
+_KIND = np.repeat((0, 1, 0), (2, 10, 1))
 
 FusionState = Filter
 
@@ -37,16 +37,16 @@ FusionState = Filter
 class Trace:
     """What a smoother needs beside the states: P of every tick, and how it was reached."""
 
-    cov: Floats  #: (n, 12, 4, 4) covariance of p, v, a, j; no rows where the ticks were not traced
-    damping: Floats  #: (n, 12) of the derivatives on the way to the tick; 1 unless the joint was unseen
+    cov: Floats  #: (n, 13, 4, 4) covariance of p, v, a, j; no rows where the ticks were not traced
+    damping: Floats  #: (n, 13) of the derivatives on the way to the tick; 1 unless the joint was unseen
 
 
 def start(cameras: tuple[str, ...]) -> FusionState:
     """The filter before the first frame of any camera."""
     c = len(cameras)
-    mean, cov = np.zeros((12, 4)), np.zeros((12, 4, 4))
+    mean, cov = np.zeros((DOF, 4)), np.zeros((DOF, 4, 4))
     mean[:, 0] = _NEUTRAL
-    for j in range(12):
+    for j in range(DOF):
         cov[j] = np.diag([_NEUTRAL_STD[j], *_REST_STD[j]]) ** 2
     return Filter(
         tick_ns=np.full(1, _NEVER_NS),
@@ -72,8 +72,8 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         samples=np.zeros(len(BODY), dtype=np.int64),
         sampled_ns=np.full(len(BODY), _NEVER_NS),
         residual=np.full(len(BODY), np.nan),
-        surprise=np.ones(12),
-        spread=np.ones(12),
+        surprise=np.ones(DOF),
+        spread=np.ones(DOF),
     )
 
 
@@ -203,13 +203,13 @@ def _rules(settings: Fusion, limits: LimitSet) -> Rules:
 def _track(n: int, cameras: int, *, traced: bool) -> Track:
     rows = n if traced else 0
     return Track(
-        motion=np.full((6, n, 12), np.nan),
+        motion=np.full((6, n, DOF), np.nan),
         lengths=np.full((2, n, len(LENGTHS)), np.nan),
         valid=np.zeros((n, cameras), dtype=np.bool_),
         residual=np.full((n, len(BODY)), np.nan),
         unseen=np.full((n, len(LIMBS)), np.inf),
-        cov=np.full((rows, 12, 4, 4), np.nan),
-        damping=np.ones((rows, 12)),
+        cov=np.full((rows, DOF, 4, 4), np.nan),
+        damping=np.ones((rows, DOF)),
         outliers=np.zeros(cameras, dtype=np.int64),
         superseded=np.zeros(cameras, dtype=np.int64),
         reacquired=np.zeros(1, dtype=np.int64),
@@ -284,7 +284,7 @@ def _transition(dt: float, damping: float) -> Floats:
 
 
 def _one_name(states: HumanStates, first: int) -> Floats:
-    """Means (n, 12, 4) with each posture by the name nearest to the one before."""
+    """Means (n, 13, 4) with each posture by the name nearest to the one before."""
     mean = np.stack([states.p, states.v, states.a, states.j], axis=2)[first:]
     for k in range(1, len(mean)):
         p = nearest(mean[k : k + 1, :, 0], mean[k - 1 : k, :, 0])[0]

@@ -7,15 +7,14 @@ from numba import njit
 
 from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, ROWS
 from hrcreplay.human.fusion.kalman import Filter, Rules, Track, ago, delay
-from hrcreplay.human.model import ARM_POINTS, HEAD, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
-from hrcreplay.records import LENGTHS, POINTS, Bools, Floats
+from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
+from hrcreplay.records import DOF, LENGTHS, POINTS, Bools, Floats
 
 #: An angle known no better than this is not observed: a circle cannot tell [rad].
 _BLIND_STD = 1.0
 #: The points that the model predicts and a camera may get wrong.
 _TESTED = np.flatnonzero(DEPENDS.any(axis=0))
 _FAR_ENDS = (
-    (),
     (PELVIS,),
     (HEAD,),
     (ARM_POINTS[0][0], ARM_POINTS[1][0]),
@@ -27,8 +26,7 @@ _FAR_ENDS = (
 #: (6, 20) the body points that place a limb of LIMBS: what its rows are computed from, however it is turned.
 _PLACING = DEPENDS[[3, 3, RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2]]
 _PLACING[0, HEAD] = True
-#: (8, 20) the points that may be wrong where a length is: the far end of its bone, both shoulders of their line. How
-#: high the pelvis is may change.
+#: (7, 20) the points that may be wrong where a length is: the far end of its bone, both shoulders of their line.
 _ENDS = np.zeros((len(LENGTHS), len(POINTS)), dtype=np.bool_)
 for _length, _point in enumerate(_FAR_ENDS):
     _ENDS[_length, list(_point)] = True
@@ -61,7 +59,7 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
             if DEPENDS[row, k]:
                 product *= confidence[k] if np.isfinite(points[k, 0]) else confidence[NECK]
                 agrees = agrees and trusted[k]
-        blind = 2 <= row < 12 and filter_.z_var[c, row] > _BLIND_STD**2
+        blind = 2 <= row < HEIGHT and filter_.z_var[c, row] > _BLIND_STD**2
         filter_.valid[c, row] = agrees and not blind and product >= rules.confidence_min
     for point in _TESTED:
         if trusted[point] and confidence[point] >= rules.confidence_min and np.isfinite(points[point, 0]):
@@ -79,25 +77,31 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
 def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
     """The points of a frame (20,) near enough to the a-priori skeleton; a lost point agrees with anything.
 
-    Near is within ``outlier_m`` widened by three standard deviations of the prediction, each joint's carried through
-    the forward kinematics.
+    Near is within ``outlier_m`` widened by three standard deviations of the prediction towards the point, each joint's
+    carried through the forward kinematics. Those across say nothing: left and right exchanged would pass.
     """
     d = delay(filter_, c, now, rules)
     p, lengths = ago(filter_.mean, d), filter_.lengths
     expected, moved = np.empty_like(filter_.points[c]), np.empty_like(filter_.points[c])
     skeleton_row(p, lengths, expected)
-    variance = np.zeros(len(expected))
-    for j in range(12):
+    towards, variance = np.zeros_like(expected), np.zeros(len(expected))
+    for k in _TESTED:
+        apart = distance(filter_.points[c, k], expected[k])
+        if apart > 0.0:
+            towards[k] = (filter_.points[c, k] - expected[k]) / apart
+    for j in range(DOF):
         p[j] += _STEP
         skeleton_row(p, lengths, moved)
         p[j] -= _STEP
         for k in _TESTED:
-            variance[k] += distance(moved[k], expected[k]) ** 2 / _STEP**2 * filter_.cov[j, 0, 0]
+            along = 0.0
+            for axis in range(3):
+                along += (moved[k, axis] - expected[k, axis]) / _STEP * towards[k, axis]
+            variance[k] += along**2 * filter_.cov[j, 0, 0]
     for k in _TESTED:
-        variance[k] += filter_.lengths_var[0]
         if k != PELVIS:
-            variance[k] += filter_.lengths_var[1] + filter_.lengths_var[2 if k == HEAD else 3]
-            variance[k] += 0.0 if k == HEAD else filter_.lengths_var[4:].sum()
+            variance[k] += filter_.lengths_var[0] + filter_.lengths_var[1 if k == HEAD else 2]
+            variance[k] += 0.0 if k == HEAD else filter_.lengths_var[3:].sum()
     agreeing = np.ones(len(expected), dtype=np.bool_)
     for k in _TESTED:
         lost = now - filter_.point_ns[k] > rules.memory_ns
@@ -115,8 +119,8 @@ def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
     for long was learnt wrong: it starts anew.
     """
     whole = np.ones(len(filter_.point_ns), dtype=np.bool_)
-    for k in range(1, len(filter_.lengths)):
-        apart = abs(filter_.z[c, 12 + k] - filter_.lengths[k])
+    for k in range(len(filter_.lengths)):
+        apart = abs(filter_.z[c, DOF + k] - filter_.lengths[k])
         if not np.isfinite(apart):
             continue
         if filter_.bone_ns[k] >= 0 and now - filter_.bone_ns[k] > rules.bone_memory_ns:

@@ -14,6 +14,7 @@ from hrcreplay.geometry.vectors import Vector, cross, dot, edge, norm
 from hrcreplay.human.model import (
     ARM_POINTS,
     HEAD,
+    HEIGHT,
     LEFT_ARM,
     NECK,
     PELVIS,
@@ -22,10 +23,11 @@ from hrcreplay.human.model import (
     torso_rotation,
     wrap,
 )
-from hrcreplay.records import LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements
+from hrcreplay.records import DOF, LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
-ROWS = 12 + len(LENGTHS)
+#: Rows of a measurement: JOINTS, then LENGTHS.
+ROWS = DOF + len(LENGTHS)
 _SHOULDER_R, _SHOULDER_L = ARM_POINTS[0][0], ARM_POINTS[1][0]
 _USED = (PELVIS, NECK, HEAD, *ARM_POINTS[0], *ARM_POINTS[1])
 _STEP_M = 1e-6
@@ -39,7 +41,7 @@ _LEAST_CONFIDENCE = 0.05
 
 
 def _points_of_rows() -> tuple[tuple[int, ...], ...]:
-    """The body points that each of the 12 angles and 8 lengths is computed from."""
+    """The body points that each joint and each length is computed from."""
     shoulders = (_SHOULDER_R, _SHOULDER_L)
     torso = (PELVIS, *shoulders)
     rows = [(PELVIS,), (PELVIS,), shoulders, torso]
@@ -51,7 +53,7 @@ def _points_of_rows() -> tuple[tuple[int, ...], ...]:
     return tuple(rows)
 
 
-#: (20, 20) whether a row (12 angles, then 8 lengths) is computed from a body point.
+#: (20, 20) whether a row (JOINTS, then LENGTHS) is computed from a body point.
 DEPENDS = np.zeros((ROWS, len(POINTS)), dtype=np.bool_)
 for _row, _points in enumerate(_points_of_rows()):
     DEPENDS[_row, list(_points)] = True
@@ -65,13 +67,13 @@ def inverse(points_m: Floats) -> tuple[Floats, Floats]:
             measured neck stands in for it only where one shoulder is missing, and then no length rests on it.
 
     Returns:
-        Angles (n, 12) JOINTS [m, m, rad...], arms by their canonical names (``human.model``), and lengths (n, 8)
+        Angles (n, 13) JOINTS [m, m, rad...], arms by their canonical names (``human.model``), and lengths (n, 7)
         LENGTHS [m]. NaN where a point is missing, or where the two ends of a bone are in one place. At a singular
         posture the angle that cannot be observed is 0.
     """
     rows = np.full((len(points_m), ROWS), np.nan)
     _inverse_rows(np.ascontiguousarray(points_m, dtype=np.float64), rows)
-    return rows[:, :12].copy(), rows[:, 12:].copy()
+    return rows[:, :DOF].copy(), rows[:, DOF:].copy()
 
 
 def measure(frames: CameraFrames, T_world_camera: Floats, settings: Fusion) -> Measurements:
@@ -151,14 +153,14 @@ def _variances_row(points: Floats, point_variance: Floats, variances: Floats) ->
                 variance += squares * point_variance[k]
             elif np.isnan(squares):  # a step more and there is no bone
                 variance = _UNOBSERVED
-        if 2 <= row < 12:
+        if 2 <= row < HEIGHT:
             variance *= 1.0 + 4.0 * variance
         variances[row] = max(_LEAST_VARIANCE, min(variance, _UNOBSERVED))
 
 
 @njit(cache=True)
 def inverse_jacobian(points: Floats) -> Floats:
-    """(20, 20, 3) derivative of the 12 angles and 8 lengths by the points (20, 3), central differences.
+    """(20, 20, 3) derivative of the joints and lengths by the points (20, 3), central differences.
 
     [rad/m, m/m]. In the arms' direct names, whose derivatives are those of any other name up to sign.
     """
@@ -174,7 +176,7 @@ def inverse_jacobian(points: Floats) -> Floats:
             moved[k, axis] = at
             for row in range(ROWS):
                 change = above[row] - below[row]
-                if 2 <= row < 12:
+                if 2 <= row < HEIGHT:
                     change = wrap(change)
                 J[row, k, axis] = change / (2.0 * _STEP_M)
     return J
@@ -188,12 +190,12 @@ def _name_arms(rows: Floats) -> None:
 
 @njit(cache=True)
 def _direct_row(points: Floats, rows: Floats) -> None:
-    """The 12 angles and 8 lengths of one skeleton (20, 3), arms by the name with |alpha_2| <= 90 degrees."""
+    """The joints and lengths of one skeleton (20, 3), arms by the name with |alpha_2| <= 90 degrees."""
     pelvis, right, left = _point(points, PELVIS), _point(points, _SHOULDER_R), _point(points, _SHOULDER_L)
     neck, line = _middle(right, left), _from_to(right, left)
     (_, elbow_r, wrist_r), (_, elbow_l, wrist_l) = ARM_POINTS
-    rows[12:] = (
-        pelvis[2],
+    rows[HEIGHT] = pelvis[2]
+    rows[DOF:] = (
         norm(_bone(_from_to(pelvis, neck))),
         norm(_bone(_from_to(neck, _point(points, HEAD)))),
         0.5 * norm(_bone(line)),

@@ -25,14 +25,14 @@ class Filter(NamedTuple):
 
     tick_ns: Ints  #: (1,) the last tick
     started: Bools  #: (1,) whether there is a person
-    mean: Floats  #: (12, 4) p, v, a, j
-    cov: Floats  #: (12, 4, 4)
-    lengths: Floats  #: (8,)
-    lengths_var: Floats  #: (8,)
-    row_ns: Ints  #: (20,) tick at which a row (12 angles, 8 lengths) was last valid
+    mean: Floats  #: (13, 4) p, v, a, j
+    cov: Floats  #: (13, 4, 4)
+    lengths: Floats  #: (7,)
+    lengths_var: Floats  #: (7,)
+    row_ns: Ints  #: (20,) tick at which a row (JOINTS, then LENGTHS) was last valid
     acquired_ns: Ints  #: (20,) tick at which a row started anew
     point_ns: Ints  #: (20,) tick at which a body point last agreed with the filter
-    bone_ns: Ints  #: (8,) tick at which a camera last saw a length that agreed with the filter
+    bone_ns: Ints  #: (7,) tick at which a camera last saw a length that agreed with the filter
     capture_ns: Ints  #: (c,) of the frame held for each camera
     uses: Ints  #: (c,) ticks that frame was used in; -1 without one
     z: Floats  #: (c, 20) its rows
@@ -46,8 +46,8 @@ class Filter(NamedTuple):
     samples: Ints  #: (7,) residuals so far
     sampled_ns: Ints  #: (7,) tick of the last
     residual: Floats  #: (7,) their quantile [m]
-    surprise: Floats  #: (12,) running mean of each joint's innovations squared over their variance
-    spread: Floats  #: (12,) highest of it lately: the factor on the variances that are told
+    surprise: Floats  #: (13,) running mean of each joint's innovations squared over their variance
+    spread: Floats  #: (13,) highest of it lately: the factor on the variances that are told
 
 
 class Frames(NamedTuple):
@@ -65,7 +65,7 @@ class Frames(NamedTuple):
 class Rules(NamedTuple):
     """Settings and limits as the kernels need them."""
 
-    sigma: Floats  #: (12, 4) of Eq. (44)
+    sigma: Floats  #: (13, 4) of Eq. (44)
     reuse: bool
     compensate: bool
     delay_max_s: float
@@ -81,7 +81,7 @@ class Rules(NamedTuple):
     spread_least: float
     spread_most: float
     rest_s: float
-    rest_std: Floats  #: (12, 3) of v, a, j of a joint nobody has seen for long
+    rest_std: Floats  #: (13, 3) of v, a, j of a joint nobody has seen for long
     p_min: Floats
     p_max: Floats
     v_min: Floats
@@ -94,13 +94,13 @@ class Rules(NamedTuple):
 class Track(NamedTuple):
     """What the ticks leave behind; rows before the start stay as they are."""
 
-    motion: Floats  #: (6, n, 12) p, v, a, j, and the deviations of p and v with the factor of ``spread``
-    lengths: Floats  #: (2, n, 8) and their deviations
+    motion: Floats  #: (6, n, 13) p, v, a, j, and the deviations of p and v with the factor of ``spread``
+    lengths: Floats  #: (2, n, 7) and their deviations
     valid: Bools  #: (n, c)
     residual: Floats  #: (n, 7)
     unseen: Floats  #: (n, 6)
-    cov: Floats  #: (n or 0, 12, 4, 4)
-    damping: Floats  #: (n or 0, 12) of the derivatives, on the way to the tick
+    cov: Floats  #: (n or 0, 13, 4, 4)
+    damping: Floats  #: (n or 0, 13) of the derivatives, on the way to the tick
     outliers: Ints  #: (c,)
     superseded: Ints  #: (c,)
     reacquired: Ints  #: (1,)
@@ -206,7 +206,7 @@ def process_variance(a: int, dt: float, damping: float, sigma: Floats, rest_std:
 
 @njit(cache=True)
 def ago(mean: Floats, d: float) -> Floats:
-    """Where the joints (12,) were d seconds before, by the Taylor polynomial of Eq. (43)."""
+    """Where the joints (13,) were d seconds before, by the Taylor polynomial of Eq. (43)."""
     return mean[:, 0] - d * mean[:, 1] + d**2 / 2.0 * mean[:, 2] - d**3 / 6.0 * mean[:, 3]
 
 

@@ -1,6 +1,6 @@
 """One tick of Alg. 3 on plain arrays, with the bounds on the fused state, Eq. (62)-(65).
 
-The filter of Eq. (42)-(57) is 12 filters of four states, one a joint, and 8 of one state, one a length.
+The filter of Eq. (42)-(57) is 13 filters of four states, one a joint, and 7 of one state, one a length.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, correct, delay, dot, enter, factor, predict
 from hrcreplay.human.fusion.model_residual import observe, unseen
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row, nearest_arm, wrap
-from hrcreplay.records import Floats, Ints
+from hrcreplay.records import DOF, Floats, Ints
 
 #: A name of an arm is kept until the other is better by this [rad].
 _NAME_MARGIN = np.radians(20.0)
@@ -32,7 +32,7 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
         rules: Settings and limits.
         track: Room for n ticks; receives the states and the counts of events.
     """
-    damping = np.ones(12)
+    damping = np.ones(DOF)
     seen = 0
     for k in range(len(ticks_ns)):
         now = ticks_ns[k]
@@ -64,7 +64,7 @@ def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
     A joint unseen for longer than ``coast_ns`` comes to rest: no jerk can be followed far.
     """
     dt = (now - filter_.tick_ns[0]) * 1e-9
-    for j in range(12):
+    for j in range(DOF):
         damping[j] = np.exp(-dt / rules.rest_s) if now - filter_.row_ns[j] > rules.coast_ns else 1.0
         predict(filter_.mean[j], filter_.cov[j], dt, damping[j], rules.sigma[j], rules.rest_std[j])
 
@@ -109,12 +109,12 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
         if not filter_.valid[c, row]:
             continue
         R = filter_.uses[c] * filter_.z_var[c, row]
-        if row >= 12:
-            both = filter_.lengths_var[row - 12] + R
+        if row >= DOF:
+            both = filter_.lengths_var[row - DOF] + R
             if both > 0.0:  # else the length is known exactly, and so is the row
-                gain = filter_.lengths_var[row - 12] / both
-                filter_.lengths[row - 12] += gain * (z[row] - filter_.lengths[row - 12])
-                filter_.lengths_var[row - 12] *= 1.0 - gain
+                gain = filter_.lengths_var[row - DOF] / both
+                filter_.lengths[row - DOF] += gain * (z[row] - filter_.lengths[row - DOF])
+                filter_.lengths_var[row - DOF] *= 1.0 - gain
         elif now - filter_.row_ns[row] > rules.memory_ns:
             _acquire(filter_, row, z[row], R, rules.rest_std[row])
             filter_.acquired_ns[row] = now
@@ -131,8 +131,8 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
 def _named(filter_: Filter, c: int, h: Floats) -> Floats:
     """The rows (20,) of a camera's frame by the names, and the turn of the heading, nearest to the estimate."""
     z = filter_.z[c].copy()
-    expected, variance = np.empty(12), np.empty(12)
-    for j in range(12):
+    expected, variance = np.empty(DOF), np.empty(DOF)
+    for j in range(DOF):
         if not filter_.valid[c, j]:
             z[j] = np.nan
         expected[j] = dot(h, filter_.mean[j])
@@ -178,7 +178,7 @@ def _rename(filter_: Filter) -> None:
 
 @njit(cache=True)
 def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats) -> None:
-    for j in range(12):
+    for j in range(DOF):
         for a in range(4):
             track.motion[a, k, j] = filter_.mean[j, a]
         for a in range(2):
@@ -194,7 +194,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
 
 @njit(cache=True)
 def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
-    """Eq. (62)-(65) on the state of all joints (12, 4), then the same for the accelerations, in place.
+    """Eq. (62)-(65) on the state of all joints (13, 4), then the same for the accelerations, in place.
 
     That is Eq. (61), the solution of Eq. (59a), (59b), (60) for bounds that do not depend on each other.
     The filter goes on from the saturated state; P is not changed by it. x and y are bounded along and across the
@@ -204,7 +204,7 @@ def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
     Returns:
         Whether anything had to give.
     """
-    low, high = np.empty(12), np.empty(12)
+    low, high = np.empty(DOF), np.empty(DOF)
     before = mean[:, :3].copy()
     p = mean[:, 0].copy()
     clamp_row(p, rules.p_min, rules.p_max, rules.coupled, low, high)
@@ -223,9 +223,9 @@ def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
 def _clip(
     rate: Floats, value: Floats, low: Floats, high: Floats, rate_low: Floats, rate_high: Floats, dt: float
 ) -> Floats:
-    """Eq. (63)-(65): the rates (12,) within their bounds and those that keep the value within its own for dt."""
-    clipped = np.empty(12)
-    for j in range(12):
+    """Eq. (63)-(65): the rates (13,) within their bounds and those that keep the value within its own for dt."""
+    clipped = np.empty(DOF)
+    for j in range(DOF):
         least, most = rate_low[j], rate_high[j]
         if dt > 0.0:
             least = min(max(least, (low[j] - value[j]) / dt), most)
@@ -236,7 +236,7 @@ def _clip(
 
 @njit(cache=True)
 def _into_body(world: Floats, theta: float) -> Floats:
-    """Eq. (33): the first two of (12,) forward and to the left."""
+    """Eq. (33): the first two of (13,) forward and to the left."""
     body = world.copy()
     c, s = np.cos(theta), np.sin(theta)
     body[0], body[1] = c * world[0] + s * world[1], -s * world[0] + c * world[1]

@@ -86,10 +86,10 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
 
     Args:
         j: Index into JOINTS.
-        bounds: (6, 12) of ``reachable_sets.bounds_of``.
+        bounds: (6, 13) of ``reachable_sets.bounds_of``.
         coupled: Whether Eq. (34b), (34c) hold.
-        low: (12,) lower ends of the joints' reachable intervals [m, m, rad...].
-        high: (12,) their upper ends.
+        low: (13,) lower ends of the joints' reachable intervals [m, m, rad...].
+        high: (13,) their upper ends.
     """
     if not coupled or j not in (5, 6, 9, 10):
         return bounds[0, j], bounds[0, j], bounds[1, j], bounds[1, j]

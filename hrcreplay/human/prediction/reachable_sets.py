@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.human.model import SHOWN_BY, LimitSet, alpha_2_bounds, alpha_3_bounds
+from hrcreplay.human.model import HEIGHT, SHOWN_BY, LimitSet, alpha_2_bounds, alpha_3_bounds
 from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, likely
 from hrcreplay.records import Bools, Floats, HumanStates, Ints, Table
 from hrcreplay.settings.sections import Occupancy
@@ -25,14 +25,14 @@ class Reach(Table):
     """Reachable interval of every joint, a row a tick, Eq. (36), (38), (39). The current posture is in it, Eq. (40)."""
 
     t_ns: Ints  #: (n,)
-    low: Floats  #: (n, 12) JOINTS [m, m, rad...]; NaN where the state is
-    high: Floats  #: (n, 12)
+    low: Floats  #: (n, 13) JOINTS [m, m, rad...]; NaN where the state is
+    high: Floats  #: (n, 13)
 
 
 class MotionLimits(NamedTuple):
     """What bounds the motions that a printed method predicts from."""
 
-    bounds: Floats  #: (6, 12) of ``bounds_of``
+    bounds: Floats  #: (6, 13) of ``bounds_of``
     coupled: bool  #: whether Eq. (34b), (34c) hold
     horizon: float  #: braking time T_s of the robot [s]
     method: int  #: index into METHODS of one of PRINTED
@@ -73,7 +73,7 @@ def reachable(
 
 
 def never_measured(states: HumanStates) -> Bools:
-    """(n, 12) joints of which no camera has shown anything yet: the filter only has a guess of them."""
+    """(n, 13) joints of which no camera has shown anything yet: the filter only has a guess of them."""
     return np.ascontiguousarray(np.isinf(states.unseen_s)[:, SHOWN_BY])
 
 
@@ -89,7 +89,7 @@ def code_of(method: str) -> int:
 
 
 def bounds_of(limits: LimitSet) -> Floats:
-    """(6, 12): p_min, p_max, v_min, v_max, a_min, a_max, as the kernels take them."""
+    """(6, 13): p_min, p_max, v_min, v_max, a_min, a_max, as the kernels take them."""
     return np.stack([limits.p_min, limits.p_max, limits.v_min, limits.v_max, limits.a_min, limits.a_max])
 
 
@@ -101,21 +101,22 @@ def _reach_rows(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: F
 
 @njit(cache=True)
 def reach_row(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Floats, high: Floats) -> None:
-    """Writes the reachable interval of every joint from p, v (12,) into low, high (12,); ``never`` was it measured.
+    """Writes the reachable interval of every joint from p, v (13,) into low, high (13,); ``never`` was it measured.
 
     Alg. 1 and its clipping to Eq. (34), (35); walking is Eq. (18)-(30).
 
     Args:
-        p: (12,) JOINTS [m, m, rad...].
-        v: (12,) their velocities [m/s, m/s, rad/s...].
-        never: (12,) whether no camera has ever shown the joint.
+        p: (13,) JOINTS [m, m, rad...].
+        v: (13,) their velocities [m/s, m/s, rad/s...].
+        never: (13,) whether no camera has ever shown the joint.
         within: What bounds the motions.
-        low: (12,) receives the lower ends [m, m, rad...].
-        high: (12,) receives the upper ends [m, m, rad...].
+        low: (13,) receives the lower ends [m, m, rad...].
+        high: (13,) receives the upper ends [m, m, rad...].
     """
     bounds, coupled, horizon, method = within
     _walk(p, v, bounds, horizon, method, low, high)
-    for j in range(3, 12):
+    low[HEIGHT], high[HEIGHT] = p[HEIGHT], p[HEIGHT]  # a length in the paper: it stays
+    for j in range(3, HEIGHT):
         if method == PAPER:
             low[j], high[j] = _joint(p[j], v[j], bounds[2:, j], horizon)
         else:

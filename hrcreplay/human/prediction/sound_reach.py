@@ -14,7 +14,7 @@ from numba import njit
 from hrcreplay.human.model import SHOWN_BY
 from hrcreplay.human.prediction.joint_reach import Stops, interval, stops
 from hrcreplay.human.prediction.walking_reach import SIDES, body_velocity, corners_of, turned, walked
-from hrcreplay.records import Floats, HumanStates
+from hrcreplay.records import DOF, Floats, HumanStates
 from hrcreplay.settings.sections import Occupancy
 
 Range = tuple[float, float]
@@ -23,17 +23,17 @@ Range = tuple[float, float]
 class Likely(NamedTuple):
     """Where people may be at the tick, a row each: a box around the estimate, and what nobody has seen for long."""
 
-    p: Floats  #: (n, 12)
-    v: Floats  #: (n, 12)
-    p_off: Floats  #: (n, 12) largest error of p
-    v_off: Floats  #: (n, 12) largest error of v
-    unseen_s: Floats  #: (n, 12) for how long a joint has not been seen, 0 within its memory [s]
+    p: Floats  #: (n, 13)
+    v: Floats  #: (n, 13)
+    p_off: Floats  #: (n, 13) largest error of p
+    v_off: Floats  #: (n, 13) largest error of v
+    unseen_s: Floats  #: (n, 13) for how long a joint has not been seen, 0 within its memory [s]
 
 
 class SoundMotionLimits(NamedTuple):
     """What bounds the motions that ``sound`` encloses."""
 
-    bounds: Floats  #: (6, 12) of ``reachable_sets.bounds_of``
+    bounds: Floats  #: (6, 13) of ``reachable_sets.bounds_of``
     coupled: bool  #: whether Eq. (34b), (34c) hold
     horizon: float  #: horizon and latency [s]
     memory: float  #: how long the filter goes on without a measurement [s]
@@ -48,7 +48,7 @@ def likely(states: HumanStates, occupancy: Occupancy, memory_s: float) -> Likely
 
 @njit(cache=True)
 def enclose_row(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high: Floats, corners: Floats) -> None:
-    """Writes the intervals (12,) of row i, and the corners (SIDES, 2) of the polygon around the pelvis [m].
+    """Writes the intervals (13,) of row i, and the corners (SIDES, 2) of the polygon around the pelvis [m].
 
     A joint unseen for longer than its memory may since have had any velocity within the bounds; its horizon starts
     when it was last seen. Its estimate has coasted from there, for at most the memory.
@@ -57,12 +57,12 @@ def enclose_row(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high
         i: Row of ``at``.
         at: Where people may be.
         within: What bounds their motions.
-        low: (12,) receives the lower ends [m, m, rad...]; NaN where the state is.
-        high: (12,) receives the upper ends.
+        low: (13,) receives the lower ends [m, m, rad...]; NaN where the state is.
+        high: (13,) receives the upper ends.
         corners: (SIDES, 2) receives the corners, world [m]; NaN where the state is.
     """
     _walk(i, at, within, low, high, corners)
-    for j in range(3, 12):
+    for j in range(3, DOF):
         limit = stops(j, within.bounds, within.coupled, low, high)
         if at.unseen_s[i, j] == np.inf:
             low[j], high[j] = limit[0], limit[3]
@@ -115,7 +115,7 @@ def _walk(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high: Floa
 
 
 def enclose(at: Likely, within: SoundMotionLimits) -> tuple[Floats, Floats]:
-    """Reachable intervals of all rows: lower and upper ends, (n, 12) each [m, m, rad...]."""
+    """Reachable intervals of all rows: lower and upper ends, (n, 13) each [m, m, rad...]."""
     low, high = np.empty_like(at.p), np.empty_like(at.p)
     _enclose_rows(at, within, low, high)
     return low, high

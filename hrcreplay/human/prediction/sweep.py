@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.geometry.hull_reduction import NX, NY, POINT, A, B, C, Surface, is_inside
+from hrcreplay.human.model import HEIGHT
 from hrcreplay.records import Floats
 
 _X, _Y, _Z = 0, 1, 2
@@ -29,12 +30,12 @@ def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tu
 
     Args:
         limb: Index into LIMBS.
-        low: (12,) lower ends of the joints' reachable intervals [m, m, rad...].
-        high: (12,) their upper ends.
-        lengths: (8,) LENGTHS [m].
+        low: (13,) lower ends of the joints' reachable intervals [m, m, rad...].
+        high: (13,) their upper ends.
+        lengths: (7,) LENGTHS [m].
     """
-    pelvis_height, torso, head, half_shoulder = lengths[0], lengths[1], lengths[2], lengths[3]
-    turn_rho = (_Y, low[3], high[3], 0.0, 0.0, pelvis_height)
+    torso, head, half_shoulder = lengths[0], lengths[1], lengths[2]
+    turn_rho = (_Y, low[3], high[3], 0.0, 0.0, low[HEIGHT])
     if limb == 0:
         points = np.array([[0.0, 0.0, torso], [0.0, 0.0, torso + head]])
         return points, np.array([turn_rho])
@@ -43,7 +44,7 @@ def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tu
         return points, np.array([turn_rho])
     left = limb >= 4
     side = 1.0 if left else -1.0
-    upper, forearm = (lengths[4], lengths[6]) if left else (lengths[5], lengths[7])
+    upper, forearm = (lengths[3], lengths[5]) if left else (lengths[4], lengths[6])
     a1 = 8 if left else 4  # first joint of the arm
     a2, a3, a4 = a1 + 1, a1 + 2, a1 + 3
     turn_2 = (_Y, -high[a2], -low[a2], 0.0, 0.0, 0.0)

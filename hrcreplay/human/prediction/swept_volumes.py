@@ -4,14 +4,14 @@ Why no motion with the stops of Eq. (34) leaves those of ``sound``, at any time 
 
 1. States. Each joint's position and velocity are within ``sigmas`` deviations of the estimate, whatever their
    correlation: a box around it. World velocities are turned into the body's frame over all headings of the box.
-2. Joints. Heading, torso and arm joints stay in the intervals of ``joint_reach`` at all times; stops that depend on
-   other joints are taken over the intervals of those.
-3. Walking. The pelvis stays in the convex polygon of ``walking_reach`` at all times.
+2. Joints. Heading, torso and arm joints and the pelvis's height stay in the intervals of ``joint_reach`` at all times;
+   stops that depend on other joints are taken over the intervals of those.
+3. Walking. The pelvis stays in the convex polygon of ``walking_reach`` at all times, at a height of its interval.
 4. Limbs. A limb at any instant is a chain of rotations, each by an angle of its interval, then a displacement of the
-   polygon. Sweeping a convex set by all angles of a joint and by all displacements, each regardless of the others,
-   holds all combinations, among them those that occur. A swept set is kept as points whose hull holds it: rotations
-   are linear, so the hull of the swept points holds the swept hull. Arcs are in triangles with their apexes outside,
-   and points are only dropped where they are proven to be inside the rest (``sweep``, ``hull_reduction``).
+   polygon and the height. Sweeping a convex set by all angles of a joint and by all displacements, each regardless of
+   the others, holds all combinations, among them those that occur. A swept set is kept as points whose hull holds it:
+   rotations are linear, so the hull of the swept points holds the swept hull. Arcs are in triangles with their apexes
+   outside, and points are only dropped where they are proven to be inside the rest (``sweep``, ``hull_reduction``).
    Where that leaves too many, the polytope of ``convex_hull`` takes their place, which holds them all. It may be cut
    back to the ball that no point of the limb can leave, because a direction's number may be any that is not below the
    truth.
@@ -21,7 +21,8 @@ Why no motion with the stops of Eq. (34) leaves those of ``sound``, at any time 
    a kilometre of the origin. Radii are larger by ``ROUNDING_M``. That is no tolerance for motions outside.
 
 The lower body is the line from the floor to the pelvis with its own radius, walking along: that of people who stand, or
-as far out as cameras have seen hips, knees and feet lately (``model_residual``).
+as far out as cameras have seen hips, knees and feet lately (``model_residual``). A low pelvis folds the legs, so the
+knees are further out.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from numba import njit
 
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
-from hrcreplay.human.model import LimitSet
+from hrcreplay.human.model import HEIGHT, LimitSet
 from hrcreplay.human.prediction.reachable_sets import SOUND, MotionLimits, bounds_of, code_of, never_measured, reach_row
 from hrcreplay.human.prediction.sound_reach import Likely, SoundMotionLimits, enclose_row, likely
 from hrcreplay.human.prediction.sweep import (
@@ -45,7 +46,7 @@ from hrcreplay.human.prediction.sweep import (
     sweep_walk,
 )
 from hrcreplay.human.prediction.walking_reach import SIDES
-from hrcreplay.records import BODY, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
 
 #: A larger set is reduced before the next rotation: below, it costs less to carry all points along.
@@ -119,7 +120,7 @@ def _predict_rows(
     limbs = 6
     offsets = np.zeros(len(p) * limbs + 1, np.int64)
     vertices = np.empty((len(p) * 256 + 256, 3))
-    low, high = np.empty(12), np.empty(12)
+    low, high = np.empty(DOF), np.empty(DOF)
     n = 0
     for i in range(len(p)):
         reach_row(p[i], v[i], never[i], within, low, high)
@@ -144,7 +145,7 @@ def _append(vertices: Floats, n: int, swept: Floats, count: int) -> Floats:
 
 @njit(cache=True)
 def _sweep_limb(limb: int, low: Floats, high: Floats, lengths: Floats, work: Surface) -> tuple[Floats, int]:
-    """Alg. 2 for one limb, given the reachable intervals (12,) and the lengths (8,)."""
+    """Alg. 2 for one limb, given the reachable intervals (13,) and the lengths (7,)."""
     points, chain = kinematic_chain(limb, low, high, lengths)
     if not np.isfinite(points.sum() + chain.sum() + low[:3].sum() + high[:3].sum()):
         return np.full((1, 3), np.nan), 1
@@ -181,6 +182,10 @@ MOST_CORNERS = 256
 _MANY_CORNERS = 40
 #: From the middle of a leg, where cameras put its points, to the skin: a thigh 0.5 m around [m].
 THIGH_M = 0.08
+#: Length of thigh and of shank with foot: two of them are the pelvis's height of the median man [m].
+BONE_M = 0.47
+#: How high a knee gets whose foot carries a person: with a shank upright on the toes [m].
+KNEE_M = 0.55
 _HEAD, _THORAX, _LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
 
 
@@ -202,6 +207,7 @@ def sweep_sound(
         np.ascontiguousarray(occupancy.sigmas * states.lengths_std_m),
         SoundMotionLimits(bounds_of(limits), limits.coupled, span_s, memory_s),
         occupancy.hand_m,
+        occupancy.legs_radius_m,
         len(LIMBS) + occupancy.legs,
         surface(),
     )
@@ -210,9 +216,8 @@ def sweep_sound(
 def sound_radii(states: HumanStates, limbs_m: Floats, occupancy: Occupancy) -> Floats:
     """(n, limbs) radii: of the limb (6,) [m], of what an unknown length up the chain displaces, and the residual.
 
-    A residual that is not known yet (NaN) is taken to be ``residual_unknown_m``. The lower body has the thorax's, which
-    tells how far the pelvis is from where it stands upright: who squats has the knees where the hips were. That of the
-    legs is how far their middles were from the line below the pelvis; where it and a thigh are more, they are the
+    A residual that is not known yet (NaN) is taken to be ``residual_unknown_m``. The lower body has the thorax's. The
+    legs' is how far their middles were from the line below the pelvis; where it and a thigh are more, they are the
     radius. Legs that were close when they were last seen make it no smaller: a table may hide that they are not now.
     """
     found = np.empty((len(states), len(LIMBS) + occupancy.legs))
@@ -227,9 +232,8 @@ def sound_radii(states: HumanStates, limbs_m: Floats, occupancy: Occupancy) -> F
 def _radii_rows(off: Floats, residual: Floats, limbs: Floats, legs: float, unknown: float, found: Floats) -> None:
     """Writes the radii; without the residual where ``unknown``, what stands for one not known yet, is NaN."""
     for i in range(len(off)):
-        pelvis = off[i, 0]
-        shoulder = pelvis + np.hypot(off[i, 1], off[i, 3])
-        displaced = (pelvis, pelvis, shoulder, shoulder + off[i, 5], shoulder, shoulder + off[i, 4])
+        shoulder = np.hypot(off[i, 0], off[i, 2])
+        displaced = (0.0, 0.0, shoulder, shoulder + off[i, 4], shoulder, shoulder + off[i, 3])
         for limb in range(found.shape[1]):
             base = legs + ROUNDING_M if limb == _LEGS else limbs[limb] + displaced[limb] + ROUNDING_M
             of = _THORAX if limb == _LEGS else limb
@@ -246,18 +250,19 @@ def _sweep_rows(
     lengths_off: Floats,
     within: SoundMotionLimits,
     hand: float,
+    legs: float,
     limbs: int,
     work: Surface,
 ) -> tuple[Floats, Ints]:
     offsets = np.zeros(len(at.p) * limbs + 1, np.int64)
     vertices = np.empty((len(at.p) * limbs * 80 + 80, 3))
-    low, high, corners = np.empty(12), np.empty(12), np.empty((SIDES, 2))
+    low, high, corners = np.empty(DOF), np.empty(DOF), np.empty((SIDES, 2))
     n = 0
     for i in range(len(at.p)):
         enclose_row(i, at, within, low, high, corners)
         for limb in range(limbs):
             if limb == _LEGS:
-                swept, count = _legs(corners, lengths[i, 0] + lengths_off[i, 0])
+                swept, count = _legs(corners, at.p[i, 2], low[HEIGHT], high[HEIGHT], legs)
             else:
                 swept, count = _limb(limb, low, high, corners, lengths[i], lengths_off[i], hand, work)
             vertices = _append(vertices, n, swept, count)
@@ -267,12 +272,27 @@ def _sweep_rows(
 
 
 @njit(cache=True)
-def _legs(corners: Floats, height: float) -> tuple[Floats, int]:
-    """From the floor to the highest pelvis, wherever it walks."""
-    if not np.isfinite(corners.sum() + height):
+def _legs(corners: Floats, ahead: float, lowest: float, highest: float, radius: float) -> tuple[Floats, int]:
+    """From the floor to the highest pelvis, wherever it walks; below, as far out as the lowest pelvis puts the knees.
+
+    Args:
+        corners: (SIDES, 2) where the pelvis walks [m].
+        ahead: Direction of its first side [rad].
+        lowest: Pelvis's height [m].
+        highest: The same [m].
+        radius: Of the ball around the result; it holds knees of people who stand [m].
+    """
+    if not np.isfinite(corners.sum() + lowest + highest):
         return np.full((1, 3), np.nan), 1
-    swept = np.zeros((2 * SIDES, 3))
-    swept[:SIDES, :2], swept[SIDES:, :2], swept[SIDES:, 2] = corners, corners, height
+    bent = np.sqrt(max(0.0, BONE_M**2 - (0.5 * lowest) ** 2))  # foot under the pelvis, thigh and shank of one length
+    out = max(0.0, bent - (radius - THIGH_M)) / np.cos(np.pi / SIDES)
+    swept = np.zeros((3 * SIDES, 3))
+    for k in range(SIDES):
+        middle = ahead + (k + 0.5) * 2.0 * np.pi / SIDES
+        swept[k, 0] = corners[k, 0] + out * np.cos(middle)
+        swept[k, 1] = corners[k, 1] + out * np.sin(middle)
+    swept[SIDES : 2 * SIDES, :2], swept[SIDES : 2 * SIDES, 2] = swept[:SIDES, :2], min(KNEE_M, highest)
+    swept[2 * SIDES :, :2], swept[2 * SIDES :, 2] = corners, highest
     return swept, len(swept)
 
 
@@ -283,9 +303,9 @@ def _limb(
     """Points around all that a limb reaches, in place of Alg. 2; a NaN vertex where state or lengths are NaN."""
     ends, chain = kinematic_chain(limb, low, high, lengths)
     ends = _longest(limb, ends, off, hand)
-    if not np.isfinite(ends.sum() + chain.sum() + corners.sum() + low[2] + high[2]):
+    if not np.isfinite(ends.sum() + chain.sum() + corners.sum() + low[2] + high[2] + high[HEIGHT]):
         return np.full((1, 3), np.nan), 1
-    points, count, faces = _turn_all(ends, chain, work)
+    points, count, faces = _turn_all(ends, chain, high[HEIGHT] - low[HEIGHT], work)
     fine = count * copies(low[2], high[2], FINE_RAD) * SIDES <= MOST_FINE
     widest = FINE_RAD if fine else TRIANGLE_RAD
     room = count * copies(low[2], high[2], widest) * SIDES
@@ -300,8 +320,12 @@ def _limb(
 
 
 @njit(cache=True)
-def _turn_all(ends: Floats, chain: Floats, work: Surface) -> tuple[Floats, int, int]:
-    """Points around what the rotations of a chain make of a limb's ends, how many, and triangles around them."""
+def _turn_all(ends: Floats, chain: Floats, rise: float, work: Surface) -> tuple[Floats, int, int]:
+    """Points around what a chain's rotations and a rise of the pelvis make of a limb's ends [m].
+
+    Returns:
+        The points, how many they are, and triangles around them.
+    """
     points, count, faces = ends, len(ends), 0
     radius = 0.0  # of the ball around the frame's origin that holds the limb
     for end in ends:
@@ -319,33 +343,45 @@ def _turn_all(ends: Floats, chain: Floats, work: Surface) -> tuple[Floats, int, 
         for i in range(count):
             for j in range(3):
                 points[i, j] += step[3 + j]
-        faces = 0
-        if room <= MOST_REDUCED and (count > _MANY_CORNERS or k == len(chain) - 1):
-            count, faces = keep_corners(points, count, work)
+        if k < len(chain) - 1 and count > _MANY_CORNERS and room <= MOST_REDUCED:
+            count, _ = keep_corners(points, count, work)
         radius += np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+    if rise > 0.0:
+        points, count = _raised(points, count, rise), 2 * count
+    if count <= MOST_REDUCED:
+        count, faces = keep_corners(points, count, work)
     return points, count, faces
 
 
 @njit(cache=True)
+def _raised(points: Floats, count: int, rise: float) -> Floats:
+    """The first ``count`` points, and the same higher by ``rise`` [m]: their hull holds all heights between."""
+    both = np.empty((2 * count, 3))
+    both[:count], both[count:] = points[:count], points[:count]
+    both[count:, 2] += rise
+    return both
+
+
+@njit(cache=True)
 def _longest(limb: int, ends: Floats, off: Floats, hand: float) -> Floats:
-    """The limb's end points, drawn out to where lengths up to ``off`` (8,) longer or shorter may put them [m]."""
+    """The limb's end points, drawn out to where lengths up to ``off`` (7,) longer or shorter may put them [m]."""
     if limb == _HEAD:
-        ends[0, 2] -= off[1]
-        ends[1, 2] += off[1] + off[2]
+        ends[0, 2] -= off[0]
+        ends[1, 2] += off[0] + off[1]
         return ends
     if limb == _THORAX:
-        if off[1] == 0.0 and off[3] == 0.0:
+        if off[0] == 0.0 and off[2] == 0.0:
             return ends
         wide = np.concatenate((ends, ends[1:]))
         for i in range(1, 5):
-            wide[i, 1] += off[3] if wide[i, 1] > 0.0 else -off[3]
-            wide[i, 2] += off[1] if i > 2 else -off[1]
+            wide[i, 1] += off[2] if wide[i, 1] > 0.0 else -off[2]
+            wide[i, 2] += off[0] if i > 2 else -off[0]
         return wide
     left = limb >= 4
     if limb in (2, 4):
-        ends[1, 2] -= off[4] if left else off[5]
+        ends[1, 2] -= off[3] if left else off[4]
     else:
-        ends[1, 2] -= hand + (off[6] if left else off[7])
+        ends[1, 2] -= hand + (off[5] if left else off[6])
     return ends
 
 

@@ -71,7 +71,7 @@ def walked(heading: Range, velocity: tuple[Range, Range, Range], bounds: Floats,
     Args:
         heading: Initial headings [rad].
         velocity: Initial v, v_perp and omega [m/s, m/s, rad/s].
-        bounds: (6, 12) of ``reachable_sets.bounds_of``.
+        bounds: (6, 13) of ``reachable_sets.bounds_of``.
         horizon: [s].
         far: Receives the sums.
     """
@@ -108,7 +108,7 @@ def turned(heading: Range, omega: Range, bounds: Floats, horizon: float) -> Rang
     Args:
         heading: Initial headings [rad].
         omega: Initial angular velocities [rad/s].
-        bounds: (6, 12) of ``reachable_sets.bounds_of``.
+        bounds: (6, 13) of ``reachable_sets.bounds_of``.
         horizon: [s].
     """
     turn = _turn(omega, bounds, horizon)

@@ -21,7 +21,7 @@ from hrcreplay.live.record.codec import PHASES, MotionRow
 from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import BODY, LIMBS, Floats, HumanStates, Motion
+from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, Floats, HumanStates, Motion
 from hrcreplay.run import build
 from hrcreplay.run.contact import write_contact
 from hrcreplay.run.job import Job
@@ -102,8 +102,9 @@ _COUNTED = {
 
 def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], where: Path) -> HumanStates:
     numbers = np.array([look.state for look in looks])
-    widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), 12)
-    widths |= {"lengths_m": 8, "lengths_std_m": 8, "residual_m": len(BODY), "unseen_s": len(LIMBS)}
+    widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), DOF)
+    widths |= dict.fromkeys(("lengths_m", "lengths_std_m"), len(LENGTHS))
+    widths |= {"residual_m": len(BODY), "unseen_s": len(LIMBS)}
     ends = np.cumsum(list(widths.values()))
     if numbers.shape[1] != ends[-1]:
         raise LogError(
