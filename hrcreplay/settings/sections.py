@@ -87,8 +87,10 @@ class Fusion(Section):
     """An angle is used when the product of the confidences of its points is at least this."""
     outlier_m: Positive = 0.20
     """A point further than this from the predicted skeleton is an outlier [m]."""
+    relearn_s: Positive = 0.1
+    """Unless a camera has shown it in one place for so long, and none has shown it where the filter has it [s]."""
     bone_m: Positive = 0.10
-    """So is one at the end of a bone that is longer or shorter than the person's by more [m]."""
+    """An outlier is also a point at the end of a bone that is longer or shorter than the person's by more [m]."""
     bone_memory_s: Positive = 5.0
     """Unless no camera has seen that bone right for so long [s]."""
     point_std_m: Positive = 0.02
@@ -107,6 +109,8 @@ class Fusion(Section):
     """Of how far each limb's measured points were from the model's: the quantile that is tracked."""
     residual_memory_s: Positive = 20.0
     """A distance seen this long ago counts 1/e of a new one [s]."""
+    residual_hold_s: NotNegative = 0.15
+    """The largest distance of so long counts where it is more than the quantile [s]."""
     spread_memory_s: Positive = 1.0
     """The reported deviations follow the surprises of measurements; a surprise falls to 1/e in this time [s]."""
     spread_least: Positive = 0.01

@@ -8,13 +8,13 @@ from hrcreplay.human.fusion.fuse import fuse, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import LimitSet, skeleton
 from hrcreplay.limits import load_limits
-from hrcreplay.records import Floats, HumanStates, Ints, Measurements
+from hrcreplay.records import DOF, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
 
 WIDE = load_limits("human")
 #: No bound but heading's absence of one, no outlier, nothing forgotten: the plain filter of (42)-(57).
-_LOW, _HIGH = np.full(12, -1e9), np.full(12, 1e9)
+_LOW, _HIGH = np.full(DOF, -1e9), np.full(DOF, 1e9)
 FREE = LimitSet("free", _LOW, _HIGH, _LOW, _HIGH, _LOW, _HIGH, coupled=False)
 PLAIN = Fusion(outlier_m=1e6, bone_m=1e6, coast_s=1e3, memory_s=1e3, spread_least=1.0, spread_most=1.0)
 

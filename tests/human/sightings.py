@@ -5,23 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from hrcreplay.human.model import LimitSet, clamp
-from hrcreplay.records import POINTS, CameraFrames, Floats, Ints, Measurements
+from hrcreplay.records import DOF, LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements
 
-NEUTRAL = np.array([0.3, -0.2, 0.4, 0.1, 0.3, 0.6, 0.1, 1.9, 0.2, 0.5, -0.1, 2.1])
-LENGTHS_M = np.array([0.94, 0.5, 0.22, 0.19, 0.31, 0.32, 0.27, 0.26])
+NEUTRAL = np.array([0.3, -0.2, 0.4, 0.1, 0.3, 0.6, 0.1, 1.9, 0.2, 0.5, -0.1, 2.1, 0.94])
+LENGTHS_M = np.array([0.5, 0.22, 0.19, 0.31, 0.32, 0.27, 0.26])
 CAMERAS = ("left", "right")
 
 
 def postures(limits: LimitSet, n: int, seed: int) -> Floats:
-    """(n, 12) uniform in the limits' box, then put inside the coupled limits."""
+    """(n, 13) uniform in the limits' box, then put inside the coupled limits."""
     rng = np.random.default_rng(seed)
     low = np.where(np.isfinite(limits.p_min), limits.p_min, -3.0)
     high = np.where(np.isfinite(limits.p_max), limits.p_max, 3.0)
-    return clamp(rng.uniform(low, high, (n, 12)), limits)
+    return clamp(rng.uniform(low, high, (n, DOF)), limits)
 
 
 def lengths(n: int, seed: int) -> Floats:
-    return np.random.default_rng(seed).uniform(0.15, 1.0, (n, 8))
+    return np.random.default_rng(seed).uniform(0.15, 1.0, (n, len(LENGTHS)))
 
 
 def frames_of(points_m: Floats, camera: Ints, capture_ns: Ints, delay_ns: int = 0) -> CameraFrames:

@@ -1,4 +1,9 @@
-"""What of a camera's frame the filter may use, 4.1.2: by confidence, and by the predicted skeleton."""
+"""What of a camera's frame the filter may use, 4.1.2: by confidence, and by the predicted skeleton.
+
+A gate that only refuses keeps a filter that went wrong from ever seeing it. So a point that a camera goes on showing in
+one place, while no camera shows it where the filter has it, is evidence: after ``relearn_s`` it is believed, and its
+rows start anew. Left and right exchanged are none.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +35,11 @@ _PLACING[0, HEAD] = True
 _ENDS = np.zeros((len(LENGTHS), len(POINTS)), dtype=np.bool_)
 for _length, _point in enumerate(_FAR_ENDS):
     _ENDS[_length, list(_point)] = True
+#: (20,) the same point on the other side of the body; itself where there is none.
+_OTHER_SIDE = np.array(
+    [POINTS.index(p[:-1] + {"l": "r", "r": "l"}[p[-1]] if p[-2] == "_" else p) for p in POINTS], dtype=np.int64
+)
+_NEVER_NS = -(2**62)
 _STEP = 1e-5
 #: How wrong a length is that starts anew, standard deviation [m].
 _UNKNOWN_M = 0.1
@@ -48,19 +58,16 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
         track: Counts the points that do not agree with the filter.
     """
     trusted = np.ones(len(filter_.point_ns), dtype=np.bool_)
+    believed = np.zeros(len(filter_.point_ns), dtype=np.bool_)
     if filter_.started[0]:
-        trusted = _agreeing(filter_, c, now, rules) & _whole(filter_, c, now, rules)
+        agreeing, believed = _agreeing(filter_, c, now, rules)
+        trusted = (agreeing | believed) & _whole(filter_, c, now, rules)
         track.outliers[c] += len(trusted) - np.sum(trusted)
+    _judge_rows(filter_, c, trusted, rules)
+    for row in np.flatnonzero(filter_.valid[c]):
+        if (DEPENDS[row] & believed).any():
+            filter_.row_ns[row] = min(filter_.row_ns[row], now - rules.memory_ns - 1)  # lost: it starts anew
     confidence, points = filter_.confidence[c], filter_.points[c]
-    for row in range(ROWS):
-        product = 1.0
-        agrees = np.isfinite(filter_.z[c, row])
-        for k in range(len(trusted)):
-            if DEPENDS[row, k]:
-                product *= confidence[k] if np.isfinite(points[k, 0]) else confidence[NECK]
-                agrees = agrees and trusted[k]
-        blind = 2 <= row < HEIGHT and filter_.z_var[c, row] > _BLIND_STD**2
-        filter_.valid[c, row] = agrees and not blind and product >= rules.confidence_min
     for point in _TESTED:
         if trusted[point] and confidence[point] >= rules.confidence_min and np.isfinite(points[point, 0]):
             filter_.point_ns[point] = now
@@ -74,14 +81,55 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
 
 
 @njit(cache=True)
-def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
-    """The points of a frame (20,) near enough to the a-priori skeleton; a lost point agrees with anything.
+def _judge_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> None:
+    """Which rows are valid, Eq. (58), given the points (20,) to be trusted."""
+    confidence, points = filter_.confidence[c], filter_.points[c]
+    for row in range(ROWS):
+        product = 1.0
+        agrees = np.isfinite(filter_.z[c, row])
+        for k in range(len(trusted)):
+            if DEPENDS[row, k]:
+                product *= confidence[k] if np.isfinite(points[k, 0]) else confidence[NECK]
+                agrees = agrees and trusted[k]
+        blind = 2 <= row < HEIGHT and filter_.z_var[c, row] > _BLIND_STD**2
+        filter_.valid[c, row] = agrees and not blind and product >= rules.confidence_min
 
-    Near is within ``outlier_m`` widened by three standard deviations of the prediction towards the point, each joint's
-    carried through the forward kinematics. Those across say nothing: left and right exchanged would pass.
+
+@njit(cache=True)
+def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Bools, Bools]:
+    """The points of a frame (20,) near enough to the a-priori skeleton, and those believed although they are not.
+
+    A lost point agrees with anything. Since when each other one has been refused is kept.
     """
-    d = delay(filter_, c, now, rules)
-    p, lengths = ago(filter_.mean, d), filter_.lengths
+    points = filter_.points[c]
+    expected, gate = _gates(filter_, c, now, rules)
+    agreeing, believed = np.ones(len(points), dtype=np.bool_), np.zeros(len(points), dtype=np.bool_)
+    for k in _TESTED:
+        lost = now - filter_.point_ns[k] > rules.memory_ns
+        agreeing[k] = lost or not distance(points[k], expected[k]) > gate[k]  # or missing
+        if not np.isfinite(points[k, 0]) or filter_.confidence[c, k] < rules.confidence_min:
+            continue
+        other = _OTHER_SIDE[k]
+        exchanged = other != k and distance(points[other], expected[k]) <= gate[k]
+        if agreeing[k] or exchanged:
+            filter_.refused_ns[c, k] = _NEVER_NS
+            continue
+        stays = distance(points[k], filter_.refused_at[c, k]) <= rules.outlier_m
+        if not stays or filter_.refused_ns[c, k] <= filter_.point_ns[k]:
+            filter_.refused_ns[c, k] = now
+        filter_.refused_at[c, k] = points[k]
+        believed[k] = now - filter_.refused_ns[c, k] >= rules.relearn_ns
+    return agreeing, believed
+
+
+@njit(cache=True)
+def _gates(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Floats, Floats]:
+    """Where a camera's frame should show the points, (20, 3) [m], and how far off they may be, (20,) [m].
+
+    That is ``outlier_m`` widened by three standard deviations of the prediction towards the point, each joint's carried
+    through the forward kinematics. Those across say nothing: left and right exchanged would pass.
+    """
+    p, lengths = ago(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths
     expected, moved = np.empty_like(filter_.points[c]), np.empty_like(filter_.points[c])
     skeleton_row(p, lengths, expected)
     towards, variance = np.zeros_like(expected), np.zeros(len(expected))
@@ -102,13 +150,7 @@ def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
         if k != PELVIS:
             variance[k] += filter_.lengths_var[0] + filter_.lengths_var[1 if k == HEAD else 2]
             variance[k] += 0.0 if k == HEAD else filter_.lengths_var[3:].sum()
-    agreeing = np.ones(len(expected), dtype=np.bool_)
-    for k in _TESTED:
-        lost = now - filter_.point_ns[k] > rules.memory_ns
-        if not lost and np.isfinite(filter_.points[c, k, 0]):
-            gate = rules.outlier_m + 3.0 * np.sqrt(variance[k])
-            agreeing[k] = distance(filter_.points[c, k], expected[k]) <= gate
-    return agreeing
+    return expected, rules.outlier_m + 3.0 * np.sqrt(variance)
 
 
 @njit(cache=True)

@@ -32,6 +32,9 @@ class Filter(NamedTuple):
     row_ns: Ints  #: (20,) tick at which a row (JOINTS, then LENGTHS) was last valid
     acquired_ns: Ints  #: (20,) tick at which a row started anew
     point_ns: Ints  #: (20,) tick at which a body point last agreed with the filter
+    refused_ns: Ints  #: (c, 20) tick since when a camera has shown a point elsewhere, in one place
+    refused_at: Floats  #: (c, 20, 3) where it last did
+    apart: Floats  #: (c, 7) how far that is from the filter, the farthest point of each limb of BODY; 0 without one [m]
     bone_ns: Ints  #: (7,) tick at which a camera last saw a length that agreed with the filter
     capture_ns: Ints  #: (c,) of the frame held for each camera
     uses: Ints  #: (c,) ticks that frame was used in; -1 without one
@@ -46,6 +49,8 @@ class Filter(NamedTuple):
     samples: Ints  #: (7,) residuals so far
     sampled_ns: Ints  #: (7,) tick of the last
     residual: Floats  #: (7,) their quantile [m]
+    peak: Floats  #: (7,) largest of the last few [m]
+    peak_ns: Ints  #: (7,) tick of it
     surprise: Floats  #: (13,) running mean of each joint's innovations squared over their variance
     spread: Floats  #: (13,) highest of it lately: the factor on the variances that are told
 
@@ -73,10 +78,12 @@ class Rules(NamedTuple):
     outlier_m: float
     bone_m: float
     memory_ns: int
+    relearn_ns: int
     bone_memory_ns: int
     coast_ns: int
     residual_quantile: float
     residual_memory_s: float
+    residual_hold_ns: int
     spread_memory_s: float
     spread_least: float
     spread_most: float

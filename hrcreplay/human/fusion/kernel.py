@@ -11,7 +11,7 @@ from numba import njit
 from hrcreplay.human.fusion.gating import judge
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, correct, delay, dot, enter, factor, predict
-from hrcreplay.human.fusion.model_residual import observe, unseen
+from hrcreplay.human.fusion.model_residual import observe, told, unseen
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row, nearest_arm, wrap
 from hrcreplay.records import DOF, Floats, Ints
 
@@ -44,6 +44,8 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
         for c in range(len(fresh)):
             if fresh[c]:
                 judge(filter_, c, now, rules, track)
+        if filter_.started[0]:
+            observe(filter_, fresh, now, rules)
         for c in range(len(fresh)):
             again = rules.reuse and filter_.uses[c] > 0 and now - filter_.capture_ns[c] <= rules.memory_ns
             if fresh[c] or again:
@@ -53,7 +55,6 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
             _rename(filter_)
             if saturate(filter_.mean, dt, rules):
                 track.saturated[0] += 1
-            observe(filter_, fresh, now, rules)
             _leave(filter_, k, rules, track, damping)
 
 
@@ -185,7 +186,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
             track.motion[4 + a, k, j] = np.sqrt(factor(filter_, j, rules) * filter_.cov[j, a, a])
     track.lengths[0, k] = filter_.lengths
     track.lengths[1, k] = np.sqrt(filter_.lengths_var)
-    track.residual[k] = filter_.residual
+    told(filter_, filter_.tick_ns[0], rules, track.residual[k])
     unseen(filter_, track.unseen[k])
     if len(track.cov) > 0:
         track.cov[k] = filter_.cov

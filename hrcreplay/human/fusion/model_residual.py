@@ -1,9 +1,9 @@
 """How far people are from their model, limb by limb, and for how long a limb has not been seen.
 
 People bend sideways, twist and lift their shoulders; twelve joints do not (docs/paper.md). A sample of a
-limb's residual is the largest distance of its measured points from those of the fused model at the frame's capture
-time, where the delay is compensated. It is taken after the tick's update and saturation, so it is about the state that
-is handed on, from frames that show the limb and all that carries it with enough confidence and without an outlier.
+limb's residual is the largest distance of its measured points from those of the predicted model at the frame's capture
+time, where the delay is compensated. It is taken before the frame is used, so it also holds how far the filter lags who
+sets off, from frames that show the limb and all that carries it with enough confidence and without an outlier.
 
 Legs have no joints in the model. Theirs is the largest distance from the line between the floor and the fused pelvis of
 the hips, knees, ankles and feet that the frame shows, if it shows the pelvis and at least one point below the hips. The
@@ -11,7 +11,8 @@ distance from a convex set is convex, so a bone between two points is no further
 
 The running quantile is that of all samples so far, each with the weight exp(-age / memory); a limb out of sight does
 not age for longer than it takes to be lost, so that what is known of a person outlives an occlusion. Samples are kept
-by the millimetre and rounded up.
+by the millimetre and rounded up. The largest of the last ``residual_hold_s`` counts where it is more: a movement of its
+kind has not been seen before.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ REACH_M = 1.2
 _BIN_M = 0.001
 #: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person's arm.
 BINS = round(REACH_M / _BIN_M)
+#: Two cameras show a point in one place where they are no further apart [m].
+NEAR_M = 0.2
 #: Fewer samples say nothing of a quantile.
 LEAST = 20
 
@@ -45,6 +48,7 @@ _ENDS = np.array(
         [_ELBOW_L, _WRIST_L, _WRIST_L],
     ]
 )
+_PELVIS_ALONE = np.full(3, PELVIS)
 #: First of the two joints of each arm's limb.
 _FIRST = np.array([RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2])
 _LEGS = BODY.index("LEGS")
@@ -57,7 +61,7 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
     """Takes the samples of the cameras' new frames in, and the quantiles of those limbs anew.
 
     Args:
-        filter_: After the tick's update and saturation; the residuals' samples and quantiles are changed.
+        filter_: After the tick's prediction, before its update; the residuals' samples and quantiles are changed.
         fresh: (c,) whether the frame held for a camera is new.
         now: The tick [ns].
         rules: Settings of the filter.
@@ -65,6 +69,7 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
     model = np.empty_like(filter_.points[0])
     for c in np.flatnonzero(fresh):
         skeleton_row(ago(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths, model)
+        _depart(filter_, c, model, now)
         for limb in np.flatnonzero(filter_.shows[c]):
             if _settled(filter_, limb, now, rules):
                 sample = 0.0
@@ -80,6 +85,51 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
         if filter_.samples[limb] >= LEAST:
             larger = (1.0 - rules.residual_quantile) * filter_.weight[limb]
             filter_.residual[limb] = _exceeded_by(filter_.residuals[limb], larger)
+
+
+@njit(cache=True)
+def _depart(filter_: Filter, c: int, model: Floats, now: int) -> None:
+    """Writes how far a camera shows each limb from the model (20, 3) [m], by points that the gates refuse.
+
+    Counts what it, or another camera, has shown there before, and no camera where the model has it.
+    """
+    filter_.apart[c] = 0.0
+    for limb in range(len(BODY)):
+        for k in _PELVIS_ALONE if limb == _LEGS else _ENDS[limb]:
+            since = filter_.refused_ns[c, k]
+            if since <= filter_.point_ns[k]:
+                continue
+            here = filter_.refused_at[c, k]
+            shown = since < now
+            for other in range(len(filter_.apart)):
+                both = filter_.refused_ns[other, k] > filter_.point_ns[k]
+                shown = shown or (other != c and both and distance(filter_.refused_at[other, k], here) <= NEAR_M)
+            if shown:
+                filter_.apart[c, limb] = max(filter_.apart[c, limb], distance(here, model[k]))
+
+
+@njit(cache=True)
+def told(filter_: Filter, now: int, rules: Rules, residual: Floats) -> None:
+    """Writes the residual of each limb of BODY that counts at a tick, (7,) [m]; NaN until known.
+
+    It holds what cameras show that the gates still refuse, so that volumes hold both, what the filter has and what the
+    cameras saw.
+
+    Args:
+        filter_: After ``observe``.
+        now: The tick [ns].
+        rules: Settings of the filter.
+        residual: Receives the quantiles, or what is farther.
+    """
+    residual[:] = filter_.residual
+    for limb in range(len(residual)):
+        if now - filter_.peak_ns[limb] <= rules.residual_hold_ns and residual[limb] < filter_.peak[limb]:
+            residual[limb] = filter_.peak[limb]
+    for c in range(len(filter_.apart)):
+        if now - filter_.capture_ns[c] <= rules.memory_ns:
+            for limb in range(len(residual)):
+                if filter_.apart[c, limb] > 0.0:
+                    residual[limb] = np.fmax(residual[limb], filter_.apart[c, limb])
 
 
 @njit(cache=True)
@@ -130,6 +180,8 @@ def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) ->
         return
     age = min(now - filter_.sampled_ns[limb], rules.memory_ns) * 1e-9
     kept = np.exp(-age / rules.residual_memory_s)
+    if sample >= filter_.peak[limb] or now - filter_.peak_ns[limb] > rules.residual_hold_ns:
+        filter_.peak[limb], filter_.peak_ns[limb] = sample, now
     filter_.residuals[limb] *= kept
     filter_.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf is no whole number
     filter_.weight[limb] = kept * filter_.weight[limb] + 1.0

@@ -1,0 +1,80 @@
+"""People who get up, sit down and squat: where they are, and whether their whole limbs stay in the volumes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from hrcreplay.human.model import HEIGHT
+from hrcreplay.human.prediction.swept_volumes import predict
+from hrcreplay.limits import load_limits
+from hrcreplay.records import BODY, POINTS, Floats
+from hrcreplay.settings.sections import Fusion, Occupancy
+from tests.human import rising
+from tests.human.filtered import fused, ticks
+
+HORIZONS_S = (0.05, 0.1, 0.2, 0.377)
+#: Every how many ticks the volumes are asked for, and how many instants of the future they are held against.
+EVERY, INSTANTS = 10, 8
+#: Axes of each limb of BODY, and the radius of its flesh [m].
+AXES = {
+    "HD": ((("neck", "head"),), 0.12),
+    "THX": ((("pelvis", "neck"), ("shoulder_l", "shoulder_r")), 0.15),
+    "URA": ((("shoulder_r", "elbow_r"),), 0.07),
+    "LRA": ((("elbow_r", "wrist_r"),), 0.07),
+    "ULA": ((("shoulder_l", "elbow_l"),), 0.07),
+    "LLA": ((("elbow_l", "wrist_l"),), 0.07),
+    "LEGS": (tuple((f"{a}_{s}", f"{b}_{s}") for s in "lr" for a, b in (("hip", "knee"), ("knee", "ankle"))), 0.08),
+}
+
+
+def outside_m(points: Floats, vertices: Floats) -> float:
+    """How far the farthest of some points (m, 3) is from the hull's planes [m]; no more than from the hull."""
+    hull = ConvexHull(vertices)
+    return float((points @ hull.equations[:, :3].T + hull.equations[:, 3]).max())
+
+
+def coverage(duration_s: float, kind: str, horizon_s: float, seed: int) -> Floats:
+    """(n, 7) whether each limb of BODY stays in its volume, flesh and all."""
+    measurements, end_s = rising.seen(duration_s, kind, seed)
+    t_ns = ticks(end_s)
+    states = fused(measurements, t_ns, Fusion())
+    some = np.arange(250, len(t_ns) - round(250 * horizon_s) - 1, EVERY)
+    volumes = predict(
+        states.rows(some), load_limits("people"), Occupancy(), horizon_s=horizon_s, memory_s=Fusion().memory_s
+    )
+    inside = np.zeros((len(some), len(BODY)))
+    for i, tick in enumerate(some):
+        at_s = t_ns[tick] * 1e-9 + np.linspace(0.0, horizon_s, INSTANTS)
+        points = rising.body(at_s, duration_s, kind)
+        for k, limb in enumerate(BODY):
+            axes, flesh_m = AXES[limb]
+            ends = np.concatenate([points[:, [POINTS.index(a), POINTS.index(b)]] for a, b in axes]).reshape(-1, 3)
+            inside[i, k] = outside_m(ends, volumes.vertices(i, k)) <= volumes.radius_m[i, k] - flesh_m
+    return inside
+
+
+@pytest.mark.parametrize("kind", ["squat", "chair"])
+@pytest.mark.parametrize("duration_s", [0.6, 1.0, 2.0])
+def test_whole_limbs_stay_in_their_volumes(kind: str, duration_s: float) -> None:
+    for horizon_s in HORIZONS_S:
+        inside = coverage(duration_s, kind, horizon_s, seed=3)
+        assert inside.all(axis=1).mean() >= 0.995, (horizon_s, dict(zip(BODY, inside.mean(axis=0), strict=True)))
+
+
+@pytest.mark.parametrize("kind", ["squat", "chair"])
+@pytest.mark.parametrize("duration_s", [0.6, 1.0, 2.0])
+def test_head_and_pelvis_are_right_soon_after(kind: str, duration_s: float) -> None:
+    measurements, end_s = rising.seen(duration_s, kind, seed=4)
+    t_ns = ticks(end_s)
+    states = fused(measurements, t_ns, Fusion())
+    for settled_s in (rising.STILL_S + duration_s + 0.5, end_s - rising.STILL_S + 0.5):
+        at = np.searchsorted(t_ns, round(settled_s * 1e9))
+        truth = rising.body(t_ns[at : at + 1] * 1e-9, duration_s, kind)[0]
+        assert abs(states.p[at, HEIGHT] - truth[POINTS.index("pelvis"), 2]) <= 0.03
+        from hrcreplay.human.model import skeleton
+
+        model = skeleton(states.p[at : at + 1], states.lengths_m[at : at + 1])[0]
+        for point in ("pelvis", "head"):
+            assert np.linalg.norm(model[POINTS.index(point)] - truth[POINTS.index(point)]) <= 0.03, point
