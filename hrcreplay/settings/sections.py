@@ -97,8 +97,8 @@ class Fusion(Section):
     """Standard deviation of a skeleton point at full confidence [m]."""
     point_std_per_m: NotNegative = 0.0
     """Its growth with the distance from the camera [m/m]."""
-    sigma_position: Sigmas = (300.0, 100.0, 5.0, 1.0)
-    """Sigmas of Eq. (44) for x and y: p, v, a, j [m/s^2, m/s^2.5, m/s^3, m/s^3.5]."""
+    sigma_position: Sigmas = (300.0, 200.0, 5.0, 1.0)
+    """Sigmas of Eq. (44) for x, y and z: p, v, a, j [m/s^2, m/s^2.5, m/s^3, m/s^3.5]."""
     sigma_angle: Sigmas = (1500.0, 600.0, 10.0, 1.0)
     """The same for the angles [rad]."""
     coast_s: Positive = 0.12

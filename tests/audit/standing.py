@@ -8,7 +8,7 @@ import numpy as np
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.records import CameraFrames, Floats
+from hrcreplay.records import DOF, CameraFrames, Floats
 from tests.human.people import LENGTHS_M
 
 
@@ -29,7 +29,7 @@ def frames(points: Floats, rate_hz: float = 30.0) -> CameraFrames:
 
 def standing(n: int) -> Floats:
     """(n, 20, 3) points of the model with slightly bent arms, swaying by 0.1 mm as nobody is frozen [m]."""
-    p = np.zeros((n, 12))
+    p = np.zeros((n, DOF))
     p[:, 0] = 1e-4 * np.sin(np.arange(n))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     return skeleton(p, np.tile(LENGTHS_M, (n, 1)))

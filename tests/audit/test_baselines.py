@@ -13,7 +13,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
-from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, SweptVolumes
+from hrcreplay.records import DOF, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
 from tests.human.people import random_states, states
 
@@ -83,7 +83,7 @@ def test_v2_a50_holds_every_motion_with_its_speed_and_acceleration(horizon_s: fl
 
 
 def test_a_faster_person_than_the_peer_believes_in_counts_as_2_m_per_s() -> None:
-    p, v = np.zeros((1, 12)), np.zeros((1, 12))
+    p, v = np.zeros((1, DOF)), np.zeros((1, DOF))
     p[0, [7, 11]], v[0, 0] = np.pi, 5.0
     head = _predict(states(p, v), "v2_a50").vertices(0, 0)
     still = _predict(states(p, 0 * v), "v2_a50").vertices(0, 0)
@@ -125,7 +125,7 @@ def test_the_lower_arm_ends_at_the_tip_of_the_hand(method: str) -> None:
 
 @pytest.mark.parametrize("method", baselines.BASELINES)
 def test_a_person_not_known_yet_has_no_volume(method: str) -> None:
-    people = states(np.full((2, 12), np.nan), np.full((2, 12), np.nan))
+    people = states(np.full((2, DOF), np.nan), np.full((2, DOF), np.nan))
     volumes = _predict(people, method)
     assert len(volumes) == 2
     assert all(np.isnan(volumes.vertices(tick, i)).any() for tick in range(2) for i in range(6))

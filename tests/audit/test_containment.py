@@ -10,7 +10,7 @@ from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.audit.containment import InflatedHull, union_volume_m3
-from hrcreplay.records import Floats
+from hrcreplay.records import DOF, Floats
 
 
 def _by_least_squares(point: Floats, vertices: Floats) -> float:
@@ -76,7 +76,7 @@ def test_the_union_of_two_balls_that_meet() -> None:
     balls = [InflatedHull.around(np.array([[x, 0.0, 0.0]]), 1.0) for x in (0.0, 1.0)]
     exact = 8.0 / 3.0 * np.pi - 5.0 / 12.0 * np.pi
     errors = []
-    for k in range(12):
+    for k in range(DOF):
         found, error = union_volume_m3(balls, 1024, 1024 * k)
         errors.append(found - exact)
         assert error < 0.05 * exact

@@ -7,6 +7,7 @@ import pytest
 
 from hrcreplay.audit.fit_limits import Futures, fit_each_side, inside_intervals
 from hrcreplay.limits import load_limits
+from hrcreplay.records import DOF
 
 PAPER = load_limits("paper")
 T_S, N = 0.4, 4000
@@ -15,7 +16,7 @@ T_S, N = 0.4, 4000
 def pushed(at_rest: tuple[int, ...] = ()) -> Futures:
     """Joints with velocities in +-2 and accelerations in -3 to 5, even; each keeps its acceleration for the horizon."""
     rng = np.random.default_rng(8)
-    v, a = rng.uniform(-2.0, 2.0, (N, 12)), rng.uniform(-3.0, 5.0, (N, 12))
+    v, a = rng.uniform(-2.0, 2.0, (N, DOF)), rng.uniform(-3.0, 5.0, (N, DOF))
     t = np.linspace(0.0, T_S, 41)[1:, None, None]
     path = v * t + 0.5 * a * t**2
     low, high = path.min(axis=0), path.max(axis=0)

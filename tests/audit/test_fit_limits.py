@@ -11,7 +11,7 @@ from hrcreplay.audit import fit_limits
 from hrcreplay.audit.fit_limits import Futures
 from hrcreplay.errors import LogError
 from hrcreplay.limits import load_limits
-from hrcreplay.records import Floats, HumanStates, Ints
+from hrcreplay.records import DOF, Floats, HumanStates, Ints
 from tests.human.people import random_states, states
 from tests.human.predictions import reachable
 
@@ -25,7 +25,7 @@ def bang_bang(seconds: float, seed: int) -> HumanStates:
     """A person whose joints are always pushed to a bound, for random spans, about a posture."""
     rng = np.random.default_rng(seed)
     n = round(seconds / STEP_S)
-    p, v = np.zeros((n, 12)), np.zeros((n, 12))
+    p, v = np.zeros((n, DOF)), np.zeros((n, DOF))
     p[:] = (PAPER.p_min.clip(-1.0) + PAPER.p_max.clip(None, 1.0)) / 2.0
     for j, (v_min, v_max, a_min, a_max) in KNOWN.items():
         push, until = 0.0, 0
@@ -62,8 +62,8 @@ def test_known_bounds_are_found_and_hold_on_a_motion_that_was_not_used(training:
 
 def test_joints_at_rest_keep_the_standard_bounds(training: Futures) -> None:
     found = fit_limits.fit(training, PAPER, 0.99, T_S)
-    still = [j for j in range(12) if j not in KNOWN]
-    assert found.kept.tolist() == [j in still for j in range(12)]
+    still = [j for j in range(DOF) if j not in KNOWN]
+    assert found.kept.tolist() == [j in still for j in range(DOF)]
     for name in ("v_min", "v_max", "a_min", "a_max"):
         np.testing.assert_array_equal(getattr(found, name)[still], getattr(PAPER, name)[still])
     assert (found.excursions[still] == 0).all()
@@ -112,7 +112,7 @@ def test_a_glitch_is_given_up_rather_than_fitted(training: Futures) -> None:
 
 def test_farthest_is_alg_1() -> None:
     person = random_states(HUMAN, 500, seed=3)
-    wide = replace(HUMAN, p_min=np.full(12, -1e9), p_max=np.full(12, 1e9))
+    wide = replace(HUMAN, p_min=np.full(DOF, -1e9), p_max=np.full(DOF, 1e9))
     reach = reachable(person, wide, T_S, "paper")
     high = fit_limits.largest_displacement(person.v, HUMAN.v_max, HUMAN.a_max, T_S)
     low = -fit_limits.largest_displacement(-person.v, -HUMAN.v_min, -HUMAN.a_min, T_S)
@@ -123,7 +123,7 @@ def test_farthest_is_alg_1() -> None:
 def test_x_and_y_are_those_of_the_body() -> None:
     t = np.arange(400) * STEP_S
     heading = np.radians(110.0)
-    p, v = np.zeros((400, 12)), np.zeros((400, 12))
+    p, v = np.zeros((400, DOF)), np.zeros((400, DOF))
     p[:, 2], p[:, 7] = heading, 1.0
     p[:, 0], p[:, 1] = 0.8 * t * np.cos(heading), 0.8 * t * np.sin(heading)
     v[:, 0], v[:, 1] = 0.8 * np.cos(heading), 0.8 * np.sin(heading)
@@ -136,7 +136,7 @@ def test_x_and_y_are_those_of_the_body() -> None:
 
 
 def test_an_arm_that_changes_its_name_has_not_moved() -> None:
-    person = states(np.tile([0, 0, 0, 0, 2.7, 0.4, 0.1, 2.0, 0, 0, 0, 2.0], (200, 1)), np.zeros((200, 12)))
+    person = states(np.tile([0, 0, 0, 0, 2.7, 0.4, 0.1, 2.0, 0, 0, 0, 2.0], (200, 1)), np.zeros((200, DOF)))
     other = person.p.copy()
     other[:, 4:7] = other[:, 4:7] * [1, -1, 1] + [-np.pi, np.pi, np.pi]
     other[:, 2] += 2.0 * np.pi

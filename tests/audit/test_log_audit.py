@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from hrcreplay.audit import driver
-from hrcreplay.records import JOINTS
+from hrcreplay.records import DOF, JOINTS
 from hrcreplay.run import replay
 
 
@@ -37,7 +37,7 @@ def test_the_joints_have_the_intervals_of_the_runs_own_margins(
 ) -> None:
     wide, _ = _audit(tmp_path / "run", "occupancy.sigmas=6")
     narrow = bare[0]
-    assert _inside(wide, "sound") == [1.0] * 12  # six deviations of the velocity alone are 3 rad/s
+    assert _inside(wide, "sound") == [1.0] * DOF  # six deviations of the velocity alone are 3 rad/s
     assert min(_inside(narrow, "sound")) < 0.9
     assert _inside(narrow, "paper") == _inside(wide, "paper")  # the print knows no margins
 

@@ -11,7 +11,7 @@ from hrcreplay.audit import recording
 from hrcreplay.audit.log_audit import check_containment, joint_travel, joints_inside, recorded_future
 from hrcreplay.audit.recording import Recording
 from hrcreplay.human.prediction import reachable_sets
-from hrcreplay.records import JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
+from hrcreplay.records import DOF, JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
 from tests.human.people import states
 
 
@@ -29,16 +29,16 @@ def _balls(people: HumanStates, radius_m: float) -> SweptVolumes:
 
 def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
     """A point that moves 1 m a sample along x, sampled every 0.1 s."""
-    people = states(np.zeros((1, 12)), np.zeros((1, 12)))
+    people = states(np.zeros((1, DOF)), np.zeros((1, DOF)))
     points = np.zeros((10, len(POINTS), 3))
     points[:, :, 0] = np.arange(10)[:, None]
-    future = recorded_future(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4)
+    future = recorded_future(_recording(points, np.zeros((10, DOF)), people), np.array([0]), 0.4)
     outcome = check_containment(_balls(people, 1.5), future, np.array([True]))
     np.testing.assert_allclose(outcome.beyond_m, 4.0)  # the sample at the horizon counts, the next does not
     np.testing.assert_allclose(outcome.escape_m(), 2.5)
     assert outcome.union_m3[0] == pytest.approx(4.0 / 3.0 * np.pi * 1.5**3, rel=0.05)
     points[4, POINTS.index("wrist_l")] = np.nan  # not seen near the end: the lower arm cannot be audited
-    future = recorded_future(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4)
+    future = recorded_future(_recording(points, np.zeros((10, DOF)), people), np.array([0]), 0.4)
     outcome = check_containment(_balls(people, 1.5), future, np.array([False]))
     assert np.isnan(outcome.beyond_m[0]).tolist() == [limb == "LLA" for limb in LIMBS]
     assert outcome.worst_m()[0] == pytest.approx(2.5)
@@ -46,20 +46,20 @@ def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
     assert future.points()["LLA"] == {"hand_l": 0}  # seen, but its limb is not checked
     assert future.points()["LRA"] == {"hand_r": 1}
     points[4, POINTS.index("hand_r")] = np.nan
-    assert recorded_future(_recording(points, np.zeros((10, 12)), people), np.array([0]), 0.4).points()["LRA"] == {
+    assert recorded_future(_recording(points, np.zeros((10, DOF)), people), np.array([0]), 0.4).points()["LRA"] == {
         "hand_r": 0
     }
     assert np.isnan(outcome.union_m3[0])
 
 
 def test_a_joint_stays_inside_whatever_its_name_and_turn() -> None:
-    people = states(np.zeros((2, 12)), np.zeros((2, 12)))
+    people = states(np.zeros((2, DOF)), np.zeros((2, DOF)))
     people = replace(people, t_ns=np.array([0, 300_000_000]))
-    joints = np.zeros((8, 12))
+    joints = np.zeros((8, DOF))
     joints[:, 2] = 2.0 * np.pi + 0.01 * np.arange(8)  # heading, a turn later
     joints[:, 4] = 0.02 * np.arange(8)
     joints[6:, 5] = np.nan
-    low, high = np.full((2, 12), -0.05), np.full((2, 12), 0.05)
+    low, high = np.full((2, DOF), -0.05), np.full((2, DOF), 0.05)
     recording = _recording(np.zeros((8, len(POINTS), 3)), joints, people)
     inside = joints_inside(recording, people, reachable_sets.Reach(people.t_ns, low, high), 0.2)
     assert inside[0, JOINTS.index("theta")] == 1.0  # 0.01, 0.02

@@ -13,7 +13,7 @@ import numpy as np
 from hrcreplay.audit import driver, recording
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.records import POINTS, Bools, Floats, Measurements
+from hrcreplay.records import DOF, POINTS, Bools, Floats, Measurements
 from hrcreplay.run.stages import FusionStage
 from hrcreplay.settings.sections import Fusion
 from tests.audit.standing import frames, standing
@@ -51,8 +51,8 @@ def test_a_teleport_is_thrown_out_and_a_squat_is_not() -> None:
     points[1, wrist] += [0.6, 0.0, 0.3]  # the marker jumps
     points[2, :, 2] -= 0.4  # the whole person goes down, which the model cannot
     points[3, pelvis] += [0.0, 1.0, 0.0]
-    best = states(np.zeros((4, 12)), np.zeros((4, 12)))
-    p = np.zeros((4, 12))
+    best = states(np.zeros((4, DOF)), np.zeros((4, DOF)))
+    p = np.zeros((4, DOF))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     best = replace(best, p=p, t_ns=frames(points).capture_ns)
     believed, counts = recording._believed(_seen(points), best, _eyes())
@@ -98,8 +98,8 @@ def test_what_has_no_confidence_was_not_seen_and_does_not_jump() -> None:
     confidence[3, wrist] = 0.0  # what it hangs from was not seen
     points[4, hand] += [0.0, 0.0, -1.0]  # this one jumps
     points[5, [wrist, hand]] += [0.6, 0.0, 0.3]  # and these do together
-    best = states(np.zeros((6, 12)), np.zeros((6, 12)))
-    p = np.zeros((6, 12))
+    best = states(np.zeros((6, DOF)), np.zeros((6, DOF)))
+    p = np.zeros((6, DOF))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     best = replace(best, p=p, t_ns=seen.capture_ns)
     believed, counts = recording._believed(replace(_seen(points), confidence=confidence), best, _eyes())
@@ -120,8 +120,8 @@ def test_shoulders_that_were_not_seen_hold_no_pelvis() -> None:
     points[:, :, 2] -= 0.4
     confidence = _seen(points).confidence.copy()
     confidence[1, [POINTS.index("shoulder_l"), POINTS.index("shoulder_r")]] = 0.0
-    best = states(np.zeros((2, 12)), np.zeros((2, 12)))
-    p = np.zeros((2, 12))
+    best = states(np.zeros((2, DOF)), np.zeros((2, DOF)))
+    p = np.zeros((2, DOF))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     best = replace(best, p=p, t_ns=frames(points).capture_ns)
     believed, _ = recording._believed(replace(_seen(points), confidence=confidence), best, _eyes())

@@ -1,4 +1,4 @@
-"""The fusion against filterpy's dense filter over the same 56 states, two cameras at 30 Hz, ticks at 250 Hz.
+"""The fusion against filterpy's dense filter over the same states, two cameras at 30 Hz, ticks at 250 Hz.
 
 Run: pytest tests/benchmarks/test_human.py --benchmark-only
 """
@@ -16,7 +16,7 @@ from hrcreplay.human.fusion.fuse import fuse, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
-from hrcreplay.records import CameraFrames, Ints, Measurements
+from hrcreplay.records import DOF, LENGTHS, CameraFrames, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
 
@@ -40,12 +40,14 @@ def measured() -> Measurements:
 
 def dense_us_per_tick(measurements: Measurements, ticks: Ints) -> float:
     """The same run with filterpy: predict every tick, update with the rows of the frames that arrived."""
-    dense = KalmanFilter(56, 1)
-    dense.P = np.eye(56)
-    F = block_diag(np.kron(sum(np.eye(4, k=k) * 0.004**k / (1, 1, 2, 6)[k] for k in range(4)), np.eye(12)), np.eye(8))
-    Q = np.diag(np.repeat([0.0, 1e-4, 0.0, 0.0, 0.0], [12, 12, 12, 12, 8]))
-    H = np.zeros((20, 56))
-    H[:12, :12], H[12:, 48:] = np.eye(12), np.eye(8)
+    dense = KalmanFilter(STATES, 1)
+    dense.P = np.eye(STATES)
+    F = block_diag(
+        np.kron(sum(np.eye(4, k=k) * 0.004**k / (1, 1, 2, 6)[k] for k in range(4)), np.eye(DOF)), np.eye(len(LENGTHS))
+    )
+    Q = np.diag(np.repeat([0.0, 1e-4, 0.0, 0.0, 0.0], [DOF] * 4 + [len(LENGTHS)]))
+    H = np.zeros((20, STATES))
+    H[:DOF, :DOF], H[DOF:, 4 * DOF :] = np.eye(DOF), np.eye(len(LENGTHS))
     z, R = measurements.z, measurements.z_std**2
     begun, seen = time.perf_counter(), 0
     for now in ticks:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hrcreplay.human.fusion.fuse import fuse, start
@@ -53,6 +55,23 @@ def measured(frames: CameraFrames) -> Measurements:
 
 def fused(m: Measurements, t_ns: Ints, settings: Fusion | None = None) -> HumanStates:
     return fuse(start(m.cameras), t_ns, m.rows(m.arrival_ns <= t_ns[-1]), settings or Fusion(), WIDE)[1]
+
+
+def predicted(m: Measurements, t_ns: Ints, settings: Fusion) -> tuple[HumanStates, HumanStates]:
+    """The fused states, and what the state before each tick predicts for it, Eq. (48), before any of its frames."""
+    _, states, _, trace = fuse(start(m.cameras), t_ns, m.rows(m.arrival_ns <= t_ns[-1]), settings, WIDE, traced=True)
+    before = {name: np.roll(getattr(states, name), 1, axis=0) for name in ("p", "v", "a", "j", "lengths_m")}
+    dt, damping = np.diff(t_ns, prepend=t_ns[0])[:, None] * 1e-9, trace.damping
+    p, v, a, j = (before[name] for name in "pvaj")
+    prior = replace(
+        states,
+        p=p + dt * v + dt**2 / 2 * a + dt**3 / 6 * j,
+        v=damping * (v + dt * a + dt**2 / 2 * j),
+        a=damping * (a + dt * j),
+        j=damping * j,
+        lengths_m=before["lengths_m"],
+    )
+    return states, prior
 
 
 def used_frames(m: Measurements, t_ns: Ints) -> list[tuple[int, int]]:

@@ -8,13 +8,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import LimitSet, clamp
-from hrcreplay.records import BODY, LIMBS, Floats, HumanStates
+from hrcreplay.records import BODY, DOF, LIMBS, Floats, HumanStates
 
-LENGTHS_M = np.array([1.0, 0.5, 0.21, 0.19, 0.33, 0.34, 0.26, 0.27])
+LENGTHS_M = np.array([0.5, 0.21, 0.19, 0.33, 0.34, 0.26, 0.27])
 
 
 def states(p: Floats, v: Floats, lengths_m: Floats = LENGTHS_M) -> HumanStates:
-    """States with the given postures and velocities, (n, 12) each."""
+    """States with the given postures and velocities, (n, 13) each."""
     zeros, lengths = np.zeros_like(p), np.tile(lengths_m, (len(p), 1))
     valid = np.ones((len(p), 1), dtype=bool)
     return HumanStates(
@@ -37,8 +37,8 @@ def states(p: Floats, v: Floats, lengths_m: Floats = LENGTHS_M) -> HumanStates:
 def random_states(limits: LimitSet, count: int, seed: int) -> HumanStates:
     """Postures and velocities all over the admissible range."""
     rng = np.random.default_rng(seed)
-    p = rng.uniform(np.maximum(limits.p_min, -4.0), np.minimum(limits.p_max, 4.0), (count, 12))
-    v = rng.uniform(limits.v_min, limits.v_max, (count, 12))
+    p = rng.uniform(np.maximum(limits.p_min, -4.0), np.minimum(limits.p_max, 4.0), (count, DOF))
+    v = rng.uniform(limits.v_min, limits.v_max, (count, DOF))
     c, s = np.cos(p[:, 2]), np.sin(p[:, 2])
     v[:, 0], v[:, 1] = c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]
     return states(clamp(p, limits), v)
@@ -46,11 +46,11 @@ def random_states(limits: LimitSet, count: int, seed: int) -> HumanStates:
 
 def raw_cloud(limb: str, low: Floats, high: Floats, lengths_m: Floats = LENGTHS_M) -> Floats:
     """Every point that Alg. 2 makes for a limb, triangles of at most 60 degrees with all their corners."""
-    height, torso, head, half_shoulder, upper_l, upper_r, fore_l, fore_r = lengths_m
+    torso, head, half_shoulder, upper_l, upper_r, fore_l, fore_r = lengths_m
     side, arm = (1.0, slice(8, 12)) if limb in ("ULA", "LLA") else (-1.0, slice(4, 8))
     upper, fore = (upper_l, fore_l) if side > 0 else (upper_r, fore_r)
     (l1, l2, l3, l4), (h1, h2, h3, h4) = low[arm], high[arm]
-    shoulder, pelvis = np.array([0, side * half_shoulder, torso]), np.array([0, 0, height])
+    shoulder, pelvis = np.array([0, side * half_shoulder, torso]), np.array([0, 0, low[12]])
     if limb == "HD":
         points = np.array([[0, 0, torso], [0, 0, torso + head]])
     elif limb == "THX":

@@ -75,7 +75,7 @@ def seen(duration_s: float, kind: str, seed: int, noise_m: float = 0.005) -> tup
     capture: Ints = np.concatenate([np.round((instants + 0.013 * c) * 1e9).astype(np.int64) for c in range(2)])
     camera = np.repeat(np.arange(2), len(instants))
     order = np.argsort(capture, kind="stable")
-    points = body(capture[order] * 1e-9, duration_s, kind)
+    points = body(np.asarray(capture[order] * 1e-9, dtype=np.float64), duration_s, kind)
     points += np.random.default_rng(seed).normal(0.0, noise_m, points.shape)
     frames = frames_of(points, camera[order], capture[order], 20_000_000)
     return measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion()), end_s

@@ -9,12 +9,13 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, POINTS
 from hrcreplay.settings.sections import Occupancy
 
-LENGTHS_M = np.array([[0.95, 0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.26]])
+LENGTHS_M = np.array([[0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.26]])
 
 
 def test_the_hand_prolongs_the_forearm() -> None:
     p = np.zeros((1, len(JOINTS)))
-    p[:, 4:] = (0.4, 0.3, 0.2, 1.9) * 2
+    p[:, 12] = 0.95
+    p[:, 4:12] = (0.4, 0.3, 0.2, 1.9) * 2
     points = skeleton(p, LENGTHS_M)
     axes = part_axes(points, 0.19)[0]
     for part, side, length in (("LRA", "r", 0.26), ("LLA", "l", 0.27)):

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import alpha_2_bounds, alpha_3_bounds, clamp, skeleton
 from hrcreplay.limits import load_limits
-from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats
+from hrcreplay.records import DOF, JOINTS, LENGTHS, POINTS, Floats
 from tests.human.sightings import LENGTHS_M, lengths, postures
 
 
@@ -14,7 +14,7 @@ def chain(p: Floats, pi: Floats) -> dict[str, Floats]:
     """The model's points by composed rotations, straight from the definition of the frames."""
     q, length = dict(zip(JOINTS, p, strict=True)), dict(zip(LENGTHS, pi, strict=True))
     torso = Rotation.from_euler("Z", q["theta"]) * Rotation.from_euler("Y", q["rho"])
-    points = {"pelvis": np.array([q["x"], q["y"], length["pi_pelvis_height"]])}
+    points = {"pelvis": np.array([q["x"], q["y"], q["z"]])}
     points["neck"] = points["pelvis"] + torso.apply([0, 0, length["pi_torso"]])
     points["head"] = points["neck"] + torso.apply([0, 0, length["pi_head"]])
     for side, s in (("l", 1), ("r", -1)):
@@ -29,7 +29,7 @@ def chain(p: Floats, pi: Floats) -> dict[str, Floats]:
 
 
 def test_the_skeleton_is_the_chain_of_rotations_that_defines_it() -> None:
-    p = np.random.default_rng(1).uniform(-3.0, 3.0, (50, 12))
+    p = np.random.default_rng(1).uniform(-3.0, 3.0, (50, DOF))
     pi = lengths(50, 2)
     found = skeleton(p, pi)
     for i in range(len(p)):
@@ -91,7 +91,7 @@ def test_coupled_bounds_of_a_box_enclose_those_of_its_points_tightly() -> None:
 @pytest.mark.parametrize("name", ["paper", "human"])
 def test_clamped_postures_obey_every_limit_and_inner_ones_are_untouched(name: str) -> None:
     limits = load_limits(name)
-    p = np.random.default_rng(5).uniform(-6.0, 6.0, (500, 12))
+    p = np.random.default_rng(5).uniform(-6.0, 6.0, (500, DOF))
     inside = clamp(p, limits)
     np.testing.assert_array_equal(inside[:, :3], p[:, :3])  # no stop for x, y and heading
     assert (inside >= limits.p_min - 1e-12).all()
@@ -107,6 +107,6 @@ def test_clamped_postures_obey_every_limit_and_inner_ones_are_untouched(name: st
 
 
 def test_one_row_and_many_give_the_same_bits() -> None:
-    p, pi = np.random.default_rng(7).uniform(-3.0, 3.0, (20, 12)), lengths(20, 8)
+    p, pi = np.random.default_rng(7).uniform(-3.0, 3.0, (20, DOF)), lengths(20, 8)
     one_by_one = np.concatenate([skeleton(p[i : i + 1], pi[i : i + 1]) for i in range(20)])
     np.testing.assert_array_equal(skeleton(p, pi), one_by_one)

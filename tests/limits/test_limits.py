@@ -20,6 +20,7 @@ TABLE_1 = {
     "1": ((-PI / 20, 8 * PI / 9), (-PI / 2, PI / 2), (-PI / 4, PI / 4)),
     "2": (None, (-PI / 2, PI / 2), (-PI / 4, PI / 4)),
     "3": (None, (-PI / 2, PI / 2), (-PI / 4, PI / 4)),
+    "z": ((0.0, 1.3), (0.0, 0.0), (-0.1, 0.1)),  # not in the table: the pelvis stays at its height
     "4": ((PI / 9, PI), (-3 * PI / 10, 3 * PI / 10), (-3 * PI / 20, 3 * PI / 20)),
 }
 

@@ -13,7 +13,7 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import SessionLogWriter
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.records import LIMBS, HumanStates, SweptVolumes
+from hrcreplay.records import DOF, LIMBS, HumanStates, SweptVolumes
 from hrcreplay.robot.control.separation import obstacles
 
 START_NS = 1_700_000_000_000_000_000
@@ -32,7 +32,7 @@ class MadeController:
 
     def __init__(self, start: dict[str, Any]) -> None:
         self.gain = start["gain"]
-        self.p = np.zeros(12)
+        self.p = np.zeros(DOF)
         self.q = np.zeros(6)
         self.looked_ns = 0
         self.silences = 0
@@ -40,9 +40,9 @@ class MadeController:
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
         """Every point of every skeleton moves the person."""
         for data in skeletons:
-            self.p += self.gain * np.array(pb.Skeleton.FromString(data).points)[:12]
+            self.p += self.gain * np.array(pb.Skeleton.FromString(data).points)[:DOF]
         self.looked_ns = t_ns
-        row = {name: np.full((1, 12), 0.5) for name in ("v", "a", "j", "p_std", "v_std")}
+        row = {name: np.full((1, DOF), 0.5) for name in ("v", "a", "j", "p_std", "v_std")}
         states = HumanStates(
             t_ns=np.array([t_ns]),
             p=self.p[None].copy(),

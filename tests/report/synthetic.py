@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, LIMBS, Floats, Ints
+from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, Floats, Ints
 from hrcreplay.store.run_folder import Run
 
 LENGTHS_M = np.array([0.95, 0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.27])
@@ -18,9 +18,9 @@ RADII_M = dict(zip(LIMBS, (0.12, 0.15, 0.07, 0.07, 0.07, 0.07), strict=True))
 
 
 def pose(t_s: Floats) -> Floats:
-    """(n, 12) a person who walks up, reaches in now and then, and turns."""
+    """(n, 13) a person who walks up, reaches in now and then, and turns."""
     reach = np.clip(np.sin(2 * np.pi * t_s / 9.0), 0.0, None) ** 2
-    p = np.zeros((len(t_s), 12))
+    p = np.zeros((len(t_s), DOF))
     p[:, 0] = 1.15 - 0.35 * np.tanh((t_s - 8.0) / 3.0) + 0.03 * np.sin(t_s)
     p[:, 1] = 0.25 * np.sin(0.35 * t_s)
     p[:, 2] = np.pi + 0.4 * np.sin(0.3 * t_s)
@@ -41,8 +41,8 @@ def _human(seconds: float, rate_hz: float) -> tuple[Ints, Floats]:
 def state_table(seconds: float, rate_hz: float, rng: np.random.Generator) -> pd.DataFrame:
     """The fused person: truth with small, slow errors; nothing in the first half second."""
     t_ns, t_s = _human(seconds, rate_hz)
-    p = pose(t_s) + 0.01 * np.sin(3.0 * t_s[:, None] + np.arange(12))
-    v = np.gradient(pose(t_s), 1.0 / rate_hz, axis=0) + 0.05 * np.sin(5.0 * t_s[:, None] + np.arange(12))
+    p = pose(t_s) + 0.01 * np.sin(3.0 * t_s[:, None] + np.arange(DOF))
+    v = np.gradient(pose(t_s), 1.0 / rate_hz, axis=0) + 0.05 * np.sin(5.0 * t_s[:, None] + np.arange(DOF))
     missing = t_s < 0.5
     p[missing], v[missing] = np.nan, np.nan
     table: dict[str, Any] = {"t_ns": t_ns}
@@ -64,7 +64,7 @@ def measurement_table(seconds: float, rng: np.random.Generator) -> pd.DataFrame:
     for camera, start, noise in (("kinect", 0.5, 0.04), ("xtion", 0.2 * seconds, 0.09)):
         t_s = np.arange(start, seconds - 0.1, 1 / 30.0)
         t_s = t_s[(t_s < 0.6 * seconds) | (t_s > 0.65 * seconds)]
-        angles = pose(t_s) + noise * rng.standard_normal((len(t_s), 12)) * np.where(np.arange(12) < 2, 0.3, 1.0)
+        angles = pose(t_s) + noise * rng.standard_normal((len(t_s), DOF)) * np.where(np.arange(DOF) < 2, 0.3, 1.0)
         angles[rng.random(angles.shape) < 0.03] = np.nan
         capture = T0_NS + np.round(t_s * 1e9).astype(np.int64)
         columns: dict[str, Any] = {"capture_ns": capture, "arrival_ns": capture + 20_000_000, "camera": camera}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.human.model import LimitSet
+from hrcreplay.records import DOF
 from hrcreplay.report import figures, page, story, tables
 from hrcreplay.report import tables as wording
 from hrcreplay.robot.control import control_step
@@ -239,7 +240,7 @@ def test_table_1_reads_as_the_paper_prints_it() -> None:
 
 
 def test_bounds_that_are_no_fraction_of_pi_stay_numbers() -> None:
-    odd = dataclasses.replace(PAPER, v_max=np.full(12, 12.6), coupled=False)
+    odd = dataclasses.replace(PAPER, v_max=np.full(DOF, 12.6), coupled=False)
     rows = {row[0]: row[1:] for row in tables.limit_table(odd, use="tracking").rows}
     assert rows["\u03b1 r,2"][3] == "12.60"
     assert rows["\u03b1 r,2"][:2] == ("\u2212\u03c0", "\u03c0")

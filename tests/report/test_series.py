@@ -3,11 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hrcreplay.records import DOF
 from hrcreplay.report import metrics
 
 
 def test_interpolation_of_angles_goes_the_short_way_round() -> None:
-    values = np.zeros((2, 12))
+    values = np.zeros((2, DOF))
     values[0, 2], values[1, 2] = np.pi - 0.1, -np.pi + 0.1
     values[:, 0] = [1.0, 3.0]
     found = metrics.interpolate(np.array([0, 100]), values, np.array([25, 50]), angles=True)
@@ -16,13 +17,13 @@ def test_interpolation_of_angles_goes_the_short_way_round() -> None:
 
 
 def test_interpolation_of_rates_does_not_wrap() -> None:
-    values = np.zeros((2, 12))
+    values = np.zeros((2, DOF))
     values[1, 2] = 10.0
     assert metrics.interpolate(np.array([0, 10]), values, np.array([5]), angles=False)[0, 2] == pytest.approx(5.0)
 
 
 def test_interpolation_is_missing_outside_and_beside_a_missing_sample() -> None:
-    values = np.zeros((4, 12))
+    values = np.zeros((4, DOF))
     values[2] = np.nan
     at = np.array([-1, 0, 10, 15, 25, 30, 31])
     found = metrics.interpolate(np.array([0, 10, 20, 30]), values, at, angles=True)
@@ -31,7 +32,7 @@ def test_interpolation_is_missing_outside_and_beside_a_missing_sample() -> None:
 
 def test_central_differences_of_a_turning_heading() -> None:
     t_ns = np.arange(0, 3_000_000_000, 10_000_000)
-    values = np.zeros((len(t_ns), 12))
+    values = np.zeros((len(t_ns), DOF))
     values[:, 2] = metrics.wrap(2.0 * metrics.seconds_from(t_ns, 0) + 3.0)
     values[:, 1] = -0.5 * t_ns * 1e-9
     rate = metrics.central_differences(t_ns, values)

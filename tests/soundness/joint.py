@@ -8,7 +8,7 @@ from hrcreplay.human.model import LimitSet
 from hrcreplay.records import Floats
 from tests.soundness.compiled import kernel
 
-#: Rows of bounds, (6, 12). The first two are NaN where (34b), (34c) tell instead.
+#: Rows of bounds, (6, 13). The first two are NaN where (34b), (34c) tell instead.
 P_MIN, P_MAX, V_MIN, V_MAX, A_MIN, A_MAX = range(6)
 
 #: Smallest and largest velocity, smallest and largest acceleration of one joint.
@@ -16,7 +16,7 @@ Rates = tuple[float, float, float, float]
 
 
 def bounds_of(limits: LimitSet) -> Floats:
-    """(6, 12) bounds of all joints; x and y bound the forward and lateral motion of the body."""
+    """(6, 13) bounds of all joints; x and y bound the forward and lateral motion of the body."""
     bounds = np.stack([limits.p_min, limits.p_max, limits.v_min, limits.v_max, limits.a_min, limits.a_max])
     if limits.coupled:
         bounds[:2, [5, 6, 9, 10]] = np.nan

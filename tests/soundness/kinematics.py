@@ -29,20 +29,20 @@ def body(q: Floats, lengths: Floats, hand: float, points: Floats) -> None:
     """Writes POINTS (10, 3), world [m].
 
     Args:
-        q: (12,) JOINTS [m, m, rad...].
-        lengths: (8,) LENGTHS [m].
+        q: (13,) JOINTS [m, m, rad...].
+        lengths: (7,) LENGTHS [m].
         hand: Length of the hand, in line with the forearm [m].
         points: Receives the result.
     """
     rho, theta = turn(q[3]), turn(q[2])
-    torso, half_shoulder = lengths[1], lengths[3]
-    _put(points, 0, to_world((0.0, 0.0, torso), rho, theta, q, lengths))
-    _put(points, 1, to_world((0.0, 0.0, torso + lengths[2]), rho, theta, q, lengths))
-    _put(points, 2, (q[0], q[1], lengths[0]))
+    torso, half_shoulder = lengths[0], lengths[2]
+    _put(points, 0, to_world((0.0, 0.0, torso), rho, theta, q))
+    _put(points, 1, to_world((0.0, 0.0, torso + lengths[1]), rho, theta, q))
+    _put(points, 2, (q[0], q[1], q[12]))
     _put(points, 9, (q[0], q[1], 0.0))
     for arm in range(2):  # right, left
         s = 1.0 if arm else -1.0
-        upper, forearm = lengths[5 - arm], lengths[7 - arm]
+        upper, forearm = lengths[4 - arm], lengths[6 - arm]
         j = 4 + 4 * arm
         flexion, abduction = turn(-q[j + 1]), turn(s * q[j])
         shoulder = (0.0, s * half_shoulder, torso)
@@ -50,9 +50,9 @@ def body(q: Floats, lengths: Floats, hand: float, points: Floats) -> None:
         tip = about_z(about_y((0.0, 0.0, -forearm - hand), turn(q[j + 3] - math.pi)), turn(s * q[j + 2]))
         tip = add((0.0, 0.0, -upper), tip)
         tip = add(shoulder, about_x(about_y(tip, flexion), abduction))
-        _put(points, 3 + 3 * arm, to_world(shoulder, rho, theta, q, lengths))
-        _put(points, 4 + 3 * arm, to_world(elbow, rho, theta, q, lengths))
-        _put(points, 5 + 3 * arm, to_world(tip, rho, theta, q, lengths))
+        _put(points, 3 + 3 * arm, to_world(shoulder, rho, theta, q))
+        _put(points, 4 + 3 * arm, to_world(elbow, rho, theta, q))
+        _put(points, 5 + 3 * arm, to_world(tip, rho, theta, q))
 
 
 @kernel
@@ -81,9 +81,9 @@ def add(a: Point, b: Point) -> Point:
 
 
 @kernel
-def to_world(p: Point, rho: tuple[float, float], theta: tuple[float, float], q: Floats, lengths: Floats) -> Point:
+def to_world(p: Point, rho: tuple[float, float], theta: tuple[float, float], q: Floats) -> Point:
     """From the torso's frame, whose origin is the pelvis."""
-    return add((q[0], q[1], lengths[0]), about_z(about_y(p, rho), theta))
+    return add((q[0], q[1], q[12]), about_z(about_y(p, rho), theta))
 
 
 @kernel

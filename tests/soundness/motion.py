@@ -16,13 +16,14 @@ import math
 
 import numpy as np
 
-from hrcreplay.records import Floats, Ints
+from hrcreplay.records import DOF, Floats, Ints
 from tests.soundness.compiled import kernel
 from tests.soundness.joint import P_MAX, P_MIN, V_MAX, V_MIN, Rates, accelerate, along, rates_of, stops_at
 from tests.soundness.walking import walk
 
-#: Joints whose limits are checked together: the torso, the right arm, the left arm. First joint and one past the last.
-GROUPS = ((3, 4), (4, 8), (8, 12))
+#: Joints whose limits are checked together: the torso, the right arm, the left arm, the pelvis's height. First joint
+#: and one past the last.
+GROUPS = ((3, 4), (4, 8), (8, 12), (12, 13))
 _DEGREE = math.pi / 180.0
 #: Halvings in search of the last instant to brake, and the finest steps towards a limit: to end there, to rest there.
 _HALVINGS = 10
@@ -44,14 +45,14 @@ def step(
     """Moves the whole body on, by ``h`` [s] or until something happens to a joint.
 
     Args:
-        q: (12,) posture, heading and place in the world; moved in place [m, m, rad...].
-        v: (12,) velocities, the first two forward and to the left [m/s, m/s, rad/s...].
-        wish: (12,) accelerations.
+        q: (13,) posture, heading and place in the world; moved in place [m, m, rad...].
+        v: (13,) velocities, the first two forward and to the left [m/s, m/s, rad/s...].
+        wish: (13,) accelerations.
         h: How long at most [s].
         style: Whether joints brake in time for their limits, and whether a limit brings a joint to rest.
-        ended: (3,) which of GROUPS are no longer followed; set for one that meets a limit.
-        bounds: (6, 12).
-        work: (8, 12) scratch.
+        ended: (4,) which of GROUPS are no longer followed; set for one that meets a limit.
+        bounds: (6, 13).
+        work: (8, 13) scratch.
 
     Returns:
         How long it moved [s], and whether a limit was met.
@@ -67,10 +68,11 @@ def step(
         h if ended[0] else _lasts(q, v, wish, h, 0, finest, bounds, work),
         h if ended[1] else _lasts(q, v, wish, h, 1, finest, bounds, work),
         h if ended[2] else _lasts(q, v, wish, h, 2, finest, bounds, work),
+        h if ended[3] else _lasts(q, v, wish, h, 3, finest, bounds, work),
     )
     moved = min(lasts)
     met = moved < h
-    for g in range(3):
+    for g in range(len(GROUPS)):
         if not ended[g]:
             for j in range(GROUPS[g][0], GROUPS[g][1]):
                 q[j], v[j], _, _ = along(q[j], v[j], wish[j], until[j], moved, rates_of(bounds, j))
@@ -80,7 +82,7 @@ def step(
                 if ended[g]:
                     v[GROUPS[g][0] : GROUPS[g][1]] = 0.0
     walk(q, v, wish, moved, bounds)
-    for j in range(12):  # not to come back for ever
+    for j in range(DOF):  # not to come back for ever
         for bound in (bounds[V_MIN, j], bounds[V_MAX, j]):
             if abs(v[j] - bound) < 1e-12:
                 v[j] = bound
@@ -89,8 +91,8 @@ def step(
 
 @kernel
 def _come_back(v: Floats, wish: Floats, h: float, bounds: Floats, effective: Floats) -> float:
-    """Writes the wishes (12,), those of joints above a velocity bound replaced; how long they hold, at most h [s]."""
-    for j in range(12):
+    """Writes the wishes (13,), those of joints above a velocity bound replaced; how long they hold, at most h [s]."""
+    for j in range(DOF):
         v_min, v_max, a_min, a_max = rates_of(bounds, j)
         effective[j] = wish[j]
         if v[j] > v_max:
@@ -104,7 +106,7 @@ def _come_back(v: Floats, wish: Floats, h: float, bounds: Floats, effective: Flo
 def _rest(q: Floats, v: Floats, wish: Floats, until: Floats, dt: float, group: int, bounds: Floats) -> bool:
     """Takes their velocity from the joints that meet a limit within dt; False where that does not help."""
     first, end = GROUPS[group]
-    low, high = np.empty(12), np.empty(12)
+    low, high = np.empty(DOF), np.empty(DOF)
     helped = False
     for j in range(first, end):
         _, _, low[j], high[j] = along(q[j], v[j], wish[j], until[j], dt, rates_of(bounds, j))
@@ -120,7 +122,7 @@ def _brake_in_time(
     q: Floats, v: Floats, wish: Floats, h: float, bounds: Floats, until: Floats, low: Floats, high: Floats
 ) -> None:
     """Writes how long each joint may do as it wishes; the coupled ones after those that they depend on."""
-    for j in range(3, 12):
+    for j in range(3, DOF):
         least, most = allowed(j, low, high, bounds)
         rates = rates_of(bounds, j)
         until[j] = _last_moment(q[j], v[j], wish[j], h, least, most, rates)
@@ -185,7 +187,7 @@ def _lasts(
 
 @kernel
 def within(low: Floats, high: Floats, first: int, end: int, bounds: Floats) -> bool:
-    """Whether all postures of a box, (12,) each, are within the limits of one group of joints."""
+    """Whether all postures of a box, (13,) each, are within the limits of one group of joints."""
     for j in range(first, end):
         least, most = allowed(j, low, high, bounds)
         if low[j] < least or high[j] > most:
@@ -195,7 +197,7 @@ def within(low: Floats, high: Floats, first: int, end: int, bounds: Floats) -> b
 
 @kernel
 def allowed(j: int, low: Floats, high: Floats, bounds: Floats) -> Range:
-    """Position limits of a joint that hold whatever the joints before it do in their ranges (12,) [m, m, rad...]."""
+    """Position limits of a joint that hold whatever the joints before it do in their ranges (13,) [m, m, rad...]."""
     if not np.isnan(bounds[P_MIN, j]):
         return bounds[P_MIN, j], bounds[P_MAX, j]
     if j in (5, 9):  # Eq. (34b)

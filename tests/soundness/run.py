@@ -5,11 +5,13 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hrcreplay.human.model import HEIGHT, LimitSet
 from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.human.prediction.reachable_sets import PRINTED
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
@@ -57,6 +59,15 @@ class Plan:
         ).model_copy(update={f"radius_{limb}_m": 0.0 for limb in limbs} | {"legs_radius_m": 0.0})
 
     @property
+    def obeyed(self) -> LimitSet:
+        """What the motions keep to: under a printed method, which holds the pelvis's height, that stays as it is."""
+        limits = load_limits(self.limits)
+        if self.method not in PRINTED:
+            return limits
+        still = [np.append(rates[:HEIGHT], 0.0) for rates in (limits.v_min, limits.v_max)]
+        return replace(limits, v_min=still[0], v_max=still[1])
+
+    @property
     def coasted_s(self) -> float:
         """For how long the filter went on without measurements: at most for its memory."""
         return MEMORY_S if self.unseen_s > MEMORY_S else 0.0
@@ -92,8 +103,8 @@ def corners_of(limbs: tuple[str, ...]) -> Corners:
     """The corners of the limbs in this order."""
     pairs = [(POINTS.index(point), k) for k, limb in enumerate(limbs) for point in CORNERS[limb]]
     points, owners = (np.array(column) for column in zip(*pairs, strict=True))
-    groups = {"HD": "t", "THX": "t", "URA": "tr", "LRA": "tr", "ULA": "tl", "LLA": "tl", "LEGS": ""}
-    moved_by = np.array([[int(group in groups[limb]) for group in "trl"] for limb in limbs])
+    groups = {"HD": "tz", "THX": "tz", "URA": "trz", "LRA": "trz", "ULA": "tlz", "LLA": "tlz", "LEGS": "z"}
+    moved_by = np.array([[int(group in groups[limb]) for group in "trlz"] for limb in limbs])
     assert moved_by.shape[1] == len(GROUPS)
     return Corners(points, owners, moved_by)
 
@@ -107,7 +118,7 @@ def predict(states: HumanStates, plan: Plan) -> SweptVolumes:
 
 def sample_states(plan: Plan, first: int, count: int) -> Result:
     """Samples the states of these numbers. Each has its own stream of chance, so any split gives the same."""
-    limits = load_limits(plan.limits)
+    limits = plan.obeyed
     generators = [np.random.default_rng([plan.seed, number]) for number in range(first, first + count)]
     estimates = [draw_estimate(rng, limits, plan.sigmas, plan.beyond, plan.coasted_s) for rng in generators]
     volumes = predict(states_of(estimates, plan.unseen_s), plan)

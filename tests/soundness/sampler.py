@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.records import Floats, Ints
+from hrcreplay.records import DOF, LENGTHS, Floats, Ints
 from tests.soundness.compiled import copy, kernel
 from tests.soundness.facets import Facets, outside
 from tests.soundness.kinematics import POINTS, body
@@ -45,10 +45,10 @@ class Worst(NamedTuple):
 class Block(NamedTuple):
     """Motions side by side."""
 
-    q: Floats  #: (b, 12) where they start
-    v: Floats  #: (b, 12), first two in the body's frame
-    lengths: Floats  #: (b, 8)
-    wish: Floats  #: (b, PIECES, 12)
+    q: Floats  #: (b, 13) where they start
+    v: Floats  #: (b, 13), first two in the body's frame
+    lengths: Floats  #: (b, 7)
+    wish: Floats  #: (b, PIECES, 13)
     cuts: Floats  #: (b, PIECES + 1) instants at which the wishes change [s]
     careful: Ints  #: (b,)
     points: Floats  #: (POINTS, INSTANTS, 3, b)
@@ -59,10 +59,10 @@ class Block(NamedTuple):
 @kernel
 def block_of(count: int) -> Block:
     return Block(
-        np.empty((count, 12)),
-        np.empty((count, 12)),
-        np.empty((count, 8)),
-        np.empty((count, PIECES, 12)),
+        np.empty((count, DOF)),
+        np.empty((count, DOF)),
+        np.empty((count, len(LENGTHS))),
+        np.empty((count, PIECES, DOF)),
         np.empty((count, PIECES + 1)),
         np.empty(count, np.int64),
         np.empty((len(POINTS), INSTANTS, 3, count)),
@@ -165,13 +165,13 @@ def _take(of: Block, k: int, to: Block, i: int) -> None:
 
 @kernel
 def _jacobians(estimate: Estimate, hand: float) -> Floats:
-    """(POINTS, 3, 12) d point / d q by differences; x and y are forward and left."""
+    """(POINTS, 3, 13) d point / d q by differences; x and y are forward and left."""
     q, span = estimate.q.copy(), 1e-5
     ahead, behind = np.empty((len(POINTS), 3)), np.empty((len(POINTS), 3))
-    jacobians = np.zeros((len(POINTS), 3, 12))
+    jacobians = np.zeros((len(POINTS), 3, DOF))
     c, s = np.cos(q[2]), np.sin(q[2])
     jacobians[:, 0, 0], jacobians[:, 1, 0], jacobians[:, 0, 1], jacobians[:, 1, 1] = c, s, -s, c
-    for j in range(2, 12):
+    for j in range(2, DOF):
         q[j] = estimate.q[j] + span
         body(q, estimate.lengths, hand, ahead)
         q[j] = estimate.q[j] - span
@@ -185,7 +185,7 @@ def _jacobians(estimate: Estimate, hand: float) -> Floats:
 def _follow(block: Block, i: int, hand: float, stops: bool, bounds: Floats) -> None:
     """Writes the points of the i-th motion at all its instants; what is not followed any more stays as at the start."""
     q, v, points = block.q[i].copy(), block.v[i].copy(), np.empty((len(POINTS), 3))
-    ended, work = np.zeros(len(GROUPS), np.int64), np.empty((8, 12))
+    ended, work = np.zeros(len(GROUPS), np.int64), np.empty((8, DOF))
     block.alive[:, i] = INSTANTS
     block.times[:, i] = 0.0
     body(q, block.lengths[i], hand, points)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from hrcreplay.human.model import LimitSet
-from hrcreplay.records import BODY, LENGTHS, LIMBS, Floats, HumanStates
+from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, Floats, HumanStates
 from tests.soundness.joint import bounds_of, rates_of, stops_at
 from tests.soundness.motion import allowed
 from tests.soundness.truth import Estimate
 
 #: Lengths of a grown person [m]; people are drawn within a quarter of them.
-_LENGTHS_M = np.array([0.95, 0.5, 0.2, 0.19, 0.3, 0.3, 0.27, 0.27])
+_LENGTHS_M = np.array([0.5, 0.2, 0.19, 0.3, 0.3, 0.27, 0.27])
 _LENGTHS_SPREAD = 0.25
 #: Places and headings are drawn up to this far from 0 [m, rad].
 _FAR = 4.0
@@ -42,32 +42,32 @@ def draw_estimate(
     world = v.copy()
     c, s = np.cos(q[2]), np.sin(q[2])
     world[0], world[1] = c * v[0] - s * v[1], s * v[0] + c * v[1]
-    std = np.concatenate([[_STD[0]] * 2, [_STD[1]] * 10, [_STD[2]] * 12, [_STD[3]] * 8])
+    std = np.concatenate([[_STD[0]] * 2, [_STD[1]] * 10, [_STD[0]], [_STD[2]] * DOF, [_STD[3]] * len(LENGTHS)])
     std = (std * rng.random() * rng.random(len(std))) if sigmas > 0.0 else 0.0 * std
     off = sigmas * std
     if coasted_s > 0.0:
         fast = np.maximum(limits.v_max, -limits.v_min)
-        off[12:24] = 10.0 * fast.max()  # nothing is known
+        off[DOF : 2 * DOF] = 10.0 * fast.max()  # nothing is known
         fast[:2] = fast[:2].max() / np.sqrt(2.0)  # whatever the heading
-        off[:12] += coasted_s * fast
+        off[:DOF] += coasted_s * fast
     true = np.concatenate([q, world, lengths])
     estimated = true + off * rng.uniform(-1.0, 1.0, len(off))
-    (p, v_world, pi), (p_off, v_off, pi_off) = (np.split(parts.copy(), [12, 24]) for parts in (estimated, off))
+    (p, v_world, pi), (p_off, v_off, pi_off) = (np.split(parts.copy(), [DOF, 2 * DOF]) for parts in (estimated, off))
     v_low, v_high = fastest * limits.v_min, fastest * limits.v_max
     return Estimate(p, v_world, pi, p_off, v_off, pi_off, v_low, v_high, q, v, lengths, std)
 
 
 def _draw(rng: np.random.Generator, limits: LimitSet, fastest: float) -> tuple[Floats, Floats]:
-    """An admissible posture (12,) and velocity (12,), the latter's first two forward and to the left."""
+    """An admissible posture (13,) and velocity (13,), the latter's first two forward and to the left."""
     bounds = bounds_of(limits)
     v_min, v_max = fastest * limits.v_min, fastest * limits.v_max
-    q, v = np.empty(12), rng.uniform(v_min, v_max)
+    q, v = np.empty(DOF), rng.uniform(v_min, v_max)
     speed, at_limit, reckless = rng.random(), rng.random() < _AT_LIMIT, rng.random() < _RECKLESS
     if speed < _AT_REST:
         v[:] = 0.0
     elif speed < _AT_REST + _AT_SPEED:
-        v = np.where(rng.random(12) < 0.6, np.where(rng.random(12) < 0.5, v_min, v_max), v)
-    for j in range(12):
+        v = np.where(rng.random(DOF) < 0.6, np.where(rng.random(DOF) < 0.5, v_min, v_max), v)
+    for j in range(DOF):
         low, high = np.clip(allowed(j, q, q, bounds), -_FAR, _FAR)
         q[j] = rng.uniform(low, high)
         if at_limit and j >= 3 and rng.random() < 0.3:
@@ -82,8 +82,8 @@ def _draw(rng: np.random.Generator, limits: LimitSet, fastest: float) -> tuple[F
 def states_of(estimates: list[Estimate], unseen_s: float = 0.0) -> HumanStates:
     """The estimates as fused states, a row each, of people that nobody has seen for so long."""
     n = len(estimates)
-    zeros = np.zeros((n, 12))
-    p_std, v_std, lengths_std = np.split(np.array([e.std for e in estimates]), [12, 24], axis=1)
+    zeros = np.zeros((n, DOF))
+    p_std, v_std, lengths_std = np.split(np.array([e.std for e in estimates]), [DOF, 2 * DOF], axis=1)
     return HumanStates(
         t_ns=np.arange(n, dtype=np.int64) * 4_000_000,
         p=np.array([e.q for e in estimates]),

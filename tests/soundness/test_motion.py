@@ -11,8 +11,8 @@ from scipy.optimize import linprog
 
 from hrcreplay.human.model import clamp, skeleton
 from hrcreplay.limits import load_limits
+from hrcreplay.records import DOF, Floats, Ints
 from hrcreplay.records import POINTS as SKELETON
-from hrcreplay.records import Floats, Ints
 from tests.human.people import LENGTHS_M
 from tests.soundness.facets import Facets, distance_m, facets_of, outside
 from tests.soundness.joint import bounds_of
@@ -27,7 +27,7 @@ DT = 0.377 / 400
 
 def test_points_are_those_of_the_model() -> None:
     rng = np.random.default_rng(1)
-    p, lengths, points = rng.uniform(-4.0, 4.0, (50, 12)), rng.uniform(0.1, 1.0, (50, 8)), np.empty((len(POINTS), 3))
+    p, lengths, points = rng.uniform(-4.0, 4.0, (50, DOF)), rng.uniform(0.1, 1.0, (50, 8)), np.empty((len(POINTS), 3))
     expected = skeleton(p, lengths)
     for i in range(len(p)):
         body(p[i], lengths[i], 0.0, points)
@@ -38,19 +38,19 @@ def test_points_are_those_of_the_model() -> None:
 
 
 def test_the_hand_goes_on_where_the_forearm_ends() -> None:
-    q, points, longer = np.linspace(-1.0, 1.0, 12), np.empty((len(POINTS), 3)), np.empty((len(POINTS), 3))
+    q, points, longer = np.linspace(-1.0, 1.0, DOF), np.empty((len(POINTS), 3)), np.empty((len(POINTS), 3))
     body(q, LENGTHS_M, 0.19, points)
     body(q, LENGTHS_M + np.array([0, 0, 0, 0, 0, 0, 0.19, 0.19]), 0.0, longer)
     assert points == pytest.approx(longer, abs=1e-15)
 
 
 def follow(limits: str, seed: int, careful: bool, beyond: bool) -> tuple[Floats, Floats, Ints]:
-    """A random motion in fine steps: q, v (n, 12), and for every step which groups had ended before it (n, 3)."""
+    """A random motion in fine steps: q, v (n, 13), and for every step which groups had ended before it (n, 4)."""
     bounds, rng = bounds_of(LIMITS[limits]), np.random.default_rng(seed)
     start = draw_estimate(rng, LIMITS[limits], beyond=beyond)
-    wish = np.empty((8, 12))
+    wish = np.empty((8, DOF))
     draw(rng, CODES[("corner", "bang_bang", "switching", "pieces")[seed % 4]], bounds, wish)
-    q, v, ended, work = start.true_q, start.true_v, np.zeros(3, np.int64), np.empty((8, 12))
+    q, v, ended, work = start.true_q, start.true_v, np.zeros(len(GROUPS), np.int64), np.empty((8, DOF))
     rows = [(q.copy(), v.copy(), ended.copy())]
     for k in range(400):
         t = 0.0
@@ -70,7 +70,7 @@ def test_motions_obey_every_bound(limits: str, careful: bool) -> None:
         q, v, ended = follow(limits, seed, careful, beyond=False)
         assert (v >= bound.v_min - 1e-12).all()
         assert (v <= bound.v_max + 1e-12).all()
-        followed = np.ones((len(q) - 1, 12), dtype=bool)
+        followed = np.ones((len(q) - 1, DOF), dtype=bool)
         for g, (first, end) in enumerate(GROUPS):
             followed[:, first:end] = ended[1:, g, None] == 0
         a, rate = np.diff(v, axis=0) / DT, np.diff(q, axis=0) / DT
@@ -80,7 +80,7 @@ def test_motions_obey_every_bound(limits: str, careful: bool) -> None:
         assert (np.abs(rate - middle) <= 0.26 * DT * (bound.a_max - bound.a_min) + 1e-9)[:, 2:][followed[:, 2:]].all()
         assert np.abs(clamp(q, bound) - q).max() < 1e-12  # the coupling (34) too
         moved += int(followed[-1].sum())
-    assert moved > 60 * 12 * (0.6 if careful else 0.3)
+    assert moved > 60 * DOF * (0.6 if careful else 0.3)
 
 
 @pytest.mark.parametrize("limits", LIMITS)
@@ -102,8 +102,8 @@ def test_what_a_stop_does(limits: str) -> None:
 
 def test_too_fast_comes_back() -> None:
     bound = LIMITS["paper"]
-    bounds, ended, work = bounds_of(bound), np.zeros(3, np.int64), np.empty((8, 12))
-    q, v = np.zeros(12), np.zeros(12)
+    bounds, ended, work = bounds_of(bound), np.zeros(len(GROUPS), np.int64), np.empty((8, DOF))
+    q, v = np.zeros(DOF), np.zeros(DOF)
     q[[3, 4, 8]], q[[7, 11]], v[0], v[4] = 0.3, 2.0, 0.85, 1.7
     moved, t, wish = 0.0, 0.0, bound.a_max
     while t < 0.377:
@@ -122,8 +122,8 @@ def test_walking_is_the_integral_of_the_unicycle(limits: str) -> None:
     for _ in range(20):
         start = draw_estimate(rng, bound)
         q, v = start.true_q.copy(), start.true_v.copy()
-        a = np.where(rng.random(12) < 0.5, bound.a_min, bound.a_max)
-        step(q, v, a, 0.1, (False, False), np.ones(3, np.int64), bounds_of(bound), np.empty((8, 12)))
+        a = np.where(rng.random(DOF) < 0.5, bound.a_min, bound.a_max)
+        step(q, v, a, 0.1, (False, False), np.ones(len(GROUPS), np.int64), bounds_of(bound), np.empty((8, DOF)))
         kinks = (np.where(a > 0.0, bound.v_max, bound.v_min) - start.true_v)[:3] / a[:3]
 
         def rate(t: float, axis: int, p: Floats = start.true_q, v: Floats = start.true_v, a: Floats = a) -> float:

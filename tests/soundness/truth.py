@@ -15,16 +15,16 @@ from tests.soundness.motion import GROUPS, allowed, within
 class Estimate(NamedTuple):
     """An estimated state, how far the truth may be from it, and one truth that is not."""
 
-    q: Floats  #: (12,) [m, m, rad...]
-    v_world: Floats  #: (12,) the first two in the world [m/s, m/s, rad/s...]
+    q: Floats  #: (13,) [m, m, rad...]
+    v_world: Floats  #: (13,) the first two in the world [m/s, m/s, rad/s...]
     lengths: Floats  #: (8,) [m]
-    q_off: Floats  #: (12,) largest distance of the truth
-    v_off: Floats  #: (12,)
+    q_off: Floats  #: (13,) largest distance of the truth
+    v_off: Floats  #: (13,)
     lengths_off: Floats  #: (8,)
-    v_low: Floats  #: (12,) velocities that a truth may have, the first two forward and to the left
-    v_high: Floats  #: (12,)
-    true_q: Floats  #: (12,) an admissible state within these distances
-    true_v: Floats  #: (12,) the first two forward and to the left
+    v_low: Floats  #: (13,) velocities that a truth may have, the first two forward and to the left
+    v_high: Floats  #: (13,)
+    true_q: Floats  #: (13,) an admissible state within these distances
+    true_v: Floats  #: (13,) the first two forward and to the left
     true_lengths: Floats  #: (8,)
     std: Floats  #: (32,) standard deviations of all of these, as the filter tells them
 
@@ -33,7 +33,7 @@ class Estimate(NamedTuple):
 def draw_truth(
     rng: np.random.Generator, estimate: Estimate, bounds: Floats, q: Floats, v: Floats, lengths: Floats
 ) -> None:
-    """Writes an admissible state around the estimate: q (12,), v (12,) in the body's frame, lengths (8,)."""
+    """Writes an admissible state around the estimate: q (13,), v (13,) in the body's frame, lengths (8,)."""
     copy(estimate.true_q, q)
     copy(estimate.true_v, v)
     copy(estimate.true_lengths, lengths)

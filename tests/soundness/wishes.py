@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.records import Floats
+from hrcreplay.records import DOF, Floats
 from tests.soundness.compiled import kernel
 from tests.soundness.joint import A_MAX, A_MIN
 
@@ -45,15 +45,15 @@ def toward(sign: float, j: int, bounds: Floats) -> float:
 
 @kernel
 def draw(rng: np.random.Generator, family: int, bounds: Floats, wish: Floats) -> None:
-    """Writes the accelerations (k, 12) of a family, one row a piece of time; not of ``push`` and ``mutate``."""
-    for j in range(12):
+    """Writes the accelerations (k, 13) of a family, one row a piece of time; not of ``push`` and ``mutate``."""
+    for j in range(DOF):
         _draw_joint(rng, family, j, bounds, wish[:, j])
     if family == SINGLE:
-        only = rng.integers(0, 12)
+        only = rng.integers(0, DOF)
         wish[:, :only], wish[:, only + 1 :] = 0.0, 0.0
     elif family == SIDEWAYS:
         coast = rng.random() < 0.5
-        for j in range(3, 12):
+        for j in range(3, DOF):
             if coast or rng.random() < 0.5:
                 wish[:, j] = 0.0
 
@@ -74,8 +74,8 @@ def _draw_joint(rng: np.random.Generator, family: int, j: int, bounds: Floats, w
 
 @kernel
 def push(normal: Floats, jacobian: Floats, bounds: Floats, wish: Floats) -> None:
-    """Every joint as hard as it can in the sense that moves a point along a normal (3,); jacobian (3, 12)."""
-    for j in range(12):
+    """Every joint as hard as it can in the sense that moves a point along a normal (3,); jacobian (3, 13)."""
+    for j in range(DOF):
         along = normal[0] * jacobian[0, j] + normal[1] * jacobian[1, j] + normal[2] * jacobian[2, j]
         wish[:, j] = toward(along if abs(along) > 1e-9 else 0.0, j, bounds)
 
@@ -84,7 +84,7 @@ def push(normal: Floats, jacobian: Floats, bounds: Floats, wish: Floats) -> None
 def mutate(rng: np.random.Generator, bounds: Floats, wish: Floats) -> None:
     """Changes a few joints from some piece of time on."""
     for _ in range(rng.integers(1, 4)):
-        j, first = int(rng.integers(0, 12)), int(rng.integers(0, len(wish)))
+        j, first = int(rng.integers(0, DOF)), int(rng.integers(0, len(wish)))
         kind = rng.random()
         a = 0.0 if kind < 0.15 else extreme(rng, j, bounds)
         if kind > 0.85:

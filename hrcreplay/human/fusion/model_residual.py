@@ -22,7 +22,7 @@ from numba import njit
 
 from hrcreplay.human.fusion.gating import distance
 from hrcreplay.human.fusion.kalman import Filter, Rules, ago, delay
-from hrcreplay.human.model import ARM_POINTS, HEAD, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
+from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
 
 #: No point of a leg is further from the pelvis: toes of a tall man's straight leg. What is further is no leg [m].
@@ -123,7 +123,7 @@ def told(filter_: Filter, now: int, rules: Rules, residual: Floats) -> None:
     """
     residual[:] = filter_.residual
     for limb in range(len(residual)):
-        if now - filter_.peak_ns[limb] <= rules.residual_hold_ns and residual[limb] < filter_.peak[limb]:
+        if now - filter_.peak_ns[limb] < rules.residual_hold_ns and residual[limb] < filter_.peak[limb]:
             residual[limb] = filter_.peak[limb]
     for c in range(len(filter_.apart)):
         if now - filter_.capture_ns[c] <= rules.memory_ns:
@@ -147,12 +147,16 @@ def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rule
 
 @njit(cache=True)
 def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
-    """Whether no joint that carries the limb has started anew within the memory: the filter must find it first."""
-    newest = filter_.acquired_ns[: 2 if limb == _LEGS else 4].max()
+    """Whether no joint that carries the limb is lost or has started anew lately: the filter must find it first."""
+    root = 2 if limb == _LEGS else 4
+    newest, last = filter_.acquired_ns[:root].max(), filter_.row_ns[:root].min()
+    newest, last = max(newest, filter_.acquired_ns[HEIGHT]), min(last, filter_.row_ns[HEIGHT])
     if 2 <= limb < _LEGS:
         first = _FIRST[limb - 2]
         newest = max(newest, filter_.acquired_ns[first - first % 4 : first + 2].max())
-    return now - newest > rules.memory_ns
+        for pair in range(first - first % 4, first + 2, 2):  # one of the two is enough, see ``unseen``
+            last = min(last, filter_.row_ns[pair : pair + 2].max())
+    return now - newest > rules.memory_ns and now - last <= rules.memory_ns
 
 
 @njit(cache=True)
@@ -180,7 +184,7 @@ def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) ->
         return
     age = min(now - filter_.sampled_ns[limb], rules.memory_ns) * 1e-9
     kept = np.exp(-age / rules.residual_memory_s)
-    if sample >= filter_.peak[limb] or now - filter_.peak_ns[limb] > rules.residual_hold_ns:
+    if sample >= filter_.peak[limb] or now - filter_.peak_ns[limb] >= rules.residual_hold_ns:
         filter_.peak[limb], filter_.peak_ns[limb] = sample, now
     filter_.residuals[limb] *= kept
     filter_.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf is no whole number

@@ -11,32 +11,37 @@ from hrcreplay.human.fusion.fuse import FusionState, fuse, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
-from hrcreplay.records import JOINTS, POINTS, HumanStates
+from hrcreplay.records import DOF, JOINTS, LENGTHS, POINTS, HumanStates
 from hrcreplay.settings.sections import Fusion
 from tests.human.filtered import FREE, PLAIN, WIDE, fused, standing, ticks, until
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, random_measurements
 
+#: p, v, a, j of every joint, and the lengths.
+STATES = 4 * DOF + len(LENGTHS)
+
 
 class Dense:
-    """The filter of (42)-(57) over all 56 states by filterpy, rows switched off in H."""
+    """The filter of (42)-(57) over all states by filterpy, rows switched off in H."""
 
     def __init__(self, state: FusionState, settings: Fusion) -> None:
         self.settings = settings
-        self.filter = KalmanFilter(56, 1)
+        self.filter = KalmanFilter(STATES, 1)
         self.filter.x = np.concatenate([state.mean.T.ravel(), state.lengths])[:, None]
-        P = np.zeros((56, 56))
-        for j in range(12):
-            P[np.ix_(range(j, 48, 12), range(j, 48, 12))] = state.cov[j]
-        P[48:, 48:] = np.diag(state.lengths_var)
+        P = np.zeros((STATES, STATES))
+        for j in range(DOF):
+            P[np.ix_(range(j, 4 * DOF, DOF), range(j, 4 * DOF, DOF))] = state.cov[j]
+        P[4 * DOF :, 4 * DOF :] = np.diag(state.lengths_var)
         self.filter.P = P
         self.held: dict[int, dict[str, Any]] = {}
 
     def predict(self, dt: float) -> None:
         powers = [1.0, dt, dt**2 / 2, dt**3 / 6]
-        F = np.kron(sum(np.eye(4, k=k) * powers[k] for k in range(4)), np.eye(12))
-        sigma = np.array([self.settings.sigma_position] * 2 + [self.settings.sigma_angle] * 10)
+        F = np.kron(sum(np.eye(4, k=k) * powers[k] for k in range(4)), np.eye(DOF))
+        sigma = np.array(
+            [self.settings.sigma_position] * 2 + [self.settings.sigma_angle] * 10 + [self.settings.sigma_position]
+        )
         G = sigma.T**2 * np.array([dt**4 / 24, dt**3 / 6, dt**2 / 2, dt])[:, None]
-        self.filter.predict(F=block_diag(F, np.eye(8)), Q=np.diag([*G.ravel(), *np.zeros(8)]))
+        self.filter.predict(F=block_diag(F, np.eye(len(LENGTHS))), Q=np.diag([*G.ravel(), *np.zeros(len(LENGTHS))]))
 
     def update(self, now_ns: int, frames: list[dict[str, Any]]) -> None:
         for frame in frames:
@@ -47,7 +52,7 @@ class Dense:
             if frame["uses"] > 1 and self.settings.stale == "skip":
                 continue
             d = (now_ns - frame["capture_ns"]) * 1e-9 if self.settings.delay == "compensate" else 0.0
-            H = block_diag(np.kron([1.0, -d, d**2 / 2, -(d**3) / 6], np.eye(12)), np.eye(8))
+            H = block_diag(np.kron([1.0, -d, d**2 / 2, -(d**3) / 6], np.eye(DOF)), np.eye(len(LENGTHS)))
             blocks.append(H[frame["valid"]])
             z.append(frame["z"][frame["valid"]])
             R.append(frame["uses"] * frame["std"][frame["valid"]] ** 2)
@@ -112,12 +117,12 @@ def test_it_is_the_dense_filter_over_the_whole_state(stale: Any, delay: Any) -> 
                 arrived[frame["camera"]] = frame
         dense.update(int(t[k]), list(arrived.values()))
         x, P, i = dense.filter.x[:, 0], dense.filter.P, k - first
-        for found, expected in zip((states.p, states.v, states.a, states.j), x[:48].reshape(4, 12), strict=True):
+        for found, expected in zip((states.p, states.v, states.a, states.j), x[: 4 * DOF].reshape(4, DOF), strict=True):
             np.testing.assert_allclose(found[i], expected, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(states.p_std[i] ** 2, np.diag(P)[:12], rtol=1e-9)
-        np.testing.assert_allclose(states.v_std[i] ** 2, np.diag(P)[12:24], rtol=1e-9)
-        np.testing.assert_allclose(states.lengths_m[i], x[48:], atol=1e-9)
-        np.testing.assert_allclose(states.lengths_std_m[i] ** 2, np.diag(P)[48:], rtol=1e-9)
+        np.testing.assert_allclose(states.p_std[i] ** 2, np.diag(P)[:DOF], rtol=1e-9)
+        np.testing.assert_allclose(states.v_std[i] ** 2, np.diag(P)[DOF : 2 * DOF], rtol=1e-9)
+        np.testing.assert_allclose(states.lengths_m[i], x[4 * DOF :], atol=1e-9)
+        np.testing.assert_allclose(states.lengths_std_m[i] ** 2, np.diag(P)[4 * DOF :], rtol=1e-9)
 
 
 @pytest.mark.parametrize("stale", ["skip", "reuse"])

@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, inverse, inverse_jacobian, measure
 from hrcreplay.human.model import canonical, nearest, skeleton
 from hrcreplay.limits import load_limits
-from hrcreplay.records import JOINTS, POINTS, Bools, Floats
+from hrcreplay.records import DOF, JOINTS, POINTS, Bools, Floats
 from hrcreplay.settings.sections import Fusion
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of, lengths, postures
 
@@ -73,7 +73,7 @@ def test_towards_a_singular_posture_the_noise_grows_and_the_rest_stays(joints: d
     exact = person(**joints)
     found = inverse(skeleton(exact[None], LENGTHS_M[None]))[0][0]
     assert np.isfinite(found).all()
-    observed = [j for j in range(12) if JOINTS[j] not in (lost, f"{lost[:2]}{4 - int(lost[2])}")]
+    observed = [j for j in range(DOF) if JOINTS[j] not in (lost, f"{lost[:2]}{4 - int(lost[2])}")]
     np.testing.assert_allclose(found[observed], exact[observed], atol=1e-6)
 
 
@@ -98,7 +98,7 @@ def test_the_jacobian_undoes_that_of_the_forward_kinematics() -> None:
         known = np.isfinite(skeleton(p[None], LENGTHS_M[None])[0].ravel())
 
         def points(x: Floats, known: Bools = known) -> Floats:
-            return np.where(known, skeleton(x[None, :12], x[None, 12:])[0].ravel(), 0.0)
+            return np.where(known, skeleton(x[None, :DOF], x[None, DOF:])[0].ravel(), 0.0)
 
         for j in range(20):
             step = np.zeros(20)

@@ -12,12 +12,12 @@ from hrcreplay.human.fusion.fuse import fuse as fuse_all
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
-from hrcreplay.records import LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements
+from hrcreplay.records import DOF, LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
 HUMAN = load_limits("human")
-POSE = np.array([0.2, 0.1, 0.3, 0.1, 0.4, 0.6, 0.1, 1.7, 0.4, 0.6, 0.1, 1.7])
-LENGTHS_M = np.array([0.94, 0.5, 0.2, 0.18, 0.3, 0.3, 0.26, 0.26])
+POSE = np.array([0.2, 0.1, 0.3, 0.1, 0.4, 0.6, 0.1, 1.7, 0.4, 0.6, 0.1, 1.7, 0.94])
+LENGTHS_M = np.array([0.5, 0.2, 0.18, 0.3, 0.3, 0.26, 0.26])
 RATE_HZ, FRAMES_HZ = 250, 50
 FREE = Fusion(spread_least=1.0, spread_most=1.0)
 
@@ -27,7 +27,7 @@ def ticks(seconds: float) -> Ints:
 
 
 def frames_of(p: Floats, noise_m: float = 0.0, lengths_m: Floats = LENGTHS_M) -> CameraFrames:
-    """One camera at the world's origin, p (n, 12) at FRAMES_HZ."""
+    """One camera at the world's origin, p (n, 13) at FRAMES_HZ."""
     points = skeleton(p, np.tile(lengths_m, (len(p), 1)))
     points = points + np.random.default_rng(4).normal(0.0, 1.0, points.shape) * noise_m
     capture = np.arange(len(p)) * (1_000_000_000 // FRAMES_HZ)
@@ -47,13 +47,13 @@ def measured(frames: CameraFrames, std_m: float = 0.02) -> Measurements:
 
 
 def factors(m: Measurements, t: Ints, settings: Fusion | None = None) -> Floats:
-    """(n, 12) what the variances of v that are told are, over those of P."""
+    """(n, 13) what the variances of v that are told are, over those of P."""
     _, states, _, trace = fuse(start(("one",)), t, m, settings or Fusion(), HUMAN, traced=True)
     return np.asarray(states.v_std**2 / trace.cov[:, :, 1, 1])
 
 
 def test_the_estimate_is_the_same_whatever_is_told_of_it() -> None:
-    sway = POSE + 0.3 * np.sin(np.arange(150) / 8.0)[:, None] * (np.arange(12) >= 4)
+    sway = POSE + 0.3 * np.sin(np.arange(150) / 8.0)[:, None] * (np.arange(DOF) >= 4)
     m = measured(frames_of(sway, 0.01))
     told, plain = (fuse_all(start(("one",)), ticks(2.9), m, s, HUMAN)[1] for s in (Fusion(), FREE))
     for name in ("p", "v", "a", "j", "lengths_m", "residual_m"):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from hrcreplay.human.fusion.model_residual import LEAST
+from hrcreplay.human.model import HEIGHT
 from hrcreplay.records import BODY, LIMBS, POINTS, CameraFrames, Floats, HumanStates, Measurements
 from hrcreplay.settings.sections import Fusion
-from tests.human.bent import RATE_HZ, bent, fused, measured, ticks, used_frames
+from tests.human.bent import RATE_HZ, bent, fused, measured, predicted, ticks, used_frames
 
 Legs = dict[str, tuple[float, float, float]]
 LEGS = BODY.index("LEGS")
@@ -58,7 +59,7 @@ def plain_samples(m: Measurements, states: HumanStates, settings: Fusion) -> lis
     for k, i in used_frames(m, states.t_ns):
         age = (states.t_ns[k] - m.capture_ns[i]) * 1e-9
         p = states.p[k] - age * states.v[k] + age**2 / 2 * states.a[k] - age**3 / 6 * states.j[k]
-        pelvis = np.array([p[0], p[1], states.lengths_m[k, 0]])
+        pelvis = np.array([p[0], p[1], p[HEIGHT]])
         trusted = {
             name
             for name in ("pelvis", *LEG_POINTS)
@@ -115,9 +116,11 @@ def lived() -> CameraFrames:
 @pytest.mark.parametrize(("quantile", "memory_s"), [(0.95, 20.0), (0.6, 1.0)])
 def test_it_is_the_weighted_quantile_of_all_samples(quantile: float, memory_s: float) -> None:
     m = measured(lived())
-    settings = Fusion(outlier_m=1e6, bone_m=1e6, residual_quantile=quantile, residual_memory_s=memory_s)
-    states = fused(m, ticks(9.0), settings)
-    expected = plain_residual(m, states, settings)
+    settings = Fusion(
+        outlier_m=1e6, bone_m=1e6, residual_quantile=quantile, residual_memory_s=memory_s, residual_hold_s=0.0
+    )
+    states, prior = predicted(m, ticks(9.0), settings)
+    expected = plain_residual(m, prior, settings)
     residual = states.residual_m[:, LEGS]
     np.testing.assert_array_equal(np.isnan(residual), np.isnan(expected))
     known = np.isfinite(expected)

@@ -9,7 +9,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction.reachable_sets import PRINTED
 from hrcreplay.limits import load_limits
-from hrcreplay.records import JOINTS, Floats
+from hrcreplay.records import DOF, JOINTS, Floats
 from tests.human.people import random_states, states
 from tests.human.predictions import reachable
 
@@ -31,7 +31,7 @@ def posture(**joints: float) -> Floats:
 
 
 def velocity(**joints: float) -> Floats:
-    v = np.zeros(12)
+    v = np.zeros(DOF)
     for name, value in joints.items():
         v[JOINTS.index(name)] = value
     return v
@@ -48,7 +48,7 @@ def bang(p: float, v: float, v_bound: float, a_bound: float, steps: int = 200_00
 @pytest.mark.parametrize("name", ["rho", "ar1", "al4"])
 @pytest.mark.parametrize("share", [-1.0, -0.9, -0.2, 0.0, 0.5, 0.95, 1.0])
 def test_alg_1_is_where_a_simulated_joint_gets(name: str, share: float) -> None:
-    free = dataclasses.replace(PAPER, p_min=np.full(12, -99.0), p_max=np.full(12, 99.0), coupled=False)
+    free = dataclasses.replace(PAPER, p_min=np.full(DOF, -99.0), p_max=np.full(DOF, 99.0), coupled=False)
     j = JOINTS.index(name)
     p, v = posture(**{name: 0.4}), velocity(**{name: share * PAPER.v_max[j]})
     low, high = one(p, v, free)
@@ -144,7 +144,7 @@ def test_positions_holds_paper_and_both_hold_the_posture(limits: LimitSet) -> No
 
 
 def test_what_is_missing_stays_missing() -> None:
-    p, v = np.tile(HANGING, (3, 1)), np.zeros((3, 12))
+    p, v = np.tile(HANGING, (3, 1)), np.zeros((3, DOF))
     p[0, JOINTS.index("theta")] = np.nan
     v[1, JOINTS.index("ar4")] = np.nan
     p[2, JOINTS.index("al1")] = np.nan
@@ -168,4 +168,4 @@ def test_one_row_has_the_bits_of_many() -> None:
 
 def test_an_unknown_method_is_named() -> None:
     with pytest.raises(SettingsError, match=r"occupancy\.method: found 'guess'; choose one of paper, positions"):
-        one(HANGING, np.zeros(12), method="guess")
+        one(HANGING, np.zeros(DOF), method="guess")

@@ -10,11 +10,11 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning, sphere_swept_volume_m3
-from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds, skeleton
+from hrcreplay.human.model import HEIGHT, LimitSet, alpha_2_bounds, alpha_3_bounds, skeleton
 from hrcreplay.human.prediction.joint_reach import rise
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
-from hrcreplay.records import JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
+from hrcreplay.records import DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
 from tests.human.people import limb_points, random_states, states
 from tests.human.predictions import predict, reachable
@@ -32,14 +32,14 @@ def volumes(people: HumanStates, limits: LimitSet = PAPER, margins: Occupancy = 
 def uncertain(people: HumanStates, p_std: float, v_std: float, lengths_std_m: float) -> HumanStates:
     return dataclasses.replace(
         people,
-        p_std=np.full_like(people.p, p_std) * np.where(np.arange(12) < 2, 0.3, 1.0),
+        p_std=np.full_like(people.p, p_std) * np.where(np.arange(DOF) < 2, 0.3, 1.0),
         v_std=np.full_like(people.v, v_std),
         lengths_std_m=np.full_like(people.lengths_m, lengths_std_m),
     )
 
 
 def stopped(p: Floats, limits: LimitSet) -> tuple[Floats, Floats]:
-    """The stops of postures (n, 12): least and most, each (n, 12)."""
+    """The stops of postures (n, 13): least and most, each (n, 13)."""
     least, most = np.tile(limits.p_min, (len(p), 1)), np.tile(limits.p_max, (len(p), 1))
     for i in range(len(p) if limits.coupled else 0):
         for a in (4, 8):
@@ -53,14 +53,14 @@ def stopped(p: Floats, limits: LimitSet) -> tuple[Floats, Floats]:
 def motions(
     rng: np.random.Generator, p: Floats, v: Floats, limits: LimitSet, count: int, sharp: bool
 ) -> list[tuple[Floats, Floats]]:
-    """Postures (count, 12) of random motions from one true state at some instants; v of x and y in the body's frame.
+    """Postures (count, DOF) of random motions from one true state at some instants; v of x and y in the body's frame.
 
     Bang-bang with a switch, or accelerations all over. The integral of a piece is never more than the model allows:
     velocities are integrated by the trapezoid of what the bounds let through. Stops end what goes into them.
     """
     q, w = np.tile(p, (count, 1)), np.tile(v, (count, 1))
-    first, second = (rng.choice([0.0, 1.0], (count, 12)) if sharp else rng.random((count, 12)) for _ in range(2))
-    switch = rng.uniform(0, 1.2, (count, 12))
+    first, second = (rng.choice([0.0, 1.0], (count, DOF)) if sharp else rng.random((count, DOF)) for _ in range(2))
+    switch = rng.uniform(0, 1.2, (count, DOF))
     dt, seen = T / STEPS, [(q.copy(), w.copy())]
     for k in range(STEPS):
         share = np.where(k / STEPS < switch, first, second)
@@ -91,12 +91,12 @@ def worst(people: HumanStates, limits: LimitSet, margins: Occupancy, seed: int, 
         solids = [ConvexHull(swept.vertices(i, limb)).equations for limb in range(len(LIMBS))]
         room = swept.radius_m[i] - np.append(limb_radii(Occupancy()), np.zeros(len(swept.limbs) - 6))
         for sharp in (True, False):
-            side = rng.choice([-1.0, 1.0], (3, 12)) if sharp else rng.uniform(-1, 1, (3, 12))
+            side = rng.choice([-1.0, 1.0], (3, DOF)) if sharp else rng.uniform(-1, 1, (3, DOF))
             p, v = people.p[i] + k * people.p_std[i] * side[0], people.v[i] + k * people.v_std[i] * side[1]
             c, s = np.cos(p[2]), np.sin(p[2])
             v[0], v[1] = c * v[0] + s * v[1], c * v[1] - s * v[0]
-            lengths = people.lengths_m[i] + k * people.lengths_std_m[i] * side[2, :8]
-            lengths[6:] += margins.hand_m
+            lengths = people.lengths_m[i] + k * people.lengths_std_m[i] * side[2, :7]
+            lengths[5:] += margins.hand_m
             for q, _ in motions(rng, p, v, limits, count, sharp):
                 points = skeleton(q, np.tile(lengths, (count, 1)))
                 for limb, name in enumerate(LIMBS):
@@ -160,14 +160,14 @@ def test_an_excursion_peaks_where_a_simulated_joint_does() -> None:
 
 
 def test_a_joint_faster_than_its_bound_comes_back_at_its_bound() -> None:
-    j, p, v = JOINTS.index("rho"), np.zeros((1, 12)), np.zeros((1, 12))
+    j, p, v = JOINTS.index("rho"), np.zeros((1, DOF)), np.zeros((1, DOF))
     v[0, j] = PAPER.v_max[j] + 0.1
     reach = reachable(states(p, v), PAPER, T, "sound", BARE)
     assert reach.high[0, j] == pytest.approx((PAPER.v_max[j] + 0.1) * T + 0.5 * PAPER.a_min[j] * T**2)
 
 
 def test_stops_hold_and_a_posture_beyond_one_stays_inside() -> None:
-    j, p, v = JOINTS.index("ar1"), np.zeros((2, 12)), np.zeros((2, 12))
+    j, p, v = JOINTS.index("ar1"), np.zeros((2, DOF)), np.zeros((2, DOF))
     p[:, j], v[:, j] = (PAPER.p_max[j] - 0.01, PAPER.p_max[j] + 0.2), (1.0, 0.0)
     reach = reachable(states(p, v), PAPER, T, "sound", BARE)
     assert reach.high[:, j].tolist() == [PAPER.p_max[j], p[1, j]]
@@ -215,7 +215,8 @@ def test_unknown_lengths_are_in_the_volumes() -> None:
     margins = Occupancy(sigmas=3.0, legs=False)
     out, where = worst(people, PAPER, margins, 5)
     assert out <= 0.0, where
-    assert volumes(people, PAPER, margins).radius_m[0, LIMBS.index("HD")] == pytest.approx(0.12 + 0.03)
+    assert volumes(people, PAPER, margins).radius_m[0, LIMBS.index("URA")] == pytest.approx(0.07 + np.hypot(0.03, 0.03))
+    assert volumes(people, PAPER, margins).radius_m[0, LIMBS.index("HD")] == pytest.approx(0.12)
 
 
 def test_a_limb_out_of_sight_grows_to_all_that_it_can_reach() -> None:
@@ -228,7 +229,7 @@ def test_a_limb_out_of_sight_grows_to_all_that_it_can_reach() -> None:
     width = reach.high[:, elbow] - reach.low[:, elbow]
     assert width[0] == width[1] < width[2] < width[4] == pytest.approx(PAPER.p_max[elbow] - PAPER.p_min[elbow])
     assert width[3] == pytest.approx(width[4])
-    others = [j for j in range(12) if JOINTS[j] not in ("al3", "al4")]
+    others = [j for j in range(DOF) if JOINTS[j] not in ("al3", "al4")]
     assert (reach.low[:, others] == reach.low[0, others]).all()
     swept = volumes(dataclasses.replace(same, unseen_s=unseen))
     sizes = [sphere_swept_volume_m3(swept.vertices(i, LIMBS.index("LLA")), 0.07) for i in range(5)]
@@ -238,7 +239,7 @@ def test_a_limb_out_of_sight_grows_to_all_that_it_can_reach() -> None:
 def test_an_arm_never_seen_needs_no_state_but_its_lengths() -> None:
     people = random_states(PAPER, 1, 11)
     p, unseen = people.p.copy(), np.zeros((1, len(LIMBS)))
-    p[0, 8:] = np.nan
+    p[0, 8:12] = np.nan
     blind = dataclasses.replace(people, p=p)
     assert np.isnan(volumes(blind).vertices(0, LIMBS.index("LLA"))).all()
     unseen[0, [LIMBS.index("ULA"), LIMBS.index("LLA")]] = np.inf
@@ -264,9 +265,25 @@ def test_residual_hand_and_legs() -> None:
         limb_radii(Occupancy())
     )
     legs = swept.vertices(0, len(LIMBS))
-    assert (legs[:, 2].min(), legs[:, 2].max()) == (0.0, people.lengths_m[0, 0])
+    assert (legs[:, 2].min(), legs[:, 2].max()) == (0.0, people.p[0, HEIGHT])
     assert (legs[:, :2].min(axis=0) <= people.p[0, :2]).all()
     assert (legs[:, :2].max(axis=0) >= people.p[0, :2]).all()
+
+
+def test_a_low_pelvis_puts_the_knees_further_out() -> None:
+    """Knees of two bones of 0.47 m between the pelvis and a foot under it, all around, and a thigh of 8 cm."""
+    p = np.tile(random_states(PAPER, 1, 15).p, (4, 1))
+    p[:, HEIGHT] = (0.94, 0.7, 0.5, 0.3)
+    swept = volumes(states(p, np.zeros_like(p)), margins=Occupancy(sigmas=0.0, residual=False))
+    for i, height in enumerate(p[:, HEIGHT]):
+        solid = ConvexHull(swept.vertices(i, 6)).equations
+        knee = np.sqrt(0.47**2 - 0.25 * height**2)
+        around = np.linspace(0.0, 2.0 * np.pi, 50)
+        knees = np.column_stack([p[i, 0] + knee * np.cos(around), p[i, 1] + knee * np.sin(around), 0 * around])
+        for at in (0.1, 0.5 * height):
+            out = (knees + [0.0, 0.0, at]) @ solid[:, :3].T + solid[:, 3]
+            assert out.max() <= swept.radius_m[i, 6] - 0.08 + 1e-9
+            assert out.max() > -0.05 or height == 0.94  # and not much more
 
 
 def test_legs_are_as_wide_as_they_were_seen() -> None:

@@ -12,7 +12,7 @@ from hrcreplay.human.model import LimitSet, clamp, skeleton
 from hrcreplay.human.prediction.reachable_sets import METHODS, PRINTED
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
-from hrcreplay.records import JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
+from hrcreplay.records import DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
 from tests.human import predictions
 from tests.human.people import LENGTHS_M, directions, limb_points, random_states, raw_cloud, states
@@ -61,7 +61,7 @@ def test_wide_limits_turn_joints_all_the_way_around() -> None:
     volumes, reach = predict(people, HUMAN), reachable(people, HUMAN, T, "paper")
     rng = np.random.default_rng(0)
     for i in range(len(people)):
-        p = rng.uniform(reach.low[i], reach.high[i], (2000, 12))
+        p = rng.uniform(reach.low[i], reach.high[i], (2000, DOF))
         points = skeleton(p, np.tile(LENGTHS_M, (len(p), 1)))
         for k, limb in enumerate(LIMBS):
             reached = np.concatenate([limb_points(point, limb) for point in points])
@@ -76,9 +76,9 @@ def test_every_posture_in_the_reachable_sets_is_inside(method: str) -> None:
     rng = np.random.default_rng(1)
     for i in range(len(people)):
         low, high = reach.low[i], reach.high[i]
-        anywhere = rng.uniform(low, high, (300, 12))
-        ends = np.where(rng.random((300, 12)) < 0.5, low, high)
-        arcs = np.where(rng.random((300, 12)) < 0.2, anywhere, ends)
+        anywhere = rng.uniform(low, high, (300, DOF))
+        ends = np.where(rng.random((300, DOF)) < 0.5, low, high)
+        arcs = np.where(rng.random((300, DOF)) < 0.2, anywhere, ends)
         points = skeleton(np.concatenate([anywhere, ends, arcs, people.p[i : i + 1]]), np.tile(LENGTHS_M, (901, 1)))
         for k, limb in enumerate(LIMBS):
             solid = ConvexHull(volumes.vertices(i, k))
@@ -106,18 +106,18 @@ def test_the_older_method_needs_more_room() -> None:
 
 def frozen(**speeds: tuple[float, float]) -> LimitSet:
     """Limits under which only the named joints move."""
-    v_min, v_max = np.zeros(12), np.zeros(12)
+    v_min, v_max = np.zeros(DOF), np.zeros(DOF)
     for name, (low, high) in speeds.items():
         v_min[JOINTS.index(name)], v_max[JOINTS.index(name)] = low, high
     return dataclasses.replace(PAPER, v_min=v_min, v_max=v_max)
 
 
 def standing(**joints: float) -> HumanStates:
-    p = np.zeros((1, 12))
-    p[0, [7, 11]] = np.pi
+    p = np.zeros((1, DOF))
+    p[0, [7, 11]], p[0, 12] = np.pi, 1.0
     for name, value in joints.items():
         p[0, JOINTS.index(name)] = value
-    return states(p, np.zeros((1, 12)))
+    return states(p, np.zeros((1, DOF)))
 
 
 def in_order(points: Floats) -> Floats:
@@ -165,9 +165,9 @@ def test_a_limb_without_a_state_has_one_nan_vertex() -> None:
     p = np.tile(standing().p, (3, 1))
     p[0, JOINTS.index("ar3")] = np.nan
     p[2] = np.nan
-    people = states(p, np.zeros((3, 12)))
+    people = states(p, np.zeros((3, DOF)))
     lengths = people.lengths_m.copy()
-    lengths[1, 2] = np.nan  # head
+    lengths[1, 1] = np.nan  # head
     volumes = predict(dataclasses.replace(people, lengths_m=lengths))
     lost = [[limb for k, limb in enumerate(LIMBS) if np.isnan(volumes.vertices(i, k)).all()] for i in range(3)]
     assert lost == [["LRA"], ["HD"], list(LIMBS)]

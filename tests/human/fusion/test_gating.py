@@ -1,0 +1,85 @@
+"""What the gates make of points that cameras go on showing elsewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hrcreplay.human.fusion.inverse_kinematics import measure
+from hrcreplay.human.model import skeleton
+from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, Measurements
+from hrcreplay.settings.sections import Fusion
+from tests.human.filtered import fused, standing, ticks
+from tests.human.sightings import NEUTRAL, frames_of
+
+#: Points of each of LIMBS that the model has.
+ENDS = {
+    "HD": ("head",),
+    "THX": ("pelvis", "shoulder_l", "shoulder_r"),
+    "URA": ("shoulder_r", "elbow_r"),
+    "LRA": ("elbow_r", "wrist_r"),
+    "ULA": ("shoulder_l", "elbow_l"),
+    "LLA": ("elbow_l", "wrist_l"),
+}
+
+
+def again(m: Measurements, points: Floats) -> Measurements:
+    """The same frames with other points."""
+    frames = frames_of(points, m.camera, m.capture_ns, 20_000_000)
+    return measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion(point_std_m=0.01))
+
+
+def apart_m(states: HumanStates, truth: Floats) -> Floats:
+    """(n, 6) how far each limb of the model is from the truth (20, 3), its farthest point [m]."""
+    off = np.linalg.norm(skeleton(states.p, states.lengths_m) - truth, axis=2)
+    return np.column_stack([off[:, [POINTS.index(name) for name in ENDS[limb]]].max(axis=1) for limb in LIMBS])
+
+
+@pytest.mark.parametrize("by_m", [(1.0, 0.0, 0.0), (0.0, 0.0, -0.45), (0.3, 0.2, 0.3)])
+def test_until_they_are_believed_the_volumes_hold_what_cameras_agree_on(by_m: tuple[float, float, float]) -> None:
+    """Everybody jumps at 2 s: from the second camera's first frame on, both places are in the volumes."""
+    moved = NEUTRAL.copy()
+    moved[[0, 1, 12]] += by_m
+    m = Measurements.join([standing(2.0), standing(3.0, moved, start_s=2.0)])
+    t = ticks(3.0)
+    states = fused(m, t, Fusion())
+    agreed_ns = m.arrival_ns[np.flatnonzero((m.capture_ns >= 2_000_000_000) & (m.camera == 1))[0]]
+    after = (t >= agreed_ns) & (t < 2_400_000_000)
+    apart = apart_m(states.rows(after), skeleton(moved[None], states.lengths_m[-1:])[0])
+    assert (apart <= states.residual_m[after][:, : len(LIMBS)] + 5e-3).all()
+    assert apart[0].max() > 0.4  # and the filter was not there yet
+    assert (apart[t[after] >= 2_160_000_000] < 0.02).all()
+
+
+def test_an_arm_that_one_camera_loses_is_where_the_other_sees_it() -> None:
+    m = standing(3.0)
+    points = m.points_m.copy()
+    wrong = (m.camera == 1) & (m.capture_ns > 1_000_000_000)
+    points[wrong, POINTS.index("wrist_l")] += [0.3, 0.0, 0.2]
+    states = fused(again(m, points), ticks(3.0), Fusion(bone_m=1e6))
+    np.testing.assert_allclose(states.p[-1], NEUTRAL, atol=5e-3)
+    assert (states.residual_m[-1, : len(LIMBS)] < 0.02).all()
+
+
+@pytest.mark.parametrize("cameras", [(0,), (0, 1)])
+def test_left_and_right_exchanged_are_never_believed(cameras: tuple[int, ...]) -> None:
+    m = standing(3.0, cameras=cameras)
+    points = m.points_m.copy()
+    wrong = (m.capture_ns > 1_600_000_000) & (m.capture_ns < 2_000_000_000)
+    for name in ("shoulder", "elbow", "wrist"):
+        left, right = (POINTS.index(f"{name}_{side}") for side in "lr")
+        points[wrong, left], points[wrong, right] = m.points_m[wrong, right], m.points_m[wrong, left]
+    t = ticks(3.0)
+    states = fused(again(m, points), t, Fusion())
+    live = t > 1_500_000_000
+    assert np.abs(states.p[live] - NEUTRAL).max() < 0.05
+    assert (states.residual_m[live][:, : len(LIMBS)] < 0.02).all()
+
+
+def test_a_single_frame_is_no_evidence() -> None:
+    m = standing(3.0)
+    points = m.points_m.copy()
+    points[20::7] += [0.6, 0.0, 0.0]
+    states = fused(again(m, points), ticks(3.0), Fusion())
+    np.testing.assert_allclose(states.p[-1], NEUTRAL, atol=5e-3)
+    assert (states.residual_m[-1, : len(LIMBS)] < 0.02).all()
