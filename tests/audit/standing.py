@@ -31,7 +31,7 @@ def standing(n: int) -> Floats:
     """(n, 20, 3) points of the model with slightly bent arms, swaying by 0.1 mm as nobody is frozen [m]."""
     p = np.zeros((n, DOF))
     p[:, 0] = 1e-4 * np.sin(np.arange(n))
-    p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
+    p[:, [4, 8]], p[:, [7, 11]], p[:, 12] = 0.2, 2.5, 1.0
     return skeleton(p, np.tile(LENGTHS_M, (n, 1)))
 
 

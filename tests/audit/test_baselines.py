@@ -13,7 +13,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
-from hrcreplay.records import DOF, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
+from hrcreplay.records import DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
 from tests.human.people import random_states, states
 
@@ -106,7 +106,7 @@ def test_iso_13855_is_the_limb_with_its_approach_speed_around() -> None:
     people = random_states(load_limits("paper"), 3, seed=8)
     volumes = _predict(people, "iso_13855")
     np.testing.assert_allclose(volumes.radius_m[0] - RADII_M, np.array([1.6, 1.6, 2.0, 2.0, 2.0, 2.0]) * HORIZON_S)
-    length = people.lengths_m[0, 5]
+    length = people.lengths_m[0, LENGTHS.index("pi_upper_arm_r")]
     r = 0.07 + 2.0 * HORIZON_S
     capsule = np.pi * r**2 * length + 4.0 / 3.0 * np.pi * r**3
     assert _solid(volumes, 0, "URA").volume_m3() == pytest.approx(capsule)

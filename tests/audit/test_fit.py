@@ -159,7 +159,7 @@ def test_a_real_recording(tmp_path: Path, name: str) -> None:
     assert found["logs"][0]["recorded_future"] == "smoothed estimate"
     assert found["total"]["training"]["share"] >= 0.99
     assert found["total"]["held_back"]["share"] > 0.6  # 20 s are few: the interval says so
-    assert found["total"]["held_back"]["low"] < 0.7
+    assert found["total"]["held_back"]["low"] < 0.8
     assert "rho" in found["kept"]  # the person walks upright
     assert any("too little motion to say" in line and "rho" in line for line in lines)
     for joint in found["kept"]:

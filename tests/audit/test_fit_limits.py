@@ -116,8 +116,9 @@ def test_farthest_is_alg_1() -> None:
     reach = reachable(person, wide, T_S, "paper")
     high = fit_limits.largest_displacement(person.v, HUMAN.v_max, HUMAN.a_max, T_S)
     low = -fit_limits.largest_displacement(-person.v, -HUMAN.v_min, -HUMAN.a_min, T_S)
-    np.testing.assert_allclose((reach.high - person.p)[:, 3:], high[:, 3:], atol=1e-12)
-    np.testing.assert_allclose((reach.low - person.p)[:, 3:], low[:, 3:], atol=1e-12)
+    turning = slice(3, 12)
+    np.testing.assert_allclose((reach.high - person.p)[:, turning], high[:, turning], atol=1e-12)
+    np.testing.assert_allclose((reach.low - person.p)[:, turning], low[:, turning], atol=1e-12)
 
 
 def test_x_and_y_are_those_of_the_body() -> None:
@@ -136,7 +137,7 @@ def test_x_and_y_are_those_of_the_body() -> None:
 
 
 def test_an_arm_that_changes_its_name_has_not_moved() -> None:
-    person = states(np.tile([0, 0, 0, 0, 2.7, 0.4, 0.1, 2.0, 0, 0, 0, 2.0], (200, 1)), np.zeros((200, DOF)))
+    person = states(np.tile([0, 0, 0, 0, 2.7, 0.4, 0.1, 2.0, 0, 0, 0, 2.0, 0.9], (200, 1)), np.zeros((200, DOF)))
     other = person.p.copy()
     other[:, 4:7] = other[:, 4:7] * [1, -1, 1] + [-np.pi, np.pi, np.pi]
     other[:, 2] += 2.0 * np.pi

@@ -40,13 +40,14 @@ def measured() -> Measurements:
 
 def dense_us_per_tick(measurements: Measurements, ticks: Ints) -> float:
     """The same run with filterpy: predict every tick, update with the rows of the frames that arrived."""
-    dense = KalmanFilter(STATES, 1)
-    dense.P = np.eye(STATES)
+    states = 4 * DOF + len(LENGTHS)
+    dense = KalmanFilter(states, 1)
+    dense.P = np.eye(states)
     F = block_diag(
         np.kron(sum(np.eye(4, k=k) * 0.004**k / (1, 1, 2, 6)[k] for k in range(4)), np.eye(DOF)), np.eye(len(LENGTHS))
     )
     Q = np.diag(np.repeat([0.0, 1e-4, 0.0, 0.0, 0.0], [DOF] * 4 + [len(LENGTHS)]))
-    H = np.zeros((20, STATES))
+    H = np.zeros((20, states))
     H[:DOF, :DOF], H[DOF:, 4 * DOF :] = np.eye(DOF), np.eye(len(LENGTHS))
     z, R = measurements.z, measurements.z_std**2
     begun, seen = time.perf_counter(), 0

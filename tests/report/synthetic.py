@@ -12,7 +12,7 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, Floats, Ints
 from hrcreplay.store.run_folder import Run
 
-LENGTHS_M = np.array([0.95, 0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.27])
+LENGTHS_M = np.array([0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.27])
 T0_NS = 1_700_000_000_000_000_000
 RADII_M = dict(zip(LIMBS, (0.12, 0.15, 0.07, 0.07, 0.07, 0.07), strict=True))
 
@@ -24,7 +24,7 @@ def pose(t_s: Floats) -> Floats:
     p[:, 0] = 1.15 - 0.35 * np.tanh((t_s - 8.0) / 3.0) + 0.03 * np.sin(t_s)
     p[:, 1] = 0.25 * np.sin(0.35 * t_s)
     p[:, 2] = np.pi + 0.4 * np.sin(0.3 * t_s)
-    p[:, 3] = 0.1 + 0.3 * reach
+    p[:, 3], p[:, 12] = 0.1 + 0.3 * reach, 0.95
     for first, side in ((4, 1.0), (8, 0.6)):
         p[:, first] = 0.15 + 0.2 * reach
         p[:, first + 1] = 0.2 + 1.2 * side * reach

@@ -16,7 +16,7 @@ from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import T0_NS, make_run
 
-ANGLES = JOINTS[2:]
+ANGLES = JOINTS[2:12]
 
 
 def metrics_of(run: Run) -> dict[str, dict[str, Any]]:

@@ -21,12 +21,12 @@ from tests.report.synthetic import make_run
 PI = np.pi
 PAPER = LimitSet(
     name="paper",
-    p_min=np.array([-np.inf, -np.inf, -np.inf, -PI / 6, *([-PI / 20, -PI, -PI, PI / 9] * 2)]),
-    p_max=np.array([np.inf, np.inf, np.inf, PI / 2, *([8 * PI / 9, PI, PI, PI] * 2)]),
-    v_min=np.array([0.0, -0.8, -PI / 4, -PI / 10, *([-PI / 2, -PI / 2, -PI / 2, -3 * PI / 10] * 2)]),
-    v_max=np.array([0.8, 0.8, PI / 4, PI / 10, *([PI / 2, PI / 2, PI / 2, 3 * PI / 10] * 2)]),
-    a_min=-np.array([0.1, 0.1, PI / 8, PI / 20, *([PI / 4, PI / 4, PI / 4, 3 * PI / 20] * 2)]),
-    a_max=np.array([0.1, 0.1, PI / 8, PI / 20, *([PI / 4, PI / 4, PI / 4, 3 * PI / 20] * 2)]),
+    p_min=np.array([-np.inf, -np.inf, -np.inf, -PI / 6, *([-PI / 20, -PI, -PI, PI / 9] * 2), 0.0]),
+    p_max=np.array([np.inf, np.inf, np.inf, PI / 2, *([8 * PI / 9, PI, PI, PI] * 2), 1.3]),
+    v_min=np.array([0.0, -0.8, -PI / 4, -PI / 10, *([-PI / 2, -PI / 2, -PI / 2, -3 * PI / 10] * 2), 0.0]),
+    v_max=np.array([0.8, 0.8, PI / 4, PI / 10, *([PI / 2, PI / 2, PI / 2, 3 * PI / 10] * 2), 0.0]),
+    a_min=-np.array([0.1, 0.1, PI / 8, PI / 20, *([PI / 4, PI / 4, PI / 4, 3 * PI / 20] * 2), 0.1]),
+    a_max=np.array([0.1, 0.1, PI / 8, PI / 20, *([PI / 4, PI / 4, PI / 4, 3 * PI / 20] * 2), 0.1]),
     coupled=True,
 )
 RADII = {"head": 0.12, "thorax": 0.15, "upper arm": 0.07, "lower arm": 0.07}

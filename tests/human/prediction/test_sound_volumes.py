@@ -279,9 +279,9 @@ def test_a_low_pelvis_puts_the_knees_further_out() -> None:
         solid = ConvexHull(swept.vertices(i, 6)).equations
         knee = np.sqrt(0.47**2 - 0.25 * height**2)
         around = np.linspace(0.0, 2.0 * np.pi, 50)
-        knees = np.column_stack([p[i, 0] + knee * np.cos(around), p[i, 1] + knee * np.sin(around), 0 * around])
         for at in (0.1, 0.5 * height):
-            out = (knees + [0.0, 0.0, at]) @ solid[:, :3].T + solid[:, 3]
+            knees = np.column_stack([p[i, 0] + knee * np.cos(around), p[i, 1] + knee * np.sin(around), np.full(50, at)])
+            out = knees @ solid[:, :3].T + solid[:, 3]
             assert out.max() <= swept.radius_m[i, 6] - 0.08 + 1e-9
             assert out.max() > -0.05 or height == 0.94  # and not much more
 
