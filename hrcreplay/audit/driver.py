@@ -28,7 +28,6 @@ from hrcreplay.audit.recording import TRUTH
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.human.prediction.swept_volumes import limb_radii
-from hrcreplay.records import LIMBS
 from hrcreplay.run import build
 from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.prediction import PredictionStage
@@ -107,9 +106,9 @@ def _summary(found: dict[str, Any]) -> list[str]:
     for log in found["logs"]:
         whole = log["methods"][method]["all"]
         share, room, deepest = whole["covered_share"], whole["union_m3"]["value"], whole["escape_max_m"]
-        words = f"audit: {log['log']}: {method}, {log['limits']}: every limb that was checked "
+        words = f"audit: {log['log']}: {method}, {log['limits']}: every whole limb that was checked "
         words += f"({checked_scope(log, method)}) inside in {100.0 * share['value']:.1f} % of "
-        words += f"{share['samples']:,} ticks"
+        words += f"{share['samples']:,} ticks (its points alone: {100.0 * whole['points_share']['value']:.1f} %)"
         words += "" if room is None else f"; union {room:.1f} m3"
         lines.append(words + ("" if deepest is None else f"; deepest escape {1e3 * deepest:.0f} mm"))
     return lines
@@ -189,9 +188,7 @@ def _margins(prediction_stage: PredictionStage) -> tuple[Any, ...]:
 
 
 def _methods(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
-    radii = limb_radii(build.prediction_stage(audits[0].job).occupancy)
-    body = dict(zip(LIMBS, radii.tolist(), strict=True))
-    return {method: method_figures([audit.outcomes[method] for audit in audits], drawn, body) for method in methods()}
+    return {method: method_figures([audit.outcomes[method] for audit in audits], drawn) for method in methods()}
 
 
 def _joints(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
@@ -220,6 +217,7 @@ def _write_rows(audit: LogAudit, writer: RunWriter) -> None:
     for method, outcome in audit.outcomes.items():
         ticks, limbs = len(outcome), len(outcome.limbs)
         escape = outcome.escape_m().ravel()
+        points = outcome.escape_m(points_alone=True).ravel()
         seen = np.isfinite(escape)
         writer.table(
             "audit",
@@ -230,6 +228,7 @@ def _write_rows(audit: LogAudit, writer: RunWriter) -> None:
                 "limb": pa.array(list(outcome.limbs) * ticks, type=pa.string()),
                 "covered": pa.array(escape == 0.0, mask=~seen),
                 "escape_m": escape,
+                "points_covered": pa.array(points == 0.0, mask=~seen),
                 "beyond_hull_m": outcome.beyond_m.ravel(),
                 "radius_m": outcome.radius_m.ravel(),
                 "volume_m3": outcome.volume_m3.ravel(),

@@ -17,7 +17,7 @@ from hrcreplay import __version__
 from hrcreplay.audit import fit_limits
 from hrcreplay.audit.bootstrap import Estimate, block_ticks, resample
 from hrcreplay.audit.fit_limits import Fit, Futures, fit_each_side
-from hrcreplay.audit.log_audit import RecordedFuture, check_containment, recorded_future, standstill_s
+from hrcreplay.audit.log_audit import RecordedFuture, check_containment, flesh_m, recorded_future, standstill_s
 from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, read_recording
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
@@ -112,9 +112,10 @@ def unchecked_parts(people: Sequence[SplitPerson]) -> list[str]:
 
 
 def all_limbs_inside(prediction_stage: PredictionStage, future: RecordedFuture, limits: LimitSet) -> Floats:
-    """(n,) whether all limbs that were seen stayed in their volumes until the horizon: 1, 0, or NaN where none was."""
+    """(n,) whether all limbs that were seen stayed whole in their volumes: 1, 0, or NaN where none was."""
     volumes = replace(prediction_stage, limits=limits).volumes(future.states)
-    worst = check_containment(volumes, future, np.zeros(len(future.states), dtype=bool)).worst_m()
+    flesh = flesh_m(prediction_stage)
+    worst = check_containment(volumes, future, flesh, np.zeros(len(future.states), dtype=bool)).worst_m()
     return np.where(np.isfinite(worst), (worst == 0.0).astype(float), np.nan)
 
 

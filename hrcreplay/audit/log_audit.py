@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,10 +15,11 @@ from hrcreplay.audit.recording import Recording, read_recording
 from hrcreplay.errors import LogError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import reachable_sets
+from hrcreplay.human.prediction.lower_body import THIGH_M
 from hrcreplay.human.prediction.reachable_sets import Reach
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import DOF, JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report.metrics import difference
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
@@ -107,12 +108,20 @@ def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
     return np.asarray(count[last] > count[first])
 
 
-def check_containment(volumes: SweptVolumes, future: RecordedFuture, counted: Bools, first_sample: int = 0) -> Outcome:
+def flesh_m(prediction_stage: PredictionStage) -> dict[str, float]:
+    """Limb -> its radius, Table 2; of the legs that of a thigh [m]."""
+    return dict(zip(BODY, (*limb_radii(prediction_stage.occupancy).tolist(), THIGH_M), strict=True))
+
+
+def check_containment(
+    volumes: SweptVolumes, future: RecordedFuture, flesh: Mapping[str, float], counted: Bools, first_sample: int = 0
+) -> Outcome:
     """Compares one method's volumes with the recorded future.
 
     Args:
         volumes: Of the n ticks.
         future: Of the same ticks.
+        flesh: Limb -> its radius, as ``flesh_m`` gives it [m].
         counted: (n,) the ticks whose union volume is estimated.
         first_sample: Number of ticks counted before, see ``union_volume_m3``.
     """
@@ -137,7 +146,8 @@ def check_containment(volumes: SweptVolumes, future: RecordedFuture, counted: Bo
             if len(limbs) > len(LIMBS):
                 union[i], union_std[i] = union_volume_m3(solids, _COUNT, _COUNT * (first_sample + i))
     radius = np.array(volumes.radius_m)
-    return Outcome(volumes.t_ns, beyond, radius, size, union, union_std, upper, upper_std, limbs)
+    thick = tuple(flesh[limb] for limb in limbs)
+    return Outcome(volumes.t_ns, beyond, radius, size, union, union_std, upper, upper_std, limbs, thick)
 
 
 def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str) -> float:
@@ -309,7 +319,8 @@ def _hold(
     for first in range(0, n, _BATCH):
         some = future.rows(slice(first, first + _BATCH))
         counted = np.arange(first, first + len(some.states)) % union_every == 0
-        parts.append(check_containment(volumes(prediction_stage, some, method), some, counted, first))
+        swept, flesh = volumes(prediction_stage, some, method), flesh_m(prediction_stage)
+        parts.append(check_containment(swept, some, flesh, counted, first))
         progress(len(some.states))
     return Outcome.join(parts)
 

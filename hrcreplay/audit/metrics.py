@@ -105,8 +105,8 @@ def checked_cameras(log: Mapping[str, Any]) -> PageTable:
 
 #: Several limbs together -> what their share is of.
 WHAT = {
-    "all": "every limb that was checked in its own volume",
-    "upper": "every limb that was checked, the lower body left out, in its own volume",
+    "all": "every limb that was checked, flesh and all, in its own volume",
+    "upper": "every limb that was checked, flesh and all, the lower body left out, in its own volume",
 }
 UNCHECKED = "not checked: not seen to the end of a horizon"
 #: Rounding of a distance [m].
@@ -130,58 +130,61 @@ class Outcome(Table):
     upper_m3: Floats  #: (n,) of the six LIMBS together, for which every method has volumes
     upper_std_m3: Floats  #: (n,)
     limbs: tuple[str, ...]  #: LIMBS first
+    flesh_m: tuple[float, ...]  #: radius of each limb itself, Table 2 and a thigh's [m]
 
-    def escape_m(self) -> Floats:
-        """(n, l) how far the limb left its volume within the horizon; 0 inside, NaN where not audited [m]."""
-        depth = self.beyond_m - self.radius_m
+    def escape_m(self, *, points_alone: bool = False) -> Floats:
+        """(n, l) how far the limb left its volume within the horizon; 0 inside, NaN where not audited [m].
+
+        The whole limb: the ball of its flesh around each of its recorded points. Volumes are convex, so what is between
+        two points is no further out than the worse of them. Or its points alone, which grants the flesh as tolerance.
+        """
+        flesh = np.zeros(len(self.limbs)) if points_alone else np.array(self.flesh_m)
+        depth = self.beyond_m + flesh - self.radius_m
         return np.where(np.isnan(depth), np.nan, np.where(depth > _ROUNDING_M, depth, 0.0))
 
-    def worst_m(self, limbs: int | None = None) -> Floats:
+    def worst_m(self, limbs: int | None = None, *, points_alone: bool = False) -> Floats:
         """(n,) largest escape of all limbs or the first so many, each from its own volume; NaN: none checked [m]."""
-        escapes = self.escape_m()[:, :limbs]
+        escapes = self.escape_m(points_alone=points_alone)[:, :limbs]
         known = np.isfinite(escapes).any(axis=1)
         return np.where(known, np.where(np.isnan(escapes), -1.0, escapes).max(axis=1), np.nan)
 
 
-def method_figures(
-    outcomes: Sequence[Outcome], resampling: Resampling, body_radius_m: Mapping[str, float]
-) -> dict[str, Any]:
+def method_figures(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:
     """Coverage, escapes and volumes of one method.
 
     Args:
         outcomes: One a log, in the order of the resampling.
         resampling: Of all their ticks.
-        body_radius_m: Radius of each limb itself, Table 2 [m].
 
     Returns:
-        ``all`` (all limbs that the method has volumes for, each in its own), ``upper`` (the six LIMBS, for which all
-        methods have them) and each limb -> name -> figure.
+        Of whole limbs, and beside them ``points_share`` of their points alone: ``all`` (all limbs that the method has
+        volumes for, each in its own), ``upper`` (the six LIMBS, for which all methods have them) and each limb -> name
+        -> figure.
     """
     whole = Outcome.join(outcomes)
-    escapes = whole.escape_m()
+    escapes, points = whole.escape_m(), whole.escape_m(points_alone=True)
     found: dict[str, Any] = {}
     for part, limbs, union, std in (
         ("all", len(whole.limbs), whole.union_m3, whole.union_std_m3),
         ("upper", len(LIMBS), whole.upper_m3, whole.upper_std_m3),
     ):
-        figures = _escape_figures(whole.worst_m(limbs), resampling)
+        figures = _escape_figures(whole.worst_m(limbs), whole.worst_m(limbs, points_alone=True), resampling)
         figures["union_m3"] = resampling.mean(union).to_dict()
         figures["union_counting_error"] = resampling.mean(_ratio(std, union)).to_dict()["value"]
         figures["sum_m3"] = resampling.mean(whole.volume_m3[:, :limbs].sum(axis=1)).to_dict()
         found[part] = figures
     for i, limb in enumerate(whole.limbs):
-        found[limb] = _escape_figures(escapes[:, i], resampling)
+        found[limb] = _escape_figures(escapes[:, i], points[:, i], resampling)
         found[limb]["volume_m3"] = resampling.mean(whole.volume_m3[:, i]).to_dict()
-        if limb in body_radius_m:
-            room = whole.radius_m[:, i] - body_radius_m[limb] + _ROUNDING_M
-            found[limb]["whole_limb_share"] = resampling.share(_hits(whole.beyond_m[:, i], room)).to_dict()
     return found
 
 
-def _escape_figures(escape_m: Floats, resampling: Resampling) -> dict[str, Any]:
+def _escape_figures(escape_m: Floats, points_escape_m: Floats, resampling: Resampling) -> dict[str, Any]:
     deep = np.where(escape_m > 0.0, escape_m, np.nan)
+    none = np.zeros(len(escape_m))
     return {
-        "covered_share": resampling.share(_hits(escape_m, np.zeros(len(escape_m)))).to_dict(),
+        "covered_share": resampling.share(_hits(escape_m, none)).to_dict(),
+        "points_share": resampling.share(_hits(points_escape_m, none)).to_dict(),
         "escape_p50_m": resampling.quantile(deep, 0.5).to_dict(),
         "escape_p95_m": resampling.quantile(deep, 0.95).to_dict(),
         "escape_max_m": _number(np.nanmax(deep)) if np.isfinite(deep).any() else None,
@@ -290,7 +293,7 @@ def headline_metrics(found: Mapping[str, Any]) -> dict[str, Metric]:
     for method, parts in found["total"]["methods"].items():
         for part, figures in parts.items():
             share = figures["covered_share"]
-            what = WHAT.get(part, f"{part} in its volume")
+            what = WHAT.get(part, f"the whole {part} in its volume")
             name = f"audit_{method}_{part}"
             meaning = f"share of ticks with {what} for the whole horizon, by {method}"
             table.add(f"{name}_covered_share", share["value"], "1", meaning, reason=UNCHECKED)
@@ -298,6 +301,9 @@ def headline_metrics(found: Mapping[str, Any]) -> dict[str, Metric]:
                 table.add(
                     f"{name}_covered_share_{end}", share[end], "1", f"its 95 % interval: {end} end", reason=UNCHECKED
                 )
+            points = figures["points_share"]["value"]
+            meaning = f"{meaning}, asked of the recorded points alone"
+            table.add(f"{name}_points_share", points, "1", meaning, reason=UNCHECKED)
             table.add(f"{name}_ticks", share["samples"], "1", "ticks at which it was checked")
             reason = "no escape" if share["samples"] else UNCHECKED
             table.add(f"{name}_escape_max_m", figures["escape_max_m"], "m", "deepest escape", reason=reason)

@@ -93,9 +93,10 @@ def _answer(found: Mapping[str, Any]) -> Answer:
     limits = sorted({log["limits"] for log in found["logs"]})
     words = (
         f"Method {METHODS.get(method, method)}, limits {', '.join(limits)}: at so many of {share['samples']} ticks, "
-        f"every limb that was checked ({checked_scope(found['total'], method)}) stayed with its recorded points "
-        f"({', '.join(sources)}) in its own volume for all of the next {found['horizon_s']:g} s. "
-        f"95 % interval {100 * share['low']:.1f} to {100 * share['high']:.1f} %."
+        f"every limb that was checked ({checked_scope(found['total'], method)}) stayed, flesh and all, around its "
+        f"recorded points ({', '.join(sources)}) in its own volume for all of the next {found['horizon_s']:g} s. "
+        f"95 % interval {100 * share['low']:.1f} to {100 * share['high']:.1f} %. Asked of the points alone, which "
+        f"grants the flesh as tolerance, it is {100 * whole['points_share']['value']:.1f} %."
     )
     deepest = whole["escape_max_m"]
     if deepest is not None:
@@ -137,7 +138,7 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> PageSection:
     if len(rows) > 1:
         rows.append(("total", found["total"]))
 
-    every = "Ticks with every limb that was checked"
+    every = "Ticks with every whole limb that was checked"
 
     def table(title: str, key: str, scale: float, decimals: int, note: str, limbs: str = "all") -> PageTable:
         body = tuple(
@@ -165,6 +166,7 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> PageSection:
             table("Union of all the limbs' volumes, mean [m\u00b3]", "union_m3", 1.0, 2, _counted(error)),
             table("Escape depth where a limb escaped, median [mm]", "escape_p50_m", 1e3, 0, ""),
             table("Escape depth where a limb escaped, 95th percentile [mm]", "escape_p95_m", 1e3, 0, ""),
+            table("Ticks with the points alone of every limb covered [%]", "points_share", 100.0, 1, ""),
             table(f"{every} covered, the lower body left out [%]", "covered_share", 100.0, 1, "", "upper"),
             table("Union of the volumes, the lower body left out, mean [m\u00b3]", "union_m3", 1.0, 2, "", "upper"),
         ),
@@ -223,8 +225,8 @@ def _limbs(found: Mapping[str, Any], folder: Path) -> PageSection:
         (_figure(folder, "audit_limbs"),),
         (
             checked_table(found["total"], found["method"]),
-            table("Ticks covered, of those checked [%]", "covered_share", 100.0, 1),
-            table("Ticks covered with the limb's own thickness, Table 2 [%]", "whole_limb_share", 100.0, 1),
+            table("Ticks with the whole limb covered, of those checked [%]", "covered_share", 100.0, 1),
+            table("Ticks with its points alone covered [%]", "points_share", 100.0, 1),
             PageTable("Deepest escape [mm]", ("limb", *_named(methods)), tuple(deepest)),
             table("Volume, mean [m\u00b3]", "volume_m3", 1.0, 2),
         ),

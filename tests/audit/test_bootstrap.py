@@ -7,7 +7,7 @@ from hrcreplay.audit import metrics as audit_checked
 from hrcreplay.audit import metrics as audit_metrics
 from hrcreplay.audit.bootstrap import Resampling, block_ticks, resample
 from hrcreplay.audit.metrics import Outcome
-from hrcreplay.records import BODY, LIMBS, Floats
+from hrcreplay.records import BODY, Floats
 
 
 def _once(n: int) -> Resampling:
@@ -15,7 +15,7 @@ def _once(n: int) -> Resampling:
     return Resampling(np.ones((4, n)), 3, 1.0)
 
 
-def _outcome(beyond: Floats, radius: float = 0.1) -> Outcome:
+def _outcome(beyond: Floats, radius: float = 0.1, flesh: float = 0.0) -> Outcome:
     n, limbs = beyond.shape
     return Outcome(
         t_ns=np.arange(n) * 40_000_000,
@@ -27,6 +27,7 @@ def _outcome(beyond: Floats, radius: float = 0.1) -> Outcome:
         upper_m3=np.where(np.arange(n) % 2 == 0, 1.5, np.nan),
         upper_std_m3=np.where(np.arange(n) % 2 == 0, 0.015, np.nan),
         limbs=BODY[:limbs],
+        flesh_m=(flesh,) * limbs,
     )
 
 
@@ -131,13 +132,18 @@ def test_escapes_by_hand() -> None:
     ]
     assert found[0]["deepest_m"] == pytest.approx(0.06)
     assert found[0]["deepest_at_s"] == 0.12
-    figures = audit_metrics.method_figures([outcome], _once(8), dict.fromkeys(LIMBS, 0.04))
+    figures = audit_metrics.method_figures([outcome], _once(8))
     assert figures["all"]["covered_share"]["value"] == 0.5
     assert figures["LRA"]["covered_share"]["value"] == pytest.approx(5 / 8)
     assert figures["LRA"]["escape_p50_m"]["value"] == pytest.approx(0.03)
     assert figures["LRA"]["escape_max_m"] == pytest.approx(0.06)
     assert figures["THX"]["covered_share"]["samples"] == 7
-    assert figures["THX"]["whole_limb_share"]["value"] == 1.0  # 0.05 within 0.10 - 0.04
+    assert figures["THX"]["points_share"] == figures["THX"]["covered_share"]  # without flesh
+    fleshy = audit_metrics.method_figures([_outcome(beyond, flesh=0.04)], _once(8))
+    assert fleshy["THX"]["covered_share"]["value"] == 1.0  # 0.05 within 0.10 - 0.04
+    thick = audit_metrics.method_figures([_outcome(beyond, flesh=0.06)], _once(8))
+    assert (thick["all"]["covered_share"]["value"], thick["all"]["points_share"]["value"]) == (0.0, 0.5)
+    assert thick["LRA"]["escape_max_m"] == pytest.approx(0.12)
     assert figures["THX"]["escape_max_m"] is None
     assert figures["all"]["union_m3"]["value"] == 2.0
     assert figures["all"]["union_m3"]["samples"] == 4
@@ -153,7 +159,7 @@ def test_every_limb_is_every_limb_that_was_checked() -> None:
     beyond[7] = np.nan
     outcome = _outcome(beyond)
     np.testing.assert_allclose(outcome.worst_m(), [0, 0, 0, 0.15, 0, 0.02, 0, np.nan], atol=1e-12)
-    figures = audit_metrics.method_figures([outcome], _once(8), {})
+    figures = audit_metrics.method_figures([outcome], _once(8))
     assert figures["all"]["covered_share"]["value"] == pytest.approx(5 / 7)
     assert figures["all"]["escape_max_m"] == pytest.approx(0.15)
     assert figures["all"]["union_m3"]["value"] == 2.0
@@ -200,7 +206,7 @@ _POINTS = {
 
 def test_logs_together_are_their_ticks_together() -> None:
     good, bad = _outcome(np.zeros((6, 6))), _outcome(np.full((2, 6), 0.2))
-    figures = audit_metrics.method_figures([good, bad], _once(8), {})
+    figures = audit_metrics.method_figures([good, bad], _once(8))
     assert figures["all"]["covered_share"]["value"] == 0.75
 
 

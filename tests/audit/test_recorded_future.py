@@ -11,7 +11,7 @@ from hrcreplay.audit import recording
 from hrcreplay.audit.log_audit import check_containment, joint_travel, joints_inside, recorded_future
 from hrcreplay.audit.recording import Recording
 from hrcreplay.human.prediction import reachable_sets
-from hrcreplay.records import DOF, JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
+from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
 from tests.human.people import states
 
 
@@ -33,13 +33,15 @@ def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
     points = np.zeros((10, len(POINTS), 3))
     points[:, :, 0] = np.arange(10)[:, None]
     future = recorded_future(_recording(points, np.zeros((10, DOF)), people), np.array([0]), 0.4)
-    outcome = check_containment(_balls(people, 1.5), future, np.array([True]))
+    flesh = dict.fromkeys(BODY, 0.07)
+    outcome = check_containment(_balls(people, 1.5), future, flesh, np.array([True]))
     np.testing.assert_allclose(outcome.beyond_m, 4.0)  # the sample at the horizon counts, the next does not
-    np.testing.assert_allclose(outcome.escape_m(), 2.5)
+    np.testing.assert_allclose(outcome.escape_m(points_alone=True), 2.5)
+    np.testing.assert_allclose(outcome.escape_m()[0], [2.5 + flesh[limb] for limb in LIMBS])
     assert outcome.union_m3[0] == pytest.approx(4.0 / 3.0 * np.pi * 1.5**3, rel=0.05)
     points[4, POINTS.index("wrist_l")] = np.nan  # not seen near the end: the lower arm cannot be audited
     future = recorded_future(_recording(points, np.zeros((10, DOF)), people), np.array([0]), 0.4)
-    outcome = check_containment(_balls(people, 1.5), future, np.array([False]))
+    outcome = check_containment(_balls(people, 1.5), future, dict.fromkeys(BODY, 0.0), np.array([False]))
     assert np.isnan(outcome.beyond_m[0]).tolist() == [limb == "LLA" for limb in LIMBS]
     assert outcome.worst_m()[0] == pytest.approx(2.5)
     assert not future.checked("LLA")[0]

@@ -77,7 +77,7 @@ def test_a_teleport_is_counted_and_no_escape(tmp_path: Path) -> None:
     # the last frame arrives after the last tick
     assert (counts["frames"], counts["rejected_frames"], counts["rejected_points"]) == (59, 3, 3)
     assert counts["outlier_points"] >= 3
-    assert log["escapes"]["paper"] == []
+    assert log["escapes"]["sound"] == []
     table = (folder / "report.html").read_text().split("jump: thrown out")[1].split("</table>")[0]
     cells = re.findall(r">\s*([^<\s]+)\s*</t[dh]>", table.split("<tbody>")[-1])
     # the model has neither hands nor legs, nor the camera: 11 points of 59 frames

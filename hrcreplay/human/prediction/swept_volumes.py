@@ -33,6 +33,7 @@ from numba import njit
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
 from hrcreplay.human.model import HEIGHT, LimitSet
+from hrcreplay.human.prediction.lower_body import THIGH_M, legs_around
 from hrcreplay.human.prediction.reachable_sets import SOUND, MotionLimits, bounds_of, code_of, never_measured, reach_row
 from hrcreplay.human.prediction.sound_reach import Likely, SoundMotionLimits, enclose_row, likely
 from hrcreplay.human.prediction.sweep import (
@@ -180,12 +181,6 @@ FINE_RAD = np.pi / 6.0
 MOST_CORNERS = 256
 #: A larger set is reduced before the next rotation.
 _MANY_CORNERS = 40
-#: From the middle of a leg, where cameras put its points, to the skin: a thigh 0.5 m around [m].
-THIGH_M = 0.08
-#: Length of thigh and of shank with foot: two of them are the pelvis's height of the median man [m].
-BONE_M = 0.47
-#: How high a knee gets whose foot carries a person: with a shank upright on the toes [m].
-KNEE_M = 0.55
 _HEAD, _THORAX, _LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
 
 
@@ -262,38 +257,13 @@ def _sweep_rows(
         enclose_row(i, at, within, low, high, corners)
         for limb in range(limbs):
             if limb == _LEGS:
-                swept, count = _legs(corners, at.p[i, 2], low[HEIGHT], high[HEIGHT], legs)
+                swept, count = legs_around(corners, at.p[i, 2], low[HEIGHT], high[HEIGHT], legs)
             else:
                 swept, count = _limb(limb, low, high, corners, lengths[i], lengths_off[i], hand, work)
             vertices = _append(vertices, n, swept, count)
             n += count
             offsets[i * limbs + limb + 1] = n
     return vertices[:n].copy(), offsets
-
-
-@njit(cache=True)
-def _legs(corners: Floats, ahead: float, lowest: float, highest: float, radius: float) -> tuple[Floats, int]:
-    """From the floor to the highest pelvis, wherever it walks; below, as far out as the lowest pelvis puts the knees.
-
-    Args:
-        corners: (SIDES, 2) where the pelvis walks [m].
-        ahead: Direction of its first side [rad].
-        lowest: Pelvis's height [m].
-        highest: The same [m].
-        radius: Of the ball around the result; it holds knees of people who stand [m].
-    """
-    if not np.isfinite(corners.sum() + lowest + highest):
-        return np.full((1, 3), np.nan), 1
-    bent = np.sqrt(max(0.0, BONE_M**2 - (0.5 * lowest) ** 2))  # foot under the pelvis, thigh and shank of one length
-    out = max(0.0, bent - (radius - THIGH_M)) / np.cos(np.pi / SIDES)
-    swept = np.zeros((3 * SIDES, 3))
-    for k in range(SIDES):
-        middle = ahead + (k + 0.5) * 2.0 * np.pi / SIDES
-        swept[k, 0] = corners[k, 0] + out * np.cos(middle)
-        swept[k, 1] = corners[k, 1] + out * np.sin(middle)
-    swept[SIDES : 2 * SIDES, :2], swept[SIDES : 2 * SIDES, 2] = swept[:SIDES, :2], min(KNEE_M, highest)
-    swept[2 * SIDES :, :2], swept[2 * SIDES :, 2] = corners, highest
-    return swept, len(swept)
 
 
 @njit(cache=True)
