@@ -197,7 +197,7 @@ def report(
 ) -> None:
     """All stages, then metrics.json, figures, report.html with the 3-D replay, and scene.mcap."""
     if snapshot is not None:
-        from hrcreplay.run.still import take_still
+        from hrcreplay.run.report import take_still
 
         sys.stdout.write(f"{take_still(source, snapshot, out)}\n")
         return

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from hrcreplay.errors import SettingsError
 from hrcreplay.human.body_capsules import PARTS, part_radii
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
-from hrcreplay.report import figures, page, tables
+from hrcreplay.report import drawing, figures, page, tables
 from hrcreplay.report.figures_human import Instant
 from hrcreplay.report.figures_robot import LinkPose
 from hrcreplay.report.limbs import add_limbs
@@ -21,10 +22,11 @@ from hrcreplay.report.metrics_data import add_fusion, add_occupancy, add_quality
 from hrcreplay.report.metrics_plan import add_plan
 from hrcreplay.report.replay_scene import ReplayScene, replay_scene
 from hrcreplay.report.scene_mcap import write_scene
+from hrcreplay.report.snapshot import snapshot
 from hrcreplay.report.story import lines
 from hrcreplay.report.tables import PageTable
 from hrcreplay.run import build
-from hrcreplay.run.job import Job
+from hrcreplay.run.job import Job, resolve
 from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.run.why import Record, stop_table
 from hrcreplay.store import run_folder
@@ -192,3 +194,32 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
     )
     add_contact(metrics, run, stationary_m_per_s)
     return metrics.sorted()
+
+
+def take_still(folder: Path, at_s: float, out: Path | None) -> Path:
+    """Draws a run at the instant of its replay that is nearest to ``at_s``.
+
+    Args:
+        folder: A run folder whose run moved a robot.
+        at_s: By the report's clock [s].
+        out: PNG file to make; None: ``snapshot-<seconds>.png`` in the folder that one works in.
+
+    Raises:
+        SettingsError: No run folder, no such instant, or the file is there or cannot be written.
+    """
+    if not run_folder.is_run(folder):
+        raise SettingsError(f"--snapshot: {folder} is no run folder; make one with: hrcreplay report {folder}")
+    run = run_folder.read(folder)
+    scene = scene_of(resolve("report", folder), run)
+    if scene is None:
+        raise SettingsError(f"--snapshot: {folder} moved no robot; make a report of it first")
+    first, last = scene.seconds[[0, -1]].tolist()
+    if not first <= at_s <= last:
+        raise SettingsError(f"--snapshot {at_s:g}: found an instant outside the run; from {first:g} to {last:g} s")
+    row = int(abs(scene.seconds - at_s).argmin())
+    path = out or Path(f"snapshot-{scene.seconds[row]:.2f}.png")
+    with drawing.style():
+        figure = snapshot(scene, row)
+        figure.set_facecolor("white")
+        run_folder.write_whole(path, drawing.png_bytes(figure))
+    return path
