@@ -16,9 +16,8 @@ from matplotlib.patches import Patch, Polygon
 from hrcreplay.records import STATUSES, Floats
 from hrcreplay.report import drawing
 from hrcreplay.report.drawing import RenderedHull, View, outline, render_hulls, view_from
-from hrcreplay.report.metrics import Metric, envelope, seconds_from, thin_path, times, true_runs
+from hrcreplay.report.metrics import Metric, envelope, path_feet, seconds_from, thin_path, times, true_runs
 from hrcreplay.report.metrics_plan import numeric_column, position_columns, stationary
-from hrcreplay.report.path_feet import path_feet
 
 ABOVE = View(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 1.0, 0.0]), toward=np.array([0.0, 0.0, 1.0]))
 SIDE = view_from(-0.5 * np.pi, 0.0)
