@@ -6,7 +6,7 @@ The colours can be told apart by readers with colour vision deficiency.
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from PIL import Image
 from scipy.spatial import ConvexHull, QhullError
 
@@ -82,18 +83,51 @@ STYLE: dict[str, Any] = {
     "svg.image_inline": True,
 }
 
+#: What differs in one column of a two-column paper.
+COLUMN_STYLE: dict[str, Any] = STYLE | {
+    "font.size": 7.0,
+    "axes.titlesize": 7.0,
+    "axes.titlepad": 3.0,
+    "axes.labelsize": 7.0,
+    "axes.labelpad": 2.0,
+    "axes.linewidth": 0.6,
+    "grid.linewidth": 0.4,
+    "xtick.labelsize": 6.5,
+    "ytick.labelsize": 6.5,
+    "xtick.major.size": 2.0,
+    "ytick.major.size": 2.0,
+    "xtick.major.pad": 2.0,
+    "ytick.major.pad": 2.0,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.fontsize": 6.5,
+    "legend.handlelength": 1.4,
+    "legend.handletextpad": 0.5,
+    "legend.columnspacing": 1.0,
+    "legend.labelspacing": 0.3,
+    "lines.linewidth": 0.9,
+}
+
 DPI = 150
 WIDTH_IN = 8.4
+#: One column of a two-column paper, and its dots an inch.
+COLUMN_IN = 3.5
+COLUMN_DPI = 300
 
 
-def style() -> Any:
-    """Context in which figures are made and saved."""
-    return mpl.rc_context(cast("Any", STYLE))
+def style(*, column: bool = False) -> Any:
+    """Context in which figures are made and saved, of the page's width or of a paper's column."""
+    return mpl.rc_context(cast("Any", COLUMN_STYLE if column else STYLE))
 
 
 def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     """An empty figure of the page's width."""
     return Figure(figsize=(width_in, height_in))
+
+
+def column_figure(height_in: float) -> Figure:
+    """An empty figure of one column of a two-column paper."""
+    return Figure(figsize=(COLUMN_IN, height_in))
 
 
 def panels(
@@ -158,37 +192,56 @@ def set_window(ax: Axes, low: Sequence[float], high: Sequence[float]) -> None:
     ax.set_ylim(middle[1] - 0.5 * scale * size_in[1], middle[1] + 0.5 * scale * size_in[1])
 
 
+def column_panels(figure: Figure, rows: int = 1, columns: int = 1, **margins: Any) -> list[list[Axes]]:
+    """``panels`` with the margins of a column; those given have priority."""
+    usual: dict[str, Any] = {
+        "left_in": 0.42,
+        "right_in": 0.07,
+        "top_in": 0.2,
+        "bottom_in": 0.34,
+        "gap_in": (0.24, 0.42),
+    }
+    return panels(figure, rows, columns, **(usual | margins))
+
+
+def no_axes(ax: Axes) -> None:
+    """Takes ticks, grid and frame away."""
+    ax.set(xticks=[], yticks=[])
+    ax.grid(visible=False)
+    ax.spines[:].set_visible(False)
+
+
 def legend_above(axes: Axes, columns: int = 6, handles: Sequence[Any] | None = None) -> None:
     """A legend in one row at the upper right, outside the data."""
     given = {} if handles is None else {"handles": list(handles)}
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.015), ncols=columns, **given)
 
 
-def png_bytes(figure: Figure) -> bytes:
+def png_bytes(figure: Figure, dpi: int = DPI) -> bytes:
     """The figure as PNG on white with a palette of 256 colours; the same figure gives the same bytes."""
-    figure.set_dpi(DPI)
+    figure.set_dpi(dpi)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     stream = io.BytesIO()
-    image.quantize(256, dither=Image.Dither.NONE).save(stream, "png", dpi=(DPI, DPI))
+    image.quantize(256, dither=Image.Dither.NONE).save(stream, "png", dpi=(dpi, dpi))
     return stream.getvalue()
 
 
-def svg_bytes(figure: Figure) -> bytes:
+def svg_bytes(figure: Figure, dpi: int = DPI) -> bytes:
     """The figure as SVG without a background; the same figure gives the same bytes."""
     stream = io.BytesIO()
-    figure.set_dpi(DPI)  # of what is drawn as pixels inside the SVG
+    figure.set_dpi(dpi)  # of what is drawn as pixels inside the SVG
     canvas: Any = FigureCanvasSVG(figure)
     canvas.print_svg(stream, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     return stream.getvalue()
 
 
-def save(figure: Figure, folder: Path, name: str) -> None:
+def save(figure: Figure, folder: Path, name: str, dpi: int = DPI) -> None:
     """Writes ``name.svg`` and ``name.png``."""
-    (folder / f"{name}.svg").write_bytes(svg_bytes(figure))
+    (folder / f"{name}.svg").write_bytes(svg_bytes(figure, dpi))
     figure.set_facecolor("white")
-    (folder / f"{name}.png").write_bytes(png_bytes(figure))
+    (folder / f"{name}.png").write_bytes(png_bytes(figure, dpi))
 
 
 #: Lines of the drawn skeleton.
@@ -287,6 +340,56 @@ def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: 
         image[rows, columns, :3][ahead] = shade[ahead]
         image[rows, columns, 3][ahead] = 1.0
     return image
+
+
+def draw_solids(
+    ax: Axes,
+    solids: Sequence[RenderedHull],
+    view: View,
+    low: Floats,
+    high: Floats,
+    *,
+    pixels: int,
+    opacity: float = 1.0,
+) -> None:
+    """Draws solids as a viewer sees them, each with a thin line around it.
+
+    Args:
+        ax: To draw on.
+        solids: Hulls with their balls and colours.
+        view: From where.
+        low: (2,) lower left corner of the picture in the axes, which need not be their window [m].
+        high: (2,) upper right corner [m].
+        pixels: Height of the picture.
+        opacity: In [0, 1].
+    """
+    image = render_hulls(solids, view, low, high, float(high[1] - low[1]) / pixels)
+    image[..., 3] *= opacity
+    limits = ax.get_xlim(), ax.get_ylim()
+    extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    ax.imshow(image, origin="lower", extent=extent, aspect="auto", interpolation="bilinear", zorder=2)
+    ax.set(xlim=limits[0], ylim=limits[1])
+    for solid in solids:
+        edge = outline(solid.vertices_m, solid.radius_m, view)
+        if len(edge):
+            ax.add_patch(Polygon(edge, fill=False, edgecolor=solid.colour, lw=0.5, alpha=0.7, zorder=3))
+
+
+def draw_outlines(ax: Axes, limbs: Mapping[str, tuple[Floats, float]], view: View) -> None:
+    """Swept volumes in pale colour behind all else: limb -> (m, 3) vertices, world, and radius [m]."""
+    for limb, (vertices, radius) in limbs.items():
+        edge = outline(vertices, radius, view)
+        if len(edge):
+            colour = LIMBS.get(limb, FAINT)
+            ax.add_patch(Polygon(edge, facecolor=colour, alpha=0.15, lw=0, zorder=0))
+            ax.add_patch(Polygon(edge, fill=False, edgecolor=colour, lw=0.5, alpha=0.8, zorder=0))
+
+
+def bounds_of(edges: Sequence[Floats], margin_m: float) -> tuple[Floats, Floats]:
+    """Corners (2,) of the box around flat points (k, 2), with a margin [m]; those that are not known are left out."""
+    corners = np.vstack([np.zeros((0, 2)), *edges])
+    corners = corners[np.isfinite(corners).all(axis=1)]
+    return corners.min(axis=0) - margin_m, corners.max(axis=0) + margin_m
 
 
 def _cloud(vertices_m: Floats, radius_m: float) -> Floats:
