@@ -1,4 +1,4 @@
-"""Shared drawing functions: figure style and export, and swept volumes in orthographic projection.
+"""Shared drawing functions: figure style, panels and export.
 
 The colours can be told apart by readers with colour vision deficiency.
 """
@@ -6,8 +6,7 @@ The colours can be told apart by readers with colour vision deficiency.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,12 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
 from PIL import Image
-from scipy.spatial import ConvexHull, QhullError
 
-from hrcreplay.geometry.visible_front import visible_front
-from hrcreplay.records import POINTS, Floats
+from hrcreplay.records import Floats
 
 # Okabe and Ito's palette.
 ORANGE, SKY, GREEN, YELLOW = "#E69F00", "#56B4E9", "#009E73", "#F0E442"
@@ -183,13 +179,18 @@ def panels(
 
 def set_window(ax: Axes, low: Sequence[float], high: Sequence[float]) -> None:
     """Limits that show at least the box from ``low`` to ``high`` with one scale for both axes."""
-    figure_in = ax.get_figure(root=True).get_size_inches()  # type: ignore[union-attr]
+    size = figure_in(ax)
     box = ax.get_position()
-    size_in = (box.width * figure_in[0], box.height * figure_in[1])
+    size_in = (box.width * size[0], box.height * size[1])
     scale = max((high[k] - low[k]) / size_in[k] for k in range(2))
     middle = [0.5 * (low[k] + high[k]) for k in range(2)]
     ax.set_xlim(middle[0] - 0.5 * scale * size_in[0], middle[0] + 0.5 * scale * size_in[0])
     ax.set_ylim(middle[1] - 0.5 * scale * size_in[1], middle[1] + 0.5 * scale * size_in[1])
+
+
+def figure_in(ax: Axes) -> Floats:
+    """(2,) width and height of an axes' figure [in]."""
+    return np.asarray(ax.get_figure(root=True).get_size_inches())  # type: ignore[union-attr]
 
 
 def column_panels(figure: Figure, rows: int = 1, columns: int = 1, **margins: Any) -> list[list[Axes]]:
@@ -224,7 +225,7 @@ def png_bytes(figure: Figure, dpi: int = DPI) -> bytes:
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     stream = io.BytesIO()
-    image.quantize(256, dither=Image.Dither.NONE).save(stream, "png", dpi=(dpi, dpi))
+    image.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(stream, "png", dpi=(dpi, dpi))
     return stream.getvalue()
 
 
@@ -254,156 +255,3 @@ BONES = (
     ("shoulder_r", "elbow_r"),
     ("elbow_r", "wrist_r"),
 )
-
-
-@dataclass(frozen=True)
-class RenderedHull:
-    """A convex hull grown by a ball, and the colour to paint it in."""
-
-    vertices_m: Floats  #: (m, 3) world [m]
-    radius_m: float
-    colour: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class View:
-    """An orthographic view: right, up and towards the viewer, each (3,) in the world."""
-
-    right: Floats
-    up: Floats
-    toward: Floats
-
-    def flat(self, points_m: Floats) -> Floats:
-        """(n, 2) of (n, 3) world points [m]."""
-        return np.asarray(points_m @ np.column_stack([self.right, self.up]))
-
-
-def view_from(azimuth_rad: float, elevation_rad: float) -> View:
-    """The view of someone who looks at the origin from there; z stays up on the page."""
-    ca, sa, ce, se = np.cos(azimuth_rad), np.sin(azimuth_rad), np.cos(elevation_rad), np.sin(elevation_rad)
-    return View(
-        right=np.array([-sa, ca, 0.0]), up=np.array([-se * ca, -se * sa, ce]), toward=np.array([ce * ca, ce * sa, se])
-    )
-
-
-def _sphere(count: int = 64) -> Floats:
-    """(count, 3) unit vectors spread evenly, by the golden angle."""
-    k = np.arange(count) + 0.5
-    polar, around = np.arccos(1.0 - 2.0 * k / count), np.pi * (1.0 + np.sqrt(5.0)) * k
-    return np.column_stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)])
-
-
-def outline(vertices_m: Floats, radius_m: float, view: View) -> Floats:
-    """(k, 2) the outline of hull + ball in a view, exact but for the circle's 36 corners [m]; empty without a hull."""
-    if not np.isfinite(vertices_m).all():
-        return np.zeros((0, 2))
-    angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
-    circle = radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
-    flat = view.flat(vertices_m)
-    cloud = (flat[:, None, :] + circle).reshape(-1, 2)
-    hull = _hull(cloud)
-    return np.zeros((0, 2)) if hull is None else np.asarray(cloud[hull.vertices])
-
-
-def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: Floats, pixel_m: float) -> Floats:
-    """What a viewer sees of solids that may intersect: each pixel shows the frontmost surface, lit from above.
-
-    Args:
-        solids: Hulls with their balls and colours.
-        view: From where.
-        low: (2,) lower left corner of the picture in the view [m].
-        high: (2,) upper right corner [m].
-        pixel_m: Edge of a pixel [m].
-
-    Returns:
-        (rows, columns, 4) colours and opacity in [0, 1], the first row at the bottom.
-    """
-    u = np.arange(low[0] + 0.5 * pixel_m, high[0], pixel_m)
-    v = np.arange(low[1] + 0.5 * pixel_m, high[1], pixel_m)
-    image = np.zeros((len(v), len(u), 4))
-    nearest = np.full((len(v), len(u)), -np.inf)
-    sun = view.toward + 0.9 * view.up - 0.6 * view.right
-    for solid in solids:
-        hull = _hull(_cloud(solid.vertices_m, solid.radius_m))
-        if hull is None:
-            continue
-        normals = hull.equations @ np.vstack(
-            [np.column_stack([view.right, view.up, view.toward, sun]), np.zeros((1, 4))]
-        )
-        flat = view.flat(hull.points[hull.vertices])
-        rows = slice(*np.searchsorted(v, [flat[:, 1].min(), flat[:, 1].max()]))
-        columns = slice(*np.searchsorted(u, [flat[:, 0].min(), flat[:, 0].max()]))
-        depth, light = visible_front(normals, hull.equations[:, 3].copy(), u[columns], v[rows])
-        ahead = depth > nearest[rows, columns]
-        shade = (0.62 + 0.38 * np.clip(light / np.linalg.norm(sun), 0.0, 1.0))[..., None] * np.asarray(solid.colour)
-        nearest[rows, columns][ahead] = depth[ahead]
-        image[rows, columns, :3][ahead] = shade[ahead]
-        image[rows, columns, 3][ahead] = 1.0
-    return image
-
-
-def draw_solids(
-    ax: Axes,
-    solids: Sequence[RenderedHull],
-    view: View,
-    low: Floats,
-    high: Floats,
-    *,
-    pixels: int,
-    opacity: float = 1.0,
-) -> None:
-    """Draws solids as a viewer sees them, each with a thin line around it.
-
-    Args:
-        ax: To draw on.
-        solids: Hulls with their balls and colours.
-        view: From where.
-        low: (2,) lower left corner of the picture in the axes, which need not be their window [m].
-        high: (2,) upper right corner [m].
-        pixels: Height of the picture.
-        opacity: In [0, 1].
-    """
-    image = render_hulls(solids, view, low, high, float(high[1] - low[1]) / pixels)
-    image[..., 3] *= opacity
-    limits = ax.get_xlim(), ax.get_ylim()
-    extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-    ax.imshow(image, origin="lower", extent=extent, aspect="auto", interpolation="bilinear", zorder=2)
-    ax.set(xlim=limits[0], ylim=limits[1])
-    for solid in solids:
-        edge = outline(solid.vertices_m, solid.radius_m, view)
-        if len(edge):
-            ax.add_patch(Polygon(edge, fill=False, edgecolor=solid.colour, lw=0.5, alpha=0.7, zorder=3))
-
-
-def draw_outlines(ax: Axes, limbs: Mapping[str, tuple[Floats, float]], view: View) -> None:
-    """Swept volumes in pale colour behind all else: limb -> (m, 3) vertices, world, and radius [m]."""
-    for limb, (vertices, radius) in limbs.items():
-        edge = outline(vertices, radius, view)
-        if len(edge):
-            colour = LIMBS.get(limb, FAINT)
-            ax.add_patch(Polygon(edge, facecolor=colour, alpha=0.15, lw=0, zorder=0))
-            ax.add_patch(Polygon(edge, fill=False, edgecolor=colour, lw=0.5, alpha=0.8, zorder=0))
-
-
-def bounds_of(edges: Sequence[Floats], margin_m: float) -> tuple[Floats, Floats]:
-    """Corners (2,) of the box around flat points (k, 2), with a margin [m]; those that are not known are left out."""
-    corners = np.vstack([np.zeros((0, 2)), *edges])
-    corners = corners[np.isfinite(corners).all(axis=1)]
-    return corners.min(axis=0) - margin_m, corners.max(axis=0) + margin_m
-
-
-def _cloud(vertices_m: Floats, radius_m: float) -> Floats:
-    return (np.asarray(vertices_m)[:, None, :] + radius_m * _sphere()).reshape(-1, 3)
-
-
-def _hull(points: Floats) -> ConvexHull | None:
-    try:
-        return ConvexHull(points)
-    except (QhullError, ValueError):  # NaN, or flat
-        return None
-
-
-def bones(points_m: Floats, view: View) -> list[Floats]:
-    """Each (2, 2): the lines of a (20, 3) skeleton in a view [m]; those with a missing end are left out."""
-    ends = [points_m[[POINTS.index(a), POINTS.index(b)]] for a, b in BONES]
-    return [view.flat(pair) for pair in ends if np.isfinite(pair).all()]

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from hrcreplay.records import JOINTS, Bools, Floats, Ints
 from hrcreplay.report import drawing
@@ -42,10 +44,12 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
         ("deg", 180 / np.pi, "deg", 180 / np.pi) if joint in ANGLES else ("m", 1.0, "mm", 1e3)
     )
     figure = drawing.column_figure(2.9 if found else 1.9)
-    rows = drawing.column_panels(figure, 2 if found else 1, heights=[1.5, 1.0] if found else None, share_x=True)
+    rows = drawing.column_panels(
+        figure, 2 if found else 1, heights=[1.5, 1.0] if found else None, share_x=True, left_in=0.47
+    )
     ax = rows[0][0]
-    for camera, colour in zip(cameras(run), drawing.CAMERAS * 3, strict=False):
-        seconds, values = _seen(run, camera, joint, t0_ns, gap_s)
+    for (camera, frames), colour in zip(_frames(run).items(), drawing.CAMERAS * 3, strict=False):
+        seconds, values = _seen(run, frames, joint, t0_ns, gap_s)
         ax.plot(*envelope(seconds, factor * values, 500), color=colour, lw=0.6, label=camera)
     if run.state is not None:
         seconds = seconds_from(times(run.state), t0_ns)
@@ -77,14 +81,21 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
     return figure
 
 
-def _seen(run: Run, camera: str, joint: str, t0_ns: int, gap_s: float) -> tuple[Floats, Floats]:
+def _frames(run: Run) -> dict[str, pd.DataFrame]:
+    """The frames of each camera, in order of capture."""
+    table = run.measurements
+    if table is None:
+        return {}
+    ordered = table.sort_values("capture_ns", kind="stable")
+    of = ordered["camera"].astype(str).to_numpy()
+    return {camera: ordered[of == camera] for camera in cameras(run)}
+
+
+def _seen(run: Run, frames: pd.DataFrame, joint: str, t0_ns: int, gap_s: float) -> tuple[Floats, Floats]:
     """A camera's raw values over time [s], broken where it was silent for longer than ``gap_s``."""
-    if run.measurements is None:
-        return np.zeros(0), np.zeros(0)
-    rows = run.measurements[run.measurements["camera"] == camera].sort_values("capture_ns", kind="stable")
-    seconds = seconds_from(times(rows, "capture_ns"), t0_ns)
-    values = _beside_fused(run, joint, times(rows, "capture_ns"), rows[joint].to_numpy(dtype=float))
-    return break_at_gaps(seconds, values, gap_s)
+    t_ns = times(frames, "capture_ns")
+    values = _beside_fused(run, joint, t_ns, frames[joint].to_numpy(dtype=float))
+    return break_at_gaps(seconds_from(t_ns, t0_ns), values, gap_s)
 
 
 def _span(ax: Axes, run: Run, t0_ns: int) -> None:
@@ -101,18 +112,18 @@ def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
     )
     for ax in [ax for row in grid for ax in row][len(JOINTS) :]:
         ax.set_visible(False)
-    seen = cameras(run)
+    seen = _frames(run)
     for k, joint in enumerate(JOINTS):
         ax = grid[k // _PANELS][k % _PANELS]
         factor = 180 / np.pi if joint in ANGLES else 1.0
-        for camera, colour in zip(seen, drawing.CAMERAS * 3, strict=False):
-            seconds, values = _seen(run, camera, joint, t0_ns, gap_s)
+        for frames, colour in zip(seen.values(), drawing.CAMERAS * 3, strict=False):
+            seconds, values = _seen(run, frames, joint, t0_ns, gap_s)
             some = slice(None, None, max(1, len(seconds) // 400))
-            ax.plot(seconds[some], factor * values[some], ".", ms=1.0, color=colour, alpha=0.5, mew=0, rasterized=True)
+            ax.plot(seconds[some], factor * values[some], ".", ms=2.0, color=colour, alpha=0.8, mew=0, rasterized=True)
         if run.state is not None:
             seconds = seconds_from(times(run.state), t0_ns)
             values = factor * run.state[joint].to_numpy(dtype=float)
-            ax.plot(*envelope(seconds, values, 150), color=drawing.FUSED, lw=0.8)
+            ax.plot(*envelope(seconds, values, 150), color=drawing.FUSED, lw=0.7)
             _limits_of(ax, values)
         if run.truth is not None:
             seconds = seconds_from(times(run.truth), t0_ns)
@@ -120,8 +131,11 @@ def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
             ax.plot(*envelope(seconds, factor * values, 150), color=drawing.TRUTH, lw=0.6, ls=(0, (4, 2)))
         ax.set_title(f"{LABELS[joint]} [{'deg' if joint in ANGLES else 'm'}]", fontweight="normal", pad=1.5)
         ax.tick_params(labelsize=6.0)
-    for column in grid[-1]:
-        column.set_xlabel("time [s]")
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+    for column in range(_PANELS):
+        lowest = grid[-1 if column < len(JOINTS) - (count - 1) * _PANELS else -2][column]
+        lowest.set_xlabel("time [s]")
+        lowest.tick_params(labelbottom=True)
     _span(grid[-1][0], run, t0_ns)
     handles = [
         Line2D([], [], ls="", marker="o", ms=3, color=c, label=n)
@@ -138,10 +152,11 @@ def _beside_fused(run: Run, joint: str, t_ns: Ints, values: Floats) -> Floats:
     """An angle in the turn of the fused one, which is unwrapped; a length as it is."""
     if run.state is None or joint not in ANGLES:
         return values
-    known = run.state[["t_ns", joint]].dropna()
-    if not len(known):
+    fused_ns, fused = times(run.state), run.state[joint].to_numpy(dtype=float)
+    known = np.isfinite(fused)
+    if not known.any():
         return values
-    fused = np.interp(t_ns, known["t_ns"].to_numpy(dtype=float), known[joint].to_numpy(dtype=float))
+    fused = np.interp(t_ns, fused_ns[known].astype(float), fused[known])
     return np.asarray(fused + wrap(values - fused))
 
 

@@ -18,9 +18,9 @@ from scipy.spatial import ConvexHull, QhullError
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import RenderedHull, View, bones, bounds_of, draw_solids, outline, view_from
 from hrcreplay.report.metrics import columns, times
 from hrcreplay.report.metrics_plan import numeric_column
+from hrcreplay.report.projection import RenderedHull, View, bones, bounds_of, draw_solids, outline, view_from
 
 #: Limb -> (m, 3) vertices, world, and radius [m].
 Limbs = Mapping[str, tuple[Floats, float]]
@@ -71,8 +71,8 @@ class Growth:
 
 def walking(walk: Walk, t0_ns: int) -> Figure:
     """Fig. 5: the circular sectors that a unicycle reaches (dashed), and the convex sets in their place (solid)."""
-    figure = drawing.column_figure(2.9)
-    ((ax,),) = drawing.column_panels(figure, bottom_in=0.72, top_in=0.2)
+    figure = drawing.column_figure(2.7)
+    ((ax,),) = drawing.column_panels(figure, bottom_in=0.64)
     beta = np.linspace(*walk.turn_rad, 60) + walk.heading_rad
     arc = walk.place_m + walk.radius_m * np.column_stack([np.cos(beta), np.sin(beta)])
     sector = np.vstack([walk.place_m, arc, walk.place_m])
@@ -96,7 +96,7 @@ def walking(walk: Walk, t0_ns: int) -> Figure:
     ax.plot(*walk.place_m, "o", color=drawing.INK, ms=3.5, zorder=6)
     ax.set(title=_at(walk.t_ns, t0_ns) + f", T = {walk.horizon_s:.3f} s", xlabel="x [m]", ylabel="y [m]")
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=drawing.INK, ls=(0, (4, 2)), lw=1.0, label="sectors of the unicycle, R and \u03b2"),
+        Line2D([], [], color=drawing.INK, ls=(0, (4, 2)), lw=1.0, label="sectors of the unicycle"),
         Line2D([], [], color=drawing.VERMILLION, lw=1.6, label="walked until T"),
         Line2D([], [], color=COLOURS["paper"], lw=1.6, label="convex set of the paper"),
         Line2D([], [], color=COLOURS["sound"], lw=1.6, label="convex set of sound"),
@@ -122,9 +122,11 @@ def sweeps(sweep: Sweep, t0_ns: int) -> Figure:
         ax.add_patch(Polygon(copy, fill=False, edgecolor=drawing.FAINT, lw=0.7))
     ax.add_patch(Polygon(flat, facecolor=drawing.ORANGE, edgecolor=drawing.ORANGE, alpha=0.7, lw=0.7, zorder=3))
     ax.plot(*ABOVE.flat(np.vstack([sweep.elbow_m, sweep.wrist_m])).T, color=drawing.INK, lw=1.6, zorder=4)
-    ax.set(title="(7) by walking, from above", xlabel="x [m]", ylabel="y [m]")
+    ax.set(title="(7) walking, from above", xlabel="x [m]", ylabel="y [m]")
     _draw_turn(turn, sweep)
-    figure.text(0.5, 0.2 / 2.35, f"{sweep.limb}, {_at(sweep.t_ns, t0_ns)}", ha="center", va="bottom", fontsize=6.5)
+    figure.text(
+        0.5, 0.2 / 2.35, f"{sweep.limb} {_at(sweep.t_ns, t0_ns).lower()}", ha="center", va="bottom", fontsize=6.5
+    )
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=drawing.INK, lw=1.6, label="forearm"),
         Line2D([], [], color=drawing.FAINT, lw=0.8, label="moved"),
@@ -156,7 +158,7 @@ def _draw_turn(ax: Axes, sweep: Sweep) -> None:
         ax.plot(*np.vstack([first, apex, last, first]).T, color=drawing.ORANGE, lw=0.8, zorder=3)
     ax.plot(*arc.T, color=drawing.ORANGE, lw=1.2, zorder=3)
     ax.plot(*np.vstack([np.zeros(2), (sweep.wrist_m - sweep.elbow_m) @ plane]).T, color=drawing.INK, lw=1.6, zorder=4)
-    ax.set(title="(8) by the elbow, in its plane", xlabel="across [m]", ylabel="along [m]")
+    ax.set(title="(8) elbow, in its plane", xlabel="across [m]", ylabel="along [m]")
 
 
 def hull_of(points: Floats) -> Floats:
@@ -193,15 +195,15 @@ def volumes_at(occupancy: pd.DataFrame, state: pd.DataFrame, moment_ns: int, t0_
     points, heading = skeleton_at(state, t_ns)
     figure = drawing.column_figure(2.5)
     (ahead, above), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.56, gap_in=(0.0, 0.42))
+    solids = _solids(limbs)
     for ax, view in ((ahead, view_from(heading - 0.7, 0.15)), (above, ABOVE)):
-        edges = [outline(vertices, radius, view) for vertices, radius in limbs.values()]
-        low, high = bounds_of(edges, 0.03)
+        low, high = bounds_of([outline(vertices, radius, view) for vertices, radius in limbs.values()], 0.03)
         drawing.set_window(ax, low.tolist(), high.tolist())
-        _draw_person(ax, limbs, points, view, np.zeros(2), (low, high), 380)
-    horizon = f", horizon {rows['horizon_s'].iloc[0]:.2f} s" if "horizon_s" in rows else ""
-    ahead.set(title=f"{rows['method'].iloc[0]}, {_at(t_ns, t0_ns)}{horizon}", xlabel="across [m]", ylabel="up [m]")
-    above.set(title="", xlabel="x [m]", ylabel="y [m]")
-    above.set_title("From above", loc="right")
+        draw_solids(ax, solids, view, opacity=0.8, line=0.45)
+        _draw_bones(ax, points, view, np.zeros(2))
+    horizon = f", {rows['horizon_s'].iloc[0]:.2f} s ahead" if "horizon_s" in rows else ""
+    ahead.set(title=f"{rows['method'].iloc[0]}{horizon}", xlabel="across [m]", ylabel="up [m]")
+    above.set(title=f"{_at(t_ns, t0_ns)}, from above", xlabel="x [m]", ylabel="y [m]")
     _limb_legend(figure, limbs)
     return figure
 
@@ -219,31 +221,41 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
     heading = float(np.nanmean([heading for _, heading in people]))
     view = view_from(heading - 0.9, 0.28)
     centres = [view.flat(points[[POINTS.index("pelvis")]])[0] for points, _ in people]
-    outlines = [
-        outline(vertices, radius, view) - centre
-        for (_, found), centre in zip(instants, centres, strict=True)
-        for limbs in found.values()
-        for vertices, radius in limbs.values()
-    ]
-    low, high = bounds_of(outlines, 0.03)
-    wide_in = (drawing.COLUMN_IN - 0.25) / max(len(instants), 1)
-    tall_in = wide_in * float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.8, 1.6))
-    figure = drawing.column_figure(0.45 + len(methods) * (tall_in + 0.04))
+    outlines = {
+        method: [
+            outline(vertices, radius, view) - centre
+            for (_, found), centre in zip(instants, centres, strict=True)
+            for vertices, radius in found[method].values()
+        ]
+        for method in methods
+    }
+    boxes = [bounds_of(edges, 0.04) for edges in outlines.values()]  # one scale, but no row taller than it need be
+    left, right = min(low[0] for low, _ in boxes), max(high[0] for _, high in boxes)
+    wide_in = (drawing.COLUMN_IN - 0.22) / len(instants)
+    tall_in = [float(high[1] - low[1]) * wide_in / float(right - left) for low, high in boxes]
+    figure = drawing.column_figure(0.56 + sum(tall_in) + 0.06 * (len(methods) - 1))
     grid = drawing.column_panels(
-        figure, len(methods), len(instants), left_in=0.2, right_in=0.02, top_in=0.22, bottom_in=0.2, gap_in=(0.04, 0.01)
+        figure,
+        *(len(methods), len(instants)),
+        left_in=0.2,
+        right_in=0.02,
+        top_in=0.34,
+        bottom_in=0.22,
+        gap_in=(0.06, 0.0),
+        heights=tall_in,
     )
     for row, method in enumerate(methods):
         for column, (t_ns, found) in enumerate(instants):
             ax = grid[row][column]
-            drawing.set_window(ax, low.tolist(), high.tolist())
-            _draw_person(ax, found[method], people[column][0], view, centres[column], (low, high), round(300 * tall_in))
+            drawing.set_window(ax, (left, boxes[row][0][1]), (right, boxes[row][1][1]))
+            _draw_person(ax, found[method], people[column][0], view, centres[column])
             if row == 0:
                 later = (t_ns - instants[0][0]) * 1e-9
                 at = f"T = {later:.0f} s\n({(t_ns - t0_ns) * 1e-9:.1f} s)"
                 ax.set_title(at if column else at.replace("\n(", "\n(at "), fontweight="normal", loc="center")
             drawing.no_axes(ax)
         grid[row][0].set_ylabel(METHODS.get(method, method), fontweight="bold")
-    _scale_bar(grid[-1][-1], float(high[0]), float(low[1]))
+    _scale_bar(grid[-1][-1], float(right) - 0.05, float(boxes[-1][0][1]))
     _limb_legend(figure, {limb for limbs in instants[0][1].values() for limb in limbs})
     return figure
 
@@ -255,18 +267,21 @@ def skeleton_at(state: pd.DataFrame, t_ns: int) -> tuple[Floats, float]:
     return skeleton(p, row[list(LENGTHS)].to_numpy(dtype=float))[0], float(p[0, JOINTS.index("theta")])
 
 
-def _draw_person(
-    ax: Axes, limbs: Limbs, points: Floats, view: View, centre: Floats, window: tuple[Floats, Floats], pixels: int
-) -> None:
+def _draw_person(ax: Axes, limbs: Limbs, points: Floats, view: View, centre: Floats) -> None:
     """Volumes, half transparent, with the skeleton in them; ``centre`` is where the axes' origin is in the view."""
     moved = centre @ np.stack([view.right, view.up])
-    solids = [
-        RenderedHull(vertices - moved, radius, to_rgb(drawing.LIMBS.get(limb, drawing.FAINT)))
-        for limb, (vertices, radius) in limbs.items()
-    ]
-    draw_solids(ax, solids, view, *window, pixels=pixels, opacity=0.78)
+    draw_solids(ax, _solids({limb: (v - moved, r) for limb, (v, r) in limbs.items()}), view, opacity=0.8, line=0.45)
+    _draw_bones(ax, points, view, centre)
+
+
+def _solids(limbs: Limbs) -> list[RenderedHull]:
+    colours = {limb: to_rgb(drawing.LIMBS.get(limb, drawing.FAINT)) for limb in limbs}
+    return [RenderedHull(vertices, radius, colours[limb]) for limb, (vertices, radius) in limbs.items()]
+
+
+def _draw_bones(ax: Axes, points: Floats, view: View, centre: Floats) -> None:
     pairs = [pair - centre for pair in bones(points, view)]
-    ax.add_collection(LineCollection(pairs, colors=drawing.INK, lw=1.0, zorder=4))
+    ax.add_collection(LineCollection(pairs, colors=drawing.INK, lw=1.0, zorder=4), autolim=False)
 
 
 def _limb_legend(figure: Figure, drawn: Mapping[str, object] | set[str]) -> None:
@@ -283,9 +298,7 @@ def _limb_legend(figure: Figure, drawn: Mapping[str, object] | set[str]) -> None
 
 def _scale_bar(ax: Axes, right: float, low: float) -> None:
     ax.plot([right - 0.5, right], [low, low], color=drawing.INK, lw=1.2, solid_capstyle="butt", zorder=5)
-    ax.annotate(
-        "0.5 m", (right - 0.25, low), xytext=(0, 2), textcoords="offset points", ha="center", fontsize=6.5, zorder=5
-    )
+    ax.annotate("0.5 m", (right, low), xytext=(0, 2), textcoords="offset points", ha="right", fontsize=6.5, zorder=5)
 
 
 def _at(t_ns: int, t0_ns: int) -> str:
@@ -305,10 +318,13 @@ def growth(found: Growth, occupancy: pd.DataFrame | None, t0_ns: int) -> Figure:
     if occupancy is not None and "horizon_s" in occupancy:
         horizon_s, volume_m3 = stored_sums(occupancy)
         some = slice(None, None, max(1, len(horizon_s) // 600))
-        ax.plot(horizon_s[some], volume_m3[some], ".", ms=2, mew=0, color=drawing.FAINT, alpha=0.6, label="stored")
+        ax.plot(horizon_s[some], volume_m3[some], ".", ms=2, mew=0, color=drawing.FAINT, alpha=0.6, label="_")
+        ax.plot([], [], ".", ms=4, color=drawing.FAINT, label="stored")
     for method, volume in found.volume_m3.items():
         ax.plot(found.horizon_s, volume, ".-", ms=4, color=COLOURS.get(method, drawing.INK), label=METHODS[method])
-    ax.set(xlim=(0.0, None), ylim=(0.0, None), xlabel="horizon [s]", ylabel="volume of the six limbs [m\u00b3]")
+    ax.set(xlim=(0.0, None), yscale="log", xlabel="horizon [s]", ylabel="volume of the six limbs [m\u00b3]")
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter("")
     ax.set_title(_at(found.t_ns, t0_ns))
     drawing.legend_above(ax)
     return figure

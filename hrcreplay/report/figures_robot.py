@@ -15,12 +15,14 @@ from matplotlib.patches import Patch
 
 from hrcreplay.records import STATUSES, Bools, Floats
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import View, bounds_of, draw_outlines, view_from
 from hrcreplay.report.figures_prediction import ABOVE, Limbs, stored_at
 from hrcreplay.report.metrics import Metric, envelope, path_feet, seconds_from, thin_path, times, true_runs
 from hrcreplay.report.metrics_plan import numeric_column, position_columns, stationary
+from hrcreplay.report.projection import View, bounds_of, draw_outlines, view_from
 
 SIDE = view_from(-0.5 * np.pi, 0.0)
+#: The path this long before and after the largest deviation is drawn boldly [s].
+_PASS_S = 2.0
 #: A deviation below this is none [m].
 _SHORTEST_M = 0.5e-3
 
@@ -79,7 +81,7 @@ def path(
         drawing.set_window(ax, low.tolist(), high.tolist())
         if T_world_base is not None:
             ax.plot(*view.flat(T_world_base[None, :3, 3]).T, "s", color=drawing.INK, ms=4, zorder=3)
-    at = f", {(int(times(motion)[worst.row]) - t0_ns) * 1e-9:.1f} s" if worst.length_m >= _SHORTEST_M else ""
+    at = f", at {(int(times(motion)[worst.row]) - t0_ns) * 1e-9:.1f} s" if worst.length_m >= _SHORTEST_M else ""
     above.set(title=f"From above{at}", xlabel="x [m]", ylabel="y [m]")
     side.set(title="From the side", xlabel="x [m]", ylabel="z [m]")
     _path_legend(figure, with_limbs=bool(limbs), with_base=T_world_base is not None)
@@ -135,7 +137,7 @@ def _label_length(ax: Axes, ends: Floats, text: str) -> None:
 def _path_legend(figure: Figure, *, with_limbs: bool, with_base: bool) -> None:
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=drawing.NOMINAL, lw=1.2, label="programmed"),
-        Line2D([], [], color=drawing.ACTUAL, lw=1.0, label="actual"),
+        Line2D([], [], color=drawing.ACTUAL, lw=1.2, label="actual"),
     ]
     if with_base:
         handles.append(Line2D([], [], ls="", marker="s", ms=4, color=drawing.INK, label="robot base"))
@@ -156,10 +158,13 @@ def _limbs_at(occupancy: pd.DataFrame | None, motion: pd.DataFrame, worst: Devia
 def _draw_path(ax: Axes, view: View, motion: pd.DataFrame, limbs: Limbs, worst: Deviation) -> None:
     reference, tcp = position_columns(motion, "ref"), position_columns(motion, "tcp")
     draw_outlines(ax, limbs, view)
-    ax.plot(*view.flat(thin_path(tcp, 0.004)).T, color=drawing.ACTUAL, lw=0.7, alpha=0.85, zorder=4)
+    seconds = seconds_from(times(motion), int(times(motion)[worst.row]))
+    then = np.abs(seconds) <= _PASS_S
+    ax.plot(*view.flat(thin_path(tcp, 0.004)).T, color=drawing.ACTUAL, lw=0.5, alpha=0.35, zorder=4)
     ax.plot(*view.flat(thin_path(reference, 0.004)).T, color=drawing.NOMINAL, lw=1.1, zorder=5)
+    ax.plot(*view.flat(thin_path(tcp[then], 0.004)).T, color=drawing.ACTUAL, lw=1.1, zorder=6)
     ends = view.flat(np.vstack([worst.foot_m, worst.at_m]))
-    ax.plot(*ends.T, color=drawing.INK, lw=0.9, zorder=6)
+    ax.plot(*ends.T, color=drawing.INK, lw=0.9, ls=(0, (2, 1)), zorder=7)
     ax.plot(*ends[0], "o", color=drawing.NOMINAL, ms=3.5, zorder=7)
     ax.plot(*ends[1], "o", color=drawing.ACTUAL, ms=3.5, zorder=7)
 

@@ -14,7 +14,9 @@ from matplotlib.patches import Patch
 
 from hrcreplay.records import Floats
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import (
+from hrcreplay.report.figures_prediction import ABOVE
+from hrcreplay.report.metrics import thin_path
+from hrcreplay.report.projection import (
     RenderedHull,
     View,
     bones,
@@ -22,11 +24,8 @@ from hrcreplay.report.drawing import (
     draw_outlines,
     draw_solids,
     outline,
-    set_window,
     view_from,
 )
-from hrcreplay.report.figures_prediction import ABOVE
-from hrcreplay.report.metrics import thin_path
 
 _COLOURS = (
     drawing.BLUE,
@@ -88,7 +87,7 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
     bodies = [outline(v, r, view) for scene in story.scenes for v, r in scene.volumes.values()]
     low, high = bounds_of([*arms, *bodies], 0.02)
     robot_low = bounds_of(arms, 0.02)[0]
-    low[1] = max(low[1], robot_low[1] - 0.35)  # the person's legs say nothing here
+    low[1] = max(low[1], min(robot_low[1], float(view.flat(story.base_m[None])[0, 1]) - 0.05))  # legs say nothing here
     wide_in = (drawing.COLUMN_IN - 0.1) / 2
     tall_in = wide_in * float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.5, 1.2))
     count = len(story.scenes)
@@ -98,8 +97,8 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
     )
     for row, scene in enumerate(story.scenes):
         for ax, side in zip(grid[row], (0, 1), strict=True):
-            set_window(ax, low.tolist(), high.tolist())
-            _draw_scene(ax, scene, side, story, view, (low, high), round(300 * tall_in))
+            drawing.set_window(ax, low.tolist(), high.tolist())
+            _draw_scene(ax, scene, side, story, view)
             clock = f"{(scene.t_ns[side] - t0_ns) * 1e-9:.1f} s"
             words = clock if side else f"programme {scene.programme_s:.1f} s, at {clock}"
             ax.set_title(words, fontweight="normal", pad=2.0)
@@ -121,15 +120,13 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
     return figure
 
 
-def _draw_scene(
-    ax: Axes, scene: Scene, side: int, story: Storyboard, view: View, window: tuple[Floats, Floats], pixels: int
-) -> None:
+def _draw_scene(ax: Axes, scene: Scene, side: int, story: Storyboard, view: View) -> None:
     if side:
         draw_outlines(ax, scene.volumes, view)
         for pair in bones(scene.points_m, view):
             ax.plot(*pair.T, color=drawing.INK, lw=1.0, zorder=1)
     links = zip(scene.ends_m[side], story.radius_m, strict=True)
-    draw_solids(ax, [RenderedHull(e, float(r), to_rgb(drawing.SKY)) for e, r in links], view, *window, pixels=pixels)
+    draw_solids(ax, [RenderedHull(e, float(r), to_rgb(drawing.SKY)) for e, r in links], view, line=0.4)
     ax.plot(*view.flat(thin_path(story.reference_m, 0.004)).T, color=drawing.NOMINAL, lw=0.9, zorder=4)
     driven = scene.tcp_m[side]
     ax.plot(*view.flat(thin_path(driven, 0.004)).T, color=drawing.ACTUAL, lw=1.1, zorder=5)
@@ -167,9 +164,9 @@ def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
     for ax, view in ((side, view_from(azimuth, 0.12)), (above, ABOVE)):
         edges = [outline(solid.vertices_m, solid.radius_m, view) for solid in solids]
         low, high = bounds_of([*edges, view.flat(base_m[None])], _MARGIN_M)
-        set_window(ax, low.tolist(), high.tolist())
+        drawing.set_window(ax, low.tolist(), high.tolist())
         draw_outlines(ax, pose.volumes, view)
-        draw_solids(ax, solids, view, low, high, pixels=400)
+        draw_solids(ax, solids, view)
         ax.plot(*view.flat(base_m[None]).T, "s", color=drawing.INK, ms=4, zorder=4)
     near = "" if np.isnan(pose.distance_m) else f", {pose.distance_m:.3f} m apart"
     side.set(title=f"At {(pose.t_ns - t0_ns) * 1e-9:.1f} s{near}", xlabel="across [m]", ylabel="up [m]")

@@ -37,7 +37,7 @@ X, Y, THETA = (JOINTS.index(name) for name in ("x", "y", "theta"))
 def computed(job: Job, run: Run, fields: Iterable[str]) -> dict[str, Any]:
     """Those fields of ``FigureData`` that are not in the tables; None or empty where the run has nothing for one."""
     wanted = [name for name in dict.fromkeys(fields) if name]
-    people = _states(run) if wanted else None
+    people = _states(job, run) if wanted else None
     return {name: _FIELDS[name](job, run, people) for name in wanted} if people is not None else {}
 
 
@@ -57,7 +57,7 @@ def volumes_by_method(job: Job, run: Run, people: HumanStates) -> list[Instant]:
 
 def fastest_walk(job: Job, run: Run, people: HumanStates) -> Walk | None:
     """Where the person could walk from the tick of the fastest walking, Eq. (18)-(30), corrected, and by ``sound``."""
-    t_ns = _fastest_ns(run)
+    t_ns = _fastest_ns(run, job.settings.occupancy.stop_s)
     if run.state is None or t_ns is None:
         return None
     stage, states = build.prediction_stage(job), _at(people, t_ns)
@@ -211,21 +211,24 @@ def _joints(motion: pd.DataFrame, row: int, axes: int) -> Floats:
     return motion.iloc[row][[f"q{axis}" for axis in range(1, axes + 1)]].to_numpy(dtype=float)
 
 
-def _fastest_ns(run: Run) -> int | None:
-    """The tick of the fastest walking [ns]."""
+def _fastest_ns(run: Run, span_s: float) -> int | None:
+    """The tick from which the person walks furthest within ``span_s`` [s], as fused [ns]; else the last known."""
     known_ns = known_ticks_ns(run)
     if run.state is None or not len(known_ns):
         return None
-    speed = np.hypot(numeric_column(run.state, "x_vel"), numeric_column(run.state, "y_vel"))
-    speed = speed[np.isin(times(run.state), known_ns)]
-    return int(known_ns[int(np.argmax(np.where(np.isfinite(speed), speed, -1.0)))])
+    place = run.state[["x", "y"]].to_numpy(dtype=float)[np.isin(times(run.state), known_ns)]
+    span_ns = round(span_s * 1e9)
+    later = np.searchsorted(known_ns, known_ns + span_ns, side="right") - 1
+    whole = known_ns[later] - known_ns >= 0.9 * span_ns
+    far = np.where(whole, np.linalg.norm(place[later] - place, axis=1), -1.0)
+    return int(known_ns[int(np.argmax(far))])
 
 
-def _states(run: Run) -> HumanStates | None:
+def _states(job: Job, run: Run) -> HumanStates | None:
     """The fused person at the ticks that any figure asks for, read once; None without a person."""
     if run.state is None:
         return None
-    wanted_ns = [*instants(run).tolist(), moment_ns(run), _fastest_ns(run)]
+    wanted_ns = [*instants(run).tolist(), moment_ns(run), _fastest_ns(run, job.settings.occupancy.stop_s)]
     if run.motion is not None and len(run.motion):
         wanted_ns.append(int(times(run.motion)[nearest_tick(run.motion)]))
     known_ns = np.array([t for t in wanted_ns if t is not None], dtype=np.int64)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.report import figures, figures_human, figures_robot
-from hrcreplay.report.drawing import RenderedHull, outline, render_hulls, view_from
+from hrcreplay.report.projection import RenderedHull, outline, render_hulls, view_from
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import RADII_M, T0_NS, make_run, volumes_at
