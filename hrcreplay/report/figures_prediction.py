@@ -28,7 +28,7 @@ Limbs = Mapping[str, tuple[Floats, float]]
 Instant = tuple[int, Mapping[str, Limbs]]
 
 ABOVE = View(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 1.0, 0.0]), toward=np.array([0.0, 0.0, 1.0]))
-METHODS = {"paper": "paper", "positions": "positions [26]", "sound": "sound"}
+METHODS = {"paper": "paper", "positions": "positions", "sound": "sound"}
 COLOURS = {"paper": drawing.ORANGE, "positions": drawing.GREEN, "sound": drawing.BLUE}
 
 
@@ -232,7 +232,7 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
     boxes = [bounds_of(edges, 0.04) for edges in outlines.values()]  # one scale, but no row taller than it need be
     left, right = min(low[0] for low, _ in boxes), max(high[0] for _, high in boxes)
     wide_in = (drawing.COLUMN_IN - 0.22) / len(instants)
-    tall_in = [float(high[1] - low[1]) * wide_in / float(right - left) for low, high in boxes]
+    tall_in = [max(0.5, float(high[1] - low[1]) * wide_in / float(right - left)) for low, high in boxes]
     figure = drawing.column_figure(0.56 + sum(tall_in) + 0.06 * (len(methods) - 1))
     grid = drawing.column_panels(
         figure,
@@ -321,7 +321,14 @@ def growth(found: Growth, occupancy: pd.DataFrame | None, t0_ns: int) -> Figure:
         ax.plot(horizon_s[some], volume_m3[some], ".", ms=2, mew=0, color=drawing.FAINT, alpha=0.6, label="_")
         ax.plot([], [], ".", ms=4, color=drawing.FAINT, label="stored")
     for method, volume in found.volume_m3.items():
-        ax.plot(found.horizon_s, volume, ".-", ms=4, color=COLOURS.get(method, drawing.INK), label=METHODS[method])
+        ax.plot(
+            found.horizon_s,
+            volume,
+            ".-",
+            ms=4,
+            color=COLOURS.get(method, drawing.INK),
+            label=METHODS.get(method, method),
+        )
     ax.set(xlim=(0.0, None), yscale="log", xlabel="horizon [s]", ylabel="volume of the six limbs [m\u00b3]")
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")

@@ -99,8 +99,8 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
         for ax, side in zip(grid[row], (0, 1), strict=True):
             drawing.set_window(ax, low.tolist(), high.tolist())
             _draw_scene(ax, scene, side, story, view)
-            clock = f"{(scene.t_ns[side] - t0_ns) * 1e-9:.1f} s"
-            words = clock if side else f"programme {scene.programme_s:.1f} s, at {clock}"
+            clock = f"at {(scene.t_ns[side] - t0_ns) * 1e-9:.1f} s"
+            words = clock if side else f"programme {scene.programme_s:.1f} s, {clock}"
             ax.set_title(words, fontweight="normal", pad=2.0)
             drawing.no_axes(ax)
     height = figure.get_figheight()

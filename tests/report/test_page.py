@@ -12,6 +12,7 @@ import pytest
 from hrcreplay.human.model import LimitSet
 from hrcreplay.report import figures, page, story, tables
 from hrcreplay.report import tables as wording
+from hrcreplay.report.figures import FigureData
 from hrcreplay.robot.control import control_step
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
@@ -85,7 +86,7 @@ def read(html: str) -> Reader:
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, run = tmp_path_factory.mktemp("figures"), make_run(8.0)
     metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
-    assert figures.draw_all(run, folder, metrics, near_m=0.5, stationary_m_per_s=0.001)
+    assert figures.draw_all(FigureData(run, metrics, near_m=0.5, stationary_m_per_s=0.001), folder)
     return folder
 
 

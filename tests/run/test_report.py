@@ -11,13 +11,11 @@ import pytest
 from PIL import Image
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS
 from hrcreplay.report import drawing
 from hrcreplay.report.snapshot import snapshot
-from hrcreplay.run import replay, report
-from hrcreplay.run.prediction import PredictionStage
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.run import figure_data, replay, report
+from hrcreplay.run.job import job_of_run
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
 from tests.report.moving import moving_run, moving_scene
@@ -33,8 +31,9 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_the_figure_of_volumes_holds_the_runs_own_method(sound: Run) -> None:
-    prediction_stage = PredictionStage(load_limits("paper"), Occupancy(sigmas=3.0), memory_s=0.5)
-    (_, methods), *others = report._instants(prediction_stage, sound)
+    people = figure_data._states(job_of_run(sound.folder), sound)
+    assert people is not None
+    (_, methods), *others = figure_data.volumes_by_method(job_of_run(sound.folder), sound, people)
     assert len(others) == 3
     assert list(methods) == ["paper", "positions", "sound"]
     assert list(methods["paper"]) == list(LIMBS)
