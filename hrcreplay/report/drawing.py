@@ -194,13 +194,20 @@ def figure_in(ax: Axes) -> Floats:
 
 
 def column_panels(figure: Figure, rows: int = 1, columns: int = 1, **margins: Any) -> list[list[Axes]]:
-    """``panels`` with the margins of a column; those given have priority."""
+    """``panels`` with the margins of a column.
+
+    Args:
+        figure: To draw on.
+        rows: Rows of axes.
+        columns: Columns of axes.
+        margins: What else ``panels`` takes; has priority.
+    """
     usual: dict[str, Any] = {
-        "left_in": 0.42,
+        "left_in": 0.48,
         "right_in": 0.07,
         "top_in": 0.2,
         "bottom_in": 0.34,
-        "gap_in": (0.24, 0.42),
+        "gap_in": (0.24, 0.5),
     }
     return panels(figure, rows, columns, **(usual | margins))
 

@@ -45,7 +45,7 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
     )
     figure = drawing.column_figure(2.9 if found else 1.9)
     heights = [1.5, 1.0] if found else [1.0]
-    rows = drawing.column_panels(figure, len(heights), heights=heights, share_x=True, left_in=0.47)
+    rows = drawing.column_panels(figure, len(heights), heights=heights, share_x=True)
     ax = rows[0][0]
     for (camera, frames), colour in zip(_frames(run).items(), drawing.CAMERAS * 3, strict=False):
         seconds, values = _seen(run, frames, joint, t0_ns, gap_s)

@@ -106,9 +106,9 @@ def walking(walk: Walk, t0_ns: int) -> Figure:
 
 
 def sweeps(sweep: Sweep, t0_ns: int) -> Figure:
-    """Fig. 7 and 8: a forearm displaced by walking, from above; and turned by the elbow, in the plane of that turn."""
+    """Fig. 7, Fig. 8: a forearm displaced by walking, from above; and turned by the elbow, in its plane."""
     figure = drawing.column_figure(2.35)
-    (ax, turn), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.62, gap_in=(0.0, 0.48))
+    (ax, turn), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.62, gap_in=(0.0, 0.5))
     swept = np.vstack([sweep.elbow_m, sweep.arc_m[[0, -1]], sweep.apexes_m])
     flat = hull_of(ABOVE.flat(swept))
     (left, back), (right, front) = sweep.box_m
@@ -194,7 +194,7 @@ def volumes_at(occupancy: pd.DataFrame, state: pd.DataFrame, moment_ns: int, t0_
     t_ns = int(times(rows)[0])
     points, heading = skeleton_at(state, t_ns)
     figure = drawing.column_figure(2.5)
-    (ahead, above), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.56, gap_in=(0.0, 0.42))
+    (ahead, above), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.56, gap_in=(0.0, 0.5))
     solids = _solids(limbs)
     for ax, view in ((ahead, view_from(heading - 0.7, 0.15)), (above, ABOVE)):
         low, high = bounds_of([outline(vertices, radius, view) for vertices, radius in limbs.values()], 0.03)

@@ -52,7 +52,7 @@ class LinkPose:
 
 
 @dataclass(frozen=True)
-class Scene:
+class StoryScene:
     """One programmed instant, as the robot passed it alone and beside the person."""
 
     programme_s: float
@@ -67,7 +67,7 @@ class Scene:
 class Storyboard:
     """The same stretch of the programme without and with the person."""
 
-    scenes: Sequence[Scene]
+    scenes: Sequence[StoryScene]
     radius_m: Floats  #: (s,) of the links' capsules
     base_m: Floats  #: (3,)
     reference_m: Floats  #: (n, 3) programmed way of the TCP over that stretch
@@ -75,7 +75,7 @@ class Storyboard:
 
 
 def storyboard(story: Storyboard, t0_ns: int) -> Figure:
-    """Fig. 15 and 16: rows of the same programmed instant, on the left without the person, on the right with.
+    """Fig. 15, Fig. 16: rows of the same programmed instant, on the left without the person, on the right with.
 
     Args:
         story: What to draw.
@@ -120,7 +120,7 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
     return figure
 
 
-def _draw_scene(ax: Axes, scene: Scene, side: int, story: Storyboard, view: View) -> None:
+def _draw_scene(ax: Axes, scene: StoryScene, side: int, story: Storyboard, view: View) -> None:
     if side:
         draw_outlines(ax, scene.volumes, view)
         for pair in bones(scene.points_m, view):

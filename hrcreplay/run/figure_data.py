@@ -1,4 +1,7 @@
-"""What the figures of a run show of its prediction and its robot, from the run folder alone."""
+"""What the figures of a run show of its prediction and its robot, from the run folder alone.
+
+Corrected equations: docs/paper.md.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from hrcreplay.human.prediction.sweep import TRIANGLE_RAD
 from hrcreplay.records import JOINTS, LIMBS, POINTS, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report import figures_prediction, figures_robot
 from hrcreplay.report.figures_prediction import Growth, Instant, Sweep, Walk
-from hrcreplay.report.figures_scene import LinkPose, Scene, Storyboard
+from hrcreplay.report.figures_scene import LinkPose, Storyboard, StoryScene
 from hrcreplay.report.metrics import times
 from hrcreplay.report.metrics_plan import numeric_column, position_columns
 from hrcreplay.report.moments import instants, known_ticks_ns, moment_ns, nearest_tick
@@ -161,7 +164,9 @@ def story(job: Job, run: Run, _people: HumanStates) -> Storyboard | None:
         ]
         points, _ = figures_prediction.skeleton_at(run.state, at[1])
         scenes.append(
-            Scene(programme_s, (at[0], at[1]), (ends[0], ends[1]), (ways[0], ways[1]), points, limbs if fresh else {})
+            StoryScene(
+                programme_s, (at[0], at[1]), (ends[0], ends[1]), (ways[0], ways[1]), points, limbs if fresh else {}
+            )
         )
     if not any(scene.volumes for scene in scenes):
         return None

@@ -176,7 +176,14 @@ def take_still(folder: Path, at_s: float, out: Path | None) -> Path:
 
 
 def figure_data(job: Job, run: Run, metrics: Mapping[str, Metric], kinds: Sequence[FigureKind]) -> FigureData:
-    """All that some figures of a run are drawn from."""
+    """All that some figures of a run are drawn from.
+
+    Args:
+        job: That made the run.
+        run: The run's tables.
+        metrics: The run's metrics.
+        kinds: The figures.
+    """
     predicted = computed(job, run, [kind.predicted for kind in kinds])
     return FigureData(run=run, metrics=metrics, **_bounds(job.settings.model_dump()), **predicted)
 

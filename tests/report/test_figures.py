@@ -5,20 +5,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hrcreplay.report import figures, figures_prediction, figures_robot
-from hrcreplay.report.figures import FigureData
+from hrcreplay.report.figures import FIGURES, FigureData
 from hrcreplay.report.figures_prediction import Growth, Sweep, Walk
 from hrcreplay.report.moments import instants
 from hrcreplay.report.projection import RenderedHull, outline, render_hulls, view_from
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
+from tests.report.moving import moving_run
 from tests.report.synthetic import RADII_M, T0_NS, make_run, volumes_at
 
 #: Of the made-up run, whose robot has no joints: all but those that show its links.
-ALL = {kind.name for kind in figures.FIGURES} - {"horizon", "fig15_storyboard", "robot_links"}
-#: What the prediction is asked for in vain where nobody computed it.
-PREDICTED = {kind.name for kind in figures.FIGURES if kind.predicted}
+ALL = {kind.name for kind in FIGURES} - {"horizon", "fig15_storyboard", "robot_links"}
 #: Those of the robot that need no prediction.
 OF_ROBOT = {"fig13a_path", "fig13b_deviation", "fig14_speed", "stationary_share", "status"}
 
@@ -108,6 +108,71 @@ def test_a_robot_that_kept_to_its_path_left_it_nowhere() -> None:
         (ax,) = figures_robot.deviation(motion, None, T0_NS).axes
         assert ax.get_title().startswith(title)
         assert bool(ax.texts) == (motion is run.motion)
+
+
+def test_every_figure_is_one_column_wide_and_has_a_name_of_its_own(tmp_path: Path) -> None:
+    names, numbers = [kind.name for kind in FIGURES], [n for kind in FIGURES for n in kind.numbers]
+    assert len(set(names)) == len(names)
+    assert numbers == ["5", "7", "8", "9", "13a", "13b", "14", "15", "16", "17", "18"]
+    assert all(kind.caption.endswith(".") and set(kind.needs) <= set(figures.NEEDS) for kind in FIGURES)
+    for name in draw(make_run(5.0), tmp_path):
+        assert 'width="252pt"' in (tmp_path / f"{name}.svg").read_text()[:600], name  # 3.5 in
+        with Image.open(tmp_path / f"{name}.png") as image:
+            assert image.width == 1050
+
+
+def test_a_figure_is_found_by_number_and_by_name() -> None:
+    found = {key: [kind.name for kind in figures.find(key)] for key in ("14", "Fig. 14", "16", "13", "13b", "horizon")}
+    assert found == {
+        "14": ["fig14_speed"],
+        "Fig. 14": ["fig14_speed"],
+        "16": ["fig15_storyboard"],
+        "13": ["fig13a_path", "fig13b_deviation"],
+        "13b": ["fig13b_deviation"],
+        "horizon": ["horizon"],
+    }
+    assert [figures.find(key) for key in ("12", "", "a", "fig99")] == [()] * 4
+
+
+def test_speed_and_horizon_show_the_runs_columns() -> None:
+    run = moving_run(4.0)
+    motion = run.motion
+    assert motion is not None
+    motion["tau_s"] = np.linspace(0.0, 0.3, len(motion))
+    seconds = (motion["t_ns"].to_numpy() - motion["t_ns"].iloc[0]) / 1e9
+    nominal, actual, separation = figures_robot.speed(motion, T0_NS, 0.5).axes
+    drawn = figures_robot.horizon(motion, T0_NS, 0.377).axes[0]
+    lines = [*(ax.lines[0] for ax in (nominal, actual, separation)), *drawn.lines[:2]]
+    for line, name in zip(lines, ("ref_speed", "tcp_speed", "distance_m", "horizon_s", "tau_s"), strict=True):
+        np.testing.assert_allclose(np.asarray(line.get_xdata(), dtype=float), seconds, atol=1e-9)
+        np.testing.assert_array_equal(np.asarray(line.get_ydata(), dtype=float), motion[name].to_numpy(dtype=float))
+    assert set(np.asarray(drawn.lines[2].get_ydata()).tolist()) == {0.377}
+
+
+def test_volumes_against_the_horizon_are_those_stored() -> None:
+    run = make_run(3.0)
+    assert run.occupancy is not None
+    occupancy = run.occupancy.assign(horizon_s=np.arange(len(run.occupancy)) // 6 * 0.001)
+    found = Growth(T0_NS, np.array([0.0, 0.1, 0.2]), {"paper": np.array([0.1, 0.2, 0.4])})
+    ax = figures_prediction.growth(found, occupancy, T0_NS).axes[0]
+    lines = {str(line.get_label()): np.asarray(line.get_xydata(), dtype=float) for line in ax.lines}
+    stored = lines["_"]
+    np.testing.assert_allclose(stored[:, 0], 0.001 * np.arange(len(occupancy) // 6))
+    np.testing.assert_allclose(stored[:, 1], 0.01 * (1 + 2 + 3 + 4 + 5 + 6))
+    assert lines["paper"][:, 1].tolist() == [0.1, 0.2, 0.4]
+    without = occupancy[(occupancy["limb"] != "HD") | (occupancy["horizon_s"] > 0.0)]  # one limb of one tick not known
+    assert len(figures_prediction.stored_sums(without)[0]) == len(occupancy) // 6 - 1
+
+
+def test_the_largest_deviation_is_where_the_tcp_was_furthest_from_every_point_of_the_path() -> None:
+    run = make_run(6.0)
+    assert run.motion is not None
+    reference, tcp = (run.motion[[f"{point}_{axis}" for axis in "xyz"]].to_numpy() for point in ("ref", "tcp"))
+    nearest = np.linalg.norm(tcp[:, None] - reference, axis=2).min(axis=1)  # to the vertices, which are dense
+    found = figures_robot.largest_deviation(run.motion)
+    assert found.length_m == pytest.approx(nearest.max(), abs=2e-3)
+    assert nearest[found.row] == pytest.approx(nearest.max(), abs=2e-3)
+    np.testing.assert_array_equal(found.at_m, tcp[found.row])
 
 
 def test_instants_are_a_second_apart_and_hold_the_nearest() -> None:

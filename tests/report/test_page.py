@@ -105,6 +105,15 @@ def test_page_is_self_contained_and_well_formed(html: str) -> None:
     assert not re.search(r"url\((?!#)", html)
 
 
+def test_page_shows_every_figure_drawn_under_its_caption(html: str, drawn: Path) -> None:
+    kinds = [kind for kind in figures.FIGURES if (drawn / f"{kind.name}.svg").exists()]
+    assert len(kinds) > 8
+    assert html.count("<figure>") == len(kinds)
+    text = " ".join(read(html).text)
+    for kind in kinds:
+        assert kind.caption in text
+
+
 def test_page_answers_with_the_metrics_values(html: str) -> None:
     metrics = compute(make_run(8.0), near_m=0.5, stationary_m_per_s=0.001)
     text = " ".join(read(html).text)

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import io
+import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.path import Path as Path2D
 from PIL import Image
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS
 from hrcreplay.report import drawing
+from hrcreplay.report.figures import FIGURES, FigureData
+from hrcreplay.report.replay_scene import posed, robot_geometry
 from hrcreplay.report.snapshot import snapshot
-from hrcreplay.run import figure_data, replay, report
+from hrcreplay.run import build, figure_data, replay, report
 from hrcreplay.run.job import job_of_run
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
@@ -76,3 +82,80 @@ def test_a_still_shows_robot_and_person_and_changes_with_the_instant() -> None:
 def test_what_no_still_can_be_taken_of_is_told(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"--snapshot: .* is no run folder; make one with: hrcreplay report"):
         report.take_still(tmp_path, 1.0, None)
+
+
+def test_every_figure_is_drawn_again_from_the_folder_alone(sound: Run, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(sound.folder, copy, ignore=shutil.ignore_patterns("figures"))
+    text = (copy / "run.json").read_text()
+    log = json.loads(text)["inputs"][0]["path"]
+    (copy / "run.json").write_text(text.replace(log, "/nowhere/demo.mcap"))
+    for kind in FIGURES:
+        for path in report.draw_figures(copy, (kind.numbers or (kind.name,))[0], tmp_path / "out"):
+            assert path.read_bytes() == (sound.folder / "figures" / path.name).read_bytes(), path.name
+    assert len(list((tmp_path / "out").iterdir())) == 2 * len(FIGURES)
+    assert not (copy / "figures").exists()
+
+
+def test_the_limits_of_a_run_are_read_back_from_it(sound: Run) -> None:
+    job, want = job_of_run(sound.folder), load_limits("people")
+    for name, value in vars(want).items():
+        np.testing.assert_array_equal(getattr(job.prediction, name), value, err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def data(sound: Run) -> FigureData:
+    metrics = json.loads((sound.folder / "metrics.json").read_text())
+    return report.figure_data(job_of_run(sound.folder), sound, metrics, FIGURES)
+
+
+def test_the_storyboard_has_both_robots_at_the_same_programmed_instant(sound: Run, data: FigureData) -> None:
+    job, story = job_of_run(sound.folder), data.story
+    assert story is not None
+    assert sound.motion is not None
+    assert sound.T_world_base is not None
+    geometry = robot_geometry(build.robot(job, sound.T_world_base))
+    step_s = np.diff([scene.programme_s for scene in story.scenes])
+    assert step_s == pytest.approx(step_s[0])
+    for scene in story.scenes:
+        for table, t_ns, ends_m in zip((sound.baselines["none"], sound.motion), scene.t_ns, scene.ends_m, strict=True):
+            row = int(np.flatnonzero(table["t_ns"].to_numpy() == t_ns)[0])
+            assert 0.0 <= table["programme_s"].iloc[row] - scene.programme_s < 0.0041
+            q = table[[f"q{i}" for i in range(1, 7)]].to_numpy(dtype=float)[[row]]
+            np.testing.assert_allclose(posed(geometry, q)[0], ends_m, atol=1e-9)
+        assert scene.volumes
+
+
+def test_the_person_walks_within_what_sound_encloses(sound: Run, data: FigureData) -> None:
+    walk = data.walk
+    assert walk is not None
+    assert sound.state is not None
+    assert len(walk.walked_m) > 80  # 0.377 s at 250 Hz
+    polygon = Path2D(walk.polygon_m)
+    assert polygon.contains_points(walk.walked_m).all()
+    at = sound.state[sound.state["t_ns"] == walk.t_ns].iloc[0]
+    assert walk.place_m.tolist() == [at["x"], at["y"]]
+    assert walk.heading_rad == at["theta"]
+    (left, back), (right, front) = walk.box_m
+    assert left <= at["x"] <= right
+    assert back <= at["y"] <= front
+
+
+def test_a_forearms_sweep_encloses_its_arc(data: FigureData) -> None:
+    sweep = data.sweep
+    assert sweep is not None
+    length_m = np.linalg.norm(sweep.wrist_m - sweep.elbow_m)
+    np.testing.assert_allclose(np.linalg.norm(sweep.arc_m - sweep.elbow_m, axis=1), length_m, rtol=1e-12)
+    assert (np.linalg.norm(sweep.apexes_m - sweep.elbow_m, axis=1) > length_m).all()
+    for end in sweep.arc_m[[0, -1]]:  # an apex is on the tangents at the arc's ends
+        for apex in sweep.apexes_m[:1] if len(sweep.apexes_m) == 1 else ():
+            assert (apex - end) @ (end - sweep.elbow_m) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_volumes_grow_with_the_horizon(data: FigureData) -> None:
+    growth = data.growth
+    assert growth is not None
+    assert growth.horizon_s[[0, -1]].tolist() == [0.0, 0.377]
+    for volume_m3 in growth.volume_m3.values():
+        assert (np.diff(volume_m3) > 0).all()
+    assert (growth.volume_m3["sound"] > growth.volume_m3["paper"]).all()
