@@ -246,7 +246,14 @@ def svg_bytes(figure: Figure, dpi: int = DPI) -> bytes:
 
 
 def save(figure: Figure, folder: Path, name: str, dpi: int = DPI) -> None:
-    """Writes ``name.svg`` and ``name.png``."""
+    """Writes ``name.svg`` and ``name.png``.
+
+    Args:
+        figure: To write.
+        folder: Where to.
+        name: Of the files.
+        dpi: Dots an inch of the PNG, and of what is pixels in the SVG.
+    """
     (folder / f"{name}.svg").write_bytes(svg_bytes(figure, dpi))
     figure.set_facecolor("white")
     (folder / f"{name}.png").write_bytes(png_bytes(figure, dpi))
