@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from hrcreplay.records import Floats
@@ -204,12 +205,15 @@ def column_panels(figure: Figure, rows: int = 1, columns: int = 1, **margins: An
     """
     usual: dict[str, Any] = {
         "left_in": 0.48,
-        "right_in": 0.07,
+        "right_in": 0.1,
         "top_in": 0.2,
         "bottom_in": 0.34,
         "gap_in": (0.24, 0.5),
     }
-    return panels(figure, rows, columns, **(usual | margins))
+    grid = panels(figure, rows, columns, **(usual | margins))
+    for ax in grid[-1] if columns > 1 else ():
+        ax.xaxis.set_major_locator(MaxNLocator(3))
+    return grid
 
 
 def no_axes(ax: Axes) -> None:

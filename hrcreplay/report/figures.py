@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from hrcreplay.report import drawing, figures_human, figures_prediction, figures_robot, figures_scene
 from hrcreplay.report.figures_prediction import Growth, Instant, Sweep, Walk
-from hrcreplay.report.figures_robot import Deviation
+from hrcreplay.report.figures_robot import SHORTEST_M, Deviation
 from hrcreplay.report.figures_scene import LinkPose, Storyboard
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
@@ -91,6 +91,10 @@ NEEDS: dict[str, tuple[Callable[[Run, Mapping[str, Metric]], bool], str]] = {
     "path": (
         lambda _, metrics: metrics["plan_deviation_max_m"]["value"] is not None,
         "the way of the TCP is not known",
+    ),
+    "deviation": (
+        lambda _, metrics: metrics["plan_deviation_max_m"]["value"] >= SHORTEST_M,
+        "its TCP never left the programmed path",
     ),
     "horizon": (
         lambda run, _: run.motion is not None and "horizon_s" in run.motion,
@@ -173,7 +177,7 @@ FIGURES = (
         ("13b",),
         "largest deviation from the programmed path",
         "cost",
-        ("motion", "path"),
+        ("motion", "path", "deviation"),
         lambda data: figures_robot.deviation(data.motion, data.run.occupancy, data.t0_ns, data.worst),
         "As the paper's Fig. 13(b). The largest deviation from the programmed path with its length, in the vertical "
         "plane that holds it. The paper's own deviation is 0.221 m.",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
+from matplotlib.ticker import LogLocator
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.human.model import skeleton
@@ -297,8 +299,16 @@ def _limb_legend(figure: Figure, drawn: Mapping[str, object] | set[str]) -> None
 
 
 def _scale_bar(ax: Axes, right: float, low: float) -> None:
-    ax.plot([right - 0.5, right], [low, low], color=drawing.INK, lw=1.2, solid_capstyle="butt", zorder=5)
-    ax.annotate("0.5 m", (right, low), xytext=(0, 2), textcoords="offset points", ha="right", fontsize=6.5, zorder=5)
+    """Half a metre at the lower edge of axes, its words below."""
+    ax.plot([right - 0.5, right], [low, low], color=drawing.INK, lw=1.2, solid_capstyle="butt", clip_on=False)
+    words: dict[str, Any] = {
+        "xytext": (0, -2),
+        "textcoords": "offset points",
+        "ha": "right",
+        "va": "top",
+        "fontsize": 6.5,
+    }
+    ax.annotate("0.5 m", (right, low), annotation_clip=False, **words)
 
 
 def _at(t_ns: int, t0_ns: int) -> str:
@@ -330,6 +340,7 @@ def growth(found: Growth, occupancy: pd.DataFrame | None, t0_ns: int) -> Figure:
             label=METHODS.get(method, method),
         )
     ax.set(xlim=(0.0, None), yscale="log", xlabel="horizon [s]", ylabel="volume of the six limbs [m\u00b3]")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")
     ax.set_title(_at(found.t_ns, t0_ns))

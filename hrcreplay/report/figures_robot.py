@@ -24,7 +24,7 @@ SIDE = view_from(-0.5 * np.pi, 0.0)
 #: The path this long before and after the largest deviation is drawn boldly [s].
 _PASS_S = 2.0
 #: A deviation below this is none [m].
-_SHORTEST_M = 0.5e-3
+SHORTEST_M = 0.5e-3
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def path(
         drawing.set_window(ax, low.tolist(), high.tolist())
         if T_world_base is not None:
             ax.plot(*view.flat(T_world_base[None, :3, 3]).T, "s", color=drawing.INK, ms=4, zorder=3)
-    at = f", at {(int(times(motion)[worst.row]) - t0_ns) * 1e-9:.1f} s" if worst.length_m >= _SHORTEST_M else ""
+    at = f", at {(int(times(motion)[worst.row]) - t0_ns) * 1e-9:.1f} s" if worst.length_m >= SHORTEST_M else ""
     above.set(title=f"From above{at}", xlabel="x [m]", ylabel="y [m]")
     side.set(title="From the side", xlabel="x [m]", ylabel="z [m]")
     _path_legend(figure, with_limbs=bool(limbs), with_base=T_world_base is not None)
@@ -109,11 +109,9 @@ def deviation(
     _draw_path(ax, view, motion, limbs, worst)
     low, high = bounds_of([ends], 0.4 * worst.length_m + 0.06)
     drawing.set_window(ax, low.tolist(), high.tolist())
-    left = worst.length_m >= _SHORTEST_M
     at = f"At {(int(times(motion)[worst.row]) - t0_ns) * 1e-9:.1f} s"
-    ax.set(title=at if left else "No deviation", xlabel="in the vertical plane of the deviation [m]", ylabel="z [m]")
-    if left:
-        _label_length(ax, ends, f"{worst.length_m:.3f} m")
+    ax.set(title=at, xlabel="in the vertical plane of the deviation [m]", ylabel="z [m]")
+    _label_length(ax, ends, f"{worst.length_m:.3f} m")
     _path_legend(figure, with_limbs=bool(limbs), with_base=False)
     return figure
 
@@ -136,7 +134,7 @@ def _label_length(ax: Axes, ends: Floats, text: str) -> None:
 
 def _path_legend(figure: Figure, *, with_limbs: bool, with_base: bool) -> None:
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=drawing.NOMINAL, lw=1.2, label="programmed"),
+        Line2D([], [], color=drawing.NOMINAL, lw=1.8, label="programmed"),
         Line2D([], [], color=drawing.ACTUAL, lw=1.2, label="actual"),
     ]
     if with_base:
@@ -161,8 +159,8 @@ def _draw_path(ax: Axes, view: View, motion: pd.DataFrame, limbs: Limbs, worst: 
     seconds = seconds_from(times(motion), int(times(motion)[worst.row]))
     then = np.abs(seconds) <= _PASS_S
     ax.plot(*view.flat(thin_path(tcp, 0.004)).T, color=drawing.ACTUAL, lw=0.5, alpha=0.35, zorder=4)
-    ax.plot(*view.flat(thin_path(reference, 0.004)).T, color=drawing.NOMINAL, lw=1.1, zorder=5)
-    ax.plot(*view.flat(thin_path(tcp[then], 0.004)).T, color=drawing.ACTUAL, lw=1.1, zorder=6)
+    ax.plot(*view.flat(thin_path(reference, 0.004)).T, color=drawing.NOMINAL, lw=1.8, zorder=5)
+    ax.plot(*view.flat(thin_path(tcp[then], 0.004)).T, color=drawing.ACTUAL, lw=1.0, zorder=6)
     ends = view.flat(np.vstack([worst.foot_m, worst.at_m]))
     ax.plot(*ends.T, color=drawing.INK, lw=0.9, ls=(0, (2, 1)), zorder=7)
     ax.plot(*ends[0], "o", color=drawing.NOMINAL, ms=3.5, zorder=7)

@@ -100,14 +100,18 @@ def test_volumes_show_every_method_and_limb_in_its_own_size() -> None:
     assert scales[0] == pytest.approx(scales[1])
 
 
-def test_a_robot_that_kept_to_its_path_left_it_nowhere() -> None:
+def test_a_robot_that_kept_to_its_path_left_it_nowhere(tmp_path: Path) -> None:
     run = make_run(5.0)
     assert run.motion is not None
     kept = run.motion.assign(tcp_x=run.motion["ref_x"], tcp_y=run.motion["ref_y"], tcp_z=run.motion["ref_z"])
-    for motion, title in ((run.motion, "At "), (kept, "No deviation")):
-        (ax,) = figures_robot.deviation(motion, None, T0_NS).axes
-        assert ax.get_title().startswith(title)
-        assert bool(ax.texts) == (motion is run.motion)
+    (ax,) = figures_robot.deviation(run.motion, None, T0_NS).axes
+    assert [text.get_text() for text in ax.texts] == [f"{figures_robot.largest_deviation(run.motion).length_m:.3f} m"]
+    kept_run = dataclasses.replace(run, motion=kept)
+    (kind,) = figures.find("13b")
+    why = figures.missing(kind, kept_run, data_of(kept_run).metrics)
+    assert why == "its TCP never left the programmed path"
+    assert draw(kept_run, tmp_path, predicted=False) >= {"fig13a_path", "fig14_speed"}
+    assert not (tmp_path / "fig13b_deviation.png").exists()
 
 
 def test_every_figure_is_one_column_wide_and_has_a_name_of_its_own(tmp_path: Path) -> None:
