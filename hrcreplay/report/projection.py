@@ -162,6 +162,8 @@ def bounds_of(edges: Sequence[Floats], margin_m: float) -> tuple[Floats, Floats]
     """Corners (2,) of the box around flat points (k, 2), with a margin [m]; those that are not known are left out."""
     corners = np.vstack([np.zeros((0, 2)), *edges])
     corners = corners[np.isfinite(corners).all(axis=1)]
+    if not len(corners):
+        return np.full(2, -margin_m), np.full(2, margin_m)
     return corners.min(axis=0) - margin_m, corners.max(axis=0) + margin_m
 
 

@@ -104,6 +104,8 @@ def forearm_sweep(job: Job, run: Run, people: HumanStates) -> Sweep | None:
     postures[:, joint] = angles
     points = skeleton(postures, np.tile(states.lengths_m, (len(angles), 1)))
     elbow, wrist = (points[:, POINTS.index(f"{name}_{side}")] for name in ("elbow", "wrist"))
+    if not np.isfinite(wrist).all():  # a length that nobody measured
+        return None
     apexes = elbow[0] + (wrist[-1 - pieces : -1] - elbow[0]) / np.cos(0.5 * (high - low) / pieces)
     return Sweep(
         t_ns=moment,
@@ -135,6 +137,8 @@ def volume_growth(job: Job, run: Run, people: HumanStates) -> Growth | None:
 
 def _sum_m3(volumes: SweptVolumes) -> float:
     hulls = _hulls(volumes, 0)
+    if not all(np.isfinite(hulls[limb][0]).all() for limb in LIMBS):
+        return float("nan")
     return sum(sphere_swept_volume_m3(*hulls[limb]) for limb in LIMBS)
 
 

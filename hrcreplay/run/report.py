@@ -222,7 +222,9 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
     with tempfile.TemporaryDirectory() as made:
         drawn = figures.draw_all(data, Path(made), kinds)
         if len(drawn) < len(kinds):
-            raise SettingsError(f"--figure {key}: {folder} has not what it needs: no volumes of the person then")
+            raise SettingsError(
+                f"--figure {key}: {folder} has not what it needs: the person was not known well enough then"
+            )
         for path in paths:
             run_folder.write_whole(path, (Path(made) / path.name).read_bytes())
     return paths

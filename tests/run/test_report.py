@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import re
@@ -150,6 +151,18 @@ def test_a_forearms_sweep_encloses_its_arc(data: FigureData) -> None:
     for end in sweep.arc_m[[0, -1]]:  # an apex is on the tangents at the arc's ends
         for apex in sweep.apexes_m[:1] if len(sweep.apexes_m) == 1 else ():
             assert (apex - end) @ (end - sweep.elbow_m) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_forearm_whose_length_nobody_measured_is_not_swept(sound: Run) -> None:
+    job = job_of_run(sound.folder)
+    people = figure_data._states(job, sound)
+    assert people is not None
+    unknown = dataclasses.replace(people, lengths_m=people.lengths_m * np.nan)
+    assert figure_data.forearm_sweep(job, sound, people) is not None
+    assert figure_data.forearm_sweep(job, sound, unknown) is None
+    growth = figure_data.volume_growth(job, sound, unknown)
+    assert growth is not None
+    assert np.isnan(growth.volume_m3["sound"]).all()
 
 
 def test_volumes_grow_with_the_horizon(data: FigureData) -> None:
