@@ -128,7 +128,6 @@ def _label_length(ax: Axes, ends: Floats, text: str) -> None:
         textcoords="offset points",
         fontweight="bold",
         zorder=8,
-        bbox={"facecolor": "white", "alpha": 0.75, "pad": 0.8, "lw": 0},
     )
 
 

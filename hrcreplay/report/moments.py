@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from hrcreplay.records import Ints
+from hrcreplay.records import JOINTS, Ints
 from hrcreplay.report.metrics import columns, times
 from hrcreplay.store.run_folder import Run
+
+#: Columns of the arms' joints.
+_ARMS = [i for i, joint in enumerate(JOINTS) if joint.startswith("a")]
 
 
 def start_ns(run: Run) -> int:
@@ -39,7 +42,7 @@ def moment_ns(run: Run) -> int | None:
     if run.motion is not None and run.motion["distance_m"].notna().any():
         moment = int(times(run.motion)[nearest_tick(run.motion)])
     else:
-        speed = np.abs(columns(run.state, "_vel")[:, 4:]).sum(axis=1)
+        speed = np.abs(columns(run.state, "_vel")[:, _ARMS]).sum(axis=1)
         moment = int(times(run.state)[int(np.argmax(np.where(np.isfinite(speed), speed, -1.0)))])
     return int(known_ns[int(np.argmin(np.abs(known_ns - moment)))])
 
