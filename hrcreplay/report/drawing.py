@@ -205,7 +205,7 @@ def column_panels(figure: Figure, rows: int = 1, columns: int = 1, **margins: An
     """
     usual: dict[str, Any] = {
         "left_in": 0.48,
-        "right_in": 0.1,
+        "right_in": 0.14,
         "top_in": 0.2,
         "bottom_in": 0.34,
         "gap_in": (0.24, 0.5),

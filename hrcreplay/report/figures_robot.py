@@ -111,21 +111,27 @@ def deviation(
     drawing.set_window(ax, low.tolist(), high.tolist())
     at = f"At {(int(times(motion)[worst.row]) - t0_ns) * 1e-9:.1f} s"
     ax.set(title=at, xlabel="in the vertical plane of the deviation [m]", ylabel="z [m]")
-    _label_length(ax, ends, f"{worst.length_m:.3f} m")
+    tcp = view.flat(position_columns(motion, "tcp"))
+    _label_length(
+        ax, ends, f"{worst.length_m:.3f} m", tcp[np.linalg.norm(tcp - ends.mean(axis=0), axis=1) < worst.length_m]
+    )
     _path_legend(figure, with_limbs=bool(limbs), with_base=False)
     return figure
 
 
-def _label_length(ax: Axes, ends: Floats, text: str) -> None:
-    """Writes beside the middle of a line, to its right."""
-    along = ends[1] - ends[0]
+def _label_length(ax: Axes, ends: Floats, text: str, crowd: Floats) -> None:
+    """Writes beside the middle of a line, away from most of a crowd of points (n, 2)."""
+    along, middle = ends[1] - ends[0], ends.mean(axis=0)
     beside = np.array([along[1], -along[0]]) / max(float(np.linalg.norm(along)), 1e-12)
-    beside = beside if beside[0] >= 0 else -beside
+    if np.nanmean(np.sign((crowd - middle) @ beside)) > 0.0:
+        beside = -beside
     ax.annotate(
         text,
-        ends.mean(axis=0),
-        xytext=(7 * beside + [0, -3]).tolist(),
+        middle,
+        xytext=(5 * beside).tolist(),
         textcoords="offset points",
+        ha="left" if beside[0] > 0.0 else "right",
+        va="center",
         fontweight="bold",
         zorder=8,
     )
