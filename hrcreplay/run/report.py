@@ -214,10 +214,6 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
     paths = [to / f"{kind.name}.{suffix}" for kind in kinds for suffix in ("png", "svg")]
     if taken := [path for path in paths if path.exists()]:
         raise SettingsError(f"{taken[0]}: exists already; name another folder with --out, or remove it")
-    try:
-        to.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SettingsError(f"{to}: cannot be made ({error.strerror}); name another folder with --out") from error
     data = figure_data(job_of_run(folder), run, metrics, kinds)
     with tempfile.TemporaryDirectory() as made:
         drawn = figures.draw_all(data, Path(made), kinds)
@@ -225,6 +221,10 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
             raise SettingsError(
                 f"--figure {key}: {folder} has not what it needs: the person was not known well enough then"
             )
+        try:
+            to.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SettingsError(f"{to}: cannot be made ({error.strerror}); name another folder with --out") from error
         for path in paths:
             run_folder.write_whole(path, (Path(made) / path.name).read_bytes())
     return paths
