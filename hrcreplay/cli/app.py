@@ -29,7 +29,7 @@ from hrcreplay.cli import (
     live,
     span,
 )
-from hrcreplay.errors import HrcReplayError
+from hrcreplay.errors import HrcReplayError, SettingsError
 
 app = typer.Typer(
     name="hrcreplay",
@@ -175,7 +175,9 @@ _stage("plan", "Stages 1 to 3: what the robot would have done (motion.parquet)."
 
 @app.command()
 def report(
-    source: Source,
+    source: Annotated[
+        Path | None, typer.Argument(metavar="LOG_OR_RUN", help="A log, or the run folder of an earlier stage.")
+    ] = None,
     config: Config = None,
     settings: Set = None,
     topic: Topic = None,
@@ -194,12 +196,21 @@ def report(
             help="Of a run folder: only a still of its replay at that instant, PNG; --out names the file.",
         ),
     ] = None,
+    figure: Annotated[
+        str | None,
+        typer.Option(
+            "--figure",
+            metavar="NUMBER",
+            help="Of a run folder: only that figure again, PNG and SVG, as 14 or horizon; --out names their folder.",
+        ),
+    ] = None,
+    list_figures: Annotated[
+        bool, typer.Option("--list-figures", help="Only list the figures, and what a run folder has for each.")
+    ] = False,
 ) -> None:
     """All stages, then metrics.json, figures, report.html with the 3-D replay, and scene.mcap."""
-    if snapshot is not None:
-        from hrcreplay.run.still import take_still
-
-        sys.stdout.write(f"{take_still(source, snapshot, out)}\n")
+    if list_figures or source is None or figure is not None or snapshot is not None:
+        _part_of_report(source, figure, snapshot, out, listed=list_figures)
         return
     from hrcreplay.run import replay
 
@@ -216,6 +227,23 @@ def report(
     )
     _summarize(folder)
     sys.stdout.write(f"{folder}\n")
+
+
+def _part_of_report(
+    source: Path | None, figure: str | None, snapshot: float | None, out: Path | None, *, listed: bool
+) -> None:
+    """What ``report`` makes of a run folder without making another."""
+    from hrcreplay.run.report import draw_figures, list_figures, take_still
+
+    if listed:
+        found: list[object] = [*list_figures(source)]
+    elif source is None:
+        raise SettingsError("report: found neither log nor run folder; give one: hrcreplay report LOG_OR_RUN")
+    elif figure is not None:
+        found = [*draw_figures(source, figure, out)]
+    else:
+        found = [take_still(source, snapshot or 0.0, out)]
+    sys.stdout.write("".join(f"{line}\n" for line in found))
 
 
 @app.command()

@@ -7,39 +7,44 @@ from numba import njit
 
 from hrcreplay.records import Floats
 
+#: A pixel so little outside a triangle, as a share of it, is on its edge: neighbours leave no gap between them.
+_EDGE = 1e-9
+
 
 @njit(cache=True)
-def visible_front(normals: Floats, offsets: Floats, u: Floats, v: Floats) -> tuple[Floats, Floats]:
+def visible_front(triangles: Floats, light: Floats, u: Floats, v: Floats) -> tuple[Floats, Floats]:
     """Depth of the front of a convex solid at pixels, and the light on the face there.
 
-    A pixel's ray is inside between the last of the planes that face away and the first of those that face the viewer.
+    Only triangles that face the viewer are drawn, each on the pixels that it covers.
 
     Args:
-        normals: (f, 4) of each face, its normal along the view's right, up and towards the viewer, and its light.
-        offsets: (f,) of the faces' planes [m].
-        u: (columns,) of the pixels, to the right [m].
-        v: (rows,) of the pixels, up [m].
+        triangles: (f, 3, 3) corners of each, along the view's right, up and towards the viewer, counterclockwise seen
+            from outside [m].
+        light: (f,) on each of them.
+        u: (columns,) of the pixels, to the right, evenly spaced [m].
+        v: (rows,) of the pixels, up, evenly spaced [m].
 
     Returns:
         (rows, columns) depth [m], -inf beside the solid, and (rows, columns) light.
     """
-    front = np.full((len(v), len(u)), np.inf)
-    back = np.full((len(v), len(u)), -np.inf)
-    light = np.zeros((len(v), len(u)))
-    for f in range(len(normals)):
-        nu, nv, nt, lit = normals[f]
-        if abs(nt) < 1e-9:
+    depth = np.full((len(v), len(u)), -np.inf)
+    lit = np.zeros((len(v), len(u)))
+    for f in range(len(triangles)):
+        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        bu, bv, cu, cv = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
+        area = bu * cv - bv * cu
+        if area <= 0.0:  # it faces away, or is seen from its edge
             continue
-        along = -offsets[f] / nt - (nu / nt) * u
-        up = nv / nt
-        for i in range(len(v)):
-            down = up * v[i]
-            for j in range(len(u)):
-                depth = along[j] - down
-                if nt > 0:
-                    if depth < front[i, j]:
-                        front[i, j] = depth
-                        light[i, j] = lit
-                elif depth > back[i, j]:
-                    back[i, j] = depth
-    return np.where(front >= back, front, -np.inf), light
+        first, last = np.searchsorted(v, min(a[1], b[1], c[1])), np.searchsorted(v, max(a[1], b[1], c[1]))
+        left, right = np.searchsorted(u, min(a[0], b[0], c[0])), np.searchsorted(u, max(a[0], b[0], c[0]))
+        for i in range(first, last):
+            pv = v[i] - a[1]
+            for j in range(left, right):
+                pu = u[j] - a[0]
+                of_b, of_c = (pu * cv - pv * cu) / area, (bu * pv - bv * pu) / area
+                if of_b < -_EDGE or of_c < -_EDGE or of_b + of_c > 1.0 + _EDGE:
+                    continue
+                near = a[2] + of_b * (b[2] - a[2]) + of_c * (c[2] - a[2])
+                if near > depth[i, j]:
+                    depth[i, j], lit[i, j] = near, light[f]
+    return depth, lit

@@ -19,8 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hrcreplay.records import Floats
-from hrcreplay.report import drawing
-from hrcreplay.report import figures as drawn
+from hrcreplay.report import drawing, figures_robot
 from hrcreplay.report.metrics import Metric, MetricTable, times, true_runs
 from hrcreplay.report.metrics_contact import PERSONS, add_contact
 from hrcreplay.report.metrics_plan import PAPER, add_plan, is_moving, numeric_column
@@ -360,7 +359,7 @@ def write(found: Mapping[str, Any], writer: RunWriter) -> None:
     folder = writer.partial / "figures"
     folder.mkdir(exist_ok=True)
     with drawing.style():
-        drawing.save(drawn.methods(found), folder, "compare")
+        drawing.save(figures_robot.methods(found), folder, "compare")
 
 
 def as_csv(found: Mapping[str, Any]) -> str:

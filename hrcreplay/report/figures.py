@@ -1,210 +1,363 @@
-"""Selects the figures that the data of a run allow, and draws them into its folder."""
+"""The figures of a run: one table of what there is and what each needs, and the drawing of what the data allow."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hrcreplay.records import Ints
-from hrcreplay.report import drawing, figures_human, figures_robot
-from hrcreplay.report.figures_human import Instant
-from hrcreplay.report.figures_robot import LinkPose
-from hrcreplay.report.metrics import Metric, columns, times
+from hrcreplay.report import drawing, figures_human, figures_prediction, figures_robot, figures_scene
+from hrcreplay.report.figures_prediction import Growth, Instant, Sweep, Walk
+from hrcreplay.report.figures_robot import SHORTEST_M, Deviation
+from hrcreplay.report.figures_scene import LinkPose, Storyboard
+from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
+from hrcreplay.report.moments import instants, known_ticks_ns, moment_ns, start_ns
 from hrcreplay.store.run_folder import Run
 
-
-def start_ns(run: Run) -> int:
-    """The instant that the report's clock counts from: the first tick, else the first frame [ns]."""
-    if run.state is not None and len(run.state):
-        return int(times(run.state)[0])
-    if run.motion is not None and len(run.motion):
-        return int(times(run.motion)[0])
-    if run.measurements is not None and len(run.measurements):
-        return int(times(run.measurements, "capture_ns").min())
-    return 0
+_T = TypeVar("_T")
 
 
-def instants(run: Run, count: int = 4, step_s: float = 1.0) -> Ints:
-    """(count,) ticks for Fig. 17, ``step_s`` apart, that end one step after the nearest or liveliest moment [ns].
+@dataclass(frozen=True)
+class FigureData:
+    """What figures are drawn from: the run's tables and metrics, and what the prediction says at some instants."""
 
-    The moment is the smallest separation of the plan or, without a plan, the fastest arm. Empty where the person is
-    not known at that many ticks.
-    """
-    none = np.zeros(0, dtype=np.int64)
-    if run.state is None:
-        return none
-    p = columns(run.state)
-    known_ns = times(run.state)[np.isfinite(p).all(axis=1)]
-    if len(known_ns) < 2:
-        return none
-    if run.motion is not None and run.motion["distance_m"].notna().any():
-        moment_ns = int(times(run.motion)[int(np.nanargmin(run.motion["distance_m"].to_numpy(dtype=float)))])
-    else:
-        speed = np.abs(columns(run.state, "_vel")[:, 4:]).sum(axis=1)
-        moment_ns = int(times(run.state)[int(np.argmax(np.where(np.isfinite(speed), speed, -1.0)))])
-    step_ns = round(step_s * 1e9)
-    first_ns = max(moment_ns - (count - 2) * step_ns, int(known_ns[0]))
-    wanted_ns = first_ns + step_ns * np.arange(count)
-    nearest = np.clip(np.searchsorted(known_ns, wanted_ns), 0, len(known_ns) - 1)
-    found = known_ns[nearest]
-    return found if len(np.unique(found)) == count else none
+    run: Run
+    metrics: Mapping[str, Metric]
+    near_m: float  #: the stationary share counts ticks with a separation of at most this
+    stationary_m_per_s: float  #: a TCP slower than this stands
+    gap_s: float = 0.2  #: a camera silent for longer has a gap
+    instants: Sequence[Instant] = ()  #: the swept volumes by several methods at the ticks that ``instants`` names
+    walk: Walk | None = None
+    sweep: Sweep | None = None
+    growth: Growth | None = None
+    story: Storyboard | None = None
+    pose: LinkPose | None = None  #: the robot at the tick that ``nearest_tick`` names
+
+    @property
+    def t0_ns(self) -> int:
+        """Instant of time zero [ns]."""
+        return start_ns(self.run)
+
+    @property
+    def motion(self) -> pd.DataFrame:
+        """Rows of motion.parquet."""
+        return given(self.run.motion)
+
+    @property
+    def state(self) -> pd.DataFrame:
+        """Rows of state.parquet."""
+        return given(self.run.state)
+
+    @cached_property
+    def worst(self) -> Deviation:
+        """The largest deviation of the TCP from its programmed path."""
+        return figures_robot.largest_deviation(self.motion)
 
 
-def nearest_tick(motion: pd.DataFrame) -> int:
-    """Row of the smallest separation of a plan; the first where none is known."""
-    distance_m = motion["distance_m"].to_numpy(dtype=float)
-    return int(np.argmin(np.where(np.isnan(distance_m), np.inf, distance_m)))
+def given(value: _T | None) -> _T:
+    """A value that is there: a figure without what it needs is not drawn."""
+    if value is None:
+        raise ValueError("a figure is drawn without what it needs")
+    return value
 
 
-def draw_all(
-    run: Run,
-    folder: Path,
-    metrics: Mapping[str, Metric],
-    *,
-    near_m: float,
-    stationary_m_per_s: float,
-    gap_s: float = 0.2,
-    volumes: Sequence[Instant] = (),
-    robot: LinkPose | None = None,
-) -> tuple[str, ...]:
-    """Draws what the run has data for into ``folder`` as ``<name>.png`` and ``<name>.svg``.
+@dataclass(frozen=True)
+class FigureKind:
+    """A figure that a run may have."""
+
+    name: str  #: of its files
+    numbers: tuple[str, ...]  #: the paper's; none for our own
+    title: str
+    section: str  #: of the page
+    needs: tuple[str, ...]  #: of NEEDS
+    draw: Callable[[FigureData], Figure]
+    caption: str
+    predicted: str = ""  #: the field of FigureData that has to be computed for it
+
+
+#: What a run may lack: how to tell whether it is there, and what to say when it is not.
+NEEDS: dict[str, tuple[Callable[[Run, Mapping[str, Metric]], bool], str]] = {
+    "motion": (
+        lambda run, _: run.motion is not None and len(run.motion) > 1,
+        "it moved no robot; run plan or report on its log",
+    ),
+    "path": (
+        lambda _, metrics: metrics["plan_deviation_max_m"]["value"] is not None,
+        "the way of the TCP is not known",
+    ),
+    "deviation": (
+        lambda _, metrics: metrics["plan_deviation_max_m"]["value"] >= SHORTEST_M,
+        "its TCP never left the programmed path",
+    ),
+    "horizon": (
+        lambda run, _: run.motion is not None and "horizon_s" in run.motion,
+        "its motion.parquet has no horizon_s; make it anew from its log",
+    ),
+    "base": (lambda run, _: run.T_world_base is not None, "where the robot stands is not known"),
+    "joints": (
+        lambda run, _: run.motion is not None and "q1" in run.motion and bool(run.motion["q1"].notna().any()),
+        "the joint positions of the robot are not known",
+    ),
+    "alone": (
+        lambda run, _: "none" in run.baselines,
+        'no robot without regard to the person beside it; run it with "none" among plan.baselines',
+    ),
+    "person": (lambda run, _: len(known_ticks_ns(run)) > 0, "nobody was seen in it"),
+    "seconds": (lambda run, _: len(instants(run)) > 0, "the person is not known for three seconds"),
+    "occupancy": (
+        lambda run, _: run.occupancy is not None and len(run.occupancy) > 0,
+        "it has no swept volumes; run predict, plan or report on its log",
+    ),
+    "measurements": (
+        lambda run, _: run.measurements is not None and len(run.measurements) > 0,
+        "no camera saw a person",
+    ),
+    "ticks": (lambda run, _: run.state is not None and len(run.state) > 1, "no person was fused"),
+    "truth": (
+        lambda _, metrics: metrics["fusion_angle_rmse"]["value"] is not None,
+        "its log has no ground truth",
+    ),
+}
+
+FIGURES = (
+    FigureKind(
+        "fig05_walking",
+        ("5",),
+        "what of the floor a person can reach, at the fastest step",
+        "prediction",
+        ("person",),
+        lambda data: figures_prediction.walking(given(data.walk), data.t0_ns),
+        "As the paper's Fig. 5, at the instant of the fastest walking. Dashed: the circular sectors that a unicycle "
+        "reaches within the stopping time, as the paper has them. Orange: their convex approximation, Eq. (22)-(30), "
+        "corrected. Blue: what sound encloses, from every likely state. Red: where the person then walked.",
+        "walk",
+    ),
+    FigureKind(
+        "fig07_sweeps",
+        ("7", "8"),
+        "a forearm swept by walking (7) and by the elbow (8)",
+        "prediction",
+        ("person",),
+        lambda data: figures_prediction.sweeps(given(data.sweep), data.t0_ns),
+        "As the paper's Fig. 7 and 8, on the forearm of this run's person. On the right the elbow turns it through all "
+        "angles that the paper's method says it can reach: arcs in triangles, and their hull. On the left that set is "
+        "displaced to all places that walking can reach, seen from above.",
+        "sweep",
+    ),
+    FigureKind(
+        "fig09_volumes",
+        ("9",),
+        "swept volumes as the run used them",
+        "prediction",
+        ("occupancy", "person"),
+        lambda data: figures_prediction.volumes_at(
+            given(data.run.occupancy), data.state, given(moment_ns(data.run)), data.t0_ns
+        ),
+        "As the paper's Fig. 9. The swept volumes that this run used, limb radii included, with the fused skeleton.",
+    ),
+    FigureKind(
+        "fig13a_path",
+        ("13a",),
+        "programmed and actual path of the TCP",
+        "cost",
+        ("motion", "path"),
+        lambda data: figures_robot.path(data.motion, data.run.occupancy, data.t0_ns, data.run.T_world_base, data.worst),
+        "As the paper's Fig. 13(a). Programmed and actual path of the TCP. The two dots are the ends of the largest "
+        "deviation; shaded: the swept volumes of the person at that tick.",
+    ),
+    FigureKind(
+        "fig13b_deviation",
+        ("13b",),
+        "largest deviation from the programmed path",
+        "cost",
+        ("motion", "path", "deviation"),
+        lambda data: figures_robot.deviation(data.motion, data.run.occupancy, data.t0_ns, data.worst),
+        "As the paper's Fig. 13(b). The largest deviation from the programmed path with its length, in the vertical "
+        "plane that holds it. The paper's own deviation is 0.221 m.",
+    ),
+    FigureKind(
+        "fig14_speed",
+        ("14",),
+        "programmed speed, actual speed, separation",
+        "safety",
+        ("motion",),
+        lambda data: figures_robot.speed(data.motion, data.t0_ns, data.near_m),
+        "As the paper's Fig. 14. Programmed speed of the TCP; its actual speed, braking shaded; and the smallest "
+        "distance, surface to surface, between the robot and what the person could reach within the tick's horizon.",
+    ),
+    FigureKind(
+        "fig15_storyboard",
+        ("15", "16"),
+        "the same stretch of the programme without the person (15) and with (16)",
+        "cost",
+        ("motion", "joints", "base", "alone", "occupancy", "person"),
+        lambda data: figures_scene.storyboard(given(data.story), data.t0_ns),
+        "As the paper's Fig. 15 and 16. Each row is the same instant of the programme: on the left as the robot passes "
+        "it with nobody to mind (the baseline none), on the right beside the person, when it got there.",
+        "story",
+    ),
+    FigureKind(
+        "fig17_volumes",
+        ("17",),
+        "swept volumes at four instants, by method",
+        "prediction",
+        ("seconds",),
+        lambda data: figures_prediction.volumes(data.instants, data.state, data.t0_ns),
+        "As the paper's Fig. 17. What the person could reach within the stopping time at four instants, limb radii "
+        "included: from positions and velocities (paper); by the older method, from positions alone; and as this run "
+        "did it, where that is neither.",
+        "instants",
+    ),
+    FigureKind(
+        "fig18_coordinate",
+        ("18",),
+        "one coordinate of the person as measured and as fused",
+        "fusion",
+        ("measurements",),
+        lambda data: figures_human.coordinate(data.run, data.t0_ns, data.gap_s),
+        "As the paper's Fig. 18. One coordinate of the person as each camera saw it and as fused, and where the log "
+        "has ground truth, the errors.",
+    ),
+    FigureKind(
+        "horizon",
+        (),
+        "horizon and stop time over time",
+        "safety",
+        ("motion", "horizon"),
+        lambda data: figures_robot.horizon(data.motion, data.t0_ns, _stop_s(data.run)),
+        "Until when the swept volumes hold by which each tick was decided, and how long the stop takes that the robot "
+        "would make from there; T\u209b is the stop from full speed. Braking is shaded.",
+    ),
+    FigureKind(
+        "volume_horizon",
+        (),
+        "swept volume against the horizon, by method",
+        "prediction",
+        ("person",),
+        lambda data: figures_prediction.growth(given(data.growth), data.run.occupancy, data.t0_ns),
+        "How the swept volumes of the six limbs, added up, grow with the horizon: by each method at one instant "
+        "(lines), and as this run stored them at all others (dots).",
+        "growth",
+    ),
+    FigureKind(
+        "status",
+        (),
+        "what each method did over time",
+        "safety",
+        ("motion",),
+        lambda data: figures_robot.status(
+            data.motion,
+            data.run.baselines,
+            method=str(data.metrics["plan_method"]["value"]),
+            t0_ns=data.t0_ns,
+            near_m=data.near_m,
+            slow_m_per_s=data.stationary_m_per_s,
+        ),
+        "What the robot did over time. Limited: held by a safety constraint or a limit. Above each bar, in grey, when "
+        "it was near the person; solid, when it then stood although its programme moves. Where stretches are narrower "
+        "than a line, the gravest status is drawn.",
+    ),
+    FigureKind(
+        "stationary_share",
+        (),
+        "share of the near ticks at which each method stood",
+        "cost",
+        ("motion",),
+        lambda data: figures_robot.stationary_share(data.metrics),
+        "Share of the ticks near the person at which the robot stood still although its programme moves. The hatched "
+        "bars are the paper's own numbers, from its own data: they can be compared in kind only.",
+    ),
+    FigureKind(
+        "robot_links",
+        (),
+        "the robot's capsules where it was nearest to the person",
+        "robot",
+        ("motion", "joints", "base"),
+        lambda data: figures_scene.links(given(data.pose), data.t0_ns, given(data.run.T_world_base)),
+        "The robot as its distances see it: a capsule around each collision shape of its links, at the tick of the "
+        "smallest separation, beside the swept volumes of the person. The square is the robot's base.",
+        "pose",
+    ),
+    FigureKind(
+        "fusion_error",
+        (),
+        "errors against ground truth, by joint",
+        "fusion",
+        ("truth",),
+        lambda data: figures_human.fusion_error(data.metrics, cameras(data.run)),
+        "Root mean square error against ground truth, of each camera's raw angles and of the fused state.",
+    ),
+    FigureKind(
+        "joint_angles",
+        (),
+        "all joints of the person over time",
+        "fusion",
+        ("ticks",),
+        lambda data: figures_human.joint_angles(data.run, data.t0_ns, data.gap_s),
+        "All joints of the human model: the cameras' raw values (dots) and the fused state (line).",
+    ),
+    FigureKind(
+        "data_quality",
+        (),
+        "when each camera saw the person",
+        "data",
+        ("measurements",),
+        lambda data: figures_human.data_quality(data.run, data.t0_ns, data.gap_s),
+        "When each camera's frames held the person (pale), when the filter used them (solid), and when it had none.",
+    ),
+)
+
+
+def label(kind: FigureKind) -> str:
+    """What a user types for it: its number, or where the paper has none its name."""
+    return ", ".join(kind.numbers) or kind.name
+
+
+def find(key: str) -> tuple[FigureKind, ...]:
+    """The figures of a number or a name; ``13`` stands for 13a and 13b. Empty for one that there is not."""
+    wanted = re.sub(r"^fig\.?\s*", "", key.strip().lower())
+    found = [kind for kind in FIGURES if wanted in (*kind.numbers, kind.name) or key == kind.name]
+    return tuple(found or (kind for kind in FIGURES if wanted and wanted in [n.rstrip("ab") for n in kind.numbers]))
+
+
+def missing(kind: FigureKind, run: Run, metrics: Mapping[str, Metric]) -> str:
+    """Why a run has not what a figure needs; empty where it has."""
+    return next((why for there, why in map(NEEDS.__getitem__, kind.needs) if not there(run, metrics)), "")
+
+
+def wanted(run: Run, metrics: Mapping[str, Metric]) -> tuple[FigureKind, ...]:
+    """The figures that a run has all for."""
+    return tuple(kind for kind in FIGURES if not missing(kind, run, metrics))
+
+
+def draw_all(data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None = None) -> tuple[str, ...]:
+    """Draws figures into ``folder`` as ``<name>.png`` and ``<name>.svg``.
 
     Args:
-        run: The run's tables.
+        data: What to draw from.
         folder: Made if need be.
-        metrics: What :func:`hrcreplay.run.report.compute` found.
-        near_m: The stationary share counts ticks with a separation of at most this [m].
-        stationary_m_per_s: A TCP slower than this stands [m/s].
-        gap_s: A camera silent for longer has a gap [s].
-        volumes: The swept volumes by several methods at the ticks that :func:`instants` names.
-        robot: The capsules of the robot's links at the tick that :func:`nearest_tick` names.
+        kinds: Which; None: all that the run has all for. One without what had to be computed for it is left out.
 
     Returns:
         The names drawn.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    t0_ns = start_ns(run)
-    makers = _of_robot(run, metrics, t0_ns, near_m, stationary_m_per_s, robot)
-    makers |= _of_human(run, metrics, t0_ns, gap_s, volumes)
-    for name, make in makers.items():
-        with drawing.style():
-            drawing.save(make(), folder, name)
-    return tuple(makers)
-
-
-def _of_robot(
-    run: Run,
-    metrics: Mapping[str, Metric],
-    t0_ns: int,
-    near_m: float,
-    stationary_m_per_s: float,
-    robot: LinkPose | None,
-) -> dict[str, Callable[[], Figure]]:
-    """The figures of the plan and of the robot by their names; the arguments are those of ``draw_all``."""
-    makers: dict[str, Callable[[], Figure]] = {}
-    if run.motion is not None and len(run.motion) > 1:
-        plan = run.motion
-        if metrics["plan_deviation_max_m"]["value"] is not None:
-            makers["fig13_path"] = lambda: figures_robot.path(plan, run.occupancy, t0_ns, run.T_world_base)
-        makers["fig14_speed"] = lambda: figures_robot.speed(plan, t0_ns, near_m)
-        makers["status"] = lambda: figures_robot.status(
-            plan,
-            run.baselines,
-            method=str(metrics["plan_method"]["value"]),
-            t0_ns=t0_ns,
-            near_m=near_m,
-            slow_m_per_s=stationary_m_per_s,
-        )
-        makers["stationary_share"] = lambda: figures_robot.stationary_share(metrics)
-    if robot is not None and run.T_world_base is not None:
-        pose, base = robot, run.T_world_base
-        makers["robot_links"] = lambda: figures_robot.links(pose, t0_ns, base)
-    return makers
-
-
-def _of_human(
-    run: Run, metrics: Mapping[str, Metric], t0_ns: int, gap_s: float, volumes: Sequence[Instant]
-) -> dict[str, Callable[[], Figure]]:
-    """The figures of the person by their names; the arguments are those of ``draw_all``."""
-    makers: dict[str, Callable[[], Figure]] = {}
-    state = run.state
-    if state is not None and volumes:
-        fused = state
-        makers["fig17_volumes"] = lambda: figures_human.volumes(volumes, fused, t0_ns)
-    if run.measurements is not None and len(run.measurements):
-        makers["fig18_coordinate"] = lambda: figures_human.coordinate(run, t0_ns, gap_s)
-        makers["data_quality"] = lambda: figures_human.data_quality(run, t0_ns, gap_s)
-    if state is not None and len(state) > 1:
-        makers["joint_angles"] = lambda: figures_human.joint_angles(run, t0_ns, gap_s)
-    if metrics["fusion_angle_rmse"]["value"] is not None:
-        makers["fusion_error"] = lambda: figures_human.fusion_error(metrics, cameras(run))
-    return makers
-
-
-#: Method -> colour, and (occupancy, horizon) -> marker.
-_COLOURS = {
-    "qp": drawing.BLUE,
-    "scaling": drawing.ORANGE,
-    "shield": drawing.GREEN,
-    "ssm": drawing.PURPLE,
-    "none": drawing.VERMILLION,
-}
-_MARKERS = {"sound": "o", "paper": "s", "positions": "D"}
-
-
-def methods(found: Mapping[str, Any]) -> Figure:
-    """Safety against productivity: the smallest distance while moving over the pace kept, a point a method.
-
-    Args:
-        found: The content of compare.json.
-    """
-    figure = drawing.new_figure(3.7)
-    ((ax,),) = drawing.panels(figure, 1, bottom_in=0.5, top_in=0.3, right_in=2.7)
-    several = len(found["logs"]) > 1
-    for label, row in found["total"].items():
-        of, alone = found["methods"][label], log_rows(found, label) if several else []
-        colour, marker = _COLOURS[of["method"]], _MARKERS.get(of.get("occupancy", ""), "X")
-        for other in alone:
-            ax.plot(*_place(other), ".", ms=5, color=colour, alpha=0.45)
-        if row["pace"] is None or row["nearest_moving_m"] is None:
+    names = []
+    for kind in wanted(data.run, data.metrics) if kinds is None else kinds:
+        if kind.predicted and not getattr(data, kind.predicted):
             continue
-        words = label.replace(":", ", ")
-        if row["touch_ticks"]:
-            words += f": {row['touch_ticks']:,} ticks in contact,\nup to {row['touch_speed_m_per_s']:.2f} m/s"
-        face = "white" if of.get("horizon") == "fixed" else colour
-        ax.plot(
-            *_place(row), marker, ms=8, mfc=face, mec=colour, mew=1.6, alpha=0.9, zorder=3, label=words, clip_on=False
-        )
-    ax.set_yscale("symlog", linthresh=20.0, linscale=1.5)
-    ticks = [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200, 500]
-    low, high = min(ax.get_ylim()[0], -12.0), max(ax.get_ylim()[1], 25.0)
-    ax.set_yticks([tick for tick in ticks if low <= tick <= high])
-    ax.yaxis.set_major_formatter("{x:.0f}")
-    ax.minorticks_off()
-    ax.set_ylim(low, high)
-    ax.set_xlim(0.0, 103.0)
-    ax.axhspan(low, 0.0, color=drawing.VERMILLION, alpha=0.08, lw=0)
-    ax.text(1.5, 0.97 * low, "in contact while moving", va="bottom", ha="left", color=drawing.VERMILLION, fontsize=8.0)
-    ax.legend(loc="upper left", bbox_to_anchor=(1.03, 1.0), labelspacing=0.9)
-    ax.set_xlabel("pace kept, of the programmed [%]")
-    ax.set_ylabel("nearest to the person while moving [cm]")
-    what = f"; {len(found['logs'])} logs, small dots: each" if several else ""
-    ax.set_title(f"Safety and pace by method (hollow: fixed horizon{what})")
-    return figure
+        with drawing.style(column=True):
+            drawing.save(kind.draw(data), folder, kind.name, drawing.COLUMN_DPI)
+        names.append(kind.name)
+    return tuple(names)
 
 
-def log_rows(found: Mapping[str, Any], label: str) -> list[Mapping[str, Any]]:
-    """The figures of a method on each log that can be placed."""
-    rows = [log["methods"][label] for log in found["logs"]]
-    return [row for row in rows if row["pace"] is not None and row["nearest_moving_m"] is not None]
-
-
-def _place(row: Mapping[str, Any]) -> tuple[float, float]:
-    """Pace [%] and smallest distance [cm]."""
-    return 100.0 * row["pace"], 100.0 * row["nearest_moving_m"]
+def _stop_s(run: Run) -> float:
+    return float(run.meta["settings"]["occupancy"]["stop_s"])

@@ -1,4 +1,4 @@
-"""Figures of the person: data quality, swept volumes (Fig. 17), joint coordinates (Fig. 18), fusion error."""
+"""Figures of the person as measured and fused: data quality, joint coordinates (Fig. 18), fusion error."""
 
 from __future__ import annotations
 
@@ -7,127 +7,27 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
-from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
+from hrcreplay.records import JOINTS, Bools, Floats, Ints
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import RenderedHull, View, bones, outline, render_hulls, view_from
-from hrcreplay.report.metrics import (
-    ANGLES,
-    Metric,
-    break_at_gaps,
-    columns,
-    envelope,
-    seconds_from,
-    times,
-    true_runs,
-    wrap,
-)
+from hrcreplay.report.metrics import ANGLES, Metric, break_at_gaps, envelope, seconds_from, times, true_runs, wrap
 from hrcreplay.report.metrics_data import cameras, errors, seconds_since
 from hrcreplay.store.run_folder import Run
-
-#: One instant of Fig. 17: t_ns, and per method and limb the swept volume: (m, 3) vertices, world [m], and radius [m].
-Instant = tuple[int, Mapping[str, Mapping[str, tuple[Floats, float]]]]
-
-METHODS = {
-    "paper": "paper\npositions and velocities",
-    "positions": "older method [26]\npositions only",
-    "sound": "sound\nall motions of the model",
-}
 
 LABELS = {
     "x": "x",
     "y": "y",
+    "z": "z",
     "theta": "heading \u03b8",
     "rho": "torso \u03c1",
-    "z": "pelvis height z",
     **{f"a{side}{i}": f"{name} \u03b1{i}" for side, name in (("r", "right"), ("l", "left")) for i in range(1, 5)},
 }
-
-
-def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Figure:
-    """Fig. 17: the person's swept volumes, a row a method, a column an instant, all to one scale.
-
-    Args:
-        instants: What to draw, in order of time.
-        state: The fused person, for the skeleton and the viewpoint.
-        t0_ns: Start of the run [ns].
-    """
-    methods = list(instants[0][1])
-    people = [_skeleton_at(state, t_ns) for t_ns, _ in instants]
-    heading = float(np.nanmean([heading for _, heading in people]))
-    view = view_from(heading - 0.9, 0.28)
-    figure = drawing.new_figure(0.55 + 2.35 * len(methods))
-    grid = drawing.panels(
-        figure, len(methods), len(instants), left_in=0.5, right_in=0.1, top_in=0.34, bottom_in=0.3, gap_in=(0.12, 0.08)
-    )
-    centres = [view.flat(points[[POINTS.index("pelvis")]])[0] for points, _ in people]
-    outlines = [
-        {
-            method: [outline(vertices, radius, view) - centre for vertices, radius in limbs.values()]
-            for method, limbs in found.items()
-        }
-        for (_, found), centre in zip(instants, centres, strict=True)
-    ]
-    corners = np.vstack([edge for found in outlines for edges in found.values() for edge in edges])
-    low, high = corners.min(axis=0) - 0.03, corners.max(axis=0) + 0.03
-    for row, method in enumerate(methods):
-        for column, (t_ns, found) in enumerate(instants):
-            ax = grid[row][column]
-            drawing.set_window(ax, low.tolist(), high.tolist())
-            skeleton_m, edges = people[column][0], outlines[column][method]
-            _draw_person(ax, found[method], edges, skeleton_m, view, centres[column], (low, high))
-            if row == 0:
-                later = (t_ns - instants[0][0]) * 1e-9
-                ax.set_title(
-                    f"T = {later:.0f} s  (at {(t_ns - t0_ns) * 1e-9:.1f} s)", fontweight="normal", loc="center"
-                )
-            ax.set(xticks=[], yticks=[])
-            ax.grid(visible=False)
-            ax.spines[:].set_visible(False)
-        grid[row][0].set_ylabel(METHODS.get(method, method), fontweight="bold")
-    _scale_bar(grid[-1][-1], float(high[0]), float(low[1]))
-    drawn = {limb for limbs in instants[0][1].values() for limb in limbs}
-    handles = [Patch(color=colour, lw=0, label=limb) for limb, colour in drawing.LIMBS.items() if limb in drawn]
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), bbox_to_anchor=(0.5, 0.005))
-    return figure
-
-
-def _skeleton_at(state: pd.DataFrame, t_ns: int) -> tuple[Floats, float]:
-    row = state.iloc[[int(np.argmin(np.abs(times(state) - t_ns)))]]
-    p = columns(row)
-    return skeleton(p, row[list(LENGTHS)].to_numpy(dtype=float))[0], float(p[0, JOINTS.index("theta")])
-
-
-def _draw_person(
-    ax: Axes,
-    limbs: Mapping[str, tuple[Floats, float]],
-    edges: Sequence[Floats],
-    points: Floats,
-    view: View,
-    centre: Floats,
-    window: tuple[Floats, Floats],
-) -> None:
-    solids = [RenderedHull(vertices, radius, to_rgb(drawing.LIMBS[limb])) for limb, (vertices, radius) in limbs.items()]
-    low, high = window
-    image = render_hulls(solids, view, low + centre, high + centre, (high[1] - low[1]) / 320.0)
-    image[..., 3] *= 0.78
-    ax.imshow(image, origin="lower", extent=(low[0], high[0], low[1], high[1]), aspect="auto", interpolation="bilinear")
-    drawing.set_window(ax, low.tolist(), high.tolist())
-    for solid, edge in zip(solids, edges, strict=True):
-        if len(edge):
-            ax.add_patch(Polygon(edge, fill=False, edgecolor=solid.colour, lw=0.8, alpha=0.6))
-    ax.add_collection(LineCollection([pair - centre for pair in bones(points, view)], colors=drawing.INK, lw=1.6))
-
-
-def _scale_bar(ax: Axes, right: float, low: float) -> None:
-    ax.plot([right - 0.5, right], [low, low], color=drawing.INK, lw=1.4, solid_capstyle="butt")
-    ax.annotate("0.5 m", (right - 0.25, low), xytext=(0, 3), textcoords="offset points", ha="center", fontsize=8)
+#: As many panels beside each other show all joints.
+_PANELS = 3
 
 
 def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
@@ -143,21 +43,22 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
     unit, factor, error_unit, error_factor = (
         ("deg", 180 / np.pi, "deg", 180 / np.pi) if joint in ANGLES else ("m", 1.0, "mm", 1e3)
     )
-    figure = drawing.new_figure(4.2 if found else 2.6)
-    rows = drawing.panels(figure, 2 if found else 1, heights=[1.5, 1.0] if found else None, share_x=True, top_in=0.34)
+    figure = drawing.column_figure(2.9 if found else 1.9)
+    heights = [1.5, 1.0] if found else [1.0]
+    rows = drawing.column_panels(figure, len(heights), heights=heights, share_x=True)
     ax = rows[0][0]
-    for camera, colour in zip(cameras(run), drawing.CAMERAS * 3, strict=False):
-        seconds, values = _seen(run, camera, joint, t0_ns, gap_s)
-        ax.plot(*envelope(seconds, factor * values), color=colour, lw=0.9, label=camera)
+    for (camera, frames), colour in zip(_frames(run).items(), drawing.CAMERAS * 3, strict=False):
+        seconds, values = _seen(run, frames, joint, t0_ns, gap_s)
+        ax.plot(*envelope(seconds, factor * values, 500), color=colour, lw=0.6, label=camera)
     if run.state is not None:
         seconds = seconds_from(times(run.state), t0_ns)
         values = factor * run.state[joint].to_numpy(dtype=float)
-        ax.plot(*envelope(seconds, values), color=drawing.FUSED, lw=1.6, label="fused")
+        ax.plot(*envelope(seconds, values, 500), color=drawing.FUSED, lw=1.2, label="fused")
     if run.truth is not None:
         seconds = seconds_from(times(run.truth), t0_ns)
         values = factor * run.truth[joint].to_numpy(dtype=float)
-        ax.plot(*envelope(seconds, values), color=drawing.TRUTH, lw=0.9, ls=(0, (4, 2)), label="truth")
-    ax.set(title=f"Coordinate {LABELS[joint]} of the person", ylabel=f"{LABELS[joint]} [{unit}]")
+        ax.plot(*envelope(seconds, values, 500), color=drawing.TRUTH, lw=0.7, ls=(0, (4, 2)), label="truth")
+    ax.set(title=f"Coordinate {LABELS[joint]}", ylabel=f"{LABELS[joint]} [{unit}]")
     drawing.legend_above(ax)
     if found:
         below = rows[1][0]
@@ -168,24 +69,32 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
                 seconds = seconds_from(found[source].t_ns, t0_ns)
                 values = error_factor * found[source].position[:, JOINTS.index(joint)]
                 below.plot(
-                    *envelope(*break_at_gaps(seconds, values, gap_s)),
+                    *envelope(*break_at_gaps(seconds, values, gap_s), 500),
                     color=colour,
-                    lw=1.3 if source == "fused" else 0.7,
+                    lw=0.9 if source == "fused" else 0.5,
                 )
-        below.set(title="Error against ground truth", ylabel=f"{error_unit}")
+        below.set(title="Error against ground truth", ylabel=f"error [{error_unit}]")
     rows[-1][0].set_xlabel("time [s]")
     _span(rows[-1][0], run, t0_ns)
+    figure.align_ylabels()
     return figure
 
 
-def _seen(run: Run, camera: str, joint: str, t0_ns: int, gap_s: float) -> tuple[Floats, Floats]:
+def _frames(run: Run) -> dict[str, pd.DataFrame]:
+    """The frames of each camera, in order of capture."""
+    table = run.measurements
+    if table is None:
+        return {}
+    ordered = table.sort_values("capture_ns", kind="stable")
+    of = ordered["camera"].astype(str).to_numpy()
+    return {camera: ordered[of == camera] for camera in cameras(run)}
+
+
+def _seen(run: Run, frames: pd.DataFrame, joint: str, t0_ns: int, gap_s: float) -> tuple[Floats, Floats]:
     """A camera's raw values over time [s], broken where it was silent for longer than ``gap_s``."""
-    if run.measurements is None:
-        return np.zeros(0), np.zeros(0)
-    rows = run.measurements[run.measurements["camera"] == camera].sort_values("capture_ns", kind="stable")
-    seconds = seconds_from(times(rows, "capture_ns"), t0_ns)
-    values = _beside_fused(run, joint, times(rows, "capture_ns"), rows[joint].to_numpy(dtype=float))
-    return break_at_gaps(seconds, values, gap_s)
+    t_ns = times(frames, "capture_ns")
+    values = _beside_fused(run, joint, t_ns, frames[joint].to_numpy(dtype=float))
+    return break_at_gaps(seconds_from(t_ns, t0_ns), values, gap_s)
 
 
 def _span(ax: Axes, run: Run, t0_ns: int) -> None:
@@ -194,33 +103,38 @@ def _span(ax: Axes, run: Run, t0_ns: int) -> None:
 
 
 def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
-    """All thirteen joints: what the cameras saw (dots), the fused state and the truth."""
-    figure = drawing.new_figure(6.8)
-    columns = (("x", "y", "z", "theta", "rho"), JOINTS[4:8], JOINTS[8:12])
-    grid = drawing.panels(figure, 5, 3, share_x=True, gap_in=(0.26, 0.55), top_in=0.5, left_in=0.6)
-    seen = cameras(run)
-    for ax, joint in ((grid[row][k], joint) for k, joints in enumerate(columns) for row, joint in enumerate(joints)):
+    """All joints: what the cameras saw (dots), the fused state and the truth."""
+    count = -(-len(JOINTS) // _PANELS)
+    figure = drawing.column_figure(0.7 + 0.95 * count)
+    grid = drawing.column_panels(
+        figure, count, _PANELS, share_x=True, gap_in=(0.2, 0.3), top_in=0.36, left_in=0.3, right_in=0.05
+    )
+    for ax in [ax for row in grid for ax in row][len(JOINTS) :]:
+        ax.set_visible(False)
+    seen = _frames(run)
+    for k, joint in enumerate(JOINTS):
+        ax = grid[k // _PANELS][k % _PANELS]
         factor = 180 / np.pi if joint in ANGLES else 1.0
-        for camera, colour in zip(seen, drawing.CAMERAS * 3, strict=False):
-            seconds, values = _seen(run, camera, joint, t0_ns, gap_s)
-            some = slice(None, None, max(1, len(seconds) // 900))
-            ax.plot(seconds[some], factor * values[some], ".", ms=1.5, color=colour, alpha=0.5, mew=0, rasterized=True)
+        for frames, colour in zip(seen.values(), drawing.CAMERAS * 3, strict=False):
+            seconds, values = _seen(run, frames, joint, t0_ns, gap_s)
+            some = slice(None, None, max(1, len(seconds) // 400))
+            ax.plot(seconds[some], factor * values[some], ".", ms=2.0, color=colour, alpha=0.8, mew=0, rasterized=True)
         if run.state is not None:
             seconds = seconds_from(times(run.state), t0_ns)
             values = factor * run.state[joint].to_numpy(dtype=float)
-            ax.plot(*envelope(seconds, values, 350), color=drawing.FUSED, lw=1.0)
+            ax.plot(*envelope(seconds, values, 150), color=drawing.FUSED, lw=0.7)
             _limits_of(ax, values)
         if run.truth is not None:
             seconds = seconds_from(times(run.truth), t0_ns)
             values = _beside_fused(run, joint, times(run.truth), run.truth[joint].to_numpy(dtype=float))
-            ax.plot(*envelope(seconds, factor * values, 350), color=drawing.TRUTH, lw=0.7, ls=(0, (4, 2)))
-        ax.set_title(f"{LABELS[joint]} [{'deg' if joint in ANGLES else 'm'}]", fontweight="normal", pad=2.5)
-    for k, joints in enumerate(columns):
-        bottom = grid[len(joints) - 1][k]
-        bottom.set_xlabel("time [s]")
-        bottom.tick_params(labelbottom=True)
-        for row in grid[len(joints) :]:
-            row[k].remove()
+            ax.plot(*envelope(seconds, factor * values, 150), color=drawing.TRUTH, lw=0.6, ls=(0, (4, 2)))
+        ax.set_title(f"{LABELS[joint]} [{'deg' if joint in ANGLES else 'm'}]", fontweight="normal", pad=1.5)
+        ax.tick_params(labelsize=6.0)
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+    for column in range(_PANELS):
+        lowest = grid[-1 if column < len(JOINTS) - (count - 1) * _PANELS else -2][column]
+        lowest.set_xlabel("time [s]")
+        lowest.tick_params(labelbottom=True)
     _span(grid[-1][0], run, t0_ns)
     handles = [
         Line2D([], [], ls="", marker="o", ms=3, color=c, label=n)
@@ -229,7 +143,7 @@ def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
     handles.append(Line2D([], [], color=drawing.FUSED, label="fused"))
     if run.truth is not None:
         handles.append(Line2D([], [], color=drawing.TRUTH, lw=0.7, ls=(0, (4, 2)), label="truth"))
-    figure.legend(handles=handles, loc="upper right", ncols=6, bbox_to_anchor=(0.985, 0.995))
+    figure.legend(handles=handles, loc="upper right", ncols=6, bbox_to_anchor=(0.985, 0.997))
     return figure
 
 
@@ -237,10 +151,11 @@ def _beside_fused(run: Run, joint: str, t_ns: Ints, values: Floats) -> Floats:
     """An angle in the turn of the fused one, which is unwrapped; a length as it is."""
     if run.state is None or joint not in ANGLES:
         return values
-    known = run.state[["t_ns", joint]].dropna()
-    if not len(known):
+    fused_ns, fused = times(run.state), run.state[joint].to_numpy(dtype=float)
+    known = np.isfinite(fused)
+    if not known.any():
         return values
-    fused = np.interp(t_ns, known["t_ns"].to_numpy(dtype=float), known[joint].to_numpy(dtype=float))
+    fused = np.interp(t_ns, fused_ns[known].astype(float), fused[known])
     return np.asarray(fused + wrap(values - fused))
 
 
@@ -254,8 +169,8 @@ def _limits_of(ax: Axes, values: Floats) -> None:
 
 def fusion_error(metrics: Mapping[str, Metric], names: Sequence[str]) -> Figure:
     """RMSE per angle and pooled, of each camera's raw angles and of the fused state; velocities likewise."""
-    figure = drawing.new_figure(3.9)
-    rows = drawing.panels(figure, 2, gap_in=(0.34, 0.0), top_in=0.34, bottom_in=0.3, share_x=True)
+    figure = drawing.column_figure(2.7)
+    rows = drawing.column_panels(figure, 2, bottom_in=0.22, share_x=True)
     sources = [*names, "fused"]
     colours = [*(drawing.CAMERAS * 3)[: len(names)], drawing.FUSED]
     width = 0.8 / len(sources)
@@ -272,8 +187,11 @@ def fusion_error(metrics: Mapping[str, Metric], names: Sequence[str]) -> Figure:
         ax.grid(visible=False, axis="x")
         ax.tick_params(axis="x", length=0)
     rows[0][0].set_title("Angles")
-    rows[1][0].set_title("Angular velocities (cameras: differenced)")
-    rows[1][0].set_xticks([*range(len(ANGLES)), len(ANGLES) + 0.35], [*(LABELS[joint] for joint in ANGLES), "pooled"])
+    rows[1][0].set_title("Angular velocities (cameras: by differences)")
+    short = [LABELS[joint].replace("right", "r").replace("left", "l") for joint in ANGLES]
+    short = [name.removeprefix("heading ").removeprefix("torso ") for name in short]
+    rows[1][0].set_xticks([*range(len(ANGLES)), len(ANGLES) + 0.35], [*short, "all"])
+    figure.align_ylabels()
     drawing.legend_above(rows[0][0])
     return figure
 
@@ -281,8 +199,8 @@ def fusion_error(metrics: Mapping[str, Metric], names: Sequence[str]) -> Figure:
 def data_quality(run: Run, t0_ns: int, gap_s: float) -> Figure:
     """Per camera: when its frames held the person, when the filter used them, and its gaps."""
     names = cameras(run)
-    figure = drawing.new_figure(0.95 + 0.42 * (len(names) + 1))
-    ax = drawing.panels(figure, 1, left_in=1.0, top_in=0.36)[0][0]
+    figure = drawing.column_figure(0.72 + 0.24 * (len(names) + 1))
+    ((ax,),) = drawing.column_panels(figure, left_in=0.62, top_in=0.34)
     end_s = 0.0
     anything: Bools | None = None
     for row, camera in enumerate(names):
@@ -304,9 +222,9 @@ def data_quality(run: Run, t0_ns: int, gap_s: float) -> Figure:
         ax.broken_barh(_tick_bars(seconds, anything), (len(names) - 0.16, 0.32), facecolors=drawing.BLUE, lw=0)
         for start, width in _tick_bars(seconds, ~anything):
             ax.broken_barh([(start, width)], (len(names) - 0.16, 0.32), facecolors=drawing.VERMILLION, lw=0)
-            if width > 0.02 * end_s:
+            if width > 0.05 * end_s:
                 ax.annotate(
-                    f"{width:.1f} s", (start + 0.5 * width, len(names) + 0.2), ha="center", va="top", fontsize=7.5
+                    f"{width:.1f} s", (start + 0.5 * width, len(names) + 0.2), ha="center", va="top", fontsize=6.0
                 )
     ax.set(xlim=(0, end_s), ylim=(len(names) + 0.62, -0.5), xlabel="time [s]")
     ax.set_yticks(range(len(names) + 1), [*names, "any camera"])
@@ -317,7 +235,7 @@ def data_quality(run: Run, t0_ns: int, gap_s: float) -> Figure:
         Patch(color=drawing.FAINT, lw=0, label=f"used by the filter within {gap_s:g} s"),
         Patch(color=drawing.VERMILLION, lw=0, label="none used"),
     ]
-    drawing.legend_above(ax, handles=handles)
+    drawing.legend_above(ax, columns=2, handles=handles)
     return figure
 
 

@@ -14,8 +14,7 @@ import numpy as np
 import pandas as pd
 
 from hrcreplay.records import STATUSES, Bools, Floats, Ints
-from hrcreplay.report.metrics import MetricTable, durations_s, times
-from hrcreplay.report.path_feet import path_feet
+from hrcreplay.report.metrics import MetricTable, durations_s, path_feet, times
 
 #: Less way than this is rounding [m].
 _ROUNDING_M = 1e-9

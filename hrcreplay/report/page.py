@@ -6,7 +6,6 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib import resources
 from pathlib import Path, PurePath
 from typing import Any
@@ -16,6 +15,7 @@ from markupsafe import Markup
 
 from hrcreplay.records import LIMBS
 from hrcreplay.report import story
+from hrcreplay.report.figures import FIGURES
 from hrcreplay.report.limbs import limb_names_text
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
@@ -24,7 +24,6 @@ from hrcreplay.report.replay_scene import ReplayScene
 from hrcreplay.report.story import defect_notes
 from hrcreplay.report.tables import (
     CAMERA,
-    CAPTIONS,
     FUSION,
     NOT_CLAIMED,
     PLAN_COST,
@@ -49,6 +48,7 @@ class PageFigure:
     name: str
     caption: str
     svg: Markup
+    wide: bool = True  #: more than one column of a paper
 
 
 @dataclass(frozen=True)
@@ -129,17 +129,16 @@ def _parts(
     tables: Sequence[PageTable],
     stops: Sequence[PageTable],
 ) -> tuple[PageSection, ...]:
-    figures = partial(_figures, figures_dir)
     seen = cameras(run)
     with_truth = metrics["fusion_angle_rmse"]["value"] is not None
     return (
         *_plan(run, metrics, figures_dir, stops),
-        *_robot(run, figures("robot_links")),
+        *_robot(run, _figures(figures_dir, "robot")),
         PageSection(
             "prediction",
             "Prediction",
             "What the person could reach until the robot would have stopped, and the bounds that this rests on.",
-            figures("fig17_volumes"),
+            _figures(figures_dir, "prediction"),
             (*_volumes(metrics), *tables),
             ""
             if run.occupancy is not None
@@ -149,7 +148,7 @@ def _parts(
             "fusion",
             "Fusion",
             "The person as each camera saw them, and as the filter has them.",
-            figures("fig18_coordinate", "fusion_error", "joint_angles"),
+            _figures(figures_dir, "fusion"),
             (_fusion_table(metrics, seen),) if with_truth else (),
             "" if with_truth else "The log has no ground truth, so there is nothing to tell errors by.",
         ),
@@ -157,7 +156,7 @@ def _parts(
             "data",
             "Data quality",
             "What the log held, and what was wrong with it.",
-            figures("data_quality"),
+            _figures(figures_dir, "data"),
             (
                 compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA),
                 *_limbs(metrics),
@@ -167,10 +166,15 @@ def _parts(
     )
 
 
-def _figures(folder: Path, *names: str) -> tuple[PageFigure, ...]:
-    """Those of the figures that were drawn."""
-    found = [name for name in names if (folder / f"{name}.svg").is_file()]
-    return tuple(PageFigure(name, CAPTIONS[name], inline_svg(folder / f"{name}.svg", name)) for name in found)
+def _figures(folder: Path, section: str) -> tuple[PageFigure, ...]:
+    """Those figures of a section that were drawn."""
+    found = [kind for kind in FIGURES if kind.section == section and (folder / f"{kind.name}.svg").is_file()]
+    return tuple(
+        PageFigure(
+            kind.name, kind.caption, inline_svg(folder / f"{kind.name}.svg", kind.name, kind.caption), wide=False
+        )
+        for kind in found
+    )
 
 
 def _plan(
@@ -185,7 +189,7 @@ def _plan(
             "safety",
             "Safety",
             "How fast the robot moved, how near to what the person could reach, and what held it.",
-            _figures(figures_dir, "fig14_speed", "status"),
+            _figures(figures_dir, "safety"),
             (
                 compare("Safety, per method on the same volumes", metrics, plans, PLAN_SAFETY),
                 *_reasons(metrics, plans),
@@ -199,7 +203,7 @@ def _plan(
             "cost",
             "Cost to the task",
             "How often it stood, how far it left its path, and how much time that took.",
-            _figures(figures_dir, "stationary_share", "fig13_path"),
+            _figures(figures_dir, "cost"),
             (compare("Cost, per method on the same volumes", metrics, plans, PLAN_COST, _papers(metrics)),)
             if planned
             else (),
@@ -310,7 +314,7 @@ def _settings(settings: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, st
     ]
 
 
-def inline_svg(path: Path, name: str) -> Markup:
+def inline_svg(path: Path, name: str, caption: str) -> Markup:
     """An SVG as part of a page: without prologue and size, its ids made the page's own."""
     svg = path.read_text("utf-8")
     svg = svg[svg.index("<svg") :]
@@ -321,5 +325,5 @@ def inline_svg(path: Path, name: str) -> Markup:
     body = body.replace("xlink:href", "href")
     body = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", body)
     body = re.sub(r">\s*\n\s*<", "><", body)
-    label = Markup.escape(CAPTIONS[name])
+    label = Markup.escape(caption)
     return Markup(f'{head} role="img" aria-label="{label}">{body.strip()}')  # noqa: S704 (our own figure)

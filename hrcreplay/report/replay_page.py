@@ -1,15 +1,39 @@
-"""The part of the page with the 3-D replay: its data, our scripts, and the two libraries that are bundled with it."""
+"""The part of the page with the 3-D replay: its data, our scripts, and the two libraries that are bundled with it.
+
+The data are a JSON header and one block of deflated numbers, as small as they can be: positions are whole millimetres,
+joints 0.1 mrad, speeds mm/s, int16, column by column, each as the difference from the one before it, low bytes before
+high bytes. ``static/data.js`` reads it again.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import base64
+import json
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from importlib import resources
+from typing import Any
 
+import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
+from numpy.typing import NDArray
 
-from hrcreplay.report.page_data import replay_data
-from hrcreplay.report.replay_scene import ReplayScene
+from hrcreplay.records import Floats, Ints
+from hrcreplay.report.drawing import BONES
+from hrcreplay.report.limbs import part_name_text
+from hrcreplay.report.metrics import seconds_from
+from hrcreplay.report.replay_scene import (
+    RATE_HZ,
+    SHOWN_POINTS,
+    VOLUME_HZ,
+    MethodTrack,
+    ReplayScene,
+    VolumeTrack,
+    at_rate,
+)
 
 #: What the browser imports by name, and the file that it is.
 MODULES = {
@@ -81,3 +105,154 @@ def script(text: str) -> Markup:
 
 def _text(path: str) -> str:
     return resources.files("hrcreplay.report").joinpath(*path.split("/")).read_text("utf-8")
+
+
+#: Stored for NaN.
+MISSING = -32768
+_LARGEST = 32767
+#: The block may take so many bytes in base64; the volumes come at the highest of these rates that keeps to it.
+BUDGET_BYTES = 9_000_000
+VOLUME_RATES_HZ = (VOLUME_HZ, 5.0, 2.5, 1.0, 0.5, 0.2)
+#: Hulls are hardly ever deflated below this share.
+_AT_BEST = 0.3
+
+
+class NumberBlock:
+    """Arrays of int16 one behind the other, and a list of where each is."""
+
+    def __init__(self) -> None:
+        self.entries: dict[str, dict[str, Any]] = {}
+        self._parts: list[bytes] = []
+        self._at = 0
+
+    def add(self, name: str, values: Floats | Ints, unit: float = 1.0) -> None:
+        """Adds an array whose rows are instants; ``unit`` is the step of one count. NaN stays NaN.
+
+        Where a value is too large for 16 bits, all steps are larger.
+        """
+        table = np.asarray(values).reshape(len(values), math.prod(values.shape[1:]))
+        largest = max((float(np.abs(column[np.isfinite(column)]).max(initial=0.0)) for column in table.T), default=0.0)
+        unit = max(unit, largest / _LARGEST)
+        steps = np.array([_steps(column, unit) for column in table.T], dtype=np.uint16)
+        self._parts += [(steps & 0xFF).astype(np.uint8).tobytes(), (steps >> 8).astype(np.uint8).tobytes()]
+        self.entries[name] = {"at": self._at, "rows": len(table), "columns": table.shape[1], "unit": unit}
+        self._at += 2 * steps.size
+
+    def deflated(self) -> bytes:
+        """All of it as a zlib stream."""
+        return zlib.compress(b"".join(self._parts), 6)
+
+
+def _steps(column: NDArray[Any], unit: float) -> NDArray[np.uint16]:
+    """(n,) the differences of a column's counts, modulo 2^16."""
+    finite = np.isfinite(column)
+    counts = np.where(finite, np.round(np.where(finite, column, 0.0) / unit), MISSING).astype(np.int32)
+    return np.diff(counts, prepend=0).astype(np.uint16)
+
+
+def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tuple[str, str]:
+    """The header as JSON and the block in base64.
+
+    Args:
+        scene: What to show.
+        budget_bytes: The block may be so long; the volumes' rate gives way first.
+    """
+    block = NumberBlock()
+    header = _header(scene)
+    block.add("points", scene.points_m, 1e-3)
+    block.add("body", scene.body_m, 1e-3)
+    for name, track in scene.methods.items():
+        _add_track(block, name, track)
+    motion = block.deflated()
+    left = budget_bytes * 3 // 4 - len(motion)
+    volumes, hulls, rate_hz = _volumes_within(scene.volumes, left)
+    header["volumes"] = {
+        "limbs": list(scene.volumes.limbs),
+        "limb_names": [part_name_text(limb) for limb in scene.volumes.limbs],
+        "rate_hz": rate_hz,
+        "at_s": [round(at_s, 4) for at_s in seconds_from(hulls.t_ns, scene.t0_ns).tolist()],
+        "entries": volumes.entries,
+    }
+    header["entries"] = block.entries
+    packed = volumes.deflated()
+    header["bytes"] = [len(motion), len(packed)]
+    text = json.dumps(header, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c"), base64.b64encode(motion + packed).decode()
+
+
+def _header(scene: ReplayScene) -> dict[str, Any]:
+    robot = scene.robot
+    return {
+        "rate_hz": RATE_HZ,
+        "count": len(scene.t_ns),
+        "start_s": round((int(scene.t_ns[0]) - scene.t0_ns) * 1e-9, 6),
+        "bones": [[SHOWN_POINTS.index(a), SHOWN_POINTS.index(b)] for a, b in BONES],
+        "body": {
+            "parts": [part_name_text(part) for part in scene.body_parts],
+            "radius_m": scene.body_radius_m.tolist(),
+        },
+        "robot": {
+            "links": list(robot.links),
+            "radius_m": robot.radius_m.tolist(),
+            "ends_m": robot.ends_m.tolist(),
+            "moved_by": robot.moved_by.tolist(),
+            "screws": robot.screws.tolist(),
+            "tcp_m": robot.tcp_m.tolist(),
+            "base_m": robot.base_m.tolist(),
+        },
+        "methods": {
+            name: {
+                "events": [_event(asdict(event)) for event in track.events],
+                "names": {kind: list(texts) for kind, (texts, _) in track.names.items()},
+            }
+            for name, track in scene.methods.items()
+        },
+        "order": list(scene.methods),
+    }
+
+
+def _event(event: Mapping[str, Any]) -> dict[str, Any]:
+    """An event with rounded numbers; null for what is not known."""
+    found: dict[str, Any] = {}
+    for name, value in event.items():
+        found[name] = (round(value, 3) if math.isfinite(value) else None) if isinstance(value, float) else value
+    found["limb"] = part_name_text(event["limb"]) if event["limb"] else ""
+    return found
+
+
+def _add_track(block: NumberBlock, name: str, track: MethodTrack) -> None:
+    for joints in ("q", "stop_q"):
+        block.add(f"{name}/{joints}", getattr(track, joints), 1e-4)
+    for metres in ("ref_m", "tcp_m", "ref_speed", "tcp_speed", "distance_m", "body_m", "horizon_s"):
+        block.add(f"{name}/{metres}", getattr(track, metres), 1e-3)
+    block.add(f"{name}/certified", track.certified)
+    for kind, (_, index) in track.names.items():
+        block.add(f"{name}/{kind}", index)
+
+
+def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, VolumeTrack, float | None]:
+    """The volumes at the highest rate that fits into so many deflated bytes; None: at no rate."""
+    counts = np.diff(volumes.offsets)
+    for rate_hz in VOLUME_RATES_HZ if len(volumes.t_ns) else ():
+        rows = at_rate(volumes.t_ns, rate_hz)
+        if _AT_BEST * 6 * counts[rows].sum() > left:
+            continue
+        hulls = volumes.rows(rows)
+        block = _hulls(hulls)
+        if len(block.deflated()) <= left:
+            return block, hulls, rate_hz
+    nothing = volumes.rows(np.zeros(0, np.int64))
+    return _hulls(nothing), nothing, None
+
+
+def _hulls(hulls: VolumeTrack) -> NumberBlock:
+    """The vertices in order of their height within each hull, which makes their differences small."""
+    block = NumberBlock()
+    owner = np.repeat(np.arange(len(hulls.t_ns)), np.diff(hulls.offsets))
+    order = np.lexsort((hulls.vertices_m[:, 0], hulls.vertices_m[:, 1], hulls.vertices_m[:, 2], owner))
+    block.add("vertices", hulls.vertices_m[order], 1e-3)
+    block.add("limb", hulls.limb)
+    block.add("count", np.diff(hulls.offsets))
+    block.add("radius", hulls.radius_m, 1e-3)
+    block.add("horizon", hulls.horizon_s, 1e-3)
+    return block

@@ -10,7 +10,7 @@ from matplotlib.patches import Patch, Polygon
 
 from hrcreplay.records import Floats
 from hrcreplay.report import drawing
-from hrcreplay.report.drawing import RenderedHull, outline, render_hulls, view_from
+from hrcreplay.report.projection import RenderedHull, View, outline, render_hulls, view_from
 from hrcreplay.report.replay_scene import RATE_HZ, MethodTrack, ReplayScene, posed
 from hrcreplay.report.tables import reason_text
 
@@ -93,7 +93,7 @@ def _stored(scene: ReplayScene, row: int) -> list[tuple[Floats, float]]:
     ]
 
 
-def volumes_outlines(volumes: list[tuple[Floats, float]], view: drawing.View) -> list[Floats]:
+def volumes_outlines(volumes: list[tuple[Floats, float]], view: View) -> list[Floats]:
     """(k, 2) the outline of each volume in a view [m]."""
     return [outline(vertices, radius, view) for vertices, radius in volumes]
 

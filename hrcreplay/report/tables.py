@@ -15,49 +15,6 @@ from hrcreplay.records import JOINTS
 from hrcreplay.report.metrics import ANGLES, Metric
 from hrcreplay.robot.model import RobotModel
 
-#: Below each figure.
-CAPTIONS = {
-    "fig14_speed": (
-        "As the paper's Fig. 14. Programmed speed of the TCP; its actual speed, braking shaded; and the smallest "
-        "distance, surface to surface, between the robot and what the person could reach within the tick's horizon."
-    ),
-    "status": (
-        "What the robot did over time. Limited: held by a safety constraint or a limit. Above each bar, in grey, when "
-        "it was near the person; solid, when it then stood although its programme moves. Where stretches are narrower "
-        "than a line, the gravest status is drawn."
-    ),
-    "stationary_share": (
-        "Share of the ticks near the person at which the robot stood still although its programme moves. The hatched "
-        "bars are the paper's own numbers, from its own data: they can be compared in kind only."
-    ),
-    "fig13_path": (
-        "As the paper's Fig. 13. Programmed and actual path of the TCP, and the largest deviation between them with "
-        "its length. Shaded: the swept volumes of the person at that tick. The paper's own deviation is 0.221 m."
-    ),
-    "robot_links": (
-        "The robot as its distances see it: a capsule around each collision shape of its links, at the tick of the "
-        "smallest separation, beside the swept volumes of the person. The square is the robot's base."
-    ),
-    "fig17_volumes": (
-        "As the paper's Fig. 17. What the person could reach within the stopping time at four instants, limb radii "
-        "included: from positions and velocities; by the older method, from positions alone; and as this run did it, "
-        "where that is neither."
-    ),
-    "fig18_coordinate": (
-        "As the paper's Fig. 18. One coordinate of the person as each camera saw it and as fused, and where the log "
-        "has ground truth, the errors."
-    ),
-    "fusion_error": (
-        "Root mean square error against ground truth, of each camera's raw angles and of the fused state."
-    ),
-    "joint_angles": (
-        "All twelve joints of the human model: the cameras' raw values (dots) and the fused state (line)."
-    ),
-    "data_quality": (
-        "When each camera's frames held the person (pale), when the filter used them (solid), and when it had none."
-    ),
-}
-
 #: Rows of the comparisons: label, and suffix of the metrics' names.
 PLAN_SAFETY = (
     ("ticks", "ticks"),

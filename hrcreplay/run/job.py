@@ -6,12 +6,15 @@ Also the files behind ``robot.urdf``: the URDF and the meshes of its links, whic
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import tomllib
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypedDict
+
+import numpy as np
 
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell, load_cell
@@ -227,6 +230,42 @@ def resolve(
         prediction=load_limits(settings.limits.prediction),
         earlier=source if earlier is not None else None,
     )
+
+
+def job_of_run(folder: Path) -> Job:
+    """The job that a run folder was made by, from its run.json alone: no log and no file of limits is looked for.
+
+    Raises:
+        SettingsError: No run folder, or one of another version.
+    """
+    meta = run_folder.read_meta(folder)
+    if missing := [key for key in (*_NEEDED, "limits") if key not in meta]:
+        raise SettingsError(f"{folder}: its run.json lacks {missing[0]}, so another version made it")
+    return Job(
+        command=meta["command"],
+        log=Path(meta["inputs"][0]["path"]),
+        log_sha256=meta["inputs"][0]["sha256"],
+        settings=load_settings(None, (), meta["settings"]),
+        cell=Cell.from_dict(meta["cell"]) if meta["cell"] else None,
+        task=meta["task"],
+        start_s=meta["span_s"][0],
+        end_s=meta["span_s"][1],
+        tracking=_limits_of(meta["limits"]["tracking"]),
+        prediction=_limits_of(meta["limits"]["prediction"]),
+        earlier=folder,
+    )
+
+
+def _limits_of(plain: dict[str, Any]) -> LimitSet:
+    """The limit set of which ``plain_limits`` gave the JSON form."""
+
+    def bound(name: str, value: Any) -> Any:
+        if not isinstance(value, list):
+            return value
+        none = -math.inf if name.endswith("_min") else math.inf
+        return np.array([none if number is None else number for number in value], dtype=float)
+
+    return LimitSet(**{name: bound(name, value) for name, value in plain.items()})
 
 
 def job_without_log(command: str, where: Path, settings: Settings, cell_file: Path | None) -> Job:

@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from hrcreplay.errors import SettingsError
 from hrcreplay.human.body_capsules import PARTS, part_radii
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
-from hrcreplay.report import figures, page, tables
-from hrcreplay.report.figures_human import Instant
-from hrcreplay.report.figures_robot import LinkPose
+from hrcreplay.report import drawing, figures, page, tables
+from hrcreplay.report.figures import FigureData, FigureKind
 from hrcreplay.report.limbs import add_limbs
 from hrcreplay.report.metrics import Metric, MetricTable
 from hrcreplay.report.metrics_contact import add_contact
 from hrcreplay.report.metrics_data import add_fusion, add_occupancy, add_quality
 from hrcreplay.report.metrics_plan import add_plan
+from hrcreplay.report.moments import start_ns
 from hrcreplay.report.replay_scene import ReplayScene, replay_scene
 from hrcreplay.report.scene_mcap import write_scene
+from hrcreplay.report.snapshot import snapshot
 from hrcreplay.report.story import lines
 from hrcreplay.report.tables import PageTable
 from hrcreplay.run import build
-from hrcreplay.run.job import Job
-from hrcreplay.run.prediction import PredictionStage
+from hrcreplay.run.figure_data import computed
+from hrcreplay.run.job import Job, job_of_run, resolve
 from hrcreplay.run.why import Record, stop_table
 from hrcreplay.store import run_folder
-from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run, RunWriter
 
 
@@ -53,8 +53,7 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any], log: Log | N
     if prediction_stage.method == "sound" and occupancy.legs:
         radii["legs, of sound"] = occupancy.legs_radius_m
     folder = writer.partial / "figures"
-    robot = _links(job, prediction_stage, run)
-    figures.draw_all(run, folder, found, **near, volumes=_instants(prediction_stage, run), robot=robot)
+    figures.draw_all(figure_data(job, run, found, figures.wanted(run, found)), folder)
     shown = [
         tables.limit_table(job.prediction, use="prediction"),
         tables.limit_table(job.tracking, use="tracking"),
@@ -72,7 +71,7 @@ def scene_of(job: Job, run: Run) -> ReplayScene | None:
         return None
     radii_m = part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
     parts = dict(zip(PARTS, radii_m.tolist(), strict=True))
-    return replay_scene(run, build.robot(job, run.T_world_base), figures.start_ns(run), parts)
+    return replay_scene(run, build.robot(job, run.T_world_base), start_ns(run), parts)
 
 
 def _stops(job: Job, log: Log, run: Run, slow_m_per_s: float, found: dict[str, Metric]) -> tuple[PageTable, ...]:
@@ -107,60 +106,13 @@ def summary(folder: Path) -> list[str]:
     return lines(run, compute(run, **_bounds(run.meta["settings"])))
 
 
-def _bounds(settings: Mapping[str, Any]) -> dict[str, float]:
+def _bounds(settings: Mapping[str, Any]) -> dict[str, Any]:
     """What the metrics ask of the settings."""
     return {
         "near_m": settings["report"]["near_m"],
         "stationary_m_per_s": settings["report"]["stationary_m_per_s"],
         "gap_s": settings["logs"]["gap_s"],
     }
-
-
-def _instants(prediction_stage: PredictionStage, run: Run) -> list[Instant]:
-    """The swept volumes by the paper's two methods and the run's own at the instants that Fig. 17 shows."""
-    wanted = figures.instants(run)
-    if not len(wanted):
-        return []
-    states = _states(run, wanted)
-    methods = dict.fromkeys(("paper", "positions", prediction_stage.method))
-    by_method = {method: prediction_stage.volumes(states, method=method) for method in methods}
-
-    return [
-        (int(t), {method: _hulls(volumes, row) for method, volumes in by_method.items()})
-        for row, t in enumerate(states.t_ns)
-    ]
-
-
-def _links(job: Job, prediction_stage: PredictionStage, run: Run) -> LinkPose | None:
-    """The robot's capsules and the swept volumes at the tick of the smallest separation."""
-    if run.motion is None or not len(run.motion) or run.T_world_base is None:
-        return None
-    robot = build.robot(job, run.T_world_base)
-    row = run.motion.iloc[figures.nearest_tick(run.motion)]
-    q = row[[f"q{axis}" for axis in range(1, robot.nv + 1)]].to_numpy(dtype=float)
-    if not np.isfinite(q).all():
-        return None
-    states = _states(run, np.array([row["t_ns"]]))
-    horizon_s = float(row["horizon_s"]) if "horizon_s" in row else None
-    hulls = _hulls(prediction_stage.volumes(states, horizon_s), 0) if len(states) else {}
-    return LinkPose(
-        t_ns=int(row["t_ns"]),
-        distance_m=float(row["distance_m"]),
-        bodies=tuple(segment.body for segment in robot.segments),
-        ends_m=robot.pose(q, np.zeros(robot.nv)).ends_m,
-        radius_m=np.array([segment.radius_m for segment in robot.segments]),
-        volumes={limb: (points, radius) for limb, (points, radius) in hulls.items() if np.isfinite(points).all()},
-    )
-
-
-def _states(run: Run, wanted_ns: Ints) -> HumanStates:
-    """The fused person at some ticks."""
-    batches = read_states(run.folder / "state.parquet", 4096)
-    return HumanStates.join([batch.rows(np.isin(batch.t_ns, wanted_ns)) for batch in batches])
-
-
-def _hulls(volumes: SweptVolumes, row: int) -> dict[str, tuple[Floats, float]]:
-    return {limb: (volumes.vertices(row, i), float(volumes.radius_m[row, i])) for i, limb in enumerate(volumes.limbs)}
 
 
 def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float = 0.2) -> dict[str, Metric]:
@@ -192,3 +144,109 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
     )
     add_contact(metrics, run, stationary_m_per_s)
     return metrics.sorted()
+
+
+def take_still(folder: Path, at_s: float, out: Path | None) -> Path:
+    """Draws a run at the instant of its replay that is nearest to ``at_s``.
+
+    Args:
+        folder: A run folder whose run moved a robot.
+        at_s: By the report's clock [s].
+        out: PNG file to make; None: ``snapshot-<seconds>.png`` in the folder that one works in.
+
+    Raises:
+        SettingsError: No run folder, no such instant, or the file is there or cannot be written.
+    """
+    if not run_folder.is_run(folder):
+        raise SettingsError(f"--snapshot: {folder} is no run folder; make one with: hrcreplay report {folder}")
+    run = run_folder.read(folder)
+    scene = scene_of(resolve("report", folder), run)
+    if scene is None:
+        raise SettingsError(f"--snapshot: {folder} moved no robot; make a report of it first")
+    first, last = scene.seconds[[0, -1]].tolist()
+    if not first <= at_s <= last:
+        raise SettingsError(f"--snapshot {at_s:g}: found an instant outside the run; from {first:g} to {last:g} s")
+    row = int(abs(scene.seconds - at_s).argmin())
+    path = out or Path(f"snapshot-{scene.seconds[row]:.2f}.png")
+    with drawing.style():
+        figure = snapshot(scene, row)
+        figure.set_facecolor("white")
+        run_folder.write_whole(path, drawing.png_bytes(figure))
+    return path
+
+
+def figure_data(job: Job, run: Run, metrics: Mapping[str, Metric], kinds: Sequence[FigureKind]) -> FigureData:
+    """All that some figures of a run are drawn from.
+
+    Args:
+        job: That made the run.
+        run: The run's tables.
+        metrics: The run's metrics.
+        kinds: The figures.
+    """
+    predicted = computed(job, run, [kind.predicted for kind in kinds])
+    return FigureData(run=run, metrics=metrics, **_bounds(job.settings.model_dump()), **predicted)
+
+
+def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
+    """Draws the figures of a number or a name from a run folder alone: the same bytes as a report of that run has.
+
+    Args:
+        folder: A run folder.
+        key: Number as the paper has it, or name of the file.
+        out: Folder for them; None: the one that one works in.
+
+    Returns:
+        The files written: PNG and SVG of each figure.
+
+    Raises:
+        SettingsError: No run folder, no such figure, the run lacks what it needs, or a file is there already.
+    """
+    kinds = figures.find(key)
+    if not kinds:
+        there = ", ".join(map(figures.label, figures.FIGURES))
+        raise SettingsError(f"--figure {key}: no such figure; there are {there}")
+    run, metrics = _recorded(folder, "--figure")
+    for kind in kinds:
+        if why := figures.missing(kind, run, metrics):
+            raise SettingsError(f"--figure {key}: {folder} has not what it needs: {why}")
+    to = out or Path()
+    paths = [to / f"{kind.name}.{suffix}" for kind in kinds for suffix in ("png", "svg")]
+    if taken := [path for path in paths if path.exists()]:
+        raise SettingsError(f"{taken[0]}: exists already; name another folder with --out, or remove it")
+    data = figure_data(job_of_run(folder), run, metrics, kinds)
+    with tempfile.TemporaryDirectory() as made:
+        drawn = figures.draw_all(data, Path(made), kinds)
+        if len(drawn) < len(kinds):
+            raise SettingsError(
+                f"--figure {key}: {folder} has not what it needs: the person was not known well enough then"
+            )
+        try:
+            to.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SettingsError(f"{to}: cannot be made ({error.strerror}); name another folder with --out") from error
+        for path in paths:
+            run_folder.write_whole(path, (Path(made) / path.name).read_bytes())
+    return paths
+
+
+def list_figures(folder: Path | None) -> list[str]:
+    """A line for each figure: number or name, title and, of a run folder, whether the run has what it needs."""
+    run = None if folder is None else _recorded(folder, "--list-figures")
+    lines = []
+    for kind in figures.FIGURES:
+        why = "" if run is None else figures.missing(kind, *run)
+        state = "" if run is None else f"lacks: {why}" if why else "there"
+        lines.append(f"{figures.label(kind):<17}{kind.title:<76}{state}".rstrip())
+    return lines
+
+
+def _recorded(folder: Path, option: str) -> tuple[Run, dict[str, Metric]]:
+    """The tables and metrics of a run folder; without metrics.json these are computed."""
+    if not run_folder.is_run(folder):
+        raise SettingsError(f"{option}: {folder} is no run folder; make one with: hrcreplay report {folder}")
+    run = run_folder.read(folder)
+    if "settings" not in run.meta or "occupancy" not in run.meta["settings"]:
+        raise SettingsError(f"{option}: {folder} is no run of fuse, predict, plan, report or live")
+    path = folder / "metrics.json"
+    return run, json.loads(path.read_text()) if path.exists() else compute(run, **_bounds(run.meta["settings"]))

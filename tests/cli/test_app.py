@@ -56,6 +56,28 @@ def test_help_imports_nothing_heavy() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 
 
+def test_figures_are_listed_with_what_a_run_lacks_for_them(run: Run) -> None:
+    code, every, _ = run("report", "--list-figures")
+    assert code == 0
+    assert [line.split("  ")[0].strip() for line in every.splitlines()][:6] == ["5", "7, 8", "9", "13a", "13b", "14"]
+    run("fuse", DEMO, "--out", "here", *SHORT)
+    code, out, _ = run("report", "here", "--list-figures")
+    assert code == 0
+    state = {line[:17].strip(): line[93:] for line in out.splitlines()}
+    assert state["18"] == "there"
+    assert state["14"] == "lacks: it moved no robot; run plan or report on its log"
+    assert state["9"] == "lacks: it has no swept volumes; run predict, plan or report on its log"
+    assert state["17"] == "lacks: the person is not known for three seconds"
+    code, out, err = run("report", "here", "--figure", 14)
+    assert (code, out) == (2, "")
+    assert err.strip() == f"hrcreplay: --figure 14: here has not what it needs: {state['14'].removeprefix('lacks: ')}"
+    code, out, _ = run("report", "here", "--figure", 18, "--out", "drawn")
+    assert (code, out) == (0, "drawn/fig18_coordinate.png\ndrawn/fig18_coordinate.svg\n")
+    code, _, err = run("report", "here", "--figure", 18, "--out", "drawn")
+    assert code == 2
+    assert "drawn/fig18_coordinate.png: exists already" in err
+
+
 def test_stdout_carries_only_the_run_folder(run: Run) -> None:
     code, out, err = run("fuse", DEMO, "--out", "here", *SHORT)
     assert (code, out) == (0, "here\n")
@@ -130,6 +152,14 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
     "calibrate out exists": (("calibrate", DEMO, "--out", "other.toml"), 2, "other.toml: exists already"),
     "calibrate up": (("calibrate", DEMO, "--out", "c.toml", "--up", "sky"), 2, "--up sky: would be right: 3 numbers"),
     "calibrate reference": (("calibrate", DEMO, "--out", "c.toml", "--reference", "eye"), 2, "found 'eye'"),
+    "figure that there is not": (
+        ("report", DEMO, "--figure", 12),
+        2,
+        "--figure 12: no such figure; there are 5, 7, 8, 9, 13a, 13b, 14, 15, 16, 17, 18, horizon, volume_horizon,",
+    ),
+    "figure of a log": (("report", DEMO, "--figure", "14"), 2, "is no run folder; make one with: hrcreplay report"),
+    "figures of a log": (("report", DEMO, "--list-figures"), 2, "--list-figures: "),
+    "nothing to report on": (("report",), 2, "report: found neither log nor run folder; give one"),
     "not a run folder": (("report", "taken"), 3, "taken"),
 }
 

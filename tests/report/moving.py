@@ -10,7 +10,7 @@ import pandas as pd
 from hrcreplay.human.body_capsules import PARTS, part_axes
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import Floats
-from hrcreplay.report import figures
+from hrcreplay.report.moments import start_ns
 from hrcreplay.report.replay_scene import ReplayScene, replay_scene
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.store.columns import body_columns
@@ -54,7 +54,7 @@ def moving_run(seconds: float = 8.0) -> Run:
 
 def moving_scene(run: Run) -> ReplayScene:
     """The replay of such a run."""
-    scene = replay_scene(run, robot(run), figures.start_ns(run), BODY_RADII_M)
+    scene = replay_scene(run, robot(run), start_ns(run), BODY_RADII_M)
     assert scene is not None
     return scene
 

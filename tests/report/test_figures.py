@@ -5,30 +5,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from hrcreplay.report import figures, figures_human, figures_robot
-from hrcreplay.report.drawing import RenderedHull, outline, render_hulls, view_from
+from hrcreplay.report import figures, figures_prediction, figures_robot
+from hrcreplay.report.figures import FIGURES, FigureData
+from hrcreplay.report.figures_prediction import Growth, Sweep, Walk
+from hrcreplay.report.moments import instants
+from hrcreplay.report.projection import RenderedHull, outline, render_hulls, view_from
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
+from tests.report.moving import moving_run
 from tests.report.synthetic import RADII_M, T0_NS, make_run, volumes_at
 
-ALL = {
-    "fig13_path",
-    "fig14_speed",
-    "fig17_volumes",
-    "fig18_coordinate",
-    "joint_angles",
-    "stationary_share",
-    "fusion_error",
-    "data_quality",
-    "status",
-}
+#: Of the made-up run, whose robot has no joints: all but those that show its links.
+ALL = {kind.name for kind in FIGURES} - {"horizon", "fig15_storyboard", "robot_links"}
+#: Those of the robot that need no prediction.
+OF_ROBOT = {"fig13a_path", "fig13b_deviation", "fig14_speed", "stationary_share", "status"}
 
 
-def draw(run: Run, folder: Path, *, volumes: bool = True) -> set[str]:
-    metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
-    ticks = figures.instants(run) if volumes else np.zeros(0, dtype=np.int64)
-    found = [
+def data_of(run: Run, *, predicted: bool = True) -> FigureData:
+    """What figures are drawn from; the predictions are made up as well."""
+    data = FigureData(run, compute(run, near_m=0.5, stationary_m_per_s=0.001), near_m=0.5, stationary_m_per_s=0.001)
+    ticks = instants(run)
+    if not predicted or not len(ticks):
+        return data
+    volumes = [
         (
             int(k),
             {
@@ -38,8 +39,17 @@ def draw(run: Run, folder: Path, *, volumes: bool = True) -> set[str]:
         )
         for k in ticks
     ]
-    names = figures.draw_all(run, folder, metrics, near_m=0.5, stationary_m_per_s=0.001, volumes=found)
-    return set(names)
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    walk = Walk(int(ticks[0]), 0.377, square[0], 0.3, 0.5, (-0.4, 0.6), square[[0, 2]], square, square[:2] * 0.2)
+    angle = np.linspace(0.2, 1.0, 21)
+    arc = 0.3 * np.column_stack([np.cos(angle), np.zeros(21), np.sin(angle)])
+    sweep = Sweep(int(ticks[0]), "LRA", np.zeros(3), arc[3], arc, arc[[10]] / np.cos(0.4), square[[0, 2]] * 0.2)
+    growth = Growth(int(ticks[0]), np.array([0.0, 0.1]), {"paper": np.array([0.1, 0.2])})
+    return dataclasses.replace(data, instants=volumes, walk=walk, sweep=sweep, growth=growth)
+
+
+def draw(run: Run, folder: Path, *, predicted: bool = True) -> set[str]:
+    return set(figures.draw_all(data_of(run, predicted=predicted), folder))
 
 
 def test_the_same_run_draws_the_same_bytes(tmp_path: Path) -> None:
@@ -51,13 +61,13 @@ def test_the_same_run_draws_the_same_bytes(tmp_path: Path) -> None:
     for name in files:
         first, second = ((tmp_path / folder / name).read_bytes() for folder in ("a", "b"))
         assert first == second, name
-        assert len(first) < 300_000 or name.endswith(".svg"), name
+        assert len(first) < 400_000 or name.endswith(".svg"), name
         assert b"Matplotlib" not in first or name.endswith(".png"), name
 
 
 def test_what_has_no_data_is_not_drawn(tmp_path: Path) -> None:
     run = make_run(4.0, human=False, robot=False)
-    assert draw(run, tmp_path, volumes=False) == {"fig18_coordinate", "joint_angles", "data_quality"}
+    assert draw(run, tmp_path, predicted=False) == {"fig18_coordinate", "joint_angles", "data_quality"}
 
 
 def test_a_person_never_seen_and_a_robot_that_never_moved(tmp_path: Path) -> None:
@@ -69,8 +79,8 @@ def test_a_person_never_seen_and_a_robot_that_never_moved(tmp_path: Path) -> Non
     state = state.assign(valid_kinect=False, valid_xtion=False)
     motion = run.motion.assign(distance_m=np.nan, limb=None, tcp_speed=0.0, status="braking", reason="no person yet")
     run = dataclasses.replace(run, state=state, motion=motion, measurements=None, occupancy=None, baselines={})
-    assert len(figures.instants(run)) == 0
-    assert draw(run, tmp_path) == {"fig13_path", "fig14_speed", "stationary_share", "status", "joint_angles"}
+    assert len(instants(run)) == 0
+    assert draw(run, tmp_path) == OF_ROBOT | {"joint_angles"}
 
 
 def test_volumes_show_every_method_and_limb_in_its_own_size() -> None:
@@ -79,29 +89,100 @@ def test_volumes_show_every_method_and_limb_in_its_own_size() -> None:
     limbs = {limb: (vertices, 0.1) for limb, vertices in volumes_at(2.0, 0.05).items()}
     tall = limbs | {"LEGS": (np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), 0.5)}
     k = T0_NS + 2_000_000_000
-    plain = figures_human.volumes([(k, {"paper": limbs})], run.state, T0_NS)
+    plain = figures_prediction.volumes([(k, {"paper": limbs})], run.state, T0_NS)
     assert "LEGS" not in {text.get_text() for text in plain.legends[0].get_texts()}
-    found = figures_human.volumes([(k, {"paper": limbs, "sound": tall})], run.state, T0_NS)
+    found = figures_prediction.volumes([(k, {"paper": limbs, "sound": tall})], run.state, T0_NS)
     assert {text.get_text() for text in found.legends[0].get_texts()} == {*limbs, "LEGS"}
     assert [ax.get_ylabel().split("\n")[0] for ax in found.axes] == ["paper", "sound"]
-    low, high = found.axes[0].get_ylim()  # one scale for both
+    low, high = found.axes[1].get_ylim()
     assert high - low > 9.0 * np.cos(0.28)
+    scales = [np.diff(ax.get_xlim()) / ax.get_position().width for ax in found.axes]
+    assert scales[0] == pytest.approx(scales[1])
 
 
-def test_a_robot_that_kept_to_its_path_left_it_nowhere() -> None:
+def test_a_robot_that_kept_to_its_path_left_it_nowhere(tmp_path: Path) -> None:
     run = make_run(5.0)
     assert run.motion is not None
     kept = run.motion.assign(tcp_x=run.motion["ref_x"], tcp_y=run.motion["ref_y"], tcp_z=run.motion["ref_z"])
-    for motion, title in ((run.motion, "Largest deviation, at"), (kept, "No deviation")):
-        last = figures_robot.path(motion, None, T0_NS).axes[2]
-        assert last.get_title().startswith(title)
-        assert bool(last.texts) == (motion is run.motion)
+    (ax,) = figures_robot.deviation(run.motion, None, T0_NS).axes
+    assert [text.get_text() for text in ax.texts] == [f"{figures_robot.largest_deviation(run.motion).length_m:.3f} m"]
+    kept_run = dataclasses.replace(run, motion=kept)
+    (kind,) = figures.find("13b")
+    why = figures.missing(kind, kept_run, data_of(kept_run).metrics)
+    assert why == "its TCP never left the programmed path"
+    assert draw(kept_run, tmp_path, predicted=False) >= {"fig13a_path", "fig14_speed"}
+    assert not (tmp_path / "fig13b_deviation.png").exists()
+
+
+def test_every_figure_is_one_column_wide_and_has_a_name_of_its_own(tmp_path: Path) -> None:
+    names, numbers = [kind.name for kind in FIGURES], [n for kind in FIGURES for n in kind.numbers]
+    assert len(set(names)) == len(names)
+    assert numbers == ["5", "7", "8", "9", "13a", "13b", "14", "15", "16", "17", "18"]
+    assert all(kind.caption.endswith(".") and set(kind.needs) <= set(figures.NEEDS) for kind in FIGURES)
+    for name in draw(make_run(5.0), tmp_path):
+        assert 'width="252pt"' in (tmp_path / f"{name}.svg").read_text()[:600], name  # 3.5 in
+        with Image.open(tmp_path / f"{name}.png") as image:
+            assert image.width == 1050
+
+
+def test_a_figure_is_found_by_number_and_by_name() -> None:
+    found = {key: [kind.name for kind in figures.find(key)] for key in ("14", "Fig. 14", "16", "13", "13b", "horizon")}
+    assert found == {
+        "14": ["fig14_speed"],
+        "Fig. 14": ["fig14_speed"],
+        "16": ["fig15_storyboard"],
+        "13": ["fig13a_path", "fig13b_deviation"],
+        "13b": ["fig13b_deviation"],
+        "horizon": ["horizon"],
+    }
+    assert [figures.find(key) for key in ("12", "", "a", "fig99")] == [()] * 4
+
+
+def test_speed_and_horizon_show_the_runs_columns() -> None:
+    run = moving_run(4.0)
+    motion = run.motion
+    assert motion is not None
+    motion["tau_s"] = np.linspace(0.0, 0.3, len(motion))
+    seconds = (motion["t_ns"].to_numpy() - motion["t_ns"].iloc[0]) / 1e9
+    nominal, actual, separation = figures_robot.speed(motion, T0_NS, 0.5).axes
+    drawn = figures_robot.horizon(motion, T0_NS, 0.377).axes[0]
+    lines = [*(ax.lines[0] for ax in (nominal, actual, separation)), *drawn.lines[:2]]
+    for line, name in zip(lines, ("ref_speed", "tcp_speed", "distance_m", "horizon_s", "tau_s"), strict=True):
+        np.testing.assert_allclose(np.asarray(line.get_xdata(), dtype=float), seconds, atol=1e-9)
+        np.testing.assert_array_equal(np.asarray(line.get_ydata(), dtype=float), motion[name].to_numpy(dtype=float))
+    assert set(np.asarray(drawn.lines[2].get_ydata()).tolist()) == {0.377}
+
+
+def test_volumes_against_the_horizon_are_those_stored() -> None:
+    run = make_run(3.0)
+    assert run.occupancy is not None
+    occupancy = run.occupancy.assign(horizon_s=np.arange(len(run.occupancy)) // 6 * 0.001)
+    found = Growth(T0_NS, np.array([0.0, 0.1, 0.2]), {"paper": np.array([0.1, 0.2, 0.4])})
+    ax = figures_prediction.growth(found, occupancy, T0_NS).axes[0]
+    lines = {str(line.get_label()): np.asarray(line.get_xydata(), dtype=float) for line in ax.lines}
+    stored = lines["_"]
+    np.testing.assert_allclose(stored[:, 0], 0.001 * np.arange(len(occupancy) // 6))
+    np.testing.assert_allclose(stored[:, 1], 0.01 * (1 + 2 + 3 + 4 + 5 + 6))
+    assert lines["paper"][:, 1].tolist() == [0.1, 0.2, 0.4]
+    without = occupancy[(occupancy["limb"] != "HD") | (occupancy["horizon_s"] > 0.0)]  # one limb of one tick not known
+    assert len(figures_prediction.stored_sums(without)[0]) == len(occupancy) // 6 - 1
+
+
+def test_the_largest_deviation_is_where_the_tcp_was_furthest_from_every_point_of_the_path() -> None:
+    run = make_run(6.0)
+    assert run.motion is not None
+    reference, tcp = (run.motion[[f"{point}_{axis}" for axis in "xyz"]].to_numpy() for point in ("ref", "tcp"))
+    nearest = np.linalg.norm(tcp[:, None] - reference, axis=2).min(axis=1)  # to the vertices, which are dense
+    found = figures_robot.largest_deviation(run.motion)
+    assert found.length_m == pytest.approx(nearest.max(), abs=2e-3)
+    assert nearest[found.row] == pytest.approx(nearest.max(), abs=2e-3)
+    np.testing.assert_array_equal(found.at_m, tcp[found.row])
 
 
 def test_instants_are_a_second_apart_and_hold_the_nearest() -> None:
     run = make_run(12.0)
     assert run.motion is not None
-    ticks = figures.instants(run)
+    ticks = instants(run)
     assert np.diff(ticks) * 1e-9 == pytest.approx([1.0, 1.0, 1.0], abs=0.011)
     nearest = run.motion.sort_values("distance_m")["t_ns"].iloc[0]
     assert ticks[0] <= nearest <= ticks[-1]

@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from hrcreplay.records import JOINTS
+from hrcreplay.report.metrics import path_feet
 from hrcreplay.report.metrics_plan import cycles, waited_s
-from hrcreplay.report.path_feet import path_feet
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import T0_NS, make_run

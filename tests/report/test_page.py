@@ -13,6 +13,7 @@ from hrcreplay.human.model import LimitSet
 from hrcreplay.records import DOF
 from hrcreplay.report import figures, page, story, tables
 from hrcreplay.report import tables as wording
+from hrcreplay.report.figures import FigureData
 from hrcreplay.robot.control import control_step
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
@@ -86,7 +87,7 @@ def read(html: str) -> Reader:
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, run = tmp_path_factory.mktemp("figures"), make_run(8.0)
     metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
-    assert figures.draw_all(run, folder, metrics, near_m=0.5, stationary_m_per_s=0.001)
+    assert figures.draw_all(FigureData(run, metrics, near_m=0.5, stationary_m_per_s=0.001), folder)
     return folder
 
 
@@ -103,6 +104,15 @@ def test_page_is_self_contained_and_well_formed(html: str) -> None:
     assert len(reader.ids) == len(set(reader.ids))
     assert {link[1:] for link in reader.links if link.startswith("#")} <= set(reader.ids)
     assert not re.search(r"url\((?!#)", html)
+
+
+def test_page_shows_every_figure_drawn_under_its_caption(html: str, drawn: Path) -> None:
+    kinds = [kind for kind in figures.FIGURES if (drawn / f"{kind.name}.svg").exists()]
+    assert len(kinds) > 8
+    assert html.count("<figure>") == len(kinds)
+    text = " ".join(read(html).text)
+    for kind in kinds:
+        assert kind.caption in text
 
 
 def test_page_answers_with_the_metrics_values(html: str) -> None:

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import LIMBS, POINTS, Floats
-from hrcreplay.report.page_data import MISSING, NumberBlock, replay_data
+from hrcreplay.report.replay_page import MISSING, NumberBlock, replay_data
 from hrcreplay.report.replay_scene import SHOWN_POINTS, ReplayScene
 from hrcreplay.report.stop_list import stop_events
 from hrcreplay.robot.control.stopping import axis_by_axis, straight

@@ -1,4 +1,4 @@
-// Reads what page_data.py wrote: a JSON header, and int16 columns as differences, deflated.
+// Reads what replay_page.py wrote: a JSON header, and int16 columns as differences, deflated.
 
 const MISSING = -32768;
 
