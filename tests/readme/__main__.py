@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.readme.blocks import fill
-from tests.readme.measurements import ROOT, Measurement, load, measurements, of_people
+from tests.readme.measurements import ROOT, Measurement, load, measurements
 
 FACTS = ROOT / "docs" / "figures.json"
 README = ROOT / "README.md"
@@ -44,7 +44,6 @@ def main(arguments: list[str] | None = None) -> int:
     known = {measurement.name: measurement for measurement in measurements()}
     old = load(FACTS)
     facts = {name: old[name] for name in known if name in old}
-    facts["people.toml"] = {"command": "hrcreplay/limits/people.toml", "figures": of_people()}
     for name, measurement in known.items():
         if wanted and not name.startswith(wanted):
             continue

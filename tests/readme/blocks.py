@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from tests.readme.measurements import BASELINES, MARGINS, PLACES, PREDICTIONS, RECORDINGS, VARIANTS, Figures
+from tests.readme.measurements import BASELINES, HORIZONS_S, MARGINS, PLACES, RECORDINGS, VARIANTS, Figures
 
 Facts = Mapping[str, Any]
 Row = Iterable[str]
@@ -104,24 +104,20 @@ def recordings(facts: Facts) -> str:
     names = {"demo (simulated)": "audit demo", **{name: f"recording, {name}" for name in RECORDINGS}}
     rows = []
     for name, key in names.items():
-        people, paper = _of(facts, f"{key}, people"), _of(facts, f"{key}, paper")
-        pairs = [(people, "sound"), (paper, "sound"), (people, "paper"), (paper, "paper"), (people, "v2_a50")]
+        short, whole = (_of(facts, f"{key}, {horizon}") for horizon in HORIZONS_S)
+        pairs = [(of, method) for of in (short, whole) for method in ("sound", "v2_a50")]
         cells = [f"{_share(of[f'{method}_share'])}, {_m3(of[f'{method}_union_m3'])}" for of, method in pairs]
-        rows.append([name, *cells, _share(people["legs_share"])])
-    head = ["recording", *(f"`{method}`, `{limits}`" for method, limits in PREDICTIONS)]
-    return _table([*head, "capsules of v \u2264 2 m/s, a \u2264 50 m/s\u00b2", "lower body, `sound`"], rows)
+        points = [_share(whole[f"{method}_points_share"]) for method in ("sound", "paper")]
+        rows.append([name, *cells, points[0], f"{points[1]}, {_m3(whole['paper_union_m3'])}"])
+    until = [f"{1000 * horizon_s:.0f} ms" for horizon_s in HORIZONS_S.values()]
+    head = [f"{title}, {time}" for time in until for title in ("`sound`", "capsules")]
+    alone = [f"`{method}`, {until[1]}, points alone" for method in ("sound", "paper")]
+    return _table(["recording", *head, *alone], rows)
 
 
 def margins(facts: Facts) -> str:
     """What the default limits and margins rest on."""
-    people = _of(facts, "people.toml")
     other = {name: _m3(_of(facts, f"audit excerpt, {name}")["sound_union_m3"]) for name in MARGINS}
-    held = "all" if people["held"] == people["ticks"] else f"{people['held']:,}"
-    default = (
-        f"`people` is the default because it held {held} of the {people['ticks']:,} ticks of these {people['logs']} "
-        "logs that it was not fitted on; Table 1 holds fewer people, as the table shows. Nobody in these logs walked "
-        "fast: fit your own people with `fit-limits`, and ask `audit`."
-    )
     sigmas = (
         "`occupancy.sigmas` is 1. The reported deviations follow the surprises of the measurements, and all joints "
         f"are off at once in the worst direction; with 3 the volume on 15 s of the demo log is {other['3 sigma']} "
@@ -131,7 +127,7 @@ def margins(facts: Facts) -> str:
         f"Without the hand it is {other['no hand']}, without the distance of the body from "
         f"the model {other['no residual']}."
     )
-    items = (default, sigmas, parts)
+    items = (sigmas, parts)
     return "\n".join(_wrapped(item, "- ") for item in items)
 
 

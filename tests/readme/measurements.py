@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +13,11 @@ from tests.test_recordings import IMPORTS, SARA, SARA_CELL
 Figures = dict[str, Any]
 
 ROOT = Path(__file__).parents[2]
-PEOPLE = ROOT / "hrcreplay" / "limits" / "people.toml"
 DEMO = "datasets/demo.mcap"
 
-#: Predictions that are compared: method and limit set.
-PREDICTIONS = (("sound", "people"), ("sound", "paper"), ("paper", "people"), ("paper", "paper"))
+#: Horizons of the audits, by their names: what the robot needs at the speeds that it keeps beside people, and from full
+#: speed [s].
+HORIZONS_S = {"short": 0.1, "whole": 0.377}
 #: Baselines of the demo's table.
 BASELINES = ("scaling", "shield", "ssm", "none")
 #: Base of the robot: further away, as in the log, and nearer [m].
@@ -113,8 +112,8 @@ def of_audit(metrics: Mapping[str, Any]) -> Figures:
     found: Figures = {"ticks": metrics["audit_ticks"]["value"]}
     for method in _AUDITED:
         found[f"{method}_share"] = metrics[f"audit_{method}_{_PART}_covered_share"]["value"]
+        found[f"{method}_points_share"] = metrics[f"audit_{method}_{_PART}_points_share"]["value"]
         found[f"{method}_union_m3"] = metrics[f"audit_{method}_{_PART}_union_m3"]["value"]
-    found["legs_share"] = metrics["audit_sound_LEGS_covered_share"]["value"]
     return found
 
 
@@ -128,18 +127,9 @@ def of_sampling(found: Mapping[str, Any]) -> Figures:
     return {name: found[name] for name in ("samples", "states", "states_let_out", "share", "worst_mm")}
 
 
-def of_people() -> Figures:
-    """How the limit set ``people`` did on what it was not fitted on, as it tells itself."""
-    logs = tomllib.loads(PEOPLE.read_text())["provenance"]["logs"]
-    parts = [log["held_back"] for log in logs]
-    ticks = sum(part["ticks"] for part in parts)
-    held = sum(round(part["share"] * part["ticks"]) for part in parts)
-    return {"logs": len(logs), "ticks": ticks, "held": held}
-
-
 def measurements() -> list[Measurement]:
     """All of them, the quick ones first."""
-    found = [_audit(f"audit demo, {limits}", (f"{DEMO} --limits {limits}",), {}) for limits in ("people", "paper")]
+    found = [_audit(f"audit demo, {name}", (f"{DEMO} {_until(name)}",), {}) for name in HORIZONS_S]
     for name, options in DEMO_RUNS.items():
         command = f"hrcreplay report {DEMO} {options} --out {{tmp}}/run"
         files = {"cell.toml": _CELL.format(x=name.split()[-2])} if "--cell" in options else {}
@@ -151,7 +141,7 @@ def measurements() -> list[Measurement]:
     command = f"hrcreplay compare {DEMO} --out {{tmp}}/run"
     found.append(Measurement("compare", (command,), "run/compare.json", of_comparison, {}))
     for name, key in RECORDINGS.items():
-        found += [_recording(name, key, limits) for limits in ("people", "paper")]
+        found += [_recording(name, key, horizon) for horizon in HORIZONS_S]
     for (method, limits), samples in sorted(SAMPLES.items(), key=lambda item: item[1]):
         command = f"tests.soundness --json --samples {samples} --method {method} --limits {limits}"
         found.append(Measurement(f"soundness, {method}, {limits}", (command,), "", of_sampling, {}, sampled=True))
@@ -165,11 +155,15 @@ def _audit(name: str, commands: tuple[str, ...], files: Mapping[str, str]) -> Me
     return Measurement(name, (*before, last), "run/metrics.json", of_audit, files)
 
 
-def _recording(name: str, key: str, limits: str) -> Measurement:
-    title = f"recording, {name}, {limits}"
+def _until(horizon: str) -> str:
+    return f"--set occupancy.stop_s={HORIZONS_S[horizon]}"
+
+
+def _recording(name: str, key: str, horizon: str) -> Measurement:
+    title = f"recording, {name}, {horizon}"
     if key not in IMPORTS:
         bag = f"{{data}}/sara_human_robot_bags/{key}.bag --config {{tmp}}/settings.toml --cell {{tmp}}/cell.toml"
-        return _audit(title, (f"{bag} --limits {limits}",), {"settings.toml": SARA, "cell.toml": SARA_CELL})
+        return _audit(title, (f"{bag} {_until(horizon)}",), {"settings.toml": SARA, "cell.toml": SARA_CELL})
     kind, files, options = IMPORTS[key]
     sources = [
         f"{{data}}/{file}" if kind == "keraal" else f"{camera}={{data}}/{file}" for camera, file in files.items()
@@ -181,7 +175,7 @@ def _recording(name: str, key: str, limits: str) -> Measurement:
         (
             f"hrcreplay import {kind} {' '.join(sources)} --out {{tmp}}/log.mcap",
             f"hrcreplay calibrate {{tmp}}/log.mcap --out {{tmp}}/cell.toml{given}",
-            f"{{tmp}}/log.mcap --cell {{tmp}}/cell.toml --limits {limits}",
+            f"{{tmp}}/log.mcap --cell {{tmp}}/cell.toml {_until(horizon)}",
         ),
         {},
     )

@@ -22,13 +22,12 @@ from tests.readme.measurements import (
     BASELINES,
     COMPARED,
     DEMO,
-    PREDICTIONS,
+    HORIZONS_S,
     ROOT,
     VARIANTS,
     Measurement,
     load,
     measurements,
-    of_people,
     of_report,
 )
 from tests.soundness import __main__ as soundness
@@ -47,7 +46,7 @@ def test_the_readme_holds_the_figures_that_were_measured() -> None:
 
 def test_every_figure_was_measured() -> None:
     known = {measurement.name: measurement for measurement in measurements()}
-    assert set(FACTS) == {*known, "people.toml"}
+    assert set(FACTS) == set(known)
     for name, measurement in known.items():
         assert FACTS[name]["command"] == " && ".join(measurement.commands)
 
@@ -73,10 +72,6 @@ def test_the_demo_as_printed(printed: Run) -> None:
     _same("demo, as printed", of_report(report.compute(printed, near_m=0.5, stationary_m_per_s=0.001)))
 
 
-def test_the_limits_of_people() -> None:
-    _same("people.toml", of_people())
-
-
 @pytest.mark.parametrize("measurement", measurements(), ids=lambda measurement: measurement.name)
 def test_the_commands_parse(measurement: Measurement) -> None:
     commands: Any = typer.main.get_command(app)
@@ -96,7 +91,7 @@ def _made_up() -> dict[str, Any]:
     for measurement in measurements():
         found = measurement.keep(_Numbers(numbers) if measurement.name != "compare" else _compared(numbers))
         facts[measurement.name] = {"figures": dict(found)}
-    return facts | {"people.toml": {"figures": {"logs": 3, "ticks": 5, "held": 5}}}
+    return facts
 
 
 def _compared(numbers: Any) -> dict[str, Any]:
@@ -106,7 +101,7 @@ def _compared(numbers: Any) -> dict[str, Any]:
 AUDIT_KEYS = [
     f"audit_{method}_{key}"
     for method in ("sound", "paper", "positions", "v2_a50")
-    for key in ("all_covered_share", "all_union_m3", "LEGS_covered_share")
+    for key in ("all_covered_share", "all_points_share", "all_union_m3")
 ]
 
 
@@ -153,10 +148,11 @@ def test_a_recording_holds_its_own_predictions() -> None:
     facts = _made_up()
     line = next(line for line in BLOCKS["recordings"](facts).splitlines() if line.startswith("| demo (simulated)"))
     cells = [cell.strip() for cell in line.strip("|").split("|")]
-    for column, (method, limits) in enumerate(PREDICTIONS, start=1):
-        audit = facts[f"audit demo, {limits}"]["figures"]
+    for column, (method, horizon) in enumerate(((m, h) for h in HORIZONS_S for m in ("sound", "v2_a50")), start=1):
+        audit = facts[f"audit demo, {horizon}"]["figures"]
         share, size = audit[f"{method}_share"], audit[f"{method}_union_m3"]
         assert cells[column] == f"{100 * share:.1f} %, {size:.2f} m\u00b3"
+    assert cells[5] == f"{100 * facts['audit demo, whole']['figures']['sound_points_share']:.1f} %"
 
 
 @pytest.mark.parametrize(
@@ -164,7 +160,7 @@ def test_a_recording_holds_its_own_predictions() -> None:
 )
 def test_all_and_none_are_said_of_all_and_none_alone(share: float | None, text: str) -> None:
     facts = _made_up()
-    facts["audit demo, people"]["figures"]["sound_share"] = share
+    facts["audit demo, short"]["figures"]["sound_share"] = share
     assert f"| demo (simulated) | {text}, " in BLOCKS["recordings"](facts)
 
 
@@ -188,7 +184,7 @@ def test_only_the_figures_asked_for_are_measured_and_nothing_twice(
     old = _made_up()
     (tmp_path / "figures.json").write_text(json.dumps(old))
     asked: list[str] = []
-    audit = next(m for m in measurements() if m.name == "audit demo, people")
+    audit = next(m for m in measurements() if m.name == "audit demo, short")
 
     def measure(measurement: Measurement, _data: str, _picture: Path) -> Any:
         asked.append(measurement.name)
@@ -196,13 +192,13 @@ def test_only_the_figures_asked_for_are_measured_and_nothing_twice(
 
     monkeypatch.setattr(readme, "_measure", measure)
     for _ in range(2):
-        assert readme.main(["audit demo, people", "recording"]) == 0
+        assert readme.main(["audit demo, short", "recording"]) == 0
     assert asked == [audit.name]
     new = json.loads((tmp_path / "figures.json").read_text())
-    assert new["audit demo, people"]["figures"]["ticks"] == 7
+    assert new["audit demo, short"]["figures"]["ticks"] == 7
     assert new["demo"] == old["demo"]
     assert (
-        "recording, Kinect v2, waving, people: left as it was, for HRCREPLAY_DATA is not set" in capsys.readouterr().out
+        "recording, Kinect v2, waving, short: left as it was, for HRCREPLAY_DATA is not set" in capsys.readouterr().out
     )
     assert "| demo (simulated) | 50.0 %, 0.50 m\u00b3 |" in (tmp_path / "README.md").read_text()
 
