@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
-from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, process_variance
+from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Frames, Rules, Track, process_variance
 from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
 from hrcreplay.human.model import LimitSet, nearest
 from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
-_NEVER_NS = -(2**62)
 #: A person nobody has measured: upright, arms hanging; and how wrong that may be [m, m, rad..., m].
 _NEUTRAL = (0.0, 0.0, 0.0, 0.1, 0.1, 0.3, 0.0, 2.6, 0.1, 0.3, 0.0, 2.6, 0.94)
 _NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2, 0.3)
@@ -49,20 +48,20 @@ def start(cameras: tuple[str, ...]) -> FusionState:
     for j in range(DOF):
         cov[j] = np.diag([_NEUTRAL_STD[j], *_REST_STD[j]]) ** 2
     return Filter(
-        tick_ns=np.full(1, _NEVER_NS),
+        tick_ns=np.full(1, NEVER_NS),
         started=np.zeros(1, dtype=np.bool_),
         mean=mean,
         cov=cov,
         lengths=np.array(MEDIAN_LENGTHS_M),
         lengths_var=np.full(len(LENGTHS), _LENGTHS_STD_M**2),
-        row_ns=np.full(ROWS, _NEVER_NS),
-        acquired_ns=np.full(ROWS, _NEVER_NS),
-        point_ns=np.full(len(POINTS), _NEVER_NS),
-        refused_ns=np.full((c, len(POINTS)), _NEVER_NS),
+        row_ns=np.full(ROWS, NEVER_NS),
+        acquired_ns=np.full(ROWS, NEVER_NS),
+        point_ns=np.full(len(POINTS), NEVER_NS),
+        refused_ns=np.full((c, len(POINTS)), NEVER_NS),
         refused_at=np.full((c, len(POINTS), 3), np.nan),
         apart=np.zeros((c, len(BODY))),
-        bone_ns=np.full(len(LENGTHS), _NEVER_NS),
-        capture_ns=np.full(c, _NEVER_NS),
+        bone_ns=np.full(len(LENGTHS), NEVER_NS),
+        capture_ns=np.full(c, NEVER_NS),
         uses=np.full(c, -1),
         z=np.full((c, ROWS), np.nan),
         z_var=np.full((c, ROWS), np.nan),
@@ -73,10 +72,10 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         residuals=np.zeros((len(BODY), BINS)),
         weight=np.zeros(len(BODY)),
         samples=np.zeros(len(BODY), dtype=np.int64),
-        sampled_ns=np.full(len(BODY), _NEVER_NS),
+        sampled_ns=np.full(len(BODY), NEVER_NS),
         residual=np.full(len(BODY), np.nan),
         peak=np.zeros(len(BODY)),
-        peak_ns=np.full(len(BODY), _NEVER_NS),
+        peak_ns=np.full(len(BODY), NEVER_NS),
         surprise=np.ones(DOF),
         spread=np.ones(DOF),
     )

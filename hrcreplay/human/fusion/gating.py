@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, ROWS
-from hrcreplay.human.fusion.kalman import Filter, Rules, Track, ago, delay
+from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Rules, Track, ago, delay
 from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.records import DOF, LENGTHS, POINTS, Bools, Floats
 
@@ -39,7 +39,6 @@ for _length, _point in enumerate(_FAR_ENDS):
 _OTHER_SIDE = np.array(
     [POINTS.index(p[:-1] + {"l": "r", "r": "l"}[p[-1]] if p[-2] == "_" else p) for p in POINTS], dtype=np.int64
 )
-_NEVER_NS = -(2**62)
 _STEP = 1e-5
 #: How wrong a length is that starts anew, standard deviation [m].
 _UNKNOWN_M = 0.1
@@ -112,7 +111,7 @@ def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Bools, B
         other = _OTHER_SIDE[k]
         exchanged = other != k and distance(points[other], expected[k]) <= gate[k]
         if agreeing[k] or exchanged:
-            filter_.refused_ns[c, k] = _NEVER_NS
+            filter_.refused_ns[c, k] = NEVER_NS
             continue
         stays = distance(points[k], filter_.refused_at[c, k]) <= rules.outlier_m
         if not stays or filter_.refused_ns[c, k] <= filter_.point_ns[k]:

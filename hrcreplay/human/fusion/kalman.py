@@ -19,6 +19,9 @@ from numba import njit
 
 from hrcreplay.records import Bools, Floats, Ints
 
+#: Before every tick: what has not happened yet [ns].
+NEVER_NS = -(2**62)
+
 
 class Filter(NamedTuple):
     """All that one tick hands to the next."""

@@ -30,8 +30,6 @@ REACH_M = 1.2
 _BIN_M = 0.001
 #: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person's arm.
 BINS = round(REACH_M / _BIN_M)
-#: Two cameras show a point in one place where they are no further apart [m].
-NEAR_M = 0.2
 #: Fewer samples say nothing of a quantile.
 LEAST = 20
 
@@ -69,7 +67,7 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
     model = np.empty_like(filter_.points[0])
     for c in np.flatnonzero(fresh):
         skeleton_row(ago(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths, model)
-        _depart(filter_, c, model, now)
+        _depart(filter_, c, model, now, rules)
         for limb in np.flatnonzero(filter_.shows[c]):
             if _settled(filter_, limb, now, rules):
                 sample = 0.0
@@ -88,7 +86,7 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
 
 
 @njit(cache=True)
-def _depart(filter_: Filter, c: int, model: Floats, now: int) -> None:
+def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> None:
     """Writes how far a camera shows each limb from the model (20, 3) [m], by points that the gates refuse.
 
     Counts what it, or another camera, has shown there before, and no camera where the model has it.
@@ -103,7 +101,9 @@ def _depart(filter_: Filter, c: int, model: Floats, now: int) -> None:
             shown = since < now
             for other in range(len(filter_.apart)):
                 both = filter_.refused_ns[other, k] > filter_.point_ns[k]
-                shown = shown or (other != c and both and distance(filter_.refused_at[other, k], here) <= NEAR_M)
+                shown = shown or (
+                    other != c and both and distance(filter_.refused_at[other, k], here) <= rules.outlier_m
+                )
             if shown:
                 filter_.apart[c, limb] = max(filter_.apart[c, limb], distance(here, model[k]))
 
