@@ -15,9 +15,9 @@ from hrcreplay.audit.recording import Recording, read_recording
 from hrcreplay.errors import LogError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import reachable_sets
-from hrcreplay.human.prediction.lower_body import THIGH_M
 from hrcreplay.human.prediction.reachable_sets import Reach
 from hrcreplay.human.prediction.swept_volumes import limb_radii
+from hrcreplay.human.prediction.walking_reach import THIGH_M
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report.metrics import difference

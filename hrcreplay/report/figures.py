@@ -16,9 +16,8 @@ from hrcreplay.report import drawing, figures_human, figures_prediction, figures
 from hrcreplay.report.figures_prediction import Growth, Instant, Sweep, Walk
 from hrcreplay.report.figures_robot import SHORTEST_M, Deviation
 from hrcreplay.report.figures_scene import LinkPose, Storyboard
-from hrcreplay.report.metrics import Metric
+from hrcreplay.report.metrics import Metric, instants, known_ticks_ns, moment_ns, start_ns
 from hrcreplay.report.metrics_data import cameras
-from hrcreplay.report.moments import instants, known_ticks_ns, moment_ns, start_ns
 from hrcreplay.store.run_folder import Run
 
 _T = TypeVar("_T")

@@ -32,11 +32,10 @@ from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.reference import Reference
 from hrcreplay.run import build, replay
-from hrcreplay.run.contact import Predicted, Volumes, contact_table, solids
+from hrcreplay.run.contact import Predicted, RecordedPerson, Volumes, contact_table, recorded_person, solids
 from hrcreplay.run.followers import Planner
 from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.prediction import Forecast, stored_ticks
-from hrcreplay.run.recorded_person import RecordedPerson, recorded_person
 from hrcreplay.run.stages import ProgressBar, Sink, print_note
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Occupancy, Plan

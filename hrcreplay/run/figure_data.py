@@ -18,9 +18,8 @@ from hrcreplay.records import JOINTS, LIMBS, POINTS, Floats, HumanStates, Ints, 
 from hrcreplay.report import figures_prediction, figures_robot
 from hrcreplay.report.figures_prediction import Growth, Instant, Sweep, Walk
 from hrcreplay.report.figures_scene import LinkPose, Storyboard, StoryScene
-from hrcreplay.report.metrics import times
+from hrcreplay.report.metrics import instants, known_ticks_ns, moment_ns, nearest_tick, times
 from hrcreplay.report.metrics_plan import numeric_column, position_columns
-from hrcreplay.report.moments import instants, known_ticks_ns, moment_ns, nearest_tick
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
 from hrcreplay.store.columns import read_states

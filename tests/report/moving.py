@@ -10,7 +10,7 @@ import pandas as pd
 from hrcreplay.human.body_capsules import PARTS, part_axes
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import Floats
-from hrcreplay.report.moments import start_ns
+from hrcreplay.report.metrics import start_ns
 from hrcreplay.report.replay_scene import ReplayScene, replay_scene
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.store.columns import body_columns

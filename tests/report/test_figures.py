@@ -10,7 +10,7 @@ from PIL import Image
 from hrcreplay.report import figures, figures_prediction, figures_robot
 from hrcreplay.report.figures import FIGURES, FigureData
 from hrcreplay.report.figures_prediction import Growth, Sweep, Walk
-from hrcreplay.report.moments import instants
+from hrcreplay.report.metrics import instants
 from hrcreplay.report.projection import RenderedHull, outline, render_hulls, view_from
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run

@@ -15,8 +15,7 @@ from hrcreplay.logs import reader
 from hrcreplay.records import POINTS, Floats, HumanStates
 from hrcreplay.robot.model import RobotModel, from_urdf
 from hrcreplay.run import contact, replay
-from hrcreplay.run.contact import VOLUME_OF, Body, Volumes
-from hrcreplay.run.recorded_person import RecordedPerson, from_states
+from hrcreplay.run.contact import VOLUME_OF, Body, RecordedPerson, Volumes, from_states
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
 from tests.robot.test_model import ONE_AXIS

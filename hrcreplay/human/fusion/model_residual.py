@@ -97,13 +97,10 @@ def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> N
             since = filter_.refused_ns[c, k]
             if since <= filter_.point_ns[k]:
                 continue
-            here = filter_.refused_at[c, k]
-            shown = since < now
+            here, shown = filter_.refused_at[c, k], since < now
             for other in range(len(filter_.apart)):
-                both = filter_.refused_ns[other, k] > filter_.point_ns[k]
-                shown = shown or (
-                    other != c and both and distance(filter_.refused_at[other, k], here) <= rules.outlier_m
-                )
+                both = other != c and filter_.refused_ns[other, k] > filter_.point_ns[k]
+                shown = shown or (both and distance(filter_.refused_at[other, k], here) <= rules.outlier_m)
             if shown:
                 filter_.apart[c, limb] = max(filter_.apart[c, limb], distance(here, model[k]))
 

@@ -33,7 +33,6 @@ from numba import njit
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
 from hrcreplay.human.model import HEIGHT, LimitSet
-from hrcreplay.human.prediction.lower_body import THIGH_M, legs_around
 from hrcreplay.human.prediction.reachable_sets import SOUND, MotionLimits, bounds_of, code_of, never_measured, reach_row
 from hrcreplay.human.prediction.sound_reach import Likely, SoundMotionLimits, enclose_row, likely
 from hrcreplay.human.prediction.sweep import (
@@ -46,7 +45,7 @@ from hrcreplay.human.prediction.sweep import (
     sweep_rot,
     sweep_walk,
 )
-from hrcreplay.human.prediction.walking_reach import SIDES
+from hrcreplay.human.prediction.walking_reach import SIDES, THIGH_M, legs_around
 from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
 
