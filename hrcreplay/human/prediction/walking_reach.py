@@ -1,4 +1,6 @@
-"""Where the model of Eq. (25) can walk, and where its legs may be: a polygon around all displacements, over all headings, velocities and times.
+"""Where the model of Eq. (25) can walk, and the legs below it.
+
+A polygon encloses all displacements, over all headings, velocities and times.
 
 The displacement at time t along u(phi) is the integral of u . Rz(theta) (v, v_perp). At every instant theta, v and
 v_perp are in intervals of their own, so the integral is at most that of
