@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from hrcreplay.records import DOF, JOINTS, LIMBS, POINTS, Floats
+from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, POINTS, Floats
 
 #: First of the four joints of each arm in JOINTS, and s of the kinematics: +1 on the left.
 RIGHT_ARM, LEFT_ARM = 4, 8
@@ -62,7 +62,12 @@ def skeleton(p: Floats, lengths_m: Floats) -> Floats:
     Returns:
         (n, 20, 3) POINTS, world [m]; NaN where the model has no say (hands, chest, legs). ``neck`` is the midpoint
         of the shoulder line.
+
+    Raises:
+        ValueError: The tables have other columns; the kernel would read beyond them.
     """
+    if p.shape[1:] != (DOF,) or lengths_m.shape[1:] != (len(LENGTHS),):
+        raise ValueError(f"found {p.shape} joints and {lengths_m.shape} lengths; (n, {DOF}) and (n, {len(LENGTHS)})")
     points = np.full((len(p), len(POINTS), 3), np.nan)
     _skeleton_rows(np.ascontiguousarray(p), np.ascontiguousarray(lengths_m), points)
     return points

@@ -28,6 +28,7 @@ Columns = dict[str, Any]
 
 #: The joint ``z`` by the name that it has among the lengths of the paper: readers know it by both.
 _HEIGHT, _AS_LENGTH = JOINTS.index("z"), "pi_pelvis_height"
+_LENGTHS = (_AS_LENGTH, *LENGTHS)
 
 
 def measurement_columns(measurements: Measurements) -> Columns:
@@ -67,12 +68,12 @@ def state_columns(states: HumanStates) -> Columns:
 
 #: Columns that a table of a run folder has whatever the cameras and the robot; who reads one counts on them.
 COLUMNS = {
-    "measurements": ("capture_ns", "arrival_ns", "camera", *JOINTS, *(f"{joint}_std" for joint in JOINTS), *LENGTHS),
-    "truth": ("t_ns", *JOINTS, *LENGTHS),
+    "measurements": ("capture_ns", "arrival_ns", "camera", *JOINTS, *(f"{joint}_std" for joint in JOINTS), *_LENGTHS),
+    "truth": ("t_ns", *JOINTS, *_LENGTHS),
     "state": (
         "t_ns",
         *(f"{joint}{suffix}" for _, suffix in _STATE for joint in JOINTS),
-        *(f"{length}{suffix}" for suffix in ("", "_std") for length in LENGTHS),
+        *(f"{length}{suffix}" for suffix in ("", "_std") for length in _LENGTHS),
         *_RESIDUAL,
         *_UNSEEN,
     ),

@@ -30,7 +30,7 @@ BEGIN_NS = 1_800_000_000_000_000_000
 RESPONSE_NS = 300_000
 CYCLE_S = PERIOD_NS * 1e-9
 FRAME_NS = 33_000_000
-LENGTHS_M = np.array([[0.94, 0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
+LENGTHS_M = np.array([[0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29]])
 
 #: Where somebody stands over time, from the robot's base [m]; None: no camera sees them.
 Walk = Callable[[float], tuple[float, float] | None]
@@ -117,7 +117,7 @@ class Flight:
     def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
         base = np.array(self.start["T_world_base"])[:3, 3]
         bend = 0.1 + 0.002 * np.sin(1e-9 * (t_ns - BEGIN_NS))  # nobody stands like a frozen picture
-        joints = np.array([[base[0] + place_m[0], base[1] + place_m[1], np.pi, bend, *(0.1, 0.5, 0.0, 1.8) * 2]])
+        joints = np.array([[base[0] + place_m[0], base[1] + place_m[1], np.pi, bend, *(0.1, 0.5, 0.0, 1.8) * 2, 0.94]])
         to_camera = np.linalg.inv(np.array(self.start["cameras"][camera]))
         points = skeleton(joints, LENGTHS_M)[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
         message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=1)

@@ -13,7 +13,7 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import SessionLogWriter
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.records import DOF, LIMBS, HumanStates, SweptVolumes
+from hrcreplay.records import DOF, LENGTHS, LIMBS, HumanStates, SweptVolumes
 from hrcreplay.robot.control.separation import obstacles
 
 START_NS = 1_700_000_000_000_000_000
@@ -47,8 +47,8 @@ class MadeController:
             t_ns=np.array([t_ns]),
             p=self.p[None].copy(),
             **row,
-            lengths_m=np.full((1, 8), 0.4),
-            lengths_std_m=np.full((1, 8), np.nan),
+            lengths_m=np.full((1, len(LENGTHS)), 0.4),
+            lengths_std_m=np.full((1, len(LENGTHS)), np.nan),
             valid=np.array([[bool(skeletons), False]]),
             residual_m=np.full((1, 7), np.nan),
             unseen_s=np.full((1, 6), np.inf),

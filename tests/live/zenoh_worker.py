@@ -32,7 +32,7 @@ POSES: dict[str, Floats] = {
 def points_m(camera: str, t_s: float) -> Floats:
     """(20, 3) in the camera's frame; NaN where the model has no say. The worker shifts from one foot to the other."""
     arm = (0.1, 0.5, 0.0, 1.8)
-    joints = np.array([[AWAY_M, 0.1 * np.sin(2.0 * t_s), np.pi, 0.1, *arm, *arm]])
+    joints = np.array([[AWAY_M, 0.1 * np.sin(2.0 * t_s), np.pi, 0.1, *arm, *arm, 0.94]])
     to_camera = np.linalg.inv(POSES[camera])
     found: Floats = skeleton(joints, LENGTHS_M)[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
     return found

@@ -244,7 +244,7 @@ def compile_kernels(start: dict[str, Any]) -> None:
 
 def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int) -> bytes:
     """Somebody at a place, arms half bent."""
-    joints = np.array([[place_m[0], place_m[1], np.pi, 0.1, 0.1, 0.5, 0.0, 1.8, 0.1, 0.5, 0.0, 1.8]])
+    joints = np.array([[place_m[0], place_m[1], np.pi, 0.1, *(0.1, 0.5, 0.0, 1.8) * 2, 0.94]])
     points = skeleton(joints, np.array([MEDIAN_LENGTHS_M]))[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
     message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=1)
     message.points.extend(points.ravel().tolist())
