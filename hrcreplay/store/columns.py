@@ -60,9 +60,9 @@ def state_columns(states: HumanStates) -> Columns:
     columns: Columns = {"t_ns": states.t_ns}
     for field, suffix in _STATE:
         columns |= _spread(getattr(states, field), JOINTS, suffix)
-    columns |= {_AS_LENGTH: states.p[:, _HEIGHT]} | _spread(states.lengths_m, LENGTHS)
-    columns |= {f"{_AS_LENGTH}_std": states.p_std[:, _HEIGHT]} | _spread(states.lengths_std_m, LENGTHS, "_std")
+    columns |= _spread(states.lengths_m, LENGTHS) | _spread(states.lengths_std_m, LENGTHS, "_std")
     columns |= _spread(states.residual_m, _RESIDUAL) | _spread(states.unseen_s, _UNSEEN)
+    columns |= {_AS_LENGTH: states.p[:, _HEIGHT], f"{_AS_LENGTH}_std": states.p_std[:, _HEIGHT]}
     return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
 
 

@@ -46,7 +46,7 @@ def test_named_postures_point_where_their_names_say() -> None:
     right = np.pi / 2
 
     def bones(ar: tuple[float, ...], al: tuple[float, ...]) -> tuple[Floats, ...]:
-        points = skeleton(np.array([[0.0, 0.0, 0.0, 0.0, *ar, *al]]), LENGTHS_M[None])[0]
+        points = skeleton(np.array([[0.0, 0.0, 0.0, 0.0, *ar, *al, 0.0]]), LENGTHS_M[None])[0]
         at = {name: points[k] for k, name in enumerate(POINTS)}
         ways = [at[f"{b}_{s}"] - at[f"{a}_{s}"] for s in "rl" for a, b in (("shoulder", "elbow"), ("elbow", "wrist"))]
         return tuple(way / np.linalg.norm(way) for way in ways)

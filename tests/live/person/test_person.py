@@ -19,7 +19,7 @@ from hrcreplay.live.person.source import BEAT_NS, SendSchedule, run
 from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import DOF, CameraFrames
+from hrcreplay.records import CameraFrames
 from tests.live.human import Human
 from tests.logs import own
 from tests.logs.bags import bag, write_openni
@@ -95,7 +95,7 @@ def test_a_repeated_recording_goes_on_rising(tmp_path: Path) -> None:
     frames = own.frames(12)
     # The last frame was quick and the first slow: shifted alone, the second pass would begin before the first ends.
     slow = CameraFrames(
-        **{**vars(frames), "capture_ns": frames.capture_ns - np.where(np.arange(DOF) < 4, 60_000_000, 0)}
+        **{**vars(frames), "capture_ns": frames.capture_ns - np.where(np.arange(12) < 4, 60_000_000, 0)}
     )
     log = open_log(own.write(tmp_path / "a.mcap", slow))
     items = playback_items(log, repeat=True)

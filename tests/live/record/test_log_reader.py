@@ -70,7 +70,7 @@ def test_every_flipped_bit_is_found(
         if kind == "unfinished" and at >= chunks[-1]:  # a length there may look like a file that was cut
             assert log.flaws or read == [m for m in messages if m in set(read)]
             continue
-        assert log.flaws, at
+        assert log.flaws or read == messages, at  # some bits of a compressed chunk mean nothing
         remaining = iter(messages)
         assert all(message in remaining for message in read), at  # what is left is as it was, in order
 
