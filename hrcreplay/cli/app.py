@@ -8,7 +8,7 @@ from __future__ import annotations
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -143,9 +143,7 @@ def _stage(command: str, text: str) -> None:
         smooth: Smooth = False,
         chunk_ticks: Chunk = 250,
     ) -> None:
-        from hrcreplay.run import replay
-
-        folder = replay.run(
+        folder = _run(
             command,
             source,
             out=out,
@@ -156,16 +154,17 @@ def _stage(command: str, text: str) -> None:
             smooth=smooth,
             chunk_ticks=chunk_ticks,
         )
-        _summarize(folder)
         sys.stdout.write(f"{folder}\n")
 
 
-def _summarize(folder: Path) -> None:
-    """The main figures of a run for the user, beside its folder for the next program."""
-    from hrcreplay.run import report, stages
+def _run(command: str, source: Path, **options: Any) -> Path:
+    """Runs the stages up to a command's, and tells the main figures on standard error; the run folder."""
+    from hrcreplay.run import replay, report, stages
 
+    folder = replay.run(command, source, **options)
     for line in report.summary(folder):
         stages.print_note(line)
+    return folder
 
 
 _stage("fuse", "Stage 1: merge the cameras' skeletons into one person (state.parquet).")
@@ -212,9 +211,7 @@ def report(
     if list_figures or source is None or figure is not None or snapshot is not None:
         _part_of_report(source, figure, snapshot, out, listed=list_figures)
         return
-    from hrcreplay.run import replay
-
-    folder = replay.run(
+    folder = _run(
         "report",
         source,
         out=out,
@@ -225,7 +222,6 @@ def report(
         smooth=smooth,
         chunk_ticks=chunk_ticks,
     )
-    _summarize(folder)
     sys.stdout.write(f"{folder}\n")
 
 
@@ -372,10 +368,7 @@ def demo(
     from hrcreplay.run import replay
 
     overrides = as_overrides(settings)
-    folder = replay.run(
-        "report", replay.demo_log(), out=out, config=config, overrides=overrides, chunk_ticks=chunk_ticks
-    )
-    _summarize(folder)
+    folder = _run("report", replay.demo_log(), out=out, config=config, overrides=overrides, chunk_ticks=chunk_ticks)
     sys.stdout.write(f"{folder / 'report.html'}\n")
 
 

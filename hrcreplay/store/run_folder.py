@@ -224,11 +224,9 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
 
     def table(name: str) -> pd.DataFrame | None:
         path = folder / f"{name}.parquet"
-        found = (
-            pq.read_table(path, pre_buffer=False).to_pandas(split_blocks=True, self_destruct=True)
-            if path.exists()
-            else None
-        )
+        if not path.exists():
+            return None
+        found = pq.read_table(path, pre_buffer=False).to_pandas(split_blocks=True, self_destruct=True)
         pa.default_memory_pool().release_unused()
         return found
 
