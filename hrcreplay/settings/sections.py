@@ -97,15 +97,17 @@ class Fusion(Section):
     """Standard deviation of a skeleton point at full confidence [m]."""
     point_std_per_m: NotNegative = 0.0
     """Its growth with the distance from the camera [m/m]."""
-    sigma_position: Sigmas = (300.0, 200.0, 5.0, 1.0)
-    """Sigmas of Eq. (44) for x, y and z: p, v, a, j [m/s^2, m/s^2.5, m/s^3, m/s^3.5]."""
+    sigma_position: Sigmas = (300.0, 100.0, 5.0, 1.0)
+    """Sigmas of Eq. (44) for x and y: p, v, a, j [m/s^2, m/s^2.5, m/s^3, m/s^3.5]."""
+    sigma_height: Sigmas = (300.0, 200.0, 5.0, 1.0)
+    """The same for z: who gets up is faster than who walks about."""
     sigma_angle: Sigmas = (1500.0, 600.0, 10.0, 1.0)
     """The same for the angles [rad]."""
     coast_s: Positive = 0.12
     """A joint without a valid row for longer comes to rest [s]."""
     delay_max_s: Positive = 0.25
     """An older frame counts as this old [s]."""
-    residual_quantile: Share = 0.95
+    residual_quantile: Share = 0.9
     """Of how far each limb's measured points were from the model's: the quantile that is tracked."""
     residual_memory_s: Positive = 20.0
     """A distance seen this long ago counts 1/e of a new one [s]."""

@@ -46,6 +46,7 @@ STALE = {
     "fusion.point_std_m": ALL,
     "fusion.point_std_per_m": ALL,
     "fusion.sigma_position": ALL,
+    "fusion.sigma_height": ALL,
     "fusion.sigma_angle": ALL,
     "fusion.coast_s": ALL,
     "fusion.delay_max_s": ALL,

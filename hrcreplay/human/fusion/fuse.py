@@ -26,8 +26,8 @@ MEDIAN_LENGTHS_M = (0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
 _LENGTHS_STD_M = 0.1
 #: How fast a joint may be moving that nobody sees: v, a, j of x, y and z [m/s...], of an angle [rad/s...].
 _REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10 + [[0.3, 2.0, 20.0]])
-#: Whether a joint is x, y or z (0) or an angle (1).
-_KIND = np.repeat((0, 1, 0), (2, 10, 1))
+#: Whether a joint is x or y (0), an angle (1) or z (2).
+_KIND = np.repeat((0, 1, 2), (2, 10, 1))
 
 FusionState = Filter
 
@@ -159,7 +159,7 @@ def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats
 
 
 def _sigma(settings: Fusion) -> Floats:
-    return np.array((settings.sigma_position, settings.sigma_angle))[_KIND]
+    return np.array((settings.sigma_position, settings.sigma_angle, settings.sigma_height))[_KIND]
 
 
 def _frames(measurements: Measurements) -> Frames:

@@ -37,9 +37,8 @@ class Dense:
     def predict(self, dt: float) -> None:
         powers = [1.0, dt, dt**2 / 2, dt**3 / 6]
         F = np.kron(sum(np.eye(4, k=k) * powers[k] for k in range(4)), np.eye(DOF))
-        sigma = np.array(
-            [self.settings.sigma_position] * 2 + [self.settings.sigma_angle] * 10 + [self.settings.sigma_position]
-        )
+        place, angle = self.settings.sigma_position, self.settings.sigma_angle
+        sigma = np.array([place] * 2 + [angle] * 10 + [self.settings.sigma_height])
         G = sigma.T**2 * np.array([dt**4 / 24, dt**3 / 6, dt**2 / 2, dt])[:, None]
         self.filter.predict(F=block_diag(F, np.eye(len(LENGTHS))), Q=np.diag([*G.ravel(), *np.zeros(len(LENGTHS))]))
 
