@@ -27,7 +27,7 @@ DT = 0.377 / 400
 
 def test_points_are_those_of_the_model() -> None:
     rng = np.random.default_rng(1)
-    p, lengths, points = rng.uniform(-4.0, 4.0, (50, DOF)), rng.uniform(0.1, 1.0, (50, 8)), np.empty((len(POINTS), 3))
+    p, lengths, points = rng.uniform(-4.0, 4.0, (50, DOF)), rng.uniform(0.1, 1.0, (50, 7)), np.empty((len(POINTS), 3))
     expected = skeleton(p, lengths)
     for i in range(len(p)):
         body(p[i], lengths[i], 0.0, points)
