@@ -112,7 +112,7 @@ class Fusion(Section):
     residual_memory_s: Positive = 20.0
     """A distance seen this long ago counts 1/e of a new one [s]."""
     residual_hold_s: NotNegative = 0.15
-    """The largest distance of so long counts where it is more than the quantile [s]."""
+    """A distance above the quantile counts for so long, or until a larger one [s]."""
     spread_memory_s: Positive = 1.0
     """The reported deviations follow the surprises of measurements; a surprise falls to 1/e in this time [s]."""
     spread_least: Positive = 0.01

@@ -11,8 +11,8 @@ distance from a convex set is convex, so a bone between two points is no further
 
 The running quantile is that of all samples so far, each with the weight exp(-age / memory); a limb out of sight does
 not age for longer than it takes to be lost, so that what is known of a person outlives an occlusion. Samples are kept
-by the millimetre and rounded up. The largest of the last ``residual_hold_s`` counts where it is more: a movement of its
-kind has not been seen before.
+by the millimetre and rounded up. A larger one counts for ``residual_hold_s``, or until one larger still: a movement of
+its kind has not been seen before.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def found_s(states: HumanStates, limb: int) -> float:
 
 
 def plain_residual(m: Measurements, states: HumanStates, prior: HumanStates, settings: Fusion) -> Floats:
-    """(n, 6) without a gate for outliers: every sample kept, the quantile exact; or the largest lately."""
+    """(n, 6) without a gate for outliers: every sample kept, the quantile exact; or a larger one that is held."""
     found = np.full((len(states), 6), np.nan)
     frames = used_frames(m, states.t_ns)
     for limb, name in enumerate(LIMBS):
@@ -83,8 +83,8 @@ def plain_residual(m: Measurements, states: HumanStates, prior: HumanStates, set
             sample = np.linalg.norm(model[ends] - m.points_m[i, ends], axis=1).max()
             ages = np.append(ages + min((states.t_ns[k] - last) * 1e-9, settings.memory_s), 0.0)
             samples, last = np.append(samples, sample), states.t_ns[k]
-            held = (states.t_ns >= last) & (states.t_ns < last + round(settings.residual_hold_s * 1e9))
-            lately[held] = np.maximum(lately[held], sample)
+            if sample >= lately[k]:  # nothing larger is held
+                lately[k:] = np.where(states.t_ns[k:] < last + round(settings.residual_hold_s * 1e9), sample, 0.0)
             if len(samples) >= LEAST:
                 weights = np.exp(-ages / settings.residual_memory_s)
                 order = np.argsort(samples)
@@ -94,7 +94,7 @@ def plain_residual(m: Measurements, states: HumanStates, prior: HumanStates, set
     return found
 
 
-@pytest.mark.parametrize(("quantile", "memory_s", "hold_s"), [(0.95, 20.0, 0.0), (0.6, 1.0, 0.0)])
+@pytest.mark.parametrize(("quantile", "memory_s", "hold_s"), [(0.95, 20.0, 0.0), (0.6, 1.0, 0.0), (0.6, 1.0, 0.15)])
 def test_it_is_the_weighted_quantile_of_all_samples(
     demo: tuple[Measurements, Ints], quantile: float, memory_s: float, hold_s: float
 ) -> None:
