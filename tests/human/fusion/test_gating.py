@@ -10,17 +10,8 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, Measurements
 from hrcreplay.settings.sections import Fusion
 from tests.human.filtered import fused, standing, ticks
+from tests.human.fusion.test_model_residual import POINTS_OF
 from tests.human.sightings import NEUTRAL, frames_of
-
-#: Points of each of LIMBS that the model has.
-ENDS = {
-    "HD": ("head",),
-    "THX": ("pelvis", "shoulder_l", "shoulder_r"),
-    "URA": ("shoulder_r", "elbow_r"),
-    "LRA": ("elbow_r", "wrist_r"),
-    "ULA": ("shoulder_l", "elbow_l"),
-    "LLA": ("elbow_l", "wrist_l"),
-}
 
 
 def again(m: Measurements, points: Floats) -> Measurements:
@@ -32,7 +23,7 @@ def again(m: Measurements, points: Floats) -> Measurements:
 def apart_m(states: HumanStates, truth: Floats) -> Floats:
     """(n, 6) how far each limb of the model is from the truth (20, 3), its farthest point [m]."""
     off = np.linalg.norm(skeleton(states.p, states.lengths_m) - truth, axis=2)
-    return np.column_stack([off[:, [POINTS.index(name) for name in ENDS[limb]]].max(axis=1) for limb in LIMBS])
+    return np.column_stack([off[:, [POINTS.index(name) for name in POINTS_OF[limb]]].max(axis=1) for limb in LIMBS])
 
 
 @pytest.mark.parametrize("by_m", [(1.0, 0.0, 0.0), (0.0, 0.0, -0.45), (0.3, 0.2, 0.3)])
