@@ -71,7 +71,7 @@ def ends(p: Floats, lengths_m: Floats, hand_m: float) -> list[Floats]:
     Head: neck, head. Thorax: pelvis, shoulders. Upper arm: shoulder, elbow. Lower arm: elbow, tip of the hand.
 
     Args:
-        p: (n, 13) JOINTS [m, m, rad...].
+        p: (n, 13) JOINTS [m, m, rad..., m].
         lengths_m: (n, 7) LENGTHS [m].
         hand_m: The hand goes on in the forearm's direction for so long [m].
     """

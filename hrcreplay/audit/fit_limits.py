@@ -62,10 +62,11 @@ _TRIED, _HARDLY = 48, 1.05
 _STEPS, _DOUBLINGS = 40, 6
 #: About how far a joint is from what it moves: makes reaches of different joints comparable [m/m, m/rad].
 _LEVER_M = np.array([1.0, 1.0, 0.5, 0.5] + 2 * [0.6, 0.6, 0.4, 0.4] + [1.0])
-#: A posture further outside its limits than this is outside [m, m, rad...].
+#: A posture further outside its limits than this is outside [m, m, rad..., m].
 _OUTSIDE = np.radians(0.1)
 _ROUNDING = 1e-9
-_ARMS = slice(4, 12)
+#: Joints of both arms in JOINTS.
+ARMS = slice(4, 12)
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Futures(Table):
 
     t_ns: Ints  #: (n,)
     v: Floats  #: estimated velocity [m/s, m/s, rad/s...]
-    down: Floats  #: lowest recorded position, from the estimated one [m, m, rad...]
+    down: Floats  #: lowest recorded position, from the estimated one [m, m, rad..., m]
     up: Floats  #: highest one
 
     @property
@@ -111,7 +112,7 @@ def futures(
         states: The fused person.
         ticks: (n,) rows of ``states``.
         t_ns: (m,) instants of the recorded joints, increasing.
-        joints: (m, 13) recorded JOINTS [m, m, rad...].
+        joints: (m, 13) recorded JOINTS [m, m, rad..., m].
         horizon_s: T_s [s].
         memory_s: What no camera had seen for longer at the tick says nothing [s].
     """
@@ -142,7 +143,7 @@ def outside_positions(p: Floats, limits: LimitSet) -> Bools:
 
 def arms_move(some: Futures) -> Bools:
     """(n,) whether a joint of an arm moves within the horizon."""
-    return np.asarray((some.moved > STIR)[:, _ARMS].any(axis=1))
+    return np.asarray((some.moved > STIR)[:, ARMS].any(axis=1))
 
 
 def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -> Fit:
@@ -166,7 +167,7 @@ def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -
     if not arms_move(training).any():
         raise LogError(
             f"found no arm motion: within no horizon of {horizon_s:g} s does a joint of an arm move by "
-            f"{np.degrees(STIR[_ARMS.start]):.0f} deg; limits are fitted to logs of people at work"
+            f"{np.degrees(STIR[ARMS.start]):.0f} deg; limits are fitted to logs of people at work"
         )
     kept = excursions < EXCURSIONS
     sides = [_Side(training, j, upward, horizon_s) for j in np.flatnonzero(~kept).tolist() for upward in (False, True)]

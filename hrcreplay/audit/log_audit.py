@@ -10,6 +10,7 @@ import numpy as np
 
 from hrcreplay.audit import baselines
 from hrcreplay.audit.containment import InflatedHull, union_volume_m3
+from hrcreplay.audit.fit_limits import ARMS
 from hrcreplay.audit.metrics import Outcome
 from hrcreplay.audit.recording import Recording, read_recording
 from hrcreplay.errors import LogError
@@ -20,7 +21,7 @@ from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.human.prediction.walking_reach import THIGH_M
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
-from hrcreplay.report.metrics import difference
+from hrcreplay.report.metrics import ANGLES, difference
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
 from hrcreplay.run.prediction import PredictionStage
@@ -182,7 +183,7 @@ def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horiz
 
 
 def joint_travel(joints: Floats) -> Floats:
-    """(13,) how far each joint went, between the 5th and the 95th percentile of its values [m, m, rad...]."""
+    """(13,) how far each joint went, between the 5th and the 95th percentile of its values [m, m, rad..., m]."""
     known = joints[np.isfinite(joints).all(axis=1)]
     if len(known) < 2:
         return np.full(joints.shape[1], np.nan)
@@ -347,13 +348,13 @@ def _remarks(recording: Recording, audited_s: float, horizon_s: float) -> tuple[
     notes = [f"the recorded future is the {recording.source}"]
     went = joint_travel(recording.joints)
     still = [
-        f"{joint} ({went[j]:.2f} m)" if j < 2 else f"{joint} ({np.degrees(went[j]):.0f} deg)"
+        f"{joint} ({went[j]:.2f} m)" if joint not in ANGLES else f"{joint} ({np.degrees(went[j]):.0f} deg)"
         for j, joint in enumerate(JOINTS)
         if not went[j] >= LITTLE[j]
     ]
     if still:
         notes.append(f"hardly moved, so the audit says little of their bounds: {', '.join(still)}")
-    if (went[4:] < LITTLE[4:]).all():
+    if (went[ARMS] < LITTLE[ARMS]).all():
         notes.append("no arm motion: the shares of the arms say nothing of a person at work")
     if audited_s < 10.0 * horizon_s:
         notes.append(f"only {audited_s:.1f} s audited: the intervals are wide")

@@ -206,7 +206,7 @@ def joint_figures(inside: Floats, travel: Floats, resampling: Resampling) -> dic
 
     Args:
         inside: (n, 13) 1 or 0; NaN where the joint was not recorded.
-        travel: (13,) how far the joint went in the recording, 5th to 95th percentile [m, m, rad...].
+        travel: (13,) how far the joint went in the recording, 5th to 95th percentile [m, m, rad..., m].
         resampling: Of the n ticks.
     """
     return {

@@ -21,7 +21,7 @@ from hrcreplay.audit.metrics import (
     volume_at,
 )
 from hrcreplay.records import JOINTS, LIMBS
-from hrcreplay.report.metrics import Metric
+from hrcreplay.report.metrics import ANGLES, Metric
 from hrcreplay.report.page import PageFigure, PageSection
 from hrcreplay.report.story import Answer, Card
 from hrcreplay.report.tables import PageTable, text_of
@@ -245,9 +245,9 @@ def _joints(found: Mapping[str, Any], folder: Path) -> PageSection:
     tables = found["total"]["joints"]
     methods = in_order(tables)
     body = []
-    for j, joint in enumerate(JOINTS):
+    for joint in JOINTS:
         went = tables[methods[0]][joint]["travel"]
-        moved = "\u2013" if went is None else f"{went:.2f} m" if j < 2 else f"{went * 57.29578:.0f}\u00b0"
+        moved = "\u2013" if went is None else f"{went:.2f} m" if joint not in ANGLES else f"{went * 57.29578:.0f}\u00b0"
         body.append((joint, moved, *(text_with_interval(tables[m][joint]["inside_share"], 100.0) for m in methods)))
     table = PageTable(
         "Ticks with the joint in its reachable interval [%]", ("joint", "moved", *_named(methods)), tuple(body)

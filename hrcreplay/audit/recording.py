@@ -50,7 +50,7 @@ class Recording:
     t_ns: Ints  #: (m,) instants of the recorded points, increasing
     points_m: Floats  #: (m, 20, 3) POINTS, world [m]; NaN where not recorded or not believed
     joints_t_ns: Ints  #: (k,) instants of the recorded joints, increasing
-    joints: Floats  #: (k, 13) JOINTS [m, m, rad...]
+    joints: Floats  #: (k, 13) JOINTS [m, m, rad..., m]
     source: str  #: TRUTH, CAMERAS or SMOOTHED
     counts: dict[str, int]
 

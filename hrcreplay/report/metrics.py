@@ -60,7 +60,7 @@ def wrap(angle_rad: Floats) -> Floats:
 
 
 def difference(a: Floats, b: Floats) -> Floats:
-    """``a - b`` of rows of JOINTS, (n, 13) [m, m, rad...]; arms by the same name, angles the short way round."""
+    """``a - b`` of rows of JOINTS, (n, 13) [m, m, rad..., m]; arms by the same name, angles the short way round."""
     apart = nearest(a, b) - b
     return np.where(IS_ANGLE, wrap(apart), apart)
 
@@ -85,7 +85,7 @@ def interpolate(t_ns: Ints, values: Floats, at_ns: Ints, *, angles: bool) -> Flo
 
     Args:
         t_ns: (n,) instants of the samples, increasing [ns].
-        values: (n, 13) samples [m, m, rad...].
+        values: (n, 13) samples [m, m, rad..., m].
         at_ns: (m,) instants asked for [ns].
         angles: The columns of angles are angles, which go the short way round; else they are rates.
 

@@ -158,7 +158,7 @@ class Errors:
     """Estimate minus truth of one source, a row a tick or a frame; NaN where one of the two is missing."""
 
     t_ns: Ints  #: (n,) when the position errors hold [ns]
-    position: Floats  #: (n, 13) [m, m, rad...]
+    position: Floats  #: (n, 13) [m, m, rad..., m]
     velocity_t_ns: Ints  #: (k,) when the velocity errors hold [ns]
     velocity: Floats  #: (k, 13) [m/s, m/s, rad/s...]
 

@@ -104,7 +104,7 @@ NOT_CLAIMED = (
         "has it. A person who sees a robot move differently may move differently too."
     ),
     (
-        "The swept volumes follow from a model of twelve joints and assumed bounds. Real people bend sideways, lift "
+        "The swept volumes follow from a model of thirteen joints and assumed bounds. Real people bend sideways, lift "
         "shoulders and move faster than Table 1: the method 'paper' does not enclose all that a person can do."
     ),
     (

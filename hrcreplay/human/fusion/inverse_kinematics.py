@@ -67,7 +67,7 @@ def inverse(points_m: Floats) -> tuple[Floats, Floats]:
             measured neck stands in for it only where one shoulder is missing, and then no length rests on it.
 
     Returns:
-        Angles (n, 13) JOINTS [m, m, rad...], arms by their canonical names (``human.model``), and lengths (n, 7)
+        Angles (n, 13) JOINTS [m, m, rad..., m], arms by their canonical names (``human.model``), and lengths (n, 7)
         LENGTHS [m]. NaN where a point is missing, or where the two ends of a bone are in one place. At a singular
         posture the angle that cannot be observed is 0.
     """

@@ -1,6 +1,6 @@
 """How far people are from their model, limb by limb, and for how long a limb has not been seen.
 
-People bend sideways, twist and lift their shoulders; twelve joints do not (docs/paper.md). A sample of a
+People bend sideways, twist and lift their shoulders; thirteen joints do not (docs/paper.md). A sample of a
 limb's residual is the largest distance of its measured points from those of the predicted model at the frame's capture
 time, where the delay is compensated. It is taken before the frame is used, so it also holds how far the filter lags who
 sets off, from frames that show the limb and all that carries it with enough confidence and without an outlier.

@@ -88,7 +88,7 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
         j: Index into JOINTS.
         bounds: (6, 13) of ``reachable_sets.bounds_of``.
         coupled: Whether Eq. (34b), (34c) hold.
-        low: (13,) lower ends of the joints' reachable intervals [m, m, rad...].
+        low: (13,) lower ends of the joints' reachable intervals [m, m, rad..., m].
         high: (13,) their upper ends.
     """
     if not coupled or j not in (5, 6, 9, 10):

@@ -25,7 +25,7 @@ class Reach(Table):
     """Reachable interval of every joint, a row a tick, Eq. (36), (38), (39). The current posture is in it, Eq. (40)."""
 
     t_ns: Ints  #: (n,)
-    low: Floats  #: (n, 13) JOINTS [m, m, rad...]; NaN where the state is
+    low: Floats  #: (n, 13) JOINTS [m, m, rad..., m]; NaN where the state is
     high: Floats  #: (n, 13)
 
 
@@ -106,12 +106,12 @@ def reach_row(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Flo
     Alg. 1 and its clipping to Eq. (34), (35); walking is Eq. (18)-(30).
 
     Args:
-        p: (13,) JOINTS [m, m, rad...].
+        p: (13,) JOINTS [m, m, rad..., m].
         v: (13,) their velocities [m/s, m/s, rad/s...].
         never: (13,) whether no camera has ever shown the joint.
         within: What bounds the motions.
-        low: (13,) receives the lower ends [m, m, rad...].
-        high: (13,) receives the upper ends [m, m, rad...].
+        low: (13,) receives the lower ends [m, m, rad..., m].
+        high: (13,) receives the upper ends [m, m, rad..., m].
     """
     bounds, coupled, horizon, method = within
     _walk(p, v, bounds, horizon, method, low, high)

@@ -57,7 +57,7 @@ def enclose_row(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high
         i: Row of ``at``.
         at: Where people may be.
         within: What bounds their motions.
-        low: (13,) receives the lower ends [m, m, rad...]; NaN where the state is.
+        low: (13,) receives the lower ends [m, m, rad..., m]; NaN where the state is.
         high: (13,) receives the upper ends.
         corners: (SIDES, 2) receives the corners, world [m]; NaN where the state is.
     """
@@ -115,7 +115,7 @@ def _walk(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high: Floa
 
 
 def enclose(at: Likely, within: SoundMotionLimits) -> tuple[Floats, Floats]:
-    """Reachable intervals of all rows: lower and upper ends, (n, 13) each [m, m, rad...]."""
+    """Reachable intervals of all rows: lower and upper ends, (n, 13) each [m, m, rad..., m]."""
     low, high = np.empty_like(at.p), np.empty_like(at.p)
     _enclose_rows(at, within, low, high)
     return low, high

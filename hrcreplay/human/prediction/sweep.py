@@ -30,7 +30,7 @@ def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tu
 
     Args:
         limb: Index into LIMBS.
-        low: (13,) lower ends of the joints' reachable intervals [m, m, rad...].
+        low: (13,) lower ends of the joints' reachable intervals [m, m, rad..., m].
         high: (13,) their upper ends.
         lengths: (7,) LENGTHS [m].
     """

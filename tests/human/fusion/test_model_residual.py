@@ -130,7 +130,7 @@ def test_chunks_of_any_size_give_the_same_bits(demo: tuple[Measurements, Ints]) 
 
 
 def test_nine_of_ten_true_postures_are_within_it(demo: tuple[Measurements, Ints]) -> None:
-    """The demo's worker is up to 89-113 mm (p95) from twelve joints; noise and estimation come on top."""
+    """The demo's worker is up to 89-113 mm (p95) from the model; noise and estimation come on top."""
     m, t = demo
     states = fused(m, t)
     truth = list(open_log(DEMO).truth())
