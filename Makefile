@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: demo test bench soundness fuzz readme lock clean
+.PHONY: demo test bench soundness fuzz readme people lock clean
 
 demo: $(VENV)/made
 	@$(BIN)/hrcreplay demo
@@ -32,6 +32,11 @@ soundness: $(VENV)/made
 ONLY ?=
 readme: $(VENV)/made
 	$(BIN)/python -m tests.readme $(ONLY)
+
+# Fits hrcreplay/limits/people.toml again, byte for byte, to the recordings by others in $HRCREPLAY_DATA and to simulated
+# people who get up and sit down; tells what each recording that was left out gave.
+people: $(VENV)/made
+	$(BIN)/python -m tests.people
 
 # Spoils logs at random and puts them through the commands: no traceback, no other exit code, nothing half-written.
 LOGS ?= 500

@@ -28,3 +28,9 @@ class LiveStopped(HrcReplayError):
     """A live session that ended by a stop reason."""
 
     exit_code = 4
+
+
+class CoverageMissed(HrcReplayError):
+    """A fit that was written and holds fewer people that it was not fitted to than was asked for."""
+
+    exit_code = 5

@@ -1,7 +1,7 @@
 """The command ``fit-limits``: velocity and acceleration bounds fitted to logs, written as a limit set.
 
-With ``cover = "limbs"`` the fitted accelerations are scaled until the swept volumes, not the joint intervals, contain
-the people of the logs in the wanted share of the ticks.
+With ``cover = "limbs"`` it also bounds how far whole limbs depart from constant velocity (``departures``), so that the
+swept volumes, not only the joint intervals, contain the people of the logs in the wanted share of the ticks.
 """
 
 from __future__ import annotations
@@ -9,21 +9,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 
 from hrcreplay import __version__
 from hrcreplay.audit import fit_limits
 from hrcreplay.audit.bootstrap import Estimate, block_ticks, resample
-from hrcreplay.audit.fit_limits import Fit, Futures, fit_each_side
-from hrcreplay.audit.log_audit import RecordedFuture, check_containment, flesh_m, recorded_future, standstill_s
+from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, not_recorded, union_m3
+from hrcreplay.audit.departures import fit as fit_departures
+from hrcreplay.audit.fit_limits import Fit, Futures
 from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, read_recording
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.human.model import LimitSet
+from hrcreplay.human.model import Departure, LimitSet
 from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
+from hrcreplay.records import JOINTS, LIMBS, Floats
 from hrcreplay.run import build
 from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.prediction import PredictionStage
@@ -59,13 +60,8 @@ def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) ->
         told.append(f"{log['name']}: training {_text(log['training'])}; held back {_text(log['held_back'])}{left_out}")
     total = facts["total"]
     told.append(f"all joints: training {_text(total['training'])}; held back {_text(total['held_back'])}")
-    if "limbs" in facts:
-        if facts["not_checked"]:
-            told.append(f"not checked, so nothing is said of it: {', '.join(facts['not_checked'])}")
-        legs = "LEGS included" if "LEGS" not in facts["not_checked"] else "not LEGS"
-        training, held_back = (_text(facts["limbs"][part]) for part in ("training", "held_back"))
-        what = f"every limb that was checked ({legs}) in its volume of {facts['method']}"
-        told.append(f"{what}: training {training}; held back {held_back}")
+    if "departures" in facts:
+        told += _departure_lines(facts["departures"])
     told[-1] = f"fit-limits: {limits.name}: {told[-1]}"
     return told
 
@@ -79,83 +75,32 @@ def _text(share: dict[str, Any]) -> str:
     return f"{numbers} of {share['ticks']} ticks"
 
 
-#: Ticks a second whose volumes are held against the recorded future [Hz].
-TIGHTEN_HZ = 12.5
-#: Share of the ticks of each side of a joint that its acceleration holds before all are scaled.
-BEFORE = 0.9
-#: The smallest factor tried: minutes of a few people do not show all that they do. How often its interval is halved.
-_SMALLEST, _HALVINGS = 0.6, 4
+def _departure_lines(found: dict[str, Any]) -> list[str]:
+    gaps = found["not_checked"]
+    told = [f"not checked, so nothing is said of it: {', '.join(gaps)}"] if gaps else []
+    for log in found["logs"]:
+        sizes = ", ".join(f"{size:.1f}" for size in log["union_m3"])
+        told.append(f"{log['name']}: {found['unknown_are']}: {_by_horizon(found, log['shares'])}; union {sizes} m3")
+    training, unknown = (_by_horizon(found, found[part]) for part in ("training", "unknown"))
+    return [*told, f"whole limbs: training {training}; {found['unknown_are']} {unknown}"]
 
 
-@dataclass(frozen=True)
-class SplitPerson:
-    """One log's ticks for the limbs: those to fit on, and those held back."""
-
-    prediction_stage: PredictionStage
-    training: RecordedFuture
-    held_back: RecordedFuture
+def _by_horizon(found: dict[str, Any], shares: Sequence[dict[str, Any]]) -> str:
+    each = zip(found["horizon_s"], shares, strict=True)
+    return ", ".join(f"{h:g} s {_text(share).split(' of ')[0]}" for h, share in each)
 
 
-def unchecked_parts(people: Sequence[SplitPerson]) -> list[str]:
-    """Limbs, and points of other limbs, that were never seen to a horizon's end, so that nothing is said of them."""
-    parts = [part for one in people for part in (one.training, one.held_back)]
-    volumes = people[0].prediction_stage.volumes(parts[0].states.rows(slice(0, 0))).limbs
-    limbs = [limb for limb in BODY if limb not in volumes or not any(part.checked(limb).any() for part in parts)]
-    points = [
-        f"{point} of {limb}"
-        for limb, names in parts[0].points().items()
-        if limb not in limbs
-        for point in names
-        if not any(part.points()[limb][point] for part in parts)
-    ]
-    return limbs + points
+class FitReport(NamedTuple):
+    """What a fit tells."""
 
-
-def all_limbs_inside(prediction_stage: PredictionStage, future: RecordedFuture, limits: LimitSet) -> Floats:
-    """(n,) whether all limbs that were seen stayed whole in their volumes: 1, 0, or NaN where none was."""
-    volumes = replace(prediction_stage, limits=limits).volumes(future.states)
-    flesh = flesh_m(prediction_stage)
-    worst = check_containment(volumes, future, flesh, np.zeros(len(future.states), dtype=bool)).worst_m()
-    return np.where(np.isfinite(worst), (worst == 0.0).astype(float), np.nan)
-
-
-def tightening_factor(people: Sequence[SplitPerson], found: Fit, positions: LimitSet, share: float) -> float:
-    """The smallest factor on the fitted accelerations with which the volumes hold a share of the training ticks.
-
-    Half of the ticks that may be missed are kept in reserve, for other ticks than those fitted on. Ticks that even the
-    fitted accelerations do not hold, for what no bound can mend (a limb that is not where the model has it, a joint
-    that keeps the standard bounds), do not count: they would drive the bounds of all others up.
-
-    Args:
-        people: One split log each.
-        found: Fit whose accelerations are scaled.
-        positions: Limit set that gives the position bounds.
-        share: Of the training ticks, in (0, 1).
-    """
-
-    def held(scale: float) -> Bools:
-        limits = scale_accelerations(found, scale).onto(positions, positions.name)
-        return np.concatenate([all_limbs_inside(one.prediction_stage, one.training, limits) == 1.0 for one in people])
-
-    best = held(1.0)
-    low, high = _SMALLEST, 1.0
-    for _ in range(_HALVINGS):
-        middle = float(np.sqrt(low * high))
-        enough = (held(middle) & best).sum() >= 0.5 * (1.0 + share) * best.sum()
-        low, high = (low, middle) if enough else (middle, high)
-    return high
-
-
-def scale_accelerations(found: Fit, scale: float) -> Fit:
-    """The fit with its own accelerations scaled; joints that keep the standard bounds keep them."""
-    by = np.where(found.kept, 1.0, scale)
-    return replace(found, a_min=by * found.a_min, a_max=by * found.a_max)
+    lines: list[str]  #: what the user should know
+    missed: str  #: where whole limbs are inside less often than asked for in recordings not fitted to; empty: nowhere
 
 
 #: Ticks a second that are fitted to [Hz]; what no camera has seen for longer is no evidence [s]; of the bootstrap.
 FIT_HZ, SEEN_S, SEED = 25.0, 0.25, 3
 #: The limit sets that joints keep which cannot be fitted, and whose positions hold more than those.
-STANDARD, WIDE, KEPT = "paper", "human", "people"
+STANDARD, WIDE, KEPT = "paper", "human", "human"
 #: What the coverage is of: joints in their intervals, or limbs in their volumes.
 COVERS = ("joints", "limbs")
 
@@ -170,7 +115,14 @@ class FitSample:
     training: Futures
     held_back: Futures
     outside: bool  #: whether a training posture is outside the standard positions
-    limbs: SplitPerson
+    prediction_stage: PredictionStage
+    limbs: tuple[LimbDepartures, LimbDepartures]  #: of the two parts; empty where they are not asked for
+
+
+#: Ticks a second whose departures are measured [Hz].
+DEPARTURES_HZ = 12.5
+#: Of the ticks of a single log that was not fitted to, so many times as many may miss as of all.
+_EACH = 3.0
 
 
 def run(
@@ -181,7 +133,7 @@ def run(
     held_back: float = 0.3,
     cover: str = "joints",
     **options: Unpack[JobOptions],
-) -> list[str]:
+) -> FitReport:
     """Fits velocity and acceleration bounds to logs and writes them as a limit set.
 
     The last part of every log is held back: nothing is fitted to it. With several logs each is also left out as a
@@ -192,12 +144,12 @@ def run(
         out: Limit set to write (TOML), with provenance.
         coverage: Share of the ticks in which all fitted joints shall stay inside their intervals.
         held_back: Share of every log's time, its end.
-        cover: ``joints``: of ticks with all fitted joints in their intervals of Alg. 1. ``limbs``: of ticks with
-            all limbs that were seen, the lower body too, in the volumes of ``occupancy.method``, margins and all.
+        cover: ``joints``: bounds on the joints, whose intervals of Alg. 1 hold that share. ``limbs``: also how far
+            whole limbs, the lower body too, depart from constant velocity in that share of the ticks.
         **options: Settings, cell and span, as ``job.resolve`` takes them.
 
     Returns:
-        What the user should know, line by line.
+        What the user should know, and whether the share was missed.
 
     Raises:
         SettingsError: A setting cannot be used, or ``out`` exists.
@@ -206,18 +158,16 @@ def run(
     _refuse(logs, out, coverage, held_back, cover)
     jobs = [resolve("fit-limits", log, **options) for log in logs]
     horizon_s = _horizon_s(jobs)
-    samples = [_sample(job, horizon_s, held_back) for job in jobs]
+    samples = [_sample(job, horizon_s, held_back, cover == "limbs") for job in jobs]
     found = _fit(samples, coverage, horizon_s)
     limits = _limits(found, samples, out.stem)
-    limbs: dict[str, Any] = {}
+    facts = _facts(samples, found, limits, coverage, horizon_s, held_back) | {"covers": cover}
+    missed = ""
     if cover == "limbs":
-        training = Futures.join([sample.training for sample in samples])
-        found = fit_each_side(training, load_limits(KEPT), BEFORE, horizon_s)
-        found, limbs = _tightened([sample.limbs for sample in samples], found, limits, coverage, horizon_s)
-        limits = found.onto(limits, out.stem)
-    facts = _facts(samples, found, limits, coverage, horizon_s, held_back) | {"covers": cover} | limbs
+        departure, facts["departures"], missed = _departures(samples, coverage)
+        limits = replace(limits, departure=departure)
     write_limits(limits, facts, out)
-    return lines(found, limits, facts, STANDARD)
+    return FitReport(lines(found, limits, facts, STANDARD), missed)
 
 
 def _refuse(logs: Sequence[Path], out: Path, coverage: float, held_back: float, cover: str) -> None:
@@ -245,7 +195,7 @@ def _horizon_s(jobs: Sequence[Job]) -> float:
     return horizons.pop()
 
 
-def _sample(job: Job, horizon_s: float, held_back: float) -> FitSample:
+def _sample(job: Job, horizon_s: float, held_back: float, limbs: bool) -> FitSample:
     log = open_log(job.log, job.settings.logs)
     first_ns = log.header.start_ns
     begin_ns = first_ns + round((job.start_s or 0.0) * NS)
@@ -276,35 +226,74 @@ def _sample(job: Job, horizon_s: float, held_back: float) -> FitSample:
         some.rows(some.t_ns + round(horizon_s * NS) <= cut_ns),
         some.rows(some.t_ns > cut_ns),
         bool(fit_limits.outside_positions(training.p, load_limits(STANDARD)).any()),
-        _limbs(job, recording, cut_ns),
+        build.prediction_stage(job),
+        _limbs(job, recording, cut_ns if limbs else None),
     )
 
 
-def _limbs(job: Job, recording: Recording, cut_ns: int) -> SplitPerson:
-    prediction_stage, states = build.prediction_stage(job), recording.states
-    horizon_s = standstill_s(prediction_stage)
-    horizon_ns = round(horizon_s * NS)
-    ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / TIGHTEN_HZ)))
+def _limbs(job: Job, recording: Recording, cut_ns: int | None) -> tuple[LimbDepartures, LimbDepartures]:
+    """The departures in both parts of a recording; of no tick where ``cut_ns``, the end of the first, is None."""
+    stage, states = build.prediction_stage(job), recording.states
+    horizon_ns = round(stage.horizon_s * NS)
+    ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / DEPARTURES_HZ)))
     ticks = ticks[np.isfinite(states.residual_m[ticks, : len(LIMBS)]).all(axis=1)]  # the filter has found the person
-    end_ns = states.t_ns[ticks] + horizon_ns
-    parts = ticks[end_ns <= cut_ns], ticks[(states.t_ns[ticks] > cut_ns) & (end_ns <= recording.t_ns[-1])]
-    return SplitPerson(prediction_stage, *(recorded_future(recording, part, horizon_s) for part in parts))
+    ticks = ticks[states.t_ns[ticks] + horizon_ns <= recording.t_ns[-1]] if cut_ns is not None else ticks[:0]
+    whole = departures(stage, recording, ticks)
+    cut = -1 if cut_ns is None else cut_ns
+    first, last = (whole.states.t_ns + horizon_ns <= cut), (whole.states.t_ns > cut)
+    return whole.rows(np.flatnonzero(first)), whole.rows(np.flatnonzero(last))
 
 
-def _tightened(
-    people: Sequence[SplitPerson], found: Fit, limits: LimitSet, coverage: float, horizon_s: float
-) -> tuple[Fit, dict[str, Any]]:
-    """The fit with the accelerations that hold the limbs, and what it holds of all logs together and of each."""
-    factor = tightening_factor(people, found, limits, coverage)
-    found = scale_accelerations(found, factor)
-    limits = found.onto(limits, limits.name)
-    shares: dict[str, Any] = {}
-    for name in ("training", "held_back"):
-        parts = [all_limbs_inside(one.prediction_stage, getattr(one, name), limits)[:, None] for one in people]
-        shares[name] = _plain(_share(parts, horizon_s, TIGHTEN_HZ))
-        shares[f"{name}_by_log"] = [_plain(_share([part], horizon_s, TIGHTEN_HZ)) for part in parts]
-    method, gaps = people[0].prediction_stage.method, unchecked_parts(people)
-    return found, {"factor": round(factor, 4), "method": method, "not_checked": gaps, "limbs": shares}
+def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departure, dict[str, Any], str]:
+    """The departures fitted to all logs, what they and those fitted without each log hold, and where that misses."""
+    parts = [sample.limbs for sample in samples]
+    if len(samples) > 1:
+        whole = [LimbDepartures.join(two) for two in parts]
+        fitted, known = whole, whole
+        folds = [fit_departures([*whole[:i], *whole[i + 1 :]], coverage) for i in range(len(whole))]
+    else:
+        fitted, known = [two[0] for two in parts], [two[1] for two in parts]
+        folds = [fit_departures(fitted, coverage)]
+    found = fit_departures(fitted, coverage)
+    inside = [one.inside(fold) for one, fold in zip(known, folds, strict=True)]
+    horizons = range(len(found.horizon_s))
+    logs = [
+        {
+            "name": sample.name,
+            "shares": [_plain(_share([hits[k][:, None]], found.horizon_s[k], DEPARTURES_HZ)) for k in horizons],
+            "union_m3": [round(size, 3) for size in union_m3(sample.prediction_stage, one, fold)],
+            "capsules_m3": [round(size, 3) for size in capsules_m3(sample.prediction_stage, one)],
+        }
+        for sample, one, fold, hits in zip(samples, known, folds, inside, strict=True)
+    ]
+
+    def pooled(every: Sequence[Floats]) -> list[dict[str, Any]]:
+        return [
+            _plain(_share([hits[k][:, None] for hits in every], found.horizon_s[k], DEPARTURES_HZ)) for k in horizons
+        ]
+
+    facts = {
+        "horizon_s": found.horizon_s.tolist(),
+        "ticks_hz": DEPARTURES_HZ,
+        "unknown_are": "each log left out once" if len(samples) > 1 else "the part held back",
+        "training": pooled([one.inside(found) for one in fitted]),
+        "unknown": pooled(inside),
+        "not_checked": not_recorded(known),
+        "logs": logs,
+    }
+    return found, facts, _missed(facts, coverage)
+
+
+def _missed(facts: dict[str, Any], coverage: float) -> str:
+    """Where whole limbs that were not fitted to are inside less often than asked for."""
+    wanted = [("all logs", facts["unknown"], coverage)]
+    wanted += [(log["name"], log["shares"], 1.0 - _EACH * (1.0 - coverage)) for log in facts["logs"]]
+    return "; ".join(
+        f"{name}: found {100.0 * share['share']:.1f} % at {h:g} s, would be right: at least {100.0 * least:.1f} %"
+        for name, shares, least in wanted
+        for h, share in zip(facts["horizon_s"], shares, strict=True)
+        if share.get("share", 1.0) < least
+    )
 
 
 def _fit(samples: Sequence[FitSample], coverage: float, horizon_s: float) -> Fit:

@@ -29,7 +29,7 @@ from hrcreplay.cli import (
     live,
     span,
 )
-from hrcreplay.errors import HrcReplayError, SettingsError
+from hrcreplay.errors import CoverageMissed, HrcReplayError, SettingsError
 
 app = typer.Typer(
     name="hrcreplay",
@@ -352,9 +352,12 @@ def fit_limits(
 
     overrides = as_overrides(settings, topic)
     options = {"config": config, "overrides": overrides, "cell_file": cell, **span(start, end)}
-    for line in fit.run(logs, out=out, coverage=coverage, held_back=held_back, cover=cover, **options):
+    found = fit.run(logs, out=out, coverage=coverage, held_back=held_back, cover=cover, **options)
+    for line in found.lines:
         sys.stderr.write(f"hrcreplay: {line}\n")
     sys.stdout.write(f"{out}\n")
+    if found.missed:
+        raise CoverageMissed(f"{out}: {found.missed}")
 
 
 @app.command()

@@ -11,7 +11,9 @@ jump although the arm does not, and whoever follows angles through time takes th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -34,6 +36,19 @@ _DEGREE = np.pi / 180.0
 
 
 @dataclass(frozen=True)
+class Departure:
+    """How far whole limbs get from where the fused velocity takes them, measured on recordings.
+
+    Until a horizon no point of a limb is further from the hull of the limb at the tick and after the horizon, its ends
+    moving on as they do, than ``beyond_m`` and ``residuals`` times the limb's residual, as far as that is noise.
+    """
+
+    horizon_s: Floats  #: (h,) increasing [s]
+    beyond_m: Floats  #: (7, h) for each limb of BODY [m]
+    residuals: Floats  #: (7, h) at least 1
+
+
+@dataclass(frozen=True)
 class LimitSet:
     """Bounds on the joints of Eq. (37), as in Table 1, (13,) each, [m, m, rad..., m] and their derivatives.
 
@@ -50,6 +65,35 @@ class LimitSet:
     a_min: Floats
     a_max: Floats
     coupled: bool
+    departure: Departure | None = None  #: bounds the limbs under ``sound``; none: only the joints are bounded
+
+    def plain(self) -> dict[str, Any]:
+        """JSON form; no bound is null."""
+        found = {name: _plain(value) for name, value in vars(self).items() if name != "departure"}
+        if self.departure is not None:
+            found["departure"] = {name: value.tolist() for name, value in vars(self.departure).items()}
+        return found
+
+    @classmethod
+    def of(cls, plain: Mapping[str, Any]) -> LimitSet:
+        """The limit set of which ``plain`` is the JSON form."""
+        found = {name: _bound(name, value) for name, value in plain.items() if name != "departure"}
+        if plain.get("departure") is not None:
+            found["departure"] = Departure(**{name: np.array(value) for name, value in plain["departure"].items()})
+        return cls(**found)
+
+
+def _plain(value: Any) -> Any:
+    if not isinstance(value, np.ndarray):
+        return value
+    return [number if abs(number) != np.inf else None for number in value.tolist()]
+
+
+def _bound(name: str, value: Any) -> Any:
+    if not isinstance(value, list):
+        return value
+    none = -np.inf if name.endswith("_min") else np.inf
+    return np.array([none if number is None else number for number in value], dtype=float)
 
 
 def skeleton(p: Floats, lengths_m: Floats) -> Floats:

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.human.model import LimitSet, alpha_2_bounds, alpha_3_bounds
-from hrcreplay.records import JOINTS, Floats
+from hrcreplay.human.model import Departure, LimitSet, alpha_2_bounds, alpha_3_bounds
+from hrcreplay.records import BODY, JOINTS, Floats
 from hrcreplay.store.run_folder import write_whole
 
 _HERE = Path(__file__).parent
@@ -22,10 +22,13 @@ _COUPLED = ("ar2", "ar3", "al2", "al3")
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _PAIR = "[low, high] with low <= high"
 _ROW = f"a row with {', '.join(_QUANTITIES)}"
+_LIMB_ROW = "a row with beyond_m, residuals"
 #: What to write instead, by the key.
 _RIGHT = {
     "coupled": "true or false",
     "joints": "a table with a row for each joint",
+    "departure": f"horizon_s and a row for each of {', '.join(BODY)}, or leave it out",
+    "horizon_s": "[s...], above 0 and increasing",
     "provenance": "a table, or leave it out",
 }
 
@@ -39,8 +42,9 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
         name_or_path: ``paper``, ``human``, ``people`` or a file like theirs: ``coupled`` and a table ``joints`` with
             a row ``{ position = [low, high], velocity = [...], acceleration = [...] }`` for each of JOINTS
             [m, m, rad..., m; per second; per second squared]. Where coupled, alpha_2 and alpha_3 have no position;
-            without a row ``z``, that of ``human`` holds. A table ``provenance`` may say where the bounds come from;
-            it changes nothing.
+            without a row ``z``, that of ``human`` holds. A table ``departure`` may bound how far limbs depart from
+            constant velocity: ``horizon_s = [...]`` and a row ``{ beyond_m = [...], residuals = [...] }`` for each of
+            BODY. A table ``provenance`` may say where the bounds come from; it changes nothing.
 
     Raises:
         SettingsError: The file cannot be read, or a key or a bound is not what it should be.
@@ -65,7 +69,25 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
     if coupled:
         _enclose(bounds)
     p, v, a = (np.ascontiguousarray(bounds[:, k].T) for k in range(len(_QUANTITIES)))
-    return LimitSet(path.stem, p[0], p[1], v[0], v[1], a[0], a[1], coupled)
+    return LimitSet(path.stem, p[0], p[1], v[0], v[1], a[0], a[1], coupled, _departure(file["departure"], str(path)))
+
+
+def _departure(table: dict[str, Any] | None, where: str) -> Departure | None:
+    if table is None:
+        return None
+    horizon_s = np.array(table["horizon_s"])
+    grows = len(horizon_s) > 0 and (np.diff(horizon_s, prepend=0.0) > 0.0).all()
+    if not (grows and np.isfinite(horizon_s).all()):
+        raise SettingsError(f"{where}: departure.horizon_s: found {table['horizon_s']}; write {_RIGHT['horizon_s']}")
+    for limb in BODY:
+        for name, least in (("beyond_m", 0.0), ("residuals", 1.0)):
+            values = np.array(table[limb][name])
+            if len(values) != len(horizon_s) or not (values >= least).all() or not np.isfinite(values).all():
+                raise SettingsError(
+                    f"{where}: departure.{limb}.{name}: found {table[limb][name]}; write {len(horizon_s)} numbers, one "
+                    f"for each horizon, at least {least:g}"
+                )
+    return Departure(horizon_s, *(np.array([table[limb][name] for limb in BODY]) for name in ("beyond_m", "residuals")))
 
 
 def write_limits(limits: LimitSet, provenance: dict[str, Any], path: Path) -> None:
@@ -95,6 +117,12 @@ def _toml(limits: LimitSet, provenance: dict[str, Any]) -> str:
         if limits.coupled and joint in _COUPLED:
             del row["position"]
         lines.append(f"{joint} = {_value(row)}")
+    known = limits.departure
+    if known is not None:
+        lines += ["", "[departure]", f"horizon_s = {_value(known.horizon_s.tolist())}"]
+        for k, limb in enumerate(BODY):
+            row = {"beyond_m": known.beyond_m[k].tolist(), "residuals": known.residuals[k].tolist()}
+            lines.append(f"{limb} = {_value(row)}")
     lines += ["", "[provenance]", *(f"{key} = {_value(value)}" for key, value in provenance.items())]
     return "\n".join(lines) + "\n"
 
@@ -129,10 +157,23 @@ class _Row(BaseModel):
     acceleration: _Pair
 
 
+class _LimbRow(BaseModel):
+    model_config = _STRICT
+    beyond_m: list[float]
+    residuals: list[float]
+
+
 _rows: Any = dict.fromkeys(JOINTS, (_Row, ...)) | {"z": (_Row | None, None)}
 _Joints = create_model("_Joints", __config__=_STRICT, **_rows)
+_limbs: Any = {"horizon_s": (list[float], ...)} | dict.fromkeys(BODY, (_LimbRow, ...))
+_Departures = create_model("_Departures", __config__=_STRICT, **_limbs)
 _LimitFile = create_model(
-    "_LimitFile", __config__=_STRICT, coupled=(bool, ...), joints=(_Joints, ...), provenance=(dict[str, Any], {})
+    "_LimitFile",
+    __config__=_STRICT,
+    coupled=(bool, ...),
+    joints=(_Joints, ...),
+    departure=(_Departures | None, None),
+    provenance=(dict[str, Any], {}),
 )
 
 
@@ -142,13 +183,16 @@ def _first_problem(error: ValidationError, table: dict[str, Any], where: str) ->
     problem = next((one for one in problems if one["type"] == "extra_forbidden"), problems[0])
     keys = [str(key) for key in problem["loc"][:3]]  # a bound inside a pair is shown with its pair
     if problem["type"] == "extra_forbidden":
-        known = (_LimitFile.model_fields, JOINTS, _QUANTITIES)[len(keys) - 1]
+        of_limbs = (("horizon_s", *BODY), tuple(_LimbRow.model_fields))
+        rows = of_limbs if keys[0] == "departure" else (JOINTS, _QUANTITIES)
+        known = (tuple(_LimitFile.model_fields), *rows)[len(keys) - 1]
         above = ".".join(keys[:-1])
         return f"{where}{above and ': '}{above}: unknown key {keys[-1]!r}; known here: {', '.join(known)}"
     found: Any = table
     for key in keys:
         found = found.get(key)
-    return f"{where}: {'.'.join(keys)}: found {found!r}; write {_RIGHT.get(keys[-1], _PAIR if len(keys) > 2 else _ROW)}"
+    row, pair = (_LIMB_ROW, "a number for each horizon") if keys[0] == "departure" else (_ROW, _PAIR)
+    return f"{where}: {'.'.join(keys)}: found {found!r}; write {_RIGHT.get(keys[-1], pair if len(keys) > 2 else row)}"
 
 
 def _bounds(row: dict[str, Any], joint: str, where: str, coupled: bool) -> list[list[float]]:

@@ -6,15 +6,12 @@ Also the files behind ``robot.urdf``: the URDF and the meshes of its links, whic
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import tomllib
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypedDict
-
-import numpy as np
 
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell, load_cell
@@ -155,7 +152,7 @@ class Job:
             "cell": None if self.cell is None else self.cell.to_dict(),
             "task": self.task,
             "span_s": [self.start_s, self.end_s],
-            "limits": {"tracking": plain_limits(self.tracking), "prediction": plain_limits(self.prediction)},
+            "limits": {"tracking": self.tracking.plain(), "prediction": self.prediction.plain()},
         }
 
 
@@ -250,22 +247,10 @@ def job_of_run(folder: Path) -> Job:
         task=meta["task"],
         start_s=meta["span_s"][0],
         end_s=meta["span_s"][1],
-        tracking=_limits_of(meta["limits"]["tracking"]),
-        prediction=_limits_of(meta["limits"]["prediction"]),
+        tracking=LimitSet.of(meta["limits"]["tracking"]),
+        prediction=LimitSet.of(meta["limits"]["prediction"]),
         earlier=folder,
     )
-
-
-def _limits_of(plain: dict[str, Any]) -> LimitSet:
-    """The limit set of which ``plain_limits`` gave the JSON form."""
-
-    def bound(name: str, value: Any) -> Any:
-        if not isinstance(value, list):
-            return value
-        none = -math.inf if name.endswith("_min") else math.inf
-        return np.array([none if number is None else number for number in value], dtype=float)
-
-    return LimitSet(**{name: bound(name, value) for name, value in plain.items()})
 
 
 def job_without_log(command: str, where: Path, settings: Settings, cell_file: Path | None) -> Job:
@@ -325,14 +310,3 @@ def urdf_digest(settings: Settings) -> str | None:
 def _urdf_inputs(settings: Settings) -> list[dict[str, str]]:
     files = read_urdf(settings.robot)
     return [] if files is None else [{"path": path, "sha256": digest} for path, digest in files.inputs]
-
-
-def plain_limits(limits: LimitSet) -> dict[str, Any]:
-    """JSON form of a limit set; no bound is null."""
-
-    def plain(value: Any) -> Any:
-        if not hasattr(value, "tolist"):
-            return value
-        return [number if abs(number) != float("inf") else None for number in value.tolist()]
-
-    return {name: plain(value) for name, value in asdict(limits).items()}

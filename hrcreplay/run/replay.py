@@ -27,7 +27,7 @@ from hrcreplay.report.story import defect_notes
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import LogLike
 from hrcreplay.run.contact import write_contact
-from hrcreplay.run.job import TABLES, Job, JobOptions, plain_limits, resolve, urdf_digest, versions
+from hrcreplay.run.job import TABLES, Job, JobOptions, resolve, urdf_digest, versions
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
 from hrcreplay.store import run_folder
@@ -298,10 +298,10 @@ def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
         "settings logs": _without(settings["logs"], "joints_topic", "gap_s"),
         "logs.gap_s": settings["logs"]["gap_s"],
         "settings fusion": settings["fusion"],
-        "limits.tracking": _without(plain_limits(job.tracking), "name"),
+        "limits.tracking": _without(job.tracking.plain(), "name"),
         "settings occupancy": _without(settings["occupancy"], "store_hz"),
         "occupancy.store_hz": settings["occupancy"]["store_hz"],
-        "limits.prediction": _without(plain_limits(job.prediction), "name"),
+        "limits.prediction": _without(job.prediction.plain(), "name"),
     }
     if "plan" in job.stages:
         base = build.known_robot_base(job, log)

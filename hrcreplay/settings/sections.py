@@ -113,6 +113,8 @@ class Fusion(Section):
     """A distance seen this long ago counts 1/e of a new one [s]."""
     residual_hold_s: NotNegative = 0.15
     """A distance above the quantile counts for so long, or until a larger one [s]."""
+    offset_memory_s: Positive = 0.5
+    """Where shoulders, head and arms are beside the model is a mean in which a frame this old counts 1/e [s]."""
     spread_memory_s: Positive = 1.0
     """The reported deviations follow the surprises of measurements; a surprise falls to 1/e in this time [s]."""
     spread_least: Positive = 0.01

@@ -66,7 +66,7 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
     "audit with an unknown key": (
         ("audit", DEMO, "--limits", "unknown.toml"),
         2,
-        "unknown.toml: unknown key 'speed'; known here: coupled, joints, provenance",
+        "unknown.toml: unknown key 'speed'; known here: coupled, joints, departure, provenance",
     ),
     "predict with an unknown joint": (("predict", DEMO, "--limits", "knee.toml"), 2, "joints: unknown key 'knee'"),
     "audit without camera poses": (

@@ -17,14 +17,17 @@ from hrcreplay.records import JOINTS
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
 from tests.audit.standing import log_of_one_who_does_not_stir
+from tests.cli.test_app import Run, run
 from tests.realdata import data_path
 from tests.test_recordings import SARA, SARA_CELL
+
+__all__ = ["run"]  # the fixture
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     out = tmp_path_factory.mktemp("fit") / "worker.toml"
-    return out, fit.run([replay.demo_log()], out=out, coverage=0.99)
+    return out, fit.run([replay.demo_log()], out=out, coverage=0.99).lines
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +96,7 @@ def test_the_part_held_back_changes_no_bound(tmp_path: Path, fitted: tuple[Path,
 def test_several_logs_are_each_left_out_once(tmp_path: Path) -> None:
     shutil.copy(replay.demo_log(), tmp_path / "copy.mcap")
     out = tmp_path / "two.toml"
-    lines = fit.run([replay.demo_log(), tmp_path / "copy.mcap"], out=out, end_s=20.0, coverage=0.95)
+    lines = fit.run([replay.demo_log(), tmp_path / "copy.mcap"], out=out, end_s=20.0, coverage=0.95).lines
     logs = tomllib.loads(out.read_text())["provenance"]["logs"]
     assert [log["name"] for log in logs] == ["demo.mcap", "copy.mcap"]
     for log in logs:
@@ -104,20 +107,47 @@ def test_several_logs_are_each_left_out_once(tmp_path: Path) -> None:
     assert sum("fitted to the other logs" in line for line in lines) == 2
 
 
-def test_covering_the_limbs_needs_less_than_covering_the_joints(tmp_path: Path, fitted: tuple[Path, list[str]]) -> None:
-    out = tmp_path / "limbs.toml"
-    lines = fit.run([replay.demo_log()], out=out, cover="limbs", overrides=("occupancy.method=sound",))
-    limits, joints = load_limits(out), load_limits(fitted[0])
-    found = tomllib.loads(out.read_text())["provenance"]
+@pytest.fixture(scope="module")
+def of_limbs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, fit.FitReport]:
+    folder = tmp_path_factory.mktemp("limbs")
+    shutil.copy(replay.demo_log(), folder / "copy.mcap")
+    out = folder / "limbs.toml"
+    return out, fit.run([replay.demo_log(), folder / "copy.mcap"], out=out, cover="limbs", end_s=30.0)
+
+
+def test_covering_the_limbs_bounds_their_departures(of_limbs: tuple[Path, fit.FitReport]) -> None:
+    out, report = of_limbs
+    departure, found = load_limits(out).departure, tomllib.loads(out.read_text())["provenance"]
+    assert departure is not None
+    assert departure.horizon_s.tolist() == [0.05, 0.1, 0.2, 0.377] == found["departures"]["horizon_s"]
+    reach = departure.beyond_m + 0.08 * departure.residuals
+    assert (np.diff(reach[:6], axis=1) > -0.01).all()  # further in more time
+    assert (reach[:6, 3] > reach[:6, 0] + 0.05).all()
+    np.testing.assert_array_equal(departure.beyond_m[[2, 3]], departure.beyond_m[[4, 5]])  # both sides alike
     assert found["covers"] == "limbs"
-    assert found["method"] == "sound"
-    assert found["factor"] < 1.0
-    assert (limits.a_max <= joints.a_max).all()  # velocities are people's own, accelerations what is left
-    assert found["limbs"]["training"]["share"] >= 0.99
-    assert found["limbs"]["held_back"]["share"] >= 0.99
-    assert found["not_checked"] == []
-    told = "fit-limits: limbs: every limb that was checked (LEGS included) in its volume of sound: training 9"
-    assert lines[-1].startswith(told) or lines[-1].startswith(told.replace("training 9", "training 100.0 %"))
+    assert [share["share"] >= 0.99 for share in found["departures"]["training"]] == [True] * 4
+    for log in found["departures"]["logs"]:
+        # the copy is the original, so what is fitted to one holds the other
+        assert [share["share"] for share in log["shares"]] == [
+            share["share"] for share in found["departures"]["training"]
+        ]
+        assert (np.diff(log["union_m3"]) > 0.0).all()
+        assert log["union_m3"][3] < 1.3 * log["capsules_m3"][3]
+    assert report.missed == ""
+    assert report.lines[-1].startswith("fit-limits: limbs: whole limbs: training 0.05 s 9")
+    assert "each log left out once" in report.lines[-1]
+
+
+def test_a_share_that_others_miss_is_told_and_fails(tmp_path: Path, run: Run) -> None:
+    """Bounds of somebody who does not stir hold nobody else."""
+    still = log_of_one_who_does_not_stir(tmp_path / "still.mcap")
+    out = tmp_path / "two.toml"
+    code, printed, told = run("fit-limits", still, replay.demo_log(), "--end", 9, "--out", out)
+    assert code == 5
+    assert printed.strip() == str(out)
+    assert load_limits(out).departure is not None
+    assert "demo.mcap: found" in told.splitlines()[-1]
+    assert "would be right: at least 97.0 %" in told.splitlines()[-1]
 
 
 def test_another_kind_of_coverage_is_refused(tmp_path: Path) -> None:
@@ -153,8 +183,8 @@ def test_a_real_recording(tmp_path: Path, name: str) -> None:
     settings, cell, out = tmp_path / "s.toml", tmp_path / "cell.toml", tmp_path / "person.toml"
     settings.write_text(SARA)
     cell.write_text(SARA_CELL)
-    lines = fit.run([bag], out=out, config=settings, cell_file=cell)
-    limits, people = load_limits(out), load_limits("people")
+    lines = fit.run([bag], out=out, config=settings, cell_file=cell).lines
+    limits, human = load_limits(out), load_limits("human")
     found = tomllib.loads(out.read_text())["provenance"]
     assert found["logs"][0]["recorded_future"] == "smoothed estimate"
     assert found["total"]["training"]["share"] >= 0.99
@@ -164,4 +194,4 @@ def test_a_real_recording(tmp_path: Path, name: str) -> None:
     assert any("too little motion to say" in line and "rho" in line for line in lines)
     for joint in found["kept"]:
         j = JOINTS.index(joint)
-        assert (limits.v_max[j], limits.a_max[j]) == (people.v_max[j], people.a_max[j])
+        assert (limits.v_max[j], limits.a_max[j]) == (human.v_max[j], human.a_max[j])

@@ -83,4 +83,4 @@ def used_frames(m: Measurements, t_ns: Ints) -> list[tuple[int, int]]:
         if k < len(t_ns) and m.capture_ns[i] >= captured[c]:
             captured[c] = int(m.capture_ns[i])
             newest[k, c] = i
-    return sorted((k, i) for (k, _), i in newest.items())
+    return [(k, i) for (k, _), i in sorted(newest.items())]

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.model import LimitSet, clamp
+from hrcreplay.human.model import LimitSet, clamp, skeleton
 from hrcreplay.records import BODY, DOF, LIMBS, Floats, HumanStates
 
 LENGTHS_M = np.array([0.5, 0.21, 0.19, 0.33, 0.34, 0.26, 0.27])
@@ -30,6 +30,7 @@ def states(p: Floats, v: Floats, lengths_m: Floats = LENGTHS_M) -> HumanStates:
         valid=valid,
         residual_m=np.zeros((len(p), len(BODY))),
         unseen_s=np.zeros((len(p), len(LIMBS))),
+        points_m=skeleton(p, lengths),
         cameras=("camera",),
     )
 

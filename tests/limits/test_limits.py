@@ -81,7 +81,7 @@ def test_a_file_of_the_users_own(tmp_path: Path) -> None:
             "human",
             "coupled = false",
             "coupled = false\nspeed = 1",
-            r"unknown key 'speed'; known here: coupled, joints, provenance",
+            r"unknown key 'speed'; known here: coupled, joints, departure, provenance",
         ),
         ("human", "\nar4 ", "\nar5 ", r"joints: unknown key 'ar5'; known here: x, y, theta"),
         ("human", "\nar4 ", "\n#ar4 ", r"joints.ar4: found None; write a row"),

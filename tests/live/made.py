@@ -52,6 +52,7 @@ class MadeController:
             valid=np.array([[bool(skeletons), False]]),
             residual_m=np.full((1, 7), np.nan),
             unseen_s=np.full((1, 6), np.inf),
+            points_m=np.full((1, 20, 3), np.nan),
             cameras=("left", "right"),
         )
         vertices = np.arange(6 * 4 * 3).reshape(-1, 3) + np.tanh(self.p[0])

@@ -53,6 +53,7 @@ STALE = {
     "fusion.residual_quantile": ALL,
     "fusion.residual_memory_s": ALL,
     "fusion.residual_hold_s": ALL,
+    "fusion.offset_memory_s": ALL,
     "fusion.spread_memory_s": ALL,
     "fusion.spread_least": ALL,
     "fusion.spread_most": ALL,

@@ -59,9 +59,14 @@ class Plan:
         ).model_copy(update={f"radius_{limb}_m": 0.0 for limb in limbs} | {"legs_radius_m": 0.0})
 
     @property
+    def of_joints(self) -> LimitSet:
+        """The limits without departures: tests/human/prediction/test_velocity_tube.py is about those."""
+        return replace(load_limits(self.limits), departure=None)
+
+    @property
     def obeyed(self) -> LimitSet:
         """What the motions keep to: under a printed method, which holds the pelvis's height, that stays as it is."""
-        limits = load_limits(self.limits)
+        limits = self.of_joints
         if self.method not in PRINTED:
             return limits
         still = [np.append(rates[:HEIGHT], 0.0) for rates in (limits.v_min, limits.v_max)]
@@ -111,9 +116,7 @@ def corners_of(limbs: tuple[str, ...]) -> Corners:
 
 def predict(states: HumanStates, plan: Plan) -> SweptVolumes:
     """The volumes under test. Limbs have no thickness, so their radii are what the method adds for other reasons."""
-    return swept_volumes.predict(
-        states, load_limits(plan.limits), plan.occupancy, horizon_s=plan.horizon_s, memory_s=MEMORY_S
-    )
+    return swept_volumes.predict(states, plan.of_joints, plan.occupancy, horizon_s=plan.horizon_s, memory_s=MEMORY_S)
 
 
 def sample_states(plan: Plan, first: int, count: int) -> Result:

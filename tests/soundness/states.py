@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.model import LimitSet
+from hrcreplay.human.model import LimitSet, skeleton
 from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, Floats, HumanStates
 from tests.soundness.joint import bounds_of, rates_of, stops_at
 from tests.soundness.motion import allowed
@@ -97,5 +97,6 @@ def states_of(estimates: list[Estimate], unseen_s: float = 0.0) -> HumanStates:
         valid=np.ones((n, 1), dtype=bool),
         residual_m=np.zeros((n, len(BODY))),
         unseen_s=np.full((n, len(LIMBS)), unseen_s),
+        points_m=skeleton(np.array([e.q for e in estimates]), np.array([e.lengths for e in estimates])),
         cameras=("camera",),
     )

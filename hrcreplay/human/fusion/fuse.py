@@ -76,6 +76,11 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         residual=np.full(len(BODY), np.nan),
         peak=np.zeros(len(BODY)),
         peak_ns=np.full(len(BODY), NEVER_NS),
+        offset=np.zeros((len(POINTS), 3)),
+        offset_weight=np.zeros(len(POINTS)),
+        offset_ns=np.full(len(POINTS), NEVER_NS),
+        carried=np.full((len(POINTS), 3), np.nan),
+        carried_ns=np.full(len(POINTS), NEVER_NS),
         surprise=np.ones(DOF),
         spread=np.ones(DOF),
     )
@@ -133,6 +138,7 @@ def fuse(
         valid=track.valid,
         residual_m=track.residual,
         unseen_s=track.unseen,
+        points_m=track.points,
         cameras=measurements.cameras,
     )
     counts = Counter({"joints_reacquired": int(track.reacquired[0]), "ticks_saturated": int(track.saturated[0])})
@@ -191,6 +197,7 @@ def _rules(settings: Fusion, limits: LimitSet) -> Rules:
         residual_quantile=settings.residual_quantile,
         residual_memory_s=settings.residual_memory_s,
         residual_hold_ns=round(settings.residual_hold_s * 1e9),
+        offset_memory_s=settings.offset_memory_s,
         spread_memory_s=settings.spread_memory_s,
         spread_least=settings.spread_least,
         spread_most=settings.spread_most,
@@ -214,6 +221,7 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         valid=np.zeros((n, cameras), dtype=np.bool_),
         residual=np.full((n, len(BODY)), np.nan),
         unseen=np.full((n, len(LIMBS)), np.inf),
+        points=np.full((n, len(POINTS), 3), np.nan),
         cov=np.full((rows, DOF, 4, 4), np.nan),
         damping=np.ones((rows, DOF)),
         outliers=np.zeros(cameras, dtype=np.int64),

@@ -54,6 +54,11 @@ class Filter(NamedTuple):
     residual: Floats  #: (7,) their quantile [m]
     peak: Floats  #: (7,) largest of the last few [m]
     peak_ns: Ints  #: (7,) tick of it
+    offset: Floats  #: (20, 3) running mean of where points are beside the model, in the torso's frame [m]
+    offset_weight: Floats  #: (20,) of all that it is the mean of
+    offset_ns: Ints  #: (20,) tick of the last
+    carried: Floats  #: (20, 3) hands from the wrist, legs from below the pelvis, world [m]
+    carried_ns: Ints  #: (20,) when a camera took that
     surprise: Floats  #: (13,) running mean of each joint's innovations squared over their variance
     spread: Floats  #: (13,) highest of it lately: the factor on the variances that are told
 
@@ -87,6 +92,7 @@ class Rules(NamedTuple):
     residual_quantile: float
     residual_memory_s: float
     residual_hold_ns: int
+    offset_memory_s: float
     spread_memory_s: float
     spread_least: float
     spread_most: float
@@ -109,6 +115,7 @@ class Track(NamedTuple):
     valid: Bools  #: (n, c)
     residual: Floats  #: (n, 7)
     unseen: Floats  #: (n, 6)
+    points: Floats  #: (n, 20, 3)
     cov: Floats  #: (n or 0, 13, 4, 4)
     damping: Floats  #: (n or 0, 13) of the derivatives, on the way to the tick
     outliers: Ints  #: (c,)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from hrcreplay.human.fusion.body_points import place
 from hrcreplay.human.fusion.gating import judge
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, correct, delay, dot, enter, factor, predict
@@ -188,6 +189,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
     track.lengths[1, k] = np.sqrt(filter_.lengths_var)
     told(filter_, filter_.tick_ns[0], rules, track.residual[k])
     unseen(filter_, track.unseen[k])
+    place(filter_, filter_.mean[:, 0].copy(), rules, track.points[k])
     if len(track.cov) > 0:
         track.cov[k] = filter_.cov
         track.damping[k] = damping

@@ -20,13 +20,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from hrcreplay.human.fusion.body_points import REACH_M, learn, shift
 from hrcreplay.human.fusion.gating import distance
 from hrcreplay.human.fusion.kalman import Filter, Rules, ago, delay
 from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
 
-#: No point of a leg is further from the pelvis: toes of a tall man's straight leg. What is further is no leg [m].
-REACH_M = 1.2
 _BIN_M = 0.001
 #: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person's arm.
 BINS = round(REACH_M / _BIN_M)
@@ -64,21 +63,28 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
         now: The tick [ns].
         rules: Settings of the filter.
     """
-    model = np.empty_like(filter_.points[0])
     for c in np.flatnonzero(fresh):
-        skeleton_row(ago(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths, model)
+        p = ago(filter_.mean, delay(filter_, c, now, rules))
+        plain = np.full(filter_.points[0].shape, np.nan)
+        skeleton_row(p, filter_.lengths, plain)
+        model = plain.copy()
+        shift(filter_, p, model)
         _depart(filter_, c, model, now, rules)
-        for limb in np.flatnonzero(filter_.shows[c]):
-            if _settled(filter_, limb, now, rules):
-                sample = 0.0
-                for k in _ENDS[limb]:
-                    sample = max(sample, distance(filter_.points[c, k], model[k]))
-                _enter(filter_, limb, now, sample, rules)
-        if filter_.valid[c, :2].all() and _settled(filter_, _LEGS, now, rules):
+        shown = np.zeros(len(BODY), np.bool_)
+        for k in range(len(BODY)):
+            has = filter_.valid[c, :2].all() if k == _LEGS else filter_.shows[c, k]
+            shown[k] = has and _settled(filter_, k, now, rules)
+        for limb in np.flatnonzero(shown[:_LEGS]):
+            sample = 0.0
+            for k in _ENDS[limb]:
+                sample = max(sample, distance(filter_.points[c, k], model[k]))
+            _enter(filter_, limb, now, sample, rules)
+        if shown[_LEGS]:
             below = _farthest(filter_, c, _BELOW, model[PELVIS], rules)
             if below >= 0.0:
                 sample = max(below, _farthest(filter_, c, _HIPS, model[PELVIS], rules))
                 _enter(filter_, _LEGS, now, sample, rules)
+        learn(filter_, c, now, shown, p, plain, model, rules)
     for limb in np.flatnonzero(filter_.sampled_ns == now):
         if filter_.samples[limb] >= LEAST:
             larger = (1.0 - rules.residual_quantile) * filter_.weight[limb]

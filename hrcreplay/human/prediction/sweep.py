@@ -318,3 +318,21 @@ def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floa
             if is_inside(px, py, points[i, 2], faces, work.planes):
                 steps[i, k], steps[i, k + 1] = x, y
     return steps
+
+
+@njit(cache=True)
+def append(vertices: Floats, n: int, swept: Floats, count: int) -> Floats:
+    """Vertices with more of them behind their first rows, in a larger array if need be.
+
+    Args:
+        vertices: (m, 3) of which the first n count [m].
+        n: How many count.
+        swept: (k, 3) what to put behind them [m].
+        count: How many of these.
+    """
+    if n + count > len(vertices):
+        roomier = np.empty((2 * (n + count), 3))
+        roomier[:n] = vertices[:n]
+        vertices = roomier
+    vertices[n : n + count] = swept[:count]
+    return vertices

@@ -174,6 +174,12 @@ KNEE_M = 0.55
 
 
 @njit(cache=True)
+def knees_out(pelvis_m: float) -> float:
+    """How far the knees are from the line below a pelvis of that height, whose foot is under it [m]."""
+    return np.sqrt(max(0.0, BONE_M**2 - (0.5 * pelvis_m) ** 2))  # thigh and shank of one length
+
+
+@njit(cache=True)
 def legs_around(corners: Floats, ahead: float, lowest: float, highest: float, radius: float) -> tuple[Floats, int]:
     """From the floor to the highest pelvis, wherever it walks; below, as far out as the lowest pelvis puts the knees.
 
@@ -189,8 +195,7 @@ def legs_around(corners: Floats, ahead: float, lowest: float, highest: float, ra
     """
     if not np.isfinite(corners.sum() + lowest + highest):
         return np.full((1, 3), np.nan), 1
-    bent = np.sqrt(max(0.0, BONE_M**2 - (0.5 * lowest) ** 2))  # foot under the pelvis, thigh and shank of one length
-    out = max(0.0, bent - (radius - THIGH_M)) / np.cos(np.pi / SIDES)
+    out = max(0.0, knees_out(lowest) - (radius - THIGH_M)) / np.cos(np.pi / SIDES)
     swept = np.zeros((3 * SIDES, 3))
     for k in range(SIDES):
         middle = ahead + (k + 0.5) * 2.0 * np.pi / SIDES

@@ -174,8 +174,8 @@ def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
         task=start["task"],
         start_s=None,
         end_s=None,
-        tracking=_limits(start["limits"]["tracking"]),
-        prediction=_limits(start["limits"]["prediction"]),
+        tracking=LimitSet.of(start["limits"]["tracking"]),
+        prediction=LimitSet.of(start["limits"]["prediction"]),
         earlier=None,
     )
 
@@ -200,18 +200,6 @@ def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
         memory_s=job.settings.fusion.memory_s,
         sending=sending,
     )
-
-
-def _limits(table: dict[str, Any]) -> LimitSet:
-    """A limit set from run.json's form of it, in which null stands for no bound."""
-    return LimitSet(**{name: _bounds(name, value) for name, value in table.items()})
-
-
-def _bounds(name: str, value: Any) -> Any:
-    if not isinstance(value, list):
-        return value
-    none = -np.inf if name.endswith("_min") else np.inf
-    return np.array([none if number is None else number for number in value])
 
 
 _TICKS = 400

@@ -226,8 +226,8 @@ def decode_perception(message: bytes) -> RecordedPerception:
 
 def state_numbers(states: HumanStates) -> Floats:
     """All numbers of one row of states, field after field."""
-    found = vars(states).values()
-    return np.concatenate([value[0] for value in found if isinstance(value, np.ndarray) and value.dtype == np.float64])
+    found = [value for value in vars(states).values() if isinstance(value, np.ndarray)]
+    return np.concatenate([value[0].ravel() for value in found if value.dtype == np.float64])
 
 
 def volume_digest(volumes: SweptVolumes, limb: int) -> bytes:

@@ -21,7 +21,7 @@ from hrcreplay.live.record.codec import PHASES, MotionRow
 from hrcreplay.live.record.log_reader import SessionLogReader
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, Floats, HumanStates, Motion
+from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Motion
 from hrcreplay.run import build
 from hrcreplay.run.contact import write_contact
 from hrcreplay.run.job import Job
@@ -104,17 +104,18 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
     numbers = np.array([look.state for look in looks])
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), DOF)
     widths |= dict.fromkeys(("lengths_m", "lengths_std_m"), len(LENGTHS))
-    widths |= {"residual_m": len(BODY), "unseen_s": len(LIMBS)}
+    widths |= {"residual_m": len(BODY), "unseen_s": len(LIMBS), "points_m": 3 * len(POINTS)}
     ends = np.cumsum(list(widths.values()))
     if numbers.shape[1] != ends[-1]:
         raise LogError(
             f"{where}: found {numbers.shape[1]} numbers a look where this version has {ends[-1]}; "
             "would be right: the version of hrcreplay that recorded the session"
         )
-    parts = np.split(numbers, ends[:-1], axis=1)
+    parts = dict(zip(widths, np.split(numbers, ends[:-1], axis=1), strict=True))
+    parts["points_m"] = parts["points_m"].reshape(len(looks), len(POINTS), 3)
     return HumanStates(
         t_ns=np.array([look.t_ns for look in looks]),
-        **dict(zip(widths, parts, strict=True)),
+        **parts,
         valid=np.array([np.frombuffer(look.valid, dtype=bool) for look in looks]),
         cameras=cameras,
     )

@@ -34,7 +34,7 @@ _ZSTD = struct.pack("<I", 4) + b"zstd"  #: the compression of our chunks, and wh
 _ZSTD_AT = _CHUNK.size - 8 - len(_ZSTD)
 _FOOTER = struct.Struct("<BQQQI")
 _DATA_END = struct.Struct("<BQI")
-_UNREADABLE = (McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, MemoryError)
+_UNREADABLE = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, KeyError, MemoryError)
 
 
 @dataclass

@@ -15,7 +15,7 @@ from tests.human.predictions import reachable
 
 T = 0.377
 PAPER = load_limits("paper")
-HANGING = np.array([0.0] * 7 + [np.pi] + [0.0] * 3 + [np.pi])
+HANGING = np.array([0.0] * 7 + [np.pi] + [0.0] * 3 + [np.pi, 0.94])
 
 
 def one(p: Floats, v: Floats, limits: LimitSet = PAPER, method: str = "paper") -> tuple[Floats, Floats]:

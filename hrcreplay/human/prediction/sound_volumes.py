@@ -1,0 +1,314 @@
+"""Swept volumes that enclose every motion of Eq. (25) under the limits, from every likely state: the method ``sound``.
+
+Where the limit set bounds how far limbs depart from constant velocity, a limb that was seen lately has the tube of
+``velocity_tube``. Every other limb is enclosed joint by joint. Why no motion with the stops of Eq. (34) leaves that, at
+any time and from any likely state:
+
+1. States. Each joint's position and velocity are within ``sigmas`` deviations of the estimate, whatever their
+   correlation: a box around it. World velocities are turned into the body's frame over all headings of the box.
+2. Joints. Heading, torso and arm joints and the pelvis's height stay in the intervals of ``joint_reach`` at all times;
+   stops that depend on other joints are taken over the intervals of those.
+3. Walking. The pelvis stays in the convex polygon of ``walking_reach`` at all times, at a height of its interval.
+4. Limbs. A limb at any instant is a chain of rotations, each by an angle of its interval, then a displacement of the
+   polygon and the height. Sweeping a convex set by all angles of a joint and by all displacements, each regardless of
+   the others, holds all combinations, among them those that occur. A swept set is kept as points whose hull holds it:
+   rotations are linear, so the hull of the swept points holds the swept hull. Arcs are in triangles with their apexes
+   outside, and points are only dropped where they are proven to be inside the rest (``sweep``, ``hull_reduction``).
+   Where that leaves too many, the polytope of ``convex_hull`` takes their place, which holds them all. It may be cut
+   back to the ball that no point of the limb can leave, because a direction's number may be any that is not below the
+   truth.
+5. Lengths. A limb is drawn as long as it may be: its far end goes out along a line through the near one. An unknown
+   length further up the chain displaces the limb by no more than its error, which is added to the radius.
+6. Rounding. The steps are exact in real numbers; in floating point they are off by less than 1e-12 m for people within
+   a kilometre of the origin. Radii are larger by ``ROUNDING_M``. That is no tolerance for motions outside.
+
+The lower body is the line from the floor to the pelvis with its own radius, walking along: that of people who stand, or
+as far out as cameras have seen hips, knees and feet lately (``model_residual``). A low pelvis folds the legs, so the
+knees are further out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
+from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
+from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, NECK, LimitSet, skeleton
+from hrcreplay.human.prediction.reachable_sets import bounds_of
+from hrcreplay.human.prediction.sound_reach import Likely, SoundMotionLimits, enclose_row, likely
+from hrcreplay.human.prediction.sweep import (
+    TRIANGLE_RAD,
+    append,
+    copies,
+    kinematic_chain,
+    polygon,
+    sweep_rot,
+    sweep_walk,
+)
+from hrcreplay.human.prediction.velocity_tube import (
+    HEAD_LIMB,
+    LEGS,
+    MOST_POINTS,
+    THORAX,
+    Tubes,
+    departs_m,
+    tube,
+    tubes,
+    velocities,
+)
+from hrcreplay.human.prediction.walking_reach import SIDES, THIGH_M, knees_out, legs_around
+from hrcreplay.records import DOF, LIMBS, POINTS, Floats, HumanStates, Ints
+from hrcreplay.settings.sections import Occupancy
+
+#: Added to every radius: more than all rounding on the way [m].
+ROUNDING_M = 1e-9
+#: More points than a rotation or walking may make: the polytope around them is made instead.
+MOST_COPIED = 2000
+#: Beyond this many, walking makes triangles of 60 degrees.
+MOST_FINE = 700
+#: Only smaller sets are reduced to their corners: the time goes with the square.
+MOST_REDUCED = 256
+#: Largest angle of a triangle around an arc: its apex is then at most 3.6 % of the radius off [rad].
+FINE_RAD = np.pi / 6.0
+#: More corners than this at the end are replaced by the polytope around them.
+MOST_CORNERS = 256
+#: A larger set is reduced before the next rotation.
+_MANY_CORNERS = 40
+
+
+def sweep_sound(
+    states: HumanStates, limits: LimitSet, occupancy: Occupancy, limbs_m: Floats, span_s: float, memory_s: float
+) -> tuple[Floats, Ints, Floats]:
+    """Swept volumes of all ticks and limbs.
+
+    Args:
+        states: The fused person.
+        limits: Bounds on the joints, and on the limbs where it has them.
+        occupancy: What is added to the model.
+        limbs_m: (6,) radii of LIMBS, Table 2 [m].
+        span_s: Horizon and latency [s].
+        memory_s: How long the filter goes on without a measurement [s].
+
+    Returns:
+        Vertices (m, 3) [m] and the offsets of ``SweptVolumes``, and (n, limbs) radii [m].
+    """
+    tubed = tubes(states, limits, occupancy.residual, occupancy.residual_unknown_m, span_s, memory_s)
+    radii = sound_radii(states, limbs_m, occupancy)
+    vertices, offsets = _sweep_rows(
+        likely(states, occupancy, memory_s),
+        tubed,
+        np.ascontiguousarray(states.lengths_m),
+        np.ascontiguousarray(occupancy.sigmas * states.lengths_std_m),
+        SoundMotionLimits(bounds_of(limits), limits.coupled, span_s, memory_s),
+        occupancy.hand_m,
+        occupancy.legs_radius_m,
+        np.append(limbs_m, THIGH_M) + ROUNDING_M,
+        radii,
+        surface(),
+    )
+    return vertices, offsets, radii
+
+
+def sound_radii(states: HumanStates, limbs_m: Floats, occupancy: Occupancy) -> Floats:
+    """(n, limbs) radii of volumes from the joints: of the limb (6,) [m], and what the model may be off by.
+
+    That is what an unknown length up the chain displaces, the residual, and how far the points are beside the model
+    that the residual is from. A residual that is not known yet (NaN) is taken to be ``residual_unknown_m``. The lower
+    body has the thorax's. The legs' is how far their middles were from the line below the pelvis; where it and a thigh
+    are more, they are the radius. Legs that were close when they were last seen make it no smaller: a table may hide
+    that they are not now.
+    """
+    found = np.empty((len(states), len(LIMBS) + occupancy.legs))
+    unknown_m = occupancy.residual_unknown_m if occupancy.residual else np.nan
+    off = occupancy.sigmas * states.lengths_std_m
+    _radii_rows(off, states.residual_m, _beside_m(states), limbs_m, occupancy.legs_radius_m, unknown_m, found)
+    return found
+
+
+#: The points of each of LIMBS that may be beside the model.
+_POINTS = (
+    (NECK, HEAD),
+    (ARM_POINTS[0][0], ARM_POINTS[1][0]),
+    *(ARM_POINTS[arm][part : part + 2] for arm in range(2) for part in range(2)),
+)
+
+
+def _beside_m(states: HumanStates) -> Floats:
+    """(n, 6) how far each limb's points are beside the model [m]."""
+    off = np.linalg.norm(states.points_m - skeleton(states.p, states.lengths_m), axis=2)
+    return np.column_stack([off[:, list(points)].max(axis=1) for points in _POINTS])
+
+
+@njit(cache=True)
+def _radii_rows(
+    off: Floats, residual: Floats, beside: Floats, limbs: Floats, legs: float, unknown: float, found: Floats
+) -> None:
+    """Writes the radii; without the residual where ``unknown``, what stands for one not known yet, is NaN."""
+    for i in range(len(off)):
+        shoulder = np.hypot(off[i, 0], off[i, 2])
+        displaced = (0.0, 0.0, shoulder, shoulder + off[i, 4], shoulder, shoulder + off[i, 3])
+        for limb in range(found.shape[1]):
+            base = legs + ROUNDING_M if limb == LEGS else limbs[limb] + displaced[limb] + ROUNDING_M
+            of = THORAX if limb == LEGS else limb
+            further = beside[i, of] + (unknown if np.isnan(residual[i, of]) else residual[i, of])
+            found[i, limb] = base if np.isnan(unknown) else base + further
+        if len(found[i]) > LEGS and not np.isnan(unknown):  # no less than where they were seen
+            found[i, LEGS] = np.fmax(found[i, LEGS], residual[i, LEGS] + (THIGH_M + ROUNDING_M))
+
+
+@njit(cache=True)
+def _sweep_rows(
+    at: Likely,
+    tubed: Tubes,
+    lengths: Floats,
+    lengths_off: Floats,
+    within: SoundMotionLimits,
+    hand: float,
+    legs: float,
+    flesh: Floats,
+    radii: Floats,
+    work: Surface,
+) -> tuple[Floats, Ints]:
+    """Vertices and offsets; writes the radii of limbs that have tubes into ``radii``, their flesh (7,) in them."""
+    limbs = radii.shape[1]
+    offsets = np.zeros(len(at.p) * limbs + 1, np.int64)
+    vertices = np.empty((len(at.p) * limbs * 80 + 80, 3))
+    low, high, corners = np.empty(DOF), np.empty(DOF), np.empty((SIDES, 2))
+    velocity, short = np.empty((len(POINTS), 3)), np.empty((MOST_POINTS, 3))
+    n = 0
+    for i in range(len(at.p)):
+        if not tubed.usable[i, :limbs].all():
+            enclose_row(i, at, within, low, high, corners)
+        velocities(at.p[i], at.v[i], lengths[i], velocity)
+        for limb in range(limbs):
+            swept, count = short, 0
+            if tubed.usable[i, limb]:
+                count = tube(limb, tubed.points[i], velocity, within.horizon, hand, short)
+                usable = np.isfinite(short[:count].sum())
+                thick = flesh[limb]
+                if limb == LEGS and not tubed.legs_shown[i]:
+                    hidden = max(legs, knees_out(at.p[i, HEIGHT]) + THIGH_M) + ROUNDING_M
+                    thick = np.fmax(hidden, tubed.legs_m[i] + flesh[limb])
+                radii[i, limb] = thick + departs_m(limb, tubed.reach_s[i, limb], tubed.residual[i, limb], tubed)
+                if not usable:
+                    short[0], count = np.nan, 1
+            elif limb == LEGS:
+                swept, count = legs_around(corners, at.p[i, 2], low[HEIGHT], high[HEIGHT], legs)
+            else:
+                swept, count = _limb(limb, low, high, corners, lengths[i], lengths_off[i], hand, work)
+            vertices = append(vertices, n, swept, count)
+            n += count
+            offsets[i * limbs + limb + 1] = n
+    return vertices[:n].copy(), offsets
+
+
+@njit(cache=True)
+def _limb(
+    limb: int, low: Floats, high: Floats, corners: Floats, lengths: Floats, off: Floats, hand: float, work: Surface
+) -> tuple[Floats, int]:
+    """Points around all that a limb reaches, in place of Alg. 2; a NaN vertex where state or lengths are NaN."""
+    ends, chain = kinematic_chain(limb, low, high, lengths)
+    ends = _longest(limb, ends, off, hand)
+    if not np.isfinite(ends.sum() + chain.sum() + corners.sum() + low[2] + high[2] + high[HEIGHT]):
+        return np.full((1, 3), np.nan), 1
+    points, count, faces = _turn_all(ends, chain, high[HEIGHT] - low[HEIGHT], work)
+    fine = count * copies(low[2], high[2], FINE_RAD) * SIDES <= MOST_FINE
+    widest = FINE_RAD if fine else TRIANGLE_RAD
+    room = count * copies(low[2], high[2], widest) * SIDES
+    if count <= MOST_REDUCED and room <= MOST_COPIED:
+        swept = np.empty((room, 3))
+        many = sweep_walk(points, count, faces, work, (low[2], high[2]), polygon(corners), swept, widest)
+        if many > MOST_CORNERS:
+            many, _ = keep_corners(swept, many, work)
+        if many <= MOST_CORNERS:
+            return swept, many
+    return _walk(points, count, low[2], high[2], corners)
+
+
+@njit(cache=True)
+def _turn_all(ends: Floats, chain: Floats, rise: float, work: Surface) -> tuple[Floats, int, int]:
+    """Points around what a chain's rotations and a rise of the pelvis make of a limb's ends [m].
+
+    Returns:
+        The points, how many they are, and triangles around them.
+    """
+    points, count, faces = ends, len(ends), 0
+    radius = 0.0  # of the ball around the frame's origin that holds the limb
+    for end in ends:
+        radius = max(radius, np.sqrt(end[0] ** 2 + end[1] ** 2 + end[2] ** 2))
+    for k, step in enumerate(chain):
+        axis, low, high = int(step[0]), step[1], step[2]
+        room = count * copies(low, high, FINE_RAD)
+        if room <= MOST_COPIED:
+            swept = np.empty((room, 3))
+            count = sweep_rot(points, count, axis, low, high, swept, FINE_RAD)
+        else:
+            swept = np.empty((CORNERS, 3))
+            count = _turn(points, count, axis, low, high, radius, swept)
+        points = swept
+        for i in range(count):
+            for j in range(3):
+                points[i, j] += step[3 + j]
+        if k < len(chain) - 1 and count > _MANY_CORNERS and room <= MOST_REDUCED:
+            count, _ = keep_corners(points, count, work)
+        radius += np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+    if rise > 0.0:
+        points, count = _raised(points, count, rise), 2 * count
+    if count <= MOST_REDUCED:
+        count, faces = keep_corners(points, count, work)
+    return points, count, faces
+
+
+@njit(cache=True)
+def _raised(points: Floats, count: int, rise: float) -> Floats:
+    """The first ``count`` points, and the same higher by ``rise`` [m]: their hull holds all heights between."""
+    both = np.empty((2 * count, 3))
+    both[:count], both[count:] = points[:count], points[:count]
+    both[count:, 2] += rise
+    return both
+
+
+@njit(cache=True)
+def _longest(limb: int, ends: Floats, off: Floats, hand: float) -> Floats:
+    """The limb's end points, drawn out to where lengths up to ``off`` (7,) longer or shorter may put them [m]."""
+    if limb == HEAD_LIMB:
+        ends[0, 2] -= off[0]
+        ends[1, 2] += off[0] + off[1]
+        return ends
+    if limb == THORAX:
+        if off[0] == 0.0 and off[2] == 0.0:
+            return ends
+        wide = np.concatenate((ends, ends[1:]))
+        for i in range(1, 5):
+            wide[i, 1] += off[2] if wide[i, 1] > 0.0 else -off[2]
+            wide[i, 2] += off[0] if i > 2 else -off[0]
+        return wide
+    left = limb >= 4
+    if limb in (2, 4):
+        ends[1, 2] -= off[3] if left else off[4]
+    else:
+        ends[1, 2] -= hand + (off[5] if left else off[6])
+    return ends
+
+
+@njit(cache=True)
+def _turn(points: Floats, count: int, axis: int, low: float, high: float, radius: float, swept: Floats) -> int:
+    far = np.full(len(DIRECTIONS), -np.inf)
+    reach_turning(points, count, axis, low, high, far)
+    for d in range(len(far)):
+        far[d] = min(far[d], radius)
+    return around(far, swept)
+
+
+@njit(cache=True)
+def _walk(points: Floats, count: int, low: float, high: float, corners: Floats) -> tuple[Floats, int]:
+    far = np.full(len(DIRECTIONS), -np.inf)
+    reach_turning(points, count, 2, low, high, far)
+    for d in range(len(far)):
+        there = -np.inf
+        for k in range(SIDES):
+            there = max(there, DIRECTIONS[d, 0] * corners[k, 0] + DIRECTIONS[d, 1] * corners[k, 1])
+        far[d] += there
+    swept = np.empty((CORNERS, 3))
+    return swept, around(far, swept)

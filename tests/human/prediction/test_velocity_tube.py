@@ -1,0 +1,174 @@
+"""Tubes against a plain implementation: whoever keeps to the departures is inside, and the tube is no larger."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+from hrcreplay.human.model import Departure, LimitSet, skeleton
+from hrcreplay.human.prediction.swept_volumes import predict
+from hrcreplay.human.prediction.velocity_tube import NOISE_M
+from hrcreplay.limits import load_limits
+from hrcreplay.records import BODY, LIMBS, POINTS, Floats, HumanStates
+from hrcreplay.settings.sections import Fusion, Occupancy
+from tests.human.people import random_states
+
+PEOPLE = load_limits("people")
+MEMORY_S, HAND_M = Fusion().memory_s, Occupancy().hand_m
+FLESH_M = dict(zip(BODY, (0.12, 0.15, 0.07, 0.07, 0.07, 0.07, 0.08), strict=True))
+ENDS = {
+    "HD": ("neck", "head"),
+    "THX": ("pelvis", "shoulder_r", "shoulder_l"),
+    "URA": ("shoulder_r", "elbow_r"),
+    "LRA": ("elbow_r", "wrist_r"),
+    "ULA": ("shoulder_l", "elbow_l"),
+    "LLA": ("elbow_l", "wrist_l"),
+}
+LEGS = tuple(f"{part}_{side}" for part in ("hip", "knee", "ankle", "foot") for side in "lr")
+
+
+def people(count: int, seed: int) -> HumanStates:
+    """Of any posture, beside the model, with bent hands, legs that are shown, and residuals."""
+    rng, states = np.random.default_rng(seed), random_states(PEOPLE, count, seed)
+    points = states.points_m + rng.normal(0.0, 0.05, states.points_m.shape)
+    for side in "rl":
+        bent = rng.normal(size=(count, 3))
+        bent *= 0.08 / np.linalg.norm(bent, axis=1)[:, None]
+        points[:, POINTS.index(f"hand_{side}")] = points[:, POINTS.index(f"wrist_{side}")] + bent
+    for name in LEGS:
+        points[:, POINTS.index(name)] = points[:, 0] + rng.uniform(-0.4, 0.4, (count, 3)) - [0.0, 0.0, 0.4]
+    return replace(states, points_m=points, residual_m=rng.uniform(0.0, 0.4, (count, len(BODY))))
+
+
+def ends(states: HumanStates, tick: int, limb: str, horizon_s: float) -> Floats:
+    """(k, 3) the limb's ends at the tick and after the horizon."""
+    step, at = 1e-5, states.rows(slice(tick, tick + 1))
+    later, earlier = (skeleton(at.p + sign * step * at.v, at.lengths_m)[0] for sign in (1.0, -1.0))
+    velocity = (later - earlier) / (2.0 * step)
+    place = {name: states.points_m[tick, k] for k, name in enumerate(POINTS)}
+    speed = {name: velocity[k] for k, name in enumerate(POINTS)}
+    if limb == "LEGS":
+        over = speed["pelvis"] * [1.0, 1.0, 0.0]
+        now = [place["pelvis"], *(place[name] for name in LEGS)]
+        going = [speed["pelvis"]] + [over] * len(LEGS)
+    else:
+        now, going = [place[name] for name in ENDS[limb]], [speed[name] for name in ENDS[limb]]
+    if limb in ("LRA", "LLA"):
+        elbow, wrist = now
+        hand = place[f"hand_{limb[1].lower()}"]
+        turning = going[1] + (going[1] - going[0]) * HAND_M / np.linalg.norm(wrist - elbow)
+        for along in (wrist - elbow, hand - wrist):
+            now.append(wrist + HAND_M * along / np.linalg.norm(along))
+            going.append(turning)
+    return np.array(now + [p + v * horizon_s for p, v in zip(now, going, strict=True)])
+
+
+def allowed_m(departure: Departure, limb: str, horizon_s: float, residual_m: float) -> float:
+    k = BODY.index(limb)
+    beyond = np.interp(horizon_s, departure.horizon_s, departure.beyond_m[k])
+    if horizon_s > departure.horizon_s[-1]:
+        beyond = departure.beyond_m[k, -1] * (horizon_s / departure.horizon_s[-1]) ** 2
+    times = np.interp(horizon_s, departure.horizon_s, departure.residuals[k])
+    return float(beyond + times * min(residual_m, NOISE_M) + max(residual_m - NOISE_M, 0.0))
+
+
+def distance_m(point: Floats, vertices: Floats) -> float:
+    """Of a point from a hull, by non-negative least squares over the weights of its corners."""
+    heavy = 1e4
+    system = np.vstack([(vertices - point).T, np.full(len(vertices), heavy)])
+    weights, _ = nnls(system, np.array([0.0, 0.0, 0.0, heavy]), maxiter=10_000)
+    return float(np.linalg.norm(weights @ vertices / weights.sum() - point))
+
+
+@pytest.mark.parametrize("horizon_s", [0.02, 0.05, 0.14, 0.377, 0.6])
+def test_who_keeps_to_the_departures_is_inside_and_nobody_much_further(horizon_s: float) -> None:
+    """500 places a limb, in the hull and as far from it as is allowed; and 1 mm further they are outside."""
+    states, rng = people(10, seed=3), np.random.default_rng(4)
+    volumes = predict(states, PEOPLE, Occupancy(), horizon_s=horizon_s, memory_s=MEMORY_S)
+    assert PEOPLE.departure is not None
+    assert volumes.limbs == BODY
+    for tick in range(len(states)):
+        for k, limb in enumerate(BODY):
+            base = ends(states, tick, limb, horizon_s)
+            residual = states.residual_m[tick, BODY.index("THX") if limb == "LEGS" else k]
+            reach = allowed_m(PEOPLE.departure, limb, horizon_s, residual)
+            radius = volumes.radius_m[tick, k] - FLESH_M[limb]
+            assert radius == pytest.approx(reach, abs=2e-9)
+            out = rng.normal(size=(50, 3))
+            out /= np.linalg.norm(out, axis=1)[:, None]
+            farthest = base[(base @ out.T).argmax(axis=0)]
+            for direction, end in zip(out, farthest, strict=True):
+                assert distance_m(end + reach * direction, volumes.vertices(tick, k)) <= radius + 1e-5
+                assert distance_m(end + (reach + 1e-3) * direction, volumes.vertices(tick, k)) > radius
+            mixed = rng.dirichlet(np.full(len(base), 0.5), 10) @ base
+            assert max(distance_m(point, volumes.vertices(tick, k)) for point in mixed) < 1e-5
+
+
+def without(limits: LimitSet) -> LimitSet:
+    return replace(limits, departure=None)
+
+
+def test_a_limb_that_is_out_of_sight_has_the_volume_of_its_joints() -> None:
+    states = people(3, seed=6)
+    unseen = states.unseen_s.copy()
+    unseen[:, LIMBS.index("LRA")] = MEMORY_S + 0.1
+    states = replace(states, unseen_s=unseen)
+    tubes = predict(states, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    joints = predict(states, without(PEOPLE), Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    for tick in range(3):
+        for k, limb in enumerate(BODY):
+            same = np.array_equal(tubes.vertices(tick, k), joints.vertices(tick, k))
+            assert same == (limb == "LRA")
+    hidden = BODY.index("LRA")
+    np.testing.assert_array_equal(tubes.radius_m[:, hidden], joints.radius_m[:, hidden])
+
+
+def test_a_limb_seen_a_while_ago_may_have_departed_for_longer() -> None:
+    states = people(3, seed=7)
+    unseen = states.unseen_s.copy()
+    unseen[:, LIMBS.index("ULA")] = 0.3
+    early = predict(states, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    late = predict(replace(states, unseen_s=unseen), PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    assert PEOPLE.departure is not None
+    k = BODY.index("ULA")
+    for tick in range(3):
+        reach = allowed_m(PEOPLE.departure, "ULA", 0.3, states.residual_m[tick, k])
+        assert late.radius_m[tick, k] == pytest.approx(FLESH_M["ULA"] + reach, abs=2e-9)
+    assert (late.radius_m[:, k] > early.radius_m[:, k]).all()
+
+
+def test_hidden_legs_are_the_line_below_the_pelvis_as_thick_as_they_were() -> None:
+    states = people(3, seed=8)
+    points = states.points_m.copy()
+    points[:, [POINTS.index(name) for name in LEGS]] = np.nan
+    hidden = replace(states, points_m=points)
+    k = BODY.index("LEGS")
+    volumes = predict(hidden, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    assert PEOPLE.departure is not None
+    for tick in range(3):
+        pelvis = points[tick, 0]
+        line = np.linspace([pelvis[0], pelvis[1], 0.0], pelvis, 5)
+        assert max(distance_m(point, volumes.vertices(tick, k)) for point in line) < 1e-5
+        reach = allowed_m(PEOPLE.departure, "LEGS", 0.1, states.residual_m[tick, BODY.index("THX")])
+        bent = np.sqrt(max(0.0, 0.47**2 - (0.5 * states.p[tick, 12]) ** 2))
+        thick = max(0.20, bent + 0.08, states.residual_m[tick, k] + 0.08)
+        assert volumes.radius_m[tick, k] == pytest.approx(thick + reach, abs=2e-9)
+
+
+def test_nobody_known_has_no_tube() -> None:
+    states = people(2, seed=9)
+    nobody = replace(states, p=np.full_like(states.p, np.nan), points_m=np.full_like(states.points_m, np.nan))
+    volumes = predict(nobody, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    assert all(np.isnan(volumes.vertices(tick, k)).all() for tick in range(2) for k in range(len(BODY)))
+
+
+def test_a_tick_has_the_same_bits_alone() -> None:
+    states = people(5, seed=10)
+    together = predict(states, PEOPLE, Occupancy(), horizon_s=0.2, memory_s=MEMORY_S)
+    alone = predict(states.rows(slice(3, 4)), PEOPLE, Occupancy(), horizon_s=0.2, memory_s=MEMORY_S)
+    for k in range(len(BODY)):
+        np.testing.assert_array_equal(together.vertices(3, k), alone.vertices(0, k))
+    np.testing.assert_array_equal(together.radius_m[3], alone.radius_m[0])
