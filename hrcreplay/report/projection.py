@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from scipy.spatial import ConvexHull, QhullError
 
-from hrcreplay.geometry.visible_front import visible_front
+from hrcreplay.geometry.convex_hull import visible_front
 from hrcreplay.records import POINTS, Floats
 from hrcreplay.report import drawing
 from hrcreplay.report.drawing import figure_in

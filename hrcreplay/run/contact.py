@@ -15,12 +15,10 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
-from hrcreplay.geometry.capsule_distance import nearest_pair
-from hrcreplay.geometry.segment_hull_distance import protrusion_m
-from hrcreplay.human import body_capsules
-from hrcreplay.human.body_capsules import LEG_PARTS, PARTS
+from hrcreplay.geometry.distances import nearest_pair, protrusion_m
+from hrcreplay.human import model
 from hrcreplay.human.fusion import fuse
-from hrcreplay.human.model import skeleton
+from hrcreplay.human.model import LEG_PARTS, PARTS, skeleton
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import Bools, Floats, HumanStates, Ints
@@ -46,9 +44,9 @@ class RecordedPerson:
     points_m: Floats  #: (n, 20, 3) POINTS, world [m]; NaN where they are not known
 
     def part_axes(self, at_ns: Ints, hand_m: float) -> Floats:
-        """(m, 10, 2, 3) axes of the capsules of ``body_capsules.PARTS`` at some instants [m]."""
-        points_m = body_capsules.at_instants(self.t_ns, self.points_m, at_ns, GAP_S)
-        return body_capsules.part_axes(points_m, hand_m)
+        """(m, 10, 2, 3) axes of the capsules of ``PARTS`` at some instants [m]."""
+        points_m = model.at_instants(self.t_ns, self.points_m, at_ns, GAP_S)
+        return model.part_axes(points_m, hand_m)
 
 
 def recorded_person(job: Job, log: Log, writer: RunWriter) -> RecordedPerson:
@@ -177,7 +175,7 @@ def contact_table(
         volumes: Instant [ns], horizon [s] and volumes of the ticks at which the person may be found to have left them.
         lines_m: None: the parts with their radii leave them; else their lines, with a hand of this length [m].
     """
-    radii_m = body_capsules.part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
+    radii_m = model.part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
     t_ns = motion["t_ns"].to_numpy()
     body = Body(person.source, person.part_axes(t_ns, job.settings.occupancy.hand_m), radii_m)
     found = compare(robot, motion, body)

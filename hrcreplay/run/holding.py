@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import linprog, nnls
 
-from hrcreplay.geometry.segment_hull_distance import distances
+from hrcreplay.geometry.distances import distances
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import qp_controller
 from hrcreplay.robot.control.approach_rows import Approach, tick_rows

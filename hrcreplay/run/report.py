@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.human.body_capsules import PARTS, part_radii
+from hrcreplay.human.model import PARTS, part_radii
 from hrcreplay.logs.reader import Log
 from hrcreplay.report import drawing, figures, page, tables
 from hrcreplay.report.figures import FigureData, FigureKind

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.body_capsules import PARTS, at_instants, part_axes, part_radii
-from hrcreplay.human.model import skeleton
+from hrcreplay.human.model import PARTS, at_instants, part_axes, part_radii, skeleton
 from hrcreplay.records import JOINTS, POINTS
 from hrcreplay.settings.sections import Occupancy
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from hrcreplay.geometry.segment_hull_distance import distances
+from hrcreplay.geometry.distances import distances
 from hrcreplay.records import Floats, Ints, SweptVolumes
 from hrcreplay.robot.model import RobotPose
 
