@@ -15,18 +15,17 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from hrcreplay.egm.udp_server import EgmServer
+from hrcreplay.egm.link import EgmServer
 from hrcreplay.errors import HrcReplayError, LiveStopped, LogError, SettingsError
 from hrcreplay.live import processes
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.last_resort import bring_to_rest
-from hrcreplay.live.control.loop import ENDING, Loop, LoopSettings
+from hrcreplay.live.control.loop import ENDING, Loop, LoopSettings, bring_to_rest
 from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.control.setup import build_controller, compile_kernels, live_job, start_table
 from hrcreplay.live.processes import HelperProcess, raise_priority, restore_priority
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import Signal
-from hrcreplay.live.view.status_publisher import StatusPublisher
+from hrcreplay.live.view.status import StatusPublisher
 from hrcreplay.settings.load import Settings
 
 #: Longest wait for a packet before the loop turns to everything else [s].

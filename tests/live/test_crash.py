@@ -15,17 +15,16 @@ import pytest
 
 from hrcreplay.cli import app
 from hrcreplay.egm.codec import Correction, decode_correction
-from hrcreplay.egm.protocol import EgmSession
-from hrcreplay.egm.udp_server import Received
+from hrcreplay.egm.link import EgmSession, Received
 from hrcreplay.errors import LiveStopped
 from hrcreplay.live import processes, session
-from hrcreplay.live.control import last_resort, session_controller, watchdog
-from hrcreplay.live.control.loop import FINAL_ANSWERS, Loop
-from hrcreplay.live.control.perception import Observer
+from hrcreplay.live.control import session_controller, watchdog
+from hrcreplay.live.control.loop import FINAL_ANSWERS, FallbackBrake, Loop, bring_to_rest
 from hrcreplay.live.control.setup import build_controller
+from hrcreplay.live.control.stages import Observer
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.verify import SessionRecomputation
-from hrcreplay.live.view import status_publisher
+from hrcreplay.live.view import status
 from hrcreplay.robot.control import stopping
 from hrcreplay.robot.control.stopping import straight
 from hrcreplay.robot.model import RobotModel
@@ -50,7 +49,7 @@ PLACES: dict[str, tuple[Any, str]] = {
     "record of an answer": (codec, "encode_decision"),
     "record of a packet": (codec, "encode_robot_packet"),
     "record of a look": (codec, "encode_perception"),
-    "status": (status_publisher.StatusPublisher, "_status"),
+    "status": (status.StatusPublisher, "_status"),
     "link": (Cable, "newest"),
 }
 MOVING_S = 0.45
@@ -140,7 +139,7 @@ def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
 
 
 def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
-    brake = last_resort.FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7, [])
+    brake = FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7, [])
     brake.update_position([9.0] * 6)  # it lags
     assert brake.dq == [20.0] * 6
     brake.update_position([11.0] * 6)
@@ -151,9 +150,7 @@ def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
 
 
 def test_a_brake_stays_within_the_joints_limits() -> None:
-    brake = last_resort.FallbackBrake(
-        [360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0, []
-    )
+    brake = FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0, [])
     said = [decode_correction(brake.step(0)) for _ in range(20)]
     assert brake.at_rest
     np.testing.assert_allclose(np.degrees([reply.q[:5] for reply in said]).max(), 90.0)
@@ -175,7 +172,7 @@ def test_garbage_is_not_answered_and_silence_ends_it() -> None:
             told.append(data)
 
     loop.link = Silent()  # type: ignore[assignment]
-    last_resort.bring_to_rest(loop, "why")
+    bring_to_rest(loop, "why")
     assert not told
 
 

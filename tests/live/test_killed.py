@@ -24,7 +24,7 @@ from tests.live.sessions import kill
 BUGS = {
     "recorder": "recorder/hrcreplay.live.record.topics:split",
     "screen": "screen/hrcreplay.live.processes:ControlChannel.receive",
-    "status": "control/hrcreplay.live.view.status_publisher:StatusPublisher._status",
+    "status": "control/hrcreplay.live.view.status:StatusPublisher._status",
 }
 
 
@@ -102,7 +102,7 @@ def test_without_the_screen_it_brakes_and_goes_on_answering(killed: dict[str, Fl
 def test_a_bug_in_control_brakes_and_goes_on_answering(killed: dict[str, Flown]) -> None:
     one = killed["status"]
     assert not_complete(one).startswith(
-        "control: ZeroDivisionError: put there by a test (hrcreplay/live/view/status_publisher.py:"
+        "control: ZeroDivisionError: put there by a test (hrcreplay/live/view/status.py:"
     )
     brakes_for("internal error", one.folder)
     never_stalls(one)

@@ -14,10 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from hrcreplay.egm.codec import AXES, BadPacket, RobotPacket, decode_robot, encode_correction
-from hrcreplay.egm.protocol import EgmSession, PacketStatus
+from hrcreplay.egm.link import EgmSession, PacketStatus
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.motion import ControlSetup, MotionState, MotionStep, brake, follow, start_approach
-from hrcreplay.live.control.perception import Observer
+from hrcreplay.live.control.stages import ControlSetup, MotionState, MotionStep, Observer, brake, follow, start_approach
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
 from hrcreplay.records import Floats

@@ -17,13 +17,12 @@ from pydantic import ValidationError
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_robot
-from hrcreplay.egm.protocol import EgmSession
+from hrcreplay.egm.link import EgmSession
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.fusion.fuse import MEDIAN_LENGTHS_M
 from hrcreplay.human.model import LimitSet, skeleton
-from hrcreplay.live.control.motion import ControlSetup
-from hrcreplay.live.control.perception import Observer
 from hrcreplay.live.control.session_controller import SessionController
+from hrcreplay.live.control.stages import ControlSetup, Observer
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2

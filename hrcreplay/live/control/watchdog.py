@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hrcreplay.egm.protocol import PacketStatus
+from hrcreplay.egm.link import PacketStatus
 from hrcreplay.live.record.codec import Perception, Signal
 from hrcreplay.records import Floats
 from hrcreplay.settings.sections import Live

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.motion import MotionState, MotionStep
 from hrcreplay.live.control.setup import build_controller
+from hrcreplay.live.control.stages import MotionState, MotionStep
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, TickEvent
 from hrcreplay.live.session import outcome

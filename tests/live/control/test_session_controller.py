@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.human.fusion import fuse
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.perception import Observer
 from hrcreplay.live.control.setup import build_controller
+from hrcreplay.live.control.stages import Observer
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.logs.clean import PersonMemory
