@@ -17,7 +17,7 @@ from hrcreplay.egm import motion_link_pb2
 from hrcreplay.egm.link import REFUSALS, STOPS, PacketStatus
 from hrcreplay.egm.robot_double.faults import KINDS, load_faults
 from hrcreplay.live.control import watchdog
-from hrcreplay.live.record import topics
+from hrcreplay.live.record import codec
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.programme.task import parse_task
 from hrcreplay.settings.load import Settings, load_settings
@@ -183,7 +183,7 @@ def test_every_kind_of_fault_is_named() -> None:
 
 
 def test_what_to_plot_is_in_the_messages() -> None:
-    types = {topics.ROBOT: motion_link_pb2.RobotMessage, topics.SENT: motion_link_pb2.SensorMessage}
+    types = {codec.ROBOT_TOPIC: motion_link_pb2.RobotMessage, codec.SENT_TOPIC: motion_link_pb2.SensorMessage}
     found = [span for span in spans(section(8)) if span.startswith("/egm/") and "." in span]
     assert len(found) == 2
     for span in found:

@@ -15,13 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.logs.tracks import Header, JointTrack
+from hrcreplay.logs.log_files import Header, JointTrack
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.programme.path import programmed, recorded
-from hrcreplay.robot.programme.reference import Reference
-from hrcreplay.robot.programme.task import Task, parse_task
+from hrcreplay.robot.programme.task import Reference, Task, parse_task
 from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
 from hrcreplay.run.prediction import PredictionStage

@@ -22,13 +22,14 @@ from hrcreplay.robot.control.control_step import (
     RobotState,
     Sight,
     Step,
+    Stop,
+    at_rest,
     observe,
 )
 from hrcreplay.robot.control.decision import decide, made, stands
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import Stop, at_rest
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.reference import Reference, ReferencePoint, advance
+from hrcreplay.robot.programme.task import Reference, ReferencePoint, advance
 
 _FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
 

@@ -15,15 +15,13 @@ from scipy.optimize import linprog, nnls
 from hrcreplay.geometry.distances import distances
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import qp_controller
-from hrcreplay.robot.control.approach_rows import Approach, tick_rows
 from hrcreplay.robot.control.certificate import MARGIN_M
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, Sight, observe
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, Sight, Stop, observe
 from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, minimise
 from hrcreplay.robot.control.path_controller import protective_distance_m
-from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import Stop
+from hrcreplay.robot.control.separation import Approach, Obstacles, tick_rows
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.reference import advance
+from hrcreplay.robot.programme.task import advance
 from hrcreplay.run.followers import Follower, PathFollower, Predict, QpFollower, ScalingFollower, SsmFollower
 
 #: A row whose link could approach faster by no more than this is one that the solution lies on [m/s].

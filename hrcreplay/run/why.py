@@ -25,9 +25,8 @@ from hrcreplay.report.metrics_plan import stationary
 from hrcreplay.report.tables import PageTable, reason_text
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import NO_PLANES
-from hrcreplay.robot.control.control_step import REASONS, observe
+from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, observe, straight
 from hrcreplay.robot.control.decision import stands
-from hrcreplay.robot.control.stopping import Stop, at_rest, axis_by_axis, straight
 from hrcreplay.run import build
 from hrcreplay.run.followers import Follower, Predict, QpFollower, unknown
 from hrcreplay.run.holding import Moment, asked, refused

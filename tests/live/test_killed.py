@@ -22,7 +22,7 @@ from tests.live.sessions import kill
 
 #: Session -> part and place of its bug.
 BUGS = {
-    "recorder": "recorder/hrcreplay.live.record.topics:split",
+    "recorder": "recorder/hrcreplay.live.record.codec:topic_and_data",
     "screen": "screen/hrcreplay.live.processes:ControlChannel.receive",
     "status": "control/hrcreplay.live.view.status:StatusPublisher._status",
 }

@@ -28,8 +28,7 @@ from hrcreplay.live.control.watchdog import REFUSED
 from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Signal, TickEvent
-from hrcreplay.robot.control.control_step import BRAKING
-from hrcreplay.robot.control.stopping import Stop
+from hrcreplay.robot.control.control_step import BRAKING, Stop
 
 _BIN_NS = 5_000
 _BINS = 20_000  # up to 0.1 s; the last one holds all that took longer

@@ -21,9 +21,8 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.control_step import RobotState, at_rest
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import at_rest
 
 #: Obstacles before the first perception update: nothing is known, so the robot stands.
 _UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=False)

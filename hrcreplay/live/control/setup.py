@@ -26,10 +26,10 @@ from hrcreplay.live.control.stages import ControlSetup, Observer
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
+from hrcreplay.logs.log_files import Header, JointTrack
 from hrcreplay.logs.reader import open_log
-from hrcreplay.logs.tracks import Header, JointTrack
 from hrcreplay.records import Floats
-from hrcreplay.robot.programme.reference import Reference
+from hrcreplay.robot.programme.task import Reference
 from hrcreplay.run import build
 from hrcreplay.run.followers import Follower
 from hrcreplay.run.job import Job, job_without_log, resolve

@@ -23,7 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, MessageIndex
 
 from hrcreplay.errors import LogError
-from hrcreplay.live.record import codec, topics
+from hrcreplay.live.record import codec
 from hrcreplay.logs import messages as own
 from hrcreplay.logs.mcap_stream import MAGIC
 
@@ -171,7 +171,7 @@ class SessionLogReader:
             while self._open:
                 self._open.pop().before_s = self._seconds(t_ns)
             self._number, self._last_ns = (number + 1) % (1 << 32), t_ns
-            message = topics.join(self._channels[channel], t_ns, content)
+            message = codec.message_on(self._channels[channel], t_ns, content)
             if message is not None:
                 yield message
 

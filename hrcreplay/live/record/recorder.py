@@ -26,7 +26,7 @@ from google.protobuf.message import DecodeError
 from mcap.writer import CompressionType, Writer
 
 from hrcreplay.egm import motion_link_pb2 as egm
-from hrcreplay.live.record import codec, topics
+from hrcreplay.live.record import codec
 from hrcreplay.logs import messages as own
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.writer import register_schema
@@ -38,7 +38,11 @@ _CHUNK_BYTES = 1 << 20  # time closes chunks, not size
 _NICE = 5  # control and the person come first
 _LARGEST = 1 << 22  # of a message
 
-_TYPES = {topics.ROBOT: egm.RobotMessage, topics.SENT: egm.SensorMessage, topics.UNSENT: egm.SensorMessage}
+_TYPES = {
+    codec.ROBOT_TOPIC: egm.RobotMessage,
+    codec.SENT_TOPIC: egm.SensorMessage,
+    codec.UNSENT_TOPIC: egm.SensorMessage,
+}
 
 
 class SessionLogWriter:
@@ -55,12 +59,12 @@ class SessionLogWriter:
     def add(self, message: bytes) -> None:
         """Writes a message of ``codec``; the first event with cameras also fills the topics of the whole session."""
         t_ns = codec.clock_ns(message)
-        topic, data = topics.split(message)
-        if topic == topics.STRAY:
+        topic, data = codec.topic_and_data(message)
+        if topic == codec.STRAY_TOPIC:
             self._frame(t_ns, data)
             return
         self._write(topic, t_ns, t_ns, data, _TYPES.get(topic))
-        if topic == topics.EVENT and not self._cameras:
+        if topic == codec.EVENT_TOPIC and not self._cameras:
             self._latch(t_ns, codec.decode_event(message))
 
     def flush(self) -> None:
@@ -80,7 +84,7 @@ class SessionLogWriter:
             capture_ns = max(0, skeleton.capture_ns)  # MCAP has no time before 1970
             self._write(own.skeleton_topic(skeleton.camera), t_ns, capture_ns, data, pb.Skeleton)
         else:
-            self._write(topics.STRAY, t_ns, t_ns, data)
+            self._write(codec.STRAY_TOPIC, t_ns, t_ns, data)
 
     def _latch(self, t_ns: int, start: dict[str, Any]) -> None:
         cameras: dict[str, Any] = start.get("cameras", {})
@@ -99,7 +103,7 @@ class SessionLogWriter:
     def _write(self, topic: str, t_ns: int, publish_ns: int, data: bytes, kind: Any = None) -> None:
         channel = self._channels.get(topic)
         if channel is None:
-            encoding = "json" if topic == topics.EVENT else topics.ENCODING if kind is None else "protobuf"
+            encoding = "json" if topic == codec.EVENT_TOPIC else codec.ENCODING if kind is None else "protobuf"
             schema = 0 if kind is None else register_schema(self._writer, self._schemas, kind)
             channel = self._writer.register_channel(topic, encoding, schema)
             self._channels[topic] = channel

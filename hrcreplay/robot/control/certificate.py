@@ -17,8 +17,8 @@ from numba import njit
 
 from hrcreplay.geometry.vectors import dot3, norm_n
 from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.control.control_step import Stop
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import Stop
 from hrcreplay.robot.model import RobotModel
 
 #: Rounding that moving away allows for [m^2/s].

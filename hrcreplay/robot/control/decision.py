@@ -29,9 +29,9 @@ from hrcreplay.robot.control.control_step import (
     RobotState,
     Sight,
     Step,
+    Stop,
 )
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import Stop
 from hrcreplay.robot.model import RobotModel
 
 

@@ -10,7 +10,7 @@ from hrcreplay.errors import LogError
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, from_urdf
 from hrcreplay.robot.programme.path import recorded
-from hrcreplay.robot.programme.reference import STEP_S
+from hrcreplay.robot.programme.task import STEP_S
 from tests.realdata import data_path
 from tests.robot.tasks import robot
 
