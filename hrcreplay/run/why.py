@@ -19,10 +19,9 @@ import pyarrow.parquet as pq
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import LIMBS, STATUSES, Floats, HumanStates, Ints
-from hrcreplay.report.limbs import part_name_text
 from hrcreplay.report.metrics import true_runs
 from hrcreplay.report.metrics_plan import stationary
-from hrcreplay.report.tables import PageTable, reason_text
+from hrcreplay.report.tables import PageTable, part_name_text, reason_text
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import NO_PLANES
 from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, observe, straight
