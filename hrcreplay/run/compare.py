@@ -32,11 +32,11 @@ from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.task import Reference
 from hrcreplay.run import build, replay
+from hrcreplay.run.build import Forecast
 from hrcreplay.run.contact import Predicted, RecordedPerson, Volumes, contact_table, recorded_person, solids
 from hrcreplay.run.followers import Planner
 from hrcreplay.run.job import Job, JobOptions, resolve
-from hrcreplay.run.prediction import Forecast, stored_ticks
-from hrcreplay.run.stages import ProgressBar, Sink, print_note
+from hrcreplay.run.stages import ProgressBar, Sink, print_note, stored_ticks
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Occupancy, Plan
 from hrcreplay.store.columns import motion_columns, read_states

@@ -25,8 +25,8 @@ from hrcreplay.records import Bools, Floats, HumanStates, Ints
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run import build, stages
+from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.job import Job
-from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter
 

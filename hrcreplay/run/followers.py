@@ -12,7 +12,7 @@ import numpy as np
 
 from hrcreplay.records import HumanStates, Motion
 from hrcreplay.robot.control import control_step, path_controller, qp_controller
-from hrcreplay.robot.control.certificate import NO_PLANES
+from hrcreplay.robot.control.certificate import NO_PLANES, decide
 from hrcreplay.robot.control.control_step import (
     NO_SOLUTION,
     NOT_FINITE,
@@ -24,9 +24,10 @@ from hrcreplay.robot.control.control_step import (
     Step,
     Stop,
     at_rest,
+    made,
     observe,
+    stands,
 )
-from hrcreplay.robot.control.decision import decide, made, stands
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.task import Reference, ReferencePoint, advance

@@ -24,13 +24,12 @@ from hrcreplay.report.metrics_plan import stationary
 from hrcreplay.report.tables import PageTable, part_name_text, reason_text
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import NO_PLANES
-from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, observe, straight
-from hrcreplay.robot.control.decision import stands
+from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, observe, stands, straight
 from hrcreplay.run import build
+from hrcreplay.run.build import Forecast
 from hrcreplay.run.followers import Follower, Predict, QpFollower, unknown
 from hrcreplay.run.holding import Moment, asked, refused
 from hrcreplay.run.job import Job, resolve
-from hrcreplay.run.prediction import Forecast
 from hrcreplay.store.columns import read_states
 
 #: A TCP slower than this is said to stand [m/s].

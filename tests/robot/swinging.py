@@ -12,9 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.records import Floats, SweptVolumes
-from hrcreplay.robot.control.certificate import NO_PLANES
-from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, axis_by_axis, observe
-from hrcreplay.robot.control.decision import decide, made, stands
+from hrcreplay.robot.control.certificate import NO_PLANES, decide
+from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, axis_by_axis, made, observe, stands
 from hrcreplay.robot.control.minimiser import SLACK, Problem
 from hrcreplay.robot.control.qp_controller import Target, problem, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles

@@ -26,15 +26,23 @@ from hrcreplay.logs.messages import Undecodable
 from hrcreplay.logs.skeleton_pb2 import Skeleton
 from hrcreplay.records import CameraFrames, Floats, HumanStates
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, Stop, axis_by_axis, straight
-from hrcreplay.robot.control.decision import Taken, made
+from hrcreplay.robot.control.control_step import (
+    PlanSettings,
+    RobotState,
+    Step,
+    Stop,
+    Taken,
+    axis_by_axis,
+    made,
+    straight,
+)
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.programme.path import approach
 from hrcreplay.robot.programme.task import Reference
+from hrcreplay.run.build import FusionStage, PredictionStage
 from hrcreplay.run.followers import Follower, Predict
-from hrcreplay.run.prediction import PredictionStage
-from hrcreplay.run.stages import NS, FusionStage, no_frames
+from hrcreplay.run.stages import NS, no_frames
 from hrcreplay.settings.sections import Live
 
 

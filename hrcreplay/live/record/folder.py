@@ -25,8 +25,8 @@ from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, Floats, HumanStates, Mo
 from hrcreplay.run import build
 from hrcreplay.run.contact import write_contact
 from hrcreplay.run.job import Job
-from hrcreplay.run.prediction import store_volumes
 from hrcreplay.run.report import write_report
+from hrcreplay.run.stages import store_volumes
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import Columns, measurement_columns, motion_columns, state_columns
 from hrcreplay.store.run_folder import RunWriter, TableWriter

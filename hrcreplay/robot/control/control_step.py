@@ -300,3 +300,51 @@ def observe(
     if math.isnan(surface):
         return Sight(pose, None, math.nan, -1, -1, NO_DISTANCE)
     return Sight(pose, pairs, max(0.0, surface), limb, link, 0, max(0.0, -surface))
+
+
+class Taken(NamedTuple):
+    """What is executed in a tick."""
+
+    stop: Stop  #: from the end of the step on; its row 0 is where the step leads
+    status: int  #: index into ``records.STATUSES``
+    reason: int  #: index into ``REASONS``
+    certified: bool  #: whether step and stop were found clear of volumes that still hold
+
+
+def stands(sight: Sight, settings: PlanSettings) -> int:
+    """Why nothing is proposed at all: people are not known, or the robot is inside a volume; 0 where neither is so.
+
+    Args:
+        sight: The robot's distances from people.
+        settings: Of the method.
+    """
+    if sight.reason:
+        return sight.reason
+    return INSIDE if settings.certified and sight.overlap_m >= settings.retreat_m and sight.distance_m <= 0.0 else 0
+
+
+def made(sight: Sight, going: Stop, taken: Taken, horizon_s: float, dt_s: float) -> Step:
+    """The record of a tick.
+
+    Args:
+        sight: What was seen at the tick.
+        going: Its row 0 is where the robot is.
+        taken: What is executed.
+        horizon_s: Until when the volumes of the tick hold [s].
+        dt_s: Length of a tick [s].
+    """
+    after = RobotState(taken.stop.q[0], taken.stop.dq[0])
+    return Step(
+        pose=sight.pose,
+        u=np.asarray((after.dq - going.dq[0]) / dt_s),
+        next=after,
+        distance_m=sight.distance_m,
+        limb=sight.limb,
+        link=sight.link,
+        status=taken.status,
+        reason=taken.reason,
+        horizon_s=horizon_s,
+        tau_s=going.ticks * dt_s,
+        certified=taken.certified,
+        stop=taken.stop,
+    )
