@@ -22,10 +22,11 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs import mcap_stream, ros_bags
+from hrcreplay.logs import ros_bags
 from hrcreplay.logs.decoders import points_of
 from hrcreplay.logs.mcap_stream import McapStream
 from hrcreplay.logs.messages import (
+    MCAP_MAGIC,
     PROFILE,
     Damage,
     LazyChunk,
@@ -130,7 +131,7 @@ def _file(path: Path, *, zstd_messages: bool = False) -> MessageStream:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from error
     if not head:
         raise LogError(f"{path}: the log holds no messages (0 bytes)")
-    if head.startswith(mcap_stream.MAGIC):
+    if head.startswith(MCAP_MAGIC):
         return McapStream(path)
     if head.startswith(ros_bags.MAGIC):
         return open_bag(path)

@@ -15,7 +15,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.live import processes
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import APPROACH, FOLLOWING
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.store import run_folder
 from tests.live.flown import MOVING, Flown, Group, brakes_for, leaves_nobody, never_stalls, read_json, told, verified
 from tests.live.sessions import kill

@@ -18,7 +18,7 @@ from hrcreplay.live import processes
 from hrcreplay.live.control.setup import job_of
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, MotionRow
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, Floats, HumanStates, Motion

@@ -16,7 +16,7 @@ import pytest
 from mcap.reader import make_reader
 
 from hrcreplay.live.record import codec, recorder
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.logs.reader import open_log
 from tests.live import made
 
