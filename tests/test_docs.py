@@ -19,7 +19,7 @@ from hrcreplay.egm.robot_double.faults import KINDS, load_faults
 from hrcreplay.live.control import watchdog
 from hrcreplay.live.record import codec
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.task import parse_task
 from hrcreplay.settings.load import Settings, load_settings
 from hrcreplay.settings.sections import Live
 

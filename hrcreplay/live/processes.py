@@ -146,13 +146,6 @@ class ControlChannel:
         return data
 
 
-#: Module through which every helper starts; see ``main``.
-ENTRY = "hrcreplay.live.processes"
-
-_BUFFER = 4 << 20  #: of messages under way: seconds of them
-_AT_ONCE = 256  #: messages taken at once, so that a flood does not hold up the loop
-
-
 class Inbox:
     """What came from control and is not written yet. A thread empties the socket, so that no disk makes it fill up."""
 
@@ -174,6 +167,13 @@ class Inbox:
     def take(self) -> list[bytes]:
         """Messages that have come since the last call."""
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
+
+
+#: Module through which every helper starts; see ``main``.
+ENTRY = "hrcreplay.live.processes"
+
+_BUFFER = 4 << 20  #: of messages under way: seconds of them
+_AT_ONCE = 256  #: messages taken at once, so that a flood does not hold up the loop
 
 
 class HelperProcess:

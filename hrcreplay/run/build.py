@@ -25,8 +25,8 @@ from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measureme
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
-from hrcreplay.robot.programme.path import programmed, recorded
-from hrcreplay.robot.programme.task import Reference, Task, parse_task
+from hrcreplay.robot.path import programmed, recorded
+from hrcreplay.robot.task import Reference, Task, parse_task
 from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
 from hrcreplay.settings.sections import Fusion, Occupancy, Robot

@@ -30,7 +30,7 @@ from hrcreplay.report import comparison
 from hrcreplay.report.comparison import Variant
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.task import Reference
+from hrcreplay.robot.task import Reference
 from hrcreplay.run import build, replay
 from hrcreplay.run.build import Forecast
 from hrcreplay.run.contact import Predicted, RecordedPerson, Volumes, contact_table, recorded_person, solids

@@ -30,7 +30,7 @@ from hrcreplay.robot.control.control_step import (
 )
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.task import Reference, ReferencePoint, advance
+from hrcreplay.robot.task import Reference, ReferencePoint, advance
 
 _FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
 

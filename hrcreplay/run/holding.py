@@ -21,7 +21,7 @@ from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, minimise
 from hrcreplay.robot.control.path_controller import protective_distance_m
 from hrcreplay.robot.control.separation import Approach, Obstacles, tick_rows
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.task import advance
+from hrcreplay.robot.task import advance
 from hrcreplay.run.followers import Follower, PathFollower, Predict, QpFollower, ScalingFollower, SsmFollower
 
 #: A row whose link could approach faster by no more than this is one that the solution lies on [m/s].

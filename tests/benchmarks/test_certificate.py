@@ -14,8 +14,8 @@ from hrcreplay.robot.control.certificate import clear
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import parse_task
 from hrcreplay.run.followers import QpFollower
 from hrcreplay.settings.sections import Plan
 from tests.robot.distances import by_coal

@@ -21,8 +21,8 @@ from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, Floats, SweptVol
 from hrcreplay.robot.control.control_step import RobotState, Stop, along_path, axis_by_axis, straight
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import parse_task
 from hrcreplay.run import build, replay, stages
 from hrcreplay.run.job import resolve
 from hrcreplay.store import run_folder

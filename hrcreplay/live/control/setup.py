@@ -29,7 +29,7 @@ from hrcreplay.logs import skeleton_pb2
 from hrcreplay.logs.log_files import Header, JointTrack
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import Floats
-from hrcreplay.robot.programme.task import Reference
+from hrcreplay.robot.task import Reference
 from hrcreplay.run import build
 from hrcreplay.run.followers import Follower
 from hrcreplay.run.job import Job, job_without_log, resolve

@@ -38,8 +38,8 @@ from hrcreplay.robot.control.control_step import (
 )
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.path import approach
-from hrcreplay.robot.programme.task import Reference
+from hrcreplay.robot.path import approach
+from hrcreplay.robot.task import Reference
 from hrcreplay.run.build import FusionStage, PredictionStage
 from hrcreplay.run.followers import Follower, Predict
 from hrcreplay.run.stages import NS, no_frames

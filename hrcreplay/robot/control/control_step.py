@@ -20,7 +20,7 @@ from numba import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.separation import Obstacles, Separation, separation
 from hrcreplay.robot.model import RobotModel, RobotPose
-from hrcreplay.robot.programme.task import Grid, place
+from hrcreplay.robot.task import Grid, place
 from hrcreplay.settings.sections import Plan
 
 

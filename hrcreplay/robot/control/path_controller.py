@@ -21,7 +21,7 @@ from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Sight, 
 from hrcreplay.robot.control.qp_controller import cartesian_bounds
 from hrcreplay.robot.control.separation import Obstacles, tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, RobotPose
-from hrcreplay.robot.programme.task import Reference, place
+from hrcreplay.robot.task import Reference, place
 
 #: Rates that differ by no more are one.
 SAME = 1e-7

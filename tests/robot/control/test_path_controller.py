@@ -13,8 +13,8 @@ from hrcreplay.robot.control.control_step import PlanSettings, Step, along_path
 from hrcreplay.robot.control.path_controller import PathState, rates
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.task import Reference, parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import Reference, parse_task
 from hrcreplay.run.followers import ScalingFollower
 from hrcreplay.settings.sections import Plan
 from tests.robot.checker import violation

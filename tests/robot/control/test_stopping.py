@@ -8,8 +8,8 @@ import pytest
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.control_step import Stop, along_path, at_rest, axis_by_axis, straight
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.task import Reference, parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import Reference, parse_task
 
 DT_S = 0.004
 
