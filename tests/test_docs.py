@@ -16,7 +16,7 @@ from hrcreplay.cli.app import app
 from hrcreplay.egm import motion_link_pb2
 from hrcreplay.egm.link import REFUSALS, STOPS, PacketStatus
 from hrcreplay.egm.robot_double.faults import KINDS, load_faults
-from hrcreplay.live.control import watchdog
+from hrcreplay.live.control import session_controller
 from hrcreplay.live.record import codec
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.task import parse_task
@@ -143,8 +143,14 @@ def test_the_program_shown_is_the_one_in_the_file() -> None:
 
 def test_every_stop_reason_is_in_the_table() -> None:
     heard = PacketStatus(answer=True, fresh=False, allowed=False, reason="", ended=False, lost=0)
-    constants = {value for name, value in vars(watchdog).items() if name.isupper() and isinstance(value, str)}
-    reasons = {*constants, *watchdog.SIGNALS.values(), *watchdog.REFUSED, *STOPS, watchdog.of_robot(heard)}
+    constants = {value for name, value in vars(session_controller).items() if name.isupper() and isinstance(value, str)}
+    reasons = {
+        *constants,
+        *session_controller.SIGNALS.values(),
+        *session_controller.REFUSED,
+        *STOPS,
+        session_controller.reason_of_robot(heard),
+    }
     table = rows(section(7), "| reason |")
     assert sorted(row[0].strip("`") for row in table) == sorted(reasons)
     assert all(len(row) == 3 and all(row) for row in table)

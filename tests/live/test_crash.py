@@ -18,7 +18,7 @@ from hrcreplay.egm.codec import Correction, decode_correction
 from hrcreplay.egm.link import EgmSession, Received
 from hrcreplay.errors import LiveStopped
 from hrcreplay.live import processes, session
-from hrcreplay.live.control import session_controller, watchdog
+from hrcreplay.live.control import session_controller
 from hrcreplay.live.control.loop import FINAL_ANSWERS, FallbackBrake, Loop, bring_to_rest
 from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.control.stages import Observer
@@ -43,7 +43,7 @@ PLACES: dict[str, tuple[Any, str]] = {
     "conversation": (EgmSession, "classify_all"),
     "reply": (EgmSession, "reply"),
     "encoding": (session_controller, "encode_correction"),
-    "watchdog": (watchdog, "of_person"),
+    "watchdog": (session_controller, "reason_of_person"),
     "age of the frames": (Observer, "age_s"),
     "messages of the human side": (Loop, "_receive_skeletons"),
     "record of an answer": (codec, "encode_decision"),
@@ -106,7 +106,7 @@ def test_a_bug_anywhere_in_control_brakes_a_moving_robot_to_rest(
         np.testing.assert_allclose(reply.dq, stop.dq[min(row, stop.ticks)], rtol=0, atol=1e-12)
     assert not any(np.any(reply.dq) for reply in replies[-FINAL_ANSWERS:])
     assert all((two.seqno - one.seqno) % 2**32 == 1 for one, two in pairwise(replies))
-    assert [why for _, why in found.flight.controller.stops] == [watchdog.FAULT]
+    assert [why for _, why in found.flight.controller.stops] == [session_controller.FAULT]
     gaps = np.diff([t_ns for t_ns, _ in found.sent]) * 1e-9
     assert gaps.max() < 3 * CYCLE_S, "it went on being answered"
 
@@ -185,7 +185,7 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
     kinds = [codec.kind(message) for message in messages]
     events = [codec.decode_event(message) for message in messages if codec.kind(message) == codec.EVENT]
     assert [event["what"] for event in events] == ["crash", "end"]
-    assert events[1]["reason"] == watchdog.FAULT
+    assert events[1]["reason"] == session_controller.FAULT
     again = SessionRecomputation(build_controller(found.flight.start))
     crashed_at = next(i for i, message in enumerate(messages) if b'"crash"' in message)
     assert all(again.difference_at(message) is None for message in messages[: crashed_at + 1])
@@ -202,7 +202,7 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
 
 def test_a_recording_that_cannot_be_read_any_further_is_named() -> None:
     loop = counted(Flight())
-    loop.controller.stop = watchdog.PERSON_DEAD
+    loop.controller.stop = session_controller.PERSON_DEAD
     loop.notes += ["failed log.mcap: no further", "a later remark"]
     with pytest.raises(
         LiveStopped, match=r"stopped by: human side dead \(log.mcap: no further\); the record is in run"

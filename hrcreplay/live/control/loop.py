@@ -22,9 +22,7 @@ from google.protobuf.message import DecodeError
 
 from hrcreplay.egm import motion_link_pb2 as messages
 from hrcreplay.egm.link import Address, EgmServer, Received
-from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.session_controller import SessionController
-from hrcreplay.live.control.watchdog import REFUSED
+from hrcreplay.live.control.session_controller import FAULT, REFUSED, SessionController
 from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Signal, TickEvent
@@ -285,9 +283,9 @@ def bring_to_rest(loop: Loop, why: str) -> None:
         why: What the record is to say of it.
     """
     with suppress(Exception):
-        if loop.controller.stop != watchdog.FAULT:
-            loop.controller.stop = watchdog.FAULT
-            loop.controller.stops.append((loop.now_ns(), watchdog.FAULT))
+        if loop.controller.stop != FAULT:
+            loop.controller.stop = FAULT
+            loop.controller.stops.append((loop.now_ns(), FAULT))
         loop.recorder.send(codec.encode_event(loop.now_ns(), {"what": "crash", "text": why}))
     brake, sender = _brake(loop), loop.sender
     if brake is None or sender is None:
@@ -360,6 +358,6 @@ def _record(
     unknown = np.full(3, np.nan)
     row = MotionRow(where, q, dq, u, unknown, unknown, *[np.nan] * 7)
     phase = codec.HOLDING if brake.at_rest else codec.STOPPING
-    answer = Decision(t_ns, 0, data, phase, BRAKING, watchdog.FAULT, -1, -1, row, None)
+    answer = Decision(t_ns, 0, data, phase, BRAKING, FAULT, -1, -1, row, None)
     loop.recorder.send(codec.encode_decision(answer, Signal.NONE, len(datagrams), 0))
     loop.recorder.send(codec.encode_reply(t_ns, data, sent=True))
