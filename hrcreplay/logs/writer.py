@@ -172,7 +172,7 @@ def _refuse_existing(path: Path) -> None:
 START_NS = 1_000_000_000
 
 #: What is told of every format imported here: none of them knows when a frame reached a computer.
-ARRIVAL_NOTE = "the files hold capture times only: arrival is taken as capture, as if there were no delay"
+_ARRIVAL_NOTE = "the files hold capture times only: arrival is taken as capture, as if there were no delay"
 
 _CHUNK = 256  # rows written at once
 
@@ -325,10 +325,10 @@ def import_cameras(
         SettingsError: ``out`` exists or cannot be written.
     """
     spans = write_log({name: read(path) for name, path in paths.items()}, out)
-    return [ARRIVAL_NOTE, *overlap_notes(spans)]
+    return [_ARRIVAL_NOTE, *_overlap_notes(spans)]
 
 
-def overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:
+def _overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:
     """A note for every camera whose times lie wholly outside the first one's."""
     names = list(spans)
     start, end = spans[names[0]]

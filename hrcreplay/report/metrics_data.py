@@ -310,7 +310,7 @@ def _add_seen(metrics: MetricTable, run: Run, found: dict[str, Errors], kind: st
 LIMB_COLUMNS = {"state": tuple(f"unseen_{limb}" for limb in LIMBS), "measurements": JOINTS}
 
 #: Joints that place a limb beside those that carry it; a part of an arm has been seen when one of its two has.
-OWN_JOINTS = {
+_OWN_JOINTS = {
     "HD": JOINTS[:4],
     "THX": JOINTS[:4],
     "URA": ("ar1", "ar2"),
@@ -357,7 +357,7 @@ def add_limbs(metrics: MetricTable, run: Run) -> None:
         )
         metrics.add(
             f"limb_{limb}_joints_unmeasured",
-            ", ".join(joint for joint in OWN_JOINTS[limb] if joint in never) or None,
+            ", ".join(joint for joint in _OWN_JOINTS[limb] if joint in never) or None,
             "name",
             f"joints of the {LIMB_NAMES[limb]} that no frame measured",
             reason="each was measured, or there is no table of measurements",

@@ -292,10 +292,10 @@ def snapshot(scene: ReplayScene, row: int) -> Figure:
     figure = drawing.new_figure(6.2)
     axes = drawing.panels(figure, 1, 1, left_in=0.62, top_in=0.62, bottom_in=0.75)[0][0]
     edges = [outline(solid.vertices_m, solid.radius_m, view) for solid in (*robot, *person)]
-    corners = np.vstack([*edges, *(edge for edge in volumes_outlines(volumes, view) if len(edge))])
+    corners = np.vstack([*edges, *(edge for edge in _volumes_outlines(volumes, view) if len(edge))])
     low, high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
     drawing.set_window(axes, low.tolist(), high.tolist())
-    for edge in volumes_outlines(volumes, view):
+    for edge in _volumes_outlines(volumes, view):
         axes.add_patch(Polygon(edge, facecolor=drawing.ORANGE, edgecolor=drawing.ORANGE, alpha=0.16, lw=0.7, zorder=1))
     image = render_hulls([*robot, *person], view, low, high, float(high[1] - low[1]) / 700.0)
     limits = axes.get_xlim(), axes.get_ylim()
@@ -344,7 +344,7 @@ def _stored(scene: ReplayScene, row: int) -> list[tuple[Floats, float]]:
     ]
 
 
-def volumes_outlines(volumes: list[tuple[Floats, float]], view: View) -> list[Floats]:
+def _volumes_outlines(volumes: list[tuple[Floats, float]], view: View) -> list[Floats]:
     """(k, 2) the outline of each volume in a view [m]."""
     return [outline(vertices, radius, view) for vertices, radius in volumes]
 

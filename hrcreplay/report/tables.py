@@ -322,12 +322,12 @@ LIMB_NAMES = {
 }
 
 #: What people call the parts of a recorded body that are no LIMBS.
-LEG_NAMES = {"THIGH_R": "right thigh", "SHANK_R": "right shank", "THIGH_L": "left thigh", "SHANK_L": "left shank"}
+_LEG_NAMES = {"THIGH_R": "right thigh", "SHANK_R": "right shank", "THIGH_L": "left thigh", "SHANK_L": "left shank"}
 
 
 def part_name_text(part: str) -> str:
     """A part of a recorded body as a reader calls it."""
-    return LIMB_NAMES.get(part) or LEG_NAMES.get(part, part)
+    return LIMB_NAMES.get(part) or _LEG_NAMES.get(part, part)
 
 
 def limb_names_text(limbs: list[str]) -> str:

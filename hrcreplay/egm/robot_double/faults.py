@@ -296,9 +296,9 @@ def _chance_of(table: object, where: str) -> dict[str, Any]:
 
 
 #: Slower than this on every axis is standstill [rad/s] ...
-REST_RAD_PER_S = 0.01
+_REST_RAD_PER_S = 0.01
 #: ... once it has lasted for so many cycles.
-REST_CYCLES = 25
+_REST_CYCLES = 25
 
 
 @dataclass(frozen=True)
@@ -324,7 +324,7 @@ def fault_outcome(fault: Fault, cycles: NDArray[Any]) -> FaultOutcome:
     """How long it took from the onset of a fault until everything stood still."""
     since_s = (cycles["t_ns"] - cycles["t_ns"][:1]) * 1e-9
     told = _told_still(cycles)
-    robot_s = _rest_s(fault, since_s, np.all(np.abs(cycles["planned_rad_per_s"]) < REST_RAD_PER_S, axis=1))
+    robot_s = _rest_s(fault, since_s, np.all(np.abs(cycles["planned_rad_per_s"]) < _REST_RAD_PER_S, axis=1))
     coast_s = None
     if robot_s is not None:
         moved = np.flatnonzero(~told & (since_s < fault.at_s + robot_s))
@@ -337,14 +337,14 @@ def _told_still(cycles: NDArray[Any]) -> Bools:
     """Cycles whose reference neither moves nor says so (n,); without a reference there is nothing that moves."""
     reference = cycles["ref_rad"]
     step = np.diff(reference, axis=0, prepend=reference[:1]) / (PERIOD_NS * 1e-9)
-    moves = (np.abs(step) >= REST_RAD_PER_S) | (np.abs(cycles["ref_rad_per_s"]) >= REST_RAD_PER_S)
+    moves = (np.abs(step) >= _REST_RAD_PER_S) | (np.abs(cycles["ref_rad_per_s"]) >= _REST_RAD_PER_S)
     return ~np.any(moves, axis=1)
 
 
 def _rest_s(fault: Fault, since_s: Floats, still: Bools) -> float | None:
     """Time from the onset of a fault to the first cycle of a standstill that lasts; None without one."""
-    if len(still) < REST_CYCLES:
+    if len(still) < _REST_CYCLES:
         return None
-    lasting = np.convolve(still, np.ones(REST_CYCLES), mode="valid") > REST_CYCLES - 0.5
+    lasting = np.convolve(still, np.ones(_REST_CYCLES), mode="valid") > _REST_CYCLES - 0.5
     resting = np.flatnonzero(lasting & (since_s[: len(lasting)] >= fault.at_s))
     return float(since_s[resting[0]]) - fault.at_s if len(resting) else None

@@ -36,7 +36,7 @@ NO_FRAME, UNCERTAIN, NOT_FINITE, TRACKING = "no fresh frame", "state uncertain",
 FAULT = "internal error"
 
 #: What ends a session whose robot may have been stopped for another reason.
-ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
+_ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
 
 #: Robots that are not answered at all.
 REFUSED = ("radians", "axes")
@@ -80,7 +80,7 @@ def reason_of_person(perception: Perception | None, age_s: float, bounds: Live) 
     return "" if sure else UNCERTAIN
 
 
-def reason_of_tracking(measured: Floats, commanded: Floats, bounds: Live) -> str:
+def _reason_of_tracking(measured: Floats, commanded: Floats, bounds: Live) -> str:
     """The reason that the robot is not where it was told to be, or none; both (6,) [rad]."""
     return "" if np.abs(measured - commanded).max() <= bounds.tracking_rad else TRACKING
 
@@ -234,7 +234,7 @@ class SessionController:
             self._clear_ns = None if why else (self._clear_ns or event.t_ns)
             if self._clear_ns is not None and event.t_ns - self._clear_ns >= self.setup.bounds.resume_s * 1e9:
                 self.stop, self.phase = "", codec.WAITING
-            elif why and why not in ENDINGS:
+            elif why and why not in _ENDINGS:
                 self.stop = why  # what holds it now
         self.waiting = why if self.phase == codec.WAITING else ""
         if self.phase == codec.WAITING and not why and self._motion is not None:
@@ -251,7 +251,7 @@ class SessionController:
         if not why:
             why = reason_of_person(self.perception, self.observer.age_s(event.t_ns), self.setup.bounds)
         if not why and self.setup.sending and self._motion is not None and self.phase != codec.ECHO:
-            why = reason_of_tracking(measured, self._motion.state.q, self.setup.bounds)
+            why = _reason_of_tracking(measured, self._motion.state.q, self.setup.bounds)
         return why
 
     def _stop(self, t_ns: int, why: str) -> None:

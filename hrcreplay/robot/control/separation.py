@@ -119,7 +119,7 @@ class Approach(NamedTuple):
 
 
 #: A link and a limb that are nearer count as this far apart where a speed is made of a row [m].
-LEAST_M = 1e-3
+_LEAST_M = 1e-3
 
 
 def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, distance_m: Floats, stop_s: float) -> Approach:
@@ -132,7 +132,7 @@ def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, distance_m
         distance_m: (s, l) between the link's axis and the limb's hull [m].
         stop_s: T_s of Eq. (70), or how far ahead the rows look [s].
     """
-    per_speed = stop_s * np.maximum(distance_m, LEAST_M)
+    per_speed = stop_s * np.maximum(distance_m, _LEAST_M)
     around = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
     return Approach(pose.ends_m, pose.J_ends, *around, room_m2, per_speed, stop_s)
 
