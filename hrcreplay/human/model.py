@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, POINTS, Floats, Ints
+from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, POINTS, Floats
 from hrcreplay.settings.sections import Occupancy
 
 #: First of the four joints of each arm in JOINTS, and s of the kinematics: +1 on the left.
@@ -338,32 +338,3 @@ def part_radii(occupancy: Occupancy, leg_m: float) -> Floats:
     upper, lower = occupancy.radius_upper_arm_m, occupancy.radius_lower_arm_m
     arms = (upper, lower, upper, lower)
     return np.array([occupancy.radius_head_m, occupancy.radius_thorax_m, *arms, *(leg_m,) * len(LEG_PARTS)])
-
-
-def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float) -> Floats:
-    """Body points between the two samples around each instant, linear.
-
-    Args:
-        t_ns: (n,) instants of the samples, increasing [ns].
-        points_m: (n, 20, 3) samples, world [m].
-        at_ns: (m,) instants asked for [ns].
-        gap_s: Between samples further apart nothing is known [s].
-
-    Returns:
-        (m, 20, 3); NaN outside the samples, in a gap, and where one of the two samples lacks the point. An instant
-        that meets a sample gets that sample.
-    """
-    found = np.full((len(at_ns), *points_m.shape[1:]), np.nan)
-    if not len(t_ns):
-        return found
-    right = np.searchsorted(t_ns, at_ns, side="left")
-    inside = (at_ns >= t_ns[0]) & (at_ns <= t_ns[-1])
-    right = np.clip(right, 0, len(t_ns) - 1)
-    met = inside & (t_ns[right] == at_ns)
-    found[met] = points_m[right[met]]
-    left = np.maximum(right - 1, 0)
-    step_ns = t_ns[right] - t_ns[left]
-    between = inside & ~met & (step_ns > 0) & (step_ns * 1e-9 <= gap_s)
-    share = ((at_ns - t_ns[left])[between] / step_ns[between])[:, None, None]
-    found[between] = (1.0 - share) * points_m[left[between]] + share * points_m[right[between]]
-    return found
