@@ -23,6 +23,7 @@ from typing import Any, Unpack, get_args
 import pandas as pd
 import pyarrow.parquet as pq
 
+import hrcreplay
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import Floats, Ints
@@ -300,9 +301,10 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
 
 
 def _second_process() -> ProcessPoolExecutor:
-    """A process with compiled kernels of its own, since numba does not lock its files."""
+    """A process with compiled kernels of its own, since numba does not lock its files; it begins with all there are."""
     first = os.environ["NUMBA_CACHE_DIR"]
     second = Path(first) / "second"
+    hrcreplay.share_kernels(Path(first), second)
     pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
     os.environ["NUMBA_CACHE_DIR"] = str(second)  # read when the process begins
     try:
