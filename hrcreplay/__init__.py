@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shutil
 from pathlib import Path
 
 __version__ = "0.1.0"
@@ -23,6 +24,17 @@ def _keep_kernels_apart() -> None:
     if not os.access(cache if cache.exists() else here, os.W_OK):
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hrcreplay"
     os.environ.setdefault("NUMBA_CACHE_DIR", str(cache / f"kernels-{digest.hexdigest()[:16]}"))
+
+
+def share_kernels(have: Path, lack: Path) -> None:
+    """Copies the compiled kernels of functions of which another folder has none: an index, and the files it names."""
+    for index in have.glob("*/*.nbi"):
+        copy = lack / index.relative_to(have)
+        if not copy.exists():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            for kernel in index.parent.glob(f"{index.stem}.*.nbc"):
+                shutil.copy2(kernel, copy.parent)
+            shutil.copy2(index, copy)
 
 
 _keep_kernels_apart()

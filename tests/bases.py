@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hrcreplay.cli import log_commands
+from hrcreplay.cli import commands
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import POINTS, Floats, HumanStates
 from hrcreplay.run import replay
@@ -71,9 +71,9 @@ def recorded(name: str, tmp: Path) -> tuple[Path, Path, Path | None]:
         return data_path(f"sara_human_robot_bags/{name}.bag"), cell, tmp / "s.toml"
     kind, files, options = IMPORTS[name]
     paths = [f"{c}={data_path(file)}" if kind != "keraal" else str(data_path(file)) for c, file in files.items()]
-    log_commands.import_files(kind, paths, tmp / "log.mcap", 30.0)
+    commands.import_files(kind, paths, tmp / "log.mcap", 30.0)
     place = {"reference": None, "up": None, "height_m": None, "base": None, **options}
-    log_commands.calibrate(tmp / "log.mcap", cell, None, (), **place)
+    commands.calibrate(tmp / "log.mcap", cell, None, (), **place)
     return tmp / "log.mcap", cell, None
 
 

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import gc
 import os
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import hrcreplay  # noqa: F401  # names the folder of compiled kernels
+import hrcreplay  # names the folder of compiled kernels
 
 if TYPE_CHECKING:
     from hrcreplay.store.run_folder import Run
@@ -48,20 +47,9 @@ def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
     """Gives every process what any of them has compiled before, as they do not run the same tests each time."""
     first, *others = (_kernels_of(spec.id) for spec in specs)
     for folder in others:
-        _add_missing(folder, first)
+        hrcreplay.share_kernels(folder, first)
     for folder in others:
-        _add_missing(first, folder)
-
-
-def _add_missing(have: Path, lack: Path) -> None:
-    """Copies the kernels of functions of which the other folder has none: an index, and the files it names."""
-    for index in [path for path in have.rglob("*.nbi") if not path.relative_to(have).parts[0].startswith("gw")]:
-        copy = lack / index.relative_to(have)
-        if not copy.exists():
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            for kernel in index.parent.glob(f"{index.stem}.*.nbc"):
-                shutil.copy2(kernel, copy.parent)
-            shutil.copy2(index, copy)
+        hrcreplay.share_kernels(first, folder)
 
 
 def _kernels_of(worker: str) -> Path:

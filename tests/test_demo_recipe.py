@@ -15,8 +15,8 @@ from hrcreplay.human.fusion.inverse_kinematics import inverse
 from hrcreplay.human.model import HEIGHT, nearest, skeleton
 from hrcreplay.records import POINTS, CameraFrames, Floats
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import parse_task
 
 SHIPPED = Path(__file__).parents[1] / "datasets" / "demo.mcap"
 AT = {name: index for index, name in enumerate(POINTS)}

@@ -13,12 +13,13 @@ import typer
 from hrcreplay import errors
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.cli.app import app
-from hrcreplay.egm import motion_link_pb2, protocol
+from hrcreplay.egm import motion_link_pb2
+from hrcreplay.egm.link import REFUSALS, STOPS, PacketStatus
 from hrcreplay.egm.robot_double.faults import KINDS, load_faults
-from hrcreplay.live.control import watchdog
-from hrcreplay.live.record import topics
+from hrcreplay.live.control import session_controller
+from hrcreplay.live.record import codec
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.task import parse_task
 from hrcreplay.settings.load import Settings, load_settings
 from hrcreplay.settings.sections import Live
 
@@ -141,16 +142,22 @@ def test_the_program_shown_is_the_one_in_the_file() -> None:
 
 
 def test_every_stop_reason_is_in_the_table() -> None:
-    heard = protocol.PacketStatus(answer=True, fresh=False, allowed=False, reason="", ended=False, lost=0)
-    constants = {value for name, value in vars(watchdog).items() if name.isupper() and isinstance(value, str)}
-    reasons = {*constants, *watchdog.SIGNALS.values(), *watchdog.REFUSED, *protocol.STOPS, watchdog.of_robot(heard)}
+    heard = PacketStatus(answer=True, fresh=False, allowed=False, reason="", ended=False, lost=0)
+    constants = {value for name, value in vars(session_controller).items() if name.isupper() and isinstance(value, str)}
+    reasons = {
+        *constants,
+        *session_controller.SIGNALS.values(),
+        *session_controller.REFUSED,
+        *STOPS,
+        session_controller.reason_of_robot(heard),
+    }
     table = rows(section(7), "| reason |")
     assert sorted(row[0].strip("`") for row in table) == sorted(reasons)
     assert all(len(row) == 3 and all(row) for row in table)
 
 
 def test_refusals_and_reasons_of_the_plan_are_explained() -> None:
-    for refusal in protocol.REFUSALS:
+    for refusal in REFUSALS:
         assert f"`{refusal}`" in section(7)
     assert {row[1].strip("`") for row in rows(section(7), "| status |")} == set(control_step.REASONS)
 
@@ -182,7 +189,7 @@ def test_every_kind_of_fault_is_named() -> None:
 
 
 def test_what_to_plot_is_in_the_messages() -> None:
-    types = {topics.ROBOT: motion_link_pb2.RobotMessage, topics.SENT: motion_link_pb2.SensorMessage}
+    types = {codec.ROBOT_TOPIC: motion_link_pb2.RobotMessage, codec.SENT_TOPIC: motion_link_pb2.SensorMessage}
     found = [span for span in spans(section(8)) if span.startswith("/egm/") and "." in span]
     assert len(found) == 2
     for span in found:

@@ -17,9 +17,9 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py") if not path.name.endswit
 #: A function with at least so many parameters needs an Args section.
 MANY = 4
 #: The command line: here the help of each option documents it, and a docstring is the text of --help.
-COMMANDS = ("cli/app.py", "cli/live.py")
+COMMANDS = ("cli/app.py", "cli/commands.py")
 #: Modules of one name in several rooms are counterparts: the same task, each for its room.
-COUNTERPARTS = {"__init__", "codec", "figures", "inverse_kinematics", "metrics", "model", "page"}
+COUNTERPARTS = {"__init__", "codec", "figures", "inverse_kinematics", "metrics", "model", "page", "stages"}
 
 _SECTIONS = re.compile(r"^(Returns|Raises|Yields|Attributes):$", re.MULTILINE)
 

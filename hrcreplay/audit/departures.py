@@ -24,7 +24,7 @@ from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, tubes
 from hrcreplay.records import BODY, Floats, HumanStates, Ints, SweptVolumes
-from hrcreplay.run.prediction import PredictionStage
+from hrcreplay.run.build import PredictionStage
 
 #: Shorter horizons than the braking time, at which a robot beside people stops [s].
 SHORTER_S = (0.05, 0.1, 0.2)

@@ -29,8 +29,8 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.prediction import reachable_sets
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.run import build
+from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.job import Job, JobOptions, resolve
-from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.run.stages import print_note
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch

@@ -26,8 +26,8 @@ from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LIMBS, Floats
 from hrcreplay.run import build
+from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.job import Job, JobOptions, resolve
-from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.run.stages import NS, ProgressBar, tick_times
 
 

@@ -23,8 +23,8 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report.metrics import ANGLES, difference
 from hrcreplay.run import build
+from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.job import Job
-from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.run.stages import NS, ProgressBar, tick_times
 from hrcreplay.store.run_folder import Stopwatch
 

@@ -14,7 +14,8 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import LENGTHS, POINTS, Bools, Floats, HumanStates, Ints, Measurements
-from hrcreplay.run.stages import FusionStage, batches
+from hrcreplay.run.build import FusionStage
+from hrcreplay.run.stages import batches
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
 

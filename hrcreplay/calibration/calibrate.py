@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hrcreplay.calibration.cell import Cell, Residual
-from hrcreplay.calibration.floor import LEVEL_VIEW, Floor, find_floor, floor_frame, up_direction
+from hrcreplay.calibration.cell import LEVEL_VIEW, Cell, Floor, Residual, find_floor, floor_frame, up_direction
 from hrcreplay.calibration.registration import Registration, SkeletonTrack, disagreement, register, transform
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.clean import PersonMemory, select_person

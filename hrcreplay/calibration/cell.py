@@ -1,4 +1,8 @@
-"""The cell file: poses of cameras and robot, clock offsets. World frame: z up, floor at z = 0."""
+"""The cell: poses of cameras and robot and clock offsets in a file, and the floor, found from a person who walks.
+
+World frame: z up, floor at z = 0. Of the floor plane and the upward direction nothing is assumed about the directions
+of the sensor's axes.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +16,9 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, ValidationError
 
+from hrcreplay.calibration.registration import SkeletonTrack, rigid
 from hrcreplay.errors import SettingsError
-from hrcreplay.records import Floats
+from hrcreplay.records import POINTS, Bools, Floats
 from hrcreplay.store.run_folder import write_whole
 
 _TOLERANCE = 1e-6
@@ -231,3 +236,160 @@ def _first_problem(error: ValidationError, table: Mapping[str, Any], where: str)
     if kind in ("float_type", "finite_number"):
         right = "a finite number"
     return f"{at}: found {None if kind == 'missing' else found!r}; would be right: {right}"
+
+
+_SOLE_M = 0.03  # foot point above the floor, Winter's foot with a shoe's sole
+_LEG = ("knee", "ankle", "foot")
+_UPRIGHT = 0.9  # neck to ankles, straight over along the bones: a chair gives 0.75 to 0.85
+_STANDING_STD = np.radians(3.0)  # sway, and errors of the trackers' feet
+_TORSO_STD = np.radians(8.0)  # how upright people sit
+_FOOT_STD_M = 0.02
+_STEP_M = 0.1  # a tracker repeats its error while a foot rests: each place counts as one measurement
+_REST_S = 0.3  # a foot that is shorter at a place only passes there
+_MANY_S = 1.0  # rows worth this long are needed to tell anything
+#: A view whose z is less points along the floor enough to give it a direction: 60 degrees up or down.
+LEVEL_VIEW = float(np.sin(np.radians(60)))
+_SURE = 0.5  # feet of at most this confidence are guesses of the tracker
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A point p of the sensor's frame is ``up @ p + height_m`` above the floor."""
+
+    up: Floats  #: (3,) unit vector in the sensor's frame
+    height_m: float  #: of the sensor's origin above the floor [m]
+    tilt_std_rad: float  #: how well ``up`` is known, standard deviation [rad]
+
+
+def up_direction(track: SkeletonTrack) -> tuple[Floats, float] | None:
+    """The upward direction, from the direction of the person's body.
+
+    Returns:
+        Unit vector (3,) in the sensor's frame and its standard deviation [rad]. Who stands keeps the centre of mass
+        over the feet, however bent; who never stands upright sits, and the trunk from pelvis to neck must do. None
+        where neither was seen long enough.
+    """
+    neck, pelvis = _point(track, "neck"), _point(track, "pelvis")
+    neck = np.where(np.isfinite(neck), neck, 0.5 * (_point(track, "shoulder_l") + _point(track, "shoulder_r")))
+    knee, ankle, foot = (0.5 * (_point(track, f"{name}_l") + _point(track, f"{name}_r")) for name in _LEG)
+    bones = _length(neck - pelvis) + _length(pelvis - knee) + _length(knee - ankle)
+    upright = _length(neck - ankle) > _UPRIGHT * bones
+    mass = 0.30 * neck + 0.44 * pelvis + 0.20 * knee + 0.06 * ankle
+    standing = _unit(mass - 0.5 * (ankle + foot))[upright]
+    trunk = _unit(neck - pelvis)
+    trunk = trunk[np.isfinite(trunk).all(axis=1)]
+    for directions, std in ((standing, _STANDING_STD), (trunk, _TORSO_STD)):
+        if len(directions) >= _rows_for(track, _MANY_S):
+            return _middle(directions), float(std)
+    return None
+
+
+def find_floor(track: SkeletonTrack, up: Floats | None = None) -> Floor | None:
+    """The plane under the feet.
+
+    Ankles and feet that rest lie on two planes of one direction; the posture says which direction is likely, the more
+    so the smaller the part of the floor that was walked on. Raised feet are left out by Tukey's weights.
+
+    Args:
+        track: The person in the sensor's frame [m].
+        up: (3,) direction to keep, in the sensor's frame; None to find it.
+
+    Returns:
+        The floor, or None where feet or trunk were not seen long enough.
+    """
+    guess = (up / np.linalg.norm(up), 1e-9) if up is not None else up_direction(track)
+    feet_m, is_ankle = _feet(track)
+    if guess is None or len(feet_m) < _rows_for(track, _MANY_S) or is_ankle.all():
+        return None
+    normal, std = guess
+    prior = (_FOOT_STD_M / std) ** 2  # on the tilt, in units of one place's residual
+    e1, e2 = _across(normal)
+    tilt = np.zeros(2)
+    heights = feet_m @ normal
+    kinds = np.stack([~is_ankle, is_ankle], axis=1).astype(np.float64)
+    level = np.array([_low(heights[~is_ankle]), _low(heights[is_ankle])])
+    A = np.column_stack([feet_m @ e1, feet_m @ e2, -kinds])
+    A[:, :2] -= np.median(A[:, :2], axis=0)  # turning about where the person walks leaves the levels alone
+    share = _share(A[:, :2], is_ankle, _rows_for(track, _REST_S))
+    for reach_m in np.concatenate([np.geomspace(0.3, 0.06, 12), np.full(20, 0.06)]):
+        left = heights + A @ np.concatenate([tilt, level])
+        weight = share * np.maximum(0.0, 1.0 - (left / reach_m) ** 2) ** 2
+        H = A.T @ (A * weight[:, None]) + np.diag([prior, prior, 1e-9, 1e-9])
+        solution = np.linalg.solve(H, -A.T @ (weight * heights) + 1e-9 * np.array([0, 0, *level]))
+        tilt, level = solution[:2], solution[2:]
+    found = _unit(normal + tilt[0] * e1 + tilt[1] * e2)
+    middle = np.array([np.median(feet_m @ e1), np.median(feet_m @ e2)])
+    # Where the person walks, the feet's plane is `level` along the first guess.
+    on_plane = middle[0] * e1 + middle[1] * e2 + level[0] * normal
+    tilt_std = _FOOT_STD_M * float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(H)[:2, :2])[-1]))
+    return Floor(found, _SOLE_M - float(found @ on_plane), tilt_std)
+
+
+def floor_frame(floor: Floor) -> Floats:
+    """T_world_sensor (4, 4) of the world that the sensor defines.
+
+    Its origin is the floor under the sensor, z is up, x is the viewing direction (the sensor's z) along the floor, or
+    the sensor's own x where it looks up or down by more than 60 degrees, as the frame of a motion capture system does.
+    """
+    view = np.array([0.0, 0.0, 1.0])
+    if abs(floor.up @ view) > LEVEL_VIEW:
+        view = np.array([1.0, 0.0, 0.0])
+    x = _unit(view - (floor.up @ view) * floor.up)
+    return rigid(np.stack([x, np.cross(floor.up, x), floor.up]), np.array([0.0, 0.0, floor.height_m]))
+
+
+def _point(track: SkeletonTrack, name: str) -> Floats:
+    i = POINTS.index(name)
+    return np.where((track.confidence[:, i] > 0)[:, None], track.points_m[:, i], np.nan)
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Directions (..., 3); NaN where a vector has no length."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0.0, length, np.nan))
+
+
+def _length(vectors: Floats) -> Floats:
+    return np.asarray(np.linalg.norm(vectors, axis=-1))
+
+
+def _rows_for(track: SkeletonTrack, seconds: float) -> float:
+    """Number of rows of this track that last so long."""
+    return max(1.0, seconds * 1e9 / float(np.median(np.diff(track.t_ns)))) if len(track) > 1 else np.inf
+
+
+def _middle(directions: Floats) -> Floats:
+    """Direction of the least sum of angles, so that bending now and then does not count."""
+    middle = _unit(np.median(directions, axis=0))
+    for _ in range(30):
+        apart = np.linalg.norm(directions - middle, axis=1)
+        middle = _unit((directions / np.maximum(apart, 1e-6)[:, None]).sum(axis=0))
+    return middle
+
+
+def _feet(track: SkeletonTrack) -> tuple[Floats, Bools]:
+    """(m, 3) ankles and feet that the sensor is sure of, and (m,) which are ankles."""
+    places, kinds = [], []
+    for name in ("ankle_l", "ankle_r", "foot_l", "foot_r"):
+        points = _point(track, name)
+        sure = (track.confidence[:, POINTS.index(name)] > _SURE) & np.isfinite(points).all(axis=1)
+        places.append(points[sure])
+        kinds.append(np.full(int(sure.sum()), name.startswith("ankle")))
+    return np.concatenate(places), np.concatenate(kinds)
+
+
+def _share(places_m: Floats, is_ankle: Bools, rest: float) -> Floats:
+    """(m,) weights under which all points of one kind at one place of the floor count once."""
+    cells = np.column_stack([np.round(places_m / _STEP_M), is_ankle])
+    _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(1.0 / np.maximum(count, rest)[which.ravel()])
+
+
+def _across(normal: Floats) -> tuple[Floats, Floats]:
+    """Two unit vectors at right angles to a direction and to one another."""
+    e1 = _unit(np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))]))
+    return e1, np.asarray(np.cross(normal, e1))
+
+
+def _low(heights_m: Floats) -> float:
+    return float(np.percentile(heights_m, 20)) if len(heights_m) else 0.0

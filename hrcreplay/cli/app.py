@@ -26,7 +26,7 @@ from hrcreplay.cli import (
     Start,
     Topic,
     as_overrides,
-    live,
+    commands,
     span,
 )
 from hrcreplay.errors import CoverageMissed, HrcReplayError, SettingsError
@@ -68,9 +68,7 @@ def info(
     topic: Topic = None,
 ) -> None:
     """What a log holds, and what is missing for the next step."""
-    from hrcreplay.cli import log_commands
-
-    sys.stdout.write("\n".join(log_commands.describe(log, config, as_overrides(settings, topic))) + "\n")
+    sys.stdout.write("\n".join(commands.describe(log, config, as_overrides(settings, topic))) + "\n")
 
 
 @app.command(name="import")
@@ -84,9 +82,7 @@ def import_(
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="keraal: rate of the Kinect, in Hz.")] = 30.0,
 ) -> None:
     """Make our log from Azure Kinect CSV, Kinect v2 CSV or KERAAL text files."""
-    from hrcreplay.cli import log_commands
-
-    for note in log_commands.import_files(kind, files, out, rate):
+    for note in commands.import_files(kind, files, out, rate):
         sys.stderr.write(f"hrcreplay: {note}\n")
     sys.stdout.write(f"{out}\n")
 
@@ -117,9 +113,7 @@ def calibrate(
     ] = None,
 ) -> None:
     """Find the poses and clock offsets of the cameras from the skeletons themselves."""
-    from hrcreplay.cli import log_commands
-
-    for line in log_commands.calibrate(
+    for line in commands.calibrate(
         log, out, config, as_overrides(settings, topic), reference=camera, up=up, height_m=height, base=base
     ):
         sys.stderr.write(f"hrcreplay: {line}\n")
@@ -375,7 +369,7 @@ def demo(
     sys.stdout.write(f"{folder / 'report.html'}\n")
 
 
-live.register(app)
+commands.register(app)
 
 
 def main() -> None:

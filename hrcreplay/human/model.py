@@ -1,4 +1,4 @@
-"""The human model of Eq. (37): limits, forward kinematics, and which of two equal triples of shoulder angles is used.
+"""The human model of Eq. (37): limits, forward kinematics, the choice between equal shoulder angles, and body capsules.
 
 World: z up, floor at z = 0. Human base: on the floor under the pelvis, x forward, y left.
 
@@ -7,6 +7,8 @@ here called two names of it. The *canonical* name has alpha_1 in the half-turn f
 of (34a), and the other angles in the turn around the middle of what (34) allows. So every posture inside (34) has its
 own angles as canonical name. At the ends of the half-turn, an arm far across the back or steeply raised, the angles
 jump although the arm does not, and whoever follows angles through time takes the name ``nearest`` to where it was.
+
+The capsules around the lines between a body's points are what a robot would touch, not what a person can reach.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, POINTS, Floats
+from hrcreplay.settings.sections import Occupancy
 
 #: First of the four joints of each arm in JOINTS, and s of the kinematics: +1 on the left.
 RIGHT_ARM, LEFT_ARM = 4, 8
@@ -335,3 +338,47 @@ def _nearest_rows(p: Floats, reference: Floats) -> None:
             for j in range(4):
                 if np.isfinite(arm[j]):
                     p[i, first + j] = arm[j]
+
+
+#: Thighs and shanks, of which the model of Eq. (37) knows nothing: there only where hip, knee and ankle were recorded.
+LEG_PARTS = ("THIGH_R", "SHANK_R", "THIGH_L", "SHANK_L")
+#: Parts of a recorded body.
+PARTS = (*LIMBS, *LEG_PARTS)
+_ENDS = {
+    "HD": ("neck", "head"),
+    "THX": ("pelvis", "neck"),
+    "URA": ("shoulder_r", "elbow_r"),
+    "LRA": ("elbow_r", "wrist_r"),
+    "ULA": ("shoulder_l", "elbow_l"),
+    "LLA": ("elbow_l", "wrist_l"),
+    "THIGH_R": ("hip_r", "knee_r"),
+    "SHANK_R": ("knee_r", "ankle_r"),
+    "THIGH_L": ("hip_l", "knee_l"),
+    "SHANK_L": ("knee_l", "ankle_l"),
+}
+_FROM, _TO = (np.array([POINTS.index(_ENDS[part][end]) for part in PARTS]) for end in (0, 1))
+_FOREARMS = np.array([PARTS.index("LRA"), PARTS.index("LLA")])
+
+
+def part_axes(points_m: Floats, hand_m: float) -> Floats:
+    """Axes of the capsules of a body's parts.
+
+    Args:
+        points_m: (n, 20, 3) POINTS, world [m].
+        hand_m: The forearm's capsule goes on beyond the wrist by so much, along the forearm [m].
+
+    Returns:
+        (n, 10, 2, 3) ends of the axes of PARTS [m]; NaN where a point is missing.
+    """
+    axes = np.stack([points_m[:, _FROM], points_m[:, _TO]], axis=2)
+    forearm = axes[:, _FOREARMS, 1] - axes[:, _FOREARMS, 0]
+    length = np.linalg.norm(forearm, axis=2, keepdims=True)
+    axes[:, _FOREARMS, 1] += hand_m * forearm / np.where(length > 0.0, length, np.inf)
+    return np.asarray(axes)
+
+
+def part_radii(occupancy: Occupancy, leg_m: float) -> Floats:
+    """(10,) radii of PARTS: Table 2, which has no legs, and ``leg_m`` for thighs and shanks [m]."""
+    upper, lower = occupancy.radius_upper_arm_m, occupancy.radius_lower_arm_m
+    arms = (upper, lower, upper, lower)
+    return np.array([occupancy.radius_head_m, occupancy.radius_thorax_m, *arms, *(leg_m,) * len(LEG_PARTS)])

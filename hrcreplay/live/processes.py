@@ -20,6 +20,7 @@ import subprocess
 import sys
 import threading
 import traceback
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -95,6 +96,7 @@ def _file(folder: Path, part: str) -> Path:
 
 
 _LARGEST = 1 << 20  #: no message is larger; one that is would be cut, never split
+_LARGEST_RECORD = 1 << 22  #: nor one to the recorder
 
 
 class ControlGoneError(Exception):
@@ -142,6 +144,29 @@ class ControlChannel:
         if not data:
             raise ControlGoneError
         return data
+
+
+class Inbox:
+    """What came from control and is not written yet. A thread empties the socket, so that no disk makes it fill up."""
+
+    def __init__(self, control: socket.socket) -> None:
+        self._control = control
+        self._waiting: deque[bytes] = deque()
+        self.ended = threading.Event()
+        threading.Thread(target=self._drain, daemon=True).start()
+
+    def _drain(self) -> None:
+        buffer = memoryview(bytearray(_LARGEST_RECORD))
+        try:
+            while size := self._control.recv_into(buffer):
+                self._waiting.append(bytes(buffer[:size]))
+        except ConnectionResetError:
+            pass  # control was killed
+        self.ended.set()
+
+    def take(self) -> list[bytes]:
+        """Messages that have come since the last call."""
+        return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
 
 #: Module through which every helper starts; see ``main``.

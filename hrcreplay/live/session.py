@@ -15,18 +15,22 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from hrcreplay.egm.udp_server import EgmServer
+from hrcreplay.egm.link import EgmServer
 from hrcreplay.errors import HrcReplayError, LiveStopped, LogError, SettingsError
 from hrcreplay.live import processes
-from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.last_resort import bring_to_rest
-from hrcreplay.live.control.loop import ENDING, Loop, LoopSettings
-from hrcreplay.live.control.session_controller import SessionController
+from hrcreplay.live.control.loop import ENDING, Loop, LoopSettings, bring_to_rest
+from hrcreplay.live.control.session_controller import (
+    PERSON_DEAD,
+    RECORDING_OVER,
+    SESSION_OVER,
+    SessionController,
+    reason_of_signals,
+)
 from hrcreplay.live.control.setup import build_controller, compile_kernels, live_job, start_table
 from hrcreplay.live.processes import HelperProcess, raise_priority, restore_priority
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import Signal
-from hrcreplay.live.view.status_publisher import StatusPublisher
+from hrcreplay.live.view.status import StatusPublisher
 from hrcreplay.settings.load import Settings
 
 #: Longest wait for a packet before the loop turns to everything else [s].
@@ -204,7 +208,7 @@ def outcome(loop: Loop) -> dict[str, Any]:
 
 
 def _reason(loop: Loop) -> str:
-    return loop.controller.stop or watchdog.of_signals(loop.caught | (loop.signals & ENDING))
+    return loop.controller.stop or reason_of_signals(loop.caught | (loop.signals & ENDING))
 
 
 def _verdict(loop: Loop, done: Path, crashes: list[str]) -> None:
@@ -212,11 +216,11 @@ def _verdict(loop: Loop, done: Path, crashes: list[str]) -> None:
         braked = "braked; " if loop.controller.stops else ""
         raise LiveStopped(f"{crashes[0]}; {braked}the record, not complete, and the traceback are in {done}")
     reason = _reason(loop)
-    if reason and reason not in (watchdog.SESSION_OVER, watchdog.RECORDING_OVER):
+    if reason and reason not in (SESSION_OVER, RECORDING_OVER):
         at = next((t_ns for t_ns, why in loop.controller.stops if why == reason), None)
         when = "" if at is None else f" after {(at - loop.start_ns) / 1e9:.1f} s"
         last_words = [note.removeprefix("failed ") for note in loop.notes if note.startswith("failed ")]
-        why = f" ({last_words[-1]})" if reason == watchdog.PERSON_DEAD and last_words else ""
+        why = f" ({last_words[-1]})" if reason == PERSON_DEAD and last_words else ""
         raise LiveStopped(f"stopped by: {reason}{why}{when}; the record is in {done}")
 
 

@@ -21,7 +21,7 @@ from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live.control import setup
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.records import STATUSES, Floats, SweptVolumes
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.logs.text_rows import (
+from hrcreplay.logs.writer import (
     START_NS,
     ImportedSkeleton,
     import_cameras,

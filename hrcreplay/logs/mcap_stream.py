@@ -24,9 +24,8 @@ from zstandard import ZstdError
 from hrcreplay.errors import LogError
 from hrcreplay.logs import ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.messages import Damage, LazyChunk, Message, Topic, Undecodable, merge_by_arrival
+from hrcreplay.logs.messages import MCAP_MAGIC, Damage, LazyChunk, Message, Topic, Undecodable, merge_by_arrival
 
-MAGIC = b"\x89MCAP0\r\n"
 _RUN_BYTES = 1 << 20
 _OURS = {
     kind.DESCRIPTOR.full_name: kind for kind in (pb.Skeleton, pb.Camera, pb.Task, pb.Base, pb.Truth, pb.JointState)
@@ -200,7 +199,7 @@ def _scan(file: IO[bytes], size: int, damage: Damage) -> _Index:
 
 def _walk(file: IO[bytes], size: int) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of every whole record up to the end of the data."""
-    offset = len(MAGIC)
+    offset = len(MCAP_MAGIC)
     while offset + 9 <= size:
         file.seek(offset)
         opcode, length = struct.unpack("<BQ", file.read(9))

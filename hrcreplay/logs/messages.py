@@ -17,6 +17,9 @@ import numpy as np
 from hrcreplay.errors import LogError
 from hrcreplay.records import POINTS, Floats
 
+#: How an MCAP file begins and ends.
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+
 
 class Undecodable(LogError):
     """A message that does not follow its own type."""

@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs import messages, plausibility, tracks
+from hrcreplay.logs import log_files, messages, plausibility
 from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
 from hrcreplay.logs.decoders import (
     MARKER_TYPE,
@@ -20,9 +20,8 @@ from hrcreplay.logs.decoders import (
     find_cameras,
     is_skeleton,
 )
-from hrcreplay.logs.log_files import LogFiles, open_source
+from hrcreplay.logs.log_files import Header, JointTopic, JointTrack, LogFiles, Truth, open_source
 from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, topic_list
-from hrcreplay.logs.tracks import Header, JointTopic, JointTrack, Truth
 from hrcreplay.records import CameraFrames
 from hrcreplay.settings.sections import Decoder, Logs
 
@@ -111,8 +110,8 @@ class Log:
         self._source = source
         self._decoders = decoders
         self._options = options
-        self._joints = tracks.find_joints(source, options.joints_topic)
-        self._truth = tracks.truth_topic(source)
+        self._joints = log_files.find_joints(source, options.joints_topic)
+        self._truth = log_files.truth_topic(source)
         self._reading: Counter[str] = Counter()
         self._remarks: list[str] = []
         self._refusals: list[str] = []
@@ -210,12 +209,12 @@ class Log:
         """The robot's joint track in order of time, in chunks of at most 1 s; nothing where there is none."""
         self._track.clear()
         if self._joints is not None:
-            yield from tracks.joints(self._source, self._joints, self._track)
+            yield from log_files.joints(self._source, self._joints, self._track)
 
     def truth(self) -> Iterator[Truth]:
         """The true person in order of time, in chunks of at most 1 s; nothing where there is none."""
         if self._truth is not None:
-            yield from tracks.truth(self._source, self._truth)
+            yield from log_files.truth(self._source, self._truth)
 
     def _remark(self, cleaner: Cleaner, start_ns: int | None, end_ns: int | None) -> None:
         if self._reading["frames_header_stamp_zero"]:
@@ -275,7 +274,7 @@ def open_log(path: Path, options: Logs = DEFAULT, *, skeletons: bool = True) -> 
 def _header(
     source: LogFiles, decoders: list[SkeletonDecoder], joints: JointTopic | None, truth: str | None, *, chosen: bool
 ) -> Header:
-    known = tracks.latched(source)
+    known = log_files.latched(source)
     seen = [camera for decoder in decoders for camera in decoder.cameras]
     declared = [camera for camera in known.cameras if camera in seen or not chosen]  # one may be silent all along
     cameras = tuple(dict.fromkeys([*declared, *seen]))

@@ -1,20 +1,26 @@
-"""Writes a log of our own format: MCAP with the messages of skeleton.proto, complete or not at all."""
+"""Writes a log of our own format: MCAP with the messages of skeleton.proto, complete or not at all.
+
+For the importers also: numbers from text lines with their places, and rows of several cameras merged into a log.
+"""
 
 from __future__ import annotations
 
+import gzip
+import heapq
 import json
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Self
+from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import CompressionType, Writer
 
-from hrcreplay.errors import SettingsError
+from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs import messages
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.records import POINTS, CameraFrames, Floats, Ints
@@ -160,3 +166,203 @@ def register_schema(writer: Writer, known: dict[str, int], kind: Any) -> int:
 def _refuse_existing(path: Path) -> None:
     if path.exists():
         raise SettingsError(f"{path}: exists already; name another file, or remove it")
+
+
+#: First stamp given to files that have none. Not 0: a stamp of zero means 'no stamp' in the logs of others.
+START_NS = 1_000_000_000
+
+#: What is told of every format imported here: none of them knows when a frame reached a computer.
+_ARRIVAL_NOTE = "the files hold capture times only: arrival is taken as capture, as if there were no delay"
+
+_CHUNK = 256  # rows written at once
+
+
+class ImportedSkeleton(NamedTuple):
+    """One body in one frame."""
+
+    t_ns: int
+    body: int
+    points_m: Floats  # (20, 3) [m]
+    confidence: Floats  # (20,)
+
+
+def lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Lines of a text file, plain or gzipped, each with its place ``file:line``. Blank lines are passed over.
+
+    Raises:
+        LogError: The file is missing, is no text, or holds nothing.
+    """
+    number = 0
+    try:
+        with _open(path) as stream:
+            for number, text in enumerate(stream, start=1):
+                if text.strip():
+                    yield f"{path}:{number}", text.strip()
+    except FileNotFoundError as error:
+        raise LogError(f"{path}: no such file; name a recording") from error
+    except UnicodeDecodeError as error:
+        raise LogError(f"{path}:{number + 1}: not text; would be right: a text file, plain or .gz") from error
+    except (OSError, EOFError) as error:
+        raise LogError(f"{path}: cannot be read ({error}); would be right: a text file, plain or .gz") from error
+    if number == 0:
+        raise LogError(f"{path}: empty; would be right: one row a frame")
+
+
+def _open(path: Path) -> IO[str]:
+    if path.suffix == ".gz":
+        return gzip.open(path, "rt", encoding="utf-8")
+    return path.open(encoding="utf-8")
+
+
+def numbers(where: str, fields: list[str], count: int) -> Floats:
+    """The fields as numbers; ``nan`` stands for missing.
+
+    Raises:
+        LogError: Another number of fields, or one that is no number.
+    """
+    if len(fields) != count:
+        raise LogError(f"{where}: found {len(fields)} columns; would be right: {count}")
+    try:
+        return np.array(fields, dtype=np.float64)
+    except ValueError:
+        place = next(i for i, field in enumerate(fields) if not _is_number(field))
+        raise LogError(f"{where}: column {place + 1}: found {fields[place]!r}; would be right: a number") from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def time_stamp_ns(where: str, text: str, unit_ns: int, before_ns: int) -> int:
+    """A time stamp [ns], not negative, that must not be before ``before_ns``.
+
+    Args:
+        where: ``file:line`` for messages.
+        text: Time stamp as the file has it.
+        unit_ns: Length of its unit [ns].
+        before_ns: Time stamp of the row before [ns].
+
+    Raises:
+        LogError: Not a whole number, negative or going backwards.
+    """
+    try:
+        t_ns = int(text) * unit_ns
+    except ValueError:
+        raise LogError(f"{where}: time: found {text!r}; would be right: a whole number") from None
+    if t_ns < 0:
+        raise LogError(f"{where}: time: found {text!r}; would be right: 0 or later")
+    if t_ns < before_ns:
+        raise LogError(f"{where}: time goes back by {(before_ns - t_ns) * 1e-9:g} s; would be right: rows in order")
+    return t_ns
+
+
+def skeleton_row(
+    t_ns: int, body: int, found: Mapping[str, int] | list[int], points_m: Floats, confidence: Floats
+) -> ImportedSkeleton:
+    """A row in the order of POINTS from a sensor's own joints; ``found`` tells where each stands.
+
+    Args:
+        t_ns: Time of the frame [ns].
+        body: Identity of the body.
+        found: Index of the sensor's joint for each of POINTS, by name or in the order of POINTS.
+        points_m: (k, 3) the sensor's joints [m].
+        confidence: (k,) of the joints, in [0, 1].
+    """
+    index = [found[name] for name in POINTS] if isinstance(found, Mapping) else found
+    points, trust = points_m[index], confidence[index]
+    missing = ~np.isfinite(points).all(axis=1)
+    points[missing], trust[missing] = np.nan, 0.0
+    return ImportedSkeleton(t_ns, body, points, trust)
+
+
+def write_log(sources: Mapping[str, Iterator[ImportedSkeleton]], out: Path) -> dict[str, tuple[int, int]]:
+    """Writes the rows of all cameras, merged by time, as our log; nothing is left behind when a source fails.
+
+    Returns:
+        Camera -> first and last time [ns].
+
+    Raises:
+        SettingsError: ``out`` exists or cannot be written.
+        LogError: A source cannot be read or holds no row.
+    """
+    spans: dict[str, tuple[int, int]] = {}
+    cameras = tuple(sources)
+    with ExitStack() as stack:
+        log = stack.enter_context(LogWriter(out))
+        for name in cameras:
+            log.camera(name, None)
+        streams = [_numbered(i, stream) for i, stream in enumerate(sources.values())]
+        merged = heapq.merge(*streams, key=lambda pair: (pair[1].t_ns, pair[0]))
+        for batch in _batches(merged):
+            log.frames(_frames(batch, cameras))
+            for i, item in batch:
+                spans[cameras[i]] = (spans.get(cameras[i], (item.t_ns, 0))[0], item.t_ns)
+        empty = [name for name in cameras if name not in spans]
+        if empty:
+            raise LogError(f"camera {empty[0]}: no row with a body; would be right: one row a body a frame")
+    return spans
+
+
+def import_cameras(
+    paths: Mapping[str, Path], out: Path, read: Callable[[Path], Iterator[ImportedSkeleton]]
+) -> list[str]:
+    """Makes our log from one file a camera, whose times are those of the captures.
+
+    Args:
+        paths: Camera -> file.
+        out: Log to write.
+        read: The rows of a file.
+
+    Returns:
+        Remarks for the user.
+
+    Raises:
+        LogError: A file that cannot be read as its format.
+        SettingsError: ``out`` exists or cannot be written.
+    """
+    spans = write_log({name: read(path) for name, path in paths.items()}, out)
+    return [_ARRIVAL_NOTE, *_overlap_notes(spans)]
+
+
+def _overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:
+    """A note for every camera whose times lie wholly outside the first one's."""
+    names = list(spans)
+    start, end = spans[names[0]]
+    return [
+        f"camera {name}: its times do not overlap those of {names[0]}; are the clocks those of one session?"
+        for name in names[1:]
+        if spans[name][0] > end or spans[name][1] < start
+    ]
+
+
+def _numbered(index: int, stream: Iterator[ImportedSkeleton]) -> Iterator[tuple[int, ImportedSkeleton]]:
+    return ((index, item) for item in stream)
+
+
+def _batches(merged: Iterable[tuple[int, ImportedSkeleton]]) -> Iterator[list[tuple[int, ImportedSkeleton]]]:
+    batch: list[tuple[int, ImportedSkeleton]] = []
+    for pair in merged:
+        # The bodies of one frame stay together.
+        if len(batch) >= _CHUNK and pair[1].t_ns != batch[-1][1].t_ns:
+            yield batch
+            batch = []
+        batch.append(pair)
+    if batch:
+        yield batch
+
+
+def _frames(batch: list[tuple[int, ImportedSkeleton]], cameras: tuple[str, ...]) -> CameraFrames:
+    t_ns = np.array([item.t_ns for _, item in batch], dtype=np.int64)
+    return CameraFrames(
+        capture_ns=t_ns,
+        arrival_ns=t_ns,
+        camera=np.array([i for i, _ in batch], dtype=np.int64),
+        body=np.array([item.body for _, item in batch], dtype=np.int64),
+        points_m=np.stack([item.points_m for _, item in batch]),
+        confidence=np.stack([item.confidence for _, item in batch]),
+        cameras=cameras,
+    )

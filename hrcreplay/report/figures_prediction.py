@@ -20,16 +20,15 @@ from scipy.spatial import ConvexHull, QhullError
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats
 from hrcreplay.report import drawing
+from hrcreplay.report.figures_scene import ABOVE, RenderedHull, View, bones, bounds_of, draw_solids, outline, view_from
 from hrcreplay.report.metrics import columns, times
 from hrcreplay.report.metrics_plan import numeric_column
-from hrcreplay.report.projection import RenderedHull, View, bones, bounds_of, draw_solids, outline, view_from
 
 #: Limb -> (m, 3) vertices, world, and radius [m].
 Limbs = Mapping[str, tuple[Floats, float]]
 #: One instant of Fig. 17: t_ns, and the swept volumes of each method.
 Instant = tuple[int, Mapping[str, Limbs]]
 
-ABOVE = View(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 1.0, 0.0]), toward=np.array([0.0, 0.0, 1.0]))
 METHODS = {"paper": "paper", "positions": "positions", "sound": "sound"}
 COLOURS = {"paper": drawing.ORANGE, "positions": drawing.GREEN, "sound": drawing.BLUE}
 

@@ -15,10 +15,10 @@ from matplotlib.patches import Patch
 
 from hrcreplay.records import STATUSES, Bools, Floats
 from hrcreplay.report import drawing
-from hrcreplay.report.figures_prediction import ABOVE, Limbs, stored_at
+from hrcreplay.report.figures_prediction import Limbs, stored_at
+from hrcreplay.report.figures_scene import ABOVE, View, bounds_of, draw_outlines, view_from
 from hrcreplay.report.metrics import Metric, envelope, path_feet, seconds_from, thin_path, times, true_runs
 from hrcreplay.report.metrics_plan import numeric_column, position_columns, stationary
-from hrcreplay.report.projection import View, bounds_of, draw_outlines, view_from
 
 SIDE = view_from(-0.5 * np.pi, 0.0)
 #: The path this long before and after the largest deviation is drawn boldly [s].

@@ -1,4 +1,8 @@
-"""Metrics of the input data, of the fused state against ground truth, and of the swept volumes."""
+"""Metrics of the input data, of which limbs the cameras measured, of the fused state, and of the swept volumes.
+
+The fused state is compared with ground truth. An unmeasured limb is where the model supposes it, so a reader has to
+know for how much of the time that was.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +24,7 @@ from hrcreplay.report.metrics import (
     times,
     true_runs,
 )
+from hrcreplay.report.tables import LIMB_NAMES
 from hrcreplay.store.run_folder import Run
 
 
@@ -299,3 +304,67 @@ def _add_seen(metrics: MetricTable, run: Run, found: dict[str, Errors], kind: st
         f"RMSE of the fused {what}, the 10 angles pooled, at ticks at most {gap_s:g} s after one that used a camera",
         reason="needs a fused state and ground truth",
     )
+
+
+#: The tables and columns that this rests on.
+LIMB_COLUMNS = {"state": tuple(f"unseen_{limb}" for limb in LIMBS), "measurements": JOINTS}
+
+#: Joints that place a limb beside those that carry it; a part of an arm has been seen when one of its two has.
+_OWN_JOINTS = {
+    "HD": JOINTS[:4],
+    "THX": JOINTS[:4],
+    "URA": ("ar1", "ar2"),
+    "LRA": ("ar3", "ar4"),
+    "ULA": ("al1", "al2"),
+    "LLA": ("al3", "al4"),
+}
+
+
+def unmeasured_shares(unseen_s: Floats, memory_s: float) -> Floats:
+    """Per limb the share of the ticks with the person in view at which it had not been measured for too long.
+
+    Args:
+        unseen_s: (n, 6) since the joints of LIMBS were last measured, as ``HumanStates`` has it; inf before [s].
+        memory_s: A limb not measured for longer is lost [s].
+
+    Returns:
+        (6,) in [0, 1]; exactly 1 for a limb that was never measured. NaN where nobody ever came into view: the person
+        is in view where any limb has been measured within the memory.
+    """
+    lost: Bools = ~(unseen_s <= memory_s)
+    in_view = ~lost.all(axis=1)
+    if not in_view.any():
+        return np.full(unseen_s.shape[1], np.nan)
+    return np.asarray(lost[in_view].mean(axis=0), dtype=np.float64)
+
+
+def add_limbs(metrics: MetricTable, run: Run) -> None:
+    """Adds for how much of the time each limb was not measured, and which of its joints never were."""
+    names = list(LIMB_COLUMNS["state"])
+    shares = np.full(len(LIMBS), np.nan)
+    memory_s = float(run.meta.get("settings", {}).get("fusion", {}).get("memory_s", 0.5))
+    if run.state is not None and set(names) <= set(run.state.columns):
+        shares = unmeasured_shares(run.state[names].to_numpy(dtype=float), memory_s)
+    never = _never_measured(run.measurements)
+    for limb, share in zip(LIMBS, shares.tolist(), strict=True):
+        metrics.add(
+            f"limb_{limb}_unmeasured_share",
+            share,
+            "1",
+            f"share of the ticks with the person in view at which the {LIMB_NAMES[limb]} had not been measured for "
+            f"{memory_s:g} s; 1: never",
+            reason="nobody came into view, or it was not fused",
+        )
+        metrics.add(
+            f"limb_{limb}_joints_unmeasured",
+            ", ".join(joint for joint in _OWN_JOINTS[limb] if joint in never) or None,
+            "name",
+            f"joints of the {LIMB_NAMES[limb]} that no frame measured",
+            reason="each was measured, or there is no table of measurements",
+        )
+
+
+def _never_measured(measurements: pd.DataFrame | None) -> frozenset[str]:
+    if measurements is None or not len(measurements):
+        return frozenset()
+    return frozenset(joint for joint in JOINTS if not np.isfinite(measurements[joint].to_numpy(dtype=float)).any())

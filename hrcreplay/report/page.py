@@ -16,7 +16,6 @@ from markupsafe import Markup
 from hrcreplay.records import LIMBS
 from hrcreplay.report import story
 from hrcreplay.report.figures import FIGURES
-from hrcreplay.report.limbs import limb_names_text
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
 from hrcreplay.report.replay_page import replay_part
@@ -30,6 +29,7 @@ from hrcreplay.report.tables import (
     PLAN_SAFETY,
     PageTable,
     compare,
+    limb_names_text,
     percent,
     robot_table,
     text_of,

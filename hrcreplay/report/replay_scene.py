@@ -13,10 +13,9 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
 from hrcreplay.report.drawing import BONES
 from hrcreplay.report.metrics import seconds_from, times
-from hrcreplay.report.metrics_contact import method_prefixes
+from hrcreplay.report.metrics_contact import StopEvent, method_prefixes, stop_events
 from hrcreplay.report.metrics_plan import numeric_column
-from hrcreplay.report.stop_list import StopEvent, stop_events
-from hrcreplay.robot.control.stopping import axis_by_axis
+from hrcreplay.robot.control.control_step import axis_by_axis
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.store.run_folder import Run
 

@@ -17,7 +17,7 @@ import pandas as pd
 from foxglove import messages
 from mcap.writer import CompressionType, Writer
 
-from hrcreplay.geometry.capsule_distance import nearest_pair
+from hrcreplay.geometry.distances import nearest_pair
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.report import scene_messages as parts

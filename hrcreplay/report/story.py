@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 from hrcreplay.logs.clean import DEFECTS
 from hrcreplay.report import verdict
-from hrcreplay.report.limbs import limb_names_text, unmeasured
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
-from hrcreplay.report.tables import percent, reason_text, text_of
+from hrcreplay.report.tables import limb_names_text, percent, reason_text, text_of
+from hrcreplay.report.verdict import unmeasured
 from hrcreplay.store.run_folder import Run
 
 #: Between groups of digits.

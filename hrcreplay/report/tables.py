@@ -309,3 +309,28 @@ def robot_table(robot: Mapping[str, Any]) -> PageTable:
         f"{len(robot['joints'])} axes from {robot['base_frame']} to {robot['tcp_frame']}.{locked} A dash: the capsule "
         "was given, not derived from a shape.",
     )
+
+
+#: What people call LIMBS.
+LIMB_NAMES = {
+    "HD": "head",
+    "THX": "trunk",
+    "URA": "right upper arm",
+    "LRA": "right lower arm",
+    "ULA": "left upper arm",
+    "LLA": "left lower arm",
+}
+
+#: What people call the parts of a recorded body that are no LIMBS.
+_LEG_NAMES = {"THIGH_R": "right thigh", "SHANK_R": "right shank", "THIGH_L": "left thigh", "SHANK_L": "left shank"}
+
+
+def part_name_text(part: str) -> str:
+    """A part of a recorded body as a reader calls it."""
+    return LIMB_NAMES.get(part) or _LEG_NAMES.get(part, part)
+
+
+def limb_names_text(limbs: list[str]) -> str:
+    """Limbs as a reader calls them, with their abbreviations: "left lower arm (LLA) and head (HD)"."""
+    names = [f"{LIMB_NAMES[limb]} ({limb})" for limb in limbs]
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

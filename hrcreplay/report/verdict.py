@@ -1,14 +1,18 @@
-"""What stands first on the page: would the robot have touched the recorded person, and at what cost; a row a method."""
+"""What stands first on the page: would the robot have touched the recorded person, and at what cost; a row a method.
+
+Beside it what a reader must know of limbs that were not measured.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from hrcreplay.report.limbs import part_name_text, unmeasured
-from hrcreplay.report.metrics import Metric
+from hrcreplay.records import LIMBS
+from hrcreplay.report.metrics import Metric, MetricTable
 from hrcreplay.report.metrics_contact import PERSONS, method_prefixes
-from hrcreplay.report.tables import PageTable, percent, text_of
+from hrcreplay.report.metrics_data import add_limbs
+from hrcreplay.report.tables import PageTable, limb_names_text, part_name_text, percent, text_of
 from hrcreplay.store.run_folder import Run
 
 Metrics = Mapping[str, Metric]
@@ -243,3 +247,44 @@ def line(run: Run, metrics: Metrics) -> str:
         else:
             parts.append(f"{method} never moved beside a known person")
     return f"moving robot touched the recorded person ({metrics['contact_person']['value']}): {'; '.join(parts)}."
+
+
+#: A limb unmeasured at more than this share of the time has to be spoken of.
+_MOST = 0.5
+
+
+def unmeasured(metrics: Metrics) -> tuple[list[str], dict[str, float]]:
+    """Limbs that were never measured, and those unmeasured most of the time with that share."""
+    shares = {limb: metrics[f"limb_{limb}_unmeasured_share"]["value"] for limb in LIMBS}
+    never = [limb for limb, share in shares.items() if share == 1.0]
+    return never, {limb: share for limb, share in shares.items() if share is not None and _MOST < share < 1.0}
+
+
+def limb_remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
+    """What a user has to know of limbs that were not measured, or not whole; a line each.
+
+    Args:
+        run: Its tables of the first stage.
+        told: Notes on the log, which may already say of a limb that no camera gave its points.
+    """
+    table = MetricTable()
+    add_limbs(table, run)
+    metrics = table.sorted()
+    never, mostly = unmeasured(metrics)
+    lines = []
+    for limb in never:
+        begin = f"limb {limb} was never measured"
+        if not any(note.startswith(begin) for note in told):
+            lines.append(
+                f"{begin}: its points never agreed, or not with the confidence that fusion.confidence_min asks for; "
+                "its volume holds all that its joints allow"
+            )
+    lines += [
+        f"the {limb_names_text([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"
+        for limb, share in mostly.items()
+    ]
+    for limb in LIMBS:
+        joints = metrics[f"limb_{limb}_joints_unmeasured"]["value"]
+        if joints is not None and limb not in never and limb != "HD":  # the head hangs on the trunk's joints
+            lines.append(f"the {limb_names_text([limb])} was measured only in part: never its {joints}")
+    return lines

@@ -1,13 +1,14 @@
-"""Builds the stages and the robot from settings, cell and log.
+"""The stages with their settings, and the robot, built from settings, cell and log.
 
 The rooms of the stages get plain values and never see a settings model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from functools import lru_cache
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -15,18 +16,119 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.logs.tracks import Header, JointTrack
-from hrcreplay.records import Floats
+from hrcreplay.human.fusion import inverse_kinematics
+from hrcreplay.human.model import LimitSet
+from hrcreplay.human.prediction import reachable_sets, swept_volumes
+from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.log_files import Header, JointTrack
+from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.robot.control.control_step import PlanSettings
+from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
-from hrcreplay.robot.programme.path import programmed, recorded
-from hrcreplay.robot.programme.reference import Reference
-from hrcreplay.robot.programme.task import Task, parse_task
+from hrcreplay.robot.path import programmed, recorded
+from hrcreplay.robot.task import Reference, Task, parse_task
 from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
 from hrcreplay.run.job import Job, UrdfFiles, read_urdf
-from hrcreplay.run.prediction import PredictionStage
-from hrcreplay.run.stages import FusionStage
-from hrcreplay.settings.sections import Robot
+from hrcreplay.settings.sections import Fusion, Occupancy, Robot
+
+
+@dataclass(frozen=True)
+class FusionStage:
+    """Stage 1: camera poses and clocks, point noise, and the settings of filter and person selection."""
+
+    T_world_camera: Floats  #: (c, 4, 4)
+    clock_offset_ns: Ints  #: (c,) camera's clock minus the reference camera's
+    filter: Fusion
+    limits: LimitSet
+    person_jump_m: float
+    person_memory_s: float
+
+    def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
+        """Measurements of the person, by the clock of the reference camera; see ``clean.select_person``."""
+        memory, mine, found = select_person(
+            frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
+        )
+        mine = replace(mine, capture_ns=mine.capture_ns - self.clock_offset_ns[mine.camera])
+        return memory, inverse_kinematics.measure(mine, self.T_world_camera, self.filter), found
+
+
+@dataclass(frozen=True)
+class PredictionStage:
+    """Stage 2: limit set, horizon, radii, margins and method of the swept volumes."""
+
+    limits: LimitSet
+    occupancy: Occupancy
+    memory_s: float  #: how long the filter goes on without a measurement [s]
+
+    @property
+    def horizon_s(self) -> float:
+        """Braking time T_s of the robot [s]."""
+        return self.occupancy.stop_s
+
+    @property
+    def method(self) -> str:
+        """How the volumes are predicted."""
+        return self.occupancy.method
+
+    @property
+    def limbs(self) -> tuple[str, ...]:
+        """Limbs that have volumes."""
+        return swept_volumes.limbs_of(self.occupancy)
+
+    def by(self, method: str) -> PredictionStage:
+        """The same by another method."""
+        return replace(self, occupancy=self.occupancy.model_copy(update={"method": method}))
+
+    def reachable(self, states: HumanStates) -> reachable_sets.Reach:
+        """Reachable interval of every joint at every tick."""
+        return reachable_sets.reachable(
+            states, self.limits, self.occupancy, horizon_s=self.horizon_s, memory_s=self.memory_s
+        )
+
+    def volumes(
+        self, states: HumanStates, horizon_s: float | None = None, *, method: str | None = None
+    ) -> SweptVolumes:
+        """Swept volumes of every tick: the one call by which replay, live and audit ask for them.
+
+        Args:
+            states: The fused person.
+            horizon_s: Until when after each tick they hold; None: the braking time T_s [s].
+            method: None: that of the settings.
+        """
+        if method is not None:
+            return self.by(method).volumes(states, horizon_s)
+        horizon_s = self.horizon_s if horizon_s is None else horizon_s
+        return swept_volumes.predict(states, self.limits, self.occupancy, horizon_s=horizon_s, memory_s=self.memory_s)
+
+
+@dataclass
+class Forecast:
+    """The volumes of a batch of ticks at any horizon."""
+
+    stage: PredictionStage
+    states: HumanStates
+
+    @cached_property
+    def full(self) -> SweptVolumes:
+        """Those of all ticks that hold for the braking time T_s."""
+        return self.stage.volumes(self.states)
+
+    def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
+        """Those of one tick that hold for ``horizon_s`` [s]."""
+        if horizon_s == self.stage.horizon_s:
+            return obstacles(self.full, tick, horizon_s)
+        return obstacles(self.stage.volumes(self.states.rows(slice(tick, tick + 1)), horizon_s), 0, horizon_s)
+
+    def asking(self, tick: int, asked: dict[float, Obstacles] | None) -> Callable[[float], Obstacles]:
+        """``obstacles`` of one tick; keeps those that are asked for, by their horizon, where they are wanted later."""
+
+        def predict(horizon_s: float) -> Obstacles:
+            found = self.obstacles(tick, horizon_s)
+            if asked is not None:
+                asked[horizon_s] = found
+            return found
+
+        return predict
 
 
 class LogLike(Protocol):

@@ -23,6 +23,7 @@ from typing import Any, Unpack, get_args
 import pandas as pd
 import pyarrow.parquet as pq
 
+import hrcreplay
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import Floats, Ints
@@ -30,13 +31,13 @@ from hrcreplay.report import comparison
 from hrcreplay.report.comparison import Variant
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.reference import Reference
+from hrcreplay.robot.task import Reference
 from hrcreplay.run import build, replay
+from hrcreplay.run.build import Forecast
 from hrcreplay.run.contact import Predicted, RecordedPerson, Volumes, contact_table, recorded_person, solids
 from hrcreplay.run.followers import Planner
 from hrcreplay.run.job import Job, JobOptions, resolve
-from hrcreplay.run.prediction import Forecast, stored_ticks
-from hrcreplay.run.stages import ProgressBar, Sink, print_note
+from hrcreplay.run.stages import ProgressBar, Sink, print_note, stored_ticks
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Occupancy, Plan
 from hrcreplay.store.columns import motion_columns, read_states
@@ -300,9 +301,10 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
 
 
 def _second_process() -> ProcessPoolExecutor:
-    """A process with compiled kernels of its own, since numba does not lock its files."""
+    """A process with compiled kernels of its own, since numba does not lock its files; it begins with all there are."""
     first = os.environ["NUMBA_CACHE_DIR"]
     second = Path(first) / "second"
+    hrcreplay.share_kernels(Path(first), second)
     pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
     os.environ["NUMBA_CACHE_DIR"] = str(second)  # read when the process begins
     try:

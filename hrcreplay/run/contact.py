@@ -15,20 +15,17 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
-from hrcreplay.geometry.capsule_distance import nearest_pair
-from hrcreplay.geometry.segment_hull_distance import protrusion_m
-from hrcreplay.human import body_capsules
-from hrcreplay.human.body_capsules import LEG_PARTS, PARTS
+from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.fusion import fuse
-from hrcreplay.human.model import skeleton
+from hrcreplay.human.model import LEG_PARTS, PARTS, part_axes, part_radii, skeleton
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import Bools, Floats, HumanStates, Ints
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run import build, stages
+from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.job import Job
-from hrcreplay.run.prediction import PredictionStage
 from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter
 
@@ -46,9 +43,38 @@ class RecordedPerson:
     points_m: Floats  #: (n, 20, 3) POINTS, world [m]; NaN where they are not known
 
     def part_axes(self, at_ns: Ints, hand_m: float) -> Floats:
-        """(m, 10, 2, 3) axes of the capsules of ``body_capsules.PARTS`` at some instants [m]."""
-        points_m = body_capsules.at_instants(self.t_ns, self.points_m, at_ns, GAP_S)
-        return body_capsules.part_axes(points_m, hand_m)
+        """(m, 10, 2, 3) axes of the capsules of ``PARTS`` at some instants [m]."""
+        points_m = at_instants(self.t_ns, self.points_m, at_ns, GAP_S)
+        return part_axes(points_m, hand_m)
+
+
+def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float) -> Floats:
+    """Body points between the two samples around each instant, linear.
+
+    Args:
+        t_ns: (n,) instants of the samples, increasing [ns].
+        points_m: (n, 20, 3) samples, world [m].
+        at_ns: (m,) instants asked for [ns].
+        gap_s: Between samples further apart nothing is known [s].
+
+    Returns:
+        (m, 20, 3); NaN outside the samples, in a gap, and where one of the two samples lacks the point. An instant
+        that meets a sample gets that sample.
+    """
+    found = np.full((len(at_ns), *points_m.shape[1:]), np.nan)
+    if not len(t_ns):
+        return found
+    right = np.searchsorted(t_ns, at_ns, side="left")
+    inside = (at_ns >= t_ns[0]) & (at_ns <= t_ns[-1])
+    right = np.clip(right, 0, len(t_ns) - 1)
+    met = inside & (t_ns[right] == at_ns)
+    found[met] = points_m[right[met]]
+    left = np.maximum(right - 1, 0)
+    step_ns = t_ns[right] - t_ns[left]
+    between = inside & ~met & (step_ns > 0) & (step_ns * 1e-9 <= gap_s)
+    share = ((at_ns - t_ns[left])[between] / step_ns[between])[:, None, None]
+    found[between] = (1.0 - share) * points_m[left[between]] + share * points_m[right[between]]
+    return found
 
 
 def recorded_person(job: Job, log: Log, writer: RunWriter) -> RecordedPerson:
@@ -177,7 +203,7 @@ def contact_table(
         volumes: Instant [ns], horizon [s] and volumes of the ticks at which the person may be found to have left them.
         lines_m: None: the parts with their radii leave them; else their lines, with a hand of this length [m].
     """
-    radii_m = body_capsules.part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
+    radii_m = part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
     t_ns = motion["t_ns"].to_numpy()
     body = Body(person.source, person.part_axes(t_ns, job.settings.occupancy.hand_m), radii_m)
     found = compare(robot, motion, body)

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.records import HumanStates, Motion
+from hrcreplay.records import Floats, HumanStates, Motion
 from hrcreplay.robot.control import control_step, path_controller, qp_controller
-from hrcreplay.robot.control.certificate import NO_PLANES
+from hrcreplay.robot.control.certificate import NO_PLANES, decide
 from hrcreplay.robot.control.control_step import (
     NO_SOLUTION,
     NOT_FINITE,
@@ -22,13 +22,15 @@ from hrcreplay.robot.control.control_step import (
     RobotState,
     Sight,
     Step,
+    Stop,
+    at_rest,
+    made,
     observe,
+    stands,
 )
-from hrcreplay.robot.control.decision import decide, made, stands
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import Stop, at_rest
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.reference import Reference, ReferencePoint, advance
+from hrcreplay.robot.task import Reference, ReferencePoint, advance
 
 _FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
 
@@ -44,6 +46,15 @@ class FollowerTick(NamedTuple):
 
 #: The swept volumes of a tick that hold until so many seconds after it.
 Predict = Callable[[float], Obstacles]
+
+
+class Observation(NamedTuple):
+    """What a robot sees of people at a tick."""
+
+    sight: Sight  #: its pose, and its distances from people
+    around: Obstacles  #: the swept volumes
+    horizon_s: float  #: until when they hold [s]
+    predict: Predict  #: the volumes for any horizon
 
 
 @dataclass
@@ -74,54 +85,52 @@ class Follower(ABC):
         """One tick."""
         settings, going = self.settings, self.stop
         state, point, now_s = self.state, self.point, self.s_s
-        horizon_s = settings.horizon_s(going)
         with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
-            around = predict(horizon_s)
-            horizon_s = min(horizon_s, around.horizon_s)  # in a live session those of an earlier look may have to do
-            pose = self.robot.pose(state.q, state.dq)
-            sight = observe(self.robot, state, around, settings.plan.clearance_m, pose)
-            wanted = self.propose(sight, around, horizon_s, predict)
-            taken, self.planes = decide(self.robot, going, wanted, around, horizon_s, self.planes, settings)
-        step = made(sight, going, taken, horizon_s, settings.dt_s)
+            seen = self.observe(predict)
+            wanted = self.propose(seen)
+            taken, self.planes = decide(self.robot, going, wanted, seen.around, seen.horizon_s, self.planes, settings)
+        step = made(seen.sight, going, taken, seen.horizon_s, settings.dt_s)
         self.stop, self.u = step.stop, step.u
         self._move_on()
         return FollowerTick(state, point, now_s, step)
 
-    @abstractmethod
-    def propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
-        """What the method would do, or the reason why it does nothing.
+    def observe(self, predict: Predict) -> Observation:
+        """The people of the tick, with the volumes that hold until the stop after its step would have ended."""
+        horizon_s = self.settings.horizon_s(self.stop)
+        around = predict(horizon_s)
+        horizon_s = min(horizon_s, around.horizon_s)  # in a live session those of an earlier look may have to do
+        return Observation(
+            observe(self.robot, self.state, around, self.settings.plan.clearance_m), around, horizon_s, predict
+        )
 
-        Args:
-            sight: The robot's pose, and its distances from people.
-            around: The swept volumes of the tick.
-            horizon_s: Until when they hold [s].
-            predict: The volumes of the tick for any horizon.
-        """
+    @abstractmethod
+    def propose(self, seen: Observation) -> list[Proposal] | int:
+        """What the method would do, or the reason why it does nothing."""
 
     @abstractmethod
     def _move_on(self) -> None:
         """Takes over the reference of the tick that follows."""
 
 
+#: What ``qp_controller`` makes Eq. (66) of, but for the settings.
+Programme = tuple[RobotModel, RobotState, Floats, qp_controller.Target, Sight, Obstacles, float]
+
+
 class QpFollower(Follower):
     """The trajectory generator of Section 5 along a reference that waits for it or not."""
 
-    def propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
-        """The step that Eq. (66) finds best, and the stop after it.
+    def propose(self, seen: Observation) -> list[Proposal] | int:
+        """The step that Eq. (66) finds best, and the stop after it."""
+        programme = self.programme(seen)
+        return stands(seen.sight, self.settings) or qp_controller.propose(*programme, self.settings)
 
-        Args:
-            sight: The robot's pose, and its distances from people.
-            around: The swept volumes of the tick.
-            horizon_s: Until when they hold [s].
-            _: The volumes of the tick for any horizon.
-        """
-        error_m = float(np.linalg.norm(sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3]))
+    def programme(self, seen: Observation) -> Programme:
+        """What Eq. (66) is made of. Its target is the reference one tick later, to which the reference moves on."""
+        error_m = float(np.linalg.norm(seen.sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3]))
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
-        if reason := stands(sight, self.settings):
-            return reason
         target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q)
-        return qp_controller.propose(self.robot, self.state, self.u, target, sight, around, horizon_s, self.settings)
+        return self.robot, self.state, self.u, target, seen.sight, seen.around, seen.horizon_s
 
     def _move_on(self) -> None:
         """The reference has moved already: the program is solved for where it will be."""
@@ -133,22 +142,18 @@ class PathFollower(Follower):
     #: Whether the method looks at people at all, and whether the rows of Eq. (66i) bound its rate.
     careful, by_rows = True, False
 
-    def propose(self, sight: Sight, around: Obstacles, horizon_s: float, _: Predict) -> list[Proposal] | int:
-        """The largest rate along the path that is allowed, and the stop after it.
-
-        Args:
-            sight: The robot's pose, and its distances from people.
-            around: The swept volumes of the tick.
-            horizon_s: Until when they hold [s].
-            _: The volumes of the tick for any horizon.
-        """
+    def propose(self, seen: Observation) -> list[Proposal] | int:
+        """The largest rate along the path that is allowed, and the stop after it."""
+        sight = seen.sight
         reason = stands(sight, self.settings) if self.careful else 0
         if reason or sight.reason == NOT_FINITE:
             return reason or sight.reason
         if np.isnan(self.stop.along[0, 0]):
             return NO_SOLUTION  # the stop of another method goes on
-        rows = around if self.by_rows else None
-        return path_controller.propose(self.robot, self.reference, self.stop, sight, rows, horizon_s, self.settings)
+        rows = seen.around if self.by_rows else None
+        return path_controller.propose(
+            self.robot, self.reference, self.stop, sight, rows, seen.horizon_s, self.settings
+        )
 
     def _move_on(self) -> None:
         if np.isnan(self.stop.along[0, 0]):
@@ -173,23 +178,21 @@ class BlindFollower(PathFollower):
 class SsmFollower(PathFollower):
     """Speed and separation monitoring, ISO/TS 15066: goes while the protective separation distance is kept."""
 
-    def propose(self, sight: Sight, around: Obstacles, horizon_s: float, predict: Predict) -> list[Proposal] | int:
-        """The same, while the protective separation distance is kept.
-
-        Args:
-            sight: The robot's pose, and its distances from people.
-            around: The swept volumes of the tick.
-            horizon_s: Until when they hold [s].
-            predict: The volumes of the tick for any horizon.
-        """
-        wanted = super().propose(sight, around, horizon_s, predict)
+    def propose(self, seen: Observation) -> list[Proposal] | int:
+        """The same, while the protective separation distance is kept."""
+        wanted = super().propose(seen)
         if isinstance(wanted, int):
             return wanted
-        present = observe(self.robot, self.state, predict(0.0), self.settings.plan.clearance_m, sight.pose)
-        needed_m = path_controller.protective_distance_m(
-            sight.pose, wanted[0].stop, self.settings.plan.human_speed, self.settings.latency_s, self.settings.dt_s
-        )
+        present, needed_m = self.protective(seen, wanted[0])
         return wanted if present.distance_m >= needed_m else TOO_NEAR
+
+    def protective(self, seen: Observation, wanted: Proposal) -> tuple[Sight, float]:
+        """The people where they are now, and the protective separation distance of a step [m]."""
+        pose, settings = seen.sight.pose, self.settings
+        present = observe(self.robot, self.state, seen.predict(0.0), settings.plan.clearance_m, pose)
+        return present, path_controller.protective_distance_m(
+            pose, wanted.stop, settings.plan.human_speed, settings.latency_s, settings.dt_s
+        )
 
 
 #: Method -> how it follows.

@@ -12,19 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import linprog, nnls
 
-from hrcreplay.geometry.segment_hull_distance import distances
+from hrcreplay.geometry.distances import distances
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import qp_controller
-from hrcreplay.robot.control.approach_rows import Approach, tick_rows
 from hrcreplay.robot.control.certificate import MARGIN_M
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, Sight, observe
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Stop
 from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, minimise
-from hrcreplay.robot.control.path_controller import protective_distance_m
-from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import Stop
+from hrcreplay.robot.control.separation import Approach, Obstacles, tick_rows
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.reference import advance
-from hrcreplay.run.followers import Follower, PathFollower, Predict, QpFollower, ScalingFollower, SsmFollower
+from hrcreplay.run.followers import Follower, Observation, PathFollower, QpFollower, ScalingFollower, SsmFollower
 
 #: A row whose link could approach faster by no more than this is one that the solution lies on [m/s].
 ACTIVE = 1e-6
@@ -39,15 +35,12 @@ NEXT = 3
 
 
 class Moment(NamedTuple):
-    """What a follower has before a tick, and what the tick sees."""
+    """What a follower has before a tick, and what it sees at the tick."""
 
     going: Stop
     u_before: Floats
     s_s: float
-    sight: Sight
-    around: Obstacles
-    horizon_s: float
-    predict: Predict
+    seen: Observation
 
 
 class LinearRows(NamedTuple):
@@ -68,13 +61,13 @@ def asked(follower: Follower, moment: Moment) -> tuple[list[Proposal] | int, dic
     follower.stop, follower.u, follower.s_s = moment.going, moment.u_before, moment.s_s
     follower.point = follower.reference.sample(moment.s_s)
     if isinstance(follower, QpFollower):
-        return _by_program(follower, moment)
-    wanted = follower.propose(moment.sight, moment.around, moment.horizon_s, moment.predict)
+        return _by_program(follower, moment.seen)
+    wanted = follower.propose(moment.seen)
     if isinstance(follower, SsmFollower):
-        return wanted, _protective(follower, moment)
+        return wanted, _protective(follower, moment.seen)
     if isinstance(follower, ScalingFollower):
         dq = moment.going.rest().dq[0] if isinstance(wanted, int) else wanted[0].stop.dq[0]
-        margins = margins_of(_rows(follower, moment, 0.0), dq, 0.0)
+        margins = margins_of(_rows(follower, moment.seen, 0.0), dq, 0.0)
         broken = [row for row in margins if row["margin_m_per_s"] < -ACTIVE]
         if isinstance(wanted, int):  # even the hardest braking along the path breaks a row
             stop = {"kind": "path", "what": "the hardest braking along the path"}
@@ -84,47 +77,37 @@ def asked(follower: Follower, moment: Moment) -> tuple[list[Proposal] | int, dic
     return wanted, {}
 
 
-def _by_program(follower: QpFollower, moment: Moment) -> tuple[list[Proposal] | int, dict[str, Any]]:
+def _by_program(follower: QpFollower, seen: Observation) -> tuple[list[Proposal] | int, dict[str, Any]]:
     """The proposals of Eq. (66), the rows that its solution lies on, or those that leave none."""
-    robot, settings, sight = follower.robot, follower.settings, moment.sight
-    error_m = float(np.linalg.norm(sight.pose.T_world_tcp[:3, 3] - follower.point.T_world_tcp[:3, 3]))
-    s_s, rate = advance(follower.reference, moment.s_s, settings.dt_s, error_m, settings.plan)
-    point = follower.reference.sample(s_s)
-    target = qp_controller.Target(point.T_world_tcp, rate * point.twist, point.q)
-    state = RobotState(moment.going.q[0], moment.going.dq[0])
-    given = robot, state, moment.u_before, target, sight, moment.around, moment.horizon_s
+    settings = follower.settings
     with np.errstate(all="ignore"):
-        wanted = qp_controller.propose(*given, settings)
-        task = qp_controller.problem(*given, settings)
+        programme = follower.programme(seen)
+        wanted = qp_controller.propose(*programme, settings)
+        task = qp_controller.problem(*programme, settings)
         solved = minimise(task)
         if not isinstance(solved, Solution) and settings.plan.jerk_s > 0.0:
-            task = qp_controller.problem(*given, settings.without_jerk())
+            task = qp_controller.problem(*programme, settings.without_jerk())
             solved = minimise(task)
     if isinstance(solved, Solution):
         return wanted, held_by(task, solved)
     return wanted, {"unsolved": solved.status, "conflict": conflict(all_rows(task))}
 
 
-def _rows(follower: Follower, moment: Moment, give_way_m: float) -> Approach:
+def _rows(follower: Follower, seen: Observation, give_way_m: float) -> Approach:
     """The approach rows of a tick."""
-    pairs, plan = moment.sight.pairs, follower.settings.plan
+    pairs, plan = seen.sight.pairs, follower.settings.plan
     if pairs is None:
         raise ValueError("why: the distances from people are not known")
     room = pairs.room_m2(plan.room, give_way_m)
-    return tick_rows(moment.sight.pose, moment.around, room, pairs.distance_m, moment.horizon_s + plan.lead_s)
+    return tick_rows(seen.sight.pose, seen.around, room, pairs.distance_m, seen.horizon_s + plan.lead_s)
 
 
-def _protective(follower: SsmFollower, moment: Moment) -> dict[str, Any]:
+def _protective(follower: SsmFollower, seen: Observation) -> dict[str, Any]:
     """What speed and separation monitoring compares: the distance now, and the protective one."""
-    settings, sight = follower.settings, moment.sight
-    rows = moment.around
-    wanted = PathFollower.propose(follower, sight, rows, moment.horizon_s, moment.predict)
+    wanted = PathFollower.propose(follower, seen)
     if isinstance(wanted, int):
         return {}
-    needed_m = protective_distance_m(
-        sight.pose, wanted[0].stop, settings.plan.human_speed, settings.latency_s, settings.dt_s
-    )
-    now = observe(follower.robot, follower.state, moment.predict(0.0), settings.plan.clearance_m, sight.pose)
+    now, needed_m = follower.protective(seen, wanted[0])
     pair = {"link": now.link, "limb": now.limb, "distance_m": now.distance_m}
     return {"protective": {**pair, "needed_m": needed_m}}
 

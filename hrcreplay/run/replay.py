@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import HumanStates, Ints
-from hrcreplay.report import limbs, tables
+from hrcreplay.report import metrics_data, tables, verdict
 from hrcreplay.report.story import defect_notes
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import LogLike
@@ -164,9 +164,9 @@ def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str
 
     def table(name: str) -> Any:
         path = folder / f"{name}.parquet"
-        return pq.read_table(path, columns=list(limbs.COLUMNS[name])).to_pandas() if path.exists() else None
+        return pq.read_table(path, columns=list(metrics_data.LIMB_COLUMNS[name])).to_pandas() if path.exists() else None
 
-    return limbs.remarks(Run(folder, meta, state=table("state"), measurements=table("measurements")), told)
+    return verdict.limb_remarks(Run(folder, meta, state=table("state"), measurements=table("measurements")), told)
 
 
 def _findings(job: Job, log: Log, sink: Sink, reused: tuple[str, ...]) -> dict[str, Any]:

@@ -5,10 +5,11 @@ Each stage passes its rows on to the next and writes its tables. The progress ba
 
 from __future__ import annotations
 
+import math
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from types import TracebackType
 from typing import Self
@@ -18,16 +19,16 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from hrcreplay.errors import LogError
+from hrcreplay.geometry import convex_hull
 from hrcreplay.human.fusion import fuse, inverse_kinematics
-from hrcreplay.human.model import LimitSet
-from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements
+from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.run.build import Forecast, FusionStage, PredictionStage
 from hrcreplay.run.followers import InitialOverlap, Planner
-from hrcreplay.run.prediction import Forecast, PredictionStage, store_volumes, stored_ticks
 from hrcreplay.settings.sections import Fusion
-from hrcreplay.store.columns import measurement_columns, motion_columns, state_columns, truth_columns
+from hrcreplay.store.columns import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 NS = 1_000_000_000
@@ -47,26 +48,6 @@ class Sink:
     progress: Callable[[str, int], None]  #: stage, ticks done
     counts: Counter[str] = field(default_factory=Counter)
     notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> what is odd
-
-
-@dataclass(frozen=True)
-class FusionStage:
-    """Stage 1: camera poses and clocks, point noise, and the settings of filter and person selection."""
-
-    T_world_camera: Floats  #: (c, 4, 4)
-    clock_offset_ns: Ints  #: (c,) camera's clock minus the reference camera's
-    filter: Fusion
-    limits: LimitSet
-    person_jump_m: float
-    person_memory_s: float
-
-    def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
-        """Measurements of the person, by the clock of the reference camera; see ``clean.select_person``."""
-        memory, mine, found = select_person(
-            frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
-        )
-        mine = replace(mine, capture_ns=mine.capture_ns - self.clock_offset_ns[mine.camera])
-        return memory, inverse_kinematics.measure(mine, self.T_world_camera, self.filter), found
 
 
 def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
@@ -209,6 +190,46 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
         within = truth.rows((truth.t_ns >= start_ns) & (truth.t_ns <= end_ns))
         if len(within):
             sink.run.table("truth", truth_columns(within.t_ns, *inverse_kinematics.inverse(within.points_m)))
+
+
+def stored_ticks(first: int, count: int, store_every: float) -> Ints:
+    """Which of ``count`` ticks from the ``first`` of a run on have their volumes stored: one in ``store_every``."""
+    if math.isinf(store_every):
+        return np.zeros(0, np.int64)
+    number = np.arange(first, first + count)
+    return np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
+
+
+def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, run: RunWriter) -> None:
+    """Writes hull vertices and size of some ticks' volumes; a tick without a person has none.
+
+    Args:
+        volumes: Of any ticks.
+        ticks: Rows of ``volumes`` to write.
+        horizon_s: (n,) how long after its tick each row holds [s].
+        run: Where they go.
+    """
+    t_ns: list[int] = []
+    limbs: list[str] = []
+    radii: list[float] = []
+    sizes: list[float] = []
+    hulls: list[Floats] = []
+    horizons: list[float] = []
+    for tick in ticks.tolist():
+        for i, limb in enumerate(volumes.limbs):
+            vertices = volumes.vertices(tick, i)
+            if np.isnan(vertices).any():
+                continue
+            corners, faces = convex_hull.hull(vertices)
+            radius = float(volumes.radius_m[tick, i])
+            t_ns.append(int(volumes.t_ns[tick]))
+            limbs.append(limb)
+            radii.append(radius)
+            sizes.append(convex_hull.sphere_swept_volume_m3(corners, radius, faces))
+            hulls.append(corners)
+            horizons.append(float(horizon_s[tick]))
+    if t_ns:
+        run.table("occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls, horizons))
 
 
 def predicted(

@@ -19,20 +19,17 @@ import pyarrow.parquet as pq
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import LIMBS, STATUSES, Floats, HumanStates, Ints
-from hrcreplay.report.limbs import part_name_text
 from hrcreplay.report.metrics import true_runs
 from hrcreplay.report.metrics_plan import stationary
-from hrcreplay.report.tables import PageTable, reason_text
+from hrcreplay.report.tables import PageTable, part_name_text, reason_text
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import NO_PLANES
-from hrcreplay.robot.control.control_step import REASONS, observe
-from hrcreplay.robot.control.decision import stands
-from hrcreplay.robot.control.stopping import Stop, at_rest, axis_by_axis, straight
+from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, stands, straight
 from hrcreplay.run import build
+from hrcreplay.run.build import Forecast
 from hrcreplay.run.followers import Follower, Predict, QpFollower, unknown
 from hrcreplay.run.holding import Moment, asked, refused
 from hrcreplay.run.job import Job, resolve
-from hrcreplay.run.prediction import Forecast
 from hrcreplay.store.columns import read_states
 
 #: A TCP slower than this is said to stand [m/s].
@@ -91,7 +88,7 @@ class Record:
             for now in range(first, tick + 1):
                 moment = self._moment(now)
                 with np.errstate(all="ignore"):
-                    step = follower.step(moment.predict).step
+                    step = follower.step(moment.seen.predict).step
                 if not self._as_recorded(now, step):
                     moment = None
                     break
@@ -100,12 +97,9 @@ class Record:
         return None
 
     def _moment(self, tick: int) -> Moment:
-        follower, predict = self.follower, self.predict(tick)
-        horizon_s = follower.settings.horizon_s(follower.stop)
+        follower = self.follower
         with np.errstate(all="ignore"):
-            around = predict(horizon_s)
-            sight = observe(follower.robot, follower.state, around, follower.settings.plan.clearance_m)
-        return Moment(follower.stop, follower.u, follower.s_s, sight, around, horizon_s, predict)
+            return Moment(follower.stop, follower.u, follower.s_s, follower.observe(self.predict(tick)))
 
     def _as_recorded(self, tick: int, step: control_step.Step) -> bool:
         """Whether a step is that of the record, bit for bit."""
@@ -213,11 +207,11 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
         "status": str(row["status"]),
         "reason": str(row["reason"] or ""),
         "tcp_speed_m_per_s": float(row["tcp_speed"]),
-        "horizon_s": moment.horizon_s,
+        "horizon_s": moment.seen.horizon_s,
         "tau_s": float(row["tau_s"]),
         "cameras": _cameras(record, tick),
     }
-    sight = moment.sight
+    sight = moment.seen.sight
     if sight.limb >= 0:
         found["nearest"] = {"link": links[sight.link], "limb": limbs[sight.limb]}
         found["nearest"] |= {"distance_m": sight.distance_m, "overlap_m": sight.overlap_m}
@@ -227,9 +221,10 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
     wanted, more = asked(record.follower, moment)
     found |= _named(more, links, limbs)
     if isinstance(wanted, list) and settings.certified and record.motion["reason"].iloc[tick] == "not certified":
-        given = moment.going, moment.around, moment.horizon_s
+        around, horizon_s = moment.seen.around, moment.seen.horizon_s
         found["refused"] = [
-            _named(refused(robot, given[0], proposal, *given[1:], settings), links, limbs) for proposal in wanted
+            _named(refused(robot, moment.going, proposal, around, horizon_s, settings), links, limbs)
+            for proposal in wanted
         ]
     return found
 

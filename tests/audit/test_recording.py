@@ -14,7 +14,7 @@ from hrcreplay.audit import driver, recording
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import DOF, POINTS, Bools, Floats, Measurements
-from hrcreplay.run.stages import FusionStage
+from hrcreplay.run.build import FusionStage
 from hrcreplay.settings.sections import Fusion
 from tests.audit.standing import frames, standing
 from tests.human.people import states

@@ -10,8 +10,8 @@ import pytest
 
 from hrcreplay.robot import irb140 as description
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import parse_task
 
 Q, DQ = np.array([0.3, 0.2, -0.4, 0.5, 0.6, -0.7]), np.array([1.0, -0.5, 0.4, 2.0, -1.0, 3.0])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from hrcreplay.geometry.segment_hull_distance import distances
+from hrcreplay.geometry.distances import distances
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel
 from tests.robot.distances import by_coal

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.calibration.floor import find_floor, floor_frame, up_direction
+from hrcreplay.calibration.cell import find_floor, floor_frame, up_direction
 from hrcreplay.calibration.registration import SkeletonTrack, rigid, transform
 from hrcreplay.records import POINTS, Floats
 from tests.reobserve import angle_deg, walker

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.egm.codec import RobotPacket
-from hrcreplay.egm.protocol import EgmSession, PacketStatus
+from hrcreplay.egm.link import EgmSession, PacketStatus
 
 CYCLE_NS = 4_032_000
 T0_NS = 1_700_000_000_000_000_000

@@ -24,8 +24,7 @@ from hrcreplay.egm.codec import (
     encode_correction,
     encode_robot,
 )
-from hrcreplay.egm.protocol import EgmSession, PacketStatus
-from hrcreplay.egm.udp_server import EgmServer, Received
+from hrcreplay.egm.link import EgmServer, EgmSession, PacketStatus, Received
 from hrcreplay.records import Floats
 
 CYCLE_NS = 4_032_000

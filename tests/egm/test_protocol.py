@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay.egm.protocol import REASONS, PacketStatus
+from hrcreplay.egm.link import REASONS, PacketStatus
 from tests.egm.talks import CYCLE_NS, T0_NS, ZERO, packet, session, talk
 
 

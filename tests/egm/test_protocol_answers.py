@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hrcreplay.egm.codec import RobotPacket
-from hrcreplay.egm.protocol import REASONS, PacketStatus
+from hrcreplay.egm.link import REASONS, PacketStatus
 from tests.egm.talks import CYCLE_NS, DQ_MAX, Q_MAX, ZERO, packet, session, talk
 
 

@@ -10,7 +10,7 @@ from contextlib import closing, contextmanager
 
 import pytest
 
-from hrcreplay.egm.udp_server import EgmServer
+from hrcreplay.egm.link import EgmServer
 from hrcreplay.errors import SettingsError
 
 LONG_S = 5.0

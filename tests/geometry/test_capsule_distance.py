@@ -9,8 +9,7 @@ from scipy.optimize import minimize
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.geometry.capsule_distance import nearest_pair, segment_distance
-from hrcreplay.geometry.segment_hull_distance import protrusion_m
+from hrcreplay.geometry.distances import nearest_pair, protrusion_m, segment_distance
 from hrcreplay.records import Floats
 
 SHARES = np.linspace(0.0, 1.0, 201)

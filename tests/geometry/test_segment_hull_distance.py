@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.geometry.segment_hull_distance import distances
+from hrcreplay.geometry.distances import distances
 from hrcreplay.records import Floats
 from tests.geometry.exact import exact_distance
 from tests.robot.distances import axis_distance

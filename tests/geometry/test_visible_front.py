@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from hrcreplay.geometry.visible_front import visible_front
+from hrcreplay.geometry.convex_hull import visible_front
 
 
 @pytest.mark.parametrize("seed", range(4))

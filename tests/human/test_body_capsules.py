@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.body_capsules import PARTS, at_instants, part_axes, part_radii
-from hrcreplay.human.model import skeleton
+from hrcreplay.human.model import PARTS, part_axes, part_radii, skeleton
 from hrcreplay.records import JOINTS, POINTS
+from hrcreplay.run.contact import at_instants
 from hrcreplay.settings.sections import Occupancy
 
 LENGTHS_M = np.array([[0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.26]])

@@ -7,10 +7,10 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
+from hrcreplay.egm.link import Address, Received
 from hrcreplay.egm.robot_double.faults import Datagram
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore
-from hrcreplay.egm.udp_server import Address, Received
 from hrcreplay.live.control.loop import Loop, LoopSettings
 from hrcreplay.live.record.codec import Decision, Perception, TickEvent
 from tests.live.flights import BEGIN_NS, FRAME_NS, RESPONSE_NS, Flight, far_away

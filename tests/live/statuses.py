@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hrcreplay.live.view.status_messages import CameraStatus, Latency, RecorderStatus, Status
+from hrcreplay.live.view.status import CameraStatus, Latency, RecorderStatus, Status
 
 
 def status(**change: Any) -> Status:

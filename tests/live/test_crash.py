@@ -15,19 +15,18 @@ import pytest
 
 from hrcreplay.cli import app
 from hrcreplay.egm.codec import Correction, decode_correction
-from hrcreplay.egm.protocol import EgmSession
-from hrcreplay.egm.udp_server import Received
+from hrcreplay.egm.link import EgmSession, Received
 from hrcreplay.errors import LiveStopped
 from hrcreplay.live import processes, session
-from hrcreplay.live.control import last_resort, session_controller, watchdog
-from hrcreplay.live.control.loop import FINAL_ANSWERS, Loop
-from hrcreplay.live.control.perception import Observer
+from hrcreplay.live.control import session_controller
+from hrcreplay.live.control.loop import FINAL_ANSWERS, FallbackBrake, Loop, bring_to_rest
 from hrcreplay.live.control.setup import build_controller
+from hrcreplay.live.control.stages import Observer
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.verify import SessionRecomputation
-from hrcreplay.live.view import status_publisher
-from hrcreplay.robot.control import stopping
-from hrcreplay.robot.control.stopping import straight
+from hrcreplay.live.view import status
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.control_step import straight
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run.followers import QpFollower
 from tests.live.counted import Cable, CountedLoop, counted
@@ -44,13 +43,13 @@ PLACES: dict[str, tuple[Any, str]] = {
     "conversation": (EgmSession, "classify_all"),
     "reply": (EgmSession, "reply"),
     "encoding": (session_controller, "encode_correction"),
-    "watchdog": (watchdog, "of_person"),
+    "watchdog": (session_controller, "reason_of_person"),
     "age of the frames": (Observer, "age_s"),
     "messages of the human side": (Loop, "_receive_skeletons"),
     "record of an answer": (codec, "encode_decision"),
     "record of a packet": (codec, "encode_robot_packet"),
     "record of a look": (codec, "encode_perception"),
-    "status": (status_publisher.StatusPublisher, "_status"),
+    "status": (status.StatusPublisher, "_status"),
     "link": (Cable, "newest"),
 }
 MOVING_S = 0.45
@@ -107,7 +106,7 @@ def test_a_bug_anywhere_in_control_brakes_a_moving_robot_to_rest(
         np.testing.assert_allclose(reply.dq, stop.dq[min(row, stop.ticks)], rtol=0, atol=1e-12)
     assert not any(np.any(reply.dq) for reply in replies[-FINAL_ANSWERS:])
     assert all((two.seqno - one.seqno) % 2**32 == 1 for one, two in pairwise(replies))
-    assert [why for _, why in found.flight.controller.stops] == [watchdog.FAULT]
+    assert [why for _, why in found.flight.controller.stops] == [session_controller.FAULT]
     gaps = np.diff([t_ns for t_ns, _ in found.sent]) * 1e-9
     assert gaps.max() < 3 * CYCLE_S, "it went on being answered"
 
@@ -130,17 +129,17 @@ def test_a_bug_is_one_line_and_a_traceback_in_the_folder(
 
 def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
     try:
-        stopping.at_rest({})  # type: ignore[arg-type]
+        control_step.at_rest({})  # type: ignore[arg-type]
     except KeyError as error:
         said = processes.describe_exception(error)
-    lines = Path(stopping.__file__).read_text().splitlines()
+    lines = Path(control_step.__file__).read_text().splitlines()
     number = next(i for i, line in enumerate(lines, 1) if "return Stop(q[None]" in line)
-    place = f"hrcreplay/robot/control/stopping.py:{number}, in at_rest"
+    place = f"hrcreplay/robot/control/control_step.py:{number}, in at_rest"
     assert said == f"KeyError: None ({place})"
 
 
 def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
-    brake = last_resort.FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7, [])
+    brake = FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [0.0] * 6, [20.0] * 6, 7, [])
     brake.update_position([9.0] * 6)  # it lags
     assert brake.dq == [20.0] * 6
     brake.update_position([11.0] * 6)
@@ -151,9 +150,7 @@ def test_a_robot_that_is_elsewhere_is_told_to_stay_there() -> None:
 
 
 def test_a_brake_stays_within_the_joints_limits() -> None:
-    brake = last_resort.FallbackBrake(
-        [360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0, []
-    )
+    brake = FallbackBrake([360.0] * 6, [-90.0] * 6, [90.0] * 6, 0.004, 10.0, [89.99] * 5 + [95.0], [20.0] * 6, 0, [])
     said = [decode_correction(brake.step(0)) for _ in range(20)]
     assert brake.at_rest
     np.testing.assert_allclose(np.degrees([reply.q[:5] for reply in said]).max(), 90.0)
@@ -175,7 +172,7 @@ def test_garbage_is_not_answered_and_silence_ends_it() -> None:
             told.append(data)
 
     loop.link = Silent()  # type: ignore[assignment]
-    last_resort.bring_to_rest(loop, "why")
+    bring_to_rest(loop, "why")
     assert not told
 
 
@@ -188,7 +185,7 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
     kinds = [codec.kind(message) for message in messages]
     events = [codec.decode_event(message) for message in messages if codec.kind(message) == codec.EVENT]
     assert [event["what"] for event in events] == ["crash", "end"]
-    assert events[1]["reason"] == watchdog.FAULT
+    assert events[1]["reason"] == session_controller.FAULT
     again = SessionRecomputation(build_controller(found.flight.start))
     crashed_at = next(i for i, message in enumerate(messages) if b'"crash"' in message)
     assert all(again.difference_at(message) is None for message in messages[: crashed_at + 1])
@@ -205,7 +202,7 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
 
 def test_a_recording_that_cannot_be_read_any_further_is_named() -> None:
     loop = counted(Flight())
-    loop.controller.stop = watchdog.PERSON_DEAD
+    loop.controller.stop = session_controller.PERSON_DEAD
     loop.notes += ["failed log.mcap: no further", "a later remark"]
     with pytest.raises(
         LiveStopped, match=r"stopped by: human side dead \(log.mcap: no further\); the record is in run"

@@ -15,16 +15,16 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.live import processes
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import APPROACH, FOLLOWING
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.store import run_folder
 from tests.live.flown import MOVING, Flown, Group, brakes_for, leaves_nobody, never_stalls, read_json, told, verified
 from tests.live.sessions import kill
 
 #: Session -> part and place of its bug.
 BUGS = {
-    "recorder": "recorder/hrcreplay.live.record.topics:split",
+    "recorder": "recorder/hrcreplay.live.record.codec:topic_and_data",
     "screen": "screen/hrcreplay.live.processes:ControlChannel.receive",
-    "status": "control/hrcreplay.live.view.status_publisher:StatusPublisher._status",
+    "status": "control/hrcreplay.live.view.status:StatusPublisher._status",
 }
 
 
@@ -102,7 +102,7 @@ def test_without_the_screen_it_brakes_and_goes_on_answering(killed: dict[str, Fl
 def test_a_bug_in_control_brakes_and_goes_on_answering(killed: dict[str, Flown]) -> None:
     one = killed["status"]
     assert not_complete(one).startswith(
-        "control: ZeroDivisionError: put there by a test (hrcreplay/live/view/status_publisher.py:"
+        "control: ZeroDivisionError: put there by a test (hrcreplay/live/view/status.py:"
     )
     brakes_for("internal error", one.folder)
     never_stalls(one)

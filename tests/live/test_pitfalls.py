@@ -11,7 +11,7 @@ import pytest
 from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.egm.robot_double.servo import ServoSettings
 from hrcreplay.egm.robot_double.twin import TwinSettings
-from hrcreplay.live.control import watchdog
+from hrcreplay.live.control import session_controller
 from hrcreplay.live.control.loop import FINAL_ANSWERS
 from hrcreplay.live.record import codec
 from hrcreplay.records import Floats
@@ -59,7 +59,7 @@ def test_5_silence_finds_the_robot_standing() -> None:
     loop.fly(2.9)
     assert np.abs(planned(flight)[1][-1]).max() > 0.2
     loop.fly()
-    assert flight.controller.stop == watchdog.SESSION_OVER
+    assert flight.controller.stop == session_controller.SESSION_OVER
     last = flight.core.record.arrivals()[-(FINAL_ANSWERS - 1) :]
     assert not last["ref_rad_per_s"].any()
     cable(loop).pass_by(3.0)
@@ -88,7 +88,7 @@ def test_7_idling_in_a_stop_ends_a_session_but_not_ours() -> None:
     seen = lambda s: None if 0.4 < s < 2.6 else (3.0, 0.0)  # noqa: E731
     flight = Flight(overrides=RESUME, twin=converging, walk=seen).fly(4.2)
     assert flight.core.ends == ["converged", ""]
-    assert [reason for _, reason in flight.controller.stops] == [watchdog.NO_FRAME]
+    assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
     assert flight.phases().count("echo") == 2
     steps_keep_the_limits(flight)
     assert np.abs(planned(flight)[1][-250:]).max() > 0.1
@@ -115,7 +115,7 @@ def test_10_a_loop_slower_than_the_robot_brakes_by_name_and_builds_no_backlog(tu
     assert np.abs(planned(flight)[1][-50:]).max() > 0.2
     loop.work_ns = round(turn_s * 1e9)
     loop.fly(1.5)
-    assert [reason for _, reason in flight.controller.stops] == [watchdog.OVERRUN]
+    assert [reason for _, reason in flight.controller.stops] == [session_controller.OVERRUN]
     arrivals, cycles = flight.core.record.arrivals(), flight.core.record.cycles()
     assert set(np.diff(arrivals["seqno"])) == {1}
     assert cycles["queued"].max() == 0

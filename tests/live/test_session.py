@@ -17,7 +17,7 @@ import pytest
 
 from hrcreplay.cli import app
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from tests.live.flights import DEMO, start

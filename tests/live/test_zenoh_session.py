@@ -17,7 +17,7 @@ from hrcreplay.calibration.cell import Cell, write_cell
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.live.verify import verify
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.robot.model import irb140

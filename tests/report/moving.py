@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 import pandas as pd
 
-from hrcreplay.human.body_capsules import PARTS, part_axes
-from hrcreplay.human.model import skeleton
+from hrcreplay.human.model import PARTS, part_axes, skeleton
 from hrcreplay.records import Floats
 from hrcreplay.report.metrics import start_ns
 from hrcreplay.report.replay_scene import ReplayScene, replay_scene

@@ -10,8 +10,8 @@ from PIL import Image
 from hrcreplay.report import figures, figures_prediction, figures_robot
 from hrcreplay.report.figures import FIGURES, FigureData
 from hrcreplay.report.figures_prediction import Growth, Sweep, Walk
+from hrcreplay.report.figures_scene import RenderedHull, outline, render_hulls, view_from
 from hrcreplay.report.metrics import instants
-from hrcreplay.report.projection import RenderedHull, outline, render_hulls, view_from
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
 from tests.report.moving import moving_run

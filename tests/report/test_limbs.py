@@ -13,7 +13,7 @@ import pytest
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats
-from hrcreplay.report import limbs, story
+from hrcreplay.report import metrics_data, story, verdict
 from hrcreplay.run import replay
 from hrcreplay.run.report import compute
 from hrcreplay.store import run_folder
@@ -41,11 +41,11 @@ def test_shares_are_of_the_ticks_with_the_person_in_view() -> None:
     unseen_s[:, 5] = np.inf  # never
     unseen_s[:50] = np.inf  # nobody yet
     unseen_s[200:260] = 3.0  # gone for a while
-    found = limbs.unmeasured_shares(unseen_s, MEMORY_S)
+    found = metrics_data.unmeasured_shares(unseen_s, MEMORY_S)
     assert found == pytest.approx(by_counting(unseen_s))
     assert found[5] == 1.0
     assert 0.0 < found[2] < 1.0
-    assert np.isnan(limbs.unmeasured_shares(np.full((9, 6), np.inf), MEMORY_S)).all()
+    assert np.isnan(metrics_data.unmeasured_shares(np.full((9, 6), np.inf), MEMORY_S)).all()
 
 
 def seen(run: Run, **unseen_s: float | Floats) -> Run:
@@ -80,7 +80,7 @@ def test_the_verdict_gives_the_share_of_a_limb_that_was_hidden_most_of_the_time(
     n = len(run.state)
     hidden = seen(run, ULA=np.where(np.arange(n) < 0.73 * n, 2.0, 0.1), HD=np.where(np.arange(n) < 0.4 * n, 2.0, 0.1))
     assert answered(hidden).short == "Not known of the left upper arm (ULA): not measured at 73 % of the ticks."
-    assert limbs.remarks(hidden) == [
+    assert verdict.limb_remarks(hidden) == [
         "the left upper arm (ULA) was not measured at 73 % of the ticks with the person in view"
     ]
 
@@ -88,9 +88,9 @@ def test_the_verdict_gives_the_share_of_a_limb_that_was_hidden_most_of_the_time(
 def test_a_limb_measured_in_part_is_told() -> None:
     run = seen(make_run(4.0))
     assert run.measurements is not None
-    assert limbs.remarks(run) == []
+    assert verdict.limb_remarks(run) == []
     part = dataclasses.replace(run, measurements=run.measurements.assign(al3=np.nan))
-    assert limbs.remarks(part) == ["the left lower arm (LLA) was measured only in part: never its al3"]
+    assert verdict.limb_remarks(part) == ["the left lower arm (LLA) was measured only in part: never its al3"]
 
 
 def test_the_page_lists_every_limb(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay.geometry.segment_hull_distance import distances
+from hrcreplay.geometry.distances import distances
 from hrcreplay.report import page
 from hrcreplay.report.replay_scene import ReplayScene
 from hrcreplay.run.report import compute

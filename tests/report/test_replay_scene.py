@@ -12,10 +12,10 @@ from scipy.linalg import expm
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import LIMBS, POINTS, Floats
+from hrcreplay.report.metrics_contact import stop_events
 from hrcreplay.report.replay_page import MISSING, NumberBlock, replay_data
 from hrcreplay.report.replay_scene import SHOWN_POINTS, ReplayScene
-from hrcreplay.report.stop_list import stop_events
-from hrcreplay.robot.control.stopping import axis_by_axis, straight
+from hrcreplay.robot.control.control_step import axis_by_axis, straight
 from tests.report.moving import joints, moving_run, moving_scene, robot
 from tests.report.synthetic import LENGTHS_M, T0_NS, pose
 

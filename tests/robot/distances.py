@@ -6,7 +6,7 @@ import coal
 import numpy as np
 from numba import njit
 
-from hrcreplay.geometry.segment_hull_distance import EXACT_M
+from hrcreplay.geometry.distances import EXACT_M
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotPose

@@ -12,13 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.records import Floats, SweptVolumes
-from hrcreplay.robot.control.certificate import NO_PLANES
-from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, observe
-from hrcreplay.robot.control.decision import decide, made, stands
+from hrcreplay.robot.control.certificate import NO_PLANES, decide
+from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, axis_by_axis, made, observe, stands
 from hrcreplay.robot.control.minimiser import SLACK, Problem
 from hrcreplay.robot.control.qp_controller import Target, problem, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.control.stopping import axis_by_axis
 from hrcreplay.robot.model import RobotModel, RobotPose, irb140
 from hrcreplay.settings.load import load_settings
 from tests.robot.distances import by_coal

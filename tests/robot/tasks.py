@@ -9,9 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.reference import Reference
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import Reference, parse_task
 
 HOME: dict[str, Any] = {"name": "home", "joints_deg": [0, 0, 0, 0, 90, 0]}
 ABOVE: dict[str, Any] = {"position_m": [0.45, 0.30, 0.25], "rpy_deg": [180, 0, 30]}

@@ -10,7 +10,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from hrcreplay.human.body_capsules import PARTS
+from hrcreplay.human.model import PARTS
 from hrcreplay.logs import reader
 from hrcreplay.records import POINTS, Floats, HumanStates
 from hrcreplay.robot.model import RobotModel, from_urdf

@@ -18,12 +18,11 @@ from hrcreplay.geometry.convex_hull import hull
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, Floats, SweptVolumes
-from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.control_step import RobotState, Stop, along_path, axis_by_axis, straight
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.control.stopping import Stop, along_path, axis_by_axis, straight
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import parse_task
 from hrcreplay.run import build, replay, stages
 from hrcreplay.run.job import resolve
 from hrcreplay.store import run_folder

@@ -19,8 +19,8 @@ from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS
 from hrcreplay.report import drawing
 from hrcreplay.report.figures import FIGURES, FigureData
+from hrcreplay.report.replay_page import snapshot
 from hrcreplay.report.replay_scene import posed, robot_geometry
-from hrcreplay.report.snapshot import snapshot
 from hrcreplay.run import build, figure_data, replay, report
 from hrcreplay.run.job import job_of_run
 from hrcreplay.store import run_folder

@@ -141,7 +141,7 @@ def assert_nearest(found: dict[str, Any], record: Record, tick: int) -> None:
     moment = record.again(tick)
     assert moment is not None
     at_links, at_limbs = names(record)
-    gap = gaps(record, moment.going.q[0], moment.around)
+    gap = gaps(record, moment.going.q[0], moment.seen.around)
     link, limb = np.unravel_index(int(np.argmin(gap)), gap.shape)
     assert found["nearest"]["link"] == at_links[link]
     assert found["nearest"]["limb"] == at_limbs[limb]
@@ -210,7 +210,7 @@ def test_a_refused_stop_is_told_where_it_comes_too_near(record: Record) -> None:
             failed = round(one["failed_s"] / 0.004)
             q = (moment.going.q[0], *stop.q)
             for i in range(failed + 1):
-                gap = gaps(record, q[i], moment.around)
+                gap = gaps(record, q[i], moment.seen.around)
                 assert (gap.min() <= 0.0) == (i == failed and one["why"] == "not clear")
             at = at_links.index(one["link"]), at_limbs.index(one["limb"])
             assert one["gap_m"] == pytest.approx(gap[at], abs=1e-7)

@@ -1,4 +1,4 @@
-"""Faults injected into the link and the robot, from a script or at random from a seed.
+"""Faults injected into the link and the robot, from a script or at random from a seed, and what came after each.
 
 ``FaultyChannel`` applies those of one direction of the link: which datagrams arrive, when, and in what order.
 """
@@ -13,8 +13,11 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.errors import SettingsError
+from hrcreplay.records import Bools, Floats
 
 
 class Datagram(NamedTuple):
@@ -290,3 +293,58 @@ def _chance_of(table: object, where: str) -> dict[str, Any]:
     if not isinstance(kinds, list | tuple) or not kinds or not set(kinds) <= set(KINDS):
         raise SettingsError(f"{where}: kinds is {kinds!r}; a list of {', '.join(KINDS)} would be right")
     return dict(table)
+
+
+#: Slower than this on every axis is standstill [rad/s] ...
+_REST_RAD_PER_S = 0.01
+#: ... once it has lasted for so many cycles.
+_REST_CYCLES = 25
+
+
+@dataclass(frozen=True)
+class FaultOutcome:
+    """A fault and what came after its onset. None: not within the run."""
+
+    fault: Fault
+    told_rest_s: float | None
+    """Until the references stood still, or no longer counted [s]."""
+    robot_rest_s: float | None
+    """Until the robot stood still [s]."""
+    coast_s: float | None
+    """Of it after the last reference that moved [s]."""
+
+    def line(self) -> str:
+        """The fault as text."""
+        rests = (("told", self.told_rest_s), ("robot", self.robot_rest_s), ("coasting", self.coast_s))
+        times = ", ".join(f"{name} {'-' if rest_s is None else f'{rest_s:.3f} s'}" for name, rest_s in rests)
+        return f"{self.fault.kind} at {self.fault.at_s:.3f} s: standstill after {times}"
+
+
+def fault_outcome(fault: Fault, cycles: NDArray[Any]) -> FaultOutcome:
+    """How long it took from the onset of a fault until everything stood still."""
+    since_s = (cycles["t_ns"] - cycles["t_ns"][:1]) * 1e-9
+    told = _told_still(cycles)
+    robot_s = _rest_s(fault, since_s, np.all(np.abs(cycles["planned_rad_per_s"]) < _REST_RAD_PER_S, axis=1))
+    coast_s = None
+    if robot_s is not None:
+        moved = np.flatnonzero(~told & (since_s < fault.at_s + robot_s))
+        last_s = float(since_s[moved[-1]]) if len(moved) else fault.at_s
+        coast_s = min(robot_s, fault.at_s + robot_s - last_s)
+    return FaultOutcome(fault, _rest_s(fault, since_s, told), robot_s, coast_s)
+
+
+def _told_still(cycles: NDArray[Any]) -> Bools:
+    """Cycles whose reference neither moves nor says so (n,); without a reference there is nothing that moves."""
+    reference = cycles["ref_rad"]
+    step = np.diff(reference, axis=0, prepend=reference[:1]) / (PERIOD_NS * 1e-9)
+    moves = (np.abs(step) >= _REST_RAD_PER_S) | (np.abs(cycles["ref_rad_per_s"]) >= _REST_RAD_PER_S)
+    return ~np.any(moves, axis=1)
+
+
+def _rest_s(fault: Fault, since_s: Floats, still: Bools) -> float | None:
+    """Time from the onset of a fault to the first cycle of a standstill that lasts; None without one."""
+    if len(still) < _REST_CYCLES:
+        return None
+    lasting = np.convolve(still, np.ones(_REST_CYCLES), mode="valid") > _REST_CYCLES - 0.5
+    resting = np.flatnonzero(lasting & (since_s[: len(lasting)] >= fault.at_s))
+    return float(since_s[resting[0]]) - fault.at_s if len(resting) else None

@@ -1,6 +1,7 @@
-"""The controller of a live session: decides what the robot is told in each cycle.
+"""The controller of a live session: decides what the robot is told in each cycle; its watchdog says when it must stop.
 
-Pure: the same events in the same order give the same bits, so a recorded session can be computed again.
+Pure: the same events in the same order give the same bits, so a recorded session can be computed again. Every condition
+that must stop a live robot has the name of its stop reason.
 """
 
 from __future__ import annotations
@@ -14,17 +15,75 @@ from dataclasses import replace
 import numpy as np
 
 from hrcreplay.egm.codec import AXES, BadPacket, RobotPacket, decode_robot, encode_correction
-from hrcreplay.egm.protocol import EgmSession, PacketStatus
-from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.motion import ControlSetup, MotionState, MotionStep, brake, follow, start_approach
-from hrcreplay.live.control.perception import Observer
+from hrcreplay.egm.link import EgmSession, PacketStatus
+from hrcreplay.live.control.stages import ControlSetup, MotionState, MotionStep, Observer, brake, follow, start_approach
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.control_step import RobotState, at_rest
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import at_rest
+from hrcreplay.settings.sections import Live
+
+#: What ends a session as it should; every other reason ends it as a stop.
+SESSION_OVER, RECORDING_OVER = "session over", "recording of the person over"
+
+INTERRUPTED, TERMINATED = "Ctrl-C", "SIGTERM"
+PERSON_DEAD, PERSON_LATE = "human side dead", "human side late"
+RECORDER_DEAD, SCREEN_DEAD = "recorder dead", "screen dead"
+OVERRUN, SILENT = "tick overrun", "robot silent"
+NO_FRAME, UNCERTAIN, NOT_FINITE, TRACKING = "no fresh frame", "state uncertain", "not finite", "tracking error"
+FAULT = "internal error"
+
+#: What ends a session whose robot may have been stopped for another reason.
+_ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
+
+#: Robots that are not answered at all.
+REFUSED = ("radians", "axes")
+
+#: Reasons by signal, the most important first.
+SIGNALS = {
+    Signal.INTERRUPT: INTERRUPTED,
+    Signal.TERMINATE: TERMINATED,
+    Signal.DURATION: SESSION_OVER,
+    Signal.PERSON_ENDED: RECORDING_OVER,
+    Signal.PERSON_DEAD: PERSON_DEAD,
+    Signal.PERSON_LATE: PERSON_LATE,
+    Signal.RECORDER_DEAD: RECORDER_DEAD,
+    Signal.SCREEN_DEAD: SCREEN_DEAD,
+    Signal.OVERRUN: OVERRUN,
+}
+
+_BASE = 4  #: x, y, heading and bend: the joints that carry the whole person
+
+
+def reason_of_signals(signals: Signal) -> str:
+    """The reason that the loop itself has found, or none."""
+    return next((reason for signal, reason in SIGNALS.items() if signal in signals), "")
+
+
+def reason_of_robot(packet_status: PacketStatus) -> str:
+    """The reason that lies with the robot, or none."""
+    if packet_status.reason:
+        return packet_status.reason
+    return "" if packet_status.allowed else "robot not ready"
+
+
+def reason_of_person(perception: Perception | None, age_s: float, bounds: Live) -> str:
+    """The reason that lies with what is known of the person, or none."""
+    if perception is None or not age_s <= bounds.fresh_s:
+        return NO_FRAME
+    std = perception.states.p_std[0, :_BASE]
+    if not math.isfinite(perception.states.p.sum() + perception.states.v.sum()):
+        return NOT_FINITE
+    sure = max(std[0], std[1]) <= bounds.uncertain_m and max(std[2], std[3]) <= bounds.uncertain_rad
+    return "" if sure else UNCERTAIN
+
+
+def _reason_of_tracking(measured: Floats, commanded: Floats, bounds: Live) -> str:
+    """The reason that the robot is not where it was told to be, or none; both (6,) [rad]."""
+    return "" if np.abs(measured - commanded).max() <= bounds.tracking_rad else TRACKING
+
 
 #: Obstacles before the first perception update: nothing is known, so the robot stands.
 _UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=False)
@@ -93,7 +152,7 @@ class SessionController:
     def silence(self, t_ns: int, signals: Signal) -> None:
         """Nothing came from the robot within the time-out."""
         self._check_silence(t_ns)
-        why = watchdog.of_signals(signals)
+        why = reason_of_signals(signals)
         if why and not self.stop:
             self._stop(t_ns, why)
 
@@ -145,7 +204,7 @@ class SessionController:
 
     def _refuse(self, t_ns: int, packet_status: PacketStatus) -> None:
         """Handles datagrams without an answer: a robot that must not be moved at all, or no usable packet."""
-        if packet_status.reason in watchdog.REFUSED and not self.stop:
+        if packet_status.reason in REFUSED and not self.stop:
             self._stop(t_ns, packet_status.reason)
             self._motion, self.phase = None, codec.HOLDING
         self._check_silence(t_ns)
@@ -155,7 +214,7 @@ class SessionController:
         if self._heard_ns is None or t_ns - self._heard_ns <= self.setup.bounds.silent_s * 1e9:
             return
         if self.phase in (codec.APPROACH, codec.FOLLOWING, codec.STOPPING):
-            self._stop(t_ns, watchdog.SILENT)
+            self._stop(t_ns, SILENT)
         self._motion, self._heard_ns = None, None
         self.phase = codec.HOLDING if self.stop else codec.WAITING
 
@@ -175,7 +234,7 @@ class SessionController:
             self._clear_ns = None if why else (self._clear_ns or event.t_ns)
             if self._clear_ns is not None and event.t_ns - self._clear_ns >= self.setup.bounds.resume_s * 1e9:
                 self.stop, self.phase = "", codec.WAITING
-            elif why and why not in watchdog.ENDINGS:
+            elif why and why not in _ENDINGS:
                 self.stop = why  # what holds it now
         self.waiting = why if self.phase == codec.WAITING else ""
         if self.phase == codec.WAITING and not why and self._motion is not None:
@@ -184,15 +243,15 @@ class SessionController:
     def _stop_reason(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> str:
         """The watchdog's reason against moving; empty without one."""
         if self.fault is not None:
-            return watchdog.FAULT
-        why = watchdog.of_signals(event.signals) or watchdog.of_robot(packet_status)
+            return FAULT
+        why = reason_of_signals(event.signals) or reason_of_robot(packet_status)
         behind_ns = 0 if self._behind_ns is None else event.t_ns - self._behind_ns
         if not why and behind_ns > self.setup.bounds.overrun_s * 1e9:
-            why = watchdog.OVERRUN
+            why = OVERRUN
         if not why:
-            why = watchdog.of_person(self.perception, self.observer.age_s(event.t_ns), self.setup.bounds)
+            why = reason_of_person(self.perception, self.observer.age_s(event.t_ns), self.setup.bounds)
         if not why and self.setup.sending and self._motion is not None and self.phase != codec.ECHO:
-            why = watchdog.of_tracking(measured, self._motion.state.q, self.setup.bounds)
+            why = _reason_of_tracking(measured, self._motion.state.q, self.setup.bounds)
         return why
 
     def _stop(self, t_ns: int, why: str) -> None:
@@ -210,9 +269,9 @@ class SessionController:
                 result = self._step(motion)
             except Exception as error:  # whatever it is, the robot must brake
                 self.fault = self.fault or error
-                return self._fallback_stop(motion, watchdog.FAULT)
+                return self._fallback_stop(motion, FAULT)
         finite = math.isfinite(result.step.next.q.sum() + result.step.next.dq.sum())
-        return result if finite else self._fallback_stop(motion, watchdog.NOT_FINITE)
+        return result if finite else self._fallback_stop(motion, NOT_FINITE)
 
     def _fallback_stop(self, motion: MotionState, why: str) -> MotionStep:
         """The stop of a robot whose step cannot be taken; once, however often it fails while the robot brakes."""

@@ -17,20 +17,19 @@ from pydantic import ValidationError
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_robot
-from hrcreplay.egm.protocol import EgmSession
+from hrcreplay.egm.link import EgmSession
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.fusion.fuse import MEDIAN_LENGTHS_M
 from hrcreplay.human.model import LimitSet, skeleton
-from hrcreplay.live.control.motion import ControlSetup
-from hrcreplay.live.control.perception import Observer
 from hrcreplay.live.control.session_controller import SessionController
+from hrcreplay.live.control.stages import ControlSetup, Observer
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
+from hrcreplay.logs.log_files import Header, JointTrack
 from hrcreplay.logs.reader import open_log
-from hrcreplay.logs.tracks import Header, JointTrack
 from hrcreplay.records import Floats
-from hrcreplay.robot.programme.reference import Reference
+from hrcreplay.robot.task import Reference
 from hrcreplay.run import build
 from hrcreplay.run.followers import Follower
 from hrcreplay.run.job import Job, job_without_log, resolve

@@ -22,7 +22,7 @@ _SEAM_NS = 40_000_000  # between the end of a recording and its repetition: abou
 _AHEAD = 16  # chunks of at most a second each that wait decoded
 _RETRY_NS = 1_000_000  # when reading has fallen behind
 
-Message = tuple[bytes, bytes]  #: kind and payload
+Outgoing = tuple[bytes, bytes]  #: kind and payload
 
 
 class Frame(NamedTuple):
@@ -98,7 +98,7 @@ def same_frame(one: Frame, two: Frame) -> bool:
     return (one.skeleton.camera, one.skeleton.capture_ns) == (two.skeleton.camera, two.skeleton.capture_ns)
 
 
-def ready_note(cameras: tuple[str, ...]) -> Message:
+def ready_note(cameras: tuple[str, ...]) -> Outgoing:
     """The note that tells control that frames can come, and from whom."""
     return b"N", b"ready " + json.dumps({"cameras": list(cameras)}).encode()
 
@@ -128,7 +128,7 @@ class Playback:
             raise RuntimeError("go before ready")
         self._shift_ns = start_ns - self._opened.start_ns
 
-    def due(self, now_ns: int) -> Iterator[Message]:
+    def due(self, now_ns: int) -> Iterator[Outgoing]:
         """The messages whose time has come.
 
         Raises:
@@ -166,7 +166,7 @@ class Playback:
             return head.arrival_ns + self._shift_ns if isinstance(head, Frame) else now_ns
         return self._end_ns + self._shift_ns if self._exhausted else now_ns + _RETRY_NS
 
-    def _open(self) -> Iterator[Message]:
+    def _open(self) -> Iterator[Outgoing]:
         try:
             opened = self._take()
         except Empty:

@@ -1,4 +1,4 @@
-"""Messages of a session's record: what control sends to the recorder, and what the log holds.
+"""Messages of a session's record: what control sends to the recorder, and on which topics the log holds them.
 
 The first byte is the kind, the next eight the session's clock [ns]; numbers are little-endian. Everything that decides
 a tick is recorded, so the log alone suffices to compute the session again (see ``live.verify``).
@@ -13,6 +13,9 @@ a tick is recorded, so the log alone suffices to compute the session again (see 
 ``S``   no packet came from the robot within the time-out
 ``E``   JSON: the settings at the start, notes, the end
 ======  ==========================================================================================================
+
+The log has our own format, so every reader of logs reads it: skeletons, cameras, task and base are on their usual
+topics. All other messages are on topics of their own, with the session's clock as log_time.
 """
 
 from __future__ import annotations
@@ -27,11 +30,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hrcreplay.egm.codec import AXES
+from hrcreplay.logs import messages
 from hrcreplay.records import Floats, HumanStates, SweptVolumes
 
 if TYPE_CHECKING:  # recorder and screen need nothing of the robot, whose imports take three quarters of their start
+    from hrcreplay.robot.control.control_step import Stop
     from hrcreplay.robot.control.separation import Obstacles
-    from hrcreplay.robot.control.stopping import Stop
 
 #: Where a session is: nobody may move yet, the first answers, on the way to the programme, the programme itself,
 #: braking for a reason of the watchdog, standing because of one.
@@ -310,3 +314,43 @@ def decode_decision(message: bytes) -> RecordedDecision:
 def motion_row(answered: RecordedDecision) -> MotionRow | None:
     """The commanded motion of a recorded decision; None without a reply."""
     return None if answered.row is None else MotionRow.of(answered.row)
+
+
+ROBOT_TOPIC = "/egm/robot"  #: datagrams of the robot, whatever is in them
+SENT_TOPIC = "/egm/correction"  #: datagrams that went to the robot
+UNSENT_TOPIC = "/egm/correction/unsent"  #: datagrams that would have gone: shadow mode
+STRAY_TOPIC = "/live/frame"  #: skeletons of no camera of the session, or not to be read
+EVENT_TOPIC = "/live/event"  #: JSON
+
+ENCODING = "hrcreplay.live"  #: of the messages that only the record has
+
+_BY_KIND = {
+    ROBOT: ROBOT_TOPIC,
+    PERCEPTION: "/live/look",
+    VOLUMES: "/live/volumes",
+    DECISION: "/live/answer",
+    TIMEOUT: "/live/silence",
+    EVENT: EVENT_TOPIC,
+}
+_KINDS = {topic: kind for kind, topic in _BY_KIND.items()} | {STRAY_TOPIC: SKELETON}
+
+
+def topic_and_data(message: bytes) -> tuple[str, bytes]:
+    """The topic of a message and what lies there; of a frame, the topic of those that belong to no camera."""
+    found = kind(message)
+    if found == REPLY:
+        sent, datagram = decode_reply(message)
+        return SENT_TOPIC if sent else UNSENT_TOPIC, datagram
+    return STRAY_TOPIC if found == SKELETON else _BY_KIND[found], body(message)
+
+
+def message_on(topic: str, t_ns: int, data: bytes) -> bytes | None:
+    """The message of the record that lies on a topic; None for what the log has beside the record."""
+    if topic in (SENT_TOPIC, UNSENT_TOPIC):
+        return encode_reply(t_ns, data, sent=topic == SENT_TOPIC)
+    if topic in _KINDS:
+        return _KINDS[topic] + encode_robot_packet(t_ns, data)[1:]
+    parts = topic.split("/")
+    if len(parts) == 4 and topic == messages.skeleton_topic(parts[2]):
+        return encode_skeleton(t_ns, data)
+    return None

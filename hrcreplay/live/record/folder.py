@@ -18,15 +18,15 @@ from hrcreplay.live import processes
 from hrcreplay.live.control.setup import job_of
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, MotionRow
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Motion
 from hrcreplay.run import build
 from hrcreplay.run.contact import write_contact
 from hrcreplay.run.job import Job
-from hrcreplay.run.prediction import store_volumes
 from hrcreplay.run.report import write_report
+from hrcreplay.run.stages import store_volumes
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import Columns, measurement_columns, motion_columns, state_columns
 from hrcreplay.store.run_folder import RunWriter, TableWriter

@@ -15,7 +15,7 @@ from foxglove import channels, messages
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.live.view.status_messages import Scene, SceneNames, Status, unpack
+from hrcreplay.live.view.status import Scene, SceneNames, Status, unpack
 from hrcreplay.records import Floats
 from hrcreplay.report.scene_messages import ROBOT, VOLUME, bones, capsule, colour, entity, points
 

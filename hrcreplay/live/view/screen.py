@@ -24,7 +24,7 @@ from rich.text import Text
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.live.processes import ControlChannel, ControlGoneError
-from hrcreplay.live.view.status_messages import CameraStatus, Status
+from hrcreplay.live.view.status import CameraStatus, Status
 
 _COLOUR = {"tracking": "green", "limited": "yellow", "braking": "bold red", "retreating": "magenta"}
 _STALE_S = 0.2  # as logs.gap_s: a camera silent for longer has a gap

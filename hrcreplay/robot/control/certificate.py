@@ -1,15 +1,20 @@
-"""Whether a motion keeps clear of the swept volumes from its first instant to its last. The only user of coal.
+"""Whether a motion keeps clear of the swept volumes from its first instant to its last, and the decision by that.
 
 By conservative advancement (Mirtich, 1996): between two positions of the axes no point of a link moves by more than the
 sum over the axes of its largest distance from the axis times the angle the axis turns. Where the link is further than
 that from a volume, the motion between is clear. The distance at a position is bounded from below by a plane between
 link and volume, found by coal; one pass over the vertices proves it, wherever the plane came from. Nothing is shared
 with the distances of the rows of Eq. (66i), so that a fault in them is no fault here.
+
+By induction from standstill no link touches the person while the robot moves, as long as the person stays inside the
+volumes of each tick until their horizon, the end of the stop that would follow. A robot that a volume has reached may
+retreat: then no point of a link comes nearer to any point of it, so that who touched it at rest is let go.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import coal
 import numpy as np
@@ -17,8 +22,20 @@ from numba import njit
 
 from hrcreplay.geometry.vectors import dot3, norm_n
 from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.control.control_step import (
+    BRAKING,
+    INSIDE,
+    LIMITED,
+    NO_HUMAN,
+    NOT_CERTIFIED,
+    NOT_FINITE,
+    RETREATING,
+    PlanSettings,
+    Proposal,
+    Stop,
+    Taken,
+)
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import Stop
 from hrcreplay.robot.model import RobotModel
 
 #: Rounding that moving away allows for [m^2/s].
@@ -337,3 +354,46 @@ def _gjk(segment: coal.Convex, hull: coal.Convex) -> tuple[float, Floats]:
     result = coal.DistanceResult()
     distance = coal.distance(segment, _PLACE, hull, _PLACE, request, result)
     return distance, np.asarray(result.normal)
+
+
+def decide(
+    robot: RobotModel,
+    going: Stop,
+    wanted: Sequence[Proposal] | int,
+    around: Obstacles,
+    horizon_s: float,
+    planes: Floats,
+    settings: PlanSettings,
+) -> tuple[Taken, Floats]:
+    """Takes a proposal that is certified, or goes on with the stop.
+
+    Args:
+        robot: The manipulator.
+        going: The stop that goes on where nothing else is taken; its row 0 is where the robot is.
+        wanted: The proposals of the method, the one it would like best first; or the reason why there is none.
+        around: The swept volumes of the tick.
+        horizon_s: Until when they hold [s].
+        planes: (s, l, 3) planes between links and limbs, of the tick before.
+        settings: Of the method.
+
+    Returns:
+        What is executed, and the planes for the next tick.
+    """
+    certify, inside = settings.certified, False
+    if not isinstance(wanted, int):
+        for stop, status in wanted:
+            if not certify:
+                return Taken(stop, status, 0, not stop.ticks and not going.ticks), planes
+            if (stop.ticks + 1) * settings.dt_s > horizon_s + 1e-9:
+                continue
+            verdict, planes = clear(
+                robot, going, stop, around, settings.plan.clearance_m, settings.dt_s, planes, settings.retreat_m
+            )
+            if verdict == CLEAR:
+                return Taken(stop, status, 0, certified=True), planes
+            if verdict == OPENING and (stop.ticks or going.ticks):
+                return Taken(stop, RETREATING, 0, certified=True), planes
+            inside = inside or verdict == OPENING
+        wanted = INSIDE if inside else NOT_CERTIFIED
+    held = not going.ticks and wanted not in (NO_HUMAN, NOT_FINITE)
+    return Taken(going.rest(), LIMITED if held else BRAKING, wanted, certify or not going.ticks), planes

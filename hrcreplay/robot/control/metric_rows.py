@@ -15,7 +15,7 @@ from numba import njit
 
 from hrcreplay.geometry.vectors import dot_n, norm_n
 from hrcreplay.records import Floats, Ints
-from hrcreplay.robot.control.approach_rows import Approach, worst_rows
+from hrcreplay.robot.control.separation import Approach, worst_rows
 
 #: Stands for a bound that there is none.
 NONE = 1e20

@@ -19,7 +19,6 @@ import proxsuite
 from scipy.optimize import nnls
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.approach_rows import Approach
 from hrcreplay.robot.control.metric_rows import (
     CLEAR,
     EMPTY,
@@ -37,6 +36,7 @@ from hrcreplay.robot.control.metric_rows import (
     next_row,
     residual,
 )
+from hrcreplay.robot.control.separation import Approach
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,13 +17,11 @@ from numba import njit
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.approach_rows import tick_rows, worst_rows
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Sight
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Sight, Stop, along_path
 from hrcreplay.robot.control.qp_controller import cartesian_bounds
-from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import Stop, along_path
+from hrcreplay.robot.control.separation import Obstacles, tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, RobotPose
-from hrcreplay.robot.programme.reference import Reference, place
+from hrcreplay.robot.task import Reference, place
 
 #: Rates that differ by no more are one.
 SAME = 1e-7

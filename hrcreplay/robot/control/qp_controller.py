@@ -21,13 +21,11 @@ from numba import njit
 from hrcreplay.geometry.vectors import to_vector
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.approach_rows import tick_rows
 from hrcreplay.robot.control.certificate import RETREAT_SPEED
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, Sight
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, Sight, axis_by_axis, straight
 from hrcreplay.robot.control.metric_rows import Limits
 from hrcreplay.robot.control.minimiser import Problem, Solution, minimise
-from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.stopping import axis_by_axis, straight
+from hrcreplay.robot.control.separation import Obstacles, tick_rows
 from hrcreplay.robot.model import RobotModel
 
 #: Bound on the rotation of the TCP for each unit of the bound on its translation [rad/m].

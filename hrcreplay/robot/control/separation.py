@@ -1,17 +1,20 @@
-"""Distances between the robot's links and the swept volumes of one tick.
+"""Distances between the robot's links and the swept volumes of one tick, and the speed limits from them, Eq. (12)-(16).
 
-The right-hand side of the safety constraints is corrected as docs/paper.md says.
+The right-hand side of the safety constraints is corrected as docs/paper.md says. Every vertex of every limb has rows;
+none is written down before a velocity breaks it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from hrcreplay.geometry.segment_hull_distance import distances
+from hrcreplay.geometry.distances import distances
+from hrcreplay.geometry.vectors import dot3
 from hrcreplay.records import Floats, Ints, SweptVolumes
 from hrcreplay.robot.model import RobotPose
 
@@ -100,3 +103,111 @@ def separation(pose: RobotPose, obstacles: Obstacles, clearance_m: Floats) -> Se
     """
     low, _, _ = distances(pose.ends_m, obstacles.vertices_m, obstacles.offsets)
     return Separation(low, clearance_m)
+
+
+class Approach(NamedTuple):
+    """What the approach rows of a tick are made of."""
+
+    ends_m: Floats  #: (s, 2, 3) ends of the links' axes [m]
+    J_ends: Floats  #: (s, 2, 3, nv) their position Jacobians [m/rad]
+    vertices_m: Floats  #: (m, 3) of all limbs [m]
+    offsets: Ints  #: (l + 1,) where each limb's vertices begin
+    boxes_m: Floats  #: (l, 2, 3) around each limb's vertices [m]
+    room_m2: Floats  #: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2]
+    per_speed: Floats  #: (s, l) what a link approaching at 1 m/s adds to the left-hand side of Eq. (14) [m s]
+    stop_s: float  #: T_s of Eq. (70), or how far ahead the rows look [s]
+
+
+#: A link and a limb that are nearer count as this far apart where a speed is made of a row [m].
+_LEAST_M = 1e-3
+
+
+def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, distance_m: Floats, stop_s: float) -> Approach:
+    """The approach rows of a tick, none of them written down.
+
+    Args:
+        pose: The robot.
+        obstacles: The swept volumes, all known.
+        room_m2: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2].
+        distance_m: (s, l) between the link's axis and the limb's hull [m].
+        stop_s: T_s of Eq. (70), or how far ahead the rows look [s].
+    """
+    per_speed = stop_s * np.maximum(distance_m, _LEAST_M)
+    around = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
+    return Approach(pose.ends_m, pose.J_ends, *around, room_m2, per_speed, stop_s)
+
+
+@njit(cache=True)
+def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, Floats, Floats]:
+    """The row of Eq. (16) that a velocity breaks most, for every pair and either end of the link; Eq. (66i), corrected.
+
+    The rows are linear in the vertex, so the worst vertex is the one furthest along the end's velocity: one pass
+    over the vertices checks them all, without any row being written down. For a vertex r and an end's velocity v,
+    Eq. (15), (16) times the joint velocity is T_s (r @ v + rest), and rest does not depend on r.
+
+    Args:
+        rows: Of the tick.
+        dq_next: (nv,) [rad/s].
+        above_m2: Rows that exceed their right-hand side by no more than this hold [m^2].
+
+    Returns:
+        For the n broken ones: ``which`` (n, 4) link, limb, row of Eq. (12), row of ``vertices_m``; ``A`` (n, nv)
+        [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2].
+    """
+    ends, J_ends, vertices, offsets, boxes, room, _, stop_s = rows
+    links, limbs = room.shape
+    which = np.empty((2 * links * limbs, 4), dtype=np.int64)
+    A, values = np.empty((len(which), len(dq_next))), np.empty(len(which))
+    n = 0
+    for s in range(links):
+        for end in range(2):  # Eq. (7)-(9), (11): linear along the link, so s = 0 and s = 1 bound all points between
+            v = _times(J_ends[s, end], dq_next)
+            rest = -dot3(ends[s, 0], v)  # Eq. (15): E_1 @ dq
+            if end == 1:
+                rest -= dot3(ends[s, 1] - ends[s, 0], _times(J_ends[s, 0], dq_next))
+            for k in range(limbs):
+                bound = room[s, k] + above_m2
+                if stop_s * (_box_top(boxes[k], v) + rest) <= bound:
+                    continue
+                best, top = offsets[k], -np.inf
+                for i in range(offsets[k], offsets[k + 1]):
+                    along = dot3(vertices[i], v)
+                    if along > top:
+                        best, top = i, along
+                value = stop_s * (top + rest)  # Eq. (66i), corrected: T_s belongs here
+                if value > bound:
+                    which[n] = s, k, end, best
+                    A[n] = stop_s * _row(ends[s], J_ends[s], vertices[best], end)
+                    values[n] = value
+                    n += 1
+    return which[:n], A[:n], values[:n]
+
+
+@njit(cache=True)
+def _row(ends: Floats, J_ends: Floats, vertex: Floats, end: int) -> Floats:
+    """(nv,) one row of E of Eq. (12), without T_s."""
+    row = np.zeros(J_ends.shape[2])
+    for j in range(len(row)):
+        for i in range(3):
+            row[j] += (vertex[i] - ends[0, i]) * J_ends[end, i, j]
+            if end == 1:
+                row[j] -= (ends[1, i] - ends[0, i]) * J_ends[0, i, j]
+    return row
+
+
+@njit(cache=True)
+def _box_top(box: Floats, v: Floats) -> float:
+    """How far along v a point of the box can lie."""
+    top = 0.0
+    for i in range(3):
+        top += max(box[0, i] * v[i], box[1, i] * v[i])
+    return top
+
+
+@njit(cache=True)
+def _times(J: Floats, dq: Floats) -> Floats:
+    v = np.zeros(3)
+    for i in range(3):
+        for j in range(len(dq)):
+            v[i] += J[i, j] * dq[j]
+    return v

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.motion import MotionState, MotionStep
+from hrcreplay.live.control import session_controller
 from hrcreplay.live.control.setup import build_controller
+from hrcreplay.live.control.stages import MotionState, MotionStep
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, TickEvent
 from hrcreplay.live.session import outcome
@@ -64,7 +64,7 @@ def test_a_step_that_cannot_be_prepared_fails_in_the_answer(monkeypatch: pytest.
     assert flight.controller.fault is None
     flight.fly(0.1)
     assert isinstance(flight.controller.fault, ZeroDivisionError)
-    assert [why for _, why in flight.controller.stops] == [watchdog.FAULT]
+    assert [why for _, why in flight.controller.stops] == [session_controller.FAULT]
 
 
 def test_no_two_looks_in_a_row_are_left_out() -> None:

@@ -10,9 +10,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.human.fusion import fuse
-from hrcreplay.live.control import watchdog
-from hrcreplay.live.control.perception import Observer
+from hrcreplay.live.control import session_controller
 from hrcreplay.live.control.setup import build_controller
+from hrcreplay.live.control.stages import Observer
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.logs.clean import PersonMemory
@@ -56,20 +56,20 @@ def after_start(signal: Signal, at_s: float, for_s: float = np.inf) -> dict[str,
 
 
 STOPS: dict[str, dict[str, Any]] = {
-    watchdog.INTERRUPTED: after_start(Signal.INTERRUPT, 2.0),
-    watchdog.TERMINATED: after_start(Signal.TERMINATE, 2.0),
-    watchdog.SESSION_OVER: after_start(Signal.DURATION, 2.0),
-    watchdog.RECORDING_OVER: after_start(Signal.PERSON_ENDED, 2.0),
-    watchdog.PERSON_DEAD: after_start(Signal.PERSON_DEAD, 2.0, 0.5),
-    watchdog.PERSON_LATE: after_start(Signal.PERSON_LATE, 2.0, 0.5),
-    watchdog.RECORDER_DEAD: after_start(Signal.RECORDER_DEAD, 2.0, 0.5),
-    watchdog.OVERRUN: after_start(Signal.OVERRUN, 2.0, 0.004),
-    watchdog.NO_FRAME: {"walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0)},
-    watchdog.UNCERTAIN: {
+    session_controller.INTERRUPTED: after_start(Signal.INTERRUPT, 2.0),
+    session_controller.TERMINATED: after_start(Signal.TERMINATE, 2.0),
+    session_controller.SESSION_OVER: after_start(Signal.DURATION, 2.0),
+    session_controller.RECORDING_OVER: after_start(Signal.PERSON_ENDED, 2.0),
+    session_controller.PERSON_DEAD: after_start(Signal.PERSON_DEAD, 2.0, 0.5),
+    session_controller.PERSON_LATE: after_start(Signal.PERSON_LATE, 2.0, 0.5),
+    session_controller.RECORDER_DEAD: after_start(Signal.RECORDER_DEAD, 2.0, 0.5),
+    session_controller.OVERRUN: after_start(Signal.OVERRUN, 2.0, 0.004),
+    session_controller.NO_FRAME: {"walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0)},
+    session_controller.UNCERTAIN: {
         "overrides": ("live.uncertain_m=0.012", "live.fresh_s=9"),
         "walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0),
     },
-    watchdog.TRACKING: {"faults": (Fault("teleport", 2.0, 0.5, angle_deg=20.0),)},
+    session_controller.TRACKING: {"faults": (Fault("teleport", 2.0, 0.5, angle_deg=20.0),)},
     "motors off": {"faults": (Fault("motors_off", 2.0, 0.5),)},
     "program stopped": {"faults": (Fault("program_stop", 2.0, 0.5),)},
     "EGM error": {"faults": (Fault("egm_error", 2.0),)},
@@ -96,7 +96,14 @@ def test_every_reason_of_the_watchdog_goes_on_with_the_certified_stop_and_holds(
 
 
 @pytest.mark.parametrize(
-    "reason", [watchdog.NO_FRAME, watchdog.OVERRUN, "motors off", "program stopped", watchdog.TRACKING]
+    "reason",
+    [
+        session_controller.NO_FRAME,
+        session_controller.OVERRUN,
+        "motors off",
+        "program stopped",
+        session_controller.TRACKING,
+    ],
 )
 def test_it_goes_on_by_a_setting_only_and_from_where_it_stands(reason: str) -> None:
     kept = STOPS[reason]
@@ -116,15 +123,15 @@ def test_it_tells_what_holds_it_once_another_reason_has_taken_over() -> None:
     flight = Flight(
         walk=lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0), signals=signals, overrides=("live.resume=true",)
     ).fly(5.0)
-    assert [why for _, why in flight.controller.stops] == [watchdog.NO_FRAME]
+    assert [why for _, why in flight.controller.stops] == [session_controller.NO_FRAME]
     told = {answer.t_ns: answer.reason for answer in flight.answers if answer.row is not None}
-    assert [reason for t_ns, reason in told.items() if t_ns < BEGIN_NS + 2.45e9][-1] == watchdog.NO_FRAME
-    assert {reason for t_ns, reason in told.items() if t_ns > BEGIN_NS + 2.7e9} == {watchdog.RECORDER_DEAD}
+    assert [reason for t_ns, reason in told.items() if t_ns < BEGIN_NS + 2.45e9][-1] == session_controller.NO_FRAME
+    assert {reason for t_ns, reason in told.items() if t_ns > BEGIN_NS + 2.7e9} == {session_controller.RECORDER_DEAD}
 
 
 def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
     flight = Flight(faults=(Fault("silence", 2.0, 0.5),), overrides=("live.resume=true",)).fly(6.0)
-    assert [why for _, why in flight.controller.stops] == [watchdog.SILENT]
+    assert [why for _, why in flight.controller.stops] == [session_controller.SILENT]
     assert flight.phases().count("echo") == 2
     replies = [answer for answer in flight.answers if answer.phase == codec.ECHO]
     assert_array_equal([answer.row.dq for answer in replies if answer.row is not None], 0.0)
@@ -142,7 +149,7 @@ class Suspended(Flight):
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_silence_that_only_the_next_packet_tells_of_stops_the_robot_too(resume: bool) -> None:
     flight = Suspended(overrides=(f"live.resume={str(resume).lower()}",)).fly(6.0)
-    assert [why for _, why in flight.controller.stops] == [watchdog.SILENT]
+    assert [why for _, why in flight.controller.stops] == [session_controller.SILENT]
     assert flight.phases().count("echo") == 2
     assert flight.phases().count("approach") == 1 + resume  # it goes on only where that was asked for
     steps_keep_the_limits(flight)
@@ -212,7 +219,7 @@ def test_a_bug_in_the_stages_brakes_the_robot_and_is_told(monkeypatch: pytest.Mo
     before = len(flight.said())
     flight.fly(1.0)
     assert isinstance(flight.controller.fault, ZeroDivisionError)
-    assert [why for _, why in flight.controller.stops] == [watchdog.FAULT]
+    assert [why for _, why in flight.controller.stops] == [session_controller.FAULT]
     assert not moved(flight, after=before + 100)
     assert len(flight.said()) > before + 200
 

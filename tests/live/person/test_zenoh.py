@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.live.person import zenoh_source
-from hrcreplay.live.person.zenoh_source import CameraSubscription
+from hrcreplay.live.person import source
+from hrcreplay.live.person.source import CameraSubscription
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.messages import AZURE_INDEX, OPENNI_JOINTS
 from hrcreplay.records import POINTS
@@ -151,7 +151,7 @@ def test_what_cannot_be_decoded_is_counted_and_told_at_powers_of_ten() -> None:
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zenoh", None)
     with pytest.raises(SettingsError, match=r"eclipse-zenoh is not installed; would be right: pip install 'hrcreplay"):
-        zenoh_source.open_session({"keys": {}})
+        source.open_session({"keys": {}})
 
 
 # --- sessions ---
@@ -271,7 +271,7 @@ def test_it_ends_in_order_while_frames_pour_in() -> None:
     with Human("--zenoh", section(endpoint, xtion={"key": "hrc/xtion"})) as human:
         human.until(b"N", text=b"ready")
         human.go(human.now_ns())
-        with zenoh_source.open_session({"connect": [endpoint]}) as cameras:
+        with source.open_session({"connect": [endpoint]}) as cameras:
             over = Event()
 
             def pour() -> None:

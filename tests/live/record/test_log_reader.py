@@ -8,7 +8,7 @@ import pytest
 
 from hrcreplay.errors import LogError
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.logs.writer import LogWriter
 from tests.live import made
 from tests.logs import own

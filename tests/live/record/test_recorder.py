@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from hrcreplay.live.record import codec, recorder, topics
-from hrcreplay.live.record.log_reader import SessionLogReader
+from hrcreplay.live.record import codec, recorder
+from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.logs.reader import open_log
 from tests.live import made
 
@@ -72,9 +72,9 @@ def test_datagrams_lie_raw_on_their_topics_even_garbage(tmp_path: Path, messages
 def test_skeletons_that_cannot_be_read_are_on_record(tmp_path: Path) -> None:
     messages = [codec.encode_event(5, made.START), codec.encode_skeleton(7, b"\xff\xff"), codec.encode_skeleton(8, b"")]
     path = made.record(tmp_path / "log.mcap", messages)
-    assert [row for row in _by_hand(path) if row[0] == topics.STRAY] == [
-        (topics.STRAY, 7, 7, b"\xff\xff"),
-        (topics.STRAY, 8, 8, b""),
+    assert [row for row in _by_hand(path) if row[0] == codec.STRAY_TOPIC] == [
+        (codec.STRAY_TOPIC, 7, 7, b"\xff\xff"),
+        (codec.STRAY_TOPIC, 8, 8, b""),
     ]
     assert list(SessionLogReader(path).messages()) == messages
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from hrcreplay.live.processes import ControlChannel
 from hrcreplay.live.view.screen import Lines, clock, line, panel, serve
-from hrcreplay.live.view.status_messages import RecorderStatus, Status
+from hrcreplay.live.view.status import RecorderStatus, Status
 from tests.live.statuses import status
 
 

@@ -16,8 +16,8 @@ from numba import njit
 
 from hrcreplay.records import LIMBS, Floats, SweptVolumes
 from hrcreplay.robot.control.certificate import NO_PLANES, clear
+from hrcreplay.robot.control.control_step import Stop, at_rest, axis_by_axis, straight
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.control.stopping import Stop, at_rest, axis_by_axis, straight
 from hrcreplay.robot.model import RobotModel, irb140
 
 DT_S, TOOL_M = 0.004, 0.10

@@ -7,8 +7,8 @@ from numpy.testing import assert_allclose
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.programme.path import approach
-from hrcreplay.robot.programme.reference import STEP_S, _cubic
+from hrcreplay.robot.path import approach
+from hrcreplay.robot.task import STEP_S, _cubic
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.approach_rows import tick_rows, worst_rows
 from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.control.qp_controller import RAD_PER_M, cartesian_bounds, joint_bounds
-from hrcreplay.robot.control.separation import obstacles
+from hrcreplay.robot.control.separation import obstacles, tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, irb140
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes

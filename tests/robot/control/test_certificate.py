@@ -8,10 +8,9 @@ from scipy.optimize import nnls
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import certificate
-from hrcreplay.robot.control.approach_rows import tick_rows, worst_rows
 from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, clear, separating_normal
-from hrcreplay.robot.control.control_step import RobotState, observe
-from hrcreplay.robot.control.stopping import Stop, at_rest, axis_by_axis, straight
+from hrcreplay.robot.control.control_step import RobotState, Stop, at_rest, axis_by_axis, observe, straight
+from hrcreplay.robot.control.separation import tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, irb140
 from tests.robot.control.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, random_step, run
 

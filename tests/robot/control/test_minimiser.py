@@ -11,9 +11,9 @@ import pytest
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import minimiser
-from hrcreplay.robot.control.approach_rows import Approach
 from hrcreplay.robot.control.metric_rows import Limits, Metric
 from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, Unsolved, minimise
+from hrcreplay.robot.control.separation import Approach
 from hrcreplay.robot.model import RobotModel
 from tests.robot.swinging import STOP_S, dense, random_tick, robot
 

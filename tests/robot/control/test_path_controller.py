@@ -9,14 +9,12 @@ import pytest
 
 from hrcreplay.records import Floats, SweptVolumes
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import PlanSettings, Step
+from hrcreplay.robot.control.control_step import PlanSettings, Step, along_path
 from hrcreplay.robot.control.path_controller import PathState, rates
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.control.stopping import along_path
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.reference import Reference
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import Reference, parse_task
 from hrcreplay.run.followers import ScalingFollower
 from hrcreplay.settings.sections import Plan
 from tests.robot.checker import violation

@@ -10,11 +10,10 @@ import pytest
 from hrcreplay.records import STATUSES, Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, OPENING, REFUSED, clear
-from hrcreplay.robot.control.control_step import PlanSettings, Step
-from hrcreplay.robot.control.stopping import at_rest, straight
+from hrcreplay.robot.control.control_step import PlanSettings, Step, at_rest, straight
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import parse_task
 from hrcreplay.run.followers import QpFollower
 from hrcreplay.settings.sections import Plan
 from tests.robot.control.random_stops import (

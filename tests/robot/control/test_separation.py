@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from hrcreplay.geometry.segment_hull_distance import EXACT_M, distances
+from hrcreplay.geometry.distances import EXACT_M, distances
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import separation as module
 from hrcreplay.robot.control.separation import obstacles, separation

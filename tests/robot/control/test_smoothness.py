@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.control_step import PlanSettings, RobotState, observe
+from hrcreplay.robot.control.control_step import PlanSettings, RobotState, axis_by_axis, observe
 from hrcreplay.robot.control.minimiser import Solution, minimise
 from hrcreplay.robot.control.qp_controller import Target, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.control.stopping import axis_by_axis
 from hrcreplay.robot.model import RobotModel
 from tests.robot.people import cloud, volumes
 from tests.robot.swinging import DT_S, HOME, SETTINGS, STOP_S, asked, dense, robot

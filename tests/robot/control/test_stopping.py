@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.stopping import Stop, along_path, at_rest, axis_by_axis, straight
+from hrcreplay.robot.control.control_step import Stop, along_path, at_rest, axis_by_axis, straight
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.programme.path import programmed
-from hrcreplay.robot.programme.reference import Reference
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot.path import programmed
+from hrcreplay.robot.task import Reference, parse_task
 
 DT_S = 0.004
 

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, from_urdf
-from hrcreplay.robot.programme.inverse_kinematics import Missed, solve
-from hrcreplay.robot.programme.reference import STEP_S, Reference
+from hrcreplay.robot.task import STEP_S, Missed, Reference, solve
 from tests.robot.tasks import ABOVE, BOX, HOME, RACK, pick_and_place, plan, robot
 
 __all__ = ["pick_and_place", "robot"]  # fixtures

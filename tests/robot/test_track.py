@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 from hrcreplay.errors import LogError
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, from_urdf
-from hrcreplay.robot.programme.path import recorded
-from hrcreplay.robot.programme.reference import STEP_S
+from hrcreplay.robot.path import recorded
+from hrcreplay.robot.task import STEP_S
 from tests.realdata import data_path
 from tests.robot.tasks import robot
 

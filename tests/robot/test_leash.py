@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from hrcreplay.robot.programme.reference import Reference, advance
+from hrcreplay.robot.task import Reference, advance
 from hrcreplay.settings.sections import Plan
 from tests.robot.tasks import pick_and_place, robot
 

@@ -18,9 +18,7 @@ from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.geometry.vectors import to_vector
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.programme.inverse_kinematics import Missed, descend, solve
-from hrcreplay.robot.programme.reference import STEP_S, Reference
-from hrcreplay.robot.programme.task import Task, Waypoint
+from hrcreplay.robot.task import STEP_S, Missed, Reference, Task, Waypoint, descend, solve
 
 #: Limits rise to their full acceleration in this time: jerk limit = acceleration limit / RAMP_S [s].
 RAMP_S = 0.1

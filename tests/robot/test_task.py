@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.robot.programme import task as task_module
-from hrcreplay.robot.programme.task import parse_task
+from hrcreplay.robot import task as task_module
+from hrcreplay.robot.task import parse_task
 
 
 def example() -> dict[str, Any]:

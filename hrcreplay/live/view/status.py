@@ -1,18 +1,115 @@
-"""Sends the status of the control loop to the screen process, ten times a second."""
+"""The status and the 3-D scene of a session: messages from control to the screen process, and what sends them.
+
+``S`` + a Status as JSON, ten times a second; what is not known is null, never NaN. For the scene ``J`` + its
+SceneNames as JSON once, and ``P`` + a packed Scene.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import struct
 from collections import Counter
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypedDict
 
-from hrcreplay.human.model import skeleton
-from hrcreplay.live.control.loop import Loop
+import numpy as np
+
+from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES
-from hrcreplay.live.view import status_messages
-from hrcreplay.live.view.status_messages import CameraStatus, Latency, Status
-from hrcreplay.records import STATUSES
+from hrcreplay.records import POINTS, STATUSES, Floats, SweptVolumes
+
+if TYPE_CHECKING:  # the screen process needs nothing of the loop, whose imports take most of its start
+    from hrcreplay.live.control.loop import Loop
+
+
+class Latency(TypedDict):
+    """From the robot's packet in to our reply out, over the whole session so far [us]."""
+
+    p50: float
+    p99: float
+    p99_9: float
+
+
+class CameraStatus(TypedDict):
+    """A camera of the session."""
+
+    name: str
+    age_s: float | None  #: from the capture of its newest frame until now
+    rate_hz: float  #: frames in the last second
+
+
+class RecorderStatus(TypedDict):
+    """State of the recorder process."""
+
+    alive: bool
+    dropped: int  #: messages that it could not take
+
+
+class Status(TypedDict):
+    """A session at one instant."""
+
+    t_s: float  #: since the session's start
+    phase: str  #: of records.PHASES
+    sending: bool  #: False: shadow mode, nothing goes to the robot
+    robot: str | None  #: address of the robot
+    rate_hz: float  #: answers in the last second
+    latency_us: Latency | None
+    distance_m: float | None  #: smallest separation, surface to surface
+    limb: str | None  #: of the nearest pair
+    link: str | None
+    tcp_speed: float | None  #: commanded [m/s]
+    status: str | None  #: of hrcreplay.records.STATUSES
+    reason: str  #: why it brakes; empty where it does not
+    cameras: list[CameraStatus]
+    stops: dict[str, int]  #: reasons of the session's stops so far, in order of their first time, with their number
+    recorder: RecorderStatus
+    note: str  #: the latest remark
+
+
+_HEAD = struct.Struct("<qH")
+
+
+class SceneNames(TypedDict):
+    """Names and radii that stay the same for a session."""
+
+    limbs: list[str]  #: of the swept volumes
+    links: list[str]  #: of the robot's segments
+    radii_m: list[float]  #: of the robot's segments
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """An instant of a session, in the world."""
+
+    t_ns: int
+    points_m: Floats  #: (20, 3) the fused person; NaN where the model has no say
+    ends_m: Floats  #: (s, 2, 3) both ends of the robot's segments, as RobotPose has them
+    volumes: SweptVolumes  #: of a single tick
+
+
+def pack(t_ns: int, points_m: Floats, ends_m: Floats, volumes: bytes) -> bytes:
+    """The payload of ``P``, of the fields of a Scene.
+
+    Args:
+        t_ns: Instant of the perception [ns].
+        points_m: (20, 3) fused person, world [m]; NaN where the model has no such point.
+        ends_m: (s, 2, 3) both ends of the robot's s segments, world [m].
+        volumes: Swept volumes of one tick, as ``codec.encode_volumes`` packs them for the record.
+    """
+    return b"".join([_HEAD.pack(t_ns, len(ends_m)), points_m.tobytes(), ends_m.tobytes(), volumes])
+
+
+def unpack(data: bytes, limbs: tuple[str, ...]) -> Scene:
+    """The inverse of ``pack``; the volumes' method does not travel."""
+    t_ns, segments = _HEAD.unpack_from(data)
+    at = _HEAD.size
+    points = np.frombuffer(data, "<f8", 3 * len(POINTS), at).reshape(-1, 3)
+    at += points.nbytes
+    ends = np.frombuffer(data, "<f8", 6 * segments, at).reshape(-1, 2, 3)
+    at += ends.nbytes
+    return Scene(t_ns, points, ends, codec.decode_volumes(data[at:], limbs, "")[0])
+
 
 _EVERY_NS = 100_000_000
 _SECOND_NS = 1_000_000_000
@@ -31,7 +128,7 @@ class StatusPublisher:
         self._rates: dict[str, float] = {}
         if in_3d:
             radii = [segment.radius_m for segment in loop.controller.setup.robot.segments]
-            cast = status_messages.SceneNames(limbs=names["limbs"], links=names["links"], radii_m=radii)
+            cast = SceneNames(limbs=names["limbs"], links=names["links"], radii_m=radii)
             self._send(b"J" + json.dumps(cast).encode())
 
     def publish(self, *, last: bool = False) -> None:
@@ -54,9 +151,11 @@ class StatusPublisher:
         perception, answer, volumes = self._loop.controller.perception, self._loop.last, self._loop.stored
         if perception is None or answer is None or answer.row is None or volumes is None:
             return
+        from hrcreplay.human.model import skeleton  # of the process that sends alone, which has it already
+
         points = skeleton(perception.states.p, perception.states.lengths_m)[0]
         pose = self._loop.controller.setup.robot.pose(answer.row.q, answer.row.dq)
-        self._send(b"P" + status_messages.pack(perception.t_ns, points, pose.ends_m, volumes))
+        self._send(b"P" + pack(perception.t_ns, points, pose.ends_m, volumes))
 
     def _count(self, now_ns: int) -> None:
         """Rates of the last second."""

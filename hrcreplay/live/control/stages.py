@@ -1,0 +1,200 @@
+"""The stages of a live session, one update at a time: skeletons to swept volumes, and the next step of the robot.
+
+The robot goes along the approach, along the programme, or to a stop; its steps are pure functions.
+
+The skeletons that are decoded here are those that are recorded, and they are cleaned as a reader of the log will clean
+them. What the process of the person has cleaned before is not enough: the message rounds to 32 bits, by which a
+skeleton may become that of the frame before it, and a capture is judged by the session's clock only here.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from hrcreplay.human.fusion import fuse
+from hrcreplay.live.record.codec import Perception
+from hrcreplay.logs.clean import Cleaner, PersonMemory
+from hrcreplay.logs.decoders import own_row
+from hrcreplay.logs.messages import Undecodable
+from hrcreplay.logs.skeleton_pb2 import Skeleton
+from hrcreplay.records import CameraFrames, Floats, HumanStates
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.control_step import (
+    PlanSettings,
+    RobotState,
+    Step,
+    Stop,
+    Taken,
+    axis_by_axis,
+    made,
+    straight,
+)
+from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.path import approach
+from hrcreplay.robot.task import Reference
+from hrcreplay.run.build import FusionStage, PredictionStage
+from hrcreplay.run.followers import Follower, Predict
+from hrcreplay.run.stages import NS, no_frames
+from hrcreplay.settings.sections import Live
+
+
+class Observer:
+    """Stages 1 and 2, updated with the skeletons that have come since the update before."""
+
+    def __init__(
+        self, fusion_stage: FusionStage, prediction_stage: PredictionStage, cameras: tuple[str, ...], gap_s: float
+    ) -> None:
+        self._fusion_stage = fusion_stage
+        self._prediction_stage = prediction_stage
+        self._cameras = cameras
+        self._nothing = no_frames(cameras)
+        self._fusion = fuse.start(cameras)
+        self._memory = PersonMemory()
+        self.counts: Counter[str] = Counter()
+        self._cleaner = Cleaner(cameras, gap_s, self.counts)
+        self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
+
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes], horizon_s: float) -> Perception:
+        """Fused person and swept volumes at ``t_ns``, which must be later than that of the update before.
+
+        Args:
+            t_ns: By the session's clock; the arrival of all skeletons of this update [ns].
+            skeletons: Serialised Skeleton messages. What cannot be read is counted and left out.
+            horizon_s: Until when the volumes must hold, the latency aside [s].
+        """
+        frames = self._frames(t_ns, skeletons)
+        measured = self._nothing
+        if frames is not None:
+            self._memory, measured, found = self._fusion_stage.measure(frames, self._memory)
+            self.counts.update(found)
+            for camera, capture_ns in zip(measured.camera.tolist(), measured.capture_ns.tolist(), strict=True):
+                self.newest_ns[self._cameras[camera]] = capture_ns
+        ticks = np.array([t_ns])
+        self._fusion, states, events, _ = fuse.fuse(
+            self._fusion, ticks, measured, self._fusion_stage.filter, self._fusion_stage.limits
+        )
+        self.counts.update(events)
+        volumes = self._prediction_stage.volumes(states, horizon_s)
+        return Perception(t_ns, states, volumes, obstacles(volumes, 0, horizon_s), horizon_s)
+
+    def present(self, states: HumanStates) -> Obstacles:
+        """Where the person may be now, for ``ssm``, which does not look ahead."""
+        return obstacles(self._prediction_stage.volumes(states, 0.0), 0)
+
+    def age_s(self, t_ns: int) -> float:
+        """How old the newest frame of the person is; inf before the first [s]."""
+        return (t_ns - max(self.newest_ns.values())) / NS if self.newest_ns else float("inf")
+
+    def _frames(self, t_ns: int, skeletons: Sequence[bytes]) -> CameraFrames | None:
+        for data in skeletons:
+            try:
+                skeleton = Skeleton.FromString(data)
+                row = own_row(skeleton, skeleton.camera, skeleton.camera)
+            except (DecodeError, Undecodable):
+                self.counts["skeletons_unreadable"] += 1
+                continue
+            if row.camera not in self._cameras:
+                self.counts["skeletons_of_unknown_cameras"] += 1
+                continue
+            # a camera whose clock is ahead has seen nothing of the future
+            self._cleaner.add(row._replace(capture_ns=min(row.capture_ns or t_ns, t_ns)), t_ns)
+        return self._cleaner.flush()
+
+
+@dataclass(frozen=True)
+class ControlSetup:
+    """Everything that the decisions of a session depend on beside its inputs."""
+
+    robot: RobotModel
+    programme: Reference
+    plan: PlanSettings
+    follow: Callable[[Reference, float], Follower]  #: a robot at a programmed time of a path
+    waypoint_m: float  #: the approach is over when the TCP is this close to its end [m]
+    approach_speed: float  #: share of the axes' top speeds on the way to the programme
+    bounds: Live
+    memory_s: float  #: a person unseen for longer counts as unknown [s]
+    sending: bool  #: False in shadow mode: the robot does not follow
+
+    def stop_from(self, state: RobotState) -> Stop:
+        """The stop of a robot whose last one ended elsewhere: it was held at a limit, or only echoed."""
+        brake = straight if self.plan.certified else axis_by_axis
+        # a copy: for an array that is read-only numba would compile the kernel anew, while the robot waits
+        return brake(state.q.copy(), state.dq.copy(), self.robot.ddq_max, self.plan.dt_s)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionState:
+    """State of the commanded motion after an answer."""
+
+    state: RobotState
+    programme_s: float  #: of the programme
+    stop: Stop  #: what goes on where no better step is certified; its row 0 is ``state``
+    follower: Follower | None = None  #: None: it stands, or brakes
+    arrived: bool = False  #: whether it follows the programme, not the way to it
+
+
+class MotionStep(NamedTuple):
+    """The step of one tick, and the state of the motion after it."""
+
+    reference_m: Floats
+    reference_speed: float
+    step: Step
+    after: MotionState
+
+
+def start_approach(setup: ControlSetup, motion: MotionState) -> MotionState:
+    """Starts the approach from where the robot stands to the point that its programme has reached."""
+    goal = setup.programme.sample(motion.programme_s).q
+    follower = setup.follow(approach(setup.robot, motion.state.q, goal, setup.approach_speed), 0.0)
+    follower.take_over(motion.stop)
+    return replace(motion, follower=follower, arrived=False)
+
+
+def follow(setup: ControlSetup, motion: MotionState, predict: Predict) -> MotionStep:
+    """One tick along the approach or the programme.
+
+    Raises:
+        ValueError: No approach was started.
+    """
+    if motion.follower is None:
+        raise ValueError("follow: the robot has not set out")
+    follower = copy(motion.follower)
+    tick = follower.step(predict)
+    after = replace(motion, state=tick.step.next, stop=tick.step.stop, follower=follower)
+    if motion.arrived:
+        after = replace(after, programme_s=tick.programme_s)
+    elif _at_the_end(setup, follower):
+        follower = setup.follow(setup.programme, motion.programme_s)
+        follower.take_over(tick.step.stop)
+        after = replace(after, follower=follower, arrived=True)
+    return MotionStep(tick.point.T_world_tcp[:3, 3], float(np.linalg.norm(tick.point.twist[:3])), tick.step, after)
+
+
+def _at_the_end(setup: ControlSetup, follower: Follower) -> bool:
+    """Whether the approach has come to its end."""
+    if follower.s_s < follower.reference.duration_s:
+        return False
+    goal = follower.reference.sample(follower.s_s).T_world_tcp[:3, 3]
+    pose = setup.robot.pose(follower.state.q, follower.state.dq)
+    return float(np.linalg.norm(pose.T_world_tcp[:3, 3] - goal)) <= setup.waypoint_m
+
+
+def brake(setup: ControlSetup, motion: MotionState, predict: Predict) -> MotionStep:
+    """The stop that was certified goes on; a robot that stands stays."""
+    robot, plan, state = setup.robot, setup.plan, motion.state
+    horizon_s = plan.horizon_s(motion.stop)
+    with np.errstate(all="ignore"):
+        seen = control_step.observe(robot, state, predict(horizon_s), plan.plan.clearance_m)
+    going = Taken(motion.stop.rest(), control_step.BRAKING, 0, plan.certified or not motion.stop.ticks)
+    step = made(seen, motion.stop, going, horizon_s, plan.dt_s)
+    point = setup.programme.sample(motion.programme_s)
+    after = MotionState(step.next, motion.programme_s, step.stop)
+    return MotionStep(point.T_world_tcp[:3, 3], 0.0, step, after)

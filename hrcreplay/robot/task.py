@@ -1,0 +1,393 @@
+"""The programmed task: waypoints, joint positions that reach them, and the reference, which is the path over time.
+
+It is what the robot would do if nobody were there.
+
+The structure of the waypoints is a task file (TOML) and the task that travels inside a log. In full::
+
+    name = "pick and place"
+    repeat = true                     # for the whole log; or: cycles = 3 (default 1)
+    speed = 0.6                       # share of every axis' top speed, in (0, 1]
+    acceleration = 0.5                # share of every axis' acceleration limit, in (0, 1]
+    tcp_speed_m_per_s = 1.0           # no move carries the TCP faster [m/s]
+    tcp_acceleration_m_per_s2 = 4.0   # of linear moves [m/s^2]
+
+    [[waypoints]]                     # the first is where the robot starts
+    name = "home"
+    joints_deg = [0, 0, 0, 0, 90, 0]  # or joints_rad
+
+    [[waypoints]]
+    name = "above the rack"
+    position_m = [0.45, 0.30, 0.25]   # TCP in the robot's base frame [m]
+    rpy_deg = [180, 0, 0]             # R = Rz(yaw) Ry(pitch) Rx(roll); or quaternion_wxyz = [0, 1, 0, 0]
+    move = "joint"                    # how to get here: "joint" (default) or "linear"
+
+    [[waypoints]]
+    name = "rack"
+    position_m = [0.45, 0.30, 0.10]
+    rpy_deg = [180, 0, 0]
+    move = "linear"
+    tcp_speed_m_per_s = 0.25          # this move only; at most the task's
+    dwell_s = 0.5                     # the robot stands this long before it goes on [s]
+
+The robot stops at every waypoint, and stands at the first for its dwell before it starts. ``cycles`` times from the
+first to the last; between two cycles it goes back to the first by the first's own ``move``. On a straight line the TCP
+turns by at most 2 pi rad for every 2.5 m of the TCP speed, so a pure turn takes its time too.
+
+Inverse kinematics is damped least squares from fixed seeds, which make it deterministic: the same pose, coming from the
+same place, has the same answer.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from numba import njit
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.geometry.vectors import to_vector
+from hrcreplay.records import Floats
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.settings.sections import Plan
+
+_Share = Annotated[float, Field(gt=0, le=1)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Three = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+_Quaternion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class Waypoint(_Strict):
+    """A place where the robot stops, as joint angles or as a pose of the TCP in the robot's base frame."""
+
+    name: str = ""
+    """Shown in messages."""
+    joints_deg: tuple[FiniteFloat, ...] | None = None
+    """An angle an axis [deg]."""
+    joints_rad: tuple[FiniteFloat, ...] | None = None
+    """An angle an axis [rad]."""
+    position_m: _Three | None = None
+    """TCP in the base frame [m]."""
+    rpy_deg: _Three | None = None
+    """Its orientation, Rz(yaw) Ry(pitch) Rx(roll) [deg]."""
+    quaternion_wxyz: _Quaternion | None = None
+    """Its orientation, scalar first."""
+    move: Literal["joint", "linear"] = "joint"
+    """How the robot gets here: every axis on its own way, or the TCP on a straight line."""
+    tcp_speed_m_per_s: _Positive | None = None
+    """Top speed of the TCP on the way here; none: the task's [m/s]."""
+    dwell_s: Annotated[float, Field(ge=0, le=3600)] = 0.0
+    """How long the robot stands here [s]."""
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Waypoint:
+        places = [n for n in ("joints_deg", "joints_rad", "position_m") if getattr(self, n) is not None]
+        turns = [n for n in ("rpy_deg", "quaternion_wxyz") if getattr(self, n) is not None]
+        if len(places) != 1:
+            raise ValueError(f"found {_listed(places)}; give exactly one of joints_deg, joints_rad, position_m")
+        if (places == ["position_m"]) != (len(turns) == 1) or len(turns) > 1:
+            raise ValueError(
+                f"found {places[0]} with {_listed(turns)}; "
+                "position_m takes one of rpy_deg, quaternion_wxyz, and joints take none"
+            )
+        if self.quaternion_wxyz is not None and sum(v * v for v in self.quaternion_wxyz) < 1e-6:
+            raise ValueError(f"found quaternion_wxyz {list(self.quaternion_wxyz)}; its length must not be 0")
+        return self
+
+
+class Task(_Strict):
+    """The waypoints of a cycle and how fast to pass them."""
+
+    name: str = "task"
+    """Shown in the report."""
+    waypoints: Annotated[tuple[Waypoint, ...], Field(min_length=2)]
+    """In order; the first is the start."""
+    repeat: bool = False
+    """Start over until the log ends."""
+    cycles: Annotated[int, Field(ge=1)] = 1
+    """How often to run the waypoints, unless they repeat."""
+    speed: _Share = 0.5
+    """Share of every axis' top speed."""
+    acceleration: _Share = 0.5
+    """Share of every axis' acceleration limit."""
+    tcp_speed_m_per_s: _Positive = 1.0
+    """Top speed of the TCP [m/s]."""
+    tcp_acceleration_m_per_s2: _Positive = 4.0
+    """Top acceleration of the TCP on linear moves [m/s^2]."""
+
+    @model_validator(mode="after")
+    def _repeat_or_cycles(self) -> Task:
+        if self.repeat and "cycles" in self.model_fields_set:
+            raise ValueError(f"found repeat = true and cycles = {self.cycles}; give one of them")
+        return self
+
+    def label(self, index: int) -> str:
+        """How messages call a waypoint, counted from 1."""
+        name = self.waypoints[index].name
+        return f"waypoint {index + 1}" + (f" ({name})" if name else "")
+
+
+def parse_task(table: dict[str, Any], where: str = "task") -> Task:
+    """A task from the structure of its file.
+
+    Args:
+        table: As ``tomllib`` reads the example above.
+        where: What messages begin with, e.g. the file's path.
+
+    Raises:
+        SettingsError: An unknown key, or a value that cannot be used; names the waypoint.
+    """
+    try:
+        return Task.model_validate(table)
+    except ValidationError as error:
+        raise SettingsError(f"{where}: {_first_problem(error)}") from error
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    at, key = _place(problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        known = Waypoint.model_fields if at else Task.model_fields
+        return f"{at}unknown key {key!r}; known here: {', '.join(known)}"
+    if problem["type"] == "missing":
+        return f"{at}{key} is missing; the task needs it"
+    if problem["type"] == "value_error":
+        return f"{at}{problem['ctx']['error']}"
+    wanted = problem["msg"].removeprefix("Input ").replace("valid tuple", "list").replace("valid dictionary", "table")
+    return f"{at}{key}: found {problem['input']!r}; it {wanted}"
+
+
+def _place(loc: tuple[int | str, ...]) -> tuple[str, str]:
+    """'waypoint 3: ' (or nothing) and the key behind it."""
+    if len(loc) > 1 and loc[0] == "waypoints":
+        return f"waypoint {int(loc[1]) + 1}: ", ".".join(str(part) for part in loc[2:]) or "waypoint"
+    return "", ".".join(str(part) for part in loc)
+
+
+def _listed(names: list[str]) -> str:
+    return " and ".join(names) or "none"
+
+
+_SEEDS = 16
+_ITERATIONS = 80
+_TOLERANCE = 1e-9  # of position [m] and orientation [rad]
+
+
+@dataclass(frozen=True)
+class Missed:
+    """No joint position was found: how near the best one came."""
+
+    position_m: float
+    angle_rad: float
+
+
+def solve(model: RobotModel, T_world_tcp: Floats, near: Floats) -> Floats | Missed:
+    """The joint position within the limits that reaches a pose with the least way, in time, from ``near``.
+
+    Args:
+        model: The robot.
+        T_world_tcp: (4, 4) pose to reach, world frame [m].
+        near: (nv,) where the robot comes from [rad].
+
+    Returns:
+        (nv,) [rad], or how near the best attempt came.
+    """
+    found: list[Floats] = []
+    missed = Missed(np.inf, np.inf)
+    for seed in (near, *_seeds(model)):
+        q, error = descend(model, T_world_tcp, seed)
+        if np.abs(error).max() <= _TOLERANCE:
+            found.append(_unwind(model, q, near))
+        else:
+            missed = min(
+                missed,
+                Missed(float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))),
+                key=lambda m: m.position_m + m.angle_rad,
+            )
+    return min(found, key=lambda q: float(np.abs((q - near) / model.dq_max).max())) if found else missed
+
+
+def descend(model: RobotModel, T_world_tcp: Floats, seed: Floats) -> tuple[Floats, Floats]:
+    """Damped least squares within the limits from one seed.
+
+    Args:
+        model: The robot.
+        T_world_tcp: (4, 4) pose to reach, world frame [m].
+        seed: (nv,) [rad].
+
+    Returns:
+        (nv,) where it ended [rad] and the (6,) pose error left there [m, rad].
+    """
+    q, still = seed, np.zeros(model.nv)
+    for _ in range(_ITERATIONS):
+        pose = model.pose(q, still)
+        q_next, error = _step(q, pose.J_tcp, pose.T_world_tcp, T_world_tcp, model.q_min, model.q_max)
+        if np.abs(error).max() <= _TOLERANCE * 1e-2 or np.array_equal(q_next, q):
+            break
+        q = q_next
+    return q, error
+
+
+def _step(q: Floats, J: Floats, T: Floats, T_goal: Floats, q_min: Floats, q_max: Floats) -> tuple[Floats, Floats]:
+    error = np.empty(6)
+    error[:3] = T_goal[:3, 3] - T[:3, 3]
+    error[3:] = to_vector(T_goal[:3, :3] @ T[:3, :3].T)
+    damping = 0.1 * (error @ error) + 1e-12  # vanishes at the solution: Newton's speed there
+    dq = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), error)
+    return np.minimum(np.maximum(q + dq, q_min), q_max), error
+
+
+def _seeds(model: RobotModel) -> Floats:
+    """(n, nv) joint positions spread evenly over the ranges by the recurrence of the generalised golden ratio."""
+    ratio = 2.0
+    for _ in range(60):
+        ratio = (1 + ratio) ** (1 / (model.nv + 1))
+    share = (0.5 + np.outer(np.arange(1, _SEEDS + 1), ratio ** -np.arange(1.0, model.nv + 1))) % 1
+    low, high = np.maximum(model.q_min, -np.pi), np.minimum(model.q_max, np.pi)
+    return np.where(low < high, low + share * (high - low), model.q_min)
+
+
+def _unwind(model: RobotModel, q: Floats, near: Floats) -> Floats:
+    """The same place with every axis on the turn that is nearest to ``near`` and within its range."""
+    turn = 2 * np.pi
+    turns = np.round((near - q) / turn)
+    fewest = np.ceil((model.q_min - q) / turn)
+    most = np.floor((model.q_max - q) / turn)
+    return q + turn * np.clip(turns, fewest, most)
+
+
+#: Time grid that a reference is computed on once; between its points it is a cubic [s].
+STEP_S = 0.004
+
+
+@dataclass(frozen=True, slots=True)
+class ReferencePoint:
+    """The reference at one instant, world frame."""
+
+    q: Floats  #: (nv,) [rad]
+    dq: Floats  #: (nv,) [rad/s]
+    ddq: Floats  #: (nv,) [rad/s^2]
+    T_world_tcp: Floats  #: (4, 4)
+    twist: Floats  #: (6,) linear and angular velocity of the TCP [m/s, rad/s]
+
+
+class Grid(NamedTuple):
+    """A path over time on the grid; see ``Reference``."""
+
+    q: Floats  #: (n, nv) [rad]
+    dq: Floats  #: (n, nv) [rad/s]
+    end: int  #: grid point of the last waypoint
+    duration_s: float  #: from the start to the end of the last cycle [s]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A path over time that starts at ``q[0]``, runs ``cycles`` times and stands at its end.
+
+    A cycle is the whole grid; the last one ends at ``end`` of the grid, before the way back to the start.
+    """
+
+    model: RobotModel
+    q: Floats  #: (n, nv) on the grid [rad]
+    dq: Floats  #: (n, nv) [rad/s]
+    end: int  #: grid point of the last waypoint
+    cycles: float  #: inf: until the log ends
+    waypoints_s: tuple[float, ...]  #: arrival at each waypoint of the first cycle [s]
+
+    @property
+    def q0(self) -> Floats:
+        """(nv,) where the robot starts [rad]."""
+        return self.q[0]
+
+    @property
+    def cycle_s(self) -> float:
+        """One cycle with the way back [s]."""
+        return (len(self.q) - 1) * STEP_S
+
+    @property
+    def duration_s(self) -> float:
+        """From the start to the end of the last cycle; inf when it repeats [s]."""
+        return (self.cycles - 1) * self.cycle_s + self.end * STEP_S
+
+    @property
+    def grid(self) -> Grid:
+        """The path without the robot, for kernels."""
+        return Grid(self.q, self.dq, self.end, self.duration_s)
+
+    def next_waypoint(self, s_s: float) -> float:
+        """Programmed time of the first arrival at a waypoint that is not before ``s_s``; inf after the last [s]."""
+        if not self.waypoints_s or s_s > self.duration_s:
+            return math.inf
+        cycle = math.floor(s_s / self.cycle_s)
+        arrivals = (n * self.cycle_s + at_s for n in (cycle, cycle + 1) for at_s in self.waypoints_s)
+        return next((arrival for arrival in arrivals if arrival >= s_s), math.inf)
+
+    def sample(self, s_s: float) -> ReferencePoint:
+        """The reference ``s_s`` seconds of programmed time after its start.
+
+        Position is a cubic through the grid, velocity and acceleration its derivatives, pose and twist those of
+        position and velocity: each is exactly the derivative of the one before. Before the start and after the end
+        it stands.
+        """
+        q, dq, ddq = place(self.grid, s_s)
+        pose = self.model.pose(q, dq)
+        return ReferencePoint(q, dq, ddq, pose.T_world_tcp, pose.J_tcp @ dq)
+
+
+@njit(cache=True)
+def place(grid: Grid, s_s: float) -> tuple[Floats, Floats, Floats]:
+    """Position, velocity and acceleration (nv,) each, ``s_s`` seconds of programmed time after a path's start."""
+    if not 0.0 <= s_s < grid.duration_s:
+        row = 0 if s_s < 0.0 else grid.end
+        return grid.q[row].copy(), np.zeros(grid.q.shape[1]), np.zeros(grid.q.shape[1])
+    at = s_s % ((len(grid.q) - 1) * STEP_S) / STEP_S
+    i = min(int(at), len(grid.q) - 2)
+    return _cubic(grid.q[i], grid.q[i + 1], grid.dq[i], grid.dq[i + 1], at - i, STEP_S)
+
+
+@njit(cache=True)
+def _cubic(
+    q0: Floats, q1: Floats, dq0: Floats, dq1: Floats, share: float, step_s: float
+) -> tuple[Floats, Floats, Floats]:
+    """The cubic with given ends and end velocities, and its derivatives."""
+    way, m0, m1 = q1 - q0, dq0 * step_s, dq1 * step_s
+    b, a = 3 * way - 2 * m0 - m1, m0 + m1 - 2 * way
+    q = q0 + share * (m0 + share * (b + share * a))
+    dq = (m0 + share * (2 * b + share * 3 * a)) / step_s
+    return q, dq, (2 * b + share * 6 * a) / step_s**2
+
+
+def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, plan: Plan) -> tuple[float, float]:
+    """Programmed time after one tick, and the rate at which it ran.
+
+    ``time`` runs with the clock: a robot that was held back then faces a reference that ran away.
+    ``path`` runs with the clock while the TCP is within half the leash of the reference, slows down smoothly beyond
+    and stands when the leash is taut (or the error is not known). It stops at every waypoint until the TCP has come
+    as near as ``waypoint_m``: however far the robot evades on the way, it never skips one. Neither runs backwards.
+
+    Args:
+        reference: The programmed path.
+        s_s: Programmed time [s].
+        dt_s: Length of the tick [s].
+        tcp_error_m: Distance from the TCP to the reference at ``s_s`` [m].
+        plan: When the reference waits.
+
+    Returns:
+        Programmed time at the next tick [s] and the rate in [0, 1]: the reference's velocity is ``rate * twist``.
+    """
+    if plan.reference == "time":
+        return s_s + dt_s, 1.0
+    slack = 2.0 - 2.0 * tcp_error_m / plan.leash_m  # 1 at half the leash, 0 where it is taut
+    if not slack > 0.0:
+        return s_s, 0.0
+    rate = 1.0 if slack >= 1.0 else slack * slack * (3.0 - 2.0 * slack)
+    ahead_s = s_s + rate * dt_s
+    if not tcp_error_m <= plan.waypoint_m:
+        ahead_s = min(ahead_s, reference.next_waypoint(s_s))
+    return ahead_s, (ahead_s - s_s) / dt_s
