@@ -32,7 +32,7 @@ def test_a_changed_source_gets_a_cache_of_its_own(tmp_path: Path) -> None:
     before = _cache(package)
     assert Path(before).is_relative_to(tmp_path)
     assert _cache(package) == before
-    for name in ("geometry/vectors.py", "human/fusion/kalman.py", "robot/model.py", "audit/containment.py"):
+    for name in ("geometry/vectors.py", "human/fusion/kalman.py", "robot/model.py", "audit/measures.py"):
         source = package / name
         source.write_text(source.read_text() + "\n# changed\n")
         after = _cache(package)

@@ -17,8 +17,8 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array, eye_array, hstack
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.containment import InflatedHull, union_volume_m3
 from hrcreplay.audit.log_audit import check_containment, flesh_m, recorded_future
+from hrcreplay.audit.measures import InflatedHull, union_volume_m3
 from hrcreplay.audit.recording import Recording
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.swept_volumes import limb_radii

@@ -12,9 +12,9 @@ import numpy as np
 import pyarrow as pa
 
 from hrcreplay.audit import page
-from hrcreplay.audit.bootstrap import DRAWS, LEVEL, Resampling, block_ticks, resample
 from hrcreplay.audit.figures import draw_all
 from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, joint_travel, methods, standstill_s
+from hrcreplay.audit.measures import DRAWS, LEVEL, Resampling, block_ticks, resample
 from hrcreplay.audit.metrics import (
     checked_scope,
     curve_point,
@@ -26,7 +26,7 @@ from hrcreplay.audit.metrics import (
 )
 from hrcreplay.audit.recording import TRUTH
 from hrcreplay.errors import SettingsError
-from hrcreplay.human.prediction import reachable_sets
+from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.run import build
 from hrcreplay.run.build import PredictionStage
@@ -165,7 +165,7 @@ def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
         "audit_hz": AUDIT_HZ,
         "interval": {"level": LEVEL, "block_ticks": block, "draws": DRAWS, "seed": SEED},
         "method": prediction_stage.method,
-        "own_methods": list(reachable_sets.METHODS),
+        "own_methods": list(swept_volumes.METHODS),
         "logs": logs,
         "total": {
             "ticks": sum(lengths),
@@ -195,7 +195,7 @@ def _joints(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:
     went = np.max([joint_travel(audit.recording.joints) for audit in audits], axis=0)
     return {
         method: joint_figures(np.concatenate([audit.joints[method] for audit in audits]), went, drawn)
-        for method in reachable_sets.METHODS
+        for method in swept_volumes.METHODS
     }
 
 
@@ -209,7 +209,7 @@ def _curves(audits: Sequence[LogAudit]) -> dict[str, Any]:
         block = block_ticks(horizon_s, rate_hz, max(lengths))
         return {"factor": factor, **curve_point(outcomes, resample(lengths, block, horizon_s * rate_hz, SEED))}
 
-    return {method: [point(method, factor) for factor in factors(method)] for method in reachable_sets.METHODS}
+    return {method: [point(method, factor) for factor in factors(method)] for method in swept_volumes.METHODS}
 
 
 def _write_rows(audit: LogAudit, writer: RunWriter) -> None:

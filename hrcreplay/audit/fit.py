@@ -15,10 +15,10 @@ import numpy as np
 
 from hrcreplay import __version__
 from hrcreplay.audit import fit_limits
-from hrcreplay.audit.bootstrap import Estimate, block_ticks, resample
 from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, not_recorded, union_m3
 from hrcreplay.audit.departures import fit as fit_departures
 from hrcreplay.audit.fit_limits import Fit, Futures
+from hrcreplay.audit.measures import Estimate, block_ticks, resample
 from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, read_recording
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import Departure, LimitSet

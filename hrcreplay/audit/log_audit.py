@@ -9,16 +9,15 @@ from functools import partial
 import numpy as np
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.containment import InflatedHull, union_volume_m3
 from hrcreplay.audit.fit_limits import ARMS
+from hrcreplay.audit.measures import InflatedHull, union_volume_m3
 from hrcreplay.audit.metrics import Outcome
 from hrcreplay.audit.recording import Recording, read_recording
 from hrcreplay.errors import LogError
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.prediction import reachable_sets
-from hrcreplay.human.prediction.reachable_sets import Reach
-from hrcreplay.human.prediction.swept_volumes import limb_radii
-from hrcreplay.human.prediction.walking_reach import THIGH_M
+from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.human.prediction.sound_reach import THIGH_M
+from hrcreplay.human.prediction.swept_volumes import Reach, limb_radii
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report.metrics import ANGLES, difference
@@ -219,7 +218,7 @@ class LogAudit:
 
 def methods() -> tuple[str, ...]:
     """Our own methods, then the baselines."""
-    return (*reachable_sets.METHODS, *baselines.BASELINES)
+    return (*swept_volumes.METHODS, *baselines.BASELINES)
 
 
 def factors(method: str) -> tuple[float, ...]:
@@ -275,7 +274,7 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
     future = recorded_future(recording, rows, horizon_s)
     outcomes, curve = {}, {}
     stage = f"auditing {name}"
-    more = sum(len(factors(method)) - 1 for method in reachable_sets.METHODS)
+    more = sum(len(factors(method)) - 1 for method in swept_volumes.METHODS)
     work = len(rows) * len(methods()) + more * len(rows[::EVERY])
     with ProgressBar(stage, work) as bar:
         progress = partial(bar.advance, stage)
@@ -287,11 +286,11 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
                 f"{job.log}: nothing to check: no limb was both predicted and seen to the end of the horizon of "
                 f"{horizon_s:g} s"
             )
-        for method in reachable_sets.METHODS:
+        for method in swept_volumes.METHODS:
             with watch.stage(f"curve {method}", len(rows)):
                 curve[method] = _curve(prediction_stage, future, method, outcomes[method], progress)
     joints = {}
-    for method in reachable_sets.METHODS:
+    for method in swept_volumes.METHODS:
         interval = prediction_stage.by(method).reachable(future.states)
         joints[method] = joints_inside(recording, future.states, interval, horizon_s)
     notes = (*log.notes, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hrcreplay.audit.bootstrap import Estimate, Resampling
+from hrcreplay.audit.measures import Estimate, Resampling
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats, Ints, Table
 from hrcreplay.report.metrics import Metric, MetricTable, true_runs
 from hrcreplay.report.tables import PageTable

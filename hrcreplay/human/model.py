@@ -99,6 +99,11 @@ def _bound(name: str, value: Any) -> Any:
     return np.array([none if number is None else number for number in value], dtype=float)
 
 
+def bounds_of(limits: LimitSet) -> Floats:
+    """(6, 13): p_min, p_max, v_min, v_max, a_min, a_max, as the kernels take them."""
+    return np.stack([limits.p_min, limits.p_max, limits.v_min, limits.v_max, limits.a_min, limits.a_max])
+
+
 def skeleton(p: Floats, lengths_m: Floats) -> Floats:
     """Forward kinematics: where the model puts the body points.
 

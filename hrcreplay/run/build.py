@@ -18,7 +18,7 @@ from hrcreplay.calibration.cell import Cell
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.fusion import inverse_kinematics
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.prediction import reachable_sets, swept_volumes
+from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.log_files import Header, JointTrack
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
@@ -79,9 +79,9 @@ class PredictionStage:
         """The same by another method."""
         return replace(self, occupancy=self.occupancy.model_copy(update={"method": method}))
 
-    def reachable(self, states: HumanStates) -> reachable_sets.Reach:
+    def reachable(self, states: HumanStates) -> swept_volumes.Reach:
         """Reachable interval of every joint at every tick."""
-        return reachable_sets.reachable(
+        return swept_volumes.reachable(
             states, self.limits, self.occupancy, horizon_s=self.horizon_s, memory_s=self.memory_s
         )
 

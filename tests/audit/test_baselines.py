@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.containment import InflatedHull
+from hrcreplay.audit.measures import InflatedHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.swept_volumes import limb_radii

@@ -5,7 +5,7 @@ import pytest
 
 from hrcreplay.audit import metrics as audit_checked
 from hrcreplay.audit import metrics as audit_metrics
-from hrcreplay.audit.bootstrap import Resampling, block_ticks, resample
+from hrcreplay.audit.measures import Resampling, block_ticks, resample
 from hrcreplay.audit.metrics import Outcome
 from hrcreplay.records import BODY, Floats
 

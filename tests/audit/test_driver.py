@@ -18,7 +18,7 @@ import pytest
 from hrcreplay.audit import baselines, driver
 from hrcreplay.audit import figures as figures_audit
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.human.prediction import reachable_sets
+from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import BODY, LIMBS, POINTS
 from hrcreplay.run import replay
@@ -57,7 +57,7 @@ def test_an_audit_leaves_what_it_promises(folder: Path, found: dict[str, Any]) -
         assert (folder / "figures" / f"{name}.png").stat().st_size > 5_000
     table = pd.read_parquet(folder / "audit.parquet")
     assert {"t_ns", "log", "method", "limb", "covered", "escape_m", "volume_m3"} <= set(table.columns)
-    assert set(table["method"]) == {*reachable_sets.METHODS, *baselines.BASELINES}
+    assert set(table["method"]) == {*swept_volumes.METHODS, *baselines.BASELINES}
     assert set(table["limb"]) >= set(LIMBS)
     assert found["logs"][0]["recorded_future"] == "ground truth"
     assert found["total"]["ticks"] == 140  # (6 s - 0.377 s) at 25 Hz; the first tick is before the first frame
@@ -279,7 +279,7 @@ def test_teleports_of_a_real_bag_do_not_count_as_motion(tmp_path: Path, name: st
     assert log["recorded_future"] == "camera points"
     assert log["counts"]["audit_rejected_frames_mocap"] >= 0
     assert found["total"]["methods"]["v2_a50"]["all"]["covered_share"]["value"] > 0.9
-    for method in reachable_sets.METHODS:
+    for method in swept_volumes.METHODS:
         assert all(e["deepest_m"] < 1.0 for e in log["escapes"][method])
     deepest = found["total"]["methods"]["paper"]["all"]["escape_max_m"]
     assert deepest is None or deepest < 1.0

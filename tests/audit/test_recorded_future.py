@@ -10,7 +10,7 @@ import pytest
 from hrcreplay.audit import recording
 from hrcreplay.audit.log_audit import check_containment, joint_travel, joints_inside, recorded_future
 from hrcreplay.audit.recording import Recording
-from hrcreplay.human.prediction import reachable_sets
+from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
 from tests.human.people import states
 
@@ -63,13 +63,13 @@ def test_a_joint_stays_inside_whatever_its_name_and_turn() -> None:
     joints[6:, 5] = np.nan
     low, high = np.full((2, DOF), -0.05), np.full((2, DOF), 0.05)
     recording = _recording(np.zeros((8, len(POINTS), 3)), joints, people)
-    inside = joints_inside(recording, people, reachable_sets.Reach(people.t_ns, low, high), 0.2)
+    inside = joints_inside(recording, people, swept_volumes.Reach(people.t_ns, low, high), 0.2)
     assert inside[0, JOINTS.index("theta")] == 1.0  # 0.01, 0.02
     assert inside[1, JOINTS.index("theta")] == 1.0  # 0.04, 0.05
     assert inside[0, 4] == 1.0  # 0.02, 0.04
     assert inside[1, 4] == 0.0  # 0.08, 0.10
     late = joints_inside(
-        recording, replace(people, t_ns=people.t_ns + 600_000_000), reachable_sets.Reach(people.t_ns, low, high), 0.2
+        recording, replace(people, t_ns=people.t_ns + 600_000_000), swept_volumes.Reach(people.t_ns, low, high), 0.2
     )
     assert late[0, 4] == 0.0
     assert np.isnan(late[1]).all()  # the recording is over

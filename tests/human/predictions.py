@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.prediction import reachable_sets, swept_volumes
-from hrcreplay.human.prediction.reachable_sets import Reach
+from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.human.prediction.swept_volumes import Reach
 from hrcreplay.records import HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Fusion, Occupancy
 
@@ -29,6 +29,6 @@ def predict(
 def reachable(
     people: HumanStates, limits: LimitSet, horizon_s: float, method: str, margins: Occupancy | None = None
 ) -> Reach:
-    """See reachable_sets.reachable."""
+    """See swept_volumes.reachable."""
     occupancy = (margins or Occupancy()).model_copy(update={"method": method})
-    return reachable_sets.reachable(people, limits, occupancy, horizon_s=horizon_s, memory_s=MEMORY_S)
+    return swept_volumes.reachable(people, limits, occupancy, horizon_s=horizon_s, memory_s=MEMORY_S)

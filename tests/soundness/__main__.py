@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from hrcreplay.errors import HrcReplayError
-from hrcreplay.human.prediction.reachable_sets import METHODS, PRINTED
+from hrcreplay.human.prediction.swept_volumes import METHODS, PRINTED
 from hrcreplay.settings.load import Settings
 from tests.soundness.run import Plan, Result, escaped, run
 

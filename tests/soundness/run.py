@@ -11,7 +11,7 @@ import numpy as np
 
 from hrcreplay.human.model import HEIGHT, LimitSet
 from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.human.prediction.reachable_sets import PRINTED
+from hrcreplay.human.prediction.swept_volumes import PRINTED
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.settings.sections import Occupancy

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.human.prediction.reachable_sets import METHODS
+from hrcreplay.human.prediction.swept_volumes import METHODS
 from hrcreplay.records import LIMBS, HumanStates, SweptVolumes
 from hrcreplay.run import build
 from hrcreplay.run.job import job_without_log

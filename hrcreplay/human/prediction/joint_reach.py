@@ -86,7 +86,7 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
 
     Args:
         j: Index into JOINTS.
-        bounds: (6, 13) of ``reachable_sets.bounds_of``.
+        bounds: (6, 13) of ``human.model.bounds_of``.
         coupled: Whether Eq. (34b), (34c) hold.
         low: (13,) lower ends of the joints' reachable intervals [m, m, rad..., m].
         high: (13,) their upper ends.

@@ -1,7 +1,22 @@
-"""Reachable sets under ``sound``: intervals of all joints, and a polygon that encloses the positions of the pelvis.
+"""Reachable sets under ``sound``: intervals of all joints, where the pelvis can walk, and the legs below it.
 
 They start from a box of likely states, not from the estimate alone, and a joint that has not been seen for long may
 have moved since: so real people stay inside, whose states are never known exactly.
+
+A polygon encloses all displacements, over all headings, velocities and times.
+
+The displacement at time t along u(phi) is the integral of u . Rz(theta) (v, v_perp). At every instant theta, v and
+v_perp are in intervals of their own, so the integral is at most that of
+
+    F(tau) = max over theta, v, v_perp in their intervals at tau of u . Rz(theta) (v, v_perp).
+
+Time is cut where a velocity profile bends and in between. In a piece theta is taken from its interval at the piece's
+end, which holds all earlier ones; the ends of the velocity intervals are then linear in tau, and F, the largest of
+linear functions of them, is convex: the trapezoid is never below its integral. So is that of max(0, F), which bounds
+what an instant inside the piece can gain.
+
+Neighbouring sides of the polygon meet in its corners. A direction between theirs is a sum of both with weights >= 0,
+so no displacement is further along it than the corner: the hull of the corners encloses them, whatever the sides.
 """
 
 from __future__ import annotations
@@ -12,8 +27,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.human.model import SHOWN_BY
-from hrcreplay.human.prediction.joint_reach import Stops, interval, stops
-from hrcreplay.human.prediction.walking_reach import SIDES, body_velocity, corners_of, turned, walked
+from hrcreplay.human.prediction.joint_reach import Stops, fastest, interval, rise, saturation_s, stops
 from hrcreplay.records import DOF, Floats, HumanStates
 from hrcreplay.settings.sections import Occupancy
 
@@ -33,7 +47,7 @@ class Likely(NamedTuple):
 class SoundMotionLimits(NamedTuple):
     """What bounds the motions that ``sound`` encloses."""
 
-    bounds: Floats  #: (6, 13) of ``reachable_sets.bounds_of``
+    bounds: Floats  #: (6, 13) of ``human.model.bounds_of``
     coupled: bool  #: whether Eq. (34b), (34c) hold
     horizon: float  #: horizon and latency [s]
     memory: float  #: how long the filter goes on without a measurement [s]
@@ -126,3 +140,183 @@ def _enclose_rows(at: Likely, within: SoundMotionLimits, low: Floats, high: Floa
     corners = np.empty((SIDES, 2))
     for i in range(len(at.p)):
         enclose_row(i, at, within, low[i], high[i], corners)
+
+
+#: Sides of the polygon; the first looks ahead.
+SIDES = 8
+#: Equal pieces of the horizon, beside the cuts where profiles bend.
+_PIECES = 4
+
+
+@njit(cache=True)
+def turned_range(x: float, y: float, low: float, high: float) -> Range:
+    """Range of x cos(phi) + y sin(phi) for phi in [low, high].
+
+    Args:
+        x: Coefficient, in the unit of the result.
+        y: Coefficient, in the same unit.
+        low: Smallest phi [rad].
+        high: Largest phi [rad].
+    """
+    middle, half = 0.5 * (low + high), min(0.5 * (high - low), np.pi)
+    c, s = np.cos(middle), np.sin(middle)
+    along, across, radius = c * x + s * y, c * y - s * x, np.sqrt(x * x + y * y)
+    cos_half, sin_half = np.cos(half), np.sin(half)
+    ends = along * cos_half, abs(across) * sin_half
+    most = radius if along >= cos_half * radius else ends[0] + ends[1]
+    least = -radius if -along >= cos_half * radius else ends[0] - ends[1]
+    return least, most
+
+
+@njit(cache=True)
+def body_velocity(v: Floats, spread: Floats, heading: Range) -> tuple[Range, Range]:
+    """Ranges of v and v_perp, Eq. (33), for a velocity in v +- spread (2,), world, and any heading in the range."""
+    forward = turned_range(v[0], v[1], heading[0], heading[1])
+    left = turned_range(v[1], -v[0], heading[0], heading[1])
+    cosine = turned_range(1.0, 0.0, heading[0], heading[1])
+    sine = turned_range(0.0, 1.0, heading[0], heading[1])
+    c, s = max(-cosine[0], cosine[1]), max(-sine[0], sine[1])
+    ahead, aside = c * spread[0] + s * spread[1], s * spread[0] + c * spread[1]
+    return (forward[0] - ahead, forward[1] + ahead), (left[0] - aside, left[1] + aside)
+
+
+@njit(cache=True)
+def walked(heading: Range, velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float, far: Floats) -> None:
+    """Adds to far (SIDES,) how far the pelvis gets along each side's direction at any time in [0, horizon] [m].
+
+    Stands for Eq. (20)-(30), whose box does not hold all motions of Eq. (25): docs/paper.md.
+
+    Args:
+        heading: Initial headings [rad].
+        velocity: Initial v, v_perp and omega [m/s, m/s, rad/s].
+        bounds: (6, 13) of ``human.model.bounds_of``.
+        horizon: [s].
+        far: Receives the sums.
+    """
+    cuts = _cuts(velocity, bounds, horizon)
+    total, largest = np.zeros(SIDES), np.zeros(SIDES)
+    middle = 0.5 * (heading[0] + heading[1])
+    box = _box(velocity, bounds, 0.0)
+    for i in range(len(cuts) - 1):
+        step, later = cuts[i + 1] - cuts[i], _box(velocity, bounds, cuts[i + 1])
+        turn = _turn(velocity[2], bounds, cuts[i + 1])
+        low, high = heading[0] - turn[0] - middle, heading[1] + turn[1] - middle
+        for side in range(SIDES):
+            phi = 2.0 * np.pi * side / SIDES
+            before, after = _farthest(box, phi - high, phi - low), _farthest(later, phi - high, phi - low)
+            gain = 0.5 * step * (max(before, 0.0) + max(after, 0.0))
+            largest[side] = max(largest[side], total[side] + gain)
+            total[side] += 0.5 * step * (before + after)
+        box = later
+    for side in range(SIDES):
+        far[side] += largest[side]
+
+
+@njit(cache=True)
+def _turn(omega: Range, bounds: Floats, t: float) -> Range:
+    """How far the heading can turn to the right and to the left at any time until t [rad]."""
+    least, most, brake, gain = bounds[2, 2], bounds[3, 2], bounds[4, 2], bounds[5, 2]
+    return rise(-omega[0], -least, -brake, -gain, t), rise(omega[1], most, gain, brake, t)
+
+
+@njit(cache=True)
+def turned(heading: Range, omega: Range, bounds: Floats, horizon: float) -> Range:
+    """All headings at any time in [0, horizon] [rad].
+
+    Args:
+        heading: Initial headings [rad].
+        omega: Initial angular velocities [rad/s].
+        bounds: (6, 13) of ``human.model.bounds_of``.
+        horizon: [s].
+    """
+    turn = _turn(omega, bounds, horizon)
+    return heading[0] - turn[0], heading[1] + turn[1]
+
+
+@njit(cache=True)
+def _cuts(velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float) -> Floats:
+    cuts = np.empty(_PIECES + 5)
+    for i in range(_PIECES + 1):
+        cuts[i] = horizon * i / _PIECES
+    for k in range(2):
+        least, most, brake, gain = bounds[2, k], bounds[3, k], bounds[4, k], bounds[5, k]
+        v = velocity[k]
+        cuts[_PIECES + 1 + 2 * k] = min(horizon, saturation_s(v[1], most, gain, brake))
+        cuts[_PIECES + 2 + 2 * k] = min(horizon, saturation_s(-v[0], -least, -brake, -gain))
+    cuts.sort()
+    return cuts
+
+
+@njit(cache=True)
+def _box(velocity: tuple[Range, Range, Range], bounds: Floats, t: float) -> tuple[Range, Range]:
+    """Intervals of v and v_perp at time t."""
+    ahead, left = velocity[0], velocity[1]
+    return _speeds(ahead, bounds, 0, t), _speeds(left, bounds, 1, t)
+
+
+@njit(cache=True)
+def _speeds(v: Range, bounds: Floats, k: int, t: float) -> Range:
+    least, most, brake, gain = bounds[2, k], bounds[3, k], bounds[4, k], bounds[5, k]
+    return -fastest(-v[0], -least, -brake, -gain, t), fastest(v[1], most, gain, brake, t)
+
+
+@njit(cache=True)
+def _farthest(box: tuple[Range, Range], low: float, high: float) -> float:
+    """F: largest v cos(psi) + v_perp sin(psi) over the box and psi in [low, high]; at a corner, for it is convex."""
+    largest = -np.inf
+    for v in box[0]:
+        for v_perp in box[1]:
+            largest = max(largest, turned_range(v, v_perp, low, high)[1])
+    return largest
+
+
+@njit(cache=True)
+def corners_of(far: Floats, ahead: float, corners: Floats) -> None:
+    """Writes into corners (SIDES, 2) where the polygon's neighbouring sides meet; ``ahead``: its first direction."""
+    step = 2.0 * np.pi / SIDES
+    for i in range(SIDES):
+        after = (i + 1) % SIDES
+        a, b = ahead + step * i, ahead + step * (i + 1)
+        corners[i, 0] = (far[i] * np.sin(b) - far[after] * np.sin(a)) / np.sin(step)
+        corners[i, 1] = (far[after] * np.cos(a) - far[i] * np.cos(b)) / np.sin(step)
+
+
+#: From the middle of a leg, where cameras put its points, to the skin: a thigh 0.5 m around [m].
+THIGH_M = 0.08
+#: Length of thigh and of shank with foot: two of them are the pelvis's height of the median man [m].
+BONE_M = 0.47
+#: How high a knee gets whose foot carries a person: with a shank upright on the toes [m].
+KNEE_M = 0.55
+
+
+@njit(cache=True)
+def knees_out(pelvis_m: float) -> float:
+    """How far the knees are from the line below a pelvis of that height, whose foot is under it [m]."""
+    return np.sqrt(max(0.0, BONE_M**2 - (0.5 * pelvis_m) ** 2))  # thigh and shank of one length
+
+
+@njit(cache=True)
+def legs_around(corners: Floats, ahead: float, lowest: float, highest: float, radius: float) -> tuple[Floats, int]:
+    """From the floor to the highest pelvis, wherever it walks; below, as far out as the lowest pelvis puts the knees.
+
+    Args:
+        corners: (SIDES, 2) where the pelvis walks [m].
+        ahead: Direction of its first side [rad].
+        lowest: Pelvis's height [m].
+        highest: The same [m].
+        radius: Of the ball around the result; it holds knees of people who stand [m].
+
+    Returns:
+        (m, 3) points whose hull is that, and m; one NaN where the state is.
+    """
+    if not np.isfinite(corners.sum() + lowest + highest):
+        return np.full((1, 3), np.nan), 1
+    out = max(0.0, knees_out(lowest) - (radius - THIGH_M)) / np.cos(np.pi / SIDES)
+    swept = np.zeros((3 * SIDES, 3))
+    for k in range(SIDES):
+        middle = ahead + (k + 0.5) * 2.0 * np.pi / SIDES
+        swept[k, 0] = corners[k, 0] + out * np.cos(middle)
+        swept[k, 1] = corners[k, 1] + out * np.sin(middle)
+    swept[SIDES : 2 * SIDES, :2], swept[SIDES : 2 * SIDES, 2] = swept[:SIDES, :2], min(KNEE_M, highest)
+    swept[2 * SIDES :, :2], swept[2 * SIDES :, 2] = corners, highest
+    return swept, len(swept)

@@ -8,7 +8,7 @@ any time and from any likely state:
    correlation: a box around it. World velocities are turned into the body's frame over all headings of the box.
 2. Joints. Heading, torso and arm joints and the pelvis's height stay in the intervals of ``joint_reach`` at all times;
    stops that depend on other joints are taken over the intervals of those.
-3. Walking. The pelvis stays in the convex polygon of ``walking_reach`` at all times, at a height of its interval.
+3. Walking. The pelvis stays in the convex polygon of ``sound_reach`` at all times, at a height of its interval.
 4. Limbs. A limb at any instant is a chain of rotations, each by an angle of its interval, then a displacement of the
    polygon and the height. Sweeping a convex set by all angles of a joint and by all displacements, each regardless of
    the others, holds all combinations, among them those that occur. A swept set is kept as points whose hull holds it:
@@ -34,9 +34,17 @@ from numba import njit
 
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
-from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, NECK, LimitSet, skeleton
-from hrcreplay.human.prediction.reachable_sets import bounds_of
-from hrcreplay.human.prediction.sound_reach import Likely, SoundMotionLimits, enclose_row, likely
+from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, NECK, LimitSet, bounds_of, skeleton
+from hrcreplay.human.prediction.sound_reach import (
+    SIDES,
+    THIGH_M,
+    Likely,
+    SoundMotionLimits,
+    enclose_row,
+    knees_out,
+    legs_around,
+    likely,
+)
 from hrcreplay.human.prediction.sweep import (
     TRIANGLE_RAD,
     append,
@@ -57,7 +65,6 @@ from hrcreplay.human.prediction.velocity_tube import (
     tubes,
     velocities,
 )
-from hrcreplay.human.prediction.walking_reach import SIDES, THIGH_M, knees_out, legs_around
 from hrcreplay.records import DOF, LIMBS, POINTS, Floats, HumanStates, Ints
 from hrcreplay.settings.sections import Occupancy
 

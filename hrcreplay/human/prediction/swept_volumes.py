@@ -1,17 +1,196 @@
-"""Swept volumes of the limbs within the horizon: Alg. 2, or under ``sound`` what encloses every motion of Eq. (25)."""
+"""What every joint can reach within the horizon, and the volumes that the limbs sweep: Eq. (18)-(30), Alg. 1, Alg. 2.
+
+Corrections: docs/paper.md. Under ``sound`` both enclose every motion of Eq. (25), see ``sound_volumes``.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
-from hrcreplay.human.model import LimitSet
-from hrcreplay.human.prediction.reachable_sets import SOUND, MotionLimits, bounds_of, code_of, never_measured, reach_row
+from hrcreplay.human.model import HEIGHT, SHOWN_BY, LimitSet, alpha_2_bounds, alpha_3_bounds, bounds_of
+from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, likely
 from hrcreplay.human.prediction.sound_volumes import sweep_sound
 from hrcreplay.human.prediction.sweep import MOST_COPIES, append, box, kinematic_chain, sweep_rot, sweep_walk
-from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
 from hrcreplay.settings.sections import Occupancy
+
+#: Ways to predict, in the order of their codes in the kernels: the two of the literature, and what encloses.
+PRINTED = ("paper", "positions")
+METHODS = (*PRINTED, "sound")
+PAPER, SOUND = METHODS.index("paper"), METHODS.index("sound")
+
+
+@dataclass(frozen=True)
+class Reach(Table):
+    """Reachable interval of every joint, a row a tick, Eq. (36), (38), (39). The current posture is in it, Eq. (40)."""
+
+    t_ns: Ints  #: (n,)
+    low: Floats  #: (n, 13) JOINTS [m, m, rad..., m]; NaN where the state is
+    high: Floats  #: (n, 13)
+
+
+class MotionLimits(NamedTuple):
+    """What bounds the motions that a printed method predicts from."""
+
+    bounds: Floats  #: (6, 13) of ``bounds_of``
+    coupled: bool  #: whether Eq. (34b), (34c) hold
+    horizon: float  #: braking time T_s of the robot [s]
+    method: int  #: index into METHODS of one of PRINTED
+
+
+def reachable(
+    states: HumanStates, limits: LimitSet, occupancy: Occupancy, *, horizon_s: float, memory_s: float
+) -> Reach:
+    """Reachable sets within the horizon, Eq. (36), (38), (39), joint by joint.
+
+    ``paper``: Eq. (20)-(30), corrected, for walking and Alg. 1 for the other joints: from positions, velocities and
+    bounds on velocity and acceleration. ``positions``: the older way of [26], from positions and velocity bounds.
+    Both hold the angles within their limits, with Eq. (34b), (34c) taken over the reachable interval of what they
+    depend on; a posture that is itself outside stays included. An arm joint that nobody ever measured may be
+    anywhere within its limits, whatever the method. ``sound``: every motion under the limits from every likely state,
+    at all times until the horizon and the latency are over; x and y are those of a polygon, see ``sound_reach``.
+
+    Args:
+        states: The fused person.
+        limits: Bounds.
+        occupancy: Method, one of METHODS, and what ``sound`` adds; the printed methods add nothing.
+        horizon_s: Braking time T_s of the robot [s].
+        memory_s: How long the filter goes on without a measurement [s].
+
+    Raises:
+        SettingsError: There is no such method.
+    """
+    code = code_of(occupancy.method)
+    if code == SOUND:
+        within = SoundMotionLimits(bounds_of(limits), limits.coupled, horizon_s + occupancy.latency_s, memory_s)
+        low, high = enclose(likely(states, occupancy, memory_s), within)
+        return Reach(states.t_ns, low, high)
+    low, high = np.empty_like(states.p), np.empty_like(states.p)
+    p, v = np.ascontiguousarray(states.p), np.ascontiguousarray(states.v)
+    allowed = MotionLimits(bounds_of(limits), limits.coupled, horizon_s, code)
+    _reach_rows(p, v, never_measured(states), allowed, low, high)
+    return Reach(states.t_ns, low, high)
+
+
+def never_measured(states: HumanStates) -> Bools:
+    """(n, 13) joints of which no camera has shown anything yet: the filter only has a guess of them."""
+    return np.ascontiguousarray(np.isinf(states.unseen_s)[:, SHOWN_BY])
+
+
+def code_of(method: str) -> int:
+    """The number by which the kernels know a method of METHODS.
+
+    Raises:
+        SettingsError: There is no such method.
+    """
+    if method not in METHODS:
+        raise SettingsError(f"occupancy.method: found {method!r}; choose one of {', '.join(METHODS)}")
+    return METHODS.index(method)
+
+
+@njit(cache=True)
+def _reach_rows(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Floats, high: Floats) -> None:
+    for i in range(len(p)):
+        reach_row(p[i], v[i], never[i], within, low[i], high[i])
+
+
+@njit(cache=True)
+def reach_row(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Floats, high: Floats) -> None:
+    """Writes the reachable interval of every joint from p, v (13,) into low, high (13,); ``never`` was it measured.
+
+    Alg. 1 and its clipping to Eq. (34), (35); walking is Eq. (18)-(30).
+
+    Args:
+        p: (13,) JOINTS [m, m, rad..., m].
+        v: (13,) their velocities [m/s, m/s, rad/s...].
+        never: (13,) whether no camera has ever shown the joint.
+        within: What bounds the motions.
+        low: (13,) receives the lower ends [m, m, rad..., m].
+        high: (13,) receives the upper ends [m, m, rad..., m].
+    """
+    bounds, coupled, horizon, method = within
+    _walk(p, v, bounds, horizon, method, low, high)
+    low[HEIGHT], high[HEIGHT] = p[HEIGHT], p[HEIGHT]  # a length in the paper: it stays
+    for j in range(3, HEIGHT):
+        if method == PAPER:
+            low[j], high[j] = _joint(p[j], v[j], bounds[2:, j], horizon)
+        else:
+            low[j], high[j] = p[j] + bounds[2, j] * horizon, p[j] + bounds[3, j] * horizon
+        least, most = bounds[0, j], bounds[1, j]
+        if coupled and j in (5, 9):
+            least, most = alpha_2_bounds(low[j - 1], high[j - 1])
+        elif coupled and j in (6, 10):
+            least, most = alpha_3_bounds(low[j - 2], high[j - 2], low[j - 1], high[j - 1])
+        if never[j]:
+            low[j], high[j] = least, most
+        elif not np.isnan(low[j] + high[j]):
+            low[j], high[j] = max(least, min(low[j], most)), max(least, min(high[j], most))
+        _include(p, j, low, high)
+
+
+@njit(cache=True)
+def _include(p: Floats, j: int, low: Floats, high: Floats) -> None:
+    """Eq. (40), the ends sorted first; an interval with a NaN anywhere is NaN at both ends."""
+    if np.isnan(p[j] + low[j] + high[j]):
+        low[j], high[j] = np.nan, np.nan
+    else:
+        low[j], high[j] = min(p[j], low[j], high[j]), max(p[j], low[j], high[j])
+
+
+@njit(cache=True)
+def _joint(p: float, v: float, bounds: Floats, horizon: float) -> tuple[float, float]:
+    """Alg. 1, corrected, for one joint; its bounds are v_min, v_max, a_min, a_max."""
+    return _farthest(p, v, bounds[0], bounds[2], horizon), _farthest(p, v, bounds[1], bounds[3], horizon)
+
+
+@njit(cache=True)
+def _farthest(p: float, v: float, v_bound: float, a_bound: float, horizon: float) -> float:
+    """Where a joint gets that accelerates at its bound until it reaches its velocity bound at T* of Alg. 1."""
+    t_star = max(0.0, min((v_bound - v) / a_bound, horizon))  # an estimate over the bound has T* < 0
+    if t_star == horizon:
+        return p + v * horizon + 0.5 * a_bound * horizon**2
+    return p + v * t_star + 0.5 * a_bound * t_star**2 + v_bound * (horizon - t_star)
+
+
+@njit(cache=True)
+def _walk(p: Floats, v: Floats, bounds: Floats, horizon: float, method: int, low: Floats, high: Floats) -> None:
+    """Eq. (18)-(30), corrected: x, y and heading.
+
+    The bounds of x and y are those of v and v_perp, so the velocity is turned into the body frame, Eq. (33), and the
+    displacements back, Eq. (32). beta = omega T_s; (27), (28) take the lateral acceleration; the two displacements
+    add up as intervals, whatever the signs of cos(theta) and sin(theta).
+    """
+    c, s = np.cos(p[2]), np.sin(p[2])
+    least, most = bounds[2, :3].copy(), bounds[3, :3].copy()
+    if method == PAPER:
+        body = (c * v[0] + s * v[1], c * v[1] - s * v[0], v[2])
+        for k in range(3):
+            gain = bounds[5, k] * horizon  # Eq. (27), (28), corrected: k = 1 is the lateral acceleration
+            most[k] = min(body[k] + gain, most[k])
+            if k > 0:  # the print lets a walker stop at once: its v^min is the bound, whatever the acceleration
+                least[k] = max(body[k] + bounds[4, k] * horizon, least[k])
+    ahead = (least[0] * horizon, most[0] * horizon)
+    left = (least[1] * horizon, most[1] * horizon)
+    low[0], high[0] = _sum(p[0], c, ahead, -s, left)  # Eq. (22), (29)
+    low[1], high[1] = _sum(p[1], s, ahead, c, left)  # Eq. (23), (30)
+    low[2], high[2] = p[2] + least[2] * horizon, p[2] + most[2] * horizon  # Eq. (20), (21), corrected, (24)
+    for k in range(3):
+        _include(p, k, low, high)
+
+
+@njit(cache=True)
+def _sum(start: float, f: float, a: tuple[float, float], g: float, b: tuple[float, float]) -> tuple[float, float]:
+    """Interval start + f a + g b."""
+    low = start + min(f * a[0], f * a[1]) + min(g * b[0], g * b[1])
+    high = start + max(f * a[0], f * a[1]) + max(g * b[0], g * b[1])
+    return low, high
+
 
 #: A larger set is reduced before the next rotation: below, it costs less to carry all points along.
 _WORTH_REDUCING = 50

@@ -7,7 +7,7 @@ import pytest
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import LimitSet
-from hrcreplay.human.prediction.reachable_sets import PRINTED
+from hrcreplay.human.prediction.swept_volumes import PRINTED
 from hrcreplay.limits import load_limits
 from hrcreplay.records import DOF, JOINTS, Floats
 from tests.human.people import random_states, states

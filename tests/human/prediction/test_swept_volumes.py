@@ -9,8 +9,7 @@ from scipy.spatial import ConvexHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.convex_hull import sphere_swept_volume_m3
 from hrcreplay.human.model import LimitSet, clamp, skeleton
-from hrcreplay.human.prediction.reachable_sets import METHODS, PRINTED
-from hrcreplay.human.prediction.swept_volumes import limb_radii
+from hrcreplay.human.prediction.swept_volumes import METHODS, PRINTED, limb_radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
