@@ -17,7 +17,7 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array, eye_array, hstack
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.log_audit import check_containment, flesh_m, recorded_future
+from hrcreplay.audit.log_audit import SHORTER_S, check_containment, flesh_m, recorded_future
 from hrcreplay.audit.measures import InflatedHull, union_volume_m3
 from hrcreplay.audit.recording import Recording
 from hrcreplay.human.model import Departure
@@ -26,8 +26,6 @@ from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, tubes
 from hrcreplay.records import BODY, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.run.build import PredictionStage
 
-#: Shorter horizons than the braking time, at which a robot beside people stops [s].
-SHORTER_S = (0.05, 0.1, 0.2)
 #: Limbs that share a line: both sides of the body.
 _PAIRS = ((0,), (1,), (2, 4), (3, 5), (6,))
 #: Share of a pair's departures below its line before it is raised.

@@ -13,13 +13,26 @@ import pyarrow as pa
 
 from hrcreplay.audit import page
 from hrcreplay.audit.figures import draw_all
-from hrcreplay.audit.log_audit import AUDIT_HZ, EVERY, LogAudit, audit_log, factors, joint_travel, methods, standstill_s
+from hrcreplay.audit.log_audit import (
+    AUDIT_HZ,
+    EVERY,
+    LogAudit,
+    audit_log,
+    compared_methods,
+    factors,
+    joint_travel,
+    methods,
+    shorter,
+    standstill_s,
+)
 from hrcreplay.audit.measures import DRAWS, LEVEL, Resampling, block_ticks, resample
 from hrcreplay.audit.metrics import (
+    Outcome,
     checked_scope,
     curve_point,
     escapes,
     headline_metrics,
+    horizon_point,
     joint_figures,
     method_figures,
     unchecked_notes,
@@ -156,6 +169,7 @@ def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
                 "methods": _methods([audit], mine),
                 "joints": _joints([audit], mine),
                 "curve": _curves([audit]),
+                "horizons": _horizons([audit]),
                 "escapes": {method: escapes(outcome, start_ns) for method, outcome in audit.outcomes.items()},
             }
         )
@@ -176,6 +190,7 @@ def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
             "methods": _methods(audits, drawn),
             "joints": _joints(audits, drawn),
             "curve": _curves(audits),
+            "horizons": _horizons(audits),
         },
     }
 
@@ -210,6 +225,26 @@ def _curves(audits: Sequence[LogAudit]) -> dict[str, Any]:
         return {"factor": factor, **curve_point(outcomes, resample(lengths, block, horizon_s * rate_hz, SEED))}
 
     return {method: [point(method, factor) for factor in factors(method)] for method in swept_volumes.METHODS}
+
+
+def _horizons(audits: Sequence[LogAudit]) -> list[dict[str, Any]]:
+    """Whole limbs at each horizon, the audit's own last."""
+    prediction_stage = build.prediction_stage(audits[0].job)
+
+    def point(horizon_s: float, rate_hz: float, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+        lengths = [len(outcome) for outcome in outcomes]
+        block = block_ticks(horizon_s, rate_hz, max(lengths))
+        return horizon_point(outcomes, resample(lengths, block, horizon_s * rate_hz, SEED))
+
+    at_fewer = AUDIT_HZ / EVERY
+    compared = compared_methods(prediction_stage)
+    found: list[dict[str, Any]] = [
+        {"horizon_s": h, "methods": {m: point(h, at_fewer, [a.horizons[h][m] for a in audits]) for m in compared}}
+        for h in shorter(prediction_stage)
+    ]
+    own = standstill_s(prediction_stage)
+    whole = {m: point(own, AUDIT_HZ, [a.outcomes[m] for a in audits]) for m in compared}
+    return [*found, {"horizon_s": own, "methods": whole}]
 
 
 def _write_rows(audit: LogAudit, writer: RunWriter) -> None:

@@ -202,6 +202,12 @@ LITTLE = np.array([0.05] * 2 + [np.radians(10.0)] * 10 + [0.05])
 _BATCH = 100
 
 
+#: Shorter horizons than the braking time, at which a robot beside people stops [s]; and who is compared there, beside
+#: the audited method.
+SHORTER_S = (0.05, 0.1, 0.2)
+_PEERS = ("v2_a50", "iso_13855")
+
+
 @dataclass(frozen=True)
 class LogAudit:
     """Results of the audit of one log."""
@@ -212,6 +218,7 @@ class LogAudit:
     outcomes: dict[str, Outcome]  #: by method, our own first
     joints: dict[str, Floats]  #: by method of ours: (n, 13) of ``joints_inside``
     curve: dict[str, dict[float, Outcome]]  #: by method of ours and factor
+    horizons: dict[float, dict[str, Outcome]]  #: by shorter horizon [s] and method, at fewer ticks
     points: dict[str, dict[str, int]]  #: limb -> each point beyond its ends -> at how many ticks it was checked
     notes: tuple[str, ...]
 
@@ -240,9 +247,22 @@ def volumes(prediction_stage: PredictionStage, window: RecordedFuture, method: s
 
 
 def scale_rates(limits: LimitSet, factor: float) -> LimitSet:
-    """A limit set whose velocities and accelerations are ``factor`` times as large."""
+    """A limit set whose velocities, accelerations and departures are ``factor`` times as large."""
     grown = {name: factor * getattr(limits, name) for name in ("v_min", "v_max", "a_min", "a_max")}
-    return replace(limits, name=f"{limits.name} x {factor:g}", **grown)
+    known = limits.departure
+    if known is not None:
+        known = replace(known, beyond_m=factor * known.beyond_m, residuals=factor * known.residuals)
+    return replace(limits, name=f"{limits.name} x {factor:g}", departure=known, **grown)
+
+
+def compared_methods(prediction_stage: PredictionStage) -> tuple[str, ...]:
+    """Methods that are asked at shorter horizons, too."""
+    return (prediction_stage.method, *_PEERS)
+
+
+def shorter(prediction_stage: PredictionStage) -> tuple[float, ...]:
+    """Those of SHORTER_S below the horizon of an audit [s]."""
+    return tuple(h for h in SHORTER_S if h < standstill_s(prediction_stage))
 
 
 def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
@@ -275,6 +295,7 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
     outcomes, curve = {}, {}
     stage = f"auditing {name}"
     more = sum(len(factors(method)) - 1 for method in swept_volumes.METHODS)
+    more += len(shorter(prediction_stage)) * len(compared_methods(prediction_stage))
     work = len(rows) * len(methods()) + more * len(rows[::EVERY])
     with ProgressBar(stage, work) as bar:
         progress = partial(bar.advance, stage)
@@ -289,12 +310,14 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         for method in swept_volumes.METHODS:
             with watch.stage(f"curve {method}", len(rows)):
                 curve[method] = _curve(prediction_stage, future, method, outcomes[method], progress)
+        with watch.stage("shorter horizons", len(rows)):
+            horizons = _shorter(prediction_stage, recording, rows[::EVERY], progress)
     joints = {}
     for method in swept_volumes.METHODS:
         interval = prediction_stage.by(method).reachable(future.states)
         joints[method] = joints_inside(recording, future.states, interval, horizon_s)
     notes = (*log.notes, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))
-    return LogAudit(job, name, recording, outcomes, joints, curve, future.points(), notes)
+    return LogAudit(job, name, recording, outcomes, joints, curve, horizons, future.points(), notes)
 
 
 def _audited(recording: Recording, rate_hz: float, horizon_s: float) -> Ints:
@@ -340,6 +363,19 @@ def _curve(
             wider = replace(prediction_stage, limits=scale_rates(prediction_stage.limits, factor))
             found[factor] = _hold(wider, some, method, 2, progress)
     return dict(sorted(found.items()))
+
+
+def _shorter(
+    prediction_stage: PredictionStage, recording: Recording, rows: Ints, progress: Callable[[int], None]
+) -> dict[float, dict[str, Outcome]]:
+    """The same question at shorter horizons: latency and all, from tick to standstill."""
+    found: dict[float, dict[str, Outcome]] = {}
+    for horizon_s in shorter(prediction_stage):
+        stop_s = horizon_s - prediction_stage.occupancy.latency_s
+        occupancy = prediction_stage.occupancy.model_copy(update={"stop_s": stop_s})
+        stage, future = replace(prediction_stage, occupancy=occupancy), recorded_future(recording, rows, horizon_s)
+        found[horizon_s] = {m: _hold(stage, future, m, 1, progress) for m in compared_methods(stage)}
+    return found
 
 
 def _remarks(recording: Recording, audited_s: float, horizon_s: float) -> tuple[str, ...]:

@@ -225,6 +225,16 @@ def curve_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str
     }
 
 
+def horizon_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:
+    """Coverage of every whole limb that was checked, and volume of their union, of one method at one horizon."""
+    whole = Outcome.join(outcomes)
+    worst = whole.worst_m()
+    return {
+        "covered_share": resampling.share(_hits(worst, np.zeros(len(worst)))).to_dict(),
+        "union_m3": resampling.mean(whole.union_m3).to_dict(),
+    }
+
+
 def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
     """Every escape: the ticks in a row whose prediction one limb left, when, and how far.
 
@@ -310,6 +320,13 @@ def headline_metrics(found: Mapping[str, Any]) -> dict[str, Metric]:
             key = "union_m3" if part in WHAT else "volume_m3"
             room = "mean volume of their union" if part in WHAT else "mean volume"
             table.add(f"{name}_{key}", figures[key]["value"], "m^3", room)
+    for point in found["total"]["horizons"]:
+        until = f"{1000.0 * point['horizon_s']:.0f}ms"
+        for method, figures in point["methods"].items():
+            name = f"audit_{method}_{until}"
+            meaning = f"share of ticks with {WHAT['all']} until {point['horizon_s']:g} s later, by {method}"
+            table.add(f"{name}_covered_share", figures["covered_share"]["value"], "1", meaning, reason=UNCHECKED)
+            table.add(f"{name}_union_m3", figures["union_m3"]["value"], "m^3", "mean volume of their union")
     table.add("audit_ticks", found["total"]["ticks"], "1", "audited ticks of all logs")
     gaps = never_checked(found["total"], found["method"])
     meaning = "limbs, and points of other limbs, of which the audit says nothing: they were never seen"

@@ -167,9 +167,33 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> PageSection:
             table("Escape depth where a limb escaped, median [mm]", "escape_p50_m", 1e3, 0, ""),
             table("Escape depth where a limb escaped, 95th percentile [mm]", "escape_p95_m", 1e3, 0, ""),
             table("Ticks with the points alone of every limb covered [%]", "points_share", 100.0, 1, ""),
+            *_by_horizon(found, every),
             table(f"{every} covered, the lower body left out [%]", "covered_share", 100.0, 1, "", "upper"),
             table("Union of the volumes, the lower body left out, mean [m\u00b3]", "union_m3", 1.0, 2, "", "upper"),
         ),
+    )
+
+
+def _by_horizon(found: Mapping[str, Any], every: str) -> tuple[PageTable, ...]:
+    """Coverage and volume at horizons up to the audit's own, of all logs together."""
+    points = found["total"]["horizons"]
+    compared = tuple(points[0]["methods"])
+    head = ("until after the tick", *_named(compared))
+
+    def table(title: str, key: str, scale: float, decimals: int, note: str) -> PageTable:
+        body = tuple(
+            (
+                f"{point['horizon_s']:g} s",
+                *(text_with_interval(point["methods"][m][key], scale, decimals) for m in compared),
+            )
+            for point in points
+        )
+        return PageTable(title, head, body, note)
+
+    note = "A robot that is slow beside people stops long before the braking time, so it is predicted for less."
+    return (
+        table(f"{every} covered, by horizon [%]", "covered_share", 100.0, 1, note),
+        table("Union of all the limbs' volumes by horizon, mean [m\u00b3]", "union_m3", 1.0, 2, ""),
     )
 
 

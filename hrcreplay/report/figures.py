@@ -135,7 +135,7 @@ FIGURES = (
         lambda data: figures_prediction.walking(given(data.walk), data.t0_ns),
         "As the paper's Fig. 5, at the instant of the fastest walking. Dashed: the circular sectors that a unicycle "
         "reaches within the stopping time, as the paper has them. Orange: their convex approximation, Eq. (22)-(30), "
-        "corrected. Blue: what sound encloses, from every likely state. Red: where the person then walked.",
+        "corrected. Blue: every walk under the joints' bounds, of every likely state. Red: where the person walked.",
         "walk",
     ),
     FigureKind(

@@ -138,8 +138,8 @@ class Occupancy(Section):
     """Section 3: what the person can reach."""
 
     method: Literal["paper", "positions", "sound"] = "sound"
-    """sound: encloses every motion of the model under the limits; paper: Eq. (20)-(30) and Alg. 1, 2 as printed;
-    positions: from positions and velocity bounds alone [26]."""
+    """sound: encloses every motion under the limits, of whole limbs where they bound departures, else of the joints;
+    paper: Eq. (20)-(30) and Alg. 1, 2 as printed; positions: from positions and velocity bounds alone [26]."""
     stop_s: Positive = 0.377
     """Worst-case braking time T_s of the robot, Eq. (70) [s]."""
     store_hz: Positive | Literal["all"] = 25.0
@@ -154,7 +154,8 @@ class Occupancy(Section):
     """Table 2 [m]."""
 
     sigmas: NotNegative = 1.0
-    """sound: states within so many standard deviations of the estimate are enclosed, all joints off at once."""
+    """sound: states within so many standard deviations of the estimate are enclosed, all joints off at once; not of
+    limbs whose departures are bounded, for these were measured from the estimate."""
     latency_s: NotNegative = 0.0
     """sound: from the newest capture to the robot's reaction; the horizon is longer by it [s]."""
     hand_m: NotNegative = 0.19

@@ -110,6 +110,40 @@ def test_what_must_hold_between_methods(found: dict[str, Any]) -> None:
     assert standard["covered_share"]["value"] == pytest.approx(whole["paper"])
 
 
+def test_shorter_horizons_take_less_room_and_the_last_is_the_audits_own(found: dict[str, Any]) -> None:
+    points = found["total"]["horizons"]
+    assert [point["horizon_s"] for point in points] == [0.05, 0.1, 0.2, 0.377]
+    for method in ("sound", "v2_a50", "iso_13855"):
+        room = [point["methods"][method]["union_m3"]["value"] for point in points]
+        assert all(b > 1.1 * a for a, b in pairwise(room))
+        assert (
+            points[-1]["methods"][method]["covered_share"] == found["total"]["methods"][method]["all"]["covered_share"]
+        )
+        assert room[-1] == found["total"]["methods"][method]["all"]["union_m3"]["value"]
+        assert all(point["methods"][method]["covered_share"]["samples"] == 28 for point in points[:-1])
+    reach_m = [1.6 * h for h in (0.05, 0.1, 0.2)]  # ISO 13855 around the thorax
+    assert points[0]["methods"]["iso_13855"]["union_m3"]["value"] > 4.0 / 3.0 * np.pi * (0.15 + reach_m[0]) ** 3
+    alone = found["logs"][0]["horizons"]
+    assert alone == points
+
+
+def test_an_audit_of_a_shorter_horizon_has_that_as_its_own(tmp_path: Path, found: dict[str, Any]) -> None:
+    """The coverage told for 0.1 s is that of an audit of 0.1 s, at every fifth of its ticks."""
+    folder = driver.run(
+        [replay.demo_log()],
+        out=tmp_path / "run",
+        start_s=START_S,
+        end_s=END_S,
+        overrides=(*TABLE_1, "occupancy.stop_s=0.1"),
+    )
+    short = json.loads((folder / "audit.json").read_text())["total"]
+    assert [point["horizon_s"] for point in short["horizons"]] == [0.05, 0.1]
+    for method in ("sound", "v2_a50"):
+        own, told = short["methods"][method]["all"], found["total"]["horizons"][1]["methods"][method]
+        assert own["covered_share"]["value"] == pytest.approx(told["covered_share"]["value"], abs=0.1)
+        assert own["union_m3"]["value"] == pytest.approx(told["union_m3"]["value"], rel=0.1)
+
+
 def test_escapes_name_their_time_and_limb(folder: Path, found: dict[str, Any]) -> None:
     table = pd.read_parquet(folder / "audit.parquet")
     rows = table[(table["method"] == "paper") & (table["escape_m"] > 0)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ Figures = dict[str, Any]
 ROOT = Path(__file__).parents[2]
 DEMO = "datasets/demo.mcap"
 
-#: Horizons of the audits, by their names: what the robot needs at the speeds that it keeps beside people, and from full
-#: speed [s].
-HORIZONS_S = {"short": 0.1, "whole": 0.377}
+#: Horizons of the audits that the README tells of: what the robot needs at the speeds that it keeps beside people, and
+#: from full speed [ms].
+HORIZONS_MS = (100, 377)
 #: Baselines of the demo's table.
 BASELINES = ("scaling", "shield", "ssm", "none")
 #: Base of the robot: further away, as in the log, and nearer [m].
@@ -45,13 +46,14 @@ VARIANTS = (
 COMPARED = ("touch_ticks", "nearest_moving_m", "pace", "cycles", "standing_share", "coverage", "jerk_rms_rad_per_s3")
 #: Part of an audit: every limb that was checked, with the lower body where a method has a volume for it.
 _PART = "all"
-_AUDITED = ("sound", "paper", "positions", "v2_a50")
+_AUDITED = ("sound", "paper", "positions")
+_COMPARED = ("sound", "v2_a50")
 #: What the audits that change one margin are run on: the worker reaches in, walks away and comes back.
 EXCERPT = f"{DEMO} --start 8 --end 23"
 #: Audits of it: name -> settings.
 MARGINS = {
     "default": "",
-    "3 sigma": "--set occupancy.sigmas=3",
+    "joints": "--limits human",
     "no hand": "--set occupancy.hand_m=0",
     "no residual": "--set occupancy.residual=false",
     "bare, paper": "--limits paper --set occupancy.sigmas=0 --set occupancy.hand_m=0 --set occupancy.residual=false",
@@ -111,9 +113,11 @@ def of_audit(metrics: Mapping[str, Any]) -> Figures:
     """What is kept of an audit's metrics."""
     found: Figures = {"ticks": metrics["audit_ticks"]["value"]}
     for method in _AUDITED:
-        found[f"{method}_share"] = metrics[f"audit_{method}_{_PART}_covered_share"]["value"]
         found[f"{method}_points_share"] = metrics[f"audit_{method}_{_PART}_points_share"]["value"]
         found[f"{method}_union_m3"] = metrics[f"audit_{method}_{_PART}_union_m3"]["value"]
+    for method, until in product(_COMPARED, HORIZONS_MS):
+        for key in ("covered_share", "union_m3"):
+            found[f"{method}_{until}ms_{key}"] = metrics[f"audit_{method}_{until}ms_{key}"]["value"]
     return found
 
 
@@ -129,7 +133,7 @@ def of_sampling(found: Mapping[str, Any]) -> Figures:
 
 def measurements() -> list[Measurement]:
     """All of them, the quick ones first."""
-    found = [_audit(f"audit demo, {name}", (f"{DEMO} {_until(name)}",), {}) for name in HORIZONS_S]
+    found = [_audit("audit demo", (DEMO,), {})]
     for name, options in DEMO_RUNS.items():
         command = f"hrcreplay report {DEMO} {options} --out {{tmp}}/run"
         files = {"cell.toml": _CELL.format(x=name.split()[-2])} if "--cell" in options else {}
@@ -140,8 +144,7 @@ def measurements() -> list[Measurement]:
     ]
     command = f"hrcreplay compare {DEMO} --out {{tmp}}/run"
     found.append(Measurement("compare", (command,), "run/compare.json", of_comparison, {}))
-    for name, key in RECORDINGS.items():
-        found += [_recording(name, key, horizon) for horizon in HORIZONS_S]
+    found += [_recording(name, key) for name, key in RECORDINGS.items()]
     for (method, limits), samples in sorted(SAMPLES.items(), key=lambda item: item[1]):
         command = f"tests.soundness --json --samples {samples} --method {method} --limits {limits}"
         found.append(Measurement(f"soundness, {method}, {limits}", (command,), "", of_sampling, {}, sampled=True))
@@ -155,15 +158,11 @@ def _audit(name: str, commands: tuple[str, ...], files: Mapping[str, str]) -> Me
     return Measurement(name, (*before, last), "run/metrics.json", of_audit, files)
 
 
-def _until(horizon: str) -> str:
-    return f"--set occupancy.stop_s={HORIZONS_S[horizon]}"
-
-
-def _recording(name: str, key: str, horizon: str) -> Measurement:
-    title = f"recording, {name}, {horizon}"
+def _recording(name: str, key: str) -> Measurement:
+    title = f"recording, {name}"
     if key not in IMPORTS:
         bag = f"{{data}}/sara_human_robot_bags/{key}.bag --config {{tmp}}/settings.toml --cell {{tmp}}/cell.toml"
-        return _audit(title, (f"{bag} {_until(horizon)}",), {"settings.toml": SARA, "cell.toml": SARA_CELL})
+        return _audit(title, (bag,), {"settings.toml": SARA, "cell.toml": SARA_CELL})
     kind, files, options = IMPORTS[key]
     sources = [
         f"{{data}}/{file}" if kind == "keraal" else f"{camera}={{data}}/{file}" for camera, file in files.items()
@@ -175,7 +174,7 @@ def _recording(name: str, key: str, horizon: str) -> Measurement:
         (
             f"hrcreplay import {kind} {' '.join(sources)} --out {{tmp}}/log.mcap",
             f"hrcreplay calibrate {{tmp}}/log.mcap --out {{tmp}}/cell.toml{given}",
-            f"{{tmp}}/log.mcap --cell {{tmp}}/cell.toml {_until(horizon)}",
+            "{tmp}/log.mcap --cell {tmp}/cell.toml",
         ),
         {},
     )

@@ -22,7 +22,7 @@ from tests.readme.measurements import (
     BASELINES,
     COMPARED,
     DEMO,
-    HORIZONS_S,
+    HORIZONS_MS,
     ROOT,
     VARIANTS,
     Measurement,
@@ -99,9 +99,17 @@ def _compared(numbers: Any) -> dict[str, Any]:
 
 
 AUDIT_KEYS = [
-    f"audit_{method}_{key}"
-    for method in ("sound", "paper", "positions", "v2_a50")
-    for key in ("all_covered_share", "all_points_share", "all_union_m3")
+    *(
+        f"audit_{method}_all_{key}"
+        for method in ("sound", "paper", "positions")
+        for key in ("points_share", "union_m3")
+    ),
+    *(
+        f"audit_{method}_{until}ms_{key}"
+        for method in ("sound", "v2_a50")
+        for until in HORIZONS_MS
+        for key in ("covered_share", "union_m3")
+    ),
 ]
 
 
@@ -148,11 +156,11 @@ def test_a_recording_holds_its_own_predictions() -> None:
     facts = _made_up()
     line = next(line for line in BLOCKS["recordings"](facts).splitlines() if line.startswith("| demo (simulated)"))
     cells = [cell.strip() for cell in line.strip("|").split("|")]
-    for column, (method, horizon) in enumerate(((m, h) for h in HORIZONS_S for m in ("sound", "v2_a50")), start=1):
-        audit = facts[f"audit demo, {horizon}"]["figures"]
-        share, size = audit[f"{method}_share"], audit[f"{method}_union_m3"]
+    audit = facts["audit demo"]["figures"]
+    for column, (method, until) in enumerate(((m, h) for h in HORIZONS_MS for m in ("sound", "v2_a50")), start=1):
+        share, size = (audit[f"{method}_{until}ms_{key}"] for key in ("covered_share", "union_m3"))
         assert cells[column] == f"{100 * share:.1f} %, {size:.2f} m\u00b3"
-    assert cells[5] == f"{100 * facts['audit demo, whole']['figures']['sound_points_share']:.1f} %"
+    assert cells[5] == f"{100 * audit['sound_points_share']:.1f} %"
 
 
 @pytest.mark.parametrize(
@@ -160,14 +168,14 @@ def test_a_recording_holds_its_own_predictions() -> None:
 )
 def test_all_and_none_are_said_of_all_and_none_alone(share: float | None, text: str) -> None:
     facts = _made_up()
-    facts["audit demo, short"]["figures"]["sound_share"] = share
+    facts["audit demo"]["figures"]["sound_100ms_covered_share"] = share
     assert f"| demo (simulated) | {text}, " in BLOCKS["recordings"](facts)
 
 
 def test_a_block_of_which_a_figure_is_missing_stays() -> None:
     text = "<!-- figures: margins -->\nold\n<!-- end -->\n<!-- figures: demo -->\nold\n<!-- end -->\n"
     facts = _made_up()
-    del facts["audit excerpt, 3 sigma"]
+    del facts["audit excerpt, joints"]
     kept, written = fill(text, facts).split("<!-- end -->\n")[:2]
     assert kept == "<!-- figures: margins -->\nold\n"
     assert "old" not in written
@@ -184,7 +192,7 @@ def test_only_the_figures_asked_for_are_measured_and_nothing_twice(
     old = _made_up()
     (tmp_path / "figures.json").write_text(json.dumps(old))
     asked: list[str] = []
-    audit = next(m for m in measurements() if m.name == "audit demo, short")
+    audit = next(m for m in measurements() if m.name == "audit demo")
 
     def measure(measurement: Measurement, _data: str, _picture: Path) -> Any:
         asked.append(measurement.name)
@@ -192,14 +200,12 @@ def test_only_the_figures_asked_for_are_measured_and_nothing_twice(
 
     monkeypatch.setattr(readme, "_measure", measure)
     for _ in range(2):
-        assert readme.main(["audit demo, short", "recording"]) == 0
+        assert readme.main(["audit demo", "recording"]) == 0
     assert asked == [audit.name]
     new = json.loads((tmp_path / "figures.json").read_text())
-    assert new["audit demo, short"]["figures"]["ticks"] == 7
+    assert new["audit demo"]["figures"]["ticks"] == 7
     assert new["demo"] == old["demo"]
-    assert (
-        "recording, Kinect v2, waving, short: left as it was, for HRCREPLAY_DATA is not set" in capsys.readouterr().out
-    )
+    assert "recording, Kinect v2, waving: left as it was, for HRCREPLAY_DATA is not set" in capsys.readouterr().out
     assert "| demo (simulated) | 50.0 %, 0.50 m\u00b3 |" in (tmp_path / "README.md").read_text()
 
 
