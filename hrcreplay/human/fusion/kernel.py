@@ -188,7 +188,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
     track.lengths[1, k] = np.sqrt(filter_.lengths_var)
     told(filter_, filter_.tick_ns[0], rules, track.residual[k])
     unseen(filter_, track.unseen[k])
-    place(filter_, filter_.mean[:, 0].copy(), rules, track.points[k])
+    place(filter_, filter_.mean[:, 0].copy(), track.points[k])
     if len(track.cov) > 0:
         track.cov[k] = filter_.cov
         track.damping[k] = damping

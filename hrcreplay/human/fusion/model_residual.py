@@ -41,6 +41,8 @@ from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, Ints
 REACH_M = 1.2
 #: Nor is a hand further from its wrist [m].
 _HAND_M = 0.3
+#: A hand or a leg that a camera showed longer ago is anywhere by now: some frames of any camera [ns].
+_SHOWN_NS = 200_000_000
 _BIN_M = 0.001
 #: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person's arm.
 BINS = round(REACH_M / _BIN_M)
@@ -295,22 +297,21 @@ def _carry(filter_: Filter, c: int, k: int, relative: Floats) -> None:
 
 
 @njit(cache=True)
-def place(filter_: Filter, p: Floats, rules: Rules, points: Floats) -> None:
-    """Writes where the points are at the tick; NaN for hands and legs that were not shown within the filter's memory.
+def place(filter_: Filter, p: Floats, points: Floats) -> None:
+    """Writes where the points are at the tick; NaN for hands and legs that no camera has shown lately.
 
     Args:
         filter_: After the tick.
         p: (13,) the posture [m, m, rad..., m].
-        rules: Settings of the filter.
         points: (20, 3) receives the points, world [m].
     """
     skeleton_row(p, filter_.lengths, points)
     shift(filter_, p, points)
     now = filter_.tick_ns[0]
     for n, k in enumerate(_HANDS):
-        if now - filter_.carried_ns[k] <= rules.memory_ns:
+        if now - filter_.carried_ns[k] <= _SHOWN_NS:
             points[k] = points[_WRISTS[n]] + filter_.carried[k]
     for k in _LEG_POINTS:
-        if now - filter_.carried_ns[k] <= rules.memory_ns:
+        if now - filter_.carried_ns[k] <= _SHOWN_NS:
             points[k] = filter_.carried[k]
             points[k, :2] += points[PELVIS, :2]
