@@ -289,19 +289,22 @@ def test_smooth_comes_nearer_to_the_truth_than_the_filter(tmp_path: Path) -> Non
 
 
 def test_what_the_volumes_hold_is_the_person(demo: Run) -> None:
-    """The fused skeleton's wrist lies in the hull of its own lower arm."""
+    """The wrist, where cameras show it, lies in the hull of its own lower arm; the fused skeleton's in its volume."""
     assert demo.state is not None
     assert demo.occupancy is not None
     arm = demo.occupancy[demo.occupancy["limb"] == "LRA"].iloc[::50]
     state = demo.state.set_index("t_ns")
-    for t, vertices in zip(arm["t_ns"], arm["vertices"], strict=True):
+    for t, vertices, radius in zip(arm["t_ns"], arm["vertices"], arm["radius_m"], strict=True):
         row = state.loc[t]
         wrist = skeleton(row[list(JOINTS)].to_numpy(dtype=float)[None], row[list(LENGTHS)].to_numpy(dtype=float)[None])[
             0, 10
         ]
         corners = np.asarray(vertices, dtype=float).reshape(-1, 3)
         directions = np.random.default_rng(0).normal(size=(200, 3))
-        assert (directions @ wrist <= (directions @ corners.T).max(axis=1) + 1e-9).all()
+        far = (directions @ corners.T).max(axis=1)
+        shown = row[[f"point_wrist_r_{axis}" for axis in "xyz"]].to_numpy(dtype=float)
+        assert (directions @ shown <= far + 1e-9).all()
+        assert (directions @ wrist <= far + radius * np.linalg.norm(directions, axis=1)).all()
 
 
 def test_nothing_of_a_span_outside_the_log_is_replayed(tmp_path: Path) -> None:
