@@ -151,6 +151,8 @@ def _factor(samples: Sequence[LimbDepartures], plain: Departure, k: int, share: 
         hits = [inside[np.isfinite(inside)] for inside in (s.inside(raised)[k] for s in samples)]
         return np.array([hit.mean() if len(hit) else 1.0 for hit in hits]), float(np.concatenate(hits).mean())
 
+    if not any(np.isfinite(s.inside(plain)[k]).any() for s in samples):
+        return 1.0
     each, together = shares(_MOST)
     asks, wanted = each >= least, min(share, together)
 

@@ -1,0 +1,118 @@
+"""The fit of departures against brute force, on departures that are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from hrcreplay.audit import departures
+from hrcreplay.audit.departures import LimbDepartures, fit, not_recorded
+from hrcreplay.human.model import Departure
+from hrcreplay.human.prediction.velocity_tube import NOISE_M
+from hrcreplay.limits import load_limits
+from hrcreplay.records import BODY, Floats
+from tests.human.people import random_states
+
+HORIZONS_S = np.array([0.1, 0.4])
+HUMAN = load_limits("human")
+
+
+def log(count: int, seed: int, scale: float = 1.0) -> LimbDepartures:
+    """Departures of 2 cm and 1.4 times the residual, three times that at the longer horizon, and some luck."""
+    rng = np.random.default_rng(seed)
+    residual = rng.uniform(0.01, 0.15, (count, len(BODY)))
+    luck = scale * rng.uniform(0.2, 1.0, (2, count, len(BODY)))
+    beyond = luck * (0.02 + 1.4 * residual) * np.array([1.0, 3.0])[:, None, None]
+    return LimbDepartures(random_states(HUMAN, count, seed), HORIZONS_S, beyond, residual)
+
+
+def plain_share(of: LimbDepartures, departure: Departure, k: int) -> float:
+    hits = []
+    for tick in range(len(of.residual_m)):
+        inside = True
+        for limb in range(len(BODY)):
+            far, residual = of.beyond_m[k, tick, limb], of.residual_m[tick, limb]
+            most = departure.beyond_m[limb, k] + departure.residuals[limb, k] * min(residual, NOISE_M)
+            inside &= not far > most + max(0.0, residual - NOISE_M)
+        if np.isfinite(of.beyond_m[k, tick]).any():
+            hits.append(inside)
+    return float(np.mean(hits))
+
+
+def loss(offset: float, slope: float, far: Floats, residual: Floats) -> float:
+    over = far - offset - slope * residual
+    return float(np.where(over > 0.0, departures._BELOW * over, (departures._BELOW - 1.0) * over).mean())
+
+
+def test_a_line_has_the_least_loss_of_all_on_a_grid() -> None:
+    one = log(400, seed=1)
+    far, residual = one.beyond_m[0, :, 0], one.residual_m[:, 0]
+    line = departures._line([(far[:, None], residual[:, None])])
+    least = min(loss(a, b, far, residual) for a, b in product(np.arange(0.0, 0.1, 0.002), np.arange(1.0, 3.0, 0.02)))
+    assert loss(float(line[0]), float(line[1]), far, residual) <= least + 1e-9
+    assert line[0] == pytest.approx(0.02, abs=0.01)
+    assert line[1] == pytest.approx(1.4, abs=0.15)
+
+
+def test_the_share_is_reached_by_whole_people_and_hardly_exceeded() -> None:
+    logs = [log(400, seed) for seed in (2, 3, 4)]
+    for share in (0.95, 0.99):
+        found = fit(logs, share)
+        for k in range(2):
+            together = [plain_share(one, found, k) for one in logs]
+            assert np.mean(together) >= share
+            assert min(together) >= 1.0 - 4.0 * (1.0 - share)
+            smaller = replace(found, beyond_m=0.9 * found.beyond_m, residuals=0.9 * found.residuals)
+            assert np.mean([plain_share(one, smaller, k) for one in logs]) < share
+            for one in logs:
+                assert np.nanmean(one.inside(found)[k]) == plain_share(one, found, k)
+    np.testing.assert_array_equal(found.beyond_m[[2, 3]], found.beyond_m[[4, 5]])
+    np.testing.assert_array_equal(found.residuals[[2, 3]], found.residuals[[4, 5]])
+    assert (found.residuals >= 1.0).all()
+
+
+def test_a_person_who_departs_further_counts_as_much_as_the_others() -> None:
+    """A quarter of the ticks of one log: without it the bounds are what the others need."""
+    logs = [log(400, seed) for seed in (2, 3, 4)]
+    wild = log(100, seed=5, scale=1.3)
+    with_wild, without = fit([*logs, wild], 0.95), fit(logs, 0.95)
+    assert plain_share(wild, without, 0) < 0.6
+    assert plain_share(wild, with_wild, 0) >= 0.8
+
+
+def test_a_camera_that_loses_the_legs_does_not_drive_the_others_up() -> None:
+    logs = [log(400, seed) for seed in (2, 3, 4)]
+    lost = log(100, seed=5)
+    beyond = lost.beyond_m.copy()
+    beyond[:, ::4, BODY.index("LEGS")] = 5.0
+    found, plain = fit([*logs, replace(lost, beyond_m=beyond)], 0.95), fit([*logs, lost], 0.95)
+    np.testing.assert_allclose(found.beyond_m[:6], plain.beyond_m[:6], rtol=0.5)
+    assert found.beyond_m[:6].max() < 2.0 * plain.beyond_m[:6].max()
+
+
+def test_a_limb_that_was_never_recorded_has_no_departure_and_is_named() -> None:
+    logs = [log(200, seed) for seed in (2, 3)]
+    blind = []
+    for one in logs:
+        beyond = one.beyond_m.copy()
+        beyond[..., BODY.index("LEGS")] = np.nan
+        blind.append(replace(one, beyond_m=beyond))
+    assert not_recorded(blind) == ["LEGS"]
+    assert not_recorded(logs) == []
+    found = fit(blind, 0.95)
+    assert found.beyond_m[BODY.index("LEGS")].tolist() == [0.0, 0.0]
+    assert np.isfinite(found.beyond_m).all()
+    nobody = [replace(one, beyond_m=np.full_like(one.beyond_m, np.nan)) for one in logs]
+    assert fit(nobody, 0.95).beyond_m.max() == 0.0
+
+
+def test_parts_join_to_the_whole() -> None:
+    whole = log(50, seed=6)
+    parts = [whole.rows(np.arange(20)), whole.rows(np.arange(20, 50))]
+    joined = LimbDepartures.join(parts)
+    np.testing.assert_array_equal(joined.beyond_m, whole.beyond_m)
+    np.testing.assert_array_equal(joined.residual_m, whole.residual_m)
+    np.testing.assert_array_equal(joined.states.p, whole.states.p)
