@@ -16,6 +16,7 @@ from hrcreplay.audit.figures import draw_all
 from hrcreplay.audit.log_audit import (
     AUDIT_HZ,
     EVERY,
+    EVERY_SHORTER,
     LogAudit,
     audit_log,
     compared_methods,
@@ -236,7 +237,7 @@ def _horizons(audits: Sequence[LogAudit]) -> list[dict[str, Any]]:
         block = block_ticks(horizon_s, rate_hz, max(lengths))
         return horizon_point(outcomes, resample(lengths, block, horizon_s * rate_hz, SEED))
 
-    at_fewer = AUDIT_HZ / EVERY
+    at_fewer = AUDIT_HZ / EVERY_SHORTER
     compared = compared_methods(prediction_stage)
     found: list[dict[str, Any]] = [
         {"horizon_s": h, "methods": {m: point(h, at_fewer, [a.horizons[h][m] for a in audits]) for m in compared}}

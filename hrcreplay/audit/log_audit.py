@@ -192,8 +192,9 @@ def joint_travel(joints: Floats) -> Floats:
     return found
 
 
-#: Ticks a second that are audited [Hz]; the union is counted out at, and the curve rests on, one in so many.
-AUDIT_HZ, EVERY = 25.0, 5
+#: Ticks a second that are audited [Hz]; the union is counted out at, and the curve rests on, one in so many. Shorter
+#: horizons rest on one in so many: out of step with cameras of 30 Hz, which else might never have a frame near the end.
+AUDIT_HZ, EVERY, EVERY_SHORTER = 25.0, 5, 4
 #: Factors on the limit set's velocities and accelerations along the curve; ``positions`` grows with their cube.
 _FACTORS = {"positions": (0.25, 0.5, 1.0, 2.0)}
 _STANDARD_FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
@@ -295,8 +296,8 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
     outcomes, curve = {}, {}
     stage = f"auditing {name}"
     more = sum(len(factors(method)) - 1 for method in swept_volumes.METHODS)
-    more += len(shorter(prediction_stage)) * len(compared_methods(prediction_stage))
-    work = len(rows) * len(methods()) + more * len(rows[::EVERY])
+    few = len(shorter(prediction_stage)) * len(compared_methods(prediction_stage)) * len(rows[::EVERY_SHORTER])
+    work = len(rows) * len(methods()) + more * len(rows[::EVERY]) + few
     with ProgressBar(stage, work) as bar:
         progress = partial(bar.advance, stage)
         for method in methods():
@@ -311,7 +312,7 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
             with watch.stage(f"curve {method}", len(rows)):
                 curve[method] = _curve(prediction_stage, future, method, outcomes[method], progress)
         with watch.stage("shorter horizons", len(rows)):
-            horizons = _shorter(prediction_stage, recording, rows[::EVERY], progress)
+            horizons = _shorter(prediction_stage, recording, rows[::EVERY_SHORTER], progress)
     joints = {}
     for method in swept_volumes.METHODS:
         interval = prediction_stage.by(method).reachable(future.states)

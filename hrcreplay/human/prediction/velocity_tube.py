@@ -85,7 +85,7 @@ def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
     """How far a limb departs at most until ``reach_s`` [m].
 
     Between the horizons that were measured linear, for it grows faster than the horizon; before the first as at it;
-    after the last with the square, as an acceleration would.
+    after the last as fast as before it, for people's speeds are bounded.
 
     Args:
         limb: Index into BODY.
@@ -95,8 +95,9 @@ def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
     """
     known, last = at.horizon_s, len(at.horizon_s) - 1
     beyond, times = np.interp(reach_s, known, at.beyond_m[limb]), np.interp(reach_s, known, at.residuals[limb])
-    if reach_s > known[last]:
-        beyond *= (reach_s / known[last]) ** 2
+    if reach_s > known[last] and last > 0:
+        slope = (at.beyond_m[limb, last] - at.beyond_m[limb, last - 1]) / (known[last] - known[last - 1])
+        beyond += max(0.0, slope) * (reach_s - known[last])
     return beyond + times * min(residual_m, NOISE_M) + max(0.0, residual_m - NOISE_M)
 
 

@@ -70,7 +70,8 @@ def allowed_m(departure: Departure, limb: str, horizon_s: float, residual_m: flo
     k = BODY.index(limb)
     beyond = np.interp(horizon_s, departure.horizon_s, departure.beyond_m[k])
     if horizon_s > departure.horizon_s[-1]:
-        beyond = departure.beyond_m[k, -1] * (horizon_s / departure.horizon_s[-1]) ** 2
+        far, long = departure.beyond_m[k], departure.horizon_s
+        beyond = far[-1] + (far[-1] - far[-2]) / (long[-1] - long[-2]) * (horizon_s - long[-1])
     times = np.interp(horizon_s, departure.horizon_s, departure.residuals[k])
     return float(beyond + times * min(residual_m, NOISE_M) + max(residual_m - NOISE_M, 0.0))
 
