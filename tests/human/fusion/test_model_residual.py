@@ -108,7 +108,7 @@ def plain_residual(m: Measurements, states: HumanStates, prior: HumanStates, set
     The residual is the quantile, or a larger one that is held.
     """
     found, lately = np.full((len(states), 6), np.nan), np.zeros((len(states), 6))
-    points = skeleton(states.p, states.lengths_m)
+    points, beside = skeleton(states.p, states.lengths_m), np.zeros((len(states), len(POINTS), 3))
     samples, offsets = {limb: Samples() for limb in LIMBS}, {point: Offset() for point in BESIDE}
     settled_s = {name: found_s(states, limb) + settings.memory_s for limb, name in enumerate(LIMBS)}
     torso = Rotation.from_euler("ZY", states.p[:, 2:4]).as_matrix()
@@ -143,7 +143,8 @@ def plain_residual(m: Measurements, states: HumanStates, prior: HumanStates, set
             if BESIDE[point] in shown:
                 a = POINTS.index(point)
                 offset.enter(turned.T @ (m.points_m[i, a] - model[a]), int(states.t_ns[k]), settings)
-                points[k:, a] = skeleton(states.p[k:], states.lengths_m[k:])[:, a] + torso[k:] @ offset.mean
+                beside[k:, a] = offset.mean
+    points += np.einsum("nij,nkj->nki", torso, beside)
     shoulders = points[:, index(("shoulder_l", "shoulder_r"))]
     points[:, POINTS.index("neck")] = shoulders.mean(axis=1)
     return np.where(np.isnan(found), np.nan, np.maximum(found, lately)), points
