@@ -184,7 +184,13 @@ def test_every_limb_is_every_limb_that_was_checked() -> None:
     assert (rows["HD"], rows["LLA"], rows["LRA: hand_r"]) == ("7", "not checked", "not checked")
     assert (rows["LEGS: foot_l"], rows["THX: shoulder_l"]) == ("3", "7")
     found = {"total": part, "method": "sound"}
-    metrics = audit_metrics.headline_metrics(found | {"total": part | {"methods": {"sound": figures}}})
+    horizon = audit_metrics.horizon_point([outcome], _once(8))
+    assert horizon["covered_share"] == figures["all"]["covered_share"]
+    assert horizon["union_m3"] == figures["all"]["union_m3"]
+    total = part | {"horizons": [{"horizon_s": 0.1, "methods": {"sound": horizon}}]}
+    metrics = audit_metrics.headline_metrics(found | {"total": total})
+    assert metrics["audit_sound_100ms_covered_share"]["value"] == pytest.approx(5 / 7)
+    assert metrics["audit_sound_100ms_union_m3"]["value"] == 2.0
     assert metrics["audit_not_checked"]["value"] == "LLA, hand_r of LRA"
     assert metrics["audit_sound_LLA_covered_share"]["value"] is None
     assert metrics["audit_sound_LLA_covered_share"]["reason"] == "not checked: not seen to the end of a horizon"
