@@ -30,8 +30,8 @@ CAPTIONS = {
     "audit_coverage": (
         "Share of the ticks at which every limb that was checked, the lower body left out, stayed in its own volume "
         "for the whole horizon, against the room that these volumes take: not all methods have a lower body. "
-        "Diamonds: our methods with the limit set as given; lines: its velocity and acceleration bounds scaled by the "
-        "factors written beside them. Squares: peers. Bars: 95 % intervals. Faint: each log."
+        "Diamonds: our methods with the limit set as given; lines: its velocities, accelerations and departures times "
+        "the factors written beside them. Squares: peers. Bars: 95 % intervals. Faint: each log."
     ),
     "audit_limbs": "Coverage, where checked, and mean volume of each limb, with 95 % intervals.",
     "audit_joints": (
