@@ -28,6 +28,8 @@ _SHORT_M = 0.02
 _HANDS = np.array([POINTS.index("hand_r"), POINTS.index("hand_l")])
 LEG_POINTS = np.array([POINTS.index(f"{part}_{side}") for part in ("hip", "knee", "ankle", "foot") for side in "rl"])
 HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
+#: For each limb of BODY, itself and those of LIMBS that carry it: an arm on a torso that nobody sees is anywhere.
+_CARRIED_BY = ((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))
 #: Most points of a tube.
 MOST_POINTS = 2 * (len(LEG_POINTS) + 1)
 _ARMS = np.array(ARM_POINTS)
@@ -40,9 +42,7 @@ class Tubes(NamedTuple):
     residual: Floats  #: (n, 7) what is added for each limb of BODY times ``residuals`` [m]
     usable: Bools  #: (n, 7) whether the limb has a tube
     legs_shown: Bools  #: (n,) whether a camera has shown any point of the legs lately
-    legs_m: (
-        Floats  #: (n,) how far from the line below the pelvis they were; NaN until known, or where it does not count
-    )
+    legs_m: Floats  #: (n,) how far from the line below the pelvis they were [m]; NaN: not known, or does not count
     reach_s: Floats  #: (n, 7) until when it may depart [s]
     horizon_s: Floats  #: (h,) of ``Departure``
     beyond_m: Floats  #: (7, h)
@@ -63,7 +63,7 @@ def tubes(
         memory_s: How long the filter goes on without a measurement [s].
     """
     known = limits.departure
-    unseen = states.unseen_s[:, [0, 1, 2, 3, 4, 5, 1]]
+    unseen = np.column_stack([states.unseen_s[:, list(carrying)].max(axis=1) for carrying in _CARRIED_BY])
     of = states.residual_m[:, [0, 1, 2, 3, 4, 5, 1]]  # legs have none of their own that tells of departures
     usable = unseen <= memory_s
     empty = np.zeros((len(BODY), 1))

@@ -127,6 +127,28 @@ def test_a_limb_that_is_out_of_sight_has_the_volume_of_its_joints() -> None:
     np.testing.assert_array_equal(tubes.radius_m[:, hidden], joints.radius_m[:, hidden])
 
 
+@pytest.mark.parametrize(
+    ("hidden", "gone"),
+    [
+        ("THX", set(BODY)),  # a pelvis behind a table: whatever the torso carries is where nobody knows
+        ("URA", {"URA", "LRA"}),
+        ("LLA", {"LLA"}),
+        ("HD", {"HD"}),
+    ],
+)
+def test_what_an_unseen_limb_carries_has_no_tube_either(hidden: str, gone: set[str]) -> None:
+    states = people(2, seed=11)
+    unseen = states.unseen_s.copy()
+    unseen[:, LIMBS.index(hidden)] = MEMORY_S + 0.5
+    states = replace(states, unseen_s=unseen)
+    tubes = predict(states, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    joints = predict(states, without(PEOPLE), Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    for k, limb in enumerate(BODY):
+        same = np.array_equal(tubes.vertices(0, k), joints.vertices(0, k))
+        assert same == (limb in gone), limb
+        assert (tubes.radius_m[0, k] == joints.radius_m[0, k]) == (limb in gone), limb
+
+
 def test_a_limb_seen_a_while_ago_may_have_departed_for_longer() -> None:
     states = people(3, seed=7)
     unseen = states.unseen_s.copy()
