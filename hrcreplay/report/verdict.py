@@ -35,6 +35,7 @@ class ContactSummary:
     """Two sentences on the chosen method, and all methods beside each other."""
 
     sentences: tuple[str, ...]
+    held: str  #: how far the prediction they rest on can be trusted; empty: not known
     details: tuple[str, ...]  #: the same with places, instants and causes
     table: PageTable
 
@@ -45,6 +46,7 @@ def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
         return None
     return ContactSummary(
         (_safe_in_short(metrics), _cost_in_short(run, metrics)),
+        _held(metrics),
         (_touched(metrics), _cost(run, metrics)),
         _table(run, metrics),
     )
@@ -83,6 +85,15 @@ def _cost_in_short(run: Run, metrics: Metrics) -> str:
         return f"{cost}; without a controller the robot would not have touched the person either."
     speed = text_of(metrics["baseline_none_touch_contact_speed_max_m_per_s"])
     return f"{cost}; without a controller the robot would have hit the person at up to {speed}."
+
+
+def _held(metrics: Metrics) -> str:
+    """How often the prediction held the person, as ``audit`` counts it."""
+    checked, left = metrics["volumes_checked_ticks"]["value"], metrics["volumes_left_ticks"]["value"]
+    if not checked or left is None:
+        return ""
+    share = f"all {checked}" if left == 0 else f"{100 * (checked - left) / checked:.1f} % of {checked}"
+    return f"The predicted volumes held the whole person until their horizon at {share} ticks that were checked."
 
 
 def _centimetres(metres: float) -> str:

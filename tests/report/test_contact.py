@@ -139,8 +139,29 @@ def test_the_first_sentences_of_a_robot_that_touched_nobody(run: Run, tmp_path: 
     assert found.table.rows[1][2:6] == ("0.248 m/s", "\u22120.029 m", "0.248 / 0.124 m/s", "\u22120.004 m")
     html = rendered(run, tmp_path)
     assert html.index(found.sentences[0]) < html.index(touched[:40])
+    assert html.index(found.sentences[1]) < html.index(found.held) < html.index(touched[:40])
     assert html.index(touched[:40]) < html.index("Robot against the recorded person") < html.index("What would it have")
     assert "At every tick of this replay, and certified." in html
+
+
+def test_how_often_the_prediction_held_the_person_stands_beside_the_verdict(run: Run) -> None:
+    assert run.contact is not None
+    found = verdict.verdict(run, metrics_of(run))
+    assert found is not None
+    checked = int((run.contact["left_m"].notna()).sum())
+    assert checked > 50
+    assert found.held == (
+        f"The predicted volumes held the whole person until their horizon at {100 * (checked - 1) / checked:.1f} % of "
+        f"{checked} ticks that were checked."
+    )
+    kept = dataclasses.replace(run, contact=run.contact.assign(left_m=run.contact["left_m"].clip(upper=0.0)))
+    always = verdict.verdict(kept, metrics_of(kept))
+    assert always is not None
+    assert f"at all {checked} ticks" in always.held
+    unknown = dataclasses.replace(run, contact=run.contact.assign(left_m=np.nan))
+    nothing = verdict.verdict(unknown, metrics_of(unknown))
+    assert nothing is not None
+    assert nothing.held == ""
 
 
 def test_the_first_sentence_says_whose_fault_a_contact_is(run: Run) -> None:
