@@ -31,7 +31,7 @@ _PAIRS = ((0,), (1,), (2, 4), (3, 5), (6,))
 #: Share of a pair's departures below its line before it is raised.
 _BELOW = 0.995
 #: The largest factor, how often its interval is halved, and how many times as many ticks of one log may miss as of all.
-_MOST, _HALVINGS, _EACH = 1.5, 12, 4.0
+_MOST, _HALVINGS, EACH = 1.5, 12, 3.0
 #: Departures and their growth are rounded up to these [m], [1].
 _MM, _HUNDREDTH = 1e-3, 1e-2
 
@@ -51,17 +51,11 @@ class LimbDepartures:
             self, states=self.states.rows(which), beyond_m=self.beyond_m[:, which], residual_m=self.residual_m[which]
         )
 
-    @classmethod
-    def join(cls, parts: Sequence[LimbDepartures]) -> LimbDepartures:
-        """One of all ticks, in the given order."""
-        beyond = np.concatenate([part.beyond_m for part in parts], axis=1)
-        residual = np.concatenate([part.residual_m for part in parts])
-        return cls(HumanStates.join([part.states for part in parts]), parts[0].horizon_s, beyond, residual)
-
     def inside(self, departure: Departure) -> Floats:
         """(h, n) whether all limbs that were recorded stayed within their departures: 1, 0, or NaN where none was."""
         noise = np.minimum(self.residual_m, NOISE_M)
-        allowed = departure.beyond_m.T[:, None] + departure.residuals.T[:, None] * noise + (self.residual_m - noise)
+        line = departure.beyond_m.T[:, None] + departure.residuals.T[:, None] * noise + (self.residual_m - noise)
+        allowed = np.maximum(line, self.residual_m)
         known = np.isfinite(self.beyond_m)
         held = (~known | (self.beyond_m <= allowed)).all(axis=2).astype(float)
         return np.where(known.any(axis=2), held, np.nan)
@@ -84,7 +78,8 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
         future = recorded_future(recording, ticks, h)
         measured = check_containment(bare.volumes(states, h), future, flesh_m(stage), nothing).beyond_m
         at = tubes(states, bare.limits, True, bare.occupancy.residual_unknown_m, h, stage.memory_s)
-        found[k] = np.where(at.usable & (at.reach_s == h), measured, np.nan)
+        lately = at.reach_s <= h  # seen so lately that it has departed for no longer
+        found[k] = np.where(at.usable & lately, measured, np.nan)
         found[k, ~at.legs_shown, LEGS] = np.nan
     return LimbDepartures(states, horizon_s, found, at.residual)
 
@@ -101,7 +96,7 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
 
     Args:
         samples: One a log, with the same horizons.
-        share: Of all ticks at each horizon, in (0, 1). Of one log's ticks four times as many may miss.
+        share: Of all ticks at each horizon, in (0, 1). Of one log's ticks three times as many may miss.
     """
     horizon_s = samples[0].horizon_s
     lines = np.zeros((len(BODY), len(horizon_s), 2))
@@ -116,7 +111,7 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
 
 
 def _line(logs: Sequence[tuple[Floats, Floats]]) -> Floats:
-    """(2,) offset >= 0 and slope >= 1 of the line with the least quantile loss; every log weighs as the root of it."""
+    """(2,) offset >= 0 and slope >= 0 of the line with the least quantile loss; every log weighs as the root of it."""
     far, near, weight = [], [], []
     for beyond, residual in logs:
         known = np.isfinite(beyond)
@@ -132,7 +127,7 @@ def _line(logs: Sequence[tuple[Floats, Floats]]) -> Floats:
         np.concatenate([[0.0, 0.0], _BELOW * w, (1.0 - _BELOW) * w]),
         A_eq=hstack([unknowns, eye_array(n), -eye_array(n)]).tocsr(),
         b_eq=y,
-        bounds=[(0.0, None), (1.0, None)] + [(0.0, None)] * (2 * n),
+        bounds=[(0.0, None)] * (2 + 2 * n),
         method="highs",
     )
     line: Floats = found.x[:2]
@@ -144,7 +139,7 @@ def _factor(samples: Sequence[LimbDepartures], plain: Departure, k: int, share: 
 
     A log whose people not even the largest factor holds, as of a camera that loses the legs, asks for none.
     """
-    least = 1.0 - _EACH * (1.0 - share)
+    least = 1.0 - EACH * (1.0 - share)
 
     def shares(factor: float) -> tuple[Floats, float]:
         raised = replace(plain, beyond_m=factor * plain.beyond_m, residuals=factor * plain.residuals)
@@ -170,7 +165,7 @@ def _factor(samples: Sequence[LimbDepartures], plain: Departure, k: int, share: 
 
 
 def _up(values: Floats, step: float) -> Floats:
-    return np.round(np.ceil(values / step - 1e-9) * step, 6)
+    return np.round(np.ceil(values / step - 1e-9) * step, 6) + 0.0  # no -0.0
 
 
 def not_recorded(samples: Sequence[LimbDepartures]) -> list[str]:

@@ -32,13 +32,14 @@ from hrcreplay.audit.metrics import (
     checked_scope,
     curve_point,
     escapes,
+    first_movements,
     headline_metrics,
     horizon_point,
     joint_figures,
     method_figures,
     unchecked_notes,
 )
-from hrcreplay.audit.recording import TRUTH
+from hrcreplay.audit.recording import TRUTH, first_movements_ns
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import limb_radii
@@ -157,6 +158,7 @@ def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
     for k, audit in enumerate(audits):
         mine = drawn.of(slice(edges[k], edges[k + 1]))
         start_ns = int(audit.recording.states.t_ns[0])
+        own, moved_ns = audit.outcomes[prediction_stage.method], first_movements_ns(audit.recording)
         logs.append(
             {
                 "log": audit.name,
@@ -171,6 +173,7 @@ def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
                 "joints": _joints([audit], mine),
                 "curve": _curves([audit]),
                 "horizons": _horizons([audit]),
+                "first_movements": first_movements(own, moved_ns, horizon_s, start_ns),
                 "escapes": {method: escapes(outcome, start_ns) for method, outcome in audit.outcomes.items()},
             }
         )

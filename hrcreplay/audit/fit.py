@@ -15,7 +15,7 @@ import numpy as np
 
 from hrcreplay import __version__
 from hrcreplay.audit import fit_limits
-from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, not_recorded, union_m3
+from hrcreplay.audit.departures import EACH, LimbDepartures, capsules_m3, departures, not_recorded, union_m3
 from hrcreplay.audit.departures import fit as fit_departures
 from hrcreplay.audit.fit_limits import Fit, Futures
 from hrcreplay.audit.measures import Estimate, block_ticks, resample
@@ -116,13 +116,12 @@ class FitSample:
     held_back: Futures
     outside: bool  #: whether a training posture is outside the standard positions
     prediction_stage: PredictionStage
-    limbs: tuple[LimbDepartures, LimbDepartures]  #: of the two parts; empty where they are not asked for
+    limbs: LimbDepartures  #: of all of it; empty where they are not asked for
+    cut_ns: int  #: end of the first part
 
 
 #: Ticks a second whose departures are measured [Hz].
-DEPARTURES_HZ = 12.5
-#: Of the ticks of a single log that was not fitted to, so many times as many may miss as of all.
-_EACH = 3.0
+DEPARTURES_HZ = 25.0
 
 
 def run(
@@ -227,32 +226,35 @@ def _sample(job: Job, horizon_s: float, held_back: float, limbs: bool) -> FitSam
         some.rows(some.t_ns > cut_ns),
         bool(fit_limits.outside_positions(training.p, load_limits(STANDARD)).any()),
         build.prediction_stage(job),
-        _limbs(job, recording, cut_ns if limbs else None),
+        _limbs(job, recording, limbs),
+        cut_ns,
     )
 
 
-def _limbs(job: Job, recording: Recording, cut_ns: int | None) -> tuple[LimbDepartures, LimbDepartures]:
-    """The departures in both parts of a recording; of no tick where ``cut_ns``, the end of the first, is None."""
+def _limbs(job: Job, recording: Recording, wanted: bool) -> LimbDepartures:
+    """The departures in a recording; of no tick where they are not wanted."""
     stage, states = build.prediction_stage(job), recording.states
     horizon_ns = round(stage.horizon_s * NS)
     ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / DEPARTURES_HZ)))
     ticks = ticks[np.isfinite(states.residual_m[ticks, : len(LIMBS)]).all(axis=1)]  # the filter has found the person
-    ticks = ticks[states.t_ns[ticks] + horizon_ns <= recording.t_ns[-1]] if cut_ns is not None else ticks[:0]
-    whole = departures(stage, recording, ticks)
-    cut = -1 if cut_ns is None else cut_ns
-    first, last = (whole.states.t_ns + horizon_ns <= cut), (whole.states.t_ns > cut)
-    return whole.rows(np.flatnonzero(first)), whole.rows(np.flatnonzero(last))
+    ticks = ticks[states.t_ns[ticks] + horizon_ns <= recording.t_ns[-1]] if wanted else ticks[:0]
+    return departures(stage, recording, ticks)
+
+
+def _parts(sample: FitSample) -> tuple[LimbDepartures, LimbDepartures]:
+    """Those of the first part of a log, horizon included, and of the last."""
+    whole, t_ns = sample.limbs, sample.limbs.states.t_ns
+    first = t_ns + round(sample.prediction_stage.horizon_s * NS) <= sample.cut_ns
+    return whole.rows(np.flatnonzero(first)), whole.rows(np.flatnonzero(t_ns > sample.cut_ns))
 
 
 def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departure, dict[str, Any], str]:
     """The departures fitted to all logs, what they and those fitted without each log hold, and where that misses."""
-    parts = [sample.limbs for sample in samples]
     if len(samples) > 1:
-        whole = [LimbDepartures.join(two) for two in parts]
-        fitted, known = whole, whole
-        folds = [fit_departures([*whole[:i], *whole[i + 1 :]], coverage) for i in range(len(whole))]
+        fitted = known = [sample.limbs for sample in samples]
+        folds = [fit_departures([*known[:i], *known[i + 1 :]], coverage) for i in range(len(known))]
     else:
-        fitted, known = [two[0] for two in parts], [two[1] for two in parts]
+        fitted, known = ([part] for part in _parts(samples[0]))
         folds = [fit_departures(fitted, coverage)]
     found = fit_departures(fitted, coverage)
     inside = [one.inside(fold) for one, fold in zip(known, folds, strict=True)]
@@ -287,7 +289,7 @@ def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departur
 def _missed(facts: dict[str, Any], coverage: float) -> str:
     """Where whole limbs that were not fitted to are inside less often than asked for."""
     wanted = [("all logs", facts["unknown"], coverage)]
-    wanted += [(log["name"], log["shares"], 1.0 - _EACH * (1.0 - coverage)) for log in facts["logs"]]
+    wanted += [(log["name"], log["shares"], 1.0 - EACH * (1.0 - coverage)) for log in facts["logs"]]
     return "; ".join(
         f"{name}: found {100.0 * share['share']:.1f} % at {h:g} s, would be right: at least {100.0 * least:.1f} %"
         for name, shares, least in wanted

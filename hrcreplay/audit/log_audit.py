@@ -12,7 +12,7 @@ from hrcreplay.audit import baselines
 from hrcreplay.audit.fit_limits import ARMS
 from hrcreplay.audit.measures import InflatedHull, union_volume_m3
 from hrcreplay.audit.metrics import Outcome
-from hrcreplay.audit.recording import Recording, read_recording
+from hrcreplay.audit.recording import LIMB_POINTS, Recording, read_recording
 from hrcreplay.errors import LogError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
@@ -27,17 +27,6 @@ from hrcreplay.run.job import Job
 from hrcreplay.run.stages import NS, ProgressBar, tick_times
 from hrcreplay.store.run_folder import Stopwatch
 
-#: Recorded points of a limb. The first two, its ends, must have been seen near the end of the horizon, or the limb is
-#: not checked.
-LIMB_POINTS = {
-    "HD": ("neck", "head"),
-    "THX": ("pelvis", "shoulder_r", "shoulder_l"),
-    "URA": ("shoulder_r", "elbow_r"),
-    "LRA": ("elbow_r", "wrist_r", "hand_r"),
-    "ULA": ("shoulder_l", "elbow_l"),
-    "LLA": ("elbow_l", "wrist_l", "hand_l"),
-    "LEGS": tuple(f"{part}_{side}" for part in ("hip", "knee", "ankle", "foot") for side in "rl"),
-}
 #: The end of the horizon: its last quarter. A limb that was last seen before could have left later.
 _END = 0.75
 #: Points with which the union of a tick's volumes is counted out.

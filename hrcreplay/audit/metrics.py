@@ -261,6 +261,38 @@ def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
     return sorted(found, key=lambda e: (e["from_s"], e["limb"]))
 
 
+def first_movements(
+    outcome: Outcome, moved_ns: Mapping[str, int | None], horizon_s: float, start_ns: int
+) -> list[dict[str, Any]]:
+    """For each limb that moved: when it first did, and whether the volumes held it then.
+
+    Asked are the volumes predicted up to a horizon before and after. Times count from ``start_ns``.
+
+    Args:
+        outcome: Of a method.
+        moved_ns: Limb -> when it first moved [ns].
+        horizon_s: Of the volumes [s].
+        start_ns: Of the log [ns].
+    """
+    depth, found = outcome.escape_m(), []
+    for i, limb in enumerate(outcome.limbs):
+        at_ns = moved_ns[limb]
+        if at_ns is None:
+            continue
+        near = depth[np.abs(outcome.t_ns - at_ns) <= horizon_s * 1e9, i]
+        near = near[np.isfinite(near)]
+        found.append(
+            {
+                "limb": limb,
+                "at_s": round((at_ns - start_ns) * 1e-9, 3),
+                "ticks": len(near),
+                "escaped_ticks": int((near > 0.0).sum()),
+                "deepest_m": float(near.max()) if len(near) else None,
+            }
+        )
+    return sorted(found, key=lambda one: (one["at_s"], one["limb"]))
+
+
 def _joined(escaped: Bools) -> list[tuple[int, int]]:
     """Runs of true, those joined that lie close together."""
     runs: list[tuple[int, int]] = []

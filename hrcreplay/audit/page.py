@@ -287,6 +287,7 @@ def _data(found: Mapping[str, Any]) -> PageSection:
         tables.append(checked_cameras(log))
         counts = tuple((name.replace("_", " "), str(count)) for name, count in log["counts"].items())
         tables.append(PageTable(f"{log['log']}: what was counted on the way", ("", "count"), counts))
+        tables.append(_first_movements(log, found["method"]))
         tables += [_escapes(log, method) for method in found["own_methods"]]
     return PageSection(
         "data",
@@ -295,6 +296,25 @@ def _data(found: Mapping[str, Any]) -> PageSection:
         (),
         tuple(table for table in tables if table.rows),
     )
+
+
+def _first_movements(log: Mapping[str, Any], method: str) -> PageTable:
+    rows = tuple(
+        (
+            f"{one['at_s']:.2f} s",
+            one["limb"],
+            str(one["ticks"]) if one["ticks"] else "not checked",
+            str(one["escaped_ticks"]) if one["ticks"] else "\u2013",
+            _millimetres(one["deepest_m"] if one["escaped_ticks"] else None),
+        )
+        for one in log["first_movements"]
+    )
+    note = (
+        "When an end of the limb was first 10 cm from where it had been: a movement of which the filter knew nothing. "
+        "Counted are the ticks up to a horizon before and after."
+    )
+    title = f"{log['log']}: first movements, and {METHODS.get(method, method)} then"
+    return PageTable(title, ("first", "limb", "ticks checked", "of these outside", "deepest [mm]"), rows, note)
 
 
 def _escapes(log: Mapping[str, Any], method: str) -> PageTable:

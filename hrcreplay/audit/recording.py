@@ -19,6 +19,17 @@ from hrcreplay.run.stages import batches
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
 
+#: Recorded points of a limb. The first two, its ends, must have been seen near the end of the horizon, or the limb is
+#: not checked.
+LIMB_POINTS = {
+    "HD": ("neck", "head"),
+    "THX": ("pelvis", "shoulder_r", "shoulder_l"),
+    "URA": ("shoulder_r", "elbow_r"),
+    "LRA": ("elbow_r", "wrist_r", "hand_r"),
+    "ULA": ("shoulder_l", "elbow_l"),
+    "LLA": ("elbow_l", "wrist_l", "hand_l"),
+    "LEGS": tuple(f"{part}_{side}" for part in ("hip", "knee", "ankle", "foot") for side in "rl"),
+}
 #: Points that the model has no say about -> the point they hang from and the longest a body makes that bone [m].
 _HANGING = {
     "hand": ("wrist", 0.30),
@@ -54,6 +65,24 @@ class Recording:
     joints: Floats  #: (k, 13) JOINTS [m, m, rad..., m]
     source: str  #: TRUTH, CAMERAS or SMOOTHED
     counts: dict[str, int]
+
+
+#: A limb has moved once one of its ends is so far from where it was first, the middle of so many sightings [m].
+_MOVED_M, _FIRST = 0.1, 10
+
+
+def first_movements_ns(recording: Recording) -> dict[str, int | None]:
+    """Limb -> when it first moved [ns]; None where it never did: a filter has seen no movement of its kind before."""
+    found: dict[str, int | None] = {}
+    for limb, names in LIMB_POINTS.items():
+        moved = np.zeros(len(recording.t_ns), dtype=bool)
+        for name in names[:2]:
+            points = recording.points_m[:, POINTS.index(name)]
+            seen = points[np.isfinite(points).all(axis=1)]
+            if len(seen):
+                moved |= np.linalg.norm(points - np.median(seen[:_FIRST], axis=0), axis=1) > _MOVED_M
+        found[limb] = int(recording.t_ns[np.argmax(moved)]) if moved.any() else None
+    return found
 
 
 def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress: Callable[[int], None]) -> Recording:

@@ -31,6 +31,8 @@ HEIGHT = JOINTS.index("z")
 PELVIS, NECK, HEAD = (POINTS.index(name) for name in ("pelvis", "neck", "head"))
 #: Rows: right, left. Columns: shoulder, elbow, wrist.
 ARM_POINTS = tuple(tuple(POINTS.index(f"{name}_{side}") for name in ("shoulder", "elbow", "wrist")) for side in "rl")
+HANDS = np.array([POINTS.index(f"hand_{side}") for side in "rl"])
+LEG_POINTS = np.array([POINTS.index(f"{part}_{side}") for part in ("hip", "knee", "ankle", "foot") for side in "rl"])
 #: Index into LIMBS of the limb whose points show each joint of JOINTS.
 SHOWN_BY = np.array(
     [LIMBS.index(limb) for limb in ("THX",) * 4 + ("URA",) * 2 + ("LRA",) * 2 + ("ULA",) * 2 + ("LLA",) * 2 + ("THX",)]
@@ -43,12 +45,13 @@ class Departure:
     """How far whole limbs get from where the fused velocity takes them, measured on recordings.
 
     Until a horizon no point of a limb is further from the hull of the limb at the tick and after the horizon, its ends
-    moving on as they do, than ``beyond_m`` and ``residuals`` times the limb's residual, as far as that is noise.
+    moving on as they do, than ``beyond_m`` and ``residuals`` times the limb's residual, as far as that is noise; and
+    at least the residual.
     """
 
     horizon_s: Floats  #: (h,) increasing [s]
     beyond_m: Floats  #: (7, h) for each limb of BODY [m]
-    residuals: Floats  #: (7, h) at least 1
+    residuals: Floats  #: (7, h)
 
 
 @dataclass(frozen=True)

@@ -80,12 +80,12 @@ def _departure(table: dict[str, Any] | None, where: str) -> Departure | None:
     if not (grows and np.isfinite(horizon_s).all()):
         raise SettingsError(f"{where}: departure.horizon_s: found {table['horizon_s']}; write {_RIGHT['horizon_s']}")
     for limb in BODY:
-        for name, least in (("beyond_m", 0.0), ("residuals", 1.0)):
+        for name in ("beyond_m", "residuals"):
             values = np.array(table[limb][name])
-            if len(values) != len(horizon_s) or not (values >= least).all() or not np.isfinite(values).all():
+            if len(values) != len(horizon_s) or not (values >= 0.0).all() or not np.isfinite(values).all():
                 raise SettingsError(
                     f"{where}: departure.{limb}.{name}: found {table[limb][name]}; write {len(horizon_s)} numbers, one "
-                    f"for each horizon, at least {least:g}"
+                    "for each horizon, at least 0"
                 )
     return Departure(horizon_s, *(np.array([table[limb][name] for limb in BODY]) for name in ("beyond_m", "residuals")))
 

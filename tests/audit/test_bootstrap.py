@@ -224,3 +224,20 @@ def test_the_volume_at_a_coverage_lies_between_the_curves_points() -> None:
     assert audit_metrics.volume_at(curve, 0.7) == pytest.approx(2.0)  # half way, on a logarithmic axis
     assert audit_metrics.volume_at(curve, 0.3) == 1.0
     assert audit_metrics.volume_at(curve[:3], 0.95) is None
+
+
+def test_first_movements_by_hand() -> None:
+    beyond = np.full((8, 6), 0.05)  # ticks of 40 ms, radius 0.1
+    beyond[2:4, 3] = 0.13, 0.16
+    beyond[7, 3] = 0.30
+    beyond[:, 1] = np.nan
+    outcome = _outcome(beyond)
+    moved: dict[str, int | None] = dict.fromkeys(outcome.limbs) | {"LRA": 120_000_000, "THX": 80_000_000, "HD": 0}
+    found = audit_metrics.first_movements(outcome, moved, 0.08, 0)
+    assert [(one["limb"], one["at_s"], one["ticks"], one["escaped_ticks"]) for one in found] == [
+        ("HD", 0.0, 3, 0),
+        ("THX", 0.08, 0, 0),
+        ("LRA", 0.12, 5, 2),
+    ]
+    assert found[2]["deepest_m"] == pytest.approx(0.06)
+    assert found[1]["deepest_m"] is None

@@ -36,7 +36,7 @@ def plain_share(of: LimbDepartures, departure: Departure, k: int) -> float:
         for limb in range(len(BODY)):
             far, residual = of.beyond_m[k, tick, limb], of.residual_m[tick, limb]
             most = departure.beyond_m[limb, k] + departure.residuals[limb, k] * min(residual, NOISE_M)
-            inside &= not far > most + max(0.0, residual - NOISE_M)
+            inside &= not far > max(residual, most + max(0.0, residual - NOISE_M))
         if np.isfinite(of.beyond_m[k, tick]).any():
             hits.append(inside)
     return float(np.mean(hits))
@@ -51,7 +51,7 @@ def test_a_line_has_the_least_loss_of_all_on_a_grid() -> None:
     one = log(400, seed=1)
     far, residual = one.beyond_m[0, :, 0], one.residual_m[:, 0]
     line = departures._line([(far[:, None], residual[:, None])])
-    least = min(loss(a, b, far, residual) for a, b in product(np.arange(0.0, 0.1, 0.002), np.arange(1.0, 3.0, 0.02)))
+    least = min(loss(a, b, far, residual) for a, b in product(np.arange(0.0, 0.1, 0.002), np.arange(0.0, 3.0, 0.02)))
     assert loss(float(line[0]), float(line[1]), far, residual) <= least + 1e-9
     assert line[0] == pytest.approx(0.02, abs=0.01)
     assert line[1] == pytest.approx(1.4, abs=0.15)
@@ -64,14 +64,21 @@ def test_the_share_is_reached_by_whole_people_and_hardly_exceeded() -> None:
         for k in range(2):
             together = [plain_share(one, found, k) for one in logs]
             assert np.mean(together) >= share
-            assert min(together) >= 1.0 - 4.0 * (1.0 - share)
+            assert min(together) >= 1.0 - 3.0 * (1.0 - share)
             smaller = replace(found, beyond_m=0.9 * found.beyond_m, residuals=0.9 * found.residuals)
             assert np.mean([plain_share(one, smaller, k) for one in logs]) < share
             for one in logs:
                 assert np.nanmean(one.inside(found)[k]) == plain_share(one, found, k)
     np.testing.assert_array_equal(found.beyond_m[[2, 3]], found.beyond_m[[4, 5]])
     np.testing.assert_array_equal(found.residuals[[2, 3]], found.residuals[[4, 5]])
-    assert (found.residuals >= 1.0).all()
+
+
+def test_departures_that_do_not_grow_with_the_residual_get_no_slope() -> None:
+    one = log(400, seed=6)
+    beyond = np.random.default_rng(7).uniform(0.0, 0.3, one.beyond_m.shape)
+    found = fit([replace(one, beyond_m=beyond)], 0.99)
+    assert (found.residuals < 0.1).all()
+    np.testing.assert_allclose(found.beyond_m, 0.3, atol=0.02)
 
 
 def test_lines_that_hold_too_few_are_raised_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,7 +101,7 @@ def test_a_person_who_departs_further_counts_as_much_as_the_others() -> None:
 
 
 def test_a_camera_that_loses_the_legs_does_not_drive_the_others_up() -> None:
-    """Five of its hundred ticks, when four may miss: no factor holds them, so it asks for none."""
+    """Five of its hundred ticks, when three may miss: no factor holds them, so it asks for none."""
     logs = [log(100, seed) for seed in range(12)]
     beyond = logs[0].beyond_m.copy()
     beyond[:, :5, BODY.index("LEGS")] = 50.0
@@ -118,12 +125,3 @@ def test_a_limb_that_was_never_recorded_has_no_departure_and_is_named() -> None:
     assert np.isfinite(found.beyond_m).all()
     nobody = [replace(one, beyond_m=np.full_like(one.beyond_m, np.nan)) for one in logs]
     assert fit(nobody, 0.95).beyond_m.max() == 0.0
-
-
-def test_parts_join_to_the_whole() -> None:
-    whole = log(50, seed=6)
-    parts = [whole.rows(np.arange(20)), whole.rows(np.arange(20, 50))]
-    joined = LimbDepartures.join(parts)
-    np.testing.assert_array_equal(joined.beyond_m, whole.beyond_m)
-    np.testing.assert_array_equal(joined.residual_m, whole.residual_m)
-    np.testing.assert_array_equal(joined.states.p, whole.states.p)

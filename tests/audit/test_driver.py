@@ -169,6 +169,7 @@ def test_every_escape_is_a_row_by_every_method(folder: Path) -> None:
         assert mine["deepest_m"].max() == theirs["escape_m"].max()
     page = (folder / "report.html").read_text()
     assert "demo: escapes from paper" in page
+    assert "demo: first movements, and sound then" in page
     shown = table[table["method"] == "paper"].sort_values("deepest_m").iloc[-1]
     assert f"{shown['deepest_at_s']:.2f} s" in page
 

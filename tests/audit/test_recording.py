@@ -126,3 +126,19 @@ def test_shoulders_that_were_not_seen_hold_no_pelvis() -> None:
     best = replace(best, p=p, t_ns=frames(points).capture_ns)
     believed, _ = recording._believed(replace(_seen(points), confidence=confidence), best, _eyes())
     assert np.isfinite(believed[:, POINTS.index("pelvis"), 0]).tolist() == [True, False]
+
+
+def test_a_limb_first_moves_when_one_of_its_ends_is_ten_centimetres_away() -> None:
+    points = standing(60)
+    points[30:, POINTS.index("wrist_r")] += [0.0, 0.0, 0.09]  # not far enough
+    points[40:, POINTS.index("wrist_r")] += [0.0, 0.0, 0.02]
+    points[:45, POINTS.index("head")] = np.nan
+    points[55:, POINTS.index("hand_l")] += [0.5, 0.0, 0.0]  # no end of a limb
+    points[57, POINTS.index("ankle_l")] += [0.5, 0.0, 0.0]  # nor this
+    points[:, POINTS.index("hip_l")] = points[:, POINTS.index("pelvis")]
+    points[58, POINTS.index("hip_l")] += [0.2, 0.0, 0.0]
+    t_ns = 1_000_000_000 + 33_000_000 * np.arange(60)
+    best = states(np.zeros((4, DOF)), np.zeros((4, DOF)))
+    recorded = recording.Recording(best, t_ns, points, best.t_ns, best.p, recording.CAMERAS, {})
+    found = recording.first_movements_ns(recorded)
+    assert {limb: at for limb, at in found.items() if at is not None} == {"LRA": t_ns[40], "LEGS": t_ns[58]}

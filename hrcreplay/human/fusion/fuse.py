@@ -59,7 +59,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         point_ns=np.full(len(POINTS), NEVER_NS),
         refused_ns=np.full((c, len(POINTS)), NEVER_NS),
         refused_at=np.full((c, len(POINTS), 3), np.nan),
-        apart=np.zeros((c, len(BODY))),
+        apart=np.zeros((c, len(LIMBS))),
         bone_ns=np.full(len(LENGTHS), NEVER_NS),
         capture_ns=np.full(c, NEVER_NS),
         uses=np.full(c, -1),

@@ -2,7 +2,8 @@
 
 A gate that only refuses keeps a filter that went wrong from ever seeing it. So a point that a camera goes on showing in
 one place, while no camera shows it where the filter has it, is evidence: after ``relearn_s`` it is believed, and its
-rows start anew. Left and right exchanged are none.
+rows start anew. Left and right exchanged are none, nor is a marker that jumps and leaves its bone behind; where two
+cameras show that, the residual holds it all the same (``model_residual``).
 """
 
 from __future__ import annotations
@@ -59,8 +60,9 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
     trusted = np.ones(len(filter_.point_ns), dtype=np.bool_)
     believed = np.zeros(len(filter_.point_ns), dtype=np.bool_)
     if filter_.started[0]:
-        agreeing, believed = _agreeing(filter_, c, now, rules)
-        trusted = (agreeing | believed) & _whole(filter_, c, now, rules)
+        whole = _whole(filter_, c, now, rules)
+        agreeing, believed = _agreeing(filter_, c, now, whole, rules)
+        trusted = (agreeing | believed) & whole
         track.outliers[c] += len(trusted) - np.sum(trusted)
     _judge_rows(filter_, c, trusted, rules)
     for row in np.flatnonzero(filter_.valid[c]):
@@ -95,10 +97,11 @@ def _judge_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> None:
 
 
 @njit(cache=True)
-def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Bools, Bools]:
+def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> tuple[Bools, Bools]:
     """The points of a frame (20,) near enough to the a-priori skeleton, and those believed although they are not.
 
-    A lost point agrees with anything. Since when each other one has been refused is kept.
+    A lost point agrees with anything. Since when each other one has been refused is kept; one that is not ``whole``
+    (20,) is refused anew in each frame, for no limb is there that it could belong to.
     """
     points = filter_.points[c]
     expected, gate = _gates(filter_, c, now, rules)
@@ -113,7 +116,7 @@ def _agreeing(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Bools, B
         if agreeing[k] or exchanged:
             filter_.refused_ns[c, k] = NEVER_NS
             continue
-        stays = distance(points[k], filter_.refused_at[c, k]) <= rules.outlier_m
+        stays = whole[k] and distance(points[k], filter_.refused_at[c, k]) <= rules.outlier_m
         if not stays or filter_.refused_ns[c, k] <= filter_.point_ns[k]:
             filter_.refused_ns[c, k] = now
         filter_.refused_at[c, k] = points[k]

@@ -37,7 +37,7 @@ class Filter(NamedTuple):
     point_ns: Ints  #: (20,) tick at which a body point last agreed with the filter
     refused_ns: Ints  #: (c, 20) tick since when a camera has shown a point elsewhere, in one place
     refused_at: Floats  #: (c, 20, 3) where it last did
-    apart: Floats  #: (c, 7) how far that is from the filter, the farthest point of each limb of BODY; 0 without one [m]
+    apart: Floats  #: (c, 6) how far that is from the filter, the farthest point of each of LIMBS; 0 without one [m]
     bone_ns: Ints  #: (7,) tick at which a camera last saw a length that agreed with the filter
     capture_ns: Ints  #: (c,) of the frame held for each camera
     uses: Ints  #: (c,) ticks that frame was used in; -1 without one

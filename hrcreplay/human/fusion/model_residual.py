@@ -26,9 +26,11 @@ from hrcreplay.human.fusion.gating import distance
 from hrcreplay.human.fusion.kalman import Filter, Rules, ago, delay
 from hrcreplay.human.model import (
     ARM_POINTS,
+    HANDS,
     HEAD,
     HEIGHT,
     LEFT_ARM,
+    LEG_POINTS,
     NECK,
     PELVIS,
     RIGHT_ARM,
@@ -62,7 +64,6 @@ _ENDS = np.array(
         [_ELBOW_L, _WRIST_L, _WRIST_L],
     ]
 )
-_PELVIS_ALONE = np.full(3, PELVIS)
 #: First of the two joints of each arm's limb.
 _FIRST = np.array([RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2])
 _LEGS = BODY.index("LEGS")
@@ -72,11 +73,9 @@ _SHOULDERS = np.array([_SHOULDER_R, _SHOULDER_L])
 #: Points that are measured beside the model, and the limb of LIMBS that must be shown for each.
 _BESIDE = np.array([HEAD, _SHOULDER_R, _SHOULDER_L, _ELBOW_R, _WRIST_R, _ELBOW_L, _WRIST_L])
 _OF_LIMB = np.array([LIMBS.index(limb) for limb in ("HD", "THX", "THX", "URA", "LRA", "ULA", "LLA")])
-#: Hands, their wrists, and the limbs that show them.
-_HANDS = np.array([POINTS.index(f"hand_{side}") for side in "rl"])
+#: Wrists of HANDS, and the limbs that show them.
 _WRISTS = np.array([_WRIST_R, _WRIST_L])
 _LOWER_ARMS = np.array([LIMBS.index("LRA"), LIMBS.index("LLA")])
-_LEG_POINTS = np.array([POINTS.index(f"{part}_{side}") for part in ("hip", "knee", "ankle", "foot") for side in "rl"])
 
 
 @njit(cache=True)
@@ -124,8 +123,8 @@ def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> N
     Counts what it, or another camera, has shown there before, and no camera where the model has it.
     """
     filter_.apart[c] = 0.0
-    for limb in range(len(BODY)):
-        for k in _PELVIS_ALONE if limb == _LEGS else _ENDS[limb]:
+    for limb in range(len(_ENDS)):
+        for k in _ENDS[limb]:
             since = filter_.refused_ns[c, k]
             if since <= filter_.point_ns[k]:
                 continue
@@ -156,7 +155,7 @@ def told(filter_: Filter, now: int, rules: Rules, residual: Floats) -> None:
             residual[limb] = filter_.peak[limb]
     for c in range(len(filter_.apart)):
         if now - filter_.capture_ns[c] <= rules.memory_ns:
-            for limb in range(len(residual)):
+            for limb in range(filter_.apart.shape[1]):
                 if filter_.apart[c, limb] > 0.0:
                     residual[limb] = np.fmax(residual[limb], filter_.apart[c, limb])
 
@@ -273,10 +272,10 @@ def learn(
                 beside += R[i, j] * (filter_.points[c, k, i] - model[k, i])
             filter_.offset[k, j] += (beside - filter_.offset[k, j]) / weight
         filter_.offset_weight[k], filter_.offset_ns[k] = weight, now
-    for n, k in enumerate(_HANDS):
+    for n, k in enumerate(HANDS):
         if shown[_LOWER_ARMS[n]] and _near(filter_, c, k, filter_.points[c, _WRISTS[n]], _HAND_M, rules):
             _carry(filter_, c, k, filter_.points[c, k] - shifted[_WRISTS[n]])
-    for k in _LEG_POINTS:
+    for k in LEG_POINTS:
         if shown[_LEGS] and _near(filter_, c, k, model[PELVIS], REACH_M, rules):
             from_below = filter_.points[c, k].copy()
             from_below[:2] -= model[PELVIS, :2]
@@ -308,10 +307,10 @@ def place(filter_: Filter, p: Floats, points: Floats) -> None:
     skeleton_row(p, filter_.lengths, points)
     shift(filter_, p, points)
     now = filter_.tick_ns[0]
-    for n, k in enumerate(_HANDS):
+    for n, k in enumerate(HANDS):
         if now - filter_.carried_ns[k] <= _SHOWN_NS:
             points[k] = points[_WRISTS[n]] + filter_.carried[k]
-    for k in _LEG_POINTS:
+    for k in LEG_POINTS:
         if now - filter_.carried_ns[k] <= _SHOWN_NS:
             points[k] = filter_.carried[k]
             points[k, :2] += points[PELVIS, :2]

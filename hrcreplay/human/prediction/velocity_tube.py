@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hrcreplay.human.model import ARM_POINTS, HEAD, NECK, PELVIS, LimitSet, skeleton_row
-from hrcreplay.records import BODY, POINTS, Bools, Floats, HumanStates
+from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, LimitSet, skeleton_row
+from hrcreplay.records import BODY, Bools, Floats, HumanStates
 
 #: Time step of the difference that gives the velocities of the points [s].
 _STEP_S = 1e-4
@@ -24,9 +24,6 @@ _FRESH_S = 0.1
 NOISE_M = 0.2
 #: No direction can be told of a hand that is nearer to its wrist [m].
 _SHORT_M = 0.02
-#: Points of the hands and legs, right before left.
-_HANDS = np.array([POINTS.index("hand_r"), POINTS.index("hand_l")])
-LEG_POINTS = np.array([POINTS.index(f"{part}_{side}") for part in ("hip", "knee", "ankle", "foot") for side in "rl"])
 HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
 #: For each limb of BODY, itself and those of LIMBS that carry it: an arm on a torso that nobody sees is anywhere.
 _CARRIED_BY = ((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))
@@ -85,7 +82,8 @@ def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
     """How far a limb departs at most until ``reach_s`` [m].
 
     Between the horizons that were measured linear, for it grows faster than the horizon; before the first as at it;
-    after the last as fast as before it, for people's speeds are bounded.
+    after the last as fast as before it, for people's speeds are bounded. Never less than the residual: the limb may be
+    there already.
 
     Args:
         limb: Index into BODY.
@@ -98,7 +96,7 @@ def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
     if reach_s > known[last] and last > 0:
         slope = (at.beyond_m[limb, last] - at.beyond_m[limb, last - 1]) / (known[last] - known[last - 1])
         beyond += max(0.0, slope) * (reach_s - known[last])
-    return beyond + times * min(residual_m, NOISE_M) + max(0.0, residual_m - NOISE_M)
+    return max(residual_m, beyond + times * min(residual_m, NOISE_M) + max(0.0, residual_m - NOISE_M))
 
 
 @njit(cache=True)
@@ -169,7 +167,7 @@ def _arm(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: flo
     if length > 0.0 and hand_m > 0.0:
         turning = velocity[wrist] + (velocity[wrist] - velocity[elbow]) * (hand_m / length)
         n = _add(points[wrist] + forearm * (hand_m / length), turning, span_s, swept, n)
-        bent = points[_HANDS[arm]] - points[wrist]
+        bent = points[HANDS[arm]] - points[wrist]
         size = np.sqrt((bent**2).sum())
         if size > _SHORT_M:
             n = _add(points[wrist] + bent * (hand_m / size), turning, span_s, swept, n)

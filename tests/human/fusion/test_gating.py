@@ -74,3 +74,21 @@ def test_a_single_frame_is_no_evidence() -> None:
     states = fused(again(m, points), ticks(3.0), Fusion())
     np.testing.assert_allclose(states.p[-1], NEUTRAL, atol=5e-3)
     assert (states.residual_m[-1, : len(LIMBS)] < 0.02).all()
+
+
+@pytest.mark.parametrize(("point", "limb"), [("pelvis", "THX"), ("head", "HD"), ("wrist_r", "LRA")])
+@pytest.mark.parametrize("cameras", [(0,), (0, 1)])
+def test_a_marker_that_leaves_its_bone_behind_is_no_evidence_of_one_camera(
+    point: str, limb: str, cameras: tuple[int, ...]
+) -> None:
+    """For 0.4 s a marker hangs far above the person: of one camera alone the residual knows nothing of it."""
+    m = standing(3.0, cameras=cameras)
+    points = m.points_m.copy()
+    t_s = m.capture_ns * 1e-9
+    points[(t_s > 1.6) & (t_s < 2.0), POINTS.index(point)] += [0.1, 0.0, 1.3]
+    t = ticks(3.0)
+    states = fused(again(m, points), t, Fusion())
+    meanwhile = (t > 1_700_000_000) & (t < 1_950_000_000)
+    told = states.residual_m[meanwhile, LIMBS.index(limb)]
+    assert (told > 0.9).all() if len(cameras) == 2 else (told < 0.05).all()
+    assert np.abs(states.p[(t > 1_500_000_000) & (states.unseen_s <= 0.1).all(axis=1)] - NEUTRAL).max() < 0.05

@@ -73,7 +73,7 @@ def allowed_m(departure: Departure, limb: str, horizon_s: float, residual_m: flo
         far, long = departure.beyond_m[k], departure.horizon_s
         beyond = far[-1] + (far[-1] - far[-2]) / (long[-1] - long[-2]) * (horizon_s - long[-1])
     times = np.interp(horizon_s, departure.horizon_s, departure.residuals[k])
-    return float(beyond + times * min(residual_m, NOISE_M) + max(residual_m - NOISE_M, 0.0))
+    return float(max(residual_m, beyond + times * min(residual_m, NOISE_M) + max(residual_m - NOISE_M, 0.0)))
 
 
 def distance_m(point: Floats, vertices: Floats) -> float:
@@ -106,6 +106,14 @@ def test_who_keeps_to_the_departures_is_inside_and_nobody_much_further(horizon_s
                 assert distance_m(end + (reach + 1e-3) * direction, volumes.vertices(tick, k)) > radius
             mixed = rng.dirichlet(np.full(len(base), 0.5), 10) @ base
             assert max(distance_m(point, volumes.vertices(tick, k)) for point in mixed) < 1e-5
+
+
+def test_a_limb_may_be_where_the_residual_says_whatever_the_departures() -> None:
+    states = people(8, seed=12)
+    nothing = Departure(np.array([0.1]), np.zeros((len(BODY), 1)), np.zeros((len(BODY), 1)))
+    volumes = predict(states, replace(PEOPLE, departure=nothing), Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    for k, limb in enumerate(LIMBS):
+        np.testing.assert_allclose(volumes.radius_m[:, k], FLESH_M[limb] + states.residual_m[:, k], atol=2e-9)
 
 
 def without(limits: LimitSet) -> LimitSet:
