@@ -12,7 +12,7 @@ from hrcreplay.audit import baselines
 from hrcreplay.audit.fit_limits import ARMS
 from hrcreplay.audit.measures import InflatedHull, union_volume_m3
 from hrcreplay.audit.metrics import Outcome
-from hrcreplay.audit.recording import LIMB_POINTS, Recording, read_recording
+from hrcreplay.audit.recording import LIMB_POINTS, Recording, errors_in_deviations, read_recording
 from hrcreplay.errors import LogError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
@@ -209,6 +209,7 @@ class LogAudit:
     joints: dict[str, Floats]  #: by method of ours: (n, 13) of ``joints_inside``
     curve: dict[str, dict[float, Outcome]]  #: by method of ours and factor
     horizons: dict[float, dict[str, Outcome]]  #: by shorter horizon [s] and method, at fewer ticks
+    errors: Floats  #: (2, n, 13) of ``errors_in_deviations``
     points: dict[str, dict[str, int]]  #: limb -> each point beyond its ends -> at how many ticks it was checked
     notes: tuple[str, ...]
 
@@ -307,7 +308,8 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         interval = prediction_stage.by(method).reachable(future.states)
         joints[method] = joints_inside(recording, future.states, interval, horizon_s)
     notes = (*log.notes, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))
-    return LogAudit(job, name, recording, outcomes, joints, curve, horizons, future.points(), notes)
+    errors = errors_in_deviations(recording, rows)
+    return LogAudit(job, name, recording, outcomes, joints, curve, horizons, errors, future.points(), notes)
 
 
 def _audited(recording: Recording, rate_hz: float, horizon_s: float) -> Ints:

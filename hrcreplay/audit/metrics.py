@@ -215,6 +215,22 @@ def joint_figures(inside: Floats, travel: Floats, resampling: Resampling) -> dic
     }
 
 
+def deviation_figures(errors: Floats) -> dict[str, Any]:
+    """Per joint, of positions and of velocities: root mean square of the errors, and how many are within 1, 2, 3.
+
+    Args:
+        errors: (2, n, 13) in standard deviations; NaN where not known.
+    """
+    found: dict[str, Any] = {joint: {} for joint in JOINTS}
+    for name, part in zip(("position", "velocity"), errors, strict=True):
+        for j, joint in enumerate(JOINTS):
+            known = np.abs(part[np.isfinite(part[:, j]), j])
+            within = [float((known <= k).mean()) for k in (1, 2, 3)] if len(known) else [None] * 3
+            rms = float(np.sqrt((known**2).mean())) if len(known) else None
+            found[joint][name] = {"rms": rms, "within": within, "ticks": len(known)}
+    return found
+
+
 def curve_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:
     """Coverage of the six LIMBS and volume of their union, of one method under one limit set."""
     whole = Outcome.join(outcomes)

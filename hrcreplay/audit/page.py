@@ -276,7 +276,25 @@ def _joints(found: Mapping[str, Any], folder: Path) -> PageSection:
     table = PageTable(
         "Ticks with the joint in its reachable interval [%]", ("joint", "moved", *_named(methods)), tuple(body)
     )
-    return PageSection("joints", "Joints", "Which bound fails.", (_figure(folder, "audit_joints"),), (table,))
+    figures = (_figure(folder, "audit_joints"),)
+    return PageSection("joints", "Joints", "Which bound fails.", figures, (table, _deviations(found["total"])))
+
+
+def _deviations(total: Mapping[str, Any]) -> PageTable:
+    rows = []
+    for joint in JOINTS:
+        cells = []
+        for name in ("position", "velocity"):
+            one = total["deviations"][joint][name]
+            within = " / ".join("\u2013" if share is None else f"{100 * share:.0f}" for share in one["within"])
+            cells += ["\u2013" if one["rms"] is None else f"{one['rms']:.2f}", within]
+        rows.append((joint, *cells))
+    note = (
+        "How well the filter knows how wrong it is. Of normal errors with the right deviations the root mean square is "
+        "1, and 68, 95 and 99.7 % are within 1, 2 and 3 of them; a smaller root mean square: the filter is too careful."
+    )
+    head = ("joint", "position, rms", "within 1 / 2 / 3 [%]", "velocity, rms", "within 1 / 2 / 3 [%]")
+    return PageTable("Errors of the fused person, in their standard deviations", head, tuple(rows), note)
 
 
 def _data(found: Mapping[str, Any]) -> PageSection:

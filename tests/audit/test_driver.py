@@ -170,6 +170,7 @@ def test_every_escape_is_a_row_by_every_method(folder: Path) -> None:
     page = (folder / "report.html").read_text()
     assert "demo: escapes from paper" in page
     assert "demo: first movements, and sound then" in page
+    assert "Errors of the fused person, in their standard deviations" in page
     shown = table[table["method"] == "paper"].sort_values("deepest_m").iloc[-1]
     assert f"{shown['deepest_at_s']:.2f} s" in page
 

@@ -9,11 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from hrcreplay.audit import driver, recording
+from hrcreplay.audit import metrics as audit_metrics
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.records import DOF, POINTS, Bools, Floats, Measurements
+from hrcreplay.records import DOF, JOINTS, LIMBS, POINTS, Bools, Floats, Ints, Measurements
 from hrcreplay.run.build import FusionStage
 from hrcreplay.settings.sections import Fusion
 from tests.audit.standing import frames, standing
@@ -142,3 +144,44 @@ def test_a_limb_first_moves_when_one_of_its_ends_is_ten_centimetres_away() -> No
     recorded = recording.Recording(best, t_ns, points, best.t_ns, best.p, recording.CAMERAS, {})
     found = recording.first_movements_ns(recorded)
     assert {limb: at for limb, at in found.items() if at is not None} == {"LRA": t_ns[40], "LEGS": t_ns[58]}
+
+
+def test_errors_are_told_in_their_standard_deviations() -> None:
+    """Joints that swing, recorded at 100 Hz, and a filter that is off by a known share of what it says."""
+    rng = np.random.default_rng(5)
+    t_ns = 10_000_000 * np.arange(2001)
+    phase, rate = rng.uniform(0.0, 6.0, DOF), rng.uniform(0.5, 3.0, DOF)
+
+    def swing(at_ns: Ints) -> tuple[Floats, Floats]:
+        angle = rate * (at_ns * 1e-9)[:, None] + phase
+        return 0.3 * np.sin(angle), 0.3 * rate * np.cos(angle)
+
+    at_ns = 4_000_000 * np.arange(20, 4980)
+    p, v = swing(at_ns)
+    off = rng.normal(size=(2, *p.shape))
+    fused = replace(states(p + 0.02 * off[0], v + 0.5 * off[1]), t_ns=at_ns)
+    n = len(at_ns)
+    unseen = np.zeros((n, len(LIMBS)))
+    unseen[100:200, LIMBS.index("LRA")] = 0.5
+    fused = replace(fused, p_std=np.full((n, DOF), 0.02), v_std=np.full((n, DOF), 0.25), unseen_s=unseen)
+    gap = (t_ns > 5_000_000_000) & (t_ns < 5_200_000_000)
+    joints = swing(t_ns)[0]
+    recorded = recording.Recording(fused, t_ns[~gap], standing(1), t_ns[~gap], joints[~gap], recording.TRUTH, {})
+    errors = recording.errors_in_deviations(recorded, np.arange(n))
+    inside_gap = (at_ns > 5_030_000_000) & (at_ns < 5_170_000_000)
+    assert np.isnan(errors[:, inside_gap]).all()
+    lower = [JOINTS.index("ar3"), JOINTS.index("ar4")]
+    assert np.isnan(errors[:, 100:200, lower]).all()
+    assert np.isfinite(errors[:, 100:200, :6]).all()
+    np.testing.assert_allclose(errors[0, :900, :4], off[0, :900, :4], atol=0.01)
+    np.testing.assert_allclose(errors[1, :900, :4], 2.0 * off[1, :900, :4], atol=0.01)
+    figures = audit_metrics.deviation_figures(errors)
+    for joint in JOINTS:
+        position, velocity = figures[joint]["position"], figures[joint]["velocity"]
+        assert position["rms"] == pytest.approx(1.0, abs=0.05)
+        np.testing.assert_allclose(position["within"], [0.683, 0.954, 0.997], atol=0.025)
+        assert velocity["rms"] == pytest.approx(2.0, abs=0.1)
+        np.testing.assert_allclose(velocity["within"], [0.383, 0.683, 0.866], atol=0.03)
+        assert position["ticks"] <= n - inside_gap.sum()
+    nobody = audit_metrics.deviation_figures(np.full((2, 3, DOF), np.nan))
+    assert nobody["x"]["position"] == {"rms": None, "within": [None, None, None], "ticks": 0}
