@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +45,8 @@ def make(path: Path, T_world_base: Floats = scene.T_WORLD_BASE) -> None:
 
 
 if __name__ == "__main__":
-    target = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("demo.mcap")
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("path", nargs="?", type=Path, default=Path(__file__).with_name("demo.mcap"))
+    target = parser.parse_args().path
     make(target)
     print(target)
