@@ -170,7 +170,7 @@ class Run:
 
     folder: Path
     meta: dict[str, Any]
-    state: pd.DataFrame | None = None
+    state: pd.DataFrame | None = None  #: without the body's points, which ``columns.read_states`` reads
     measurements: pd.DataFrame | None = None
     truth: pd.DataFrame | None = None
     occupancy: pd.DataFrame | None = None
@@ -222,11 +222,12 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
     """The tables of a run folder, or of a run under way when its ``meta`` is given."""
     meta = read_meta(folder) if meta is None else meta
 
-    def table(name: str) -> pd.DataFrame | None:
+    def table(name: str, unread: str | None = None) -> pd.DataFrame | None:
         path = folder / f"{name}.parquet"
         if not path.exists():
             return None
-        found = pq.read_table(path, pre_buffer=False).to_pandas(split_blocks=True, self_destruct=True)
+        names = [column for column in pq.read_schema(path).names if unread is None or not column.startswith(unread)]
+        found = pq.read_table(path, columns=names, pre_buffer=False).to_pandas(split_blocks=True, self_destruct=True)
         pa.default_memory_pool().release_unused()
         return found
 
@@ -234,7 +235,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
     return Run(
         folder=folder,
         meta=meta,
-        state=table("state"),
+        state=table("state", unread="point_"),
         measurements=table("measurements"),
         truth=table("truth"),
         occupancy=table("occupancy"),
