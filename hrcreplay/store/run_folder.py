@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -170,7 +171,7 @@ class Run:
 
     folder: Path
     meta: dict[str, Any]
-    state: pd.DataFrame | None = None  #: without the body's points, which ``columns.read_states`` reads
+    state: pd.DataFrame | None = None  #: positions, velocities, lengths; ``columns.read_states`` reads the rest
     measurements: pd.DataFrame | None = None
     truth: pd.DataFrame | None = None
     occupancy: pd.DataFrame | None = None
@@ -222,11 +223,11 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
     """The tables of a run folder, or of a run under way when its ``meta`` is given."""
     meta = read_meta(folder) if meta is None else meta
 
-    def table(name: str, unread: str | None = None) -> pd.DataFrame | None:
+    def table(name: str, unread: str = "") -> pd.DataFrame | None:
         path = folder / f"{name}.parquet"
         if not path.exists():
             return None
-        names = [column for column in pq.read_schema(path).names if unread is None or not column.startswith(unread)]
+        names = [column for column in pq.read_schema(path).names if not (unread and re.search(unread, column))]
         found = pq.read_table(path, columns=names, pre_buffer=False).to_pandas(split_blocks=True, self_destruct=True)
         pa.default_memory_pool().release_unused()
         return found
@@ -235,7 +236,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
     return Run(
         folder=folder,
         meta=meta,
-        state=table("state", unread="point_"),
+        state=table("state", unread="^point_|_(acc|jerk|std)$"),
         measurements=table("measurements"),
         truth=table("truth"),
         occupancy=table("occupancy"),
