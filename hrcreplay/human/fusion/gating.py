@@ -36,6 +36,13 @@ _PLACING[0, HEAD] = True
 _ENDS = np.zeros((len(LENGTHS), len(POINTS)), dtype=np.bool_)
 for _length, _point in enumerate(_FAR_ENDS):
     _ENDS[_length, list(_point)] = True
+#: (20, 20) the points at which the bone to a point begins, or those that stand for the neck.
+_NEAR_ENDS = np.zeros((len(POINTS), len(POINTS)), dtype=np.bool_)
+for _shoulder, _elbow, _wrist in ARM_POINTS:
+    _NEAR_ENDS[_elbow, _shoulder] = _NEAR_ENDS[_wrist, _elbow] = True
+    _NEAR_ENDS[[PELVIS, HEAD], _shoulder] = True
+    _NEAR_ENDS[_shoulder, [points[0] for points in ARM_POINTS]] = True
+    _NEAR_ENDS[_shoulder, [_shoulder, PELVIS]] = False, True
 #: (20,) the same point on the other side of the body; itself where there is none.
 _OTHER_SIDE = np.array(
     [POINTS.index(p[:-1] + {"l": "r", "r": "l"}[p[-1]] if p[-2] == "_" else p) for p in POINTS], dtype=np.int64
@@ -100,23 +107,28 @@ def _judge_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> None:
 def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> tuple[Bools, Bools]:
     """The points of a frame (20,) near enough to the a-priori skeleton, and those believed although they are not.
 
-    A lost point agrees with anything. Since when each other one has been refused is kept; one that is not ``whole``
-    (20,) is refused anew in each frame, for no limb is there that it could belong to.
+    A lost point agrees with anything. Since when each other one has been refused is kept. One that is not ``whole``
+    (20,), while its bone begins where the filter has it, is refused anew in each frame: no limb is there.
     """
     points = filter_.points[c]
     expected, gate = _gates(filter_, c, now, rules)
     agreeing, believed = np.ones(len(points), dtype=np.bool_), np.zeros(len(points), dtype=np.bool_)
+    shown, there = np.zeros(len(points), dtype=np.bool_), np.zeros(len(points), dtype=np.bool_)
     for k in _TESTED:
         lost = now - filter_.point_ns[k] > rules.memory_ns
         agreeing[k] = lost or not distance(points[k], expected[k]) > gate[k]  # or missing
-        if not np.isfinite(points[k, 0]) or filter_.confidence[c, k] < rules.confidence_min:
+        shown[k] = np.isfinite(points[k, 0]) and filter_.confidence[c, k] >= rules.confidence_min
+        there[k] = shown[k] and distance(points[k], expected[k]) <= gate[k]
+    for k in _TESTED:
+        if not shown[k]:
             continue
         other = _OTHER_SIDE[k]
         exchanged = other != k and distance(points[other], expected[k]) <= gate[k]
         if agreeing[k] or exchanged:
             filter_.refused_ns[c, k] = NEVER_NS
             continue
-        stays = whole[k] and distance(points[k], filter_.refused_at[c, k]) <= rules.outlier_m
+        torn = not whole[k] and (there & _NEAR_ENDS[k]).any()
+        stays = not torn and distance(points[k], filter_.refused_at[c, k]) <= rules.outlier_m
         if not stays or filter_.refused_ns[c, k] <= filter_.point_ns[k]:
             filter_.refused_ns[c, k] = now
         filter_.refused_at[c, k] = points[k]

@@ -92,3 +92,15 @@ def test_a_marker_that_leaves_its_bone_behind_is_no_evidence_of_one_camera(
     told = states.residual_m[meanwhile, LIMBS.index(limb)]
     assert (told > 0.9).all() if len(cameras) == 2 else (told < 0.05).all()
     assert np.abs(states.p[(t > 1_500_000_000) & (states.unseen_s <= 0.1).all(axis=1)] - NEUTRAL).max() < 0.05
+
+
+def test_somebody_of_another_size_elsewhere_is_evidence_even_of_one_camera() -> None:
+    """All bones are a third longer from 1.6 s on, 0.8 m to the side: no marker that was torn off."""
+    m = standing(2.1, cameras=(0,))
+    points, t_s = m.points_m.copy(), m.capture_ns * 1e-9
+    pelvis = points[:, [POINTS.index("pelvis")]]
+    points[t_s > 1.6] = (pelvis + 1.33 * (points - pelvis) + [0.8, 0.0, 0.0])[t_s > 1.6]
+    t = ticks(2.1)
+    states = fused(again(m, points), t, Fusion())
+    meanwhile = (t > 1_720_000_000) & (t < 2_000_000_000)
+    assert (states.residual_m[meanwhile, LIMBS.index("THX")] > 0.75).all()
