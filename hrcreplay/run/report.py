@@ -40,7 +40,7 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any], log: Log | N
         log: Of a replay, whose ticks can be computed again; None: a live session's are not.
     """
     near = _bounds(job.settings.model_dump())
-    run = run_folder.read(writer.partial, meta)
+    run = run_folder.read(writer.partial, meta, shown=True)
     found = compute(run, **near)
     stops = _stops(job, log, run, near["stationary_m_per_s"], found) if log else ()
     writer.text("metrics.json", run_folder.to_json(found))

@@ -171,7 +171,7 @@ class Run:
 
     folder: Path
     meta: dict[str, Any]
-    state: pd.DataFrame | None = None  #: positions, velocities, lengths; ``columns.read_states`` reads the rest
+    state: pd.DataFrame | None = None
     measurements: pd.DataFrame | None = None
     truth: pd.DataFrame | None = None
     occupancy: pd.DataFrame | None = None
@@ -219,15 +219,19 @@ def read_meta(folder: Path, *, broken_off: bool = False) -> dict[str, Any]:
     return meta
 
 
-def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
-    """The tables of a run folder, or of a run under way when its ``meta`` is given."""
+#: Columns of the table of states that no page shows; a quarter of what a long run takes in memory.
+NOT_SHOWN = re.compile("^point_|_(acc|jerk|std)$")
+
+
+def read(folder: Path, meta: dict[str, Any] | None = None, *, shown: bool = False) -> Run:
+    """The tables of a run folder, or of a run under way when its ``meta`` is given; ``shown``: without NOT_SHOWN."""
     meta = read_meta(folder) if meta is None else meta
 
-    def table(name: str, unread: str = "") -> pd.DataFrame | None:
+    def table(name: str, without: re.Pattern[str] | None = None) -> pd.DataFrame | None:
         path = folder / f"{name}.parquet"
         if not path.exists():
             return None
-        names = [column for column in pq.read_schema(path).names if not (unread and re.search(unread, column))]
+        names = [column for column in pq.read_schema(path).names if without is None or not without.search(column)]
         found = pq.read_table(path, columns=names, pre_buffer=False).to_pandas(split_blocks=True, self_destruct=True)
         pa.default_memory_pool().release_unused()
         return found
@@ -236,7 +240,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
     return Run(
         folder=folder,
         meta=meta,
-        state=table("state", unread="^point_|_(acc|jerk|std)$"),
+        state=table("state", NOT_SHOWN if shown else None),
         measurements=table("measurements"),
         truth=table("truth"),
         occupancy=table("occupancy"),
