@@ -117,6 +117,13 @@ def minimise(task: Problem) -> Solution | Unsolved:
     return Unsolved("too many rows")
 
 
+def compile_denied() -> None:
+    """Compiles what is asked only after a try of proxqp has failed, which few sessions see before they wait for it."""
+    none, rows = np.zeros(1), np.zeros(2)
+    problem = Metric(np.eye(1), none, np.zeros((2, 1)), rows, rows)
+    denied(problem, rows, Limits(none, none, np.zeros((6, 1)), np.zeros(6), np.zeros(6)))
+
+
 def _keeps(limits: Limits, w: Floats) -> bool:
     """Whether a velocity, rounded into the axes' bounds, also keeps those of the TCP."""
     twist = limits.J @ w
