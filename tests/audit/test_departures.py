@@ -73,6 +73,14 @@ def test_the_share_is_reached_by_whole_people_and_hardly_exceeded() -> None:
     np.testing.assert_array_equal(found.residuals[[2, 3]], found.residuals[[4, 5]])
 
 
+def test_where_the_residual_says_a_limb_may_be_it_is_inside() -> None:
+    one = log(50, seed=8)
+    nothing = Departure(HORIZONS_S, np.zeros((len(BODY), 2)), np.zeros((len(BODY), 2)))
+    for share, held in ((0.99, 1.0), (1.01, 0.0)):
+        there = replace(one, beyond_m=np.broadcast_to(share * one.residual_m, one.beyond_m.shape))
+        assert (there.inside(nothing) == held).all()
+
+
 def test_departures_that_do_not_grow_with_the_residual_get_no_slope() -> None:
     one = log(400, seed=6)
     beyond = np.random.default_rng(7).uniform(0.0, 0.3, one.beyond_m.shape)

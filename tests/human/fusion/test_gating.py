@@ -91,6 +91,7 @@ def test_a_marker_that_leaves_its_bone_behind_is_no_evidence_of_one_camera(
     meanwhile = (t > 1_700_000_000) & (t < 1_950_000_000)
     told = states.residual_m[meanwhile, LIMBS.index(limb)]
     assert (told > 0.9).all() if len(cameras) == 2 else (told < 0.05).all()
+    assert not (states.residual_m[:, len(LIMBS)] > 0.2).any()  # the trunk's widens the legs
     assert np.abs(states.p[(t > 1_500_000_000) & (states.unseen_s <= 0.1).all(axis=1)] - NEUTRAL).max() < 0.05
 
 

@@ -140,6 +140,7 @@ def test_a_limb_that_is_out_of_sight_has_the_volume_of_its_joints() -> None:
     [
         ("THX", set(BODY)),  # a pelvis behind a table: whatever the torso carries is where nobody knows
         ("URA", {"URA", "LRA"}),
+        ("ULA", {"ULA", "LLA"}),
         ("LLA", {"LLA"}),
         ("HD", {"HD"}),
     ],
