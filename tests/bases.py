@@ -4,8 +4,9 @@
 
 The robot stands where the person's hands are most of the time: before the person, and to either side. Prints a line a
 base and method: pace, standing of the near ticks, full stops, ticks moving without a certificate, ticks moving in
-contact with the recorded person inside and outside the volume that the motion was certified with; then every contact,
-tick by tick. Leaves with 1 where a tick moved without a certificate, or in contact with a person who was inside.
+contact with the recorded person: inside the volume that the motion was certified with, inside one that the robot was
+moving out of, and outside; then every contact, tick by tick. Leaves with 1 where a tick moved without a certificate, or
+in contact with a person who was inside while the robot did not retreat.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from hrcreplay.cli import commands
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import POINTS, Floats, HumanStates
+from hrcreplay.report.metrics_contact import retreats
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
@@ -108,12 +110,14 @@ def told(name: str, base: str, folder: Path) -> int:
         near = motion["distance_m"].to_numpy(dtype=float) <= 0.5
         stands = motion["tcp_speed"].to_numpy(dtype=float) < 0.001
         uncertified = int((moving & ~motion["certified"].to_numpy(dtype=bool)).sum())
-        at_fault = touch & ~(outside_m > 0.0)
+        retreat = touch & ~(outside_m > 0.0) & retreats(motion, rows["t_ns"].to_numpy())
+        at_fault = touch & ~(outside_m > 0.0) & ~retreat
         pace = float(motion["programme_s"].iloc[-1]) / (0.004 * len(motion))
         print(  # noqa: T201
             f"{name} | {base} | {method} | pace {pace:.1%} | standing {(stands & near).sum() / max(1, near.sum()):.1%} "
             f"of {near.sum()} near | full stops {((motion['status'].astype(str) == 'braking') & moving).mean():.1%} | "
-            f"uncertified {uncertified} | contact inside {at_fault.sum()}, outside {(touch & ~at_fault).sum()}",
+            f"uncertified {uncertified} | contact inside {at_fault.sum()}, retreating {retreat.sum()}, "
+            f"outside {(touch & ~at_fault & ~retreat).sum()}",
             flush=True,
         )
         if method == "none":

@@ -56,7 +56,7 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
             rows = run.contact[run.contact["method"] == method]
             _add_touch(metrics, prefix, rows, what)
             _add_nearest(metrics, prefix, rows, what)
-            _add_faults(metrics, prefix, rows, what, blind=method == "none")
+            _add_faults(metrics, prefix, rows, what, motion, blind=method == "none")
     if run.contact is not None:
         _add_left(metrics, run.contact)
 
@@ -168,12 +168,36 @@ def _least(distance: Floats, which: Bools) -> int | None:
     return int(np.argmin(np.where(known, distance, np.inf))) if known.any() else None
 
 
-def _add_faults(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str, *, blind: bool) -> None:
+def retreats(motion: pd.DataFrame, t_ns: Ints) -> Bools:
+    """Whether the motion at some ticks (n,) was a retreat, or the stop of one.
+
+    What moves the robot at a tick was decided at the last tick before it that did not only go on braking.
+    """
+    status = motion["status"].astype(str).to_numpy()
+    decided = np.maximum.accumulate(np.where(status != "braking", np.arange(len(status)), -1))
+    before = np.searchsorted(times(motion), t_ns) - 1
+    last = np.where(before >= 0, decided[before], -1)
+    return np.asarray((last >= 0) & (status[last] == "retreating"))
+
+
+def _add_faults(
+    metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str, motion: pd.DataFrame, *, blind: bool
+) -> None:
     """Of the contacts while moving: was the person where the prediction said?"""
     touch = (numeric_column(rows, "distance_m") <= 0.0) & rows["moving"].to_numpy(dtype=bool)
-    outside = numeric_column(rows, "outside_m")[touch]
+    outside, retreat = numeric_column(rows, "outside_m")[touch], retreats(motion, times(rows)[touch])
+    inside = outside <= 0.0
     for name, which, meaning in (
-        ("inside", outside <= 0.0, "inside the volume by which the motion was certified: the robot is at fault"),
+        (
+            "inside",
+            inside & ~retreat,
+            "inside the volume by which the motion was certified: the robot is at fault",
+        ),
+        (
+            "retreating",
+            inside & retreat,
+            "inside a volume that the robot was moving out of, so that the person came after it",
+        ),
         ("outside", outside > 0.0, "outside the volume by which the motion was certified: the prediction is at fault"),
         ("unpredicted", ~np.isfinite(outside), "without a volume by which the motion was certified"),
     ):

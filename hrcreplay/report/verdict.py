@@ -142,14 +142,16 @@ def _when(metrics: Metrics) -> str:
 
 def _fault(metrics: Metrics) -> str:
     """Whose fault the contacts were."""
-    inside, outside, unknown = (
-        metrics[f"plan_touch_{name}_ticks"]["value"] for name in ("inside", "outside", "unpredicted")
+    inside, retreating, outside, unknown = (
+        metrics[f"plan_touch_{name}_ticks"]["value"] for name in ("inside", "retreating", "outside", "unpredicted")
     )
     if inside is None:
         return "; it heeds nobody"
     parts = []
     if inside:
         parts.append(f"at {inside} of these ticks the person was where the prediction said, so the robot is at fault")
+    if retreating:
+        parts.append(f"at {retreating} the robot was moving away, and the person came after it")
     if outside:
         parts.append(f"at {outside} the person was not where the prediction said, so the prediction is at fault")
     if unknown:

@@ -135,9 +135,10 @@ def test_a_limb_first_moves_when_one_of_its_ends_is_ten_centimetres_away() -> No
     points[30:, POINTS.index("wrist_r")] += [0.0, 0.0, 0.09]  # not far enough
     points[40:, POINTS.index("wrist_r")] += [0.0, 0.0, 0.02]
     points[:45, POINTS.index("head")] = np.nan
+    for beyond, end in (("hand_l", "wrist_l"), ("ankle_l", "pelvis"), ("hip_l", "pelvis")):
+        points[:, POINTS.index(beyond)] = points[:, POINTS.index(end)]
     points[55:, POINTS.index("hand_l")] += [0.5, 0.0, 0.0]  # no end of a limb
     points[57, POINTS.index("ankle_l")] += [0.5, 0.0, 0.0]  # nor this
-    points[:, POINTS.index("hip_l")] = points[:, POINTS.index("pelvis")]
     points[58, POINTS.index("hip_l")] += [0.2, 0.0, 0.0]
     t_ns = 1_000_000_000 + 33_000_000 * np.arange(60)
     best = states(np.zeros((4, DOF)), np.zeros((4, DOF)))

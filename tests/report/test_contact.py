@@ -144,6 +144,25 @@ def test_the_first_sentences_of_a_robot_that_touched_nobody(run: Run, tmp_path: 
     assert "At every tick of this replay, and certified." in html
 
 
+def test_contacts_while_the_robot_retreats_have_a_count_of_their_own(run: Run) -> None:
+    assert run.contact is not None
+    assert run.motion is not None
+    contact = pd.concat([contact_table(run, "qp", range(95, 125)), run.contact[run.contact["method"] != "qp"]])
+    tick = np.arange(len(run.motion))
+    status = np.where((tick >= 100) & (tick < 110), "retreating", np.where(tick < 115, "braking", "tracking"))
+    touching = dataclasses.replace(run, contact=contact, motion=run.motion.assign(status=status))
+    found = metrics_of(touching)
+    inside = np.arange(102, 125, 3)  # of those while moving
+    expected = int(((inside > 100) & (inside <= 115)).sum())  # a retreat's stop belongs to it
+    assert found["plan_touch_retreating_ticks"]["value"] == expected == 5
+    assert found["plan_touch_inside_ticks"]["value"] == len(inside) - expected
+    assert found["plan_touch_moving_ticks"]["value"] == 25
+    said = verdict.verdict(touching, found)
+    assert said is not None
+    assert "at 5 the robot was moving away, and the person came after it" in said.details[0]
+    assert "at 3 of these ticks the person was where the prediction said, so the robot is at fault" in said.details[0]
+
+
 def test_how_often_the_prediction_held_the_person_stands_beside_the_verdict(run: Run) -> None:
     assert run.contact is not None
     found = verdict.verdict(run, metrics_of(run))
