@@ -33,7 +33,7 @@ AXES = {
 
 #: Share of the ticks whose whole limbs stay inside, by how long the rise takes [s]. Who is up within 0.6 s pushes off
 #: with 7 m/s^2: the filter lags until the second or third frame shows it, and up to 5 cm are missing meanwhile.
-LEAST_SHARE = {0.6: 0.94, 1.0: 0.995, 2.0: 0.995}
+LEAST_SHARE = {0.6: 0.985, 1.0: 0.995, 2.0: 0.995}
 
 
 def outside_m(points: Floats, vertices: Floats) -> float:
