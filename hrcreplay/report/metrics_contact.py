@@ -168,16 +168,20 @@ def _least(distance: Floats, which: Bools) -> int | None:
     return int(np.argmin(np.where(known, distance, np.inf))) if known.any() else None
 
 
-def retreats(motion: pd.DataFrame, t_ns: Ints) -> Bools:
-    """Whether the motion at some ticks (n,) was a retreat, or the stop of one.
+def deciding_rows(motion: pd.DataFrame) -> Ints:
+    """(n,) the row at which it was decided what moves the robot at each tick; -1 where none was.
 
-    What moves the robot at a tick was decided at the last tick before it that did not only go on braking.
+    That is the last row before the tick that did not only go on braking.
     """
-    status = motion["status"].astype(str).to_numpy()
-    decided = np.maximum.accumulate(np.where(status != "braking", np.arange(len(status)), -1))
-    before = np.searchsorted(times(motion), t_ns) - 1
-    last = np.where(before >= 0, decided[before], -1)
-    return np.asarray((last >= 0) & (status[last] == "retreating"))
+    going_on = motion["status"].astype(str).to_numpy() == "braking"
+    last = np.maximum.accumulate(np.where(going_on, -1, np.arange(len(motion))))
+    return np.concatenate([[-1], last])[:-1]
+
+
+def retreats(motion: pd.DataFrame, t_ns: Ints) -> Bools:
+    """Whether the motion at some of its ticks (n,) was a retreat, or the stop of one."""
+    decided = deciding_rows(motion)[np.searchsorted(times(motion), t_ns)]
+    return np.asarray((decided >= 0) & (motion["status"].astype(str).to_numpy()[decided] == "retreating"))
 
 
 def _add_faults(

@@ -21,6 +21,7 @@ from hrcreplay.human.model import LEG_PARTS, PARTS, part_axes, part_radii, skele
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import Bools, Floats, HumanStates, Ints
+from hrcreplay.report.metrics_contact import deciding_rows
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.run import build, stages
@@ -317,8 +318,8 @@ def solids(around: Obstacles, limbs: tuple[str, ...]) -> Volumes:
 def by_volume(motion: pd.DataFrame, found: Contact, body: Body, predicted: Predicted) -> Floats:
     """``Contact.by_volume_m``.
 
-    What moves the robot at a tick was decided at a tick before it: the last that did not only go on braking. Its
-    volumes hold until the stop that was found clear of them has ended.
+    The volumes of the tick at which it was decided what moves the robot hold until the stop that was found clear of
+    them has ended.
 
     Args:
         motion: Rows of a motion table.
@@ -328,12 +329,11 @@ def by_volume(motion: pd.DataFrame, found: Contact, body: Body, predicted: Predi
     """
     outside_m = np.full(len(motion), np.nan)
     t_ns, horizon_s = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float)
-    decided = np.where(motion["status"].astype(str).to_numpy() != "braking", np.arange(len(motion)), -1)
-    decided = np.maximum.accumulate(decided)
+    decided = deciding_rows(motion)
     volumes: Volumes = {}
     last = -1
     for i in np.flatnonzero(found.moving & (found.distance_m <= 0.0)).tolist():
-        k = int(decided[i - 1]) if i else -1
+        k = int(decided[i])
         if k < 0:
             continue
         if k != last:

@@ -219,7 +219,7 @@ def read_meta(folder: Path, *, broken_off: bool = False) -> dict[str, Any]:
     return meta
 
 
-#: Columns of the table of states that no page shows; a quarter of what a long run takes in memory.
+#: Columns of the table of states that no page shows: two thirds of it.
 NOT_SHOWN = re.compile("^point_|_(acc|jerk|std)$")
 
 

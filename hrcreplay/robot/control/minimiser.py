@@ -118,7 +118,7 @@ def minimise(task: Problem) -> Solution | Unsolved:
 
 
 def compile_denied() -> None:
-    """Compiles what is asked only after a try of proxqp has failed, which few sessions see before they wait for it."""
+    """Compiles ``denied``: it is asked only after a try of proxqp has failed, so a session might be the first to."""
     none, rows = np.zeros(1), np.zeros(2)
     problem = Metric(np.eye(1), none, np.zeros((2, 1)), rows, rows)
     denied(problem, rows, Limits(none, none, np.zeros((6, 1)), np.zeros(6), np.zeros(6)))
