@@ -149,11 +149,11 @@ def test_contacts_while_the_robot_retreats_have_a_count_of_their_own(run: Run) -
     assert run.motion is not None
     contact = pd.concat([contact_table(run, "qp", range(95, 125)), run.contact[run.contact["method"] != "qp"]])
     tick = np.arange(len(run.motion))
-    status = np.where((tick >= 100) & (tick < 110), "retreating", np.where(tick < 115, "braking", "tracking"))
+    status = np.where((tick >= 100) & (tick < 110), "retreating", np.where(tick < 114, "braking", "tracking"))
     touching = dataclasses.replace(run, contact=contact, motion=run.motion.assign(status=status))
     found = metrics_of(touching)
     inside = np.arange(102, 125, 3)  # of those while moving
-    expected = int(((inside > 100) & (inside <= 115)).sum())  # a retreat's stop belongs to it
+    expected = int(((inside > 100) & (inside <= 114)).sum())  # what was decided at 113 moves it at 114
     assert found["plan_touch_retreating_ticks"]["value"] == expected == 5
     assert found["plan_touch_inside_ticks"]["value"] == len(inside) - expected
     assert found["plan_touch_moving_ticks"]["value"] == 25
