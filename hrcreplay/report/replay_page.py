@@ -62,12 +62,16 @@ LAYERS = (
     ("paths", "driven", "paths"),
     ("distance", "toBody", "distances"),
 )
+MESHES = ("meshes", "robot", "meshes of the links")  #: the same, where the robot has some
+ROBOT_LEGEND = {
+    False: "Orange: the robot as the capsules that its distances are measured from",
+    True: "Orange: the robot, in the shell of the capsules that its distances are measured from",
+}
 LEGEND = (
-    "Orange: the robot as the capsules that its distances are measured from; red: where the stop ends that it could "
-    "begin at that instant, and the way of its TCP until then. Blue: the recorded body; the dark lines in it are the "
-    "person as fused from the cameras. Yellow: all that the person could reach until the robot would have stood. Blue "
-    "line: programmed path; orange line: driven path. Violet: from the robot to the nearest part of the body; dashed: "
-    "to the nearest volume."
+    "red: where the stop ends that it could begin at that instant, and the way of its TCP until then. Blue: the "
+    "recorded body; the dark lines in it are the person as fused from the cameras. Yellow: all that the person could "
+    "reach until the robot would have stood. Blue line: programmed path; orange line: driven path. Violet: from the "
+    "robot to the nearest part of the body; dashed: to the nearest volume."
 )
 
 
@@ -92,8 +96,8 @@ def replay_part(scene: ReplayScene) -> ReplayPart:
             "numbers": numbers,
             "modules": [(name, script(text)) for name, text in modules.items()],
             "scripts": [script(_text(f"static/{path}")) for path in ("uplot/uPlot.iife.min.js", "boot.js")],
-            "layers": LAYERS,
-            "legend": LEGEND,
+            "layers": (*LAYERS, MESHES) if scene.robot.meshes else LAYERS,
+            "legend": f"{ROBOT_LEGEND[bool(scene.robot.meshes)]}; {LEGEND}",
         }
     )
     return ReplayPart(
@@ -168,6 +172,9 @@ def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tupl
     header = _header(scene)
     block.add("points", scene.points_m, 1e-3)
     block.add("body", scene.body_m, 1e-3)
+    for number, mesh in enumerate(scene.robot.meshes):
+        block.add(f"mesh/{number}/vertices", mesh.vertices_m, 1e-4)
+        block.add(f"mesh/{number}/triangles", mesh.triangles)
     for name, track in scene.methods.items():
         _add_track(block, name, track)
     motion = block.deflated()
@@ -206,6 +213,7 @@ def _header(scene: ReplayScene) -> dict[str, Any]:
             "screws": robot.screws.tolist(),
             "tcp_m": robot.tcp_m.tolist(),
             "base_m": robot.base_m.tolist(),
+            "meshes": [mesh.link for mesh in robot.meshes],
         },
         "methods": {
             name: {

@@ -30,6 +30,15 @@ SHOWN_POINTS = tuple(dict.fromkeys(name for bone in BONES for name in bone))
 
 
 @dataclass(frozen=True)
+class LinkMesh:
+    """The surface of a link in the world, with all axes at zero."""
+
+    link: int  #: which of the robot's links
+    vertices_m: Floats  #: (k, 3)
+    triangles: Ints  #: (t, 3) which vertices
+
+
+@dataclass(frozen=True)
 class RobotGeometry:
     """A serial robot for drawing: with all axes at zero in the world, and the screws that move it from there."""
 
@@ -40,6 +49,7 @@ class RobotGeometry:
     screws: Floats  #: (nv, 6) of a unit turn: velocity of the point at the world's origin, angular velocity
     tcp_m: Floats  #: (3,)
     base_m: Floats  #: (3,)
+    meshes: tuple[LinkMesh, ...]  #: of the links that have one
 
 
 @dataclass(frozen=True)
@@ -121,7 +131,44 @@ def robot_geometry(robot: RobotModel) -> RobotGeometry:
         screws=screws,
         tcp_m=robot.pose(zero[0], zero[0]).T_world_tcp[:3, 3],
         base_m=robot.T_world_base[:3, 3],
+        meshes=tuple(_meshes(robot, motion.ends_m[0, :, 0], zero[0])),
     )
+
+
+#: A mesh of more triangles is drawn coarser.
+_TRIANGLES = 8000
+
+
+def _meshes(robot: RobotModel, start_m: Floats, q: Floats) -> Iterator[LinkMesh]:
+    """The links' meshes in the world at joint positions (nv,) [rad], where the links begin at (s, 3) [m]."""
+    for link, (segment, turn) in enumerate(zip(robot.segments, robot.R_bodies(q), strict=True)):
+        if segment.surface is not None and len(segment.surface.triangles):
+            vertices_m, triangles = coarser(segment.surface.vertices_m, segment.surface.triangles, _TRIANGLES)
+            yield LinkMesh(link, (vertices_m - segment.start_m) @ turn.T + start_m[link], triangles)
+
+
+def coarser(vertices_m: Floats, triangles: Ints, most: int) -> tuple[Floats, Ints]:
+    """A mesh of so many triangles at most: what lies in one cell of a grid becomes one vertex, their mean.
+
+    Args:
+        vertices_m: (k, 3) [m].
+        triangles: (t, 3) which vertices.
+        most: As few triangles are left.
+
+    Returns:
+        (k, 3) vertices [m] and (t, 3) triangles.
+    """
+    cell_m = 1e-4
+    while True:
+        cells, owner = np.unique(np.round(vertices_m / cell_m), axis=0, return_inverse=True)
+        owner = owner.ravel()
+        corners = owner[triangles]
+        corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+        if len(corners) <= most:
+            count = np.bincount(owner, minlength=len(cells))
+            mean = [np.bincount(owner, axis, minlength=len(cells)) / count for axis in vertices_m.T]
+            return np.column_stack(mean), corners
+        cell_m *= 1.5
 
 
 def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floats]]:

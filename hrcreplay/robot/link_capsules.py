@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -13,9 +13,17 @@ from numba import njit
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.records import Floats
+from hrcreplay.records import Floats, Ints
 
 Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The triangles of a collision mesh, to be drawn; what is computed knows the capsule around them alone."""
+
+    vertices_m: Floats  #: (k, 3) in the frame of the segment's body [m]
+    triangles: Ints  #: (t, 3) which vertices
 
 
 @dataclass(frozen=True)
@@ -31,6 +39,7 @@ class Segment:
     end_m: Vector  #: second end in the body's frame [m]
     radius_m: float
     shape_m3: float = math.nan  #: volume of the collision shape's convex hull inside it; NaN where it was given [m^3]
+    surface: Surface | None = field(default=None, compare=False, repr=False)  #: of the mesh that it was fitted to
 
     @property
     def volume_m3(self) -> float:
@@ -173,6 +182,7 @@ class Extent:
 
     points_m: Floats  #: (n, 3) corners or vertices, or (2, 3) ends of the axis [m]
     radius_m: float  #: 0 where nothing is round [m]
+    triangles: Ints | None = None  #: (t, 3) which vertices of a mesh; None of any other shape
 
 
 def shapes(links: Sequence[ET.Element]) -> tuple[Shape, ...]:
@@ -216,4 +226,5 @@ def _around(shape: Shape, extent: Extent) -> Segment:
         length_m = math.dist(start, end)
         inside_m3 = math.pi * radius_m**2 * length_m if shape.kind == "cylinder" else capsule_m3(length_m, radius_m)
     ends = [(float(x), float(y), float(z)) for x, y, z in (start, end)]
-    return Segment(shape.name, shape.link, ends[0], ends[1], radius_m, inside_m3)
+    surface = None if extent.triangles is None else Surface(points_m, extent.triangles)
+    return Segment(shape.name, shape.link, ends[0], ends[1], radius_m, inside_m3, surface)

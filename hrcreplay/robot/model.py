@@ -7,10 +7,9 @@ it does not tell of a URDF is read in ``robot.urdf``.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +19,8 @@ from numba import njit
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot import irb140 as irb140_data
-from hrcreplay.robot.link_capsules import Extent, Segment, Shape, Vector, capsules, distance_m
-from hrcreplay.robot.urdf import Description, describe, no_size, unreadable, with_shapes
+from hrcreplay.robot.link_capsules import Extent, Segment, Vector, capsules, distance_m
+from hrcreplay.robot.urdf import Description, describe, own_extent, unreadable, with_shapes
 
 __all__ = ["RobotModel", "RobotPose", "Segment", "from_urdf", "irb140"]
 
@@ -93,6 +92,10 @@ class RobotModel:
         """(s, 2, 3) ends of the segments in the world [m], for joint positions (nv,) [rad]."""
         return self._kinematics.ends_m(q)
 
+    def R_bodies(self, q: Floats) -> Floats:
+        """(s, 3, 3) of the bodies that the segments are on to the world, for joint positions (nv,) [rad]."""
+        return self._kinematics.R_bodies(q)
+
     def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
         """Where the segments are and how they move, at many instants.
 
@@ -111,6 +114,7 @@ class _Kinematics:
         self._J = self._data.J.reshape(6, model.nv)  # pinocchio gives (6,) when nv == 1
         self._dJ = self._data.dJ.reshape(6, model.nv)
         self._points = tuple(self._data.oMf[frame].translation for frame in points)
+        self._turns = tuple(self._data.oMf[frame].rotation for frame in points[::2])
         self._tcp = self._data.oMf[tcp].rotation, self._data.oMf[tcp].translation
         self._moves = np.array([_support(model, frame) for frame in points]).reshape(len(points), model.nv)
 
@@ -127,6 +131,10 @@ class _Kinematics:
     def ends_m(self, q: Floats) -> Floats:
         pin.framesForwardKinematics(self._model, self._data, q)
         return np.array(self._points).reshape(-1, 2, 3)
+
+    def R_bodies(self, q: Floats) -> Floats:
+        pin.framesForwardKinematics(self._model, self._data, q)
+        return np.array(self._turns).reshape(-1, 3, 3)
 
     def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
         moves = self._moves[::2].astype(float)
@@ -293,23 +301,10 @@ def _extents(whole: Any, robot: Description, meshes: Mapping[str, str]) -> dict[
             raise unreadable(shape)
         one = found[names[shape.name]]
         T_link_shape = whole.frames[one.parentFrame].placement.inverse() * one.placement
-        points_m, radius_m = _own_extent(shape, one.geometry)
-        extents[shape.name] = Extent(points_m @ T_link_shape.rotation.T + T_link_shape.translation, radius_m)
+        extent = own_extent(shape, one.geometry)
+        points_m = extent.points_m @ T_link_shape.rotation.T + T_link_shape.translation
+        extents[shape.name] = replace(extent, points_m=points_m)
     return extents
-
-
-def _own_extent(shape: Shape, geometry: Any) -> tuple[Floats, float]:
-    """The points and the radius of an Extent in the shape's own frame."""
-    if shape.kind == "mesh":
-        return np.asarray(geometry.vertices()), 0.0
-    if shape.kind == "box":
-        if not (geometry.halfSide > 0).all():
-            raise no_size(shape)
-        return np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * geometry.halfSide, 0.0
-    half_m = 0.0 if shape.kind == "sphere" else float(geometry.halfLength)
-    if not (geometry.radius > 0 and half_m >= 0):
-        raise no_size(shape)
-    return np.array([[0.0, 0.0, -half_m], [0.0, 0.0, half_m]]), float(geometry.radius)
 
 
 def _chain(whole: Any, joints: Sequence[str]) -> Any:

@@ -8,16 +8,18 @@ pinocchio gets a text that it can read: without shapes, or with those whose caps
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
-from hrcreplay.robot.link_capsules import KINDS, Shape, shapes
+from hrcreplay.robot.link_capsules import KINDS, Extent, Shape, shapes
 
 _TURNING = ("revolute", "continuous")
 
@@ -111,6 +113,29 @@ def with_shapes(robot: Description, paths: Mapping[str, str]) -> tuple[str, dict
         names[shape.name] = f"{shape.link}_{len(links[shape.link].findall('collision'))}"
         links[shape.link].append(collision)
     return ET.tostring(root, encoding="unicode"), names
+
+
+def own_extent(shape: Shape, geometry: Any) -> Extent:
+    """What a shape takes up in its own frame.
+
+    Args:
+        shape: As the URDF has it.
+        geometry: As pinocchio has read it.
+
+    Raises:
+        SettingsError: It has no size.
+    """
+    if shape.kind == "mesh":
+        triangles = [[geometry.tri_indices(i)[k] for k in range(3)] for i in range(geometry.num_tris)]
+        return Extent(np.asarray(geometry.vertices()), 0.0, np.array(triangles, dtype=np.int64).reshape(-1, 3))
+    if shape.kind == "box":
+        if not (geometry.halfSide > 0).all():
+            raise no_size(shape)
+        return Extent(np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * geometry.halfSide, 0.0)
+    half_m = 0.0 if shape.kind == "sphere" else float(geometry.halfLength)
+    if not (geometry.radius > 0 and half_m >= 0):
+        raise no_size(shape)
+    return Extent(np.array([[0.0, 0.0, -half_m], [0.0, 0.0, half_m]]), float(geometry.radius))
 
 
 def unreadable(shape: Shape) -> SettingsError:

@@ -40,6 +40,30 @@ class Capsules {
   }
 }
 
+// Surfaces of links, where the turned axes bring them.
+class Surfaces {
+  constructor(robot, motion, material) {
+    this.moved_by = robot.meshes.map((link) => robot.moved_by[link]);
+    this.group = new THREE.Group();
+    robot.meshes.forEach((_, k) => {
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(motion(`mesh/${k}/vertices`).values, 3));
+      geometry.setIndex(Array.from(motion(`mesh/${k}/triangles`).values));
+      const mesh = new THREE.Mesh(geometry, material);
+      mesh.matrixAutoUpdate = mesh.frustumCulled = false;
+      this.group.add(mesh);
+    });
+  }
+
+  show(placements) {
+    this.group.children.forEach((mesh, k) => {
+      mesh.matrix.copy(placements[this.moved_by[k]]);
+      mesh.visible = mesh.matrix.elements.every(Number.isFinite);
+      mesh.matrixWorldNeedsUpdate = true;
+    });
+  }
+}
+
 // A line with a width: a rod for each piece that is long enough to be seen.
 class Way {
   constructor(most, radius, material) {
@@ -128,8 +152,10 @@ export class ReplayView {
     this.scene.add(sun);
     const solid = () => new THREE.MeshLambertMaterial();
     const glass = (opacity) => new THREE.MeshLambertMaterial({ transparent: true, opacity, depthWrite: false, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
-    this.materials = { robot: solid(), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid() };
+    this.materials = { robot: solid(), shell: glass(0.18), mesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid() };
     this.robot = new Capsules(header.robot.radius_m, this.materials.robot);
+    this.shell = new Capsules(header.robot.radius_m, this.materials.shell);
+    this.surfaces = new Surfaces(header.robot, data.motion, this.materials.mesh);
     this.stop = new Capsules(header.robot.radius_m, this.materials.stop);
     this.person = new Capsules(header.body.radius_m, this.materials.person);
     const ball = sphere(4);
@@ -155,9 +181,9 @@ export class ReplayView {
       toVolume: way(1, 0.006, true),
     };
     this.scene.add(
-      this.robot.group, this.stop.group, this.person.group, this.volumeGroup, this.base, ...Object.values(this.lines).map((one) => one.mesh),
+      this.robot.group, this.shell.group, this.surfaces.group, this.stop.group, this.person.group, this.volumeGroup, this.base, ...Object.values(this.lines).map((one) => one.mesh),
     );
-    this.shown = { person: true, volumes: true, skeleton: true, stop: true, paths: true, distance: true };
+    this.shown = { meshes: true, person: true, volumes: true, skeleton: true, stop: true, paths: true, distance: true };
     this.paint(colours);
     this.home();
   }
@@ -166,7 +192,7 @@ export class ReplayView {
   paint(colours) {
     const { materials, lines } = this;
     this.scene.background = new THREE.Color(colours.stage);
-    for (const [name, material] of Object.entries(materials)) material.color.set(colours[name]);
+    for (const [name, material] of Object.entries(materials)) material.color.set(colours[["mesh", "shell"].includes(name) ? "robot" : name]);
     for (const [name, one] of Object.entries(lines)) one.mesh.material.color.set(colours[name]);
     if (this.grid) {
       this.scene.remove(this.grid);
@@ -217,7 +243,7 @@ export class ReplayView {
     const { header, motion } = this.data, { shown, lines } = this;
     const q = between(motion(`${method}/q`), at);
     const robot = posed(header.robot, q);
-    this.robot.show(robot.ends);
+    this.showRobot(robot);
     this.ends = robot.ends;
     const stopQ = between(motion(`${method}/stop_q`), at);
     const goes = Math.max(...q.map((x, i) => Math.abs(stopQ[i] - x)));
@@ -231,6 +257,16 @@ export class ReplayView {
     const hulls = this.showVolumes(t_s);
     this.showPaths(method, at);
     return this.showDistances(method, robot.ends, body, hulls, at);
+  }
+
+  // Links with a mesh as that, in a shell: the capsule that their distances are measured from.
+  showRobot({ T, ends }) {
+    const { meshes } = this.data.header.robot, nowhere = [new THREE.Vector3(NaN), new THREE.Vector3(NaN)];
+    const bare = ends.map((_, link) => !this.shown.meshes || !meshes.includes(link));
+    this.robot.show(ends.map((pair, link) => (bare[link] ? pair : nowhere)));
+    this.shell.show(ends.map((pair, link) => (bare[link] ? nowhere : pair)));
+    this.surfaces.group.visible = this.shown.meshes;
+    this.surfaces.show(T);
   }
 
   wayOfTheStop(q, stopQ) {
