@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +17,13 @@ START_NS = 1_600_000_000_000_000_000  #: no clock is read
 TRUTH_EVERY = 2  #: rows of the simulation: 100 Hz
 
 
-def make(path: Path, T_world_base: Floats = scene.T_WORLD_BASE) -> None:
+def make(path: Path, T_world_base: Floats = scene.T_WORLD_BASE, task: dict[str, Any] = scene.TASK) -> None:
     """Simulates the session and writes it.
 
     Args:
         path: Log to make.
         T_world_base: (4, 4) where the robot stands; the worker does not mind.
+        task: What it does there.
 
     Raises:
         SettingsError: The file exists, or its folder cannot be written.
@@ -34,7 +36,7 @@ def make(path: Path, T_world_base: Floats = scene.T_WORLD_BASE) -> None:
         for sensor in cameras.SENSORS:
             log.camera(sensor.name, np.round(sensor.T_world_camera, 9))
         log.base(T_world_base)
-        log.task(scene.TASK)
+        log.task(task)
         for second in range(int(t_s[-1]) + 1):  # side by side in the file, as in time
             first, last = START_NS + second * 10**9, START_NS + (second + 1) * 10**9
             arrived = (frames.arrival_ns >= first) & (frames.arrival_ns < last)

@@ -255,8 +255,8 @@ class Plan(Section):
     """Task file (TOML); none: the one inside the log, else the joint track inside the log."""
     reference: Literal["time", "path"] = "path"
     """time: the reference runs with the clock; path: only as far as the robot has followed."""
-    leash_m: Positive = 0.25
-    """path: the reference waits when the TCP is this far away [m]."""
+    leash_m: Positive = 0.4
+    """path: the reference waits when the TCP is this far away; no way round a person can be longer [m]."""
     waypoint_m: Positive = 0.02
     """path: the reference leaves a waypoint when the TCP has come this close [m]."""
     q_p: tuple[NotNegative, NotNegative] = (0.10, 0.10)
