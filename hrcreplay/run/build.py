@@ -28,7 +28,7 @@ from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.path import programmed, recorded
 from hrcreplay.robot.task import Reference, Task, parse_task
 from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
-from hrcreplay.run.job import Job, UrdfFiles, read_urdf
+from hrcreplay.run.job import Job, UrdfFiles, derived_capsules
 from hrcreplay.settings.sections import Fusion, Occupancy, Robot
 
 
@@ -194,8 +194,7 @@ def robot(job: Job, T_world_base: Floats) -> RobotModel:
     Raises:
         SettingsError: The URDF or a robot setting cannot be used.
     """
-    settings = job.settings.robot
-    return _robot(settings, read_urdf(settings), job.settings.occupancy.stop_s, T_world_base)
+    return _robot(job.settings.robot, job.urdf, job.settings.occupancy.stop_s, T_world_base)
 
 
 def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base: Floats) -> RobotModel:
@@ -214,7 +213,7 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
             T_tool_tcp=T_tool_tcp,
             acceleration=settings.acceleration,
         )
-    segments = tuple(Segment(**dict(link)) for link in settings.links)
+    segments = tuple(Segment(**dict(link)) for link in settings.links or files.capsules)
     return from_urdf(
         files.text,
         T_world_base,
@@ -223,17 +222,9 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
         base_frame=settings.base_frame,
         tool_m=settings.tool_m,
         T_tool_tcp=T_tool_tcp,
-        segments=segments or _capsules(files, settings.tcp_frame, settings.base_frame),
+        segments=segments or derived_capsules(files, settings.tcp_frame, settings.base_frame),
         acceleration=settings.acceleration,
     )
-
-
-@lru_cache(maxsize=4)  # a run makes its robot several times; a file that changes has another digest
-def _capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -> tuple[Segment, ...]:
-    """The link capsules that a URDF's collision shapes give."""
-    meshes = dict(files.meshes)
-    model = from_urdf(files.text, np.eye(4), stop_s=1.0, tcp_frame=tcp_frame, base_frame=base_frame, meshes=meshes)
-    return model.segments
 
 
 def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int | None]:
@@ -249,7 +240,7 @@ def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int
     own = (log.header.task, f"{log.header.path}: task")
     table, where = (job.task, str(job.settings.plan.task)) if job.task else own
     if table is not None:
-        parts = job.settings.robot, read_urdf(job.settings.robot), job.settings.occupancy.stop_s
+        parts = job.settings.robot, job.urdf, job.settings.occupancy.stop_s
         path = _programme(parse_task(table, where), where, *parts, model.T_world_base.tobytes())
         return replace(path, model=model), None
     track = list(log.joints())

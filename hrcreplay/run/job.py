@@ -9,18 +9,22 @@ import hashlib
 import os
 import tomllib
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypedDict
+
+import numpy as np
 
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell, load_cell
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.limits import load_limits
+from hrcreplay.robot.model import Segment, from_urdf
 from hrcreplay.robot.urdf import describe
 from hrcreplay.settings.load import Settings, as_overrides, load_settings
-from hrcreplay.settings.sections import Robot
+from hrcreplay.settings.sections import LinkSettings, Robot
 from hrcreplay.store import run_folder
 
 
@@ -31,6 +35,7 @@ class UrdfFiles:
     text: str
     meshes: tuple[tuple[str, str], ...]  #: file that a collision mesh names, and its path
     inputs: tuple[tuple[str, str], ...]  #: path and SHA-256 of each file that was read, the URDF first
+    capsules: tuple[LinkSettings, ...] = ()  #: of the links, where a run has recorded them: no mesh is read then
 
 
 def read_urdf(robot: Robot) -> UrdfFiles | None:
@@ -122,6 +127,16 @@ class Job:
     tracking: LimitSet
     prediction: LimitSet
     earlier: Path | None  #: run folder given instead of a log
+    recorded_urdf: UrdfFiles | None = None  #: of the run folder that the job is from; else the settings' own file
+
+    @property
+    def urdf(self) -> UrdfFiles | None:
+        """The robot's files; none for the IRB 140.
+
+        Raises:
+            SettingsError: As ``read_urdf``.
+        """
+        return self.recorded_urdf or read_urdf(self.settings.robot)
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -148,6 +163,7 @@ class Job:
             "command": self.command,
             "versions": versions(),
             "inputs": [{"path": str(self.log), "sha256": self.log_sha256}, *_urdf_inputs(self.settings)],
+            "urdf": _urdf_record(self) if "plan" in self.stages else None,
             "settings": self.settings.model_dump(mode="json"),
             "cell": None if self.cell is None else self.cell.to_dict(),
             "task": self.task,
@@ -250,6 +266,7 @@ def job_of_run(folder: Path) -> Job:
         tracking=LimitSet.of(meta["limits"]["tracking"]),
         prediction=LimitSet.of(meta["limits"]["prediction"]),
         earlier=folder,
+        recorded_urdf=_recorded_urdf(meta),
     )
 
 
@@ -310,3 +327,29 @@ def urdf_digest(settings: Settings) -> str | None:
 def _urdf_inputs(settings: Settings) -> list[dict[str, str]]:
     files = read_urdf(settings.robot)
     return [] if files is None else [{"path": path, "sha256": digest} for path, digest in files.inputs]
+
+
+@lru_cache(maxsize=4)  # a run makes its robot several times; a file that changes has another digest
+def derived_capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -> tuple[Segment, ...]:
+    """The link capsules that a URDF's collision shapes give."""
+    meshes = dict(files.meshes)
+    model = from_urdf(files.text, np.eye(4), stop_s=1.0, tcp_frame=tcp_frame, base_frame=base_frame, meshes=meshes)
+    return model.segments
+
+
+def _urdf_record(job: Job) -> dict[str, Any] | None:
+    """What makes the robot again without its files."""
+    robot, files = job.settings.robot, job.urdf
+    if files is None:
+        return None
+    links = robot.links or files.capsules or derived_capsules(files, robot.tcp_frame, robot.base_frame)
+    names = tuple(LinkSettings.model_fields)
+    return {"text": files.text, "links": [{name: getattr(link, name) for name in names} for link in links]}
+
+
+def _recorded_urdf(meta: dict[str, Any]) -> UrdfFiles | None:
+    record = meta.get("urdf")
+    if record is None:
+        return None
+    inputs = tuple((str(file["path"]), str(file["sha256"])) for file in meta["inputs"][1:])
+    return UrdfFiles(record["text"], (), inputs, tuple(LinkSettings(**link) for link in record["links"]))

@@ -24,7 +24,7 @@ from hrcreplay.report.story import lines
 from hrcreplay.report.tables import PageTable
 from hrcreplay.run import build
 from hrcreplay.run.figure_data import computed
-from hrcreplay.run.job import Job, job_of_run, resolve
+from hrcreplay.run.job import Job, job_of_run
 from hrcreplay.run.why import Record, stop_table
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
@@ -158,7 +158,7 @@ def take_still(folder: Path, at_s: float, out: Path | None) -> Path:
     if not run_folder.is_run(folder):
         raise SettingsError(f"--snapshot: {folder} is no run folder; make one with: hrcreplay report {folder}")
     run = run_folder.read(folder)
-    scene = scene_of(resolve("report", folder), run)
+    scene = scene_of(job_of_run(folder), run)
     if scene is None:
         raise SettingsError(f"--snapshot: {folder} moved no robot; make a report of it first")
     first, last = scene.seconds[[0, -1]].tolist()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -15,6 +16,7 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, from_urdf
 from hrcreplay.run import replay
 from hrcreplay.run.job import read_urdf
+from hrcreplay.run.report import draw_figures, take_still
 from hrcreplay.settings.sections import Robot
 from hrcreplay.store import run_folder
 from tests.run.arms import ARMS, Arm
@@ -154,3 +156,27 @@ def test_it_drives_the_demo_to_the_page(name: str, tmp_path: Path) -> None:
         assert f"Capsules of the links: {run.meta['robot']['name']}" in page
         assert (folder / "figures" / "robot_links.png").is_file()
         assert "robot_links-" in page
+
+
+def test_figures_and_stills_of_a_run_need_no_urdf_any_more(tmp_path: Path) -> None:
+    """The run folder holds the URDF and the capsules that its meshes gave, so both may go."""
+    arm = ARMS["ur5"]
+    robots = arm.path.parents[2]
+    moved = tmp_path / "share" / "example-robot-data" / "robots"
+    shutil.copytree(robots / "ur_description", moved / "ur_description", copy_function=shutil.copyfile)
+    overrides = [one for one in arm.overrides(tmp_path) if not one.startswith("robot.urdf")]
+    overrides.append(f"robot.urdf={moved / arm.urdf}")
+    folder = replay.run("report", replay.demo_log(), out=tmp_path / "run", end_s=11.0, overrides=tuple(overrides))
+    shutil.rmtree(tmp_path / "share")
+    drawn = [path for key in ("15", "9") for path in draw_figures(folder, key, tmp_path / "figures")]
+    assert {path.stem for path in drawn} == {"fig15_storyboard", "fig09_volumes"}, "those that show the robot's links"
+    for path in drawn:
+        assert path.read_bytes() == (folder / "figures" / path.name).read_bytes(), path.name
+    assert take_still(folder, 9.0, tmp_path / "still.png").stat().st_size > 10_000
+    recorded = run_folder.read_meta(folder)["urdf"]
+    assert recorded["text"] == arm.path.read_text()
+    want = {segment.name: segment for segment in arm_of(arm)[0].segments}
+    assert [link["name"] for link in recorded["links"]] == list(want)
+    for link in recorded["links"]:
+        assert_allclose(link["radius_m"], want[link["name"]].radius_m)
+        assert_allclose(link["end_m"], want[link["name"]].end_m)
