@@ -19,7 +19,7 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Surface:
+class MeshSurface:
     """The triangles of a collision mesh, to be drawn; what is computed knows the capsule around them alone."""
 
     vertices_m: Floats  #: (k, 3) in the frame of the segment's body [m]
@@ -39,7 +39,7 @@ class Segment:
     end_m: Vector  #: second end in the body's frame [m]
     radius_m: float
     shape_m3: float = math.nan  #: volume of the collision shape's convex hull inside it; NaN where it was given [m^3]
-    surface: Surface | None = field(default=None, compare=False, repr=False)  #: of the mesh that it was fitted to
+    surface: MeshSurface | None = field(default=None, compare=False, repr=False)  #: of the mesh that it was fitted to
 
     @property
     def volume_m3(self) -> float:
@@ -226,5 +226,5 @@ def _around(shape: Shape, extent: Extent) -> Segment:
         length_m = math.dist(start, end)
         inside_m3 = math.pi * radius_m**2 * length_m if shape.kind == "cylinder" else capsule_m3(length_m, radius_m)
     ends = [(float(x), float(y), float(z)) for x, y, z in (start, end)]
-    surface = None if extent.triangles is None else Surface(points_m, extent.triangles)
+    surface = None if extent.triangles is None else MeshSurface(points_m, extent.triangles)
     return Segment(shape.name, shape.link, ends[0], ends[1], radius_m, inside_m3, surface)
