@@ -244,7 +244,7 @@ class Plan(Section):
     smooth_s: NotNegative = 0.08
     """qp: time constant with which the velocity approaches the best one that keeps the rows; 0: as fast as the limits
     allow [s]."""
-    retreat_m: NotNegative = 0.05
+    retreat_m: NotNegative = 0.03
     """qp: a robot that is inside a volume by no more than this moves out of it, at 0.25 m/s at most, if no point of it
     comes nearer to any point of the volume; deeper inside, or with 0, it stands [m]."""
     posture: NotNegative = 0.01
