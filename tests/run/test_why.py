@@ -171,7 +171,7 @@ def test_ten_stops_of_the_demo_are_told_as_brute_force_finds_them(
             assert_binding(found, tasks[0], record)
         else:
             assert found["reason"] == "inside a volume"
-            assert found["nearest"]["overlap_m"] >= 0.05  # plan.retreat_m
+            assert found["nearest"]["overlap_m"] >= record.job.settings.plan.retreat_m
             assert "overlap by" in why.cause(found)
     assert {"limited inside a volume", "retreating "} <= kinds
 
