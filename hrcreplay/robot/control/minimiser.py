@@ -141,6 +141,8 @@ def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] 
     status = ""
     for sweeps, penalty, rounds in TRIES:
         y, z = descend(problem, z, sweeps) if sweeps >= 0 else _least_distance(problem)
+        if sweeps < 0 and denied(problem, z, limits):
+            return Unsolved("infeasible")
         y, z, status = _by_proxqp(problem, y, z, penalty, rounds)
         if residual(problem, y, z) <= PROVEN:  # false for NaN
             return y, z
@@ -153,7 +155,7 @@ def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] 
 def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
     """The minimiser as the point nearest to -b, by non-negative least squares (Lawson and Hanson).
 
-    Where it finds none: -b itself.
+    Where no point keeps the rows: -b itself, and multipliers that may prove it (``denied``).
     """
     _, b, E, low, high = problem
     n, m = len(b), len(E)
@@ -164,12 +166,13 @@ def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
         pull, _ = nnls(np.vstack((G.T, f)), np.append(np.zeros(n), 1.0))
     except (RuntimeError, ValueError):
         return -b, np.zeros(m)
+    z = np.zeros(m)
+    z[above] += pull[: np.count_nonzero(above)]
+    z[below] -= pull[np.count_nonzero(above) :]
     left = 1.0 - f @ pull
     if not left > EMPTY:
-        return -b, np.zeros(m)
-    z = np.zeros(m)
-    z[above] += pull[: np.count_nonzero(above)] / left
-    z[below] -= pull[np.count_nonzero(above) :] / left
+        return -b, z
+    z /= left
     return -b - z @ E, z
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import minimiser
@@ -155,6 +156,32 @@ def test_limits_that_leave_nothing_are_infeasible_also_where_people_are_soft() -
     apart = FREE._replace(J=np.eye(6, 3), J_low=np.full(6, -30.0), J_high=np.full(6, -20.0))
     for limits in (crossed, apart):
         assert minimise(asked(np.ones(3), np.eye(3), np.ones(3), soft=True, limits=limits)) == Unsolved("infeasible")
+
+
+def test_what_no_velocity_keeps_is_proven_after_one_try(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that is too fast for a retreat asks such things; six tries took longer than a live cycle."""
+    rng, tries, infeasible = np.random.default_rng(11), [0], 0
+    really = minimiser._by_proxqp
+
+    def counted(*given: Any) -> Any:
+        tries[0] += 1
+        return really(*given)
+
+    monkeypatch.setattr(minimiser, "_by_proxqp", counted)
+    for _ in range(300):
+        J, middle = rng.normal(size=(6, 3)), rng.normal(size=6)
+        room = rng.uniform(0.2, 2.0, 6)
+        limits = Limits(-WIDE, WIDE, J, middle - room, middle + room)
+        known = linprog(
+            np.zeros(3), np.vstack([J, -J]), np.concatenate([middle + room, room - middle]), bounds=[(-10.0, 10.0)] * 3
+        )
+        tries[0] = 0
+        found = minimise(asked(rng.normal(size=3), np.eye(3), np.ones(3), soft=True, limits=limits))
+        assert (found == Unsolved("infeasible")) == (known.status == 2)
+        if known.status == 2:
+            infeasible += 1
+            assert tries[0] <= 1
+    assert 50 < infeasible < 250
 
 
 def test_rows_without_room_leave_what_lies_across_them() -> None:
