@@ -256,7 +256,7 @@ class Plan(Section):
     reference: Literal["time", "path"] = "path"
     """time: the reference runs with the clock; path: only as far as the robot has followed."""
     leash_m: Positive = 0.4
-    """path: the reference waits when the TCP is this far away; no way round a person can be longer [m]."""
+    """path: the reference waits when the TCP is this far away, so no way round a person leads further off [m]."""
     waypoint_m: Positive = 0.02
     """path: the reference leaves a waypoint when the TCP has come this close [m]."""
     q_p: tuple[NotNegative, NotNegative] = (0.10, 0.10)
