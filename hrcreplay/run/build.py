@@ -24,11 +24,11 @@ from hrcreplay.logs.log_files import Header, JointTrack
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
+from hrcreplay.robot.model import RobotModel, from_urdf, irb140
 from hrcreplay.robot.path import programmed, recorded
 from hrcreplay.robot.task import Reference, Task, parse_task
 from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
-from hrcreplay.run.job import Job, UrdfFiles, derived_capsules
+from hrcreplay.run.job import Job, UrdfFiles, link_capsules
 from hrcreplay.settings.sections import Fusion, Occupancy, Robot
 
 
@@ -213,7 +213,6 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
             T_tool_tcp=T_tool_tcp,
             acceleration=settings.acceleration,
         )
-    segments = tuple(Segment(**dict(link)) for link in settings.links or files.capsules)
     return from_urdf(
         files.text,
         T_world_base,
@@ -222,7 +221,7 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
         base_frame=settings.base_frame,
         tool_m=settings.tool_m,
         T_tool_tcp=T_tool_tcp,
-        segments=segments or derived_capsules(files, settings.tcp_frame, settings.base_frame),
+        segments=link_capsules(settings, files),
         acceleration=settings.acceleration,
     )
 

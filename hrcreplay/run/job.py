@@ -330,20 +330,25 @@ def _urdf_inputs(settings: Settings) -> list[dict[str, str]]:
 
 
 @lru_cache(maxsize=4)  # a run makes its robot several times; a file that changes has another digest
-def derived_capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -> tuple[Segment, ...]:
+def _derived_capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -> tuple[Segment, ...]:
     """The link capsules that a URDF's collision shapes give."""
     meshes = dict(files.meshes)
     model = from_urdf(files.text, np.eye(4), stop_s=1.0, tcp_frame=tcp_frame, base_frame=base_frame, meshes=meshes)
     return model.segments
 
 
+def link_capsules(robot: Robot, files: UrdfFiles) -> tuple[Segment, ...]:
+    """The links' capsules: those of the settings, else those that a run recorded, else what the shapes give."""
+    given = tuple(Segment(**dict(link)) for link in robot.links or files.capsules)
+    return given or _derived_capsules(files, robot.tcp_frame, robot.base_frame)
+
+
 def _urdf_record(job: Job) -> dict[str, Any] | None:
     """What makes the robot again without its files."""
-    robot, files = job.settings.robot, job.urdf
+    files = job.urdf
     if files is None:
         return None
-    links = robot.links or files.capsules or derived_capsules(files, robot.tcp_frame, robot.base_frame)
-    names = tuple(LinkSettings.model_fields)
+    links, names = link_capsules(job.settings.robot, files), tuple(LinkSettings.model_fields)
     return {"text": files.text, "links": [{name: getattr(link, name) for name in names} for link in links]}
 
 

@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.linalg import expm
+from scipy.spatial import ConvexHull
 
 from hrcreplay.records import Floats, Ints
 from hrcreplay.report.replay_page import replay_part
-from hrcreplay.report.replay_scene import coarser, robot_geometry
+from hrcreplay.report.replay_scene import LinkMesh, ReplayScene, coarser, robot_geometry
 from hrcreplay.robot.model import from_urdf
 from hrcreplay.run.job import read_urdf
 from hrcreplay.settings.sections import Robot
 from tests.report.browser import chromium, opened
 from tests.report.moving import moving_run, moving_scene
-from tests.report.with_meshes import box_on, with_meshes
 from tests.run.arms import ARMS
 
 PROGRAM = chromium()
+
+
+def box_on(seed: int) -> Floats:
+    """(8, 3) corners of a box about the origin, of its own size and turn."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * rng.uniform(0.05, 0.2, 3) @ turn.T
+
+
+def with_meshes(scene: ReplayScene, corners_m: Mapping[int, Floats]) -> ReplayScene:
+    """The same scene with a convex mesh about the middle of some links."""
+    meshes = tuple(
+        LinkMesh(link, corners + scene.robot.ends_m[link].mean(axis=0), ConvexHull(corners).simplices.astype(np.int64))
+        for link, corners in corners_m.items()
+    )
+    return dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, meshes=meshes))
 
 
 def ball(rings: int) -> tuple[Floats, Ints]:
@@ -89,6 +108,7 @@ def test_a_fine_mesh_is_drawn_coarser_and_stays_where_it_is() -> None:
     assert len(triangles) > 50_000
     fewer, corners = coarser(vertices, triangles, 8000)
     assert 2000 < len(corners) <= 8000
+    assert (corners != np.roll(corners, 1, axis=1)).all(), "a triangle of two corners"
     assert np.abs(np.linalg.norm(fewer, axis=1) - 1.0).max() < 0.01
     assert volume_m3(fewer, corners) == pytest.approx(volume_m3(vertices, triangles), rel=0.02)
     assert volume_m3(vertices, triangles) == pytest.approx(4.0 / 3.0 * np.pi, rel=0.002)
