@@ -1,39 +1,44 @@
 """How far whole limbs depart from constant velocity on recordings: the fit of ``human.model.Departure``.
 
-At a tick a limb departs until a horizon by how far its recorded points get from the hull of the limb at the tick and
-after the horizon, its ends moving on as they do (``velocity_tube``), at worst. It grows with the limb's residual. So
-each pair of limbs and horizon gets a line over the residual, by quantile regression: of all lines above the wanted
-share of the departures, the one that is least above them. The lines are then raised by one factor a horizon, until
-whole people are inside, not limbs one by one, in the wanted share of the ticks of every log.
+At a tick the pelvis departs until a horizon by how far it rises above, and sinks below, its heights at the tick and
+where its velocity takes it, and a limb by how far its recorded points get from its tube (``velocity_tube``) without the
+ball, at worst. First rise and sink are fitted: a quantile, for the whole body moves with the pelvis. Then each pair of
+limbs and horizon gets a line over the limb's residual, by quantile regression: of all lines above the wanted share of
+the departures, the one that is least above them. The lines are then raised by one factor a horizon, until whole people
+are inside, not limbs one by one, in the wanted share of the ticks of every log.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import coo_array, eye_array, hstack
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.log_audit import SHORTER_S, check_containment, flesh_m, recorded_future
+from hrcreplay.audit.log_audit import SHORTER_S, RecordedFuture, check_containment, flesh_m, recorded_future
 from hrcreplay.audit.measures import InflatedHull, union_volume_m3
 from hrcreplay.audit.recording import Recording
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.swept_volumes import limb_radii
-from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, tubes
-from hrcreplay.records import BODY, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, tubes
+from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.run.build import PredictionStage
 
 #: Limbs that share a line: both sides of the body.
 _PAIRS = ((0,), (1,), (2, 4), (3, 5), (6,))
 #: Share of a pair's departures below its line before it is raised.
 _BELOW = 0.995
+#: No line is steeper: what is steeper rests on the few logs of much noise.
+_STEEPEST = 1.0
 #: The largest factor, how often its interval is halved, and how many times as many ticks of one log may miss as of all.
 _MOST, _HALVINGS, EACH = 1.5, 12, 3.0
-#: Departures and their growth are rounded up to these [m], [1].
-_MM, _HUNDREDTH = 1e-3, 1e-2
+#: Departures, their growth, and rise and sink are rounded up to these [m], [1], [m]: with steps that coarse most folds
+#: have the same rise and sink, beside which departures need to be measured once.
+_MM, _HUNDREDTH, _CM = 1e-3, 1e-2, 1e-2
 
 
 @dataclass(frozen=True)
@@ -42,23 +47,33 @@ class LimbDepartures:
 
     states: HumanStates  #: (n,) the fused person at the ticks
     horizon_s: Floats  #: (h,) [s]
-    beyond_m: Floats  #: (h, n, 7) of BODY; NaN where a limb was not recorded near the horizon's end, or not seen lately
+    height_m: Floats  #: (2, h, n) how far the pelvis rises and sinks; NaN where it was not recorded [m]
+    #: Of a horizon's index, rise and sink [m]: (n, 7) how far limbs of BODY depart beside those [m]; NaN where a limb
+    #: was not recorded near the horizon's end, or not seen lately.
+    beyond_m: Callable[[int, float, float], Floats]
     residual_m: Floats  #: (n, 7)
 
     def rows(self, which: Ints) -> LimbDepartures:
         """The same at some of the ticks."""
         return replace(
-            self, states=self.states.rows(which), beyond_m=self.beyond_m[:, which], residual_m=self.residual_m[which]
+            self,
+            states=self.states.rows(which),
+            height_m=self.height_m[..., which],
+            beyond_m=lambda k, rise_m, sink_m: self.beyond_m(k, rise_m, sink_m)[which],
+            residual_m=self.residual_m[which],
         )
 
-    def inside(self, departure: Departure) -> Floats:
-        """(h, n) whether all limbs that were recorded stayed within their departures: 1, 0, or NaN where none was."""
+    def inside(self, departure: Departure, k: int) -> Floats:
+        """(n,) whether all limbs that were recorded stayed within their departures at a horizon.
+
+        1, 0, or NaN where none was recorded.
+        """
+        beyond = self.beyond_m(k, float(departure.rise_m[k]), float(departure.sink_m[k]))
         noise = np.minimum(self.residual_m, NOISE_M)
-        line = departure.beyond_m.T[:, None] + departure.residuals.T[:, None] * noise + (self.residual_m - noise)
-        allowed = np.maximum(line, self.residual_m)
-        known = np.isfinite(self.beyond_m)
-        held = (~known | (self.beyond_m <= allowed)).all(axis=2).astype(float)
-        return np.where(known.any(axis=2), held, np.nan)
+        line = departure.beyond_m[:, k] + departure.residuals[:, k] * noise + (self.residual_m - noise)
+        known = np.isfinite(beyond)
+        held = (~known | (beyond <= np.maximum(line, self.residual_m))).all(axis=1).astype(float)
+        return np.where(known.any(axis=1), held, np.nan)
 
 
 def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> LimbDepartures:
@@ -70,18 +85,46 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
         ticks: (n,) rows of ``recording.states``, of a person whom the filter has found.
     """
     horizon_s = np.array([*(h for h in SHORTER_S if h < stage.horizon_s), stage.horizon_s])
-    none = Departure(horizon_s, np.zeros((len(BODY), len(horizon_s))), np.ones((len(BODY), len(horizon_s))))
-    bare = tube_stage(stage, none, residual=False)
     states, nothing = recording.states.rows(ticks), np.zeros(len(ticks), dtype=bool)
-    found = np.empty((len(horizon_s), len(ticks), len(BODY)))
-    for k, h in enumerate(horizon_s.tolist()):
-        future = recorded_future(recording, ticks, h)
-        measured = check_containment(bare.volumes(states, h), future, flesh_m(stage), nothing).beyond_m
-        at = tubes(states, bare.limits, True, bare.occupancy.residual_unknown_m, h, stage.memory_s)
-        lately = at.reach_s <= h  # seen so lately that it has departed for no longer
-        found[k] = np.where(at.usable & lately, measured, np.nan)
-        found[k, ~at.legs_shown, LEGS] = np.nan
-    return LimbDepartures(states, horizon_s, found, at.residual)
+    futures = [recorded_future(recording, ticks, h) for h in horizon_s.tolist()]
+    bare = tube_stage(stage, _bare(horizon_s, 0.0, 0.0), residual=False)
+    unknown_m = bare.occupancy.residual_unknown_m
+    at = [tubes(states, bare.limits, True, unknown_m, h, stage.memory_s) for h in horizon_s.tolist()]
+
+    # seen so lately that a limb has departed for no longer
+    asked = [tubed.usable & (tubed.reach_s <= h) for tubed, h in zip(at, horizon_s, strict=True)]
+
+    @cache
+    def beyond_m(k: int, rise_m: float, sink_m: float) -> Floats:
+        volumes = tube_stage(stage, _bare(horizon_s, rise_m, sink_m), residual=False).volumes(states, horizon_s[k])
+        found = check_containment(volumes, futures[k], flesh_m(stage), nothing).beyond_m
+        found = np.where(asked[k], found, np.nan)
+        found[~at[k].legs_shown, LEGS] = np.nan
+        return found
+
+    heights = [_heights(bare.volumes(states, h), future) for h, future in zip(horizon_s, futures, strict=True)]
+    of_thorax = np.array([usable[:, THORAX] for usable in asked])
+    return LimbDepartures(
+        states, horizon_s, np.where(of_thorax, np.stack(heights, axis=1), np.nan), beyond_m, at[0].residual
+    )
+
+
+def _bare(horizon_s: Floats, rise_m: float, sink_m: float) -> Departure:
+    """Tubes without a ball."""
+    rows, same = (len(BODY), len(horizon_s)), np.ones(len(horizon_s))
+    return Departure(horizon_s, np.zeros(rows), np.ones(rows), rise_m * same, sink_m * same)
+
+
+def _heights(volumes: SweptVolumes, future: RecordedFuture) -> Floats:
+    """(2, n) how far the pelvis gets above and below where the thorax's tube starts, the pelvis now and later [m]."""
+    found = np.full((2, len(volumes)), np.nan)
+    for i in range(len(volumes)):
+        pelvis = volumes.vertices(i, THORAX)[:2, 2]
+        seen = future.limbs[BODY[THORAX]][future.first[i] : future.last[i], 0, 2]
+        seen = seen[np.isfinite(seen)]
+        if len(seen):
+            found[:, i] = max(0.0, seen.max() - pelvis.max()), max(0.0, pelvis.min() - seen.min())
+    return found
 
 
 def tube_stage(stage: PredictionStage, departure: Departure, *, residual: bool = True) -> PredictionStage:
@@ -99,19 +142,39 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
         share: Of all ticks at each horizon, in (0, 1). Of one log's ticks three times as many may miss.
     """
     horizon_s = samples[0].horizon_s
+    rise_m, sink_m = (
+        np.array([_often([s.height_m[way, k] for s in samples]) for k in range(len(horizon_s))]) for way in range(2)
+    )
     lines = np.zeros((len(BODY), len(horizon_s), 2))
     for k in range(len(horizon_s)):
+        beyond = [s.beyond_m(k, float(rise_m[k]), float(sink_m[k])) for s in samples]
         for pair in _PAIRS:
-            lines[list(pair), k] = _line(
-                [(s.beyond_m[k][:, pair], np.minimum(s.residual_m[:, pair], NOISE_M)) for s in samples]
-            )
-    plain = Departure(horizon_s, _up(lines[..., 0], _MM), _up(lines[..., 1], _HUNDREDTH))
+            logs = zip(beyond, samples, strict=True)
+            lines[list(pair), k] = _line([(b[:, pair], np.minimum(s.residual_m[:, pair], NOISE_M)) for b, s in logs])
+    plain = Departure(horizon_s, _up(lines[..., 0], _MM), _up(lines[..., 1], _HUNDREDTH), rise_m, sink_m)
     factor = np.array([_factor(samples, plain, k, share) for k in range(len(horizon_s))])
-    return Departure(horizon_s, _up(plain.beyond_m * factor, _MM), _up(plain.residuals * factor, _HUNDREDTH))
+    raised = {name: factor * getattr(plain, name) for name in ("beyond_m", "residuals")}
+    return replace(plain, beyond_m=_up(raised["beyond_m"], _MM), residuals=_up(raised["residuals"], _HUNDREDTH))
+
+
+def _often(logs: Sequence[Floats]) -> float:
+    """What the wanted share of a pair's departures is below; every log weighs as the root of its ticks [m]."""
+    known = [log[np.isfinite(log)] for log in logs]
+    height = np.concatenate(known)
+    if not len(height):
+        return 0.0
+    weight = np.concatenate([np.full(len(log), max(1, len(log)) ** -0.5) for log in known])
+    order = np.argsort(height, kind="stable")
+    below = np.cumsum(weight[order])
+    found = height[order][np.searchsorted(below, _BELOW * below[-1])]
+    return float(_up(np.array(found), _CM))
 
 
 def _line(logs: Sequence[tuple[Floats, Floats]]) -> Floats:
-    """(2,) offset >= 0 and slope >= 0 of the line with the least quantile loss; every log weighs as the root of it."""
+    """(2,) offset >= 0 and slope, up to _STEEPEST, of the line with the least quantile loss.
+
+    Every log weighs as the root of its ticks.
+    """
     far, near, weight = [], [], []
     for beyond, residual in logs:
         known = np.isfinite(beyond)
@@ -127,7 +190,7 @@ def _line(logs: Sequence[tuple[Floats, Floats]]) -> Floats:
         np.concatenate([[0.0, 0.0], _BELOW * w, (1.0 - _BELOW) * w]),
         A_eq=hstack([unknowns, eye_array(n), -eye_array(n)]).tocsr(),
         b_eq=y,
-        bounds=[(0.0, None)] * (2 + 2 * n),
+        bounds=[(0.0, None), (0.0, _STEEPEST)] + [(0.0, None)] * (2 * n),
         method="highs",
     )
     line: Floats = found.x[:2]
@@ -143,10 +206,10 @@ def _factor(samples: Sequence[LimbDepartures], plain: Departure, k: int, share: 
 
     def shares(factor: float) -> tuple[Floats, float]:
         raised = replace(plain, beyond_m=factor * plain.beyond_m, residuals=factor * plain.residuals)
-        hits = [inside[np.isfinite(inside)] for inside in (s.inside(raised)[k] for s in samples)]
+        hits = [inside[np.isfinite(inside)] for inside in (s.inside(raised, k) for s in samples)]
         return np.array([hit.mean() if len(hit) else 1.0 for hit in hits]), float(np.concatenate(hits).mean())
 
-    if not any(np.isfinite(s.inside(plain)[k]).any() for s in samples):
+    if not any(np.isfinite(s.inside(plain, k)).any() for s in samples):
         return 1.0
     each, together = shares(_MOST)
     asks, wanted = each >= least, min(share, together)
@@ -170,7 +233,12 @@ def _up(values: Floats, step: float) -> Floats:
 
 def not_recorded(samples: Sequence[LimbDepartures]) -> list[str]:
     """Limbs of BODY that no log shows near a horizon's end, so that nothing is said of them."""
-    return [limb for k, limb in enumerate(BODY) if not any(np.isfinite(s.beyond_m[..., k]).any() for s in samples)]
+    return [limb for k, limb in enumerate(BODY) if not any(_recorded(s)[k] for s in samples)]
+
+
+def _recorded(sample: LimbDepartures) -> Bools:
+    """(7,) whether a limb was recorded near any horizon's end."""
+    return np.any([np.isfinite(sample.beyond_m(k, 0.0, 0.0)).any(axis=0) for k in range(len(sample.horizon_s))], axis=0)
 
 
 #: Ticks of a log whose volumes are counted out, and points for each.

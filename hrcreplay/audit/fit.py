@@ -257,8 +257,8 @@ def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departur
         fitted, known = ([part] for part in _parts(samples[0]))
         folds = [fit_departures(fitted, coverage)]
     found = fit_departures(fitted, coverage)
-    inside = [one.inside(fold) for one, fold in zip(known, folds, strict=True)]
     horizons = range(len(found.horizon_s))
+    inside = [[one.inside(fold, k) for k in horizons] for one, fold in zip(known, folds, strict=True)]
     logs = [
         {
             "name": sample.name,
@@ -269,7 +269,7 @@ def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departur
         for sample, one, fold, hits in zip(samples, known, folds, inside, strict=True)
     ]
 
-    def pooled(every: Sequence[Floats]) -> list[dict[str, Any]]:
+    def pooled(every: Sequence[Sequence[Floats]]) -> list[dict[str, Any]]:
         return [
             _plain(_share([hits[k][:, None] for hits in every], found.horizon_s[k], DEPARTURES_HZ)) for k in horizons
         ]
@@ -278,7 +278,7 @@ def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departur
         "horizon_s": found.horizon_s.tolist(),
         "ticks_hz": DEPARTURES_HZ,
         "unknown_are": "each log left out once" if len(samples) > 1 else "the part held back",
-        "training": pooled([one.inside(found) for one in fitted]),
+        "training": pooled([[one.inside(found, k) for k in horizons] for one in fitted]),
         "unknown": pooled(inside),
         "not_checked": not_recorded(known),
         "logs": logs,

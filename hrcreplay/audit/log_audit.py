@@ -242,7 +242,8 @@ def scale_rates(limits: LimitSet, factor: float) -> LimitSet:
     grown = {name: factor * getattr(limits, name) for name in ("v_min", "v_max", "a_min", "a_max")}
     known = limits.departure
     if known is not None:
-        known = replace(known, beyond_m=factor * known.beyond_m, residuals=factor * known.residuals)
+        scaled = {name: factor * getattr(known, name) for name in ("beyond_m", "residuals", "rise_m", "sink_m")}
+        known = replace(known, **scaled)
     return replace(limits, name=f"{limits.name} x {factor:g}", departure=known, **grown)
 
 

@@ -44,14 +44,16 @@ _DEGREE = np.pi / 180.0
 class Departure:
     """How far whole limbs get from where the fused velocity takes them, measured on recordings.
 
-    Until a horizon no point of a limb is further from the hull of the limb at the tick and after the horizon, its ends
-    moving on as they do, than ``beyond_m`` and ``residuals`` times the limb's residual, as far as that is noise; and
-    at least the residual.
+    The body may rise by ``rise_m`` and sink by ``sink_m`` more than that. Until a horizon no point of a limb is further
+    from the hull of all these places than ``beyond_m`` and ``residuals`` times the limb's residual, as far as that is
+    noise; and at least the residual.
     """
 
     horizon_s: Floats  #: (h,) increasing [s]
     beyond_m: Floats  #: (7, h) for each limb of BODY [m]
     residuals: Floats  #: (7, h)
+    rise_m: Floats  #: (h,) [m]
+    sink_m: Floats  #: (h,) [m]
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,15 @@ _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _PAIR = "[low, high] with low <= high"
 _ROW = f"a row with {', '.join(_QUANTITIES)}"
 _LIMB_ROW = "a row with beyond_m, residuals"
+#: Rows of departures that are not a limb's.
+_OF_BODY = ("horizon_s", "rise_m", "sink_m")
 #: What to write instead, by the key.
 _RIGHT = {
     "coupled": "true or false",
     "joints": "a table with a row for each joint",
-    "departure": f"horizon_s and a row for each of {', '.join(BODY)}, or leave it out",
+    "departure": f"horizon_s, rise_m, sink_m and a row for each of {', '.join(BODY)}, or leave it out",
     "horizon_s": "[s...], above 0 and increasing",
+    **dict.fromkeys(("rise_m", "sink_m"), "a number for each horizon, at least 0"),
     "provenance": "a table, or leave it out",
 }
 
@@ -43,8 +46,9 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
             a row ``{ position = [low, high], velocity = [...], acceleration = [...] }`` for each of JOINTS
             [m, m, rad..., m; per second; per second squared]. Where coupled, alpha_2 and alpha_3 have no position;
             without a row ``z``, that of ``human`` holds. A table ``departure`` may bound how far limbs depart from
-            constant velocity: ``horizon_s = [...]`` and a row ``{ beyond_m = [...], residuals = [...] }`` for each of
-            BODY. A table ``provenance`` may say where the bounds come from; it changes nothing.
+            constant velocity: ``horizon_s = [...]``, ``rise_m = [...]``, ``sink_m = [...]`` and a row
+            ``{ beyond_m = [...], residuals = [...] }`` for each of BODY. A table ``provenance`` may say where the
+            bounds come from; it changes nothing.
 
     Raises:
         SettingsError: The file cannot be read, or a key or a bound is not what it should be.
@@ -79,15 +83,15 @@ def _departure(table: dict[str, Any] | None, where: str) -> Departure | None:
     grows = len(horizon_s) > 0 and (np.diff(horizon_s, prepend=0.0) > 0.0).all()
     if not (grows and np.isfinite(horizon_s).all()):
         raise SettingsError(f"{where}: departure.horizon_s: found {table['horizon_s']}; write {_RIGHT['horizon_s']}")
-    for limb in BODY:
-        for name in ("beyond_m", "residuals"):
-            values = np.array(table[limb][name])
-            if len(values) != len(horizon_s) or not (values >= 0.0).all() or not np.isfinite(values).all():
-                raise SettingsError(
-                    f"{where}: departure.{limb}.{name}: found {table[limb][name]}; write {len(horizon_s)} numbers, one "
-                    "for each horizon, at least 0"
-                )
-    return Departure(horizon_s, *(np.array([table[limb][name] for limb in BODY]) for name in ("beyond_m", "residuals")))
+    rows = {f"{limb}.{name}": table[limb][name] for limb in BODY for name in ("beyond_m", "residuals")}
+    for name, row in {**rows, "rise_m": table["rise_m"], "sink_m": table["sink_m"]}.items():
+        if len(row) != len(horizon_s) or not (np.array(row) >= 0.0).all() or not np.isfinite(row).all():
+            raise SettingsError(
+                f"{where}: departure.{name}: found {row}; write {len(horizon_s)} numbers, one for each horizon, at "
+                "least 0"
+            )
+    beyond, residuals = (np.array([table[limb][name] for limb in BODY]) for name in ("beyond_m", "residuals"))
+    return Departure(horizon_s, beyond, residuals, np.array(table["rise_m"]), np.array(table["sink_m"]))
 
 
 def write_limits(limits: LimitSet, provenance: dict[str, Any], path: Path) -> None:
@@ -119,7 +123,8 @@ def _toml(limits: LimitSet, provenance: dict[str, Any]) -> str:
         lines.append(f"{joint} = {_value(row)}")
     known = limits.departure
     if known is not None:
-        lines += ["", "[departure]", f"horizon_s = {_value(known.horizon_s.tolist())}"]
+        lines += ["", "[departure]"]
+        lines += [f"{name} = {_value(getattr(known, name).tolist())}" for name in _OF_BODY]
         for k, limb in enumerate(BODY):
             row = {"beyond_m": known.beyond_m[k].tolist(), "residuals": known.residuals[k].tolist()}
             lines.append(f"{limb} = {_value(row)}")
@@ -165,7 +170,7 @@ class _LimbRow(BaseModel):
 
 _rows: Any = dict.fromkeys(JOINTS, (_Row, ...)) | {"z": (_Row | None, None)}
 _Joints = create_model("_Joints", __config__=_STRICT, **_rows)
-_limbs: Any = {"horizon_s": (list[float], ...)} | dict.fromkeys(BODY, (_LimbRow, ...))
+_limbs: Any = dict.fromkeys(_OF_BODY, (list[float], ...)) | dict.fromkeys(BODY, (_LimbRow, ...))
 _Departures = create_model("_Departures", __config__=_STRICT, **_limbs)
 _LimitFile = create_model(
     "_LimitFile",
@@ -183,7 +188,7 @@ def _first_problem(error: ValidationError, table: dict[str, Any], where: str) ->
     problem = next((one for one in problems if one["type"] == "extra_forbidden"), problems[0])
     keys = [str(key) for key in problem["loc"][:3]]  # a bound inside a pair is shown with its pair
     if problem["type"] == "extra_forbidden":
-        of_limbs = (("horizon_s", *BODY), tuple(_LimbRow.model_fields))
+        of_limbs = ((*_OF_BODY, *BODY), tuple(_LimbRow.model_fields))
         rows = of_limbs if keys[0] == "departure" else (JOINTS, _QUANTITIES)
         known = (tuple(_LimitFile.model_fields), *rows)[len(keys) - 1]
         above = ".".join(keys[:-1])

@@ -263,11 +263,23 @@ def job_of_run(folder: Path) -> Job:
         task=meta["task"],
         start_s=meta["span_s"][0],
         end_s=meta["span_s"][1],
-        tracking=LimitSet.of(meta["limits"]["tracking"]),
-        prediction=LimitSet.of(meta["limits"]["prediction"]),
+        tracking=recorded_limits(meta["limits"]["tracking"], folder),
+        prediction=recorded_limits(meta["limits"]["prediction"], folder),
         earlier=folder,
         recorded_urdf=_recorded_urdf(meta),
     )
+
+
+def recorded_limits(plain: dict[str, Any], where: str | Path) -> LimitSet:
+    """The limit set whose JSON form a run recorded.
+
+    Raises:
+        SettingsError: Another version recorded it.
+    """
+    try:
+        return LimitSet.of(plain)
+    except TypeError as error:  # a bound too many or too few
+        raise SettingsError(f"{where}: its limit set {plain.get('name')} is of another version of hrcreplay") from error
 
 
 def job_without_log(command: str, where: Path, settings: Settings, cell_file: Path | None) -> Job:

@@ -108,6 +108,14 @@ def test_the_limits_of_a_run_are_read_back_from_it(sound: Run) -> None:
             np.testing.assert_array_equal(found[name], right[name], err_msg=name)
 
 
+def test_a_run_of_other_bounds_is_told_to_be_of_another_version(sound: Run, tmp_path: Path) -> None:
+    meta = json.loads((sound.folder / "run.json").read_text())
+    del meta["limits"]["prediction"]["departure"]["rise_m"]
+    (tmp_path / "run.json").write_text(json.dumps(meta))
+    with pytest.raises(SettingsError, match=f"^{tmp_path}: its limit set people is of another version"):
+        job_of_run(tmp_path)
+
+
 @pytest.fixture(scope="module")
 def data(sound: Run) -> FigureData:
     metrics = json.loads((sound.folder / "metrics.json").read_text())

@@ -191,13 +191,14 @@ def _sweep_rows(
         for limb in range(limbs):
             swept, count = short, 0
             if tubed.usable[i, limb]:
-                count = tube(limb, tubed.points[i], velocity, within.horizon, hand, short)
+                reach = tubed.reach_s[i, limb]
+                count = tube(limb, tubed.points[i], velocity, within.horizon, reach, hand, tubed, short)
                 usable = np.isfinite(short[:count].sum())
                 thick = flesh[limb]
                 if limb == LEGS and not tubed.legs_shown[i]:
                     hidden = max(legs, knees_out(at.p[i, HEIGHT]) + THIGH_M) + ROUNDING_M
                     thick = np.fmax(hidden, tubed.legs_m[i] + flesh[limb])
-                radii[i, limb] = thick + departs_m(limb, tubed.reach_s[i, limb], tubed.residual[i, limb], tubed)
+                radii[i, limb] = thick + departs_m(limb, reach, tubed.residual[i, limb], tubed)
                 if not usable:
                     short[0], count = np.nan, 1
             elif limb == LEGS:

@@ -2,8 +2,8 @@
 
 Bounds on thirteen joints, each at its worst, enclose two to three times what people do. So a limit set may also bound
 how far whole limbs depart from constant velocity (``Departure``), fitted on recordings. The tube of a limb is the hull
-of its ends at the tick and after the horizon, with a ball around it: who stops or slows down stays in that hull. No
-motion that keeps to the bound leaves the tube, whatever the joints do.
+of its ends at the tick and after the horizon, raised and lowered as people get up and sit down, with a ball around it:
+who stops or slows down stays in that hull. No motion that keeps to the bound leaves the tube, whatever the joints do.
 """
 
 from __future__ import annotations
@@ -22,13 +22,17 @@ _STEP_S = 1e-4
 _FRESH_S = 0.1
 #: A larger residual is no noise of one place but another place, which the filter does not believe yet [m].
 NOISE_M = 0.2
+#: A velocity of now says nothing of where people are later than this: they have changed it [s].
+_CARRIES_S = 0.25
+#: A swinging leg is so many times as fast as the body: it stands for about half of the time.
+_STRIDE = 2.0
 #: No direction can be told of a hand that is nearer to its wrist [m].
 _SHORT_M = 0.02
 HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
 #: For each limb of BODY, itself and those of LIMBS that carry it: an arm on a torso that nobody sees is anywhere.
 _CARRIED_BY = ((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))
 #: Most points of a tube.
-MOST_POINTS = 2 * (len(LEG_POINTS) + 1)
+MOST_POINTS = 2 * (len(LEG_POINTS) + 2)
 _ARMS = np.array(ARM_POINTS)
 
 
@@ -44,6 +48,8 @@ class Tubes(NamedTuple):
     horizon_s: Floats  #: (h,) of ``Departure``
     beyond_m: Floats  #: (7, h)
     residuals: Floats  #: (7, h)
+    rise_m: Floats  #: (h,) [m]
+    sink_m: Floats  #: (h,) [m]
 
 
 def tubes(
@@ -74,6 +80,8 @@ def tubes(
         horizon_s=np.ones(1) if known is None else np.ascontiguousarray(known.horizon_s),
         beyond_m=empty if known is None else np.ascontiguousarray(known.beyond_m),
         residuals=empty if known is None else np.ascontiguousarray(known.residuals),
+        rise_m=np.zeros(1) if known is None else np.ascontiguousarray(known.rise_m),
+        sink_m=np.zeros(1) if known is None else np.ascontiguousarray(known.sink_m),
     )
 
 
@@ -81,9 +89,7 @@ def tubes(
 def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
     """How far a limb departs at most until ``reach_s`` [m].
 
-    Between the horizons that were measured linear, for it grows faster than the horizon; before the first as at it;
-    after the last as fast as before it, for people's speeds are bounded. Never less than the residual: the limb may be
-    there already.
+    Never less than the residual: the limb may be there already.
 
     Args:
         limb: Index into BODY.
@@ -91,12 +97,23 @@ def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
         residual_m: The limb's residual [m]
         at: Holds the table.
     """
-    known, last = at.horizon_s, len(at.horizon_s) - 1
-    beyond, times = np.interp(reach_s, known, at.beyond_m[limb]), np.interp(reach_s, known, at.residuals[limb])
-    if reach_s > known[last] and last > 0:
-        slope = (at.beyond_m[limb, last] - at.beyond_m[limb, last - 1]) / (known[last] - known[last - 1])
-        beyond += max(0.0, slope) * (reach_s - known[last])
+    beyond = _until(reach_s, at.horizon_s, at.beyond_m[limb])
+    times = np.interp(reach_s, at.horizon_s, at.residuals[limb])
     return max(residual_m, beyond + times * min(residual_m, NOISE_M) + max(0.0, residual_m - NOISE_M))
+
+
+@njit(cache=True)
+def _until(reach_s: float, horizon_s: Floats, most_m: Floats) -> float:
+    """A row (h,) of the table at ``reach_s`` [m].
+
+    Between the horizons that were measured linear, for it grows faster than the horizon; before the first as at it;
+    after the last as fast as before it, for people's speeds are bounded.
+    """
+    found, last = np.interp(reach_s, horizon_s, most_m), len(horizon_s) - 1
+    if reach_s > horizon_s[last] and last > 0:
+        slope = (most_m[last] - most_m[last - 1]) / (horizon_s[last] - horizon_s[last - 1])
+        found += max(0.0, slope) * (reach_s - horizon_s[last])
+    return found
 
 
 @njit(cache=True)
@@ -116,19 +133,35 @@ def velocities(p: Floats, v: Floats, lengths: Floats, found: Floats) -> None:
 
 
 @njit(cache=True)
-def tube(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats) -> int:
+def tube(
+    limb: int, points: Floats, velocity: Floats, span_s: float, reach_s: float, hand_m: float, at: Tubes, swept: Floats
+) -> int:
     """Writes the points whose hull is a limb's tube before the ball, in place of Alg. 2; returns how many.
 
-    The hand lies along the forearm, and where a camera shows it.
+    The hand lies along the forearm, and where a camera shows it. Of the lower body the pelvis rises and sinks.
 
     Args:
         limb: Index into BODY.
         points: (20, 3) where the body's points are [m].
         velocity: (20, 3) of the model's points [m/s].
         span_s: Horizon and latency [s].
+        reach_s: Until when the limb may depart, since the tick [s].
         hand_m: Length of the hand beyond the wrist [m].
+        at: Holds the table.
         swept: (MOST_POINTS, 3) receives the points.
     """
+    n = _ends(limb, points, velocity, min(span_s, _CARRIES_S), hand_m, swept)
+    rising = 2 if limb == LEGS else n
+    for i in range(rising):
+        swept[n + i] = swept[i]
+        swept[n + i, 2] -= _until(reach_s, at.horizon_s, at.sink_m)
+        swept[i, 2] += _until(reach_s, at.horizon_s, at.rise_m)
+    return n + rising
+
+
+@njit(cache=True)
+def _ends(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats) -> int:
+    """Writes where a limb's ends are at the tick and after ``span_s``; returns how many points, the pelvis's first."""
     n = 0
     if limb == HEAD_LIMB:
         n = _add(points[NECK], velocity[NECK], span_s, swept, n)
@@ -139,7 +172,7 @@ def tube(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: flo
         return n
     if limb == LEGS:
         n = _add(points[PELVIS], velocity[PELVIS], span_s, swept, n)
-        along = velocity[PELVIS].copy()
+        along = _STRIDE * velocity[PELVIS]
         along[2] = 0.0  # feet stay on the floor
         for k in LEG_POINTS:
             if np.isfinite(points[k].sum()):

@@ -20,7 +20,7 @@ from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_ro
 from hrcreplay.egm.link import EgmSession
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.fusion.fuse import MEDIAN_LENGTHS_M
-from hrcreplay.human.model import LimitSet, skeleton
+from hrcreplay.human.model import skeleton
 from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.control.stages import ControlSetup, Observer
 from hrcreplay.live.record import codec
@@ -33,7 +33,7 @@ from hrcreplay.robot.control.minimiser import compile_denied
 from hrcreplay.robot.task import Reference
 from hrcreplay.run import build
 from hrcreplay.run.followers import Follower
-from hrcreplay.run.job import Job, job_without_log, resolve
+from hrcreplay.run.job import Job, job_without_log, recorded_limits, resolve
 from hrcreplay.settings.load import Settings, load_settings
 
 
@@ -157,7 +157,7 @@ def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
     """The job of a session, from its start table.
 
     Raises:
-        SettingsError: Its settings are not those of this version.
+        SettingsError: Its settings or its limit sets are not those of this version.
     """
     try:
         settings = Settings.model_validate(start["settings"])
@@ -174,8 +174,8 @@ def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
         task=start["task"],
         start_s=None,
         end_s=None,
-        tracking=LimitSet.of(start["limits"]["tracking"]),
-        prediction=LimitSet.of(start["limits"]["prediction"]),
+        tracking=recorded_limits(start["limits"]["tracking"], log),
+        prediction=recorded_limits(start["limits"]["prediction"], log),
         earlier=None,
     )
 

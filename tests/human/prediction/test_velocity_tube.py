@@ -43,15 +43,15 @@ def people(count: int, seed: int) -> HumanStates:
     return replace(states, points_m=points, residual_m=rng.uniform(0.0, 0.4, (count, len(BODY))))
 
 
-def ends(states: HumanStates, tick: int, limb: str, horizon_s: float) -> Floats:
-    """(k, 3) the limb's ends at the tick and after the horizon."""
+def ends(states: HumanStates, tick: int, limb: str, departure: Departure, horizon_s: float) -> Floats:
+    """(k, 3) the limb's ends at the tick and after the horizon or 0.25 s, as high and as low as the body may be."""
     step, at = 1e-5, states.rows(slice(tick, tick + 1))
     later, earlier = (skeleton(at.p + sign * step * at.v, at.lengths_m)[0] for sign in (1.0, -1.0))
     velocity = (later - earlier) / (2.0 * step)
     place = {name: states.points_m[tick, k] for k, name in enumerate(POINTS)}
     speed = {name: velocity[k] for k, name in enumerate(POINTS)}
     if limb == "LEGS":
-        over = speed["pelvis"] * [1.0, 1.0, 0.0]
+        over = speed["pelvis"] * [2.0, 2.0, 0.0]
         now = [place["pelvis"], *(place[name] for name in LEGS)]
         going = [speed["pelvis"]] + [over] * len(LEGS)
     else:
@@ -63,15 +63,23 @@ def ends(states: HumanStates, tick: int, limb: str, horizon_s: float) -> Floats:
         for along in (wrist - elbow, hand - wrist):
             now.append(wrist + HAND_M * along / np.linalg.norm(along))
             going.append(turning)
-    return np.array(now + [p + v * horizon_s for p, v in zip(now, going, strict=True)])
+    later = [p + v * min(horizon_s, 0.25) for p, v in zip(now, going, strict=True)]
+    rising = [now[0], later[0]] if limb == "LEGS" else now + later
+    rise, sink = (at_horizon(departure, row, horizon_s) for row in (departure.rise_m, departure.sink_m))
+    high, low = ([p + np.array([0.0, 0.0, by]) for p in rising] for by in (rise, -sink))
+    return np.array(now + later + high + low)
+
+
+def at_horizon(departure: Departure, row: Floats, horizon_s: float) -> float:
+    long = departure.horizon_s
+    if horizon_s > long[-1]:
+        return float(row[-1] + (row[-1] - row[-2]) / (long[-1] - long[-2]) * (horizon_s - long[-1]))
+    return float(np.interp(horizon_s, long, row))
 
 
 def allowed_m(departure: Departure, limb: str, horizon_s: float, residual_m: float) -> float:
     k = BODY.index(limb)
-    beyond = np.interp(horizon_s, departure.horizon_s, departure.beyond_m[k])
-    if horizon_s > departure.horizon_s[-1]:
-        far, long = departure.beyond_m[k], departure.horizon_s
-        beyond = far[-1] + (far[-1] - far[-2]) / (long[-1] - long[-2]) * (horizon_s - long[-1])
+    beyond = at_horizon(departure, departure.beyond_m[k], horizon_s)
     times = np.interp(horizon_s, departure.horizon_s, departure.residuals[k])
     return float(max(residual_m, beyond + times * min(residual_m, NOISE_M) + max(residual_m - NOISE_M, 0.0)))
 
@@ -93,7 +101,7 @@ def test_who_keeps_to_the_departures_is_inside_and_nobody_much_further(horizon_s
     assert volumes.limbs == BODY
     for tick in range(len(states)):
         for k, limb in enumerate(BODY):
-            base = ends(states, tick, limb, horizon_s)
+            base = ends(states, tick, limb, PEOPLE.departure, horizon_s)
             residual = states.residual_m[tick, BODY.index("THX") if limb == "LEGS" else k]
             reach = allowed_m(PEOPLE.departure, limb, horizon_s, residual)
             radius = volumes.radius_m[tick, k] - FLESH_M[limb]
@@ -110,7 +118,7 @@ def test_who_keeps_to_the_departures_is_inside_and_nobody_much_further(horizon_s
 
 def test_a_limb_may_be_where_the_residual_says_whatever_the_departures() -> None:
     states = people(8, seed=12)
-    nothing = Departure(np.array([0.1]), np.zeros((len(BODY), 1)), np.zeros((len(BODY), 1)))
+    nothing = Departure(np.array([0.1]), *np.zeros((2, len(BODY), 1)), *np.zeros((2, 1)))
     volumes = predict(states, replace(PEOPLE, departure=nothing), Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
     for k, limb in enumerate(LIMBS):
         np.testing.assert_allclose(volumes.radius_m[:, k], FLESH_M[limb] + states.residual_m[:, k], atol=2e-9)
