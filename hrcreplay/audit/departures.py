@@ -34,8 +34,10 @@ _PAIRS = ((0,), (1,), (2, 4), (3, 5), (6,))
 _BELOW = 0.995
 #: No line is steeper: what is steeper rests on the few logs of much noise.
 _STEEPEST = 1.0
-#: The largest factor, how often its interval is halved, and how many times as many ticks of one log may miss as of all.
-_MOST, _HALVINGS, EACH = 1.5, 12, 3.0
+#: The largest factor, and how often its interval is halved.
+_MOST, _HALVINGS = 1.5, 12
+#: How many times as many ticks of one log may miss as of all: where it was left out, and where it is fitted to.
+EACH, _FITTED = 3.0, 2.5
 #: Departures, their growth, and rise and sink are rounded up to these [m], [1], [m]: with steps that coarse most folds
 #: have the same rise and sink, beside which departures need to be measured once.
 _MM, _HUNDREDTH, _CM = 1e-3, 1e-2, 1e-2
@@ -139,7 +141,7 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
 
     Args:
         samples: One a log, with the same horizons.
-        share: Of all ticks at each horizon, in (0, 1). Of one log's ticks three times as many may miss.
+        share: Of all ticks at each horizon, in (0, 1). Of one log's ticks two and a half times as many may miss.
     """
     horizon_s = samples[0].horizon_s
     rise_m, sink_m = (
@@ -202,7 +204,7 @@ def _factor(samples: Sequence[LimbDepartures], plain: Departure, k: int, share: 
 
     A log whose people not even the largest factor holds, as of a camera that loses the legs, asks for none.
     """
-    least = 1.0 - EACH * (1.0 - share)
+    least = 1.0 - _FITTED * (1.0 - share)
 
     def shares(factor: float) -> tuple[Floats, float]:
         raised = replace(plain, beyond_m=factor * plain.beyond_m, residuals=factor * plain.residuals)

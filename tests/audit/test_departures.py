@@ -77,7 +77,7 @@ def test_the_share_is_reached_by_whole_people_and_hardly_exceeded() -> None:
         for k in range(2):
             together = [plain_share(one, found, k) for one in logs]
             assert np.mean(together) >= share
-            assert min(together) >= 1.0 - 3.0 * (1.0 - share)
+            assert min(together) >= 1.0 - 2.5 * (1.0 - share)
             smaller = replace(found, beyond_m=0.9 * found.beyond_m, residuals=0.9 * found.residuals)
             assert np.mean([plain_share(one, smaller, k) for one in logs]) < share
             for one in logs:
@@ -118,10 +118,10 @@ def test_a_person_who_departs_further_counts_as_much_as_the_others() -> None:
     wild = log(100, seed=5, scale=1.4)
     with_wild, without = fit([*logs, wild], 0.95), fit(logs, 0.95)
     assert plain_share(wild, without, 0) < 0.6
-    assert plain_share(wild, with_wild, 0) >= 1.0 - departures.EACH * 0.05
+    assert plain_share(wild, with_wild, 0) >= 1.0 - departures._FITTED * 0.05
 
 
-def test_a_log_may_miss_three_times_as_many_ticks_as_all() -> None:
+def test_a_log_may_miss_two_and_a_half_times_as_many_ticks_as_all() -> None:
     """Of 100 ticks six are further out than any line needs, too few among 1,300 for the line itself to mind."""
     logs = [log(300, seed) for seed in (2, 3, 4, 5)]
     rare = log(100, seed=6, scale=0.5)
@@ -130,7 +130,7 @@ def test_a_log_may_miss_three_times_as_many_ticks_as_all() -> None:
     rare = given(beyond, rare.residual_m)
     found = fit([*logs, rare], 0.99)
     for k in range(2):
-        assert plain_share(rare, found, k) >= 0.97
+        assert plain_share(rare, found, k) >= 0.975
 
 
 def test_a_camera_that_loses_the_legs_does_not_drive_the_others_up() -> None:

@@ -22,8 +22,8 @@ _STEP_S = 1e-4
 _FRESH_S = 0.1
 #: A larger residual is no noise of one place but another place, which the filter does not believe yet [m].
 NOISE_M = 0.2
-#: A velocity of now says nothing of where people are later than this: they have changed it [s].
-_CARRIES_S = 0.25
+#: A velocity of now says nothing of where trunk and legs, and where arms, are later than this: people change it [s].
+_CARRIES_S, _CARRIES_ARMS_S = 0.25, 0.15
 #: A swinging leg is so many times as fast as the body: it stands for about half of the time.
 _STRIDE = 2.0
 #: No direction can be told of a hand that is nearer to its wrist [m].
@@ -150,7 +150,8 @@ def tube(
         at: Holds the table.
         swept: (MOST_POINTS, 3) receives the points.
     """
-    n = _ends(limb, points, velocity, min(span_s, _CARRIES_S), hand_m, swept)
+    carries_s = _CARRIES_S if limb in (HEAD_LIMB, THORAX, LEGS) else _CARRIES_ARMS_S
+    n = _ends(limb, points, velocity, min(span_s, carries_s), hand_m, swept)
     rising = 2 if limb == LEGS else n
     for i in range(rising):
         swept[n + i] = swept[i]

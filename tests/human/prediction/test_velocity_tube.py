@@ -44,7 +44,7 @@ def people(count: int, seed: int) -> HumanStates:
 
 
 def ends(states: HumanStates, tick: int, limb: str, departure: Departure, horizon_s: float) -> Floats:
-    """(k, 3) the limb's ends at the tick and after the horizon or 0.25 s, as high and as low as the body may be."""
+    """(k, 3) the limb's ends at the tick and where they are carried, as high and as low as the body may be."""
     step, at = 1e-5, states.rows(slice(tick, tick + 1))
     later, earlier = (skeleton(at.p + sign * step * at.v, at.lengths_m)[0] for sign in (1.0, -1.0))
     velocity = (later - earlier) / (2.0 * step)
@@ -63,7 +63,8 @@ def ends(states: HumanStates, tick: int, limb: str, departure: Departure, horizo
         for along in (wrist - elbow, hand - wrist):
             now.append(wrist + HAND_M * along / np.linalg.norm(along))
             going.append(turning)
-    later = [p + v * min(horizon_s, 0.25) for p, v in zip(now, going, strict=True)]
+    carried = 0.15 if "A" in limb else 0.25
+    later = [p + v * min(horizon_s, carried) for p, v in zip(now, going, strict=True)]
     rising = [now[0], later[0]] if limb == "LEGS" else now + later
     rise, sink = (at_horizon(departure, row, horizon_s) for row in (departure.rise_m, departure.sink_m))
     high, low = ([p + np.array([0.0, 0.0, by]) for p in rising] for by in (rise, -sink))
