@@ -15,8 +15,9 @@ import numpy as np
 
 from hrcreplay import __version__
 from hrcreplay.audit import fit_limits
-from hrcreplay.audit.departures import EACH, LimbDepartures, capsules_m3, departures, not_recorded, union_m3
-from hrcreplay.audit.departures import fit as fit_departures
+from hrcreplay.audit.departure_fit import EACH
+from hrcreplay.audit.departure_fit import fit as fit_departures
+from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, not_recorded, union_m3
 from hrcreplay.audit.fit_limits import Fit, Futures
 from hrcreplay.audit.measures import Estimate, block_ticks, resample
 from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, read_recording

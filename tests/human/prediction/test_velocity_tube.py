@@ -74,7 +74,7 @@ def ends(states: HumanStates, tick: int, limb: str, departure: Departure, horizo
 def at_horizon(departure: Departure, row: Floats, horizon_s: float) -> float:
     long = departure.horizon_s
     if horizon_s > long[-1]:
-        return float(row[-1] + (row[-1] - row[-2]) / (long[-1] - long[-2]) * (horizon_s - long[-1]))
+        return float(row[-1] + max(0.0, row[-1] - row[-2]) / (long[-1] - long[-2]) * (horizon_s - long[-1]))
     return float(np.interp(horizon_s, long, row))
 
 

@@ -8,8 +8,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from hrcreplay.audit import departures
-from hrcreplay.audit.departures import LimbDepartures, fit, not_recorded
+from hrcreplay.audit import departure_fit
+from hrcreplay.audit.departure_fit import fit
+from hrcreplay.audit.departures import LimbDepartures, not_recorded
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.velocity_tube import NOISE_M
 from hrcreplay.limits import load_limits
@@ -25,7 +26,7 @@ def given(beyond: Floats, residual: Floats, seed: int = 1, height: Floats | None
     count = len(residual)
     height = np.zeros((2, 2, count)) if height is None else height
     return LimbDepartures(
-        random_states(HUMAN, count, seed), HORIZONS_S, height, lambda k, *_: np.asarray(beyond[k]), residual
+        random_states(HUMAN, count, seed), HORIZONS_S, height, lambda k, *_: np.asarray(beyond[k]), residual, False
     )
 
 
@@ -57,13 +58,13 @@ def plain_share(of: LimbDepartures, departure: Departure, k: int) -> float:
 
 def loss(offset: float, slope: float, far: Floats, residual: Floats) -> float:
     over = far - offset - slope * residual
-    return float(np.where(over > 0.0, departures._BELOW * over, (departures._BELOW - 1.0) * over).mean())
+    return float(np.where(over > 0.0, departure_fit._BELOW * over, (departure_fit._BELOW - 1.0) * over).mean())
 
 
 def test_a_line_has_the_least_loss_of_all_on_a_grid() -> None:
     one = log(400, seed=1)
     far, residual = one.beyond_m(0, 0.0, 0.0)[:, 0], one.residual_m[:, 0]
-    line = departures._line([(far[:, None], residual[:, None])])
+    line = departure_fit._line([(far[:, None], residual[:, None])])
     least = min(loss(a, b, far, residual) for a, b in product(np.arange(0.0, 0.1, 0.002), np.arange(0.0, 3.0, 0.02)))
     assert loss(float(line[0]), float(line[1]), far, residual) <= least + 1e-9
     assert line[0] == pytest.approx(0.02, abs=0.01)
@@ -77,7 +78,7 @@ def test_the_share_is_reached_by_whole_people_and_hardly_exceeded() -> None:
         for k in range(2):
             together = [plain_share(one, found, k) for one in logs]
             assert np.mean(together) >= share
-            assert min(together) >= 1.0 - 2.5 * (1.0 - share)
+            assert min(together) >= 1.0 - departure_fit._FITTED * (1.0 - share)
             smaller = replace(found, beyond_m=0.9 * found.beyond_m, residuals=0.9 * found.residuals)
             assert np.mean([plain_share(one, smaller, k) for one in logs]) < share
             for one in logs:
@@ -105,7 +106,7 @@ def test_departures_that_do_not_grow_with_the_residual_get_no_slope() -> None:
 def test_lines_that_hold_too_few_are_raised_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     logs = [log(400, seed) for seed in (2, 3, 4)]
     wanted = fit(logs, 0.9)
-    monkeypatch.setattr(departures, "_BELOW", 0.8)
+    monkeypatch.setattr(departure_fit, "_BELOW", 0.8)
     found = fit(logs, 0.9)
     for k in range(2):
         assert np.mean([plain_share(one, found, k) for one in logs]) >= 0.9
@@ -118,10 +119,10 @@ def test_a_person_who_departs_further_counts_as_much_as_the_others() -> None:
     wild = log(100, seed=5, scale=1.4)
     with_wild, without = fit([*logs, wild], 0.95), fit(logs, 0.95)
     assert plain_share(wild, without, 0) < 0.6
-    assert plain_share(wild, with_wild, 0) >= 1.0 - departures._FITTED * 0.05
+    assert plain_share(wild, with_wild, 0) >= 1.0 - departure_fit._FITTED * 0.05
 
 
-def test_a_log_may_miss_two_and_a_half_times_as_many_ticks_as_all() -> None:
+def test_a_log_may_miss_a_few_times_as_many_ticks_as_all() -> None:
     """Of 100 ticks six are further out than any line needs, too few among 1,300 for the line itself to mind."""
     logs = [log(300, seed) for seed in (2, 3, 4, 5)]
     rare = log(100, seed=6, scale=0.5)
@@ -130,7 +131,7 @@ def test_a_log_may_miss_two_and_a_half_times_as_many_ticks_as_all() -> None:
     rare = given(beyond, rare.residual_m)
     found = fit([*logs, rare], 0.99)
     for k in range(2):
-        assert plain_share(rare, found, k) >= 0.975
+        assert plain_share(rare, found, k) >= 1.0 - 0.01 * departure_fit._FITTED
 
 
 def test_a_camera_that_loses_the_legs_does_not_drive_the_others_up() -> None:
@@ -160,11 +161,12 @@ def test_a_limb_that_was_never_recorded_has_no_departure_and_is_named() -> None:
     assert fit(nobody, 0.95).beyond_m.max() == 0.0
 
 
-def test_a_line_is_never_steeper_than_the_residual() -> None:
+def test_no_line_is_steeper_than_the_steepest() -> None:
     """Beyond that it is the offset that grows, not what everybody pays by their cameras' noise."""
     residual = np.random.default_rng(3).uniform(0.01, 0.15, (400, len(BODY)))
     found = fit([given(np.stack([3.0 * residual] * 2), residual)], 0.99)
-    assert 1.0 <= found.residuals.min() <= found.residuals.max() < 1.05
+    assert found.residuals.min() >= departure_fit._STEEPEST
+    assert found.residuals.max() < departure_fit._STEEPEST + 0.05
     np.testing.assert_allclose(found.beyond_m + 0.15 * found.residuals, 0.45, atol=0.02)
 
 
@@ -180,9 +182,12 @@ def test_rise_and_sink_are_a_quantile_in_which_each_log_weighs_as_its_root() -> 
     for row, way in ((found.rise_m, 0), (found.sink_m, 1)):
         for k in range(2):
             known = [height[way, k][np.isfinite(height[way, k])] for height in heights]
+            if k == 0:  # before the last horizon at most who accelerates evenly until then, rounded up to 1 cm
+                assert row[0] == pytest.approx(np.ceil(100.0 * row[1] / 16.0 - 1.0) / 100.0, abs=0.0101)
+                continue
             above = sum(len(h) ** -0.5 * (h > row[k]).sum() for h in known) / sum(len(h) ** 0.5 for h in known)
             lower = sum(len(h) ** -0.5 * (h > row[k] - 0.01).sum() for h in known) / sum(len(h) ** 0.5 for h in known)
-            assert above <= 1.0 - departures._BELOW < lower
+            assert above <= 1.0 - departure_fit._BELOW < lower
             assert row[k] == pytest.approx(round(row[k], 2), abs=1e-12)
 
 
@@ -195,7 +200,24 @@ def test_departures_are_beside_the_rise_and_sink_that_are_fitted() -> None:
         asked.append((rise_m, sink_m))
         return np.full((200, len(BODY)), 0.3 - min(rise_m, sink_m))
 
-    found = fit([LimbDepartures(random_states(HUMAN, 200, 1), HORIZONS_S, height, beyond, residual)], 0.99)
-    assert set(asked) == {(0.2, 0.2)}
-    assert found.rise_m.tolist() == found.sink_m.tolist() == [0.2, 0.2]
-    np.testing.assert_allclose(found.beyond_m + 0.02 * found.residuals, 0.1, atol=2e-3)
+    found = fit([LimbDepartures(random_states(HUMAN, 200, 1), HORIZONS_S, height, beyond, residual, False)], 0.99)
+    assert set(asked) == {(0.02, 0.02), (0.2, 0.2)}
+    assert found.rise_m.tolist() == found.sink_m.tolist() == [0.02, 0.2]
+    reach = found.beyond_m + 0.02 * found.residuals
+    np.testing.assert_allclose(reach, np.tile([0.28, 0.1], (len(BODY), 1)), atol=2e-3)
+
+
+@pytest.mark.parametrize("true", [False, True])
+def test_what_is_raised_is_what_costs_the_least(true: bool) -> None:
+    """In four of 1,000 ticks a head, in four others a lower arm is 1.4 times as far out as ever else.
+
+    A log with the truth may miss but five: one line is enough for that, the head's, for arms are two.
+    """
+    residual = np.full((1000, len(BODY)), 0.02)
+    beyond = np.tile(np.random.default_rng(14).uniform(0.05, 0.1, (1000, len(BODY))), (2, 1, 1))
+    plain = fit([given(beyond, residual)], 0.99)
+    beyond[:, ::250, BODY.index("HD")] = beyond[:, 100::250, BODY.index("LLA")] = 0.14
+    found = fit([replace(given(beyond, residual), true=true)], 0.99)
+    before, after = (of.beyond_m + 0.02 * of.residuals for of in (plain, found))
+    np.testing.assert_allclose(after[0], [0.14] * 2 if true else before[0], atol=4e-3)
+    np.testing.assert_allclose(after[1:], before[1:], atol=2e-3)
