@@ -151,7 +151,8 @@ def tube(
         swept: (MOST_POINTS, 3) receives the points.
     """
     carries_s = _CARRIES_S if limb in (HEAD_LIMB, THORAX, LEGS) else _CARRIES_ARMS_S
-    n = _ends(limb, points, velocity, min(span_s, carries_s), hand_m, swept)
+    unmeasured_s = max(0.0, span_s - at.horizon_s[-1])  # of that nothing is known but the velocity
+    n = _ends(limb, points, velocity, min(span_s, carries_s + unmeasured_s), hand_m, swept)
     rising = 2 if limb == LEGS else n
     for i in range(rising):
         swept[n + i] = swept[i]

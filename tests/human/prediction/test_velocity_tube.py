@@ -64,7 +64,8 @@ def ends(states: HumanStates, tick: int, limb: str, departure: Departure, horizo
             now.append(wrist + HAND_M * along / np.linalg.norm(along))
             going.append(turning)
     carried = 0.15 if "A" in limb else 0.25
-    later = [p + v * min(horizon_s, carried) for p, v in zip(now, going, strict=True)]
+    carried = min(horizon_s, carried + max(0.0, horizon_s - 0.377))
+    later = [p + v * carried for p, v in zip(now, going, strict=True)]
     rising = [now[0], later[0]] if limb == "LEGS" else now + later
     rise, sink = (at_horizon(departure, row, horizon_s) for row in (departure.rise_m, departure.sink_m))
     high, low = ([p + np.array([0.0, 0.0, by]) for p in rising] for by in (rise, -sink))
