@@ -95,6 +95,17 @@ def test_where_the_residual_says_a_limb_may_be_it_is_inside() -> None:
         assert all((there.inside(nothing, k) == held).all() for k in range(2))
 
 
+def test_a_residual_that_is_another_place_counts_once() -> None:
+    """Beyond NOISE_M it is not noise that is multiplied, but a place that is added."""
+    residual = np.random.default_rng(15).uniform(0.0, 0.6, (300, len(BODY)))
+    beyond = np.random.default_rng(16).uniform(0.0, 0.7, (2, 300, len(BODY))) * (0.2 + residual)
+    of, some = given(beyond, residual), fit([log(400, seed=2)], 0.99)
+    some = replace(some, beyond_m=np.full_like(some.beyond_m, 0.05), residuals=np.full_like(some.residuals, 0.8))
+    for k in range(2):
+        assert 0.05 < plain_share(of, some, k) < 0.95
+        assert of.inside(some, k).mean() == pytest.approx(plain_share(of, some, k), abs=1e-12)
+
+
 def test_departures_that_do_not_grow_with_the_residual_get_no_slope() -> None:
     one = log(400, seed=6)
     beyond = np.random.default_rng(7).uniform(0.0, 0.3, (2, *one.residual_m.shape))

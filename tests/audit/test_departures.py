@@ -1,0 +1,82 @@
+"""Departures measured on a made-up recording whose person does what is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hrcreplay.audit.departures import LimbDepartures, departures
+from hrcreplay.audit.recording import CAMERAS, TRUTH, Recording
+from hrcreplay.human.model import Departure, skeleton
+from hrcreplay.records import BODY, DOF, LIMBS, Floats
+from hrcreplay.run import build, replay
+from hrcreplay.run.job import resolve
+from tests.human.people import states
+
+#: What people do upwards [m/s], how often it is recorded [s], and the residual that they are said to have [m].
+UP_M_PER_S, EVERY_S, RESIDUAL_M = 0.6, 0.02, 0.02
+
+
+def measured(up_m_per_s: float, seen_s: float = 0.0, source: str = TRUTH) -> LimbDepartures:
+    """Of somebody who stands still by the filter, last seen so long ago, and is recorded to go straight up."""
+    posture = np.zeros((1, DOF))
+    posture[0, [4, 6, 8, 10, 7, 11, 12]] = 0.3, 0.1, 0.3, 0.1, 1.8, 1.8, 0.9
+    people = states(posture, np.zeros((1, DOF)))
+    people = replace(
+        people,
+        residual_m=np.full((1, len(BODY)), RESIDUAL_M),
+        unseen_s=np.full((1, len(LIMBS)), seen_s),
+        points_m=skeleton(posture, people.lengths_m),
+    )
+    after_s = EVERY_S * np.arange(1, 25)
+    points = np.repeat(people.points_m, len(after_s), axis=0)
+    points[..., 2] += up_m_per_s * after_s[:, None]
+    t_ns = people.t_ns[0] + np.round(after_s * 1e9).astype(np.int64)
+    recording = Recording(people, t_ns, points, t_ns, np.repeat(posture, len(after_s), axis=0), source, {})
+    return departures(build.prediction_stage(resolve("audit", replay.demo_log())), recording, np.array([0]))
+
+
+def gone_m(of: LimbDepartures) -> Floats:
+    """(h,) how far until each horizon, by what was recorded until then."""
+    return np.asarray(UP_M_PER_S * EVERY_S * np.floor(of.horizon_s / EVERY_S + 1e-9))
+
+
+def lines(of: LimbDepartures, rise_m: Floats) -> Departure:
+    """Nothing but that rise."""
+    nothing = np.zeros((len(BODY), len(of.horizon_s)))
+    return Departure(of.horizon_s, nothing, nothing, rise_m, 0.0 * rise_m)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_body_that_rises_departs_by_what_the_rise_does_not_hold(sign: float) -> None:
+    of = measured(sign * UP_M_PER_S)
+    far = gone_m(of)
+    ways = np.stack([far, 0.0 * far][:: int(sign)])
+    np.testing.assert_allclose(of.height_m[..., 0], ways, atol=1e-9)
+    for k, moved in enumerate(far):
+        found = of.beyond_m(k, 0.0, 0.0)[0, : len(LIMBS)]
+        np.testing.assert_allclose(found[[0, 1, 2, 4]], moved, atol=1e-6)
+        assert (0.9 * moved <= found).all()  # a forearm leaves by its wrist, which the hand's tube holds a little
+        assert (found <= moved + 1e-6).all()
+        held = (moved, 0.0) if sign > 0.0 else (0.0, moved)
+        np.testing.assert_allclose(of.beyond_m(k, *held)[0, : len(LIMBS)], 0.0, atol=1e-6)
+        assert np.isnan(of.beyond_m(k, 0.0, 0.0)[0, BODY.index("LEGS")])  # no camera has shown them
+
+
+def test_who_rises_by_more_than_the_rise_and_the_residual_is_outside() -> None:
+    of = measured(UP_M_PER_S)
+    far = gone_m(of)
+    for more_m, inside in ((0.9 * RESIDUAL_M, 1.0), (1.1 * RESIDUAL_M, 0.0)):
+        for k in range(len(far)):
+            assert of.inside(lines(of, np.maximum(far - more_m, 0.0)), k).tolist() == [inside]
+
+
+def test_a_limb_seen_longer_ago_is_not_measured_and_the_truth_is_known_as_such() -> None:
+    of = measured(UP_M_PER_S, seen_s=0.3, source=CAMERAS)
+    assert np.isnan(of.height_m).all()
+    assert all(np.isnan(of.beyond_m(k, 0.0, 0.0)).all() for k in range(len(of.horizon_s)))
+    assert np.isnan(of.inside(lines(of, np.zeros(len(of.horizon_s))), 0)).all()
+    assert not of.true
+    assert measured(UP_M_PER_S).true
