@@ -69,9 +69,9 @@ def _times(departure: Departure, factor: Floats) -> Departure:
 
 
 def _rise(horizon_s: Floats, logs: Sequence[Floats]) -> Floats:
-    """(h,) what is above the wanted share of the departures of a pelvis's height, (h, n) a log [m].
+    """(h,) how far the pelvis rises, or sinks, at most in nearly all ticks; of each log (h, n) how far it did [m].
 
-    Before the last horizon no more than who accelerates evenly until then: the rest is noise, and the ball's.
+    Before the last horizon no more than who accelerates evenly until then: the rest is noise, which the ball holds.
     """
     last = _often([log[-1] for log in logs])
     evenly = last * (horizon_s / horizon_s[-1]) ** 2
@@ -79,7 +79,7 @@ def _rise(horizon_s: Floats, logs: Sequence[Floats]) -> Floats:
 
 
 def _often(logs: Sequence[Floats]) -> float:
-    """What the wanted share of a pair's departures is below; every log weighs as the root of its ticks [m]."""
+    """The height [m] that the share _BELOW of all ticks is not above; every log weighs as the root of its ticks."""
     known = [log[np.isfinite(log)] for log in logs]
     height = np.concatenate(known)
     if not len(height):

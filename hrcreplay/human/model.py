@@ -44,9 +44,9 @@ _DEGREE = np.pi / 180.0
 class Departure:
     """How far whole limbs get from where the fused velocity takes them, measured on recordings.
 
-    The body may rise by ``rise_m`` and sink by ``sink_m`` more than that. Until a horizon no point of a limb is further
-    from the hull of all these places than ``beyond_m`` and ``residuals`` times the limb's residual, as far as that is
-    noise; and at least the residual.
+    The body may be ``rise_m`` higher and ``sink_m`` lower than its velocity says. Until a horizon no point of a limb is
+    further from the hull of the limb at the tick and at all these places later (``human.prediction.velocity_tube``)
+    than ``beyond_m`` and ``residuals`` times the limb's residual, as far as that is noise; and at least the residual.
     """
 
     horizon_s: Floats  #: (h,) increasing [s]

@@ -93,6 +93,19 @@ def test_a_file_of_the_users_own(tmp_path: Path) -> None:
         ("human", "velocity = [-1.3, 2.5]", "velocity = [1.0, 2.5]", r"joints.x: found rates without 0"),
         ("human", "theta = { position = [-inf, inf]", "theta = { position = [-3, 3]", r"heading has no stop"),
         ("paper", "ar2   = { ", "ar2   = { position = [0, 1], ", r"joints.ar2: found a position; Eq. \(34\) gives it"),
+        (
+            "people",
+            "rise_m = [",
+            "rise_m = [0.1, ",
+            r"departure.rise_m: found \[0.1, .*; write 4 numbers, one for each",
+        ),
+        ("people", "sink_m = [", "sink_m = [-", r"departure.sink_m: found \[-0.01, .*; write 4 numbers, .* at least 0"),
+        (
+            "people",
+            "sink_m = [",
+            "sank_m = [",
+            r"departure: unknown key 'sank_m'; known here: horizon_s, rise_m, sink_m",
+        ),
         ("human", "[joints]", "[joints", r"not TOML"),
     ],
 )
