@@ -137,7 +137,7 @@ def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress
         LogError: No camera saw anybody.
     """
     counts: Counter[str] = Counter()
-    stretches = _fuse(log, ticks_ns, fusion_stage, counts, progress)
+    stretches = fused_stretches(log, ticks_ns, fusion_stage, counts, progress)
     truth = [part.rows((part.t_ns >= ticks_ns[0]) & (part.t_ns <= ticks_ns[-1])) for part in log.truth()]
     truth = [part for part in truth if len(part)]
     if truth:
@@ -156,13 +156,25 @@ def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress
     return Recording(states, t_ns, points, best.t_ns, best.p, source, _plain(log, counts))
 
 
+#: What was measured, what was fused from it, and how.
 Stretch = tuple[Measurements, HumanStates, fuse.Trace]
 
 
-def _fuse(
+def fused_stretches(
     log: Log, ticks_ns: Ints, fusion_stage: FusionStage, counts: Counter[str], progress: Callable[[int], None]
 ) -> Iterator[Stretch]:
-    """Stage 1 from the first stretch on in which a camera saw somebody."""
+    """Stage 1, traced, from the first stretch on in which a camera saw somebody.
+
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks, increasing [ns].
+        fusion_stage: Cameras and settings of stage 1.
+        counts: Receives the counts of events.
+        progress: Called with the number of ticks done since the last call.
+
+    Raises:
+        LogError: No camera saw anybody.
+    """
     state, memory = fuse.start(log.header.cameras), PersonMemory()
     measured: Measurements | None = None
     for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _STRETCH):
@@ -193,10 +205,7 @@ def _smoothed(stretches: Iterator[Stretch], fusion_stage: FusionStage) -> tuple[
         states, trace = held
         if after is not None:
             states = HumanStates.join([states, after[0].rows(slice(0, _LATER))])
-            trace = fuse.Trace(
-                cov=np.concatenate([trace.cov, after[1].cov[:_LATER]]),
-                damping=np.concatenate([trace.damping, after[1].damping[:_LATER]]),
-            )
+            trace = fuse.Trace.join([trace, after[1].rows(slice(0, _LATER))])
         best.append(fuse.smooth(states, trace, fusion_stage.filter).rows(slice(0, len(held[0]))))
 
     for measured, states, trace in stretches:

@@ -136,8 +136,8 @@ def fused(
 
 def smoothed(passed: list[tuple[HumanStates, fuse.Trace]], settings: Fusion) -> HumanStates:
     """Every tick given all measurements of the run, from the batches of a whole run in order."""
-    cov, damping = (np.concatenate([getattr(trace, name) for _, trace in passed]) for name in ("cov", "damping"))
-    return fuse.smooth(HumanStates.join([states for states, _ in passed]), fuse.Trace(cov, damping), settings)
+    states, traces = zip(*passed, strict=True)
+    return fuse.smooth(HumanStates.join(states), fuse.Trace.join(traces), settings)
 
 
 def _nobody(log: Log, found: Counter[str]) -> LogError:

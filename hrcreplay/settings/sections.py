@@ -116,10 +116,10 @@ class Fusion(Section):
     offset_memory_s: Positive = 0.5
     """Where shoulders, head and arms are beside the model is a mean in which a frame this old counts 1/e [s]."""
     spread_memory_s: Positive = 1.0
-    """The reported deviations follow the surprises of measurements; a surprise falls to 1/e in this time [s]."""
+    """The reported deviations follow the innovations; a large one falls to 1/e in this time [s]."""
     spread_least: Positive = 0.01
-    """Least factor on the variances that the surprises of measurements may lead to."""
-    spread_most: Positive = 4.0
+    """Least factor on the variances that the innovations may lead to."""
+    spread_most: Positive = 30.0
     """Largest such factor."""
     memory_s: Positive = 0.5
     """Without a valid row for longer than this the person counts as lost [s]."""

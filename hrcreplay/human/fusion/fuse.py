@@ -6,10 +6,12 @@ The smoother (Rauch, Tung, Striebel) also uses the measurements after a tick: a 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from hrcreplay.human.fusion.deviations import FIRST_SPREAD
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Frames, Rules, Track, process_variance
 from hrcreplay.human.fusion.kernel import run
@@ -34,10 +36,21 @@ FusionState = Filter
 
 @dataclass(frozen=True)
 class Trace:
-    """What a smoother needs beside the states: P of every tick, and how it was reached."""
+    """What a smoother needs beside the states: P of every tick, and how it was reached. No rows where not traced."""
 
-    cov: Floats  #: (n, 13, 4, 4) covariance of p, v, a, j; no rows where the ticks were not traced
+    cov: Floats  #: (n, 13, 4, 4) covariance of p, v, a, j
     damping: Floats  #: (n, 13) of the derivatives on the way to the tick; 1 unless the joint was unseen
+    spread: Floats  #: (n, 13) highest innovation squared over its variance lately
+    correlation: Floats  #: (n, 13) of neighbouring innovations lately
+
+    def rows(self, which: slice) -> Trace:
+        """The trace of some of the ticks."""
+        return Trace(self.cov[which], self.damping[which], self.spread[which], self.correlation[which])
+
+    @staticmethod
+    def join(parts: Sequence[Trace]) -> Trace:
+        """The traces of consecutive ticks as one."""
+        return Trace(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Trace)))
 
 
 def start(cameras: tuple[str, ...]) -> FusionState:
@@ -81,8 +94,10 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         offset_ns=np.full(len(POINTS), NEVER_NS),
         carried=np.full((len(POINTS), 3), np.nan),
         carried_ns=np.full(len(POINTS), NEVER_NS),
-        surprise=np.ones(DOF),
-        spread=np.ones(DOF),
+        innovation=np.zeros((c, DOF)),
+        squares=np.zeros(DOF),
+        products=np.zeros(DOF),
+        spread=np.full(DOF, FIRST_SPREAD),
     )
 
 
@@ -145,7 +160,7 @@ def fuse(
     for c, camera in enumerate(measurements.cameras):
         counts[f"outlier_points_{camera}"] = int(track.outliers[c])
         counts[f"superseded_frames_{camera}"] = int(track.superseded[c])
-    return after, states, counts, Trace(cov=track.cov, damping=track.damping)
+    return after, states, counts, Trace(track.cov, track.damping, track.spread, track.correlation)
 
 
 def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats:
@@ -224,6 +239,8 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         points=np.full((n, len(POINTS), 3), np.nan),
         cov=np.full((rows, DOF, 4, 4), np.nan),
         damping=np.ones((rows, DOF)),
+        spread=np.full((rows, DOF), np.nan),
+        correlation=np.full((rows, DOF), np.nan),
         outliers=np.zeros(cameras, dtype=np.int64),
         superseded=np.zeros(cameras, dtype=np.int64),
         reacquired=np.zeros(1, dtype=np.int64),

@@ -1,13 +1,6 @@
 """The Kalman filter of one joint with the states p, v, a, j, Eq. (42)-(57); corrections: docs/paper.md.
 
 The arrays that the kernels of the fusion share are defined here too.
-
-The variances that are handed on are those of the filter, scaled by the normalised innovations squared. P of Eq. (49)
-follows from the sigmas alone, which must do for the liveliest motion and the worst camera. To multiply R and G by one
-number leaves every gain, and so the estimate, as it is, and multiplies P: the variance of unit weight of the calculus
-of observations. Each joint has its own, from its innovations squared over their variance: the mean of the last few,
-held at its highest and forgotten slowly. At rest it is small; when a joint sets off, the first innovations raise it at
-once, and it outlasts the motion.
 """
 
 from __future__ import annotations
@@ -59,8 +52,10 @@ class Filter(NamedTuple):
     offset_ns: Ints  #: (20,) tick of the last
     carried: Floats  #: (20, 3) hands from the wrist, legs from below the pelvis, world [m]
     carried_ns: Ints  #: (20,) when a camera took that
-    surprise: Floats  #: (13,) running mean of each joint's innovations squared over their variance
-    spread: Floats  #: (13,) highest of it lately: the factor on the variances that are told
+    innovation: Floats  #: (c, 13) each joint's last innovation by a camera, over its standard deviation
+    squares: Floats  #: (13,) running sum of the squares of these
+    products: Floats  #: (13,) running sum of their products with the same camera's one before
+    spread: Floats  #: (13,) the highest square lately
 
 
 class Frames(NamedTuple):
@@ -110,7 +105,7 @@ class Rules(NamedTuple):
 class Track(NamedTuple):
     """What the ticks leave behind; rows before the start stay as they are."""
 
-    motion: Floats  #: (6, n, 13) p, v, a, j, and the deviations of p and v with the factor of ``spread``
+    motion: Floats  #: (6, n, 13) p, v, a, j, and the deviations of p and v that are told
     lengths: Floats  #: (2, n, 7) and their deviations
     valid: Bools  #: (n, c)
     residual: Floats  #: (n, 7)
@@ -118,6 +113,8 @@ class Track(NamedTuple):
     points: Floats  #: (n, 20, 3)
     cov: Floats  #: (n or 0, 13, 4, 4)
     damping: Floats  #: (n or 0, 13) of the derivatives, on the way to the tick
+    spread: Floats  #: (n or 0, 13) of the filter
+    correlation: Floats  #: (n or 0, 13) of neighbouring innovations
     outliers: Ints  #: (c,)
     superseded: Ints  #: (c,)
     reacquired: Ints  #: (1,)
@@ -180,7 +177,7 @@ def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> floa
 
 @njit(cache=True)
 def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
-    """Eq. (52)-(57) for one joint and one scalar row; returns the innovation squared over its variance.
+    """Eq. (52)-(57) for one joint and one scalar row; returns the innovation over its standard deviation.
 
     A row whose innovation has no variance, or none that a number can hold, tells nothing: it changes nothing.
 
@@ -202,7 +199,7 @@ def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
         mean[a] += Ph[a] / S * innovation  # Eq. (54), (56)
         for b in range(4):
             P[a, b] -= Ph[a] * Ph[b] / S  # Eq. (55), corrected: (I - K H) P; Eq. (57)
-    return innovation**2 / S
+    return innovation / np.sqrt(S)
 
 
 @njit(cache=True)
@@ -231,30 +228,3 @@ def ago(mean: Floats, d: float) -> Floats:
 def dot(a: Floats, b: Floats) -> float:
     """The scalar product of (4,) and (4,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-
-
-#: Weight of the newest innovation in the running mean.
-_NEWEST = 0.25
-
-
-@njit(cache=True)
-def enter(filter_: Filter, j: int, squared: float, now: int, rules: Rules) -> None:
-    """Takes an innovation of joint j in, squared over its variance; ``row_ns`` still tells of the one before.
-
-    Args:
-        filter_: ``surprise`` and ``spread`` of the joint are changed.
-        j: Index into JOINTS.
-        squared: The innovation squared over its variance.
-        now: The tick [ns].
-        rules: Memory of the factor [s].
-    """
-    filter_.surprise[j] += _NEWEST * (squared - filter_.surprise[j])
-    kept = np.exp(-(now - filter_.row_ns[j]) * 1e-9 / rules.spread_memory_s)
-    filter_.spread[j] = max(kept * filter_.spread[j], filter_.surprise[j])
-
-
-@njit(cache=True)
-def factor(filter_: Filter, j: int, rules: Rules) -> float:
-    """On the variances of joint j; at least 1 while it coasts, for nothing is known of a joint that is not seen."""
-    least = 1.0 if filter_.tick_ns[0] - filter_.row_ns[j] > rules.coast_ns else rules.spread_least
-    return max(least, min(filter_.spread[j], rules.spread_most))

@@ -1,15 +1,19 @@
-"""What the gates make of points that cameras go on showing elsewhere."""
+"""What the gates make of points that cameras show elsewhere, and of bones that are too long or too short."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from hrcreplay.human.fusion.fuse import fuse, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, Measurements
+from hrcreplay.records import LENGTHS, LIMBS, POINTS, Floats, HumanStates, Measurements
 from hrcreplay.settings.sections import Fusion
-from tests.human.filtered import fused, standing, ticks
+from tests.human.filtered import WIDE, fused, standing, ticks
+from tests.human.fusion import one_camera
 from tests.human.fusion.test_model_residual import POINTS_OF
 from tests.human.sightings import NEUTRAL, frames_of
 
@@ -105,3 +109,35 @@ def test_somebody_of_another_size_elsewhere_is_evidence_even_of_one_camera() -> 
     states = fused(again(m, points), t, Fusion())
     meanwhile = (t > 1_720_000_000) & (t < 2_000_000_000)
     assert (states.residual_m[meanwhile, LIMBS.index("THX")] > 0.75).all()
+
+
+def test_a_marker_that_jumps_off_the_bone_is_no_measurement() -> None:
+    frames = one_camera.frames_of(np.tile(one_camera.POSE, (400, 1)))
+    elbow, wrist = (frames.points_m[:, POINTS.index(f"{name}_l")] for name in ("elbow", "wrist"))
+    points = frames.points_m.copy()
+    points[100:300, POINTS.index("wrist_l")] = wrist[100:300] + 0.7 * (wrist - elbow)[100:300]  # within 0.2 m
+    t = one_camera.ticks(7.9)
+    _, states, counts, _ = fuse(
+        start(("one",)), t, one_camera.measured(replace(frames, points_m=points)), Fusion(), WIDE
+    )
+    assert counts["outlier_points_one"] == 200
+    forearm = LENGTHS.index("pi_forearm_l")
+    assert states.lengths_m[-1, forearm] == pytest.approx(0.26, abs=2e-3)
+    assert states.unseen_s[round(5.9 * one_camera.RATE_HZ), 5] > 3.8
+    assert states.unseen_s[-1, 5] < 0.03
+
+
+def test_a_length_that_was_learnt_wrong_is_learnt_anew() -> None:
+    short = one_camera.LENGTHS_M.copy()
+    short[LENGTHS.index("pi_forearm_l")] = 0.08
+    frames, wrong = (
+        one_camera.frames_of(np.tile(one_camera.POSE, (700, 1))),
+        one_camera.frames_of(np.tile(one_camera.POSE, (700, 1)), lengths_m=short),
+    )
+    points = np.concatenate([wrong.points_m[:100], frames.points_m[100:]])
+    _, states, _, _ = fuse(
+        start(("one",)), one_camera.ticks(13.9), one_camera.measured(replace(frames, points_m=points)), Fusion(), WIDE
+    )
+    forearm = states.lengths_m[:, LENGTHS.index("pi_forearm_l")]
+    assert forearm[round(6.5 * one_camera.RATE_HZ)] == pytest.approx(0.08, abs=0.02)
+    assert forearm[-1] == pytest.approx(0.26, abs=0.02)
