@@ -20,7 +20,7 @@ from numba import njit
 
 from hrcreplay.human.fusion.kalman import Filter, Rules
 
-#: Highest square before the first innovations: nothing is known yet, so the filter's own variances hold.
+#: Highest square before the first innovations: nothing is known yet, so the variances are about the filter's own.
 FIRST_SPREAD = 4.0
 #: An innovation this long ago counts 1/e in the correlation [s].
 _MEMORY_S = 2.0

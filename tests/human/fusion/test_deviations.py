@@ -9,6 +9,7 @@ import pytest
 
 from hrcreplay.human.fusion.deviations import FIRST_SPREAD, FITTED, KIND
 from hrcreplay.human.fusion.fuse import fuse, process_noise, start
+from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.limits import load_limits
 from hrcreplay.records import DOF, POINTS, Floats, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
@@ -67,6 +68,26 @@ def test_spread_and_correlation_are_those_of_the_innovations() -> None:
             plain, agreeing = FITTED[0, KIND[j]]
             told = np.clip(highest * np.exp(plain + agreeing * agree), 0.01, 30.0)
             assert states.p_std[used[n], j] ** 2 == pytest.approx(told * trace.cov[used[n], j, 0, 0], rel=1e-6)
+
+
+def test_cameras_that_stand_apart_have_innovations_that_agree_with_their_own() -> None:
+    """In turn two cameras show a person who stands still, the second one 4 cm further in x: each is off one way."""
+    frames = frames_of(np.tile(POSE, (200, 1)))
+    second = np.arange(200) % 2
+    points = frames.points_m + np.multiply.outer(0.04 * second, np.array([1.0, 0.0, 0.0]))[:, None]
+    both = replace(frames, points_m=points, camera=second, cameras=("one", "two"))
+    m = measure(both, np.tile(np.eye(4), (2, 1, 1)), Fusion())
+    _, states, _, trace = fuse(start(("one", "two")), ticks(3.9), m, Fusion(), HUMAN, traced=True)
+    assert trace.correlation[-1, 0] > 0.8
+    assert states.p_std[-200:, 0].min() > 0.01  # whichever camera is right
+
+
+def test_before_any_innovation_the_deviations_are_about_those_of_the_filter() -> None:
+    m = measured(frames_of(np.tile(POSE, (3, 1))))
+    _, states, _, trace = fuse(start(("one",)), ticks(0.02), m, Fusion(), HUMAN, traced=True)
+    first = np.flatnonzero(np.isfinite(states.p[:, 0]))[0]
+    factor = states.p_std[first] ** 2 / trace.cov[first, :, 0, 0]
+    assert ((factor > 0.5) & (factor < 1.5)).all()
 
 
 @pytest.mark.parametrize("lingers_s", [0.0, 0.05])
