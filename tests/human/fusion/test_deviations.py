@@ -65,9 +65,10 @@ def test_spread_and_correlation_are_those_of_the_innovations() -> None:
             kept = np.exp(-ago_s / 2.0)
             agree = (kept[1:] * nu[1 : n + 1] * nu[:n]).sum() / (kept * nu[: n + 1] ** 2).sum()
             assert trace.correlation[used[n], j] == pytest.approx(agree, rel=1e-6, abs=1e-9)
-            plain, agreeing = FITTED[0, KIND[j]]
-            told = np.clip(highest * np.exp(plain + agreeing * agree), 0.01, 30.0)
-            assert states.p_std[used[n], j] ** 2 == pytest.approx(told * trace.cov[used[n], j, 0, 0], rel=1e-6)
+            for a, std in enumerate((states.p_std, states.v_std)):
+                plain, agreeing = FITTED[a, KIND[j]]
+                told = np.clip(highest * np.exp(plain + agreeing * agree), 0.01, 30.0)
+                assert std[used[n], j] ** 2 == pytest.approx(told * trace.cov[used[n], j, a, a], rel=1e-6)
 
 
 def test_cameras_that_stand_apart_have_innovations_that_agree_with_their_own() -> None:
@@ -80,6 +81,24 @@ def test_cameras_that_stand_apart_have_innovations_that_agree_with_their_own() -
     _, states, _, trace = fuse(start(("one", "two")), ticks(3.9), m, Fusion(), HUMAN, traced=True)
     assert trace.correlation[-1, 0] > 0.8
     assert states.p_std[-200:, 0].min() > 0.01  # whichever camera is right
+
+
+def test_a_joint_that_was_lost_starts_anew() -> None:
+    frames = frames_of(swaying(200), 0.02)
+    points = frames.points_m.copy()
+    points[60:110, POINTS.index("wrist_r")] = np.nan  # for 1 s: lost after 0.5 s
+    t = ticks(3.9)
+    _, _, _, trace = fuse(start(("one",)), t, measured(replace(frames, points_m=points)), Fusion(), HUMAN, traced=True)
+    again = round(110 / FRAMES_HZ * RATE_HZ)
+    assert trace.correlation[again - 1, 7] != 0.0
+    assert trace.correlation[again, 7] == 0.0
+    assert trace.spread[again, 7] == FIRST_SPREAD
+    assert trace.correlation[again, 11] != 0.0
+
+
+def test_both_arms_are_told_alike() -> None:
+    np.testing.assert_array_equal(KIND[4:8], KIND[8:12])
+    assert len(set(KIND[:8])) == FITTED.shape[1] - 1
 
 
 def test_before_any_innovation_the_deviations_are_about_those_of_the_filter() -> None:
