@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.human.fusion.deviations import FIRST_SPREAD, FITTED, KIND
-from hrcreplay.human.fusion.fuse import fuse, process_noise, start
+from hrcreplay.human.fusion.fuse import Trace, fuse, process_noise, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.limits import load_limits
 from hrcreplay.records import DOF, POINTS, Floats, Ints, Measurements
@@ -94,6 +94,24 @@ def test_a_joint_that_was_lost_starts_anew() -> None:
     assert trace.correlation[again, 7] == 0.0
     assert trace.spread[again, 7] == FIRST_SPREAD
     assert trace.correlation[again, 11] != 0.0
+
+
+def test_no_factor_is_beyond_its_bounds() -> None:
+    m, t = measured(frames_of(swaying(150), 0.03)), ticks(2.9)
+    bounded = Fusion(spread_least=0.5, spread_most=0.8, coast_s=10.0)
+    _, states, _, trace = fuse(start(("one",)), t, m, bounded, HUMAN, traced=True)
+    known = np.isfinite(states.p[:, 0])
+    factor = (states.p_std**2 / trace.cov[:, :, 0, 0])[known]
+    assert factor.min() == pytest.approx(0.5)
+    assert factor.max() == pytest.approx(0.8)
+
+
+def test_a_trace_cut_and_joined_is_the_same() -> None:
+    m, t = measured(frames_of(swaying(50), 0.03)), ticks(0.9)
+    trace = fuse(start(("one",)), t, m, Fusion(), HUMAN, traced=True)[-1]
+    joined = Trace.join([trace.rows(slice(0, 70)), trace.rows(slice(70, None))])
+    for name in ("cov", "damping", "spread", "correlation"):
+        np.testing.assert_array_equal(getattr(joined, name), getattr(trace, name))
 
 
 def test_both_arms_are_told_alike() -> None:
