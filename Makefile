@@ -38,7 +38,7 @@ readme: $(VENV)/made
 people: $(VENV)/made
 	$(BIN)/python -m tests.people
 
-# Holds the deviations that state.parquet tells against the truth and against smoothed recordings (docs/deviations.md), and
+# Compares the deviations in state.parquet with errors against the truth and against smoothed recordings (docs/deviations.md), and
 # fits their constants anew; exit code 5 where these are not those in the code.
 deviations: $(VENV)/made
 	$(BIN)/python -m tests.deviations

@@ -1,6 +1,6 @@
 """Fits how far to believe the filter's deviations: ``python -m tests.deviations``, with recordings by others at hand.
 
-Writes docs/deviations.md, and says what ``human.fusion.deviations.FITTED`` would be right.
+Writes docs/deviations.md, and says what ``human.fusion.reported_deviations.FITTED`` would be right.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ import numpy as np
 from scipy.optimize import minimize
 
 from hrcreplay.audit.recording import TRUTH, errors_in_deviations, fused_stretches, read_recording
-from hrcreplay.human.fusion.deviations import FITTED, KIND
 from hrcreplay.human.fusion.fuse import Trace
+from hrcreplay.human.fusion.reported_deviations import FITTED, KIND
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, Floats
 from hrcreplay.run import build
 from hrcreplay.run.job import resolve
-from hrcreplay.run.stages import NS, tick_times
+from hrcreplay.run.replay import span_ticks
 from tests.people import fused
 
 OUT = Path(__file__).parents[1] / "docs/deviations.md"
 KINDS = ("x, y", "theta", "rho", "alpha_1", "alpha_2", "alpha_3", "alpha_4", "z")
-#: Every so many ticks; errors beyond so many deviations of the filter are no measure of an exponent.
+#: Ticks between two samples; larger errors, in deviations with a factor of the spread alone, are clipped.
 _EVERY, _MOST = 5, 20.0
 _SIGMAS = (1, 2, 3)
 
@@ -41,13 +41,13 @@ class Sample:
     error: Floats  #: (2, n, 13)
     std: Floats  #: (2, n, 13) of the filter alone
     spread: Floats  #: (n, 13)
-    correlation: Floats  #: (n, 13)
+    autocorrelation: Floats  #: (n, 13)
     bounds: tuple[float, float]  #: least and largest factor on the variance
 
     def in_deviations(self, fitted: Floats) -> Floats:
-        """(2, n, 13) errors over the deviations that these constants tell."""
-        constants = fitted[:, KIND]  # (2, 13, 2)
-        log = constants[:, None, :, 0] + constants[:, None, :, 1] * self.correlation
+        """(2, n, 13) errors over the deviations that these constants, as FITTED, report."""
+        offset, slope = (fitted[KIND, :, i].T[:, None] for i in range(2))  # (2, 1, 13)
+        log = offset + slope * self.autocorrelation
         return self.error / (self.std * np.sqrt(np.clip(self.spread * np.exp(log), *self.bounds)))
 
 
@@ -55,46 +55,44 @@ def sample(run: Path) -> Sample:
     """Reads the log of a run folder."""
     job = resolve("fit-limits", run)
     log, settings = open_log(job.log, job.settings.logs), job.settings.fusion
-    header, stage = log.header, build.fusion_stage(job, log)
-    end_ns = header.end_ns if job.end_s is None else min(header.end_ns, header.start_ns + round(job.end_s * NS))
-    ticks_ns = tick_times(header.start_ns + round((job.start_s or 0.0) * NS), end_ns, settings.rate_hz)
+    stage, ticks_ns = build.fusion_stage(job, log), span_ticks(job, log)
     recording = read_recording(log, ticks_ns, stage, lambda _: None)
     parts = fused_stretches(open_log(job.log, job.settings.logs), ticks_ns, stage, Counter(), lambda _: None)
     trace = Trace.join([part for *_, part in parts])
     ticks, states = np.arange(0, len(recording.states), _EVERY), recording.states
-    told = np.stack([states.p_std, states.v_std])[:, ticks]
+    reported = np.stack([states.p_std, states.v_std])[:, ticks]
     return Sample(
         job.log.name,
         recording.source == TRUTH,
-        errors_in_deviations(recording, ticks) * told,
+        errors_in_deviations(recording, ticks) * reported,
         np.sqrt(np.stack([trace.cov[ticks, :, a, a] for a in range(2)])),
         trace.spread[ticks],
-        trace.correlation[ticks],
+        trace.autocorrelation[ticks],
         (settings.spread_least, settings.spread_most),
     )
 
 
 def fit(samples: Sequence[Sample]) -> Floats:
-    """(2, kinds, 2) the most likely constants, errors normal; each log weighs as the root of its ticks."""
-    found = np.zeros((2, len(KINDS), 2))
+    """(kinds, 2, 2) the most likely constants, errors normal; each log weighs as the root of its ticks."""
+    found = np.zeros((len(KINDS), 2, 2))
     for a in range(2):
         for kind in range(len(KINDS)):
-            squares, agreeing, weight = [], [], []
+            squares, rho, weight = [], [], []
             for of in samples:
                 with np.errstate(invalid="ignore", divide="ignore"):
                     square = (of.error[a] / of.std[a])[:, kind == KIND] ** 2
                 known = np.isfinite(square) & (of.spread[:, kind == KIND] > 0.0)
                 square = np.minimum(square[known] / of.spread[:, kind == KIND][known], _MOST**2)
                 squares.append(square)
-                agreeing.append(of.correlation[:, kind == KIND][known])
+                rho.append(of.autocorrelation[:, kind == KIND][known])
                 weight.append(np.full(len(square), max(1, len(square)) ** -0.5))
-            found[a, kind] = _most_likely(*(np.concatenate(part) for part in (squares, agreeing, weight)))
+            found[kind, a] = _most_likely(*(np.concatenate(part) for part in (squares, rho, weight)))
     return found
 
 
-def _most_likely(square: Floats, agreeing: Floats, weight: Floats) -> Floats:
-    """(2,) of the logarithm of the variance: plain, and times the correlation."""
-    X, w = np.column_stack([np.ones(len(square)), agreeing]), weight / weight.sum()
+def _most_likely(square: Floats, rho: Floats, weight: Floats) -> Floats:
+    """(2,) offset and slope of the logarithm of the variance over the autocorrelation ``rho``."""
+    X, w = np.column_stack([np.ones(len(square)), rho]), weight / weight.sum()
 
     def loss(b: Floats) -> tuple[float, Floats]:
         log = X @ b
@@ -115,15 +113,17 @@ def lines(samples: Sequence[Sample]) -> list[str]:
     """The tables."""
     filter_alone = [of.error / of.std for of in samples]
     left_out = [of.in_deviations(fit([other for other in samples if other is not of])) for of in samples]
-    told = [of.in_deviations(FITTED) for of in samples]
+    reported = [of.in_deviations(FITTED) for of in samples]
     text = [
         "# How far to believe the deviations",
         "",
-        "`state.parquet` tells a standard deviation with each position and velocity. This page holds them against logs",
-        "whose truth is known (simulated), and against recordings smoothed with what came later. It is written by",
-        "`make deviations`, which also fits the constants of `hrcreplay/human/fusion/deviations.py`; *left out* are",
-        "constants fitted to the other logs. An error over its deviation has a root mean square (rms) of 1 where the",
-        "deviation is right, more where it is too small. Of normal errors 68, 95 and 99.7 % are within 1, 2 and 3.",
+        "`state.parquet` has a standard deviation for each position and velocity. This page compares them with the",
+        "errors, against the truth of simulated logs and against recordings smoothed with what came later. It is",
+        "written by `make deviations`, which also fits the constants of",
+        "`hrcreplay/human/fusion/reported_deviations.py`; *filter alone* is the covariance of the Kalman filter, *left",
+        "out* are constants fitted to the other logs, *reported* those in the code. An error over its deviation has a",
+        "root mean square (rms) of 1 where the deviation is right, more where it is too small. Of normal errors 68, 95",
+        "and 99.7 % are within 1, 2 and 3.",
         "Six of the simulated logs are of one kind, people who get up: to leave one of them out says little.",
         "",
     ]
@@ -133,9 +133,9 @@ def lines(samples: Sequence[Sample]) -> list[str]:
         text += [
             "| | position | | | | velocity | | | |",
             "|---|---|---|---|---|---|---|---|---|",
-            "| joint | filter alone | left out | as told | within 1, 2, 3 | alone | left out | as told | within |",
+            "| joint | filter alone | left out | reported | within 1, 2, 3 | alone | left out | reported | within |",
         ]
-        alone, left, now = (pooled([z[i] for i in which]) for z in (filter_alone, left_out, told))
+        alone, left, now = (pooled([z[i] for i in which]) for z in (filter_alone, left_out, reported))
         for j, joint in enumerate(JOINTS):
             cells = []
             for a in range(2):

@@ -116,9 +116,10 @@ class Fusion(Section):
     offset_memory_s: Positive = 0.5
     """Where shoulders, head and arms are beside the model is a mean in which a frame this old counts 1/e [s]."""
     spread_memory_s: Positive = 1.0
-    """The reported deviations follow the innovations; a large one falls to 1/e in this time [s]."""
+    """The reported variances are scaled by the highest normalised innovation squared; it decays to 1/e in this time
+    [s]."""
     spread_least: Positive = 0.01
-    """Least factor on the variances that the innovations may lead to."""
+    """Least factor by which the reported variances are scaled."""
     spread_most: Positive = 30.0
     """Largest such factor."""
     memory_s: Positive = 0.5

@@ -11,11 +11,11 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from hrcreplay.human.fusion.deviations import FIRST_SPREAD
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Frames, Rules, Track, process_variance
 from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
+from hrcreplay.human.fusion.reported_deviations import FIRST_SPREAD
 from hrcreplay.human.model import LimitSet, nearest
 from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
@@ -40,12 +40,12 @@ class Trace:
 
     cov: Floats  #: (n, 13, 4, 4) covariance of p, v, a, j
     damping: Floats  #: (n, 13) of the derivatives on the way to the tick; 1 unless the joint was unseen
-    spread: Floats  #: (n, 13) highest innovation squared over its variance lately
-    correlation: Floats  #: (n, 13) of neighbouring innovations lately
+    spread: Floats  #: (n, 13) highest normalised innovation squared, decaying
+    autocorrelation: Floats  #: (n, 13) of the innovations, at lag 1
 
     def rows(self, which: slice) -> Trace:
         """The trace of some of the ticks."""
-        return Trace(self.cov[which], self.damping[which], self.spread[which], self.correlation[which])
+        return Trace(*(getattr(self, f.name)[which] for f in fields(Trace)))
 
     @staticmethod
     def join(parts: Sequence[Trace]) -> Trace:
@@ -160,7 +160,7 @@ def fuse(
     for c, camera in enumerate(measurements.cameras):
         counts[f"outlier_points_{camera}"] = int(track.outliers[c])
         counts[f"superseded_frames_{camera}"] = int(track.superseded[c])
-    return after, states, counts, Trace(track.cov, track.damping, track.spread, track.correlation)
+    return after, states, counts, Trace(track.cov, track.damping, track.spread, track.autocorrelation)
 
 
 def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats:
@@ -240,7 +240,7 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         cov=np.full((rows, DOF, 4, 4), np.nan),
         damping=np.ones((rows, DOF)),
         spread=np.full((rows, DOF), np.nan),
-        correlation=np.full((rows, DOF), np.nan),
+        autocorrelation=np.full((rows, DOF), np.nan),
         outliers=np.zeros(cameras, dtype=np.int64),
         superseded=np.zeros(cameras, dtype=np.int64),
         reacquired=np.zeros(1, dtype=np.int64),

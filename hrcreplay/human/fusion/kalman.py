@@ -52,10 +52,10 @@ class Filter(NamedTuple):
     offset_ns: Ints  #: (20,) tick of the last
     carried: Floats  #: (20, 3) hands from the wrist, legs from below the pelvis, world [m]
     carried_ns: Ints  #: (20,) when a camera took that
-    innovation: Floats  #: (c, 13) each joint's last innovation by a camera, over its standard deviation
+    innovation: Floats  #: (c, 13) each joint's last normalised innovation by a camera
     squares: Floats  #: (13,) running sum of the squares of these
     products: Floats  #: (13,) running sum of their products with the same camera's one before
-    spread: Floats  #: (13,) the highest square lately
+    spread: Floats  #: (13,) the highest square, decaying
 
 
 class Frames(NamedTuple):
@@ -105,7 +105,7 @@ class Rules(NamedTuple):
 class Track(NamedTuple):
     """What the ticks leave behind; rows before the start stay as they are."""
 
-    motion: Floats  #: (6, n, 13) p, v, a, j, and the deviations of p and v that are told
+    motion: Floats  #: (6, n, 13) p, v, a, j, and the reported deviations of p and v
     lengths: Floats  #: (2, n, 7) and their deviations
     valid: Bools  #: (n, c)
     residual: Floats  #: (n, 7)
@@ -114,7 +114,7 @@ class Track(NamedTuple):
     cov: Floats  #: (n or 0, 13, 4, 4)
     damping: Floats  #: (n or 0, 13) of the derivatives, on the way to the tick
     spread: Floats  #: (n or 0, 13) of the filter
-    correlation: Floats  #: (n or 0, 13) of neighbouring innovations
+    autocorrelation: Floats  #: (n or 0, 13) of the innovations
     outliers: Ints  #: (c,)
     superseded: Ints  #: (c,)
     reacquired: Ints  #: (1,)
@@ -177,7 +177,7 @@ def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> floa
 
 @njit(cache=True)
 def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
-    """Eq. (52)-(57) for one joint and one scalar row; returns the innovation over its standard deviation.
+    """Eq. (52)-(57) for one joint and one scalar row; returns the normalised innovation, over its standard deviation.
 
     A row whose innovation has no variance, or none that a number can hold, tells nothing: it changes nothing.
 

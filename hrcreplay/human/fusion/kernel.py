@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hrcreplay.human.fusion.deviations import correlation, enter, factor, forget
 from hrcreplay.human.fusion.gating import judge
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, correct, delay, dot, predict
 from hrcreplay.human.fusion.model_residual import observe, place, told, unseen
+from hrcreplay.human.fusion.reported_deviations import add_innovation, autocorrelation, reset, variance_factor
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row, nearest_arm, wrap
 from hrcreplay.records import DOF, Floats, Ints
 
@@ -123,7 +123,7 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
             track.reacquired[0] += filter_.row_ns[row] >= 0  # the first time is no loss
         else:
             innovation = correct(filter_.mean[row], filter_.cov[row], h, z[row], R)
-            enter(filter_, c, row, innovation, now, rules)
+            add_innovation(filter_, c, row, innovation, now, rules)
         if filter_.uses[c] == 1:
             filter_.row_ns[row] = now
     return True
@@ -161,7 +161,7 @@ def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> N
     """A joint seen for the first time, or for the first time after it was lost: nothing old is carried over."""
     filter_.mean[j] = 0.0
     filter_.mean[j, 0] = z
-    forget(filter_, j)
+    reset(filter_, j)
     filter_.cov[j] = 0.0
     filter_.cov[j, 0, 0] = R
     for k in range(3):
@@ -184,7 +184,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
         for a in range(4):
             track.motion[a, k, j] = filter_.mean[j, a]
         for a in range(2):
-            track.motion[4 + a, k, j] = np.sqrt(factor(filter_, j, a, rules) * filter_.cov[j, a, a])
+            track.motion[4 + a, k, j] = np.sqrt(variance_factor(filter_, j, a, rules) * filter_.cov[j, a, a])
     track.lengths[0, k] = filter_.lengths
     track.lengths[1, k] = np.sqrt(filter_.lengths_var)
     told(filter_, filter_.tick_ns[0], rules, track.residual[k])
@@ -195,7 +195,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
         track.damping[k] = damping
         track.spread[k] = filter_.spread
         for j in range(DOF):
-            track.correlation[k, j] = correlation(filter_, j)
+            track.autocorrelation[k, j] = autocorrelation(filter_, j)
 
 
 @njit(cache=True)

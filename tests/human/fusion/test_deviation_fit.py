@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.fusion.deviations import FITTED, KIND
+from hrcreplay.human.fusion.reported_deviations import FITTED, KIND
 from hrcreplay.records import DOF, Floats
 from tests.deviations import Sample, fit, pooled
 
@@ -14,8 +14,8 @@ def drawn(seed: int, constants: Floats, n: int = 3000) -> Sample:
     random = np.random.default_rng(seed)
     std, spread = random.uniform(0.01, 0.1, (2, n, DOF)), random.uniform(0.1, 5.0, (n, DOF))
     correlation = random.uniform(-0.5, 1.0, (n, DOF))
-    of = constants[:, KIND]
-    variance = std**2 * spread * np.exp(of[:, None, :, 0] + of[:, None, :, 1] * correlation)
+    offset, slope = (constants[KIND, :, i].T[:, None] for i in range(2))  # (2, 1, 13), of p and of v
+    variance = std**2 * spread * np.exp(offset + slope * correlation)
     error = random.normal(0.0, 1.0, std.shape) * np.sqrt(variance)
     error[random.uniform(size=error.shape) < 0.2] = np.nan
     return Sample(f"{seed}", True, error, std, spread, correlation, (1e-9, 1e9))

@@ -1,4 +1,4 @@
-"""The standard deviations that are told."""
+"""The reported standard deviations."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hrcreplay.human.fusion.deviations import FIRST_SPREAD, FITTED, KIND
 from hrcreplay.human.fusion.fuse import Trace, fuse, process_noise, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
+from hrcreplay.human.fusion.reported_deviations import FIRST_SPREAD, FITTED, KIND
 from hrcreplay.limits import load_limits
 from hrcreplay.records import DOF, POINTS, Floats, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
@@ -27,7 +27,7 @@ def swaying(frames: int) -> Floats:
 
 
 def factors(m: Measurements, t: Ints, settings: Fusion | None = None) -> Floats:
-    """(n, 13) what the variances of v that are told are, over those of P."""
+    """(n, 13) the reported variances of v over those of P."""
     _, states, _, trace = fuse(start(("one",)), t, m, settings or Fusion(), HUMAN, traced=True)
     return np.asarray(states.v_std**2 / trace.cov[:, :, 1, 1])
 
@@ -35,10 +35,10 @@ def factors(m: Measurements, t: Ints, settings: Fusion | None = None) -> Floats:
 def test_the_estimate_is_the_same_whatever_is_told_of_it() -> None:
     sway = POSE + 0.3 * np.sin(np.arange(150) / 8.0)[:, None] * (np.arange(DOF) >= 4)
     m = measured(frames_of(sway, 0.01))
-    told, plain = (fuse(start(("one",)), ticks(2.9), m, s, HUMAN)[1] for s in (Fusion(), FREE))
+    scaled, plain = (fuse(start(("one",)), ticks(2.9), m, s, HUMAN)[1] for s in (Fusion(), FREE))
     for name in ("p", "v", "a", "j", "lengths_m", "residual_m"):
-        np.testing.assert_array_equal(getattr(told, name), getattr(plain, name))
-    assert np.nanmax(np.abs(told.v_std / plain.v_std - 1.0)) > 0.3
+        np.testing.assert_array_equal(getattr(scaled, name), getattr(plain, name))
+    assert np.nanmax(np.abs(scaled.v_std / plain.v_std - 1.0)) > 0.3
 
 
 def test_spread_and_correlation_are_those_of_the_innovations() -> None:
@@ -64,11 +64,11 @@ def test_spread_and_correlation_are_those_of_the_innovations() -> None:
             assert trace.spread[used[n], j] == pytest.approx(highest, rel=1e-9)
             kept = np.exp(-ago_s / 2.0)
             agree = (kept[1:] * nu[1 : n + 1] * nu[:n]).sum() / (kept * nu[: n + 1] ** 2).sum()
-            assert trace.correlation[used[n], j] == pytest.approx(agree, rel=1e-6, abs=1e-9)
+            assert trace.autocorrelation[used[n], j] == pytest.approx(agree, rel=1e-6, abs=1e-9)
             for a, std in enumerate((states.p_std, states.v_std)):
-                plain, agreeing = FITTED[a, KIND[j]]
-                told = np.clip(highest * np.exp(plain + agreeing * agree), 0.01, 30.0)
-                assert std[used[n], j] ** 2 == pytest.approx(told * trace.cov[used[n], j, a, a], rel=1e-6)
+                offset, slope = FITTED[KIND[j], a]
+                scale = np.clip(highest * np.exp(offset + slope * agree), 0.01, 30.0)
+                assert std[used[n], j] ** 2 == pytest.approx(scale * trace.cov[used[n], j, a, a], rel=1e-6)
 
 
 def test_cameras_that_stand_apart_have_innovations_that_agree_with_their_own() -> None:
@@ -79,7 +79,7 @@ def test_cameras_that_stand_apart_have_innovations_that_agree_with_their_own() -
     both = replace(frames, points_m=points, camera=second, cameras=("one", "two"))
     m = measure(both, np.tile(np.eye(4), (2, 1, 1)), Fusion())
     _, states, _, trace = fuse(start(("one", "two")), ticks(3.9), m, Fusion(), HUMAN, traced=True)
-    assert trace.correlation[-1, 0] > 0.8
+    assert trace.autocorrelation[-1, 0] > 0.8
     assert states.p_std[-200:, 0].min() > 0.01  # whichever camera is right
 
 
@@ -90,10 +90,10 @@ def test_a_joint_that_was_lost_starts_anew() -> None:
     t = ticks(3.9)
     _, _, _, trace = fuse(start(("one",)), t, measured(replace(frames, points_m=points)), Fusion(), HUMAN, traced=True)
     again = round(110 / FRAMES_HZ * RATE_HZ)
-    assert trace.correlation[again - 1, 7] != 0.0
-    assert trace.correlation[again, 7] == 0.0
+    assert trace.autocorrelation[again - 1, 7] != 0.0
+    assert trace.autocorrelation[again, 7] == 0.0
     assert trace.spread[again, 7] == FIRST_SPREAD
-    assert trace.correlation[again, 11] != 0.0
+    assert trace.autocorrelation[again, 11] != 0.0
 
 
 def test_no_factor_is_beyond_its_bounds() -> None:
@@ -110,13 +110,13 @@ def test_a_trace_cut_and_joined_is_the_same() -> None:
     m, t = measured(frames_of(swaying(50), 0.03)), ticks(0.9)
     trace = fuse(start(("one",)), t, m, Fusion(), HUMAN, traced=True)[-1]
     joined = Trace.join([trace.rows(slice(0, 70)), trace.rows(slice(70, None))])
-    for name in ("cov", "damping", "spread", "correlation"):
+    for name in ("cov", "damping", "spread", "autocorrelation"):
         np.testing.assert_array_equal(getattr(joined, name), getattr(trace, name))
 
 
 def test_both_arms_are_told_alike() -> None:
     np.testing.assert_array_equal(KIND[4:8], KIND[8:12])
-    assert len(set(KIND[:8])) == FITTED.shape[1] - 1
+    assert len(set(KIND[:8])) == len(FITTED) - 1
 
 
 def test_before_any_innovation_the_deviations_are_about_those_of_the_filter() -> None:

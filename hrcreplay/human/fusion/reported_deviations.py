@@ -1,0 +1,93 @@
+"""Scales the reported variances by the filter's normalised innovations and their autocorrelation.
+
+P of Eq. (49) follows from the sigmas alone, which must do for the liveliest motion and the worst camera. To multiply R
+and G by one number leaves every gain, and so the estimate, as it is, and multiplies P: the variance of unit weight of
+the calculus of observations. Each joint has its own: the highest normalised innovation squared (innovation squared over
+its variance), which decays exponentially. At rest it is small; when a joint sets off, the first innovation raises it at
+once, and it outlasts the motion.
+
+The innovations of a filter whose model is right are white (Mehra, IEEE Trans. Automatic Control 15(2), 1970). Where the
+filter lags, a camera is calibrated wrongly or its noise is coloured, successive innovations by the same camera are
+correlated, and the estimate is further off than their size tells: white noise is averaged out, coloured noise is not.
+So the variances also grow exponentially with the autocorrelation at lag 1. By how much is fitted on recordings
+(docs/deviations.md).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.human.fusion.kalman import Filter, Rules
+
+#: Highest square before the first innovation: the reported variances are then about the filter's own.
+FIRST_SPREAD = 4.0
+#: An innovation this long ago counts 1/e in the autocorrelation [s].
+_MEMORY_S = 2.0
+#: Of JOINTS, the row of FITTED: both arms share theirs.
+KIND = np.array([0, 0, 1, 2, 3, 4, 5, 6, 3, 4, 5, 6, 7])
+#: For the variances of p and of v: logarithm of the factor without autocorrelation, and its slope over the
+#: autocorrelation. Fitted by ``python -m tests.deviations``.
+FITTED = np.array(
+    [
+        [[-1.65, 2.03], [-1.64, 2.67]],  # x, y
+        [[-1.90, 2.19], [-2.51, 3.36]],  # theta
+        [[-1.61, 1.06], [-1.56, 1.94]],  # rho
+        [[-1.69, 2.36], [-2.30, 3.40]],  # alpha_1
+        [[-1.56, 2.17], [-2.01, 3.41]],  # alpha_2
+        [[-1.53, 2.53], [-2.06, 3.10]],  # alpha_3
+        [[-1.70, 2.18], [-1.90, 2.75]],  # alpha_4
+        [[-1.15, 0.80], [-1.22, 1.56]],  # z
+    ]
+)
+
+
+@njit(cache=True)
+def reset(filter_: Filter, j: int) -> None:
+    """Joint j has been acquired: no innovation yet."""
+    filter_.innovation[:, j], filter_.squares[j], filter_.products[j] = 0.0, 0.0, 0.0
+    filter_.spread[j] = FIRST_SPREAD
+
+
+@njit(cache=True)
+def add_innovation(filter_: Filter, c: int, j: int, innovation: float, now: int, rules: Rules) -> None:
+    """Adds a normalised innovation of joint j; ``row_ns`` is still the tick of the one before.
+
+    Args:
+        filter_: Sums, last innovation and spread of the joint are changed.
+        c: Index of the camera.
+        j: Index into JOINTS.
+        innovation: Over its standard deviation.
+        now: The tick [ns].
+        rules: Memory of the spread [s].
+    """
+    age_s = (now - filter_.row_ns[j]) * 1e-9
+    kept = np.exp(-age_s / _MEMORY_S)
+    filter_.squares[j] = kept * filter_.squares[j] + innovation**2
+    filter_.products[j] = kept * filter_.products[j] + innovation * filter_.innovation[c, j]
+    filter_.innovation[c, j] = innovation
+    filter_.spread[j] = max(np.exp(-age_s / rules.spread_memory_s) * filter_.spread[j], innovation**2)
+
+
+@njit(cache=True)
+def autocorrelation(filter_: Filter, j: int) -> float:
+    """Of successive innovations of joint j by the same camera, at lag 1, in [-1, 1]; 0 before there are any."""
+    if not 0.0 < filter_.squares[j] < np.inf:
+        return 0.0
+    return float(max(-1.0, min(filter_.products[j] / filter_.squares[j], 1.0)))
+
+
+@njit(cache=True)
+def variance_factor(filter_: Filter, j: int, a: int, rules: Rules) -> float:
+    """By which the variance of a joint is scaled; at least 1 while it coasts, for then no innovation tells of it.
+
+    Args:
+        filter_: After the tick.
+        j: Index into JOINTS.
+        a: 0 for the variance of p, 1 for that of v.
+        rules: Bounds on the factor.
+    """
+    least = 1.0 if filter_.tick_ns[0] - filter_.row_ns[j] > rules.coast_ns else rules.spread_least
+    offset, slope = FITTED[KIND[j], a]
+    scale = filter_.spread[j] * np.exp(offset + slope * autocorrelation(filter_, j))
+    return float(max(least, min(scale, rules.spread_most)))
