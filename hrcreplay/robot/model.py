@@ -244,11 +244,7 @@ def from_urdf(
     _place_base(model, robot.base, pin.SE3(T_world_base))
     offset = pin.SE3(np.eye(3), np.array([0.0, 0.0, tool_m])) * pin.SE3(np.eye(4) if T_tool_tcp is None else T_tool_tcp)
     tcp = _add_frame(model, robot.tcp, offset, "robot.tcp_frame")
-    points = [
-        _add_frame(model, s.body, _shift(end), f"robot.links: {s.name}")
-        for s in segments
-        for end in (s.start_m, s.end_m)
-    ]
+    points = _add_ends(model, segments)
     return RobotModel(
         name=robot.name,
         joint_names=robot.joints,
@@ -267,6 +263,15 @@ def from_urdf(
         axis_reach_m=_axis_reach_m(model, points),
         _kinematics=_Kinematics(model, points, tcp),
     )
+
+
+def _add_ends(model: Any, segments: Sequence[Segment]) -> list[int]:
+    """Frames at both ends of each segment, in their order."""
+    return [
+        _add_frame(model, s.body, _shift(end), f"robot.links: {s.name}")
+        for s in segments
+        for end in (s.start_m, s.end_m)
+    ]
 
 
 def _accelerations(robot: Description, given: Sequence[float], stop_s: float) -> Floats:

@@ -91,13 +91,18 @@ def run(
             "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
         }
         if command == "report":
-            with sink.watch.stage("contact", len(ticks_ns)):
-                write_contact(job, log, writer, build.robot_base(job, log))
-            with sink.watch.stage("report", len(ticks_ns)):
-                write_report(job, writer, meta, log)
+            _report(job, log, sink, meta, len(ticks_ns))
         writer.timing.update(sink.watch.summary(1.0 / job.settings.fusion.rate_hz))
         writer.finish(meta)
         return writer.folder
+
+
+def _report(job: Job, log: Log, sink: Sink, meta: dict[str, Any], ticks: int) -> None:
+    """The contact table and the report of a run whose other tables are written."""
+    with sink.watch.stage("contact", ticks):
+        write_contact(job, log, sink.run, build.robot_base(job, log))
+    with sink.watch.stage("report", ticks):
+        write_report(job, sink.run, meta, log)
 
 
 def run_stages(
