@@ -22,16 +22,19 @@ PEOPLE = Path(__file__).parents[1] / "hrcreplay/limits/people.toml"
 #: Who gets up, sits down and squats is rare in the recordings: simulated, in so many seconds, with noise of a seed.
 RISES_S, KINDS, SEED = (0.6, 1.0, 2.0), ("squat", "chair"), 11
 _CAMERA_HZ, _LATE_NS = 30.0, 20_000_000
+#: How often each does it in a log.
+_TIMES = 3
 
 
 def rise(path: Path, duration_s: float, kind: str) -> Path:
-    """A log of somebody who gets up and goes down again, before two cameras, with the true points."""
-    end_s = 3.0 * rising.STILL_S + 2.0 * duration_s
-    instants = np.arange(0.0, end_s, 1.0 / _CAMERA_HZ)
+    """A log of somebody who gets up and goes down again, _TIMES, before two cameras, with the true points."""
+    once_s = 3.0 * rising.STILL_S + 2.0 * duration_s
+    instants = np.arange(0.0, _TIMES * once_s, 1.0 / _CAMERA_HZ)
     capture: Ints = np.concatenate([np.round((instants + 0.013 * c) * 1e9).astype(np.int64) for c in range(2)])
     order = np.argsort(capture, kind="stable")
     capture, camera = capture[order] + 1_000_000_000, np.repeat(np.arange(2), len(instants))[order]
-    true = rising.body(np.asarray((capture - 1_000_000_000) * 1e-9, dtype=np.float64), duration_s, kind)
+    at_s = np.asarray((capture - 1_000_000_000) * 1e-9, dtype=np.float64)
+    true = rising.body(at_s % once_s, duration_s, kind)
     points = true + np.random.default_rng(SEED).normal(0.0, 0.005, true.shape)
     with LogWriter(path) as writer:
         for name in ("left", "right"):

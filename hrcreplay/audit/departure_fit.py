@@ -4,13 +4,15 @@ First rise and sink are fitted: a quantile, for the whole body moves with the pe
 horizon gets a line over the limb's residual, by quantile regression: of all lines above the wanted share of the
 departures, the one that is least above them. The lines are then raised by one factor a horizon, until whole people are
 inside, not limbs one by one, in the wanted share of the ticks of every log. Last, people whose truth is known are all
-but wholly taken in, by raising what costs the least volume: of them no miss is a camera's.
+but wholly taken in, by raising what costs the least volume: of them no miss is a camera's. Simulated people, of whom
+there are as many ticks as one likes, do not count where ticks of all logs are counted together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 from scipy.optimize import linprog
@@ -54,13 +56,20 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
             logs = zip(beyond, samples, strict=True)
             lines[list(pair), k] = _line([(b[:, pair], np.minimum(s.residual_m[:, pair], NOISE_M)) for b, s in logs])
     plain = Departure(horizon_s, _up(lines[..., 0], _MM), _up(lines[..., 1], _HUNDREDTH), rise_m, sink_m)
-    common = np.array([_factor(samples, plain, k, share) for k in range(len(horizon_s))])
+    recorded = list(compress(samples, counted(samples)))
+    common = np.array([_factor(recorded, plain, k, share) for k in range(len(horizon_s))])
     raised = _times(plain, common)
     true = [s for s in samples if s.true]
     if true:
         raised = _times(raised, np.column_stack([_raise(true, raised, k, share) for k in range(len(horizon_s))]))
     beyond_m, residuals = _up(raised.beyond_m, _MM), _up(raised.residuals, _HUNDREDTH)
     return replace(raised, beyond_m=beyond_m, residuals=residuals)
+
+
+def counted(samples: Sequence[LimbDepartures]) -> list[bool]:
+    """Which logs count where ticks of all are counted together: those without the truth; without any such log, all."""
+    all_true = all(sample.true for sample in samples)
+    return [all_true or not sample.true for sample in samples]
 
 
 def _times(departure: Departure, factor: Floats) -> Departure:

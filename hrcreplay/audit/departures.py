@@ -23,6 +23,8 @@ from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, tube
 from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.run.build import PredictionStage
 
+#: Robots beside people stop within some 10 ms to 100 ms; nothing is known before the first horizon that is measured [s].
+_FIRST_S = 0.02
 #: Smaller than any number that counts.
 EXACT = 1e-12
 
@@ -79,7 +81,7 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
         recording: The log.
         ticks: (n,) rows of ``recording.states``, of a person whom the filter has found.
     """
-    horizon_s = np.array([*(h for h in SHORTER_S if h < stage.horizon_s), stage.horizon_s])
+    horizon_s = np.array([*(h for h in (_FIRST_S, *SHORTER_S) if h < stage.horizon_s), stage.horizon_s])
     states, nothing = recording.states.rows(ticks), np.zeros(len(ticks), dtype=bool)
     futures = [recorded_future(recording, ticks, h) for h in horizon_s.tolist()]
     bare = tube_stage(stage, _bare(horizon_s, 0.0, 0.0), residual=False)

@@ -156,6 +156,16 @@ def test_a_camera_that_loses_the_legs_does_not_drive_the_others_up() -> None:
     np.testing.assert_allclose(found.residuals[:6], plain.residuals[:6], rtol=0.2)
 
 
+def test_ticks_of_simulated_people_are_not_counted_with_those_of_recorded_ones() -> None:
+    """Of these the simulated are twice as many and hardly depart, and yet the recorded ones are inside."""
+    recorded, simulated = log(400, seed=2), replace(log(800, seed=3, scale=0.2), true=True)
+    assert departure_fit.counted([recorded, simulated]) == [True, False]
+    assert departure_fit.counted([simulated, simulated]) == [True, True]
+    found = fit([recorded, simulated], 0.95)
+    for k in range(2):
+        assert plain_share(recorded, found, k) >= 0.95
+
+
 def test_a_limb_that_was_never_recorded_has_no_departure_and_is_named() -> None:
     logs = [log(200, seed) for seed in (2, 3)]
     blind = []

@@ -16,7 +16,7 @@ from hrcreplay.run.job import resolve
 from tests.human.people import states
 
 #: What people do upwards [m/s], how often it is recorded [s], and the residual that they are said to have [m].
-UP_M_PER_S, EVERY_S, RESIDUAL_M = 0.6, 0.02, 0.02
+UP_M_PER_S, EVERY_S, RESIDUAL_M = 1.6, 0.02, 0.02
 
 
 def measured(up_m_per_s: float, seen_s: float = 0.0, source: str = TRUTH) -> LimbDepartures:

@@ -131,7 +131,8 @@ def people(facts: Facts) -> str:
         cells = [f"{_share(part['share'])}, {_m3(size)}" for part, size in shares]
         rows.append([log["name"].rsplit(".", 1)[0], *cells, _m3(log["capsules_m3"][-1])])
     pooled = [f"{_share(one['share'])} ({_share(one['low'])} to {_share(one['high'])})" for one in found["unknown"]]
-    return _table(head, [*rows, ["all together (95 % interval)", *pooled, ""]])
+    together = "recordings together, demo and simulated people not (95 % interval)"
+    return _table(head, [*rows, [together, *pooled, ""]])
 
 
 def margins(facts: Facts) -> str:
