@@ -31,9 +31,9 @@ _BELOW = 0.995
 _STEEPEST = 1.25
 #: The largest factor of all lines, how often its interval is halved, and the largest of one line after that.
 _MOST, _HALVINGS, _MOST_AGAIN = 1.5, 12, 1.5
-#: How many times as many ticks of one log may miss as of all: where it was left out, where it is fitted to, and where
-#: that log holds the truth.
-EACH, _FITTED, _TRUE = 3.0, 2.25, 0.5
+#: How many times as many ticks may miss as are asked for: of one log that was left out; and where it is fitted to, of
+#: one log, of one that holds the truth, and of all logs together, for people who are not known miss more.
+EACH, _FITTED, _TRUE, _TOGETHER = 3.0, 2.25, 0.3, 0.6
 #: Departures, their growth, and rise and sink are rounded up to these [m], [1], [m]: with steps that coarse most folds
 #: have the same rise and sink, beside which departures need to be measured once.
 _MM, _HUNDREDTH, _CM = 1e-3, 1e-2, 1e-2
@@ -44,8 +44,8 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
 
     Args:
         samples: One a log, with the same horizons.
-        share: Of all ticks at each horizon, in (0, 1). Of one log's ticks 2.25 times as many may miss, of one with
-            the truth half as many.
+        share: Of the ticks of other logs at each horizon, in (0, 1). Of all ticks fitted to, 0.6 times as many may
+            miss, of one log's 2.25 times as many, of those of one with the truth 0.3 times as many.
     """
     horizon_s = samples[0].horizon_s
     rise_m, sink_m = (_rise(horizon_s, [s.height_m[way] for s in samples]) for way in range(2))
@@ -141,7 +141,7 @@ def _factor(samples: Sequence[LimbDepartures], plain: Departure, k: int, share: 
         return np.array([hit.mean() if len(hit) else 1.0 for hit in hits]), float(np.concatenate(hits).mean())
 
     each, together = shares(_MOST)
-    asks, wanted = each >= least, min(share, together)
+    asks, wanted = each >= least, min(1.0 - _TOGETHER * (1.0 - share), together)
 
     def enough(factor: float) -> bool:
         each, together = shares(factor)

@@ -23,7 +23,7 @@ from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, tube
 from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.run.build import PredictionStage
 
-#: Robots beside people stop within some 10 ms to 100 ms; nothing is known before the first horizon that is measured [s].
+#: Robots beside people stop within some 10 to 100 ms; nothing is known before the first horizon that is measured [s].
 _FIRST_S = 0.02
 #: Smaller than any number that counts.
 EXACT = 1e-12
