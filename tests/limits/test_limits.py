@@ -97,9 +97,9 @@ def test_a_file_of_the_users_own(tmp_path: Path) -> None:
             "people",
             "rise_m = [",
             "rise_m = [0.1, ",
-            r"departure.rise_m: found \[0.1, .*; write 4 numbers, one for each",
+            r"departure.rise_m: found \[0.1, .*; write 5 numbers, one for each",
         ),
-        ("people", "sink_m = [", "sink_m = [-", r"departure.sink_m: found \[-0.01, .*; write 4 numbers, .* at least 0"),
+        ("people", "sink_m = [", "sink_m = [-", r"departure.sink_m: found \[-0.01, .*; write 5 numbers, .* at least 0"),
         (
             "people",
             "sink_m = [",

@@ -332,7 +332,7 @@ def test_another_base_takes_over_the_person_and_comes_out_like_a_fresh_run(
     reported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cell = tmp_path / "cell.toml"
-    cell.write_text("T_world_base = { position_m = [0.2, 0.1, 0.65], yaw_deg = 10 }\n")
+    cell.write_text("T_world_base = { position_m = [0.3, 0.1, 0.65], yaw_deg = 10 }\n")
     moved = replay.run("report", reported, out=tmp_path / "moved", cell_file=cell)
     said = capsys.readouterr().err.splitlines()
     assert said[:3] == [
