@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from hrcreplay.human.fusion.body_points import FOOT_M
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Frames, Rules, Track, process_variance
 from hrcreplay.human.fusion.kernel import run
@@ -94,6 +95,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         offset_ns=np.full(len(POINTS), NEVER_NS),
         carried=np.full((len(POINTS), 3), np.nan),
         carried_ns=np.full(len(POINTS), NEVER_NS),
+        foot=np.tile(FOOT_M, (2, 1)),
         innovation=np.zeros((c, DOF)),
         squares=np.zeros(DOF),
         products=np.zeros(DOF),

@@ -52,6 +52,7 @@ class Filter(NamedTuple):
     offset_ns: Ints  #: (20,) tick of the last
     carried: Floats  #: (20, 3) hands from the wrist, legs from below the pelvis, world [m]
     carried_ns: Ints  #: (20,) when a camera took that
+    foot: Floats  #: (2, 3) right and left foot from its ankle, as last shown, in the body's heading [m]
     innovation: Floats  #: (c, 13) each joint's last normalised innovation by a camera
     squares: Floats  #: (13,) running sum of the squares of these
     products: Floats  #: (13,) running sum of their products with the same camera's one before

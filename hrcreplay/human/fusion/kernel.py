@@ -8,10 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from hrcreplay.human.fusion.body_points import place
 from hrcreplay.human.fusion.gating import judge
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, correct, delay, dot, predict
-from hrcreplay.human.fusion.model_residual import observe, place, told, unseen
+from hrcreplay.human.fusion.model_residual import observe, told, unseen
 from hrcreplay.human.fusion.reported_deviations import add_innovation, autocorrelation, reset, variance_factor
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row, nearest_arm, wrap
 from hrcreplay.records import DOF, Floats, Ints

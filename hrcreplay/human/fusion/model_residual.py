@@ -1,8 +1,4 @@
-"""Where the body's points are beside the model, how far they are from there, and for how long no camera saw them.
-
-People bend sideways, twist and lift their shoulders; thirteen joints do not (docs/paper.md). Where shoulders, head,
-elbows and wrists are beside the model is a running mean in the torso's frame. Hands and legs have no joints: they are
-where a camera last showed them, carried along with the wrist, and with the pelvis over the floor.
+"""How far the body's points are from where the model and ``body_points`` have them, and how long no camera saw them.
 
 A sample of a limb's residual is the largest distance of its measured points from those, of the predicted model at the
 frame's capture time, where the delay is compensated. It is taken before the frame is used, so it also holds how far the
@@ -22,29 +18,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from hrcreplay.human.fusion.body_points import REACH_M, learn, shift
 from hrcreplay.human.fusion.gating import distance
 from hrcreplay.human.fusion.kalman import Filter, Rules, ago, delay
-from hrcreplay.human.model import (
-    ARM_POINTS,
-    HANDS,
-    HEAD,
-    HEIGHT,
-    LEFT_ARM,
-    LEG_POINTS,
-    NECK,
-    PELVIS,
-    RIGHT_ARM,
-    skeleton_row,
-    torso_rotation,
-)
-from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, Ints
+from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
+from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
 
-#: No point of a leg is further from the pelvis: toes of a tall man's straight leg. What is further is no leg [m].
-REACH_M = 1.2
-#: Nor is a hand further from its wrist [m].
-_HAND_M = 0.3
-#: A hand or a leg that a camera showed longer ago is anywhere by now: some frames of any camera [ns].
-_SHOWN_NS = 200_000_000
 _BIN_M = 0.001
 #: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person's arm.
 BINS = round(REACH_M / _BIN_M)
@@ -69,13 +48,6 @@ _FIRST = np.array([RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2])
 _LEGS = BODY.index("LEGS")
 _HIPS = np.array([POINTS.index(f"hip_{side}") for side in "rl"])
 _BELOW = np.array([POINTS.index(f"{part}_{side}") for part in ("knee", "ankle", "foot") for side in "rl"])
-_SHOULDERS = np.array([_SHOULDER_R, _SHOULDER_L])
-#: Points that are measured beside the model, and the limb of LIMBS that must be shown for each.
-_BESIDE = np.array([HEAD, _SHOULDER_R, _SHOULDER_L, _ELBOW_R, _WRIST_R, _ELBOW_L, _WRIST_L])
-_OF_LIMB = np.array([LIMBS.index(limb) for limb in ("HD", "THX", "THX", "URA", "LRA", "ULA", "LLA")])
-#: Wrists of HANDS, and the limbs that show them.
-_WRISTS = np.array([_WRIST_R, _WRIST_L])
-_LOWER_ARMS = np.array([LIMBS.index("LRA"), LIMBS.index("LLA")])
 
 
 @njit(cache=True)
@@ -230,87 +202,3 @@ def _exceeded_by(weights: Floats, larger: float) -> float:
         bin_ -= 1
         above += weights[bin_]
     return bin_ * _BIN_M
-
-
-@njit(cache=True)
-def shift(filter_: Filter, p: Floats, points: Floats) -> None:
-    """Moves the model's points (20, 3) of a posture p (13,) to where they lately were beside it [m]."""
-    R = torso_rotation(p[2], p[3])
-    for k in _BESIDE:
-        for i in range(3):
-            for j in range(3):
-                points[k, i] += R[i, j] * filter_.offset[k, j]
-    for i in range(3):
-        points[NECK, i] = 0.5 * (points[_SHOULDERS[0], i] + points[_SHOULDERS[1], i])
-
-
-@njit(cache=True)
-def learn(
-    filter_: Filter, c: int, now: int, shown: Bools, p: Floats, model: Floats, shifted: Floats, rules: Rules
-) -> None:
-    """Takes in where a camera's frame shows the points.
-
-    Args:
-        filter_: Holds the frame; its offsets and what it carries are changed.
-        c: Index of the camera.
-        now: The tick [ns].
-        shown: (7,) the limbs of BODY that the frame shows, of a person whom the filter has found.
-        p: (13,) the posture at the capture time.
-        model: (20, 3) the model's points there [m].
-        shifted: (20, 3) the same where they lately were beside it [m].
-        rules: Settings of the filter.
-    """
-    R = torso_rotation(p[2], p[3])
-    for n, k in enumerate(_BESIDE):
-        if not shown[_OF_LIMB[n]]:
-            continue
-        age = min(now - filter_.offset_ns[k], rules.memory_ns) * 1e-9  # what is out of sight longer is lost anyway
-        weight = np.exp(-age / rules.offset_memory_s) * filter_.offset_weight[k] + 1.0
-        for j in range(3):
-            beside = 0.0
-            for i in range(3):
-                beside += R[i, j] * (filter_.points[c, k, i] - model[k, i])
-            filter_.offset[k, j] += (beside - filter_.offset[k, j]) / weight
-        filter_.offset_weight[k], filter_.offset_ns[k] = weight, now
-    for n, k in enumerate(HANDS):
-        if shown[_LOWER_ARMS[n]] and _near(filter_, c, k, filter_.points[c, _WRISTS[n]], _HAND_M, rules):
-            _carry(filter_, c, k, filter_.points[c, k] - shifted[_WRISTS[n]])
-    for k in LEG_POINTS:
-        if shown[_LEGS] and _near(filter_, c, k, model[PELVIS], REACH_M, rules):
-            from_below = filter_.points[c, k].copy()
-            from_below[:2] -= model[PELVIS, :2]
-            _carry(filter_, c, k, from_below)
-
-
-@njit(cache=True)
-def _near(filter_: Filter, c: int, k: int, place: Floats, most: float, rules: Rules) -> bool:
-    """Whether a camera shows a point with enough confidence within ``most`` [m] of a place."""
-    shown = filter_.confidence[c, k] >= rules.confidence_min
-    return bool(shown and distance(filter_.points[c, k], place) <= most)
-
-
-@njit(cache=True)
-def _carry(filter_: Filter, c: int, k: int, relative: Floats) -> None:
-    if filter_.capture_ns[c] >= filter_.carried_ns[k]:
-        filter_.carried[k], filter_.carried_ns[k] = relative, filter_.capture_ns[c]
-
-
-@njit(cache=True)
-def place(filter_: Filter, p: Floats, points: Floats) -> None:
-    """Writes where the points are at the tick; NaN for hands and legs that no camera has shown lately.
-
-    Args:
-        filter_: After the tick.
-        p: (13,) the posture [m, m, rad..., m].
-        points: (20, 3) receives the points, world [m].
-    """
-    skeleton_row(p, filter_.lengths, points)
-    shift(filter_, p, points)
-    now = filter_.tick_ns[0]
-    for n, k in enumerate(HANDS):
-        if now - filter_.carried_ns[k] <= _SHOWN_NS:
-            points[k] = points[_WRISTS[n]] + filter_.carried[k]
-    for k in LEG_POINTS:
-        if now - filter_.carried_ns[k] <= _SHOWN_NS:
-            points[k] = filter_.carried[k]
-            points[k, :2] += points[PELVIS, :2]

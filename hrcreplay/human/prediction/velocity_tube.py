@@ -34,6 +34,8 @@ _CARRIED_BY = ((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))
 #: Most points of a tube.
 MOST_POINTS = 2 * (len(LEG_POINTS) + 2)
 _ARMS = np.array(ARM_POINTS)
+#: Knees and ankles: without one of them nobody knows where a leg is.
+_BENDS = LEG_POINTS[2:6]
 
 
 class Tubes(NamedTuple):
@@ -42,7 +44,7 @@ class Tubes(NamedTuple):
     points: Floats  #: (n, 20, 3) of ``HumanStates.points_m``
     residual: Floats  #: (n, 7) what is added for each limb of BODY times ``residuals`` [m]
     usable: Bools  #: (n, 7) whether the limb has a tube
-    legs_shown: Bools  #: (n,) whether a camera has shown any point of the legs lately
+    legs_shown: Bools  #: (n,) whether it is known where both knees and ankles are
     legs_m: Floats  #: (n,) how far from the line below the pelvis they were [m]; NaN: not known, or does not count
     reach_s: Floats  #: (n, 7) until when it may depart [s]
     horizon_s: Floats  #: (h,) of ``Departure``
@@ -74,7 +76,7 @@ def tubes(
         points=np.ascontiguousarray(states.points_m),
         residual=np.where(np.isnan(of), unknown_m, of) if residual else np.zeros_like(of),
         usable=np.ascontiguousarray(usable if known is not None else np.zeros_like(usable)),
-        legs_shown=np.any(np.isfinite(states.points_m[:, LEG_POINTS].sum(axis=2)), axis=1),
+        legs_shown=np.isfinite(states.points_m[:, _BENDS].sum(axis=(1, 2))),
         legs_m=np.where(residual, states.residual_m[:, LEGS], np.nan),
         reach_s=span_s + np.clip(unseen - _FRESH_S, 0.0, memory_s),
         horizon_s=np.ones(1) if known is None else np.ascontiguousarray(known.horizon_s),
@@ -179,7 +181,7 @@ def _ends(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: fl
         for k in LEG_POINTS:
             if np.isfinite(points[k].sum()):
                 n = _add(points[k], along, span_s, swept, n)
-        if n == 2:  # nobody has shown them lately: the line from the floor to the pelvis
+        if not np.isfinite(points[_BENDS].sum()):  # somewhere about the line from the floor to the pelvis
             below = points[PELVIS].copy()
             below[2] = 0.0
             n = _add(below, along, span_s, swept, n)

@@ -73,16 +73,54 @@ def test_hands_go_along_with_the_wrist_and_are_forgotten() -> None:
 
 
 def test_what_is_too_far_to_be_a_leg_or_a_hand_is_none() -> None:
-    """A foot at the origin of the world, and a hand half a metre from its wrist."""
+    """A knee at the origin of the world, and a hand half a metre from its wrist."""
     frames = walking(4.0)
     points = frames.points_m.copy()
-    foot, hand = POINTS.index("foot_l"), POINTS.index("hand_l")
-    points[frames.capture_ns > 2e9, foot] = 0.0
+    knee, hand = POINTS.index("knee_l"), POINTS.index("hand_l")
+    points[frames.capture_ns > 2e9, knee] = 0.0
     points[frames.capture_ns > 2e9, hand] += 0.5
     states = fused(measured(replace(frames, points_m=points)), ticks(4.0))
-    assert np.isnan(states.points_m[at(states, 2.3) :, [foot, hand]]).all()
-    others = [k for k in (*LEGS, *HANDS) if k not in (foot, hand)]
+    assert np.isnan(states.points_m[at(states, 2.3) :, [knee, hand]]).all()
+    others = [k for k in (*LEGS, *HANDS) if k not in (knee, hand)]
     assert np.isfinite(states.points_m[at(states, 2.3) :, others]).all()
+
+
+def turning(frames: CameraFrames, rate_rad_per_s: float) -> CameraFrames:
+    """The same who turns on the spot, about the origin."""
+    angle = rate_rad_per_s * frames.capture_ns * 1e-9
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    points = frames.points_m.copy()
+    x, y = frames.points_m[..., 0], frames.points_m[..., 1]
+    points[..., 0], points[..., 1] = c * x - s * y, s * x + c * y
+    return replace(frames, points_m=points)
+
+
+def test_a_hidden_foot_is_before_its_ankle_and_turns_with_the_body() -> None:
+    """Seen for two seconds, then not for two, in which the body turns by 70 degrees."""
+    feet, ankles = ([POINTS.index(f"{part}_{side}") for side in "lr"] for part in ("foot", "ankle"))
+    frames = walking(4.0)
+    frames = turning(replace(frames, points_m=frames.points_m - frames.points_m[:, :1] * [1.0, 1.0, 0.0]), 0.6)
+    states = fused(measured(hidden(frames, feet, 2.0)), ticks(4.0))
+    off = states.points_m[:, feet] - states.points_m[:, ankles]
+    angle = 0.6 * states.t_ns[at(states, 2.3) :] * 1e-9
+    expected = np.stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), np.full(len(angle), -0.06)], axis=1)
+    for foot in range(2):
+        np.testing.assert_allclose(off[at(states, 2.3) :, foot], expected, atol=0.02)
+
+
+def test_without_its_ankle_a_hidden_foot_is_nowhere() -> None:
+    feet, ankles = ([POINTS.index(f"{part}_{side}") for side in "lr"] for part in ("foot", "ankle"))
+    gone = fused(measured(hidden(walking(4.0), [*feet, *ankles], 2.0)), ticks(4.0))
+    assert np.isnan(gone.points_m[at(gone, 2.3) :, [*feet, *ankles]]).all()
+
+
+def test_a_foot_that_was_never_shown_is_ahead_of_its_ankle() -> None:
+    feet, ankles = ([POINTS.index(f"{part}_{side}") for side in "lr"] for part in ("foot", "ankle"))
+    states = fused(measured(hidden(walking(3.0), feet, -1.0)), ticks(3.0))
+    off = states.points_m[at(states, 1.0) :, feet] - states.points_m[at(states, 1.0) :, ankles]
+    np.testing.assert_allclose(np.hypot(off[..., 0], off[..., 1]), 0.2, atol=1e-9)
+    heading = np.repeat(states.p[at(states, 1.0) :, 2:3], 2, axis=1)
+    np.testing.assert_allclose(np.arctan2(off[..., 1], off[..., 0]), heading, atol=1e-9)
 
 
 def test_what_no_camera_trusts_is_not_shown() -> None:

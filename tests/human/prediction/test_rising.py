@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from itertools import product
 
@@ -12,7 +13,7 @@ from scipy.spatial import ConvexHull
 from hrcreplay.human.model import HEIGHT, skeleton
 from hrcreplay.human.prediction.swept_volumes import predict
 from hrcreplay.limits import load_limits
-from hrcreplay.records import BODY, POINTS, Floats, HumanStates
+from hrcreplay.records import BODY, POINTS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Fusion, Occupancy
 from tests.human import rising
 from tests.human.filtered import fused, ticks
@@ -59,13 +60,47 @@ def coverage(duration_s: float, kind: str, seed: int, horizon_s: float) -> Float
     )
     inside = np.zeros((len(some), len(BODY)))
     for i, tick in enumerate(some):
-        at_s = float(t_ns[tick]) * 1e-9 + np.linspace(0.0, horizon_s, INSTANTS)
-        points = rising.body(at_s, duration_s, kind)
-        for k, limb in enumerate(BODY):
-            axes, flesh_m = AXES[limb]
-            ends = np.concatenate([points[:, [POINTS.index(a), POINTS.index(b)]] for a, b in axes]).reshape(-1, 3)
-            inside[i, k] = outside_m(ends, volumes.vertices(i, k)) <= volumes.radius_m[i, k] - flesh_m
+        for k in range(len(BODY)):
+            inside[i, k] = limb_inside(volumes, i, k, float(t_ns[tick]) * 1e-9, duration_s, kind, horizon_s)
     return inside
+
+
+def limb_inside(
+    volumes: SweptVolumes, i: int, k: int, from_s: float, duration_s: float, kind: str, horizon_s: float
+) -> bool:
+    """Whether a limb of BODY stays in its volume at a tick, flesh and all."""
+    points = rising.body(from_s + np.linspace(0.0, horizon_s, INSTANTS), duration_s, kind)
+    axes, flesh_m = AXES[BODY[k]]
+    ends = np.concatenate([points[:, [POINTS.index(a), POINTS.index(b)]] for a, b in axes]).reshape(-1, 3)
+    return bool(outside_m(ends, volumes.vertices(i, k)) <= volumes.radius_m[i, k] - flesh_m)
+
+
+@pytest.mark.parametrize("kind", ["squat", "chair"])
+@pytest.mark.parametrize("parts", [("knee", "ankle", "foot"), ("ankle", "foot"), ("knee",), ("foot",)])
+def test_legs_that_a_table_hides_stay_in_their_volume(parts: tuple[str, ...], kind: str) -> None:
+    """From the start, and from the first rise on: hips alone do not tell where knees and ankles are."""
+    measurements, end_s = rising.seen(0.6, kind, SEEDS[0])
+    for from_s in (0.0, 2.3):
+        points = measurements.points_m.copy()
+        late = np.flatnonzero(measurements.capture_ns > from_s * 1e9)
+        points[late[:, None], [POINTS.index(f"{part}_{side}") for part in parts for side in "lr"]] = np.nan
+        states = fused(replace(measurements, points_m=points), ticks(end_s), Fusion())
+        for horizon_s in (0.02, 0.1, 0.377):
+            inside = legs_inside(states, 0.6, kind, horizon_s)
+            assert inside.mean() >= LEAST_SHARE, (from_s, horizon_s)
+
+
+def legs_inside(states: HumanStates, duration_s: float, kind: str, horizon_s: float) -> Floats:
+    """(n,) whether the legs stay in their volume, flesh and all, at every eighth tick."""
+    some = np.arange(500, len(states) - round(250 * horizon_s) - 1, 8)
+    limits, k = load_limits("people"), BODY.index("LEGS")
+    volumes = predict(states.rows(some), limits, Occupancy(), horizon_s=horizon_s, memory_s=Fusion().memory_s)
+    return np.array(
+        [
+            limb_inside(volumes, i, k, float(states.t_ns[tick]) * 1e-9, duration_s, kind, horizon_s)
+            for i, tick in enumerate(some)
+        ]
+    )
 
 
 @pytest.mark.parametrize("kind", ["squat", "chair"])

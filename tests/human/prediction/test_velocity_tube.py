@@ -182,10 +182,12 @@ def test_a_limb_seen_a_while_ago_may_have_departed_for_longer() -> None:
     assert (late.radius_m[:, k] > early.radius_m[:, k]).all()
 
 
-def test_hidden_legs_are_the_line_below_the_pelvis_as_thick_as_they_were() -> None:
+@pytest.mark.parametrize("gone", [LEGS, LEGS[2:], ("knee_l",), ("ankle_r", "foot_r")])
+def test_hidden_legs_are_the_line_below_the_pelvis_as_thick_as_they_were(gone: tuple[str, ...]) -> None:
+    """Of one leg, or of both below the hips or the knees: it says nothing of where the rest of them is."""
     states = people(3, seed=8)
     points = states.points_m.copy()
-    points[:, [POINTS.index(name) for name in LEGS]] = np.nan
+    points[:, [POINTS.index(name) for name in gone]] = np.nan
     hidden = replace(states, points_m=points)
     k = BODY.index("LEGS")
     volumes = predict(hidden, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
@@ -193,11 +195,23 @@ def test_hidden_legs_are_the_line_below_the_pelvis_as_thick_as_they_were() -> No
     for tick in range(3):
         pelvis = points[tick, 0]
         line = np.linspace([pelvis[0], pelvis[1], 0.0], pelvis, 5)
-        assert max(distance_m(point, volumes.vertices(tick, k)) for point in line) < 1e-5
+        shown = [points[tick, POINTS.index(name)] for name in LEGS if name not in gone]
+        assert max(distance_m(point, volumes.vertices(tick, k)) for point in [*line, *shown]) < 1e-5
         reach = allowed_m(PEOPLE.departure, "LEGS", 0.1, states.residual_m[tick, BODY.index("THX")])
         bent = np.sqrt(max(0.0, 0.47**2 - (0.5 * states.p[tick, 12]) ** 2))
         thick = max(0.20, bent + 0.08, states.residual_m[tick, k] + 0.08)
         assert volumes.radius_m[tick, k] == pytest.approx(thick + reach, abs=2e-9)
+
+
+def test_a_hidden_foot_or_hip_makes_legs_no_thicker() -> None:
+    states = people(3, seed=8)
+    points = states.points_m.copy()
+    points[:, [POINTS.index(name) for name in ("hip_l", "foot_l", "foot_r")]] = np.nan
+    shown, fewer = (
+        predict(of, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+        for of in (states, replace(states, points_m=points))
+    )
+    np.testing.assert_array_equal(fewer.radius_m, shown.radius_m)
 
 
 def test_nobody_known_has_no_tube() -> None:
