@@ -129,9 +129,11 @@ def _heights(volumes: SweptVolumes, future: RecordedFuture) -> Floats:
     return found
 
 
-def tube_stage(stage: PredictionStage, departure: Departure, *, residual: bool = True) -> PredictionStage:
-    """The stage by ``sound`` with the lower body and these departures, from the tick on."""
-    changed = {"method": "sound", "legs": True, "latency_s": 0.0, "residual": residual}
+def tube_stage(
+    stage: PredictionStage, departure: Departure, *, residual: bool = True, legs: bool = True
+) -> PredictionStage:
+    """The stage by ``sound`` with these departures, from the tick on."""
+    changed = {"method": "sound", "legs": legs, "latency_s": 0.0, "residual": residual}
     limits = replace(stage.limits, departure=departure)
     return replace(stage, limits=limits, occupancy=stage.occupancy.model_copy(update=changed))
 
@@ -150,9 +152,9 @@ def _recorded(sample: LimbDepartures) -> Bools:
 _COUNTED, _POINTS = 24, 1024
 
 
-def union_m3(stage: PredictionStage, sample: LimbDepartures, departure: Departure) -> list[float]:
-    """Mean volume of all limbs, the lower body too, at each horizon [m^3]."""
-    with_departures = tube_stage(stage, departure)
+def union_m3(stage: PredictionStage, sample: LimbDepartures, departure: Departure, *, legs: bool = True) -> list[float]:
+    """Mean volume of all limbs, with the lower body or without, at each horizon [m^3]."""
+    with_departures = tube_stage(stage, departure, legs=legs)
     states = _some(sample.states)
     return [_union_m3(with_departures.volumes(states, h)) for h in sample.horizon_s.tolist()]
 

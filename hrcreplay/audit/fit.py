@@ -81,8 +81,9 @@ def _departure_lines(found: dict[str, Any]) -> list[str]:
     gaps = found["not_checked"]
     told = [f"not checked, so nothing is said of it: {', '.join(gaps)}"] if gaps else []
     for log in found["logs"]:
-        sizes = ", ".join(f"{size:.1f}" for size in log["union_m3"])
-        told.append(f"{log['name']}: {found['unknown_are']}: {_by_horizon(found, log['shares'])}; union {sizes} m3")
+        sizes, best = (", ".join(f"{size:.1f}" for size in log[name]) for name in ("union_m3", "fitted_to_it_m3"))
+        held = f"{log['name']}: {found['unknown_are']}: {_by_horizon(found, log['shares'])}"
+        told.append(f"{held}; union {sizes} m3, fitted to it alone {best} m3")
     training, unknown = (_by_horizon(found, found[part]) for part in ("training", "unknown"))
     return [*told, f"whole limbs, {found['pooled_are']}: training {training}; {found['unknown_are']} {unknown}"]
 
@@ -271,8 +272,7 @@ def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departur
         {
             "name": sample.name,
             "shares": [shares([hits[k]], k) for k in horizons],
-            "union_m3": [round(size, 3) for size in union_m3(sample.prediction_stage, one, fold)],
-            "capsules_m3": [round(size, 3) for size in capsules_m3(sample.prediction_stage, one)],
+            **_sizes(sample.prediction_stage, one, fold, coverage),
         }
         for sample, one, fold, hits in zip(samples, known, folds, inside, strict=True)
     ]
@@ -291,6 +291,17 @@ def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departur
         "logs": logs,
     }
     return found, facts, _missed(facts, coverage)
+
+
+def _sizes(stage: PredictionStage, one: LimbDepartures, fold: Departure, coverage: float) -> dict[str, list[float]]:
+    """Volumes [m^3]: of a log's people by the fold; beside it without the lower body, as capsules are; fitted to it."""
+    found = {
+        "union_m3": union_m3(stage, one, fold),
+        "union_without_legs_m3": union_m3(stage, one, fold, legs=False),
+        "capsules_m3": capsules_m3(stage, one),
+        "fitted_to_it_m3": union_m3(stage, one, fit_departures([one], coverage)),
+    }
+    return {name: [round(size, 3) for size in sizes] for name, sizes in found.items()}
 
 
 def _missed(facts: dict[str, Any], coverage: float) -> str:

@@ -133,6 +133,9 @@ def test_covering_the_limbs_bounds_their_departures(of_limbs: tuple[Path, fit.Fi
         ]
         assert (np.diff(log["union_m3"]) > 0.0).all()
         assert log["union_m3"][-1] < 1.3 * log["capsules_m3"][-1]
+        less = [log[name][-1] for name in ("union_without_legs_m3", "fitted_to_it_m3")]
+        assert max(less) < 1.02 * log["union_m3"][-1]  # fitted to the copy, it is fitted to it
+        assert less[0] < 0.95 * log["union_m3"][-1]
     assert report.missed == ""
     assert report.lines[-1].startswith("fit-limits: limbs: whole limbs, all logs: training 0.02 s ")
     assert "each log left out once" in report.lines[-1]

@@ -124,15 +124,16 @@ def people(facts: Facts) -> str:
     """What each recording, left out of the fit once, gave: from the limit set itself, which ``make people`` makes."""
     found = tomllib.loads(PEOPLE.read_text())["provenance"]["departures"]
     until = [f"{1000 * horizon_s:.0f} ms" for horizon_s in found["horizon_s"]]
-    head = ["left out", *until, f"capsules, {until[-1]}"]
+    beside = {"union_without_legs_m3": "no legs", "capsules_m3": "capsules", "fitted_to_it_m3": "fitted to it"}
+    head = ["left out", *until, *(f"{title}, {until[-1]}" for title in beside.values())]
     rows = []
     for log in found["logs"]:
         shares = zip(log["shares"], log["union_m3"], strict=True)
         cells = [f"{_share(part['share'])}, {_m3(size)}" for part, size in shares]
-        rows.append([log["name"].rsplit(".", 1)[0], *cells, _m3(log["capsules_m3"][-1])])
+        rows.append([log["name"].rsplit(".", 1)[0], *cells, *(_m3(log[name][-1]) for name in beside)])
     pooled = [f"{_share(one['share'])} ({_share(one['low'])} to {_share(one['high'])})" for one in found["unknown"]]
     together = "recordings together, demo and simulated people not (95 % interval)"
-    return _table(head, [*rows, [together, *pooled, ""]])
+    return _table(head, [*rows, [together, *pooled, *[""] * len(beside)]])
 
 
 def margins(facts: Facts) -> str:
