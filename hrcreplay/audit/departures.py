@@ -132,7 +132,14 @@ def _heights(volumes: SweptVolumes, future: RecordedFuture) -> Floats:
 def tube_stage(
     stage: PredictionStage, departure: Departure, *, residual: bool = True, legs: bool = True
 ) -> PredictionStage:
-    """The stage by ``sound`` with these departures, from the tick on."""
+    """The stage by ``sound`` with some departures, from the tick on.
+
+    Args:
+        stage: Radii, braking time and margins.
+        departure: The departures.
+        residual: Whether the distance from the model counts.
+        legs: Whether there is a lower body.
+    """
     changed = {"method": "sound", "legs": legs, "latency_s": 0.0, "residual": residual}
     limits = replace(stage.limits, departure=departure)
     return replace(stage, limits=limits, occupancy=stage.occupancy.model_copy(update=changed))
@@ -153,7 +160,14 @@ _COUNTED, _POINTS = 24, 1024
 
 
 def union_m3(stage: PredictionStage, sample: LimbDepartures, departure: Departure, *, legs: bool = True) -> list[float]:
-    """Mean volume of all limbs, with the lower body or without, at each horizon [m^3]."""
+    """Mean volume of all limbs at each horizon [m^3].
+
+    Args:
+        stage: Radii, braking time and margins.
+        sample: The person.
+        departure: The departures.
+        legs: Whether there is a lower body.
+    """
     with_departures = tube_stage(stage, departure, legs=legs)
     states = _some(sample.states)
     return [_union_m3(with_departures.volumes(states, h)) for h in sample.horizon_s.tolist()]
