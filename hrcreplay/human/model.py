@@ -32,6 +32,8 @@ PELVIS, NECK, HEAD = (POINTS.index(name) for name in ("pelvis", "neck", "head"))
 #: Rows: right, left. Columns: shoulder, elbow, wrist.
 ARM_POINTS = tuple(tuple(POINTS.index(f"{name}_{side}") for name in ("shoulder", "elbow", "wrist")) for side in "rl")
 HANDS = np.array([POINTS.index(f"hand_{side}") for side in "rl"])
+#: Knees and ankles: without one of them nobody knows where a leg is.
+BENDS = np.array([POINTS.index(f"{part}_{side}") for part in ("knee", "ankle") for side in "rl"])
 LEG_POINTS = np.array([POINTS.index(f"{part}_{side}") for part in ("hip", "knee", "ankle", "foot") for side in "rl"])
 #: Index into LIMBS of the limb whose points show each joint of JOINTS.
 SHOWN_BY = np.array(

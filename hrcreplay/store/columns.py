@@ -14,7 +14,6 @@ from hrcreplay.records import (
     BODY,
     JOINTS,
     LENGTHS,
-    LIMBS,
     POINTS,
     STATUSES,
     Bools,
@@ -53,7 +52,7 @@ def truth_columns(t_ns: Ints, angles: Floats, lengths_m: Floats) -> Columns:
 
 _STATE = (("p", ""), ("v", "_vel"), ("a", "_acc"), ("j", "_jerk"), ("p_std", "_std"), ("v_std", "_vel_std"))
 _RESIDUAL = tuple(f"residual_{limb}" for limb in BODY)
-_UNSEEN = tuple(f"unseen_{limb}" for limb in LIMBS)
+_UNSEEN = tuple(f"unseen_{limb}" for limb in BODY)
 _SHOWN = tuple(f"point_{point}_{axis}" for point in POINTS for axis in "xyz")
 
 

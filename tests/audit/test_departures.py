@@ -27,7 +27,7 @@ def measured(up_m_per_s: float, seen_s: float = 0.0, source: str = TRUTH) -> Lim
     people = replace(
         people,
         residual_m=np.full((1, len(BODY)), RESIDUAL_M),
-        unseen_s=np.full((1, len(LIMBS)), seen_s),
+        unseen_s=np.full((1, len(BODY)), seen_s),
         points_m=skeleton(posture, people.lengths_m),
     )
     after_s = EVERY_S * np.arange(1, 25)

@@ -29,7 +29,7 @@ def states(p: Floats, v: Floats, lengths_m: Floats = LENGTHS_M) -> HumanStates:
         lengths_std_m=0 * lengths,
         valid=valid,
         residual_m=np.zeros((len(p), len(BODY))),
-        unseen_s=np.zeros((len(p), len(LIMBS))),
+        unseen_s=np.zeros((len(p), len(BODY))),
         points_m=skeleton(p, lengths),
         cameras=("camera",),
     )

@@ -51,7 +51,7 @@ class MadeController:
             lengths_std_m=np.full((1, len(LENGTHS)), np.nan),
             valid=np.array([[bool(skeletons), False]]),
             residual_m=np.full((1, 7), np.nan),
-            unseen_s=np.full((1, 6), np.inf),
+            unseen_s=np.full((1, 7), np.inf),
             points_m=np.full((1, 20, 3), np.nan),
             cameras=("left", "right"),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hrcreplay.human.model import LimitSet, skeleton
-from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, Floats, HumanStates
+from hrcreplay.records import BODY, DOF, LENGTHS, Floats, HumanStates
 from tests.soundness.joint import bounds_of, rates_of, stops_at
 from tests.soundness.motion import allowed
 from tests.soundness.truth import Estimate
@@ -96,7 +96,7 @@ def states_of(estimates: list[Estimate], unseen_s: float = 0.0) -> HumanStates:
         lengths_std_m=lengths_std,
         valid=np.ones((n, 1), dtype=bool),
         residual_m=np.zeros((n, len(BODY))),
-        unseen_s=np.full((n, len(LIMBS)), unseen_s),
+        unseen_s=np.full((n, len(BODY)), unseen_s),
         points_m=skeleton(np.array([e.q for e in estimates]), np.array([e.lengths for e in estimates])),
         cameras=("camera",),
     )

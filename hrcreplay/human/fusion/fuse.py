@@ -237,7 +237,7 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         lengths=np.full((2, n, len(LENGTHS)), np.nan),
         valid=np.zeros((n, cameras), dtype=np.bool_),
         residual=np.full((n, len(BODY)), np.nan),
-        unseen=np.full((n, len(LIMBS)), np.inf),
+        unseen=np.full((n, len(BODY)), np.inf),
         points=np.full((n, len(POINTS), 3), np.nan),
         cov=np.full((rows, DOF, 4, 4), np.nan),
         damping=np.ones((rows, DOF)),

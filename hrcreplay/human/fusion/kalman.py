@@ -110,7 +110,7 @@ class Track(NamedTuple):
     lengths: Floats  #: (2, n, 7) and their deviations
     valid: Bools  #: (n, c)
     residual: Floats  #: (n, 7)
-    unseen: Floats  #: (n, 6)
+    unseen: Floats  #: (n, 7)
     points: Floats  #: (n, 20, 3)
     cov: Floats  #: (n or 0, 13, 4, 4)
     damping: Floats  #: (n or 0, 13) of the derivatives, on the way to the tick

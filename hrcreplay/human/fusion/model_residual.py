@@ -21,7 +21,7 @@ from numba import njit
 from hrcreplay.human.fusion.body_points import REACH_M, learn, shift
 from hrcreplay.human.fusion.gating import distance
 from hrcreplay.human.fusion.kalman import Filter, Rules, ago, delay
-from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
+from hrcreplay.human.model import ARM_POINTS, BENDS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
 
 _BIN_M = 0.001
@@ -161,7 +161,7 @@ def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
 
 @njit(cache=True)
 def unseen(filter_: Filter, seconds: Floats) -> None:
-    """Writes how long ago the last valid row of each limb's own joints came, (6,) [s].
+    """Writes how long ago the last valid row of each limb's own joints came, (7,) [s]; of the legs, knees and ankles.
 
     Head and thorax have been seen when all four joints of the torso have. Of the two joints of a part of an arm one is
     enough: the other goes blind where it does not matter (alpha_3 when the elbow is straight).
@@ -170,6 +170,7 @@ def unseen(filter_: Filter, seconds: Floats) -> None:
     seconds[:2] = _since(now, filter_.row_ns[:4].min())
     for i in range(len(_FIRST)):
         seconds[2 + i] = _since(now, filter_.row_ns[_FIRST[i] : _FIRST[i] + 2].max())
+    seconds[_LEGS] = _since(now, filter_.carried_ns[BENDS].min())
 
 
 @njit(cache=True)

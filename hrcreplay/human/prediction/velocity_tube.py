@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, LimitSet, skeleton_row
+from hrcreplay.human.model import ARM_POINTS, BENDS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, LimitSet, skeleton_row
 from hrcreplay.records import BODY, Bools, Floats, HumanStates
 
 #: Time step of the difference that gives the velocities of the points [s].
@@ -34,8 +34,6 @@ _CARRIED_BY = ((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))
 #: Most points of a tube.
 MOST_POINTS = 2 * (len(LEG_POINTS) + 2)
 _ARMS = np.array(ARM_POINTS)
-#: Knees and ankles: without one of them nobody knows where a leg is.
-_BENDS = LEG_POINTS[2:6]
 
 
 class Tubes(NamedTuple):
@@ -69,14 +67,15 @@ def tubes(
     """
     known = limits.departure
     unseen = np.column_stack([states.unseen_s[:, list(carrying)].max(axis=1) for carrying in _CARRIED_BY])
+    usable, legs_shown = unseen <= memory_s, np.isfinite(states.points_m[:, BENDS].sum(axis=(1, 2)))
+    unseen[legs_shown, LEGS] = np.maximum(unseen, states.unseen_s)[legs_shown, LEGS]
     of = states.residual_m[:, [0, 1, 2, 3, 4, 5, 1]]  # legs have none of their own that tells of departures
-    usable = unseen <= memory_s
     empty = np.zeros((len(BODY), 1))
     return Tubes(
         points=np.ascontiguousarray(states.points_m),
         residual=np.where(np.isnan(of), unknown_m, of) if residual else np.zeros_like(of),
         usable=np.ascontiguousarray(usable if known is not None else np.zeros_like(usable)),
-        legs_shown=np.isfinite(states.points_m[:, _BENDS].sum(axis=(1, 2))),
+        legs_shown=legs_shown,
         legs_m=np.where(residual, states.residual_m[:, LEGS], np.nan),
         reach_s=span_s + np.clip(unseen - _FRESH_S, 0.0, memory_s),
         horizon_s=np.ones(1) if known is None else np.ascontiguousarray(known.horizon_s),
@@ -181,7 +180,7 @@ def _ends(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: fl
         for k in LEG_POINTS:
             if np.isfinite(points[k].sum()):
                 n = _add(points[k], along, span_s, swept, n)
-        if not np.isfinite(points[_BENDS].sum()):  # somewhere about the line from the floor to the pelvis
+        if not np.isfinite(points[BENDS].sum()):  # somewhere about the line from the floor to the pelvis
             below = points[PELVIS].copy()
             below[2] = 0.0
             n = _add(below, along, span_s, swept, n)

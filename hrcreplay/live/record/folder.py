@@ -21,7 +21,7 @@ from hrcreplay.live.record.codec import PHASES, MotionRow
 from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Motion
+from hrcreplay.records import BODY, DOF, LENGTHS, POINTS, Floats, HumanStates, Motion
 from hrcreplay.run import build
 from hrcreplay.run.contact import write_contact
 from hrcreplay.run.job import Job
@@ -104,7 +104,7 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
     numbers = np.array([look.state for look in looks])
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), DOF)
     widths |= dict.fromkeys(("lengths_m", "lengths_std_m"), len(LENGTHS))
-    widths |= {"residual_m": len(BODY), "unseen_s": len(LIMBS), "points_m": 3 * len(POINTS)}
+    widths |= {"residual_m": len(BODY), "unseen_s": len(BODY), "points_m": 3 * len(POINTS)}
     ends = np.cumsum(list(widths.values()))
     if numbers.shape[1] != ends[-1]:
         raise LogError(

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hrcreplay.records import POINTS, CameraFrames, HumanStates
+from hrcreplay.records import BODY, POINTS, CameraFrames, HumanStates
 from hrcreplay.settings.sections import Fusion
 from tests.human.bent import bent, fused, measured, ticks
 
@@ -83,6 +83,18 @@ def test_what_is_too_far_to_be_a_leg_or_a_hand_is_none() -> None:
     assert np.isnan(states.points_m[at(states, 2.3) :, [knee, hand]]).all()
     others = [k for k in (*LEGS, *HANDS) if k not in (knee, hand)]
     assert np.isfinite(states.points_m[at(states, 2.3) :, others]).all()
+
+
+def test_legs_have_been_unseen_since_a_frame_showed_both_knees_and_ankles() -> None:
+    frames = hidden(walking(3.0), [POINTS.index("knee_l")], 2.0)
+    states = fused(measured(frames), ticks(3.0))
+    unseen_s, legs = states.unseen_s[:, BODY.index("LEGS")], BODY.index("LEGS")
+    last_ns = frames.capture_ns[frames.capture_ns <= 2_000_000_000].max()
+    late = slice(at(states, 2.1), None)
+    np.testing.assert_allclose(unseen_s[late], (states.t_ns[late] - last_ns) * 1e-9, atol=1e-12)
+    assert (states.unseen_s[late, :legs] < 0.05).all()
+    assert (unseen_s[at(states, 1.0) : at(states, 1.9)] < 0.06).all()
+    assert np.isinf(unseen_s[0])
 
 
 def turning(frames: CameraFrames, rate_rad_per_s: float) -> CameraFrames:

@@ -78,9 +78,9 @@ def limb_inside(
 @pytest.mark.parametrize("kind", ["squat", "chair"])
 @pytest.mark.parametrize("parts", [("knee", "ankle", "foot"), ("ankle", "foot"), ("knee",), ("foot",)])
 def test_legs_that_a_table_hides_stay_in_their_volume(parts: tuple[str, ...], kind: str) -> None:
-    """From the start, and from when they stand: hips alone do not tell where knees and ankles are."""
+    """From the start, and while people rise, stand and sit down: hips alone do not tell where knees and ankles are."""
     measurements, end_s = rising.seen(0.6, kind, SEEDS[0])
-    for from_s in (0.0, 3.0):
+    for from_s in (0.0, 2.3, 3.0, 4.7):
         points = measurements.points_m.copy()
         late = np.flatnonzero(measurements.capture_ns > from_s * 1e9)
         points[late[:, None], [POINTS.index(f"{part}_{side}") for part in parts for side in "lr"]] = np.nan

@@ -182,6 +182,17 @@ def test_a_limb_seen_a_while_ago_may_have_departed_for_longer() -> None:
     assert (late.radius_m[:, k] > early.radius_m[:, k]).all()
 
 
+def test_legs_that_were_hidden_just_now_may_have_departed_for_longer() -> None:
+    states = people(3, seed=7)
+    unseen, k = states.unseen_s.copy(), BODY.index("LEGS")
+    unseen[:, k] = 0.18
+    late = predict(replace(states, unseen_s=unseen), PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    assert PEOPLE.departure is not None
+    for tick in range(3):
+        reach = allowed_m(PEOPLE.departure, "LEGS", 0.18, states.residual_m[tick, BODY.index("THX")])
+        assert late.radius_m[tick, k] == pytest.approx(FLESH_M["LEGS"] + reach, abs=2e-9)
+
+
 @pytest.mark.parametrize("gone", [LEGS, LEGS[2:], ("knee_l",), ("ankle_r", "foot_r")])
 def test_hidden_legs_are_the_line_below_the_pelvis_as_thick_as_they_were(gone: tuple[str, ...]) -> None:
     """Of one leg, or of both below the hips or the knees: it says nothing of where the rest of them is."""
