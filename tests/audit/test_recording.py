@@ -15,7 +15,7 @@ from hrcreplay.audit import driver, recording
 from hrcreplay.audit import metrics as audit_metrics
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.records import DOF, JOINTS, LIMBS, POINTS, Bools, Floats, Ints, Measurements
+from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Bools, Floats, Ints, Measurements
 from hrcreplay.run.build import FusionStage
 from hrcreplay.settings.sections import Fusion
 from tests.audit.standing import frames, standing
@@ -162,7 +162,7 @@ def test_errors_are_told_in_their_standard_deviations() -> None:
     off = rng.normal(size=(2, *p.shape))
     fused = replace(states(p + 0.02 * off[0], v + 0.5 * off[1]), t_ns=at_ns)
     n = len(at_ns)
-    unseen = np.zeros((n, len(LIMBS)))
+    unseen = np.zeros((n, len(BODY)))
     unseen[100:200, LIMBS.index("LRA")] = 0.5
     fused = replace(fused, p_std=np.full((n, DOF), 0.02), v_std=np.full((n, DOF), 0.25), unseen_s=unseen)
     gap = (t_ns > 5_000_000_000) & (t_ns < 5_200_000_000)

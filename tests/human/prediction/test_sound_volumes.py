@@ -14,7 +14,7 @@ from hrcreplay.human.model import HEIGHT, LimitSet, alpha_2_bounds, alpha_3_boun
 from hrcreplay.human.prediction.joint_reach import rise
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
-from hrcreplay.records import DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
+from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
 from tests.human.people import limb_points, random_states, states
 from tests.human.predictions import predict, reachable
@@ -221,7 +221,7 @@ def test_unknown_lengths_are_in_the_volumes() -> None:
 
 def test_a_limb_out_of_sight_grows_to_all_that_it_can_reach() -> None:
     people = random_states(PAPER, 5, 10)
-    unseen = np.zeros((5, len(LIMBS)))
+    unseen = np.zeros((5, len(BODY)))
     unseen[:, LIMBS.index("LLA")] = (0.0, 0.5, 0.6, 3.0, np.inf)
     same = people.rows(np.zeros(5, dtype=np.int64))
     reach = reachable(dataclasses.replace(same, unseen_s=unseen), PAPER, T, "sound", BARE)
@@ -238,7 +238,7 @@ def test_a_limb_out_of_sight_grows_to_all_that_it_can_reach() -> None:
 
 def test_an_arm_never_seen_needs_no_state_but_its_lengths() -> None:
     people = random_states(PAPER, 1, 11)
-    p, unseen = people.p.copy(), np.zeros((1, len(LIMBS)))
+    p, unseen = people.p.copy(), np.zeros((1, len(BODY)))
     p[0, 8:12] = np.nan
     blind = dataclasses.replace(people, p=p)
     assert np.isnan(volumes(blind).vertices(0, LIMBS.index("LLA"))).all()
@@ -248,7 +248,7 @@ def test_an_arm_never_seen_needs_no_state_but_its_lengths() -> None:
 
 def test_a_person_out_of_sight_may_have_walked_anywhere() -> None:
     people = random_states(PAPER, 1, 12)
-    away = dataclasses.replace(people, unseen_s=np.full((1, len(LIMBS)), 2.0))
+    away = dataclasses.replace(people, unseen_s=np.full((1, len(BODY)), 2.0))
     near, far = (reachable(someone, PAPER, T, "sound", BARE) for someone in (people, away))
     assert (far.high[0, :2] - far.low[0, :2] > near.high[0, :2] - near.low[0, :2] + 0.8 * 2.0).all()
 

@@ -11,7 +11,7 @@ from hrcreplay.geometry.convex_hull import sphere_swept_volume_m3
 from hrcreplay.human.model import LimitSet, clamp, skeleton
 from hrcreplay.human.prediction.swept_volumes import METHODS, PRINTED, limb_radii
 from hrcreplay.limits import load_limits
-from hrcreplay.records import DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
+from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Occupancy
 from tests.human import predictions
 from tests.human.people import LENGTHS_M, directions, limb_points, random_states, raw_cloud, states
@@ -200,7 +200,7 @@ def test_an_unknown_method_is_named() -> None:
 def test_an_arm_that_nobody_measured_may_be_anywhere_within_its_limits(method: str) -> None:
     """Forward kinematics of random arms at the torso that is known, against the arm's volumes."""
     people = random_states(PAPER, 3, 15)
-    unseen = np.zeros((3, len(LIMBS)))
+    unseen = np.zeros((3, len(BODY)))
     arm = [LIMBS.index("URA"), LIMBS.index("LRA")]
     unseen[:, arm] = np.inf
     known = predict(people, method=method)
