@@ -151,6 +151,10 @@ def test_a_share_that_others_miss_is_told_and_fails(tmp_path: Path, run: Run) ->
     assert load_limits(out).departure is not None
     assert "demo.mcap: found" in told.splitlines()[-1]
     assert "would be right: at least 97.0 %" in told.splitlines()[-1]
+    demo = next(
+        one for one in tomllib.loads(out.read_text())["provenance"]["departures"]["logs"] if "demo" in one["name"]
+    )
+    assert demo["fitted_to_it_m3"][-1] > 1.2 * demo["union_m3"][-1] > 1.2 * demo["union_without_legs_m3"][-1]
 
 
 def test_another_kind_of_coverage_is_refused(tmp_path: Path) -> None:

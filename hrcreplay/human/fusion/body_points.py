@@ -14,13 +14,13 @@ from numba import njit
 from hrcreplay.human.fusion.gating import distance
 from hrcreplay.human.fusion.kalman import Filter, Rules
 from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, skeleton_row, torso_rotation
-from hrcreplay.records import BODY, LIMBS, Bools, Floats
+from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats
 
 #: No point of a leg is further from the pelvis: toes of a tall man's straight leg. What is further is no leg [m].
 REACH_M = 1.2
 #: Nor is a hand further from its wrist [m].
 _HAND_M = 0.3
-#: A foot's tip from its ankle until a camera has shown it, in the body's heading [m].
+#: A foot's tip from its ankle until a camera has shown it, in the body's heading: about a man's [m].
 FOOT_M = (0.2, 0.0, -0.06)
 #: A hand or a leg that a camera showed longer ago is anywhere by now: some frames of any camera [ns].
 _SHOWN_NS = 200_000_000
@@ -34,7 +34,8 @@ _OF_LIMB = np.array([LIMBS.index(limb) for limb in ("HD", "THX", "THX", "URA", "
 #: Wrists of HANDS, and the limbs that show them.
 _WRISTS = np.array([_WRIST_R, _WRIST_L])
 _LOWER_ARMS = np.array([LIMBS.index("LRA"), LIMBS.index("LLA")])
-_ANKLES, _FEET = LEG_POINTS[4:6], LEG_POINTS[6:]
+#: Right, left.
+_ANKLES, _FEET = (np.array([POINTS.index(f"{part}_{side}") for side in "rl"]) for part in ("ankle", "foot"))
 
 
 @njit(cache=True)
