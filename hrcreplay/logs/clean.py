@@ -122,8 +122,10 @@ def _places(frames: CameraFrames, poses: Floats) -> Floats:
 #: Every name in ``Log.defects``, with what was done about it. <camera> stands for a camera's name.
 DEFECTS: Mapping[str, str] = {
     "chunks_unreadable": "damaged chunks of an MCAP file; left out",
+    "files_damaged": "files of a ROS 2 bag that are damaged; the messages that can be read are used",
     "files_empty": "files of 0 bytes in a folder; left out",
     "files_missing": "files that metadata.yaml names and the folder lacks",
+    "files_unreadable": "files of a folder that cannot be read; left out",
     "frames_<camera>": "no defect: rows delivered, one a body a frame",
     "frames_duplicate": "rows of the same camera, body and capture as the one before; dropped",
     "frames_header_stamp_zero": "rows with a capture time of zero; their arrival is used",

@@ -17,7 +17,6 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
-import zstandard
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -38,7 +37,8 @@ from hrcreplay.logs.messages import (
     stamp_ns,
     topic_list,
 )
-from hrcreplay.logs.ros_bags import open_bag, open_db3
+from hrcreplay.logs.ros_bags import Db3Stream, open_bag
+from hrcreplay.logs.unpack import ZSTD_MAGIC, unpack_file
 from hrcreplay.records import Floats, Ints, Table
 
 _SQLITE = b"SQLite format 3\0"
@@ -111,19 +111,24 @@ def open_source(path: Path) -> LogFiles:
     if not path.exists():
         raise LogError(f"{path}: there is no such file or folder; name a log")
     source = _folder(path) if path.is_dir() else _single(path)
+    told = source.damage().notes
     source.streams = [stream for stream in source.streams if any(topic.count for topic in stream.topics)]
     if not source.streams:
-        raise LogError(f"{path}: the log holds no messages")
+        raise LogError(f"{path}: the log holds no messages" + "".join(f"; {note}" for note in told))
     return source
 
 
 def _single(path: Path) -> LogFiles:
+    if path.suffix == ".zstd":
+        source = LogFiles(path, "ros2", [])
+        source.streams = [_file(_unpacked(source, path))]
+        return source
     stream = _file(path)
     kind = stream.profile if stream.profile in (PROFILE, "ros1", "ros2") else "mcap"
     return LogFiles(path, kind, [stream])
 
 
-def _file(path: Path, *, zstd_messages: bool = False) -> MessageStream:
+def _file(path: Path) -> MessageStream:
     try:
         with path.open("rb") as file:
             head = file.read(16)
@@ -136,9 +141,18 @@ def _file(path: Path, *, zstd_messages: bool = False) -> MessageStream:
     if head.startswith(ros_bags.MAGIC):
         return open_bag(path)
     if head.startswith(_SQLITE) and path.suffix == ".db3":
-        return open_db3(path, zstd_messages=zstd_messages)
+        return Db3Stream(path)
     text = _IMPORT.format(path=path) if _is_text(path) else ""
     raise LogError(f"{path}: is no log of a known kind; {_KNOWN}{text}")
+
+
+def _unpacked(source: LogFiles, file: Path) -> Path:
+    """A file of the log, decompressed where it is zstd's."""
+    with file.open("rb") as opened:
+        if opened.read(4) != ZSTD_MAGIC:
+            return file
+    source.folder = source.folder or tempfile.TemporaryDirectory(prefix="hrcreplay-")
+    return unpack_file(file, Path(source.folder.name) / file.stem)
 
 
 def _is_text(path: Path) -> bool:
@@ -151,68 +165,81 @@ def _is_text(path: Path) -> bool:
     return path.suffix.lower() != ".bag" and bool(head) and all(byte >= 32 or byte in b"\t\r\n" for byte in head)
 
 
+#: A metadata.yaml is some kB, with a line or two a file [bytes].
+_METADATA_BYTES = 4 << 20
+_ENDINGS = ("mcap", "db3", "mcap.zstd", "db3.zstd")
+
+
 def _folder(path: Path) -> LogFiles:
     """A ROS 2 bag. Its files are opened one by one, so that their messages are all there are."""
     metadata = path / "metadata.yaml"
+    source = LogFiles(path, "ros2", [])
     if not metadata.exists():
-        files = sorted(p for suffix in ("mcap", "db3") for p in path.glob(f"*.{suffix}"))
+        files = sorted(p for ending in _ENDINGS for p in path.glob(f"*.{ending}"))
         if not files:
             raise LogError(f"{path}: is a folder without metadata.yaml; {_KNOWN}")
-        source = _together(path, files)
-        source.notes.insert(0, "metadata.yaml is missing: the files of the folder are read in order of time")
+        source.notes.append("metadata.yaml is missing: the files of the folder are read in order of time")
+        _open_files(source, files)
         return source
     described = _metadata(metadata)
-    files = [path / PurePath(name).name for name in described.get("relative_file_paths") or ()]
+    files = [path / PurePath(name).name for name in described.files]
     present = [file for file in files if file.exists()]
-    promised = int(described.get("message_count") or 0)
-    mode = str(described.get("compression_mode") or "").lower()
-    temporary = None
-    if mode == "file":
-        temporary = tempfile.TemporaryDirectory(prefix="hrcreplay-")
-        present = [_unpacked(file, Path(temporary.name)) for file in present]
-    source = _together(path, present, zstd_messages=mode == "message")
-    source.folder = temporary
+    _open_files(source, present)
     if len(present) < len(files):
         source.defects["files_missing"] = len(files) - len(present)
         source.notes.append(f"{len(files) - len(present)} of the {len(files)} files in metadata.yaml are not there")
     delivered = sum(topic.count for topic in source.topics())
-    if promised and not delivered:
+    if described.messages and not delivered:
         raise LogError(
-            f"{path}: metadata.yaml promises {promised} messages, but its files ({len(present)}) give none; "
+            f"{path}: metadata.yaml promises {described.messages} messages, but its files ({len(present)}) give none; "
             "copy the folder again, or rebuild it with ros2 bag reindex"
         )
-    if delivered < promised:
-        source.defects["messages_missing"] = promised - delivered
-        source.notes.append(f"metadata.yaml promises {promised} messages, but the files give {delivered}")
+    if delivered < described.messages:
+        source.defects["messages_missing"] = described.messages - delivered
+        source.notes.append(f"metadata.yaml promises {described.messages} messages, but the files give {delivered}")
     return source
 
 
-def _together(path: Path, files: list[Path], *, zstd_messages: bool = False) -> LogFiles:
-    source = LogFiles(path, "ros2", [])
+def _open_files(source: LogFiles, files: list[Path]) -> None:
+    """Opens the files of a folder; one that cannot be read is left out and told, unless it is the only one."""
+    refused: LogError | None = None
     for file in files:
         if not file.stat().st_size:
             source.defects["files_empty"] += 1
             source.notes.append(f"{file.name}: has 0 bytes")
             continue
-        source.streams.append(_file(file, zstd_messages=zstd_messages))
-    return source
-
-
-def _metadata(path: Path) -> dict[str, Any]:
-    try:
-        return dict(YAML(typ="safe").load(path.read_text())["rosbag2_bagfile_information"])
-    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise LogError(f"{path}: is not the metadata of a ROS 2 bag; rebuild it with ros2 bag reindex") from error
-
-
-def _unpacked(file: Path, folder: Path) -> Path:
-    target = folder / file.stem
-    with file.open("rb") as packed, target.open("wb") as unpacked:
         try:
-            zstandard.ZstdDecompressor().copy_stream(packed, unpacked)
-        except zstandard.ZstdError as error:
-            raise LogError(f"{file}: cannot be decompressed ({error}); copy it again") from error
-    return target
+            source.streams.append(_file(_unpacked(source, file)))
+        except LogError as error:
+            refused = refused or error
+            source.defects["files_unreadable"] += 1
+            source.notes.append(f"{file.name} is left out: {str(error).removeprefix(f'{file}: ')}")
+    if refused is not None and not source.streams:
+        raise refused
+
+
+@dataclass(frozen=True)
+class _Metadata:
+    """What the metadata of a ROS 2 bag says of its files."""
+
+    files: tuple[str, ...]
+    messages: int
+
+
+def _metadata(path: Path) -> _Metadata:
+    wrong = f"{path}: is not the metadata of a ROS 2 bag; rebuild it with ros2 bag reindex"
+    try:
+        if path.stat().st_size > _METADATA_BYTES:
+            raise LogError(f"{wrong} (it has {path.stat().st_size / 1e6:.0f} MB)")
+        found = YAML(typ="safe").load(path.read_text())["rosbag2_bagfile_information"]
+        files, count = found.get("relative_file_paths") or (), found.get("message_count") or 0
+        if not isinstance(count, int) or not all(isinstance(name, str) for name in files):
+            raise LogError(wrong)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror})") from error
+    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise LogError(wrong) from error
+    return _Metadata(tuple(files), count)
 
 
 @dataclass(frozen=True)

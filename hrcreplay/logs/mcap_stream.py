@@ -5,32 +5,33 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 
 from google.protobuf.message import DecodeError
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, McapRecord, Schema
+from mcap.records import Channel, Chunk, McapRecord, Schema
 from mcap.records import Header as McapHeader
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import CRCValidationError, StreamReader
-from zstandard import ZstdError
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs import ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.messages import MCAP_MAGIC, Damage, LazyChunk, Message, Topic, Undecodable, merge_by_arrival
+from hrcreplay.logs.unpack import CHUNK_BYTES, KNOWN, METHODS, CannotUnpack, unpack, unpack_message
 
 _RUN_BYTES = 1 << 20
 _OURS = {
     kind.DESCRIPTOR.full_name: kind for kind in (pb.Skeleton, pb.Camera, pb.Task, pb.Base, pb.Truth, pb.JointState)
 }
-_BROKEN = (McapError, CRCValidationError, ZstdError, struct.error, RuntimeError, ValueError)  # RuntimeError: lz4's
+_BROKEN = (McapError, CRCValidationError, struct.error, RuntimeError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ class _Index:
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: Counter[int] = field(default_factory=Counter)
     blocks: list[_Block] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)  #: of each chunk of an unknown compression, which it is
+    damaged: dict[int, str] = field(default_factory=dict)  #: byte at which a damaged chunk begins -> what is wrong
 
     def add(self, records: list[McapRecord], offset: int, length: int) -> None:
         """Adds what a block holds."""
@@ -76,11 +79,20 @@ class McapStream:
         with path.open("rb") as file:
             self.profile = _profile(file, path)
             index = _summary(file) or _scan(file, path.stat().st_size, damage)
+        if index.foreign and len(index.foreign) >= len(index.blocks):
+            raise LogError(
+                f"{path}: its chunks are compressed by {', '.join(sorted(set(index.foreign)))!r}; known are "
+                f"{', '.join(KNOWN)}; write the file again with one of them"
+            )
         self._blocks = index.blocks
         self.start_ns = min((b.start_ns for b in index.blocks), default=0)
         self.end_ns = max((b.end_ns for b in index.blocks), default=0)
         self.defects, self.notes = damage.defects, damage.notes
-        self._damaged: set[int] = set()  # offsets of chunks known to be damaged, each counted once
+        self._described = len(self.notes)  # behind these, one note on all damaged chunks
+        self._damaged: dict[int, str] = {}  # as in the index; each chunk is counted once
+        for offset, error in index.damaged.items():
+            self._leave_out(offset, error)
+        self._cdr = frozenset(n for n, channel in index.channels.items() if channel.message_encoding == "cdr")
         self._topics = {
             number: Topic(
                 channel.topic,
@@ -111,13 +123,10 @@ class McapStream:
         try:
             records = _records(file, block.offset, block.length)
         except _BROKEN as error:
-            if block.offset not in self._damaged:
-                self._damaged.add(block.offset)
-                self.defects["chunks_unreadable"] += 1
-                self.notes.append(f"the chunk at byte {block.offset} is damaged and left out ({error})")
+            self._leave_out(block.offset, str(error))
             return
         messages = [
-            Message(record.log_time, wanted[record.channel_id], record.data)
+            Message(record.log_time, wanted[record.channel_id], self._unpacked(record, wanted))
             for record in records
             if isinstance(record, McapMessage)
             and record.channel_id in wanted
@@ -126,6 +135,24 @@ class McapStream:
         ]
         messages.sort(key=lambda message: message.arrival_ns)
         yield from messages
+
+    def _leave_out(self, offset: int, error: str) -> None:
+        if offset not in self._damaged:
+            self._damaged[offset] = error
+            self.defects["chunks_unreadable"] += 1
+            self.notes[self._described :] = [_damage_note(self._damaged)]
+
+    def _unpacked(self, record: McapMessage, wanted: dict[int, Topic]) -> bytes:
+        if record.channel_id not in self._cdr:
+            return record.data
+        return unpack_message(record.data, f"{self._path}: {wanted[record.channel_id].name}")
+
+
+def _damage_note(damaged: dict[int, str]) -> str:
+    """A note on chunks that are left out, by the byte at which they begin."""
+    offset = min(damaged)
+    first = f"at byte {offset} is damaged and left out ({damaged[offset]})"
+    return f"the chunk {first}" if len(damaged) == 1 else f"{len(damaged)} chunks are damaged; the first {first}"
 
 
 def _profile(file: IO[bytes], path: Path) -> str:
@@ -160,7 +187,8 @@ def _summary(file: IO[bytes]) -> _Index | None:
         for chunk in summary.chunk_indexes
     ]
     counts = Counter(summary.statistics.channel_message_counts)
-    return _Index(dict(summary.schemas), dict(summary.channels), counts, blocks)
+    foreign = [chunk.compression for chunk in summary.chunk_indexes if chunk.compression not in METHODS]
+    return _Index(dict(summary.schemas), dict(summary.channels), counts, blocks, foreign)
 
 
 def _scan(file: IO[bytes], size: int, damage: Damage) -> _Index:
@@ -178,10 +206,7 @@ def _scan(file: IO[bytes], size: int, damage: Damage) -> _Index:
     for opcode, offset, end in _walk(file, size):
         if opcode == Opcode.CHUNK:
             close_run()
-            try:
-                index.add(_records(file, offset, end - offset), offset, end - offset)
-            except _BROKEN:
-                damage.defects["chunks_unreadable"] += 1
+            _add_chunk(index, file, offset, end - offset)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
             run.append((offset, end))
             if end - run[0][0] > _RUN_BYTES:
@@ -195,6 +220,17 @@ def _scan(file: IO[bytes], size: int, damage: Damage) -> _Index:
     elif index.blocks:
         damage.ends_at(max(b.end_ns for b in index.blocks), min(b.start_ns for b in index.blocks))
     return index
+
+
+def _add_chunk(index: _Index, file: IO[bytes], offset: int, length: int) -> None:
+    """Adds what a chunk holds to the index, or why it cannot be read."""
+    try:
+        index.add(_records(file, offset, length), offset, length)
+    except _UnknownCompression as error:
+        index.foreign.append(error.method)
+        index.damaged[offset] = str(error)
+    except _BROKEN as error:
+        index.damaged[offset] = str(error)
 
 
 def _walk(file: IO[bytes], size: int) -> Iterator[tuple[int, int, int]]:
@@ -212,15 +248,35 @@ def _walk(file: IO[bytes], size: int) -> Iterator[tuple[int, int, int]]:
         offset = end
 
 
+class _UnknownCompression(CannotUnpack):
+    """A chunk is compressed by a method that is not known."""
+
+    def __init__(self, method: str) -> None:
+        super().__init__(f"compressed by {method!r}")
+        self.method = method
+
+
 def _records(file: IO[bytes], offset: int, length: int) -> list[McapRecord]:
+    if length > CHUNK_BYTES:
+        raise CannotUnpack(f"of {length / 1e6:.0f} MB; at most {CHUNK_BYTES / 1e6:.0f} MB are read of one")
     file.seek(offset)
+    data = file.read(length)
+    if data[:1] == bytes([Opcode.CHUNK]):
+        return _unpacked_records(Chunk.read(ReadDataStream(BytesIO(data[9:]))))
     found: list[McapRecord] = []
     try:
-        for record in StreamReader(BytesIO(file.read(length)), skip_magic=True, validate_crcs=True).records:
+        for record in StreamReader(BytesIO(data), skip_magic=True).records:
             found.append(record)  # noqa: PERF402 - what came before the end is kept
     except EndOfFile:
         pass  # the only end of a stretch from the middle of a file
     return found
+
+
+def _unpacked_records(chunk: Chunk) -> list[McapRecord]:
+    if chunk.compression not in METHODS:
+        raise _UnknownCompression(chunk.compression)
+    data = unpack(chunk.compression, chunk.data)
+    return breakup_chunk(replace(chunk, compression="", data=data), validate_crc=True)
 
 
 def _type(schema: Schema | None) -> str:

@@ -6,27 +6,28 @@ with a broken one, are read by going through their chunks once. Layout: http://w
 
 from __future__ import annotations
 
-import bz2
+import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 
-import lz4.frame  # type: ignore[import-untyped]
-from rosbags import rosbag1, rosbag2
-from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags import rosbag1
+from rosbags.interfaces import Connection
+from rosbags.rosbag1.reader import decompressors
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
-from zstandard import ZstdDecompressor, ZstdError
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs.messages import Damage, LazyChunk, Message, MessageStream, Topic, Undecodable, merge_by_arrival
+from hrcreplay.logs.unpack import unpack, unpack_message
 
 _IDL_RULE = "=" * 80 + "\n"
 _ROS1 = (Stores.ROS1_NOETIC,)
@@ -113,11 +114,6 @@ def _full(msgtype: str) -> str:
 
 MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
-_DECOMPRESS: dict[bytes, Callable[[bytes], bytes]] = {
-    b"none": bytes,
-    b"bz2": bz2.decompress,
-    b"lz4": lz4.frame.decompress,
-}
 _BROKEN_CHUNK = (struct.error, OSError, RuntimeError, ValueError, KeyError, EOFError)
 
 Fields = dict[str, bytes]
@@ -183,7 +179,7 @@ class RecoveredBag:
                 (length,) = struct.unpack("<L", file.read(4))
                 data = file.read(length)
                 if fields["op"][0] == _CHUNK:
-                    self._add(offset, _DECOMPRESS[fields["compression"]](data), connections, counts)
+                    self._add(offset, unpack(fields["compression"].decode(), data), connections, counts)
                 if len(data) < length:
                     return False
                 if fields["op"][0] == _CONNECTION:
@@ -210,7 +206,7 @@ class RecoveredBag:
         data = file.read(struct.unpack("<L", file.read(4))[0])
         messages = [
             Message(_time_ns(fields), wanted[_number(fields)], content)
-            for fields, content in _inner(_DECOMPRESS[header["compression"]](data))
+            for fields, content in _inner(unpack(header["compression"].decode(), data))
             if fields["op"][0] == _MESSAGE and _number(fields) in wanted
         ]
         messages.sort(key=lambda message: message.arrival_ns)
@@ -272,7 +268,7 @@ def _topic(path: Path, name: str, fields: Fields, count: int) -> Topic:
 
 
 _NO_INDEX = (rosbag1.ReaderError, AssertionError, struct.error, ValueError, IndexError)
-_BROKEN = (*_NO_INDEX, rosbag2.ReaderError, ZstdError, RuntimeError, OSError)  # the last two: lz4's, bz2's
+_BROKEN = (*_NO_INDEX, RuntimeError, OSError)
 
 
 def open_bag(path: Path) -> MessageStream:
@@ -282,61 +278,193 @@ def open_bag(path: Path) -> MessageStream:
         LogError: It holds no whole message.
     """
     try:
-        return RosStream(path, rosbag1.Reader, cdr=False)
+        return RosStream(path)
     except _NO_INDEX:
         return RecoveredBag(path)
 
 
-def open_db3(path: Path, *, zstd_messages: bool = False) -> MessageStream:
-    """A sqlite3 file of a ROS 2 bag, by itself; ``zstd_messages`` where each message is compressed.
+class _LimitedReader(rosbag1.Reader):
+    """Unpacks no chunk beyond the limit."""
 
-    Raises:
-        LogError: It is no such file.
-    """
-    try:
-        stream = RosStream(path, rosbag2.Reader, cdr=True, zstd_messages=zstd_messages)
-    except rosbag2.ReaderError as error:
-        raise LogError(f"{path}: cannot be read as a ROS 2 bag ({error}); record or copy it again") from error
-    journal = path.with_name(f"{path.name}-wal")
-    if journal.exists() and journal.stat().st_size:
-        stream.notes.append(f"{journal.name} beside the file holds messages not yet in it; they are left out")
-    return stream
+    def read_chunk(self) -> Any:
+        """The next chunk, with a decompressor that knows the limit."""
+        chunk = super().read_chunk()
+        method = next(name for name, decompress in decompressors.items() if decompress is chunk.decompressor)
+        return chunk._replace(decompressor=partial(unpack, method))
 
 
 class RosStream:
-    """A bag file that the library rosbags reads."""
+    """A ROS 1 bag that the library rosbags reads."""
 
-    def __init__(self, path: Path, reader: Callable[[Path], Any], *, cdr: bool, zstd_messages: bool = False) -> None:
+    profile = "ros1"
+
+    def __init__(self, path: Path) -> None:
         self._path = path
-        self._reader = reader
-        self._unpack: Callable[[bytes], bytes] = ZstdDecompressor().decompress if zstd_messages else bytes
-        self.profile = "ros2" if cdr else "ros1"
         self.defects: Counter[str] = Counter()
         self.notes: list[str] = []
-        with reader(path) as opened:
+        with _LimitedReader(path) as opened:
             connections: list[Connection] = list(opened.connections)
             self.start_ns, self.end_ns = opened.start_time, opened.end_time - 1
         self._topics: dict[tuple[str, str], Topic] = {}
         for c in connections:
             key = (c.topic, c.msgtype)
             count = c.msgcount + (self._topics[key].count if key in self._topics else 0)
-            self._topics[key] = Topic(c.topic, plain(c.msgtype), count, _parser(path, c, cdr=cdr))
+            self._topics[key] = Topic(c.topic, plain(c.msgtype), count, _parser(path, c))
         self.topics = tuple(self._topics.values())
 
     def messages(self, names: Collection[str], start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
         """Messages on these topics with start <= arrival < end, in order of arrival."""
         try:
-            with self._reader(self._path) as opened:
+            with _LimitedReader(self._path) as opened:
                 wanted = [c for c in opened.connections if c.topic in names]
                 if not wanted:
                     return
                 for c, arrival_ns, data in opened.messages(wanted, start_ns, end_ns):
-                    yield Message(arrival_ns, self._topics[(c.topic, c.msgtype)], self._unpack(data))
+                    yield Message(arrival_ns, self._topics[(c.topic, c.msgtype)], data)
         except _BROKEN as error:
             found = str(error) or type(error).__name__  # struct and zlib say what they found, EOFError does not
             raise LogError(f"{self._path}: broken in the middle ({found}); copy it again") from error
 
 
-def _parser(path: Path, connection: Connection, *, cdr: bool) -> Callable[[bytes], Any]:
-    form = "idl" if connection.msgdef.format == MessageDefinitionFormat.IDL else "msg"
-    return parser(f"{path}: {connection.topic}", connection.msgtype, connection.msgdef.data, form, cdr=cdr)
+def _parser(path: Path, connection: Connection) -> Callable[[bytes], Any]:
+    return parser(f"{path}: {connection.topic}", connection.msgtype, connection.msgdef.data, "msg", cdr=False)
+
+
+#: Beyond this many unreadable rows one after the other nothing more is looked for.
+_SEARCH_ROWS = 1 << 20
+
+
+class Db3Stream:
+    """A sqlite3 file of a ROS 2 bag, by itself; a damaged one as far as it can be read.
+
+    Raises:
+        LogError: It is no such file, or nothing in it can be read.
+    """
+
+    profile = "ros2"
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._found: list[tuple[int, int, int]] | None = None  # time, row and topic; None: the file is whole
+        damage = Damage()
+        self.defects, self.notes = damage.defects, damage.notes
+        try:
+            with closing(_database(path)) as database:
+                kinds = database.execute("SELECT id, name, type FROM topics").fetchall()
+                definitions = _definitions(database)
+        except sqlite3.Error as error:
+            raise LogError(f"{path}: cannot be read as a ROS 2 bag ({error}); record or copy it again") from error
+        counts: Counter[int] = Counter()
+        try:
+            self.start_ns, self.end_ns = self._summarize(counts)
+        except sqlite3.Error as error:
+            self.start_ns, self.end_ns = self._recover(damage, error)
+            counts = self._count()
+        self._topics: dict[int, Topic] = {}
+        for number, name, msgtype in kinds:
+            form, text = definitions.get(msgtype, ("msg", ""))
+            parse = parser(f"{path}: {name}", msgtype, text, form, cdr=True)
+            self._topics[number] = Topic(name, plain(msgtype), counts[number], parse)
+        self.topics = tuple(self._topics.values())
+        journal = path.with_name(f"{path.name}-wal")
+        if journal.exists() and journal.stat().st_size:
+            self.notes.append(f"{journal.name} beside the file holds messages not yet in it; they are left out")
+
+    def _summarize(self, counts: Counter[int]) -> tuple[int, int]:
+        with closing(_database(self._path)) as database:
+            found = dict(database.execute("SELECT topic_id, count(id) FROM messages GROUP BY topic_id"))
+            start_ns, end_ns = database.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
+        counts.update(found)
+        return start_ns or 0, end_ns or 0
+
+    def _recover(self, damage: Damage, error: sqlite3.Error) -> tuple[int, int]:
+        """Finds the rows that can be read, and tells what is wrong; first and last arrival of them."""
+        with closing(_database(self._path)) as database:
+            self._found = sorted(_readable_rows(database))
+        if not self._found:
+            raise LogError(f"{self._path}: none of its messages can be read ({error}); record or copy it again")
+        start_ns, end_ns = self._found[0][0], self._found[-1][0]
+        damage.defects["files_damaged"] = 1
+        damage.notes.append(f"{self._path.name} is damaged ({error}): {len(self._found)} of its messages can be read")
+        if _is_short(self._path):
+            damage.ends_at(end_ns, start_ns)
+        return start_ns, end_ns
+
+    def _count(self) -> Counter[int]:
+        return Counter(topic for _, _, topic in self._found or ())
+
+    def messages(self, names: Collection[str], start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
+        """Messages on these topics with start <= arrival < end, in order of arrival."""
+        wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
+        span = (-(1 << 63) if start_ns is None else start_ns, (1 << 63) - 1 if end_ns is None else end_ns)
+        given: tuple[int, int] | None = None  # time and row of the newest message
+        if self._found is None:
+            try:
+                for arrival_ns, row, number, data in self._whole(wanted, span):
+                    yield self._message(arrival_ns, wanted[number], data)
+                    given = (arrival_ns, row)
+            except sqlite3.Error as error:
+                self._recover(Damage(self.defects, self.notes), error)
+            else:
+                return
+        found = [at for at in self._found or () if at[2] in wanted and span[0] <= at[0] < span[1]]
+        with closing(_database(self._path)) as database:
+            for arrival_ns, row, number in found:
+                if given is None or (arrival_ns, row) > given:
+                    (data,) = database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()
+                    yield self._message(arrival_ns, wanted[number], data)
+
+    def _whole(self, wanted: Collection[int], span: tuple[int, int]) -> Iterator[tuple[int, int, int, Any]]:
+        marks = ",".join("?" for _ in wanted)
+        with closing(_database(self._path)) as database:
+            yield from database.execute(
+                f"SELECT timestamp, id, topic_id, data FROM messages WHERE topic_id IN ({marks}) "  # noqa: S608  marks
+                "AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, id",
+                (*wanted, *span),
+            )
+
+    def _message(self, arrival_ns: int, topic: Topic, data: Any) -> Message:
+        where = f"{self._path}: {topic.name}"
+        return Message(arrival_ns, topic, unpack_message(data, where) if isinstance(data, bytes) else b"")
+
+
+def _database(path: Path) -> sqlite3.Connection:
+    """A database to read; also one that is shorter than it says, which takes a writable schema to open."""
+    database = sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True, check_same_thread=False)
+    database.execute("PRAGMA writable_schema = ON")
+    database.text_factory = lambda text: text.decode(errors="replace")
+    return database
+
+
+def _definitions(database: sqlite3.Connection) -> dict[str, tuple[str, str]]:
+    """Type -> "msg" or "idl", and its definition, where the recorder stored them."""
+    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+    try:
+        return {
+            msgtype: ("idl" if form == "ros2idl" else "msg", text) for msgtype, form, text in database.execute(query)
+        }
+    except sqlite3.OperationalError:  # recorders before Iron have no such table
+        return {}
+
+
+def _readable_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int, int]]:
+    """Time, row and topic of each message that can be read; around damage it searches in ever longer steps."""
+    row, step = 0, 1
+    while step <= _SEARCH_ROWS:
+        query = "SELECT timestamp, id, topic_id, data FROM messages WHERE id >= ? ORDER BY id"
+        try:
+            for arrival_ns, at, topic, _ in database.execute(query, (row,)):
+                yield arrival_ns, at, topic
+                row, step = at + 1, 1
+        except sqlite3.Error:
+            row, step = row + step, 2 * step
+        else:
+            return
+
+
+def _is_short(path: Path) -> bool:
+    """Whether a database has fewer bytes than its header says."""
+    with path.open("rb") as file:
+        head = file.read(32)
+    (page,), (pages,) = struct.unpack_from(">H", head, 16), struct.unpack_from(">L", head, 28)
+    return path.stat().st_size < pages * (65536 if page == 1 else page)

@@ -186,6 +186,10 @@ class ImportedSkeleton(NamedTuple):
     confidence: Floats  # (20,)
 
 
+#: A row of a tracker's file is some kB.
+_LINE_CHARACTERS = 1 << 20
+
+
 def lines(path: Path) -> Iterator[tuple[str, str]]:
     """Lines of a text file, plain or gzipped, each with its place ``file:line``. Blank lines are passed over.
 
@@ -195,7 +199,9 @@ def lines(path: Path) -> Iterator[tuple[str, str]]:
     number = 0
     try:
         with _open(path) as stream:
-            for number, text in enumerate(stream, start=1):
+            for number, text in enumerate(iter(lambda: stream.readline(_LINE_CHARACTERS), ""), start=1):
+                if len(text) == _LINE_CHARACTERS:
+                    raise LogError(f"{path}:{number}: a line of over 1 MB; would be right: one row a frame")
                 if text.strip():
                     yield f"{path}:{number}", text.strip()
     except FileNotFoundError as error:

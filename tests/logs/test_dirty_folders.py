@@ -146,25 +146,3 @@ def test_truncated_ros2_mcap(tmp_path: Path) -> None:
     assert 200 < len(frames) < 2000
     assert log.defects["messages_missing"] > 0
     assert log.defects["truncated_at_ns"] == log.header.end_ns
-
-
-def test_database_that_is_broken(tmp_path: Path) -> None:
-    with bag(tmp_path / "a", "db3") as (write, store):
-        write_openni(write, store, frames=200, start_ns=BEGIN)
-    path = tmp_path / "a" / "a.db3"
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2])
-    with pytest.raises(LogError, match=r"a\.db3: "):
-        list(open_log(tmp_path / "a").frames())
-
-
-def test_database_with_a_page_lost(tmp_path: Path) -> None:
-    with bag(tmp_path / "a", "db3") as (write, store):
-        write_openni(write, store, frames=400, start_ns=BEGIN)
-    path = tmp_path / "a" / "a.db3"
-    data = bytearray(path.read_bytes())
-    half = len(data) // 2 // 4096 * 4096
-    data[half : half + 40960] = b"\xff" * 40960
-    path.write_bytes(data)
-    with pytest.raises(LogError, match=r"a\.db3: (broken in the middle|cannot be read as a ROS 2 bag)"):
-        list(open_log(tmp_path / "a").frames())
