@@ -127,6 +127,7 @@ DEFECTS: Mapping[str, str] = {
     "files_missing": "files that metadata.yaml names and the folder lacks",
     "files_unreadable": "files of a folder that cannot be read; left out",
     "frames_<camera>": "no defect: rows delivered, one a body a frame",
+    "frames_contradicting": "rows of the same camera, body and capture as the one before, with other points; dropped",
     "frames_duplicate": "rows of the same camera, body and capture as the one before; dropped",
     "frames_header_stamp_zero": "rows with a capture time of zero; their arrival is used",
     "frames_out_of_order": "rows captured before an earlier delivered one of the same camera and body; dropped",
@@ -233,6 +234,7 @@ class Cleaner:
         self.arrivals: dict[str, tuple[int, int]] = {}  #: camera -> first and last arrival
         self.seen: dict[str, Bools] = {}  #: camera -> (20,) points it ever gave a place and a confidence
         self.points: Counter[str] = Counter()  #: camera -> points with a place and a confidence
+        self.rows: Counter[str] = Counter()  #: camera -> rows that came
         self.flaws: Counter[tuple[str, str]] = Counter()  #: (camera, name in DEFECTS) -> points or rows
         self.frozen: dict[str, RepeatedSkeleton] = {}  #: camera -> its longest standstill
         for name in (*_ALWAYS, *(f"{kind}_{camera}" for kind in ("frames", "gaps") for camera in cameras)):
@@ -251,8 +253,14 @@ class Cleaner:
         self._defects["frames_header_stamp_zero"] += row.stamp_zero
         capture_ns = self._captured(row, arrival_ns)
         newest_ns = self._newest.get((row.camera, row.body))
+        self.rows[row.camera] += 1
         if newest_ns is not None and capture_ns <= newest_ns:
-            self._defects["frames_duplicate" if capture_ns == newest_ns else "frames_out_of_order"] += 1
+            if capture_ns < newest_ns:
+                self._defects["frames_out_of_order"] += 1
+            elif self._agrees(row):
+                self._defects["frames_duplicate"] += 1
+            else:
+                self._flaw(row.camera, "frames_contradicting", 1)
             return None
         self._newest[(row.camera, row.body)] = capture_ns
         whole, flaws = clean_skeleton(row)
@@ -267,6 +275,11 @@ class Cleaner:
         chunk = self.flush() if self._rows and arrival_ns - self._rows[0][1] >= _CHUNK_NS else None
         self._rows.append((capture_ns, arrival_ns, whole))
         return chunk
+
+    def _agrees(self, row: RawSkeleton) -> bool:
+        """Whether a row has the points of the last one of its body."""
+        before, _ = self._last[(row.camera, row.body)]
+        return np.array_equal(before.points_m, clean_skeleton(row).row.points_m, equal_nan=True)
 
     def _captured(self, row: RawSkeleton, arrival_ns: int) -> int:
         """When the row was captured; its arrival where its stamp cannot be right."""

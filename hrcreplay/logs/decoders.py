@@ -1,23 +1,23 @@
 """Decoders of skeleton topics, one class a message format.
 
-Our own Skeleton message; the transforms of openni_tracker (camera to left_elbow_1 on /tf, one message a joint); the
-MarkerArray of the Azure Kinect ROS driver (a marker a joint); and message types that the settings describe.
+Our own Skeleton message; the transforms of openni_tracker (camera to left_elbow_1 on /tf, one message a joint); and
+message types that the settings describe. The markers of the Azure Kinect ROS driver: ``markers``.
 """
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, ClassVar
 
 import numpy as np
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs.messages import (
-    AZURE_INDEX,
-    AZURE_JOINTS,
+    METRES,
     OPENNI_JOINTS,
     OPENNI_POINTS,
     Message,
@@ -65,58 +65,7 @@ def points_of(values: Any, topic: str) -> Floats:
     return np.array(values, dtype=np.float64).reshape(len(POINTS), 3)
 
 
-MARKER_TYPE = "visualization_msgs/MarkerArray"
-_IDS_A_BODY = 100
-_LEAST_MARKERS = 8
-_GONE = (2, 3)  # actions DELETE and DELETEALL
-
-
-class MarkerDecoder:
-    """A MarkerArray topic; marker.id = body * 100 + joint, positions in metres in the camera's frame.
-
-    The markers carry no confidence: it is 1 for every point. The camera is named after the topic.
-    """
-
-    notes: ClassVar[tuple[str, ...]] = ("markers carry no confidence: 1 for every point",)
-    shows_camera_alive: ClassVar[bool] = True
-
-    def __init__(self, topic: str) -> None:
-        self.topic = topic
-        self.cameras = (camera_of(topic),)
-
-    def fresh_copy(self) -> MarkerDecoder:
-        """Itself: it remembers nothing."""
-        return self
-
-    def rows(self, message: Message) -> list[RawSkeleton]:
-        """A row a body; none for an empty or a clearing array."""
-        rows = []
-        for body, markers in sorted(_bodies(message.read()).items()):
-            points, confidence = missing_body()
-            for joint, marker in markers.items():
-                if joint in AZURE_INDEX:
-                    at = marker.pose.position
-                    points[AZURE_INDEX[joint]] = at.x, at.y, at.z
-                    confidence[AZURE_INDEX[joint]] = 1.0
-            stamp = stamp_ns(next(iter(markers.values())).header.stamp, self.topic)
-            rows.append(RawSkeleton(stamp or None, self.cameras[0], body, points, confidence, stamp_zero=not stamp))
-        return rows
-
-
-def is_skeleton(array: Any) -> bool:
-    """Whether the markers of an array look like a body's joints: any other node publishes markers too."""
-    return any(len(markers) >= _LEAST_MARKERS for markers in _bodies(array).values())
-
-
-def _bodies(array: Any) -> dict[int, dict[int, Any]]:
-    bodies: dict[int, dict[int, Any]] = {}
-    for marker in array.markers:
-        body, joint = divmod(marker.id, _IDS_A_BODY)
-        if marker.action not in _GONE and body >= 0 and joint < len(AZURE_JOINTS):
-            bodies.setdefault(body, {})[joint] = marker
-    return bodies
-
-
+_PEEK = 300  # messages by which a topic is described
 TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 _FRAME_NS = 15_000_000  # half a period of 30 Hz: openni_tracker stamps every joint by itself, some ms apart
 _LEAST_JOINTS = 6
@@ -150,14 +99,15 @@ class TfDecoder:
     )
     shows_camera_alive: ClassVar[bool] = False
 
-    def __init__(self, topic: str, cameras: tuple[str, ...]) -> None:
+    def __init__(self, topic: str, cameras: tuple[str, ...], unit: str = "m") -> None:
         self.topic = topic
         self.cameras = cameras
+        self._unit = unit
         self._people: dict[tuple[str, int], _Person] = defaultdict(_Person)
 
     def fresh_copy(self) -> TfDecoder:
         """A decoder that has seen nobody yet."""
-        return TfDecoder(self.topic, self.cameras)
+        return TfDecoder(self.topic, self.cameras, self._unit)
 
     def rows(self, message: Message) -> list[RawSkeleton]:
         """The frames that this message completes."""
@@ -177,7 +127,7 @@ class TfDecoder:
             if not person.joints:
                 person.first_ns = capture_ns
             at = transform.transform.translation
-            person.joints[joint] = np.array([at.x, at.y, at.z])
+            person.joints[joint] = METRES[self._unit] * np.array([at.x, at.y, at.z])
             if person.joints.keys() >= (person.known if len(person.known) >= _LEAST_JOINTS else OPENNI_JOINTS):
                 rows.append(_finish(person, camera, body))
         return rows
@@ -219,9 +169,6 @@ def find_cameras(messages: Iterable[Message]) -> tuple[str, ...]:
     return tuple(camera for camera, names in joints.items() if len(names) >= _LEAST_JOINTS)
 
 
-_METRES = {"m": 1.0, "mm": 1e-3}
-
-
 @dataclass(frozen=True)
 class GenericDecoder:
     """Reads skeletons from a message type that settings describe; one body, called 0."""
@@ -254,7 +201,7 @@ class GenericDecoder:
         if not len(elements):
             return []
         points, confidence = missing_body()
-        scale = _METRES[self.how.unit]
+        scale = METRES[self.how.unit]
         for name, element in self.how.index.items():
             if not 0 <= element < len(elements):
                 continue  # a shorter array has no such point
@@ -266,6 +213,11 @@ class GenericDecoder:
                     f"{where}: elements of {self.how.points!r} have no x, y, z; name an array of points"
                 ) from error
             confidence[i] = 1.0 if trust is None else float(trust[element]) if element < len(trust) else 0.0
+            if confidence[i] > 1.0:
+                raise LogError(
+                    f"{where}: found a confidence of {confidence[i]:g} in {self.how.confidence!r}; would be right: 0 "
+                    'to 1, so leave it out (confidence = "none")'
+                )
         stamp = None if self.how.stamp is None else stamp_ns(_field(content, self.how.stamp, where), where)
         return [RawSkeleton(stamp or None, self.how.camera, 0, points, confidence, stamp_zero=stamp == 0)]
 
@@ -284,3 +236,47 @@ def _field(content: Any, path: str, where: str) -> Any:
             raise LogError(f"{where}: has no field {path!r}; {name!r} is not among {known or 'its fields'}")
         content = getattr(content, name)
     return content
+
+
+_ARRAY_DEPTH = 4
+_LISTED = 6
+
+
+def describe_transforms(messages: Iterable[Message]) -> str:
+    """The frames of a tf topic, in a few words, by its first messages."""
+    children: dict[str, None] = {}
+    for message in islice(messages, _PEEK):
+        children.update(dict.fromkeys(str(transform.child_frame_id) for transform in message.read().transforms))
+    more = f" and {len(children) - _LISTED} more" if len(children) > _LISTED else ""
+    return (
+        f"has the frames {', '.join(list(children)[:_LISTED])}{more}; known are those of openni_tracker (head_1, "
+        "torso_1, left_elbow_1...), so publish the joints under these names"
+    )
+
+
+def describe_arrays(messages: Iterable[Message]) -> str:
+    """The arrays of points that a described decoder could read in a topic, in a few words, by its first messages."""
+    found: dict[str, int] = {}
+    for message in islice(messages, _PEEK):
+        for path, count in _point_arrays(message.read(), ""):
+            found[path] = max(found.get(path, 0), count)
+    if not found:
+        return (
+            "has no array of points with x, y, z that [[logs.decoders]] could read; write the bodies into a log of "
+            "ours with hrcreplay.logs.writer.LogWriter, or publish them as markers of the Azure Kinect"
+        )
+    arrays = ", ".join(f"{path!r} (up to {count})" for path, count in found.items())
+    return f"has arrays of points, which [[logs.decoders]] can read if they are one body's: {arrays}"
+
+
+def _point_arrays(content: Any, path: str) -> Iterator[tuple[str, int]]:
+    """Path and length of each array of points in a message."""
+    if path.count(".") >= _ARRAY_DEPTH:
+        return
+    for name in getattr(content, "__dataclass_fields__", ()):
+        value, at = getattr(content, name), f"{path}.{name}".lstrip(".")
+        if isinstance(value, list):
+            if value and all(hasattr(value[0], axis) for axis in "xyz"):
+                yield at, len(value)
+        elif hasattr(value, "__dataclass_fields__"):
+            yield from _point_arrays(value, at)

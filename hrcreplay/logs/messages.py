@@ -194,6 +194,10 @@ KINECT2_INDEX: Mapping[int, int] = {
 }
 
 
+#: Units of points -> metres.
+METRES: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
+
+
 class RawSkeleton(NamedTuple):
     """One body in one frame, not yet cleaned."""
 

@@ -1,4 +1,4 @@
-"""Checks whether the bodies of a log can be a person: size, left and right, uprightness, limbs never measured.
+"""Checks whether the bodies of a log can be a person: size, proportions, left and right, uprightness, limbs never seen.
 
 What is unusual becomes a note. What is certainly no person (a wrong unit) is refused, with what would correct it. All
 checks use medians, so that occasional errors of a tracker change nothing.
@@ -6,6 +6,7 @@ checks use medians, so that occasional errors of a tracker change nothing.
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -51,6 +52,7 @@ class BodyShape:
         self._waiting: list[Floats] = []
         self._statures: list[Floats] = []
         self._sides: list[Floats] = []
+        self._bones: list[Floats] = []
 
     def add(self, points: Floats) -> None:
         """Takes a body (20, 3) in the camera's frame, in what was said to be metres."""
@@ -66,6 +68,13 @@ class BodyShape:
             points = np.where(there[..., None] & (np.abs(points) < 1e12), points, np.nan)  # so that squares are numbers
             self._statures.append(statures(points))
             self._sides.append(handedness(points))
+            self._bones.append(_heights(points))
+
+    @property
+    def ratio(self) -> float:
+        """How many times as tall the body is by one bone as by another, by medians; 1 where few were seen."""
+        self._flush()
+        return _ratio(np.concatenate(self._bones)) if self._bones else 1.0
 
     @property
     def stature_m(self) -> float:
@@ -93,12 +102,37 @@ def _median(parts: list[Floats]) -> float:
 
 def statures(points: Floats) -> Floats:
     """(n,) how tall bodies (n, 20, 3) are by the middle one of their bones [m]; NaN where none is seen."""
-    lengths = np.linalg.norm(points[:, _TO] - points[:, _FROM], axis=2)
-    by_bone = np.where(lengths > 0.0, lengths, np.nan) / _SHARE
+    by_bone = _heights(points)
     found = np.full(len(points), np.nan)
     some = np.isfinite(by_bone).any(axis=1)
     found[some] = np.nanmedian(by_bone[some], axis=1)
     return found
+
+
+#: A person is at most so many times as tall by one bone as by another; trackers' bodies reach 1.6.
+PROPORTION = 2.5
+_FEW_BONES = 4
+
+
+def bone_ratio(points: Floats) -> float:
+    """How many times as tall bodies (n, 20, 3) are by one bone as by another, by medians; 1 where few are seen."""
+    return _ratio(_heights(points))
+
+
+def _heights(points: Floats) -> Floats:
+    """(n, bones) how tall bodies are by each bone; NaN where it is not seen."""
+    lengths = np.linalg.norm(points[:, _TO] - points[:, _FROM], axis=2)
+    return np.asarray(np.where(lengths > 0.0, lengths, np.nan) / _SHARE)
+
+
+def _ratio(heights: Floats) -> float:
+    medians = [np.median(seen) for bone in heights.T if len(seen := bone[np.isfinite(bone)])]
+    return float(max(medians) / min(medians)) if len(medians) >= _FEW_BONES else 1.0
+
+
+def looks_like_person(points: Floats) -> bool:
+    """Whether bodies (n, 20, 3), in any unit, have the proportions of a person."""
+    return bone_ratio(points) <= PROPORTION
 
 
 def handedness(points: Floats) -> Floats:
@@ -132,6 +166,16 @@ def size_remark(camera: str, stature_m: float, mend: str) -> str | None:
     return f"{text}; are its points in metres? {mend}"
 
 
+def proportion_remark(camera: str, ratio: float) -> str | None:
+    """A note where bones do not belong to one person; None where they may."""
+    if ratio <= PROPORTION:
+        return None
+    return (
+        f"camera {camera}: the body is {ratio:.1f} times as tall by one bone as by another, where {PROPORTION:g} is "
+        "the most that trackers give; are the names or the indices of its joints right, and all joints of one person?"
+    )
+
+
 def impossible_size(stature_m: float) -> bool:
     """Whether nobody can be of that size."""
     return stature_m > _CERTAIN * PERSON_M[1] or stature_m < PERSON_M[0] / _CERTAIN
@@ -159,6 +203,55 @@ def unmeasured_limbs(seen: Mapping[str, Bools]) -> Iterator[str]:
                 f"limb {limb} was never measured: no camera gave {' or '.join(lacking)}; its volume holds all that its "
                 "joints allow"
             )
+
+
+_JUMP_M = 0.3  # within _SOON_NS: nobody is so fast
+_SOON_NS = 80_000_000
+_BACK = 1.0 / 3.0  # of the jump: nearer than this to where the body was before it
+_ALTERNATING = 0.1  # of the rows
+
+
+class Alternation:
+    """Whether a body's rows alternate between two places, as where two cameras publish under one name."""
+
+    def __init__(self) -> None:
+        self._before: dict[tuple[str, int], tuple[tuple[int, Floats], ...]] = {}  # a body's last two rows
+        self._rows: Counter[str] = Counter()
+        self._returns: Counter[str] = Counter()
+        self._jumps_m: dict[str, list[float]] = defaultdict(list)
+
+    def add(self, camera: str, body: int, t_ns: int, points_m: Floats) -> None:
+        """Takes a row: (20, 3) points in the camera's frame [m]."""
+        self._rows[camera] += 1
+        before = self._before.get((camera, body), ())
+        self._before[(camera, body)] = (*before[-1:], (t_ns, points_m))
+        if len(before) < 2 or t_ns - before[0][0] > 2 * _SOON_NS:
+            return
+        jump_m = _apart(points_m, before[1][1])
+        if not jump_m > _JUMP_M or not _apart(points_m, before[0][1]) < _BACK * jump_m:
+            return
+        others = [row for (of, other), rows in self._before.items() if of == camera and other != body for row in rows]
+        if any(t_ns - at_ns < _SOON_NS and _apart(points_m, at) < _BACK * jump_m for at_ns, at in others):
+            return  # two people whose numbers the tracker exchanges
+        self._returns[camera] += 1
+        self._jumps_m[camera].append(jump_m)
+
+    def remarks(self) -> Iterator[str]:
+        """A sentence for each camera whose bodies alternate."""
+        for camera, count in self._returns.items():
+            if count >= _FEW and count > _ALTERNATING * self._rows[camera]:
+                jump_m = float(np.median(self._jumps_m[camera]))
+                yield (
+                    f"camera {camera}: a body is in two places by turns, {jump_m:.2f} m apart ({count} times there and "
+                    "back): two cameras under one name; would be right: another frame or topic for each"
+                )
+
+
+def _apart(points_m: Floats, others_m: Floats) -> float:
+    """Median distance of the points that both bodies have; NaN where there are none [m]."""
+    away = np.linalg.norm(points_m - others_m, axis=1)
+    known = away[np.isfinite(away)]
+    return float(np.median(known)) if len(known) else float("nan")
 
 
 class BodyPosture:

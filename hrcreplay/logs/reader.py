@@ -4,29 +4,36 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from itertools import islice
+from dataclasses import dataclass
 from pathlib import Path
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs import log_files, messages, plausibility
 from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
 from hrcreplay.logs.decoders import (
-    MARKER_TYPE,
     TF_TYPES,
     GenericDecoder,
-    MarkerDecoder,
     OwnDecoder,
     TfDecoder,
+    describe_arrays,
+    describe_transforms,
     find_cameras,
-    is_skeleton,
 )
 from hrcreplay.logs.log_files import Header, JointTopic, JointTrack, LogFiles, Truth, open_source
+from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder, MarkerLayout, survey_markers
 from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, topic_list
 from hrcreplay.records import CameraFrames
-from hrcreplay.settings.sections import Decoder, Logs
+from hrcreplay.settings.sections import Logs
 
 _OWN = "hrcreplay.Skeleton"
-_PEEK = 300  # markers: ten seconds of a sensor to show a body in
+_BODIES = "body_tracking"  # in the name of a topic: it carries bodies even where nobody is in sight
+_NO_BODIES = (
+    "sensor_msgs/JointState",
+    "hrcreplay.JointState",
+    "hrcreplay.Truth",
+    "hrcreplay.Task",
+    "rcl_interfaces/Log",
+)
 _HOW = "Name one with --topic NAME, or a decoder for it in [logs.decoders] of the settings file."
 
 
@@ -34,13 +41,21 @@ _HOW = "Name one with --topic NAME, or a decoder for it in [logs.decoders] of th
 DEFAULT = Logs()
 
 
-def choose_decoders(source: LogFiles, names: tuple[str, ...], described: tuple[Decoder, ...]) -> list[SkeletonDecoder]:
+@dataclass(frozen=True)
+class Chosen:
+    """The decoders of a log's skeleton topics, and what is told of topics that have none."""
+
+    decoders: list[SkeletonDecoder]
+    remarks: list[str]
+
+
+def choose_decoders(source: LogFiles, options: Logs) -> Chosen:
     """The decoders of a log's skeleton topics.
 
     Args:
         source: The log's files.
-        names: Topics that the user named; () for all that a decoder knows.
-        described: Decoders that settings describe; a topic with one is read by it.
+        options: The topics that the user named, () for all that a decoder knows; the decoders that settings describe,
+            by which their topics are read; units and numbering of markers.
 
     Returns:
         A decoder a topic, none where no topic carries skeletons.
@@ -49,40 +64,74 @@ def choose_decoders(source: LogFiles, names: tuple[str, ...], described: tuple[D
         LogError: A named topic is not in the log, or carries no skeletons.
     """
     found = {topic.name: topic for topic in source.topics()}
-    for name in (*names, *(decoder.topic for decoder in described)):
+    for name in (*options.topics, *(decoder.topic for decoder in options.decoders)):
         if name not in found:
             raise LogError(f"{source.path}: no topic {name}; found {topic_list(found.values())}")
-    by_topic = {decoder.topic: GenericDecoder(decoder) for decoder in described}
-    decoders: list[SkeletonDecoder] = []
+    by_topic = {decoder.topic: GenericDecoder(decoder) for decoder in options.decoders}
+    chosen = Chosen([], [])
     for topic in found.values():
-        if names and topic.name not in names:
+        if options.topics and topic.name not in options.topics:
             continue
-        decoder = by_topic.get(topic.name) or _known(source, topic, asked=bool(names))
+        decoder = by_topic.get(topic.name) or _known(source, topic, options, chosen.remarks)
         if decoder is not None:
-            decoders.append(decoder)
-        elif names:
-            raise LogError(f"{source.path}: no skeletons on {topic.name} ({topic.type}). {_HOW}")
-    _check_cameras(source, decoders)
-    return decoders
+            chosen.decoders.append(decoder)
+        elif options.topics:
+            told = "".join(f": {remark}" for remark in chosen.remarks[-1:])
+            raise LogError(f"{source.path}: no skeletons on {topic.name} ({topic.type}){told}. {_HOW}")
+    if not chosen.decoders:
+        chosen.remarks.extend(_descriptions(source))
+    _check_cameras(source, chosen.decoders)
+    return chosen
 
 
-def no_skeletons_error(source: LogFiles) -> LogError:
+def no_skeletons_error(source: LogFiles, remarks: list[str]) -> LogError:
     """The error for a log in which no topic carries skeletons, with what the user can do."""
-    return LogError(f"{source.path}: no skeleton topic; found {topic_list(source.topics())}.\n{_HOW}")
+    told = "".join(f"\n{remark}." for remark in remarks)
+    return LogError(f"{source.path}: no skeleton topic; found {topic_list(source.topics())}.{told}\n{_HOW}")
 
 
-def _known(source: LogFiles, topic: Topic, *, asked: bool) -> SkeletonDecoder | None:
+def _known(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) -> SkeletonDecoder | None:
     if not topic.count:
         return None
     if topic.type == _OWN:
         return OwnDecoder(topic.name, messages.camera_of_topic(topic.name))
     if topic.type in TF_TYPES:
         cameras = find_cameras(source.messages([topic.name]))
-        return TfDecoder(topic.name, cameras) if cameras else None
+        return TfDecoder(topic.name, cameras, options.unit) if cameras else None
     if topic.type == MARKER_TYPE:
-        looks = any(is_skeleton(m.read()) for m in islice(source.messages([topic.name]), _PEEK))
-        return MarkerDecoder(topic.name) if looks or asked or "body_tracking" in topic.name else None
+        return _markers(source, topic, options, remarks)
     return None
+
+
+def _markers(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) -> SkeletonDecoder | None:
+    """The decoder of a marker topic; None, with a remark, where its markers are no bodies."""
+    layout = survey_markers(source.messages([topic.name]), options.marker_ids_per_body)
+    if isinstance(layout, MarkerLayout):
+        return MarkerDecoder(topic.name, layout, options.unit)
+    expected = bool(options.topics) or _BODIES in topic.name
+    if layout.certain and _BODIES in topic.name:
+        raise LogError(
+            f"{source.path}: {topic.name}: found {layout.found}; would be right: a body's 32 joints of the Azure "
+            "Kinect by their ids, how many ids a body has in logs.marker_ids_per_body, or other topics with --topic"
+        )
+    if layout.certain:
+        remarks.append(f"{topic.name} is left out, as its markers are no skeletons: found {layout.found}")
+        return None
+    return MarkerDecoder(topic.name, layout.layout, options.unit) if expected else None
+
+
+def _descriptions(source: LogFiles) -> Iterator[str]:
+    """What the topics of a log without skeletons hold, as far as they may be bodies."""
+    for topic in source.topics():
+        if not topic.count or topic.type in _NO_BODIES:
+            continue
+        try:
+            if topic.type in TF_TYPES:
+                yield f"{topic.name} {describe_transforms(source.messages([topic.name]))}"
+            elif topic.type != MARKER_TYPE:
+                yield f"{topic.name} ({topic.type}) {describe_arrays(source.messages([topic.name]))}"
+        except Undecodable as error:
+            yield str(error)
 
 
 def _check_cameras(source: LogFiles, decoders: list[SkeletonDecoder]) -> None:
@@ -98,6 +147,7 @@ def _check_cameras(source: LogFiles, decoders: list[SkeletonDecoder]) -> None:
 
 
 _LATE_NS = 10**9  # a camera absent for so long at either end of the log is worth a remark
+_CONTRADICTING = 0.05  # of a camera's rows
 _FROZEN_S = 0.5  # so is one that gives the same skeleton for so long
 #: What is told of points that were made missing, and of rows that repeat.
 _TOLD = ("points_at_origin", "points_coincident", "points_not_finite", "points_too_far")
@@ -106,9 +156,10 @@ _TOLD = ("points_at_origin", "points_coincident", "points_not_finite", "points_t
 class Log:
     """An open log. ``defects`` (names: clean.DEFECTS) and ``notes`` are about the latest pass over its frames."""
 
-    def __init__(self, source: LogFiles, decoders: list[SkeletonDecoder], options: Logs) -> None:
+    def __init__(self, source: LogFiles, chosen: Chosen, options: Logs) -> None:
         self._source = source
-        self._decoders = decoders
+        self._decoders = decoders = chosen.decoders
+        self._topic_remarks = chosen.remarks
         self._options = options
         self._joints = log_files.find_joints(source, options.joints_topic)
         self._truth = log_files.truth_topic(source)
@@ -135,7 +186,7 @@ class Log:
     @property
     def notes(self) -> list[str]:
         """Remarks for the user."""
-        return [*self._source.damage().notes, *self._remarks]
+        return [*self._source.damage().notes, *self._topic_remarks, *self._remarks]
 
     @property
     def topics(self) -> list[Topic]:
@@ -149,11 +200,12 @@ class Log:
             LogError: The log is broken in a way that cannot be worked around.
         """
         self._reading.clear()
-        self._remarks = [note for decoder in self._decoders for note in decoder.notes]
+        self._remarks = list(dict.fromkeys(note for decoder in self._decoders for note in decoder.notes))
         decoders = {decoder.topic: decoder.fresh_copy() for decoder in self._decoders}
         self._refusals, self.points_seen = [], 0
         cleaner = Cleaner(self.header.cameras, self._options.gap_s, self._reading)
         shapes = {camera: plausibility.BodyShape() for camera in self.header.cameras}
+        places = plausibility.Alternation()
         for message in self._source.messages(list(decoders), start_ns, end_ns):
             decoder = decoders[message.topic.name]
             try:
@@ -165,6 +217,7 @@ class Log:
                 cleaner.note_arrival(decoder.cameras[0], message.arrival_ns)
             for row in rows:
                 shapes[row.camera].add(row.points_m)
+                places.add(row.camera, row.body, message.arrival_ns, row.points_m)
                 chunk = cleaner.add(row, message.arrival_ns)
                 if chunk is not None:
                     yield chunk
@@ -173,6 +226,8 @@ class Log:
             yield chunk
         self._remark(cleaner, start_ns, end_ns)
         self._judge(cleaner, shapes)
+        self._refuse(_contradictions(cleaner))
+        self._refuse(places.remarks())
 
     def check(self) -> None:
         """Refuses a log whose latest complete pass showed bodies that are certainly no person.
@@ -192,10 +247,18 @@ class Log:
                 self._remarks.append(size)
                 if shape.certain and plausibility.impossible_size(shape.stature_m):
                     self._refusals.append(size)
+            proportion = plausibility.proportion_remark(camera, shape.ratio)
+            if proportion is not None and shape.certain:
+                self._remarks.append(proportion)
             side = plausibility.mirror_remark(camera, shape.side)
             if side is not None:
                 self._remarks.append(side)
         self._remarks.extend(plausibility.unmeasured_limbs(cleaner.seen))
+
+    def _refuse(self, remarks: Iterator[str]) -> None:
+        found = list(remarks)
+        self._remarks.extend(found)
+        self._refusals.extend(found)
 
     def _unit_of(self, camera: str) -> str:
         """Where the unit of a camera's points is set."""
@@ -203,6 +266,9 @@ class Log:
             if camera in decoder.cameras and isinstance(decoder, GenericDecoder):
                 other = "m" if decoder.how.unit == "mm" else "mm"
                 return f'would be right, in its [[logs.decoders]]: unit = "{other}", or points in {decoder.how.unit}'
+            if camera in decoder.cameras and not isinstance(decoder, OwnDecoder):
+                other = "m" if self._options.unit == "mm" else "mm"
+                return f"would be right: --set logs.unit={other}, or points in {self._options.unit}"
         return "would be right: points in metres"
 
     def joints(self) -> Iterator[JointTrack]:
@@ -231,6 +297,17 @@ class Log:
             if end - last > _LATE_NS:
                 self._remarks.append(f"camera {camera} ends {(end - last) / 1e9:.2f} s before the log")
             self._remarks.extend(_flaws(camera, cleaner, begin))
+
+
+def _contradictions(cleaner: Cleaner) -> Iterator[str]:
+    """A sentence for each camera of which many rows say something else than the row before, of the same instant."""
+    for (camera, name), count in sorted(cleaner.flaws.items()):
+        if name == "frames_contradicting" and count > _CONTRADICTING * cleaner.rows[camera]:
+            yield (
+                f"camera {camera}: {count} of {cleaner.rows[camera]} rows are of the same body and instant as the row "
+                "before, but elsewhere: two bodies or cameras under one name; would be right: ids, frames or topics of "
+                "their own"
+            )
 
 
 def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
@@ -265,10 +342,10 @@ def open_log(path: Path, options: Logs = DEFAULT, *, skeletons: bool = True) -> 
         LogError: It cannot be read, holds no messages, lacks a named topic, or has no skeletons.
     """
     source = open_source(path)
-    decoders = choose_decoders(source, options.topics, options.decoders)
-    if skeletons and not decoders:
-        raise no_skeletons_error(source)
-    return Log(source, decoders, options)
+    chosen = choose_decoders(source, options)
+    if skeletons and not chosen.decoders:
+        raise no_skeletons_error(source, chosen.remarks)
+    return Log(source, chosen, options)
 
 
 def _header(

@@ -86,7 +86,10 @@ def as_overrides(settings: Settings) -> tuple[str, ...]:
 def _toml(value: Any, *, inside: bool = False) -> str:
     """A value as ``--set`` takes it: TOML, or a plain word."""
     if isinstance(value, BaseModel):
-        value = value.model_dump(exclude_none=True)
+        usual = {name: field.default for name, field in type(value).model_fields.items()}
+        value = {name: part for name in usual if (part := getattr(value, name)) != usual[name]}
+    if value is None:
+        return '"none"'
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(key)} = {_toml(part, inside=True)}" for key, part in value.items()) + "}"
     if isinstance(value, (list, tuple)):

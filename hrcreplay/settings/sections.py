@@ -7,9 +7,9 @@ corrected, docs/paper.md says how.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from hrcreplay.records import POINTS
 
@@ -24,6 +24,16 @@ class Section(BaseModel):
     """A group of settings: frozen, and an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _none(cls, given: Any) -> Any:
+        """Takes the word "none" for no value where a setting may have none: TOML has no other way to say it."""
+        if not isinstance(given, dict):
+            return given
+        fields = cls.model_fields
+        optional = {name for name, field in fields.items() if type(None) in get_args(field.annotation)}
+        return {name: None if value == "none" and name in optional else value for name, value in given.items()}
 
 
 class Decoder(Section):
@@ -40,7 +50,7 @@ class Decoder(Section):
     unit: Literal["m", "mm"] = "m"
     """Unit of the points."""
     stamp: str | None = "header.stamp"
-    """Path to the capture time; none: the arrival time is used."""
+    """Path to the capture time; "none": the arrival time is used."""
     confidence: str | None = None
     """Path to an array of confidences in [0, 1], one a point; none: every finite point has confidence 1."""
 
@@ -58,6 +68,11 @@ class Logs(Section):
     """Skeleton topics to read; none: all that a decoder knows."""
     decoders: tuple[Decoder, ...] = ()
     """Decoders for message types the package does not know."""
+    unit: Literal["m", "mm"] = "m"
+    """Unit of the positions in markers and transforms."""
+    marker_ids_per_body: Annotated[int, Field(ge=1)] | None = None
+    """Ids of markers from one body to the next, of which the first are the joints; none: 100, or 33 or 32 where only
+    that fits the ids in the log."""
     joints_topic: str | None = None
     """Topic of the robot's joint states; none: the first sensor_msgs/JointState or our own."""
     person_jump_m: Positive = 0.8
@@ -301,9 +316,9 @@ class ZenohKey(Section):
     index: dict[str, int] = Field(default_factory=dict)
     """cdr: which element is which body point."""
     unit: Literal["m", "mm"] = "m"
-    """cdr: unit of the points."""
+    """cdr: unit of the points, also of markers and transforms."""
     stamp: str | None = "header.stamp"
-    """cdr: path to the capture time."""
+    """cdr: path to the capture time; "none": the arrival time is used."""
     confidence: str | None = None
     """cdr: path to an array of confidences."""
 

@@ -204,8 +204,8 @@ def play(path: Path, options: dict[str, Any], *, repeat: bool) -> Playback:
 
     Args:
         path: The log.
-        options: ``topics`` and ``decoders`` as in the settings' section ``logs``; may be empty.
+        options: The settings' section ``logs``; may be empty.
         repeat: Whether it starts again at its end.
     """
-    chosen = Logs.model_validate({name: options.get(name, ()) for name in ("topics", "decoders")})
+    chosen = Logs.model_validate(options)
     return Playback(lambda: playback_items(open_log(path, chosen), repeat=repeat))

@@ -34,13 +34,14 @@ from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.logs import decoders, ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
-from hrcreplay.logs.decoders import GenericDecoder, MarkerDecoder, OwnDecoder, TfDecoder
+from hrcreplay.logs.decoders import GenericDecoder, OwnDecoder, TfDecoder
+from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder
 from hrcreplay.logs.messages import Message, RawSkeleton, SkeletonDecoder, Topic, Undecodable
 from hrcreplay.settings.sections import Decoder, ZenohKey
 
 _OWN = "hrcreplay.Skeleton"
 _RMW_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")  # in the keys of rmw_zenoh: <domain>/<topic>/<type>/<hash>
-_KNOWN = (decoders.MARKER_TYPE, *decoders.TF_TYPES)
+_KNOWN = (MARKER_TYPE, *decoders.TF_TYPES)
 _AHEAD_NS = 10**9  # a capture further in the future would make all that follow look late
 _FAR_NS = round(STAMP_FAR_S * 1e9)
 _OLD_NS = 10**9  # an older capture hints at clocks that are not set
@@ -129,9 +130,9 @@ class CameraSubscription:
             how = {name: getattr(given, name) for name in ("points", "index", "unit", "stamp", "confidence")}
             return topic, GenericDecoder(Decoder(topic=key, camera=self._camera, **how))
         if msgtype in decoders.TF_TYPES:
-            return topic, TfDecoder(key, (self._camera,))
-        if msgtype == decoders.MARKER_TYPE:
-            return topic, MarkerDecoder(key)
+            return topic, TfDecoder(key, (self._camera,), given.unit)
+        if msgtype == MARKER_TYPE:
+            return topic, MarkerDecoder(key, unit=given.unit)
         raise LogError(f"no decoder for {msgtype}; describe it with points and index, as in [[logs.decoders]]")
 
     def _note(self, text: str) -> Outgoing:
@@ -317,7 +318,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m hrcreplay.live.person.source", description=__doc__)
     parser.add_argument("--fd", type=int, required=True, help="socket to control")
     parser.add_argument("--anchor", type=int, required=True, help="session time minus monotonic time [ns]")
-    parser.add_argument("--options", type=json.loads, default={}, help='JSON: "topics", "decoders" as in [logs]')
+    parser.add_argument("--options", type=json.loads, default={}, help="JSON of the settings' section logs")
     parser.add_argument("--repeat", action="store_true", help="start the recording again at its end")
     kind = parser.add_mutually_exclusive_group(required=True)
     kind.add_argument("--log", type=Path, help="recording to play")
