@@ -221,7 +221,14 @@ class Alternation:
         self._jumps_m: dict[str, list[float]] = defaultdict(list)
 
     def add(self, camera: str, body: int, t_ns: int, points_m: Floats) -> None:
-        """Takes a row: (20, 3) points in the camera's frame [m]."""
+        """Takes a row.
+
+        Args:
+            camera: Its camera.
+            body: The body's number.
+            t_ns: Its arrival [ns].
+            points_m: (20, 3) in the camera's frame [m].
+        """
         self._rows[camera] += 1
         before = self._before.get((camera, body), ())
         self._before[(camera, body)] = (*before[-1:], (t_ns, points_m))
