@@ -5,6 +5,10 @@ A message says *where: what was found; what would be right*. A bug keeps its tra
 
 from __future__ import annotations
 
+#: Exit codes of ``verify`` where a run does not come out bit by bit as it was recorded: something differs; nothing
+#: differs but numbers, by no more than 1e-9, and the run was recorded on another machine.
+EXIT_DIFFERS, EXIT_SAME_DECISIONS = 1, 6
+
 
 class HrcReplayError(Exception):
     """Something the user can mend. The command prints the message and leaves with ``exit_code``."""

@@ -165,7 +165,7 @@ def test_refusals_and_reasons_of_the_plan_are_explained() -> None:
 def test_exit_codes() -> None:
     kinds = (errors.HrcReplayError, errors.SettingsError, errors.LogError, errors.LiveStopped)
     codes = [int(row[0]) for row in rows(section(7), "| exit code |")]
-    assert codes == [0, *(kind.exit_code for kind in kinds)]
+    assert codes == [0, *(kind.exit_code for kind in kinds), errors.EXIT_SAME_DECISIONS]
 
 
 def test_every_setting_of_live_with_its_default() -> None:

@@ -127,15 +127,18 @@ def verify(
         bool, typer.Option("--finish", help="First make the run folder of a killed session, RUN.partial, from its log.")
     ] = False,
 ) -> None:
-    """Compute a run again from its log and compare every bit; says 'identical', or what differs first."""
+    """Compute a run again from its log and compare every bit.
+
+    Says 'identical' (exit code 0); 'same decisions, numbers within 1e-9' (exit code 6) where the run was recorded on
+    another processor and nothing else differs; or what differs first (exit code 1).
+    """
     from hrcreplay.live import verify as again
     from hrcreplay.live.record import folder
 
     run = folder.finish(run) if finish else run
     verdict = again.verify(run)
     sys.stdout.write("\n".join(verdict.lines) + "\n")
-    if not verdict.identical:
-        raise typer.Exit(1)
+    raise typer.Exit(int(verdict.agreement))
 
 
 def _positive(duration: float | None) -> float:

@@ -1,6 +1,8 @@
-"""The command ``verify``: computes a recorded run again and compares it with the record, bit for bit.
+"""The command ``verify``: computes a recorded run again and compares it with the record.
 
 A live session is computed again from its log, message by message; a replay by running its command from its run.json.
+Every bit is compared. On another machine numbers may differ by ``differences.TOLERANCE``, and the verdict is then
+another one: the same decisions.
 """
 
 from __future__ import annotations
@@ -8,31 +10,103 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
+from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.egm.codec import AXES
-from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.errors import EXIT_DIFFERS, EXIT_SAME_DECISIONS, LogError, SettingsError
 from hrcreplay.live.control import setup
+from hrcreplay.live.differences import (
+    TOLERANCE,
+    Difference,
+    decisions_differing,
+    differing,
+    json_differing,
+    messages_differing,
+    numbers_differing,
+    tables_differing,
+    worst,
+)
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.records import STATUSES, Floats, SweptVolumes
 from hrcreplay.run import replay
+from hrcreplay.run.job import versions
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import state_columns
+from hrcreplay.store.machine import describe_machine, name_machine
 
 COMMANDS = ("fuse", "predict", "plan", "report")
 _CONTEXT = ("versions", "limits", "task", "cell")  #: of run.json: what else may make a difference
 
 
-def replay_again(run: Path) -> Iterator[str]:
-    """What is not the same when a replay is run again; nothing where all of it is.
+class Agreement(IntEnum):
+    """How a run came out when it was computed again; the value is the exit code."""
+
+    IDENTICAL = 0
+    DIFFERS = EXIT_DIFFERS
+    SAME_DECISIONS = EXIT_SAME_DECISIONS
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How a run came out again, and what there is to say of it."""
+
+    agreement: Agreement
+    lines: tuple[str, ...]
+
+    @property
+    def identical(self) -> bool:
+        """Whether every bit was the same."""
+        return self.agreement is Agreement.IDENTICAL
+
+
+#: What run.json says of a machine, as a message calls it.
+_PARTS = {
+    **dict.fromkeys(("processor", "architecture", "features"), "processor"),
+    "blas": "BLAS kernels",
+    "numpy_simd": "numpy loops",
+    "numba_target": "numba target",
+    "c_library": "C library",
+    "environment": "environment variables",
+}
+
+
+def find_other_parts(recorded: dict[str, Any]) -> str:
+    """What of the machine is not that of the record, in words; empty where all of it is, or the record names none.
+
+    Other versions come with it, but do not alone explain a difference.
+    """
+    machine, now = recorded.get("machine"), describe_machine()
+    if not isinstance(machine, dict):
+        return ""
+    parts = [label for name, label in _PARTS.items() if machine.get(name) != now[name]]
+    parts += ["versions"] if parts and recorded.get("versions") != versions() else []
+    return ", ".join(dict.fromkeys(parts))
+
+
+def _origin(recorded: dict[str, Any]) -> tuple[str, ...]:
+    """Where a run was recorded and where it was computed again."""
+    here = describe_machine()
+    machine = recorded.get("machine")
+    if machine == here:
+        return (f"recorded and computed again on {name_machine(here)}",)
+    return (f"recorded on {name_machine(machine)}", f"computed again on {name_machine(here)}")
+
+
+def _same_decisions(other: str) -> str:
+    within = np.format_float_scientific(TOLERANCE, trim="-", exp_digits=1)
+    return f"same decisions, numbers within {within} (other {other})"
+
+
+def _replay(run: Path) -> Verdict:
+    """Runs a replay again and compares its outputs.
 
     Raises:
         SettingsError: No complete run of a replay.
@@ -47,8 +121,8 @@ def replay_again(run: Path) -> Iterator[str]:
     if not log.exists():
         raise LogError(f"{log}: the log of {run} is gone; put it back, or start where its path leads to it")
     if (now := run_folder.sha256(log)) != digest:
-        yield f"{log}: is not the log of this run: SHA-256 recorded {digest}, now {now}"
-        return
+        line = f"{log}: is not the log of this run: SHA-256 recorded {digest}, now {now}"
+        return Verdict(Agreement.DIFFERS, (line, *_changed(run)))
     with TemporaryDirectory(prefix="hrcreplay-") as temporary:
         # A run folder that says all of itself and holds nothing, so that nothing can be taken over from it.
         plan = Path(temporary) / "plan"
@@ -56,23 +130,47 @@ def replay_again(run: Path) -> Iterator[str]:
         (plan / "run.json").write_text(json.dumps({**meta, "stages": {}, "outputs": {}}))
         smooth = "smooth.parquet" in meta["outputs"]
         made = replay.run(meta["command"], plan, out=Path(temporary) / "again", smooth=smooth)
-        yield from _compared(run, meta, made)
+        return _compared(run, meta, made)
 
 
-def _compared(run: Path, meta: dict[str, Any], made: Path) -> Iterator[str]:
+def _compared(run: Path, meta: dict[str, Any], made: Path) -> Verdict:
     now = run_folder.read_meta(made)
-    recorded, found = meta["outputs"], now["outputs"]
-    different = [name for name in sorted({*recorded, *found}) if recorded.get(name) != found.get(name)]
+    recorded, again = meta["outputs"], now["outputs"]
+    different = [name for name in sorted({*recorded, *again}) if recorded.get(name) != again.get(name)]
+    changed = list(_changed(run))
+    if not different and not changed:
+        return Verdict(Agreement.IDENTICAL, ("identical",))
+    other = find_other_parts(meta)
+    found = {name: _output_differing(name, run, made, recorded, again) for name in different}
+    drawn = [name for name in different if not found[name]]
+    small = [one.at(f"{name}: ") for name, ones in found.items() for one in ones]
+    if other and not changed and all(one.tolerable for one in small):
+        lines = [_same_decisions(other), *_origin(meta)]
+        lines += [f"largest difference: {worst(small).text}"] if small else []
+        lines += [f"not compared number by number, since drawn from the tables: {', '.join(drawn)}"] if drawn else []
+        return Verdict(Agreement.SAME_DECISIONS, tuple(lines))
+    lines = []
     for name in different:
-        if name not in found:
-            yield f"{name}: recorded, but not made again"
-        elif name not in recorded:
-            yield f"{name}: not recorded, but made again"
-        else:
-            where = _table(run / name, made / name) if name.endswith(".parquet") else None
-            yield f"{name}: {where or 'not the same bytes again'}"
+        ones = found[name]
+        shown = (worst(ones) if other else ones[0]).text if ones else "not the same bytes again"
+        lines.append(f"{name}: {shown}")
     for key in _CONTEXT if different else ():
-        yield from _context(key, meta.get(key), now.get(key))
+        lines += _context(key, meta.get(key), now.get(key))
+    return Verdict(Agreement.DIFFERS, (*lines, *(_origin(meta) if different else ()), *changed))
+
+
+def _output_differing(
+    name: str, run: Path, made: Path, recorded: dict[str, str], again: dict[str, str]
+) -> list[Difference]:
+    """What differs in an output whose bytes do; nothing for one that is drawn, of which the bytes are all there is."""
+    if name not in again:
+        return [Difference("recorded, but not made again", np.inf)]
+    if name not in recorded:
+        return [Difference("not recorded, but made again", np.inf)]
+    if not name.endswith((".parquet", ".json")):
+        return []
+    found = (tables_differing if name.endswith(".parquet") else json_differing)(run / name, made / name)
+    return found or [Difference("not the same bytes again", np.inf)]
 
 
 def _context(key: str, recorded: Any, now: Any) -> Iterator[str]:
@@ -87,54 +185,12 @@ def _context(key: str, recorded: Any, now: Any) -> Iterator[str]:
             yield f"{key} of {name}{values}" if values else f"{key}: {name} is not that of the run"
 
 
-def _table(recorded: Path, made: Path) -> str | None:
-    """The first row, and in it the first column, that differs between two tables."""
-    try:
-        tables = pq.read_table(recorded), pq.read_table(made)
-    except (OSError, pa.ArrowException):
-        return None
-    names = [table.column_names for table in tables]
-    if names[0] != names[1]:
-        return f"columns: recorded {len(names[0])}, again {len(names[1])}"
-    rows = min(len(table) for table in tables)
-    firsts = {name: _row(*(table.column(name)[:rows] for table in tables)) for name in names[0]}
-    row = min((found for found in firsts.values() if found is not None), default=None)
-    if row is None:
-        lengths = [len(table) for table in tables]
-        return None if lengths[0] == lengths[1] else f"rows: recorded {lengths[0]}, again {lengths[1]}"
-    name = next(name for name, found in firsts.items() if found == row)
-    mine, yours = (table.column(name)[row].as_py() for table in tables)
-    return f"row {row}, {name}: recorded {mine!r}, again {yours!r}"
-
-
-def _row(recorded: pa.ChunkedArray, made: pa.ChunkedArray) -> int | None:
-    """The first row in which two columns differ by a bit."""
-    if recorded.type != made.type:
-        return 0
-    if pa.types.is_floating(recorded.type):
-        mine, yours = (column.to_numpy().view(np.int64) for column in (recorded, made))
-        different = np.flatnonzero(mine != yours)
-        return int(different[0]) if len(different) else None
-    if recorded.equals(made):
-        return None
-    pairs = zip(recorded.to_pylist(), made.to_pylist(), strict=True)
-    return next((i for i, (mine, yours) in enumerate(pairs) if mine != yours), None)
-
-
 LOG = "log.mcap"
 _ROW = (
     *(f"{name}{axis}" for name in ("q_measured", "q", "dq", "u") for axis in range(1, AXES + 1)),
     *("ref_x", "ref_y", "ref_z", "tcp_x", "tcp_y", "tcp_z", "tcp_speed", "ref_speed", "programme_s", "distance_m"),
     *("horizon_s", "tau_s", "certified"),
 )  #: the numbers of a MotionRow, named as in motion.parquet
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Whether a run came out the same again, and what there is to say of it."""
-
-    identical: bool
-    lines: tuple[str, ...]
 
 
 class DecisionMaker(Protocol):
@@ -164,33 +220,42 @@ def verify(run: Path, build: ControllerFactory = setup.build_controller) -> Verd
         SettingsError: No run folder, or one of a command that cannot be run again.
         LogError: The log of the run cannot be read.
     """
-    if not (run / LOG).exists():
-        lines = [*replay_again(run), *_changed(run)]
-        return Verdict(identical=False, lines=tuple(lines)) if lines else Verdict(identical=True, lines=("identical",))
-    return _session(run, build)
+    return _session(run, build) if (run / LOG).exists() else _replay(run)
 
 
 def _session(run: Path, build: ControllerFactory) -> Verdict:
     log = SessionLogReader(run / LOG)
-    again = SessionRecomputation(build(log.start()))
-    difference = None
+    start = log.start()
+    other = find_other_parts(start)
+    again = SessionRecomputation(build(start))
+    found, largest = list[Difference](), list[Difference]()
     for message in log.messages():
         if log.flaws or again.crashed:
             break
-        difference = again.difference_at(message)
-        if difference is not None:
+        found = again.differences_at(message)
+        if found and not (other and all(one.tolerable for one in found)):
             break
+        largest = [worst([*largest, *found])] if found else largest
     else:
-        difference = again.pending_difference()
+        found = again.pending_differences()
+    stopped = bool(found) and not (other and all(one.tolerable for one in found))
+    largest = [worst([*largest, *found])] if found and not stopped else largest
     lines = [f"{log.path}: {flaw}" for flaw in log.flaws]
-    if difference is not None:
-        lines.append(difference)
+    if stopped:
+        lines += [(worst(found) if other else found[0]).text, *_origin(start)]
     lines += _changed(run)
     if lines:
-        return Verdict(identical=False, lines=(*lines, f"identical until then: {again.ticks} ticks"))
+        until = "within the tolerance" if largest else "identical"
+        return Verdict(Agreement.DIFFERS, (*lines, f"{until} until then: {again.ticks} ticks"))
     end = "" if again.ended and log.finished else "; the record breaks off: the session or its recorder was killed"
     end = f"; then control crashed: {again.crashed}" if again.crashed else end
-    return Verdict(identical=True, lines=(f"identical: {again.ticks} ticks, {again.looks} looks{end}",))
+    counts = f"{again.ticks} ticks, {again.looks} looks{end}"
+    if not largest:
+        return Verdict(Agreement.IDENTICAL, (f"identical: {counts}",))
+    lines = [f"{_same_decisions(other)}: {counts}", *_origin(start), f"largest difference: {largest[0].text}"]
+    if again.by_digest:
+        lines.append(f"{again.by_digest} volumes that are not recorded whole: within {codec.GRID_M * 1e6:g} um")
+    return Verdict(Agreement.SAME_DECISIONS, tuple(lines))
 
 
 def _changed(run: Path) -> Iterator[str]:
@@ -215,6 +280,7 @@ class SessionRecomputation:
     def __init__(self, controller: DecisionMaker) -> None:
         self.ticks = 0  #: answers so far
         self.looks = 0
+        self.by_digest = 0  #: volumes with other bits that are the same on a grid, and not recorded whole
         self.ended = False
         self.crashed = ""  #: how control crashed, after which no controller answered
         self._pilot = controller
@@ -224,8 +290,8 @@ class SessionRecomputation:
         self._datagrams: list[bytes] = []
         self._reply: bytes | None = None  # due as the next message
         self._perception: Perception | None = None
-        self._suspect = ""  # a limb whose volume is not that of the record; perhaps it is there whole
-        self._take = {
+        self._suspects: list[Difference] = []  # limbs whose volume is not that of the record; perhaps it follows whole
+        self._take: dict[bytes, Callable[[bytes], list[Difference]]] = {
             codec.ROBOT: self._robot,
             codec.REPLY: self._replied,
             codec.SKELETON: self._frame,
@@ -236,104 +302,116 @@ class SessionRecomputation:
             codec.EVENT: self._event,
         }
 
-    def difference_at(self, message: bytes) -> str | None:
-        """The first thing about a message, or due before it, that is not the same again."""
+    def differences_at(self, message: bytes) -> list[Difference]:
+        """What of a message, or due before it, is not the same again; in the order of the record."""
         kind, t_ns = codec.kind(message), codec.clock_ns(message)
         if self._start_ns is None:
             self._start_ns = t_ns
         self._last_ns = t_ns
-        found = None
         if kind == codec.EVENT and (event := codec.decode_event(message)).get("what") == "crash":
             self.crashed = str(event["text"])
-            return None
+            return []
+        due: list[Difference] = []
         if self._reply is not None and kind != codec.REPLY:
-            found = _both("reply", "none", f"{len(self._reply)} bytes")
-        elif self._suspect and kind != codec.VOLUMES:
-            found = self._suspect
-        else:
-            found = self._take[kind](message)
-        return None if found is None else self._at(t_ns, found)
+            return self._at(t_ns, [differing("reply", "none", f"{len(self._reply)} bytes")])
+        if kind != codec.VOLUMES:
+            due = self._at(t_ns, self._unproven())
+            if not all(one.tolerable for one in due):
+                return due
+        return due + self._at(t_ns, self._take[kind](message))
 
-    def pending_difference(self) -> str | None:
+    def pending_differences(self) -> list[Difference]:
         """What differs that the message after the last one would have shown."""
-        return self._at(self._last_ns, self._suspect) if self._suspect else None
+        return self._at(self._last_ns, self._unproven())
 
-    def _at(self, t_ns: int, found: str) -> str:
-        return f"tick {max(0, self.ticks - 1)} at {(t_ns - (self._start_ns or 0)) / 1e9:.3f} s: {found}"
+    def _unproven(self) -> list[Difference]:
+        """Volumes that only their digests tell of."""
+        found, self._suspects = self._suspects, []
+        self.by_digest += sum(one.tolerable for one in found)
+        return found
 
-    def _robot(self, message: bytes) -> None:
+    def _at(self, t_ns: int, found: list[Difference]) -> list[Difference]:
+        where = f"tick {max(0, self.ticks - 1)} at {(t_ns - (self._start_ns or 0)) / 1e9:.3f} s: "
+        return [one.at(where) for one in found]
+
+    def _robot(self, message: bytes) -> list[Difference]:
         self._datagrams.append(codec.body(message))
+        return []
 
-    def _frame(self, message: bytes) -> None:
+    def _frame(self, message: bytes) -> list[Difference]:
         self._frames.append(codec.body(message))
+        return []
 
-    def _silence(self, message: bytes) -> None:
+    def _silence(self, message: bytes) -> list[Difference]:
         self._pilot.silence(codec.clock_ns(message), codec.decode_timeout(message))
+        return []
 
-    def _event(self, message: bytes) -> str | None:
+    def _event(self, message: bytes) -> list[Difference]:
         what = codec.decode_event(message).get("what")
         self.ended = what == "end"
         if what != "blind":
-            return None
+            return []
         frames, self._frames = self._frames, []
         self._perception = self._pilot.update_perception(codec.clock_ns(message), frames)
-        return None if self._perception is None else _both("look", "failed", "none of it")
+        return [] if self._perception is None else [differing("look", "failed", "none of it")]
 
-    def _look(self, message: bytes) -> str | None:
+    def _look(self, message: bytes) -> list[Difference]:
         frames, self._frames = self._frames, []
         recorded = codec.decode_perception(message)
         if len(frames) != recorded.skeletons:
-            return f"the record has {len(frames)} of the {recorded.skeletons} skeletons of this look"
+            text = f"the record has {len(frames)} of the {recorded.skeletons} skeletons of this look"
+            return [Difference(text, np.inf)]
         perception = self._perception = self._pilot.update_perception(recorded.t_ns, frames)
         self.looks += 1
         if perception is None:
-            return _both("look", "done", "failed")
+            return [differing("look", "done", "failed")]
         if codec.encode_perception(perception.states, perception.volumes, len(frames)) == message:
-            return None
+            return []
         columns = state_columns(perception.states)
         cameras = [f"valid_{camera}" for camera in perception.states.cameras]
         names = [name for name in columns if name != "t_ns" and name not in cameras]
-        found = _first(names, recorded.state, codec.state_numbers(perception.states))
-        found = found or _first(cameras, list(recorded.valid), list(perception.states.valid[0].tobytes()))
-        if found is None:
-            digests = [codec.volume_digest(perception.volumes, limb) for limb in range(len(perception.volumes.limbs))]
-            whole = [f"volume of {limb} (digest)" for limb in perception.volumes.limbs]
-            self._suspect = _first(whole, [d.hex() for d in recorded.digests], [d.hex() for d in digests]) or ""
-        return found
+        self._suspects = _digests_differing(recorded.digests, perception.volumes)
+        return [
+            *numbers_differing(names, recorded.state, codec.state_numbers(perception.states)),
+            *decisions_differing(cameras, list(recorded.valid), list(perception.states.valid[0].tobytes())),
+        ]
 
-    def _volumes(self, message: bytes) -> str | None:
-        suspect, self._suspect = self._suspect, ""
+    def _volumes(self, message: bytes) -> list[Difference]:
+        suspects, self._suspects = self._suspects, []
         if self._perception is None:
-            return _both("volumes", "some", "none")
+            return [differing("volumes", "some", "none")]
         volumes, horizon_s = self._perception.volumes, self._perception.horizon_s
-        if codec.encode_volumes(volumes, horizon_s) == message:
-            return suspect or None
         recorded, held_s = codec.decode_volumes(message, volumes.limbs, volumes.method)
-        return _first(["horizon_s"], [held_s], [horizon_s]) or _volume(recorded, volumes) or suspect or None
+        found = [
+            *numbers_differing(["horizon_s"], np.array([held_s]), np.array([horizon_s])),
+            *_volumes_differing(recorded, volumes),
+        ]
+        # the record's own digests: of volumes that are whole in it, they must be those
+        digests = _digests_differing(codec.volume_digests(recorded), volumes) if suspects else []
+        return found if [one.text for one in digests] == [one.text for one in suspects] else [*found, *suspects]
 
-    def _answer(self, message: bytes) -> str | None:
+    def _answer(self, message: bytes) -> list[Difference]:
         datagrams, self._datagrams = tuple(self._datagrams), []
         recorded = codec.decode_decision(message)
         self.ticks += 1
         if len(datagrams) != recorded.datagrams:
-            return f"the record has {len(datagrams)} of the {recorded.datagrams} packets of this tick"
+            text = f"the record has {len(datagrams)} of the {recorded.datagrams} packets of this tick"
+            return [Difference(text, np.inf)]
         again = self._pilot.answer(TickEvent(recorded.t_ns, datagrams, recorded.signals))
         self._reply = again.datagram
         said = codec.decode_decision(codec.encode_decision(again, recorded.signals, len(datagrams), recorded.took_us))
-        return _first(
-            ("phase", "status", "reason", "look_ns", "limb", "link"), _decision(recorded), _decision(said)
-        ) or (_first(_ROW, _numbers(recorded), _numbers(said)))
+        names = ("phase", "status", "reason", "look_ns", "limb", "link")
+        return [
+            *decisions_differing(names, _decision(recorded), _decision(said)),
+            *numbers_differing(_ROW, _numbers(recorded), _numbers(said)),
+        ]
 
-    def _replied(self, message: bytes) -> str | None:
+    def _replied(self, message: bytes) -> list[Difference]:
         _, recorded = codec.decode_reply(message)
         again, self._reply = self._reply, None
         if again is None:
-            return _both("reply", f"{len(recorded)} bytes", "none")
-        if again == recorded:
-            return None
-        if len(again) != len(recorded):
-            return _both("length of the reply", len(recorded), len(again))
-        return _first([f"byte {i} of the reply" for i in range(len(again))], list(recorded), list(again))
+            return [differing("reply", f"{len(recorded)} bytes", "none")]
+        return messages_differing(egm.SensorMessage, recorded, again)
 
 
 def _decision(found: codec.RecordedDecision) -> list[Any]:
@@ -351,36 +429,28 @@ def _numbers(found: codec.RecordedDecision) -> Floats:
     return np.empty(0) if found.row is None else found.row
 
 
-def _volume(recorded: SweptVolumes, again: SweptVolumes) -> str | None:
-    """The first number that differs in the volumes of a perception update."""
+def _digests_differing(recorded: tuple[bytes, ...], volumes: SweptVolumes) -> list[Difference]:
+    """Limbs whose volume has another digest; tolerable where its numbers are the same on a grid."""
+    again = codec.volume_digests(volumes)
+    names = [f"volume of {limb} (digest)" for limb in volumes.limbs]
+    found = decisions_differing(names, [one.hex() for one in recorded], [one.hex() for one in again])
+    grid = {
+        f"volume of {limb} (digest)"
+        for limb, one, other in zip(volumes.limbs, recorded, again, strict=False)
+        if codec.same_on_a_grid(one, other)
+    }
+    return [Difference(one.text, 0.0) if one.text.partition(":")[0] in grid else one for one in found]
+
+
+def _volumes_differing(recorded: SweptVolumes, again: SweptVolumes) -> list[Difference]:
+    """The numbers that differ in the volumes of a perception update."""
+    found: list[Difference] = []
     for limb, name in enumerate(again.limbs):
         mine, yours = recorded.vertices(0, limb), again.vertices(0, limb)
         if len(mine) != len(yours):
-            return _both(f"vertices of {name}", len(mine), len(yours))
+            return [*found, differing(f"vertices of {name}", len(mine), len(yours))]
         names = [f"vertex {i} of {name}, {axis}" for i in range(len(mine)) for axis in "xyz"]
-        found = _first(names, mine.ravel(), yours.ravel())
-        found = found or _first(
-            [f"radius of {name}"], recorded.radius_m[0, limb : limb + 1], again.radius_m[0, limb : limb + 1]
-        )
-        if found is not None:
-            return found
-    return None
-
-
-def _first(names: Sequence[str], recorded: Sequence[Any] | Floats, again: Sequence[Any] | Floats) -> str | None:
-    """The first of some quantities that differs by a bit; any NaN is like any other."""
-    if len(recorded) != len(again):
-        return _both(f"how many of {names[0]} ... there are" if names else "numbers", len(recorded), len(again))
-    for name, mine, yours in zip(names, recorded, again, strict=False):
-        if isinstance(mine, float) and isinstance(yours, float):
-            same = np.float64(mine).tobytes() == np.float64(yours).tobytes() or (mine != mine and yours != yours)
-            mine, yours = float(mine), float(yours)
-        else:
-            same = mine == yours
-        if not same:
-            return _both(name, mine, yours)
-    return None
-
-
-def _both(name: str, recorded: Any, again: Any) -> str:
-    return f"{name}: recorded {recorded!r}, again {again!r}"
+        radii = (volumes.radius_m[0, limb : limb + 1] for volumes in (recorded, again))
+        found += numbers_differing(names, mine.ravel(), yours.ravel())
+        found += numbers_differing([f"radius of {name}"], *radii)
+    return found

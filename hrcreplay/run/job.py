@@ -26,6 +26,7 @@ from hrcreplay.robot.urdf import describe
 from hrcreplay.settings.load import Settings, as_overrides, load_settings
 from hrcreplay.settings.sections import LinkSettings, Robot
 from hrcreplay.store import run_folder
+from hrcreplay.store.machine import describe_machine
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,10 @@ TABLES = {
 _NEEDED = ("inputs", "settings", "cell", "task", "span_s")
 
 #: Packages whose version can change a result.
-PACKAGES = ("coal", "filterpy", "mcap", "numba", "numpy", "pin", "proxsuite", "rosbags", "ruckig", "scipy")
+PACKAGES = (
+    *("coal", "filterpy", "llvmlite", "mcap", "numba", "numpy", "pin", "proxsuite", "pyarrow", "rosbags", "ruckig"),
+    "scipy",
+)
 
 
 @dataclass(frozen=True)
@@ -162,6 +166,7 @@ class Job:
         return {
             "command": self.command,
             "versions": versions(),
+            "machine": describe_machine(),
             "inputs": [{"path": str(self.log), "sha256": self.log_sha256}, *_urdf_inputs(self.settings)],
             "urdf": _urdf_record(self) if "plan" in self.stages else None,
             "settings": self.settings.model_dump(mode="json"),

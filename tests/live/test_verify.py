@@ -1,8 +1,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import struct
+import subprocess
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +14,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.egm.robot_double.faults import KINDS, Fault
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Decision, Signal, TickEvent
-from hrcreplay.live.verify import Verdict, verify
+from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
+from hrcreplay.live.record.recorder import SessionLogReader
+from hrcreplay.live.verify import Agreement, Verdict, verify
 from hrcreplay.records import DOF
 from hrcreplay.run import replay
+from hrcreplay.run.job import versions
 from hrcreplay.store import run_folder
+from hrcreplay.store.machine import describe_machine
 from tests.live import made
 from tests.live.flights import BEGIN_NS, Flight
 
@@ -55,7 +63,7 @@ def test_the_same_again_is_identical(tmp_path: Path, messages: list[bytes]) -> N
     made.record(run / "log.mcap", messages)
     meta = {"complete": True, "outputs": {"log.mcap": run_folder.sha256(run / "log.mcap")}}
     (run / "run.json").write_text(json.dumps(meta))
-    assert verify(run, made.MadeController) == Verdict(identical=True, lines=("identical: 60 ticks, 60 looks",))
+    assert verify(run, made.MadeController) == Verdict(Agreement.IDENTICAL, lines=("identical: 60 ticks, 60 looks",))
 
 
 class Drifting(made.MadeController):
@@ -114,17 +122,15 @@ def test_changed_decisions_and_replies_are_named(tmp_path: Path, messages: list[
 
     changed = list(messages)
     changed[at + 1] = changed[at + 1][:-3] + bytes([changed[at + 1][-3] ^ 1]) + changed[at + 1][-2:]
-    reply = codec.decode_reply(messages[at + 1])[1]
-    value = reply[-3]
-    assert (
-        _verdict(tmp_path, changed)
-        .lines[0]
-        .endswith(f"s: byte {len(reply) - 3} of the reply: recorded {value ^ 1}, again {value}")
-    )
+    replies = [codec.decode_reply(one[at + 1])[1] for one in (changed, messages)]
+    mine, yours = (egm.SensorMessage.FromString(reply).planned.joints.joints[5] for reply in replies)
+    line = _verdict(tmp_path, changed).lines[0]
+    assert f"s: reply.planned.joints.joints[5]: recorded {mine!r}, again {yours!r}" in line
 
     changed = list(messages)
     del changed[at + 1]
-    assert _verdict(tmp_path, changed).lines[0].endswith(f"s: reply: recorded 'none', again '{len(reply)} bytes'")
+    line = _verdict(tmp_path, changed).lines[0]
+    assert line.endswith(f"s: reply: recorded 'none', again '{len(replies[1])} bytes'")
 
 
 def test_a_volume_that_is_not_stored_is_compared_by_digest(tmp_path: Path, messages: list[bytes]) -> None:
@@ -210,7 +216,7 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_replay_comes_out_the_same_again(replayed: Path) -> None:
-    assert verify(replayed) == Verdict(identical=True, lines=("identical",))
+    assert verify(replayed) == Verdict(Agreement.IDENTICAL, lines=("identical",))
 
 
 def test_a_replay_that_does_not_is_named_by_row_and_column(replayed: Path, tmp_path: Path) -> None:
@@ -230,7 +236,7 @@ def test_a_replay_that_does_not_is_named_by_row_and_column(replayed: Path, tmp_p
     meta["versions"]["numpy"] = "1.0"
     (run / "run.json").write_text(json.dumps(meta))
     lines = verify(run).lines
-    assert lines[0] == f"motion.parquet: row 7, q3: recorded {float(q3[7])!r}, again {was!r}"
+    assert lines[0] == f"motion.parquet: row 7, q3: recorded {float(q3[7])!r}, again {was!r}, 1.0e-12 apart"
     assert lines[1].startswith("versions of numpy: recorded 1.0, now ")
 
 
@@ -272,3 +278,175 @@ def test_a_session_with_every_fault_is_identical(tmp_path: Path) -> None:
     made.record(run / "log.mcap", [codec.encode_event(BEGIN_NS - 1, flight.start), *flight.messages], chunk=500)
     verdict = verify(run)
     assert verdict.identical, verdict.lines
+
+
+OTHER = {**describe_machine(), "processor": "Another CPU", "features": ["sse4_2"]}
+
+
+@pytest.fixture(scope="module")
+def elsewhere(messages: list[bytes]) -> list[bytes]:
+    """The same session as another machine records it."""
+    start = {**made.START, "machine": OTHER, "versions": versions()}
+    return [codec.encode_event(made.START_NS, start), *messages[1:]]
+
+
+class Rounding(made.MadeController):
+    """Rounds otherwise, the person as well as the robot."""
+
+    def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception:
+        self.p = np.nextafter(self.p, np.inf)
+        return super().update_perception(t_ns, skeletons)
+
+    def answer(self, event: TickEvent) -> Decision:
+        self.q = np.nextafter(self.q, np.inf)
+        return super().answer(event)
+
+
+def test_another_machine_may_round_otherwise(tmp_path: Path, messages: list[bytes], elsewhere: list[bytes]) -> None:
+    verdict = _verdict(tmp_path, elsewhere, Rounding)
+    assert verdict.agreement is Agreement.SAME_DECISIONS
+    assert not verdict.identical
+    first, recorded, here, largest, unstored = verdict.lines
+    assert first.startswith("same decisions, numbers within 1e-9 (other processor): 60 ticks, 60 looks")
+    assert recorded.startswith("recorded on Another CPU (sse4_2; ")
+    assert here.startswith(f"computed again on {describe_machine()['processor']} (")
+    assert 0.0 < float(largest.removesuffix(" apart").rpartition(", ")[2]) <= 1e-9
+    stored = sum(codec.kind(message) == codec.VOLUMES for message in messages)
+    assert 0 < int(unstored.split()[0]) <= (60 - stored) * 6
+    # the same on the machine that recorded it, and in a record that does not say where it is from, is a difference
+    for machine in ({"machine": describe_machine(), "versions": versions()}, {}):
+        there = [codec.encode_event(made.START_NS, made.START | machine), *messages[1:]]
+        assert _verdict(tmp_path, there, Rounding).agreement is Agreement.DIFFERS
+    assert _verdict(tmp_path, elsewhere).agreement is Agreement.IDENTICAL
+
+
+_ANSWER = struct.calcsize("<cqqIIBBhhH")
+_LOOKED = struct.calcsize("<cqHHHH")
+
+
+@pytest.mark.parametrize(
+    ("kind", "number", "offset", "change", "name"),
+    [
+        (codec.DECISION, 7, _ANSWER + 1 + 8 * 8, 1e-6, "q3"),
+        (codec.DECISION, 7, _ANSWER + 1 + 8 * 14, 1e-6, "dq3"),
+        (codec.DECISION, 7, _ANSWER + 1 + 8 * 20, 1e-3, "u3"),
+        (codec.DECISION, 7, _ANSWER + 1 + 8 * 33, 1e-6, "distance_m"),
+        (codec.DECISION, 7, _ANSWER + 1 + 8 * 34, 1e-12, "horizon_s"),
+        (codec.DECISION, 7, _ANSWER + 1 + 8 * 36, 1e-12, "certified"),
+        (codec.DECISION, 7, _ANSWER + 1 + 8 * 33, np.nan, "distance_m"),
+        (codec.PERCEPTION, 7, _LOOKED + 8 * 3, 1e-6, "theta"),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 6) + 8 * 4, 1e-6, "vertex 1 of HD, y"),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHI"), 1e-12, "horizon_s"),
+    ],
+)
+def test_a_changed_number_differs_on_any_machine(
+    tmp_path: Path, elsewhere: list[bytes], kind: bytes, number: int, offset: int, change: float, name: str
+) -> None:
+    changed, at = list(elsewhere), _at(elsewhere, kind, number)
+    changed[at] = _float(changed[at], offset, change)
+    verdict = _verdict(tmp_path, changed, Rounding)
+    assert verdict.agreement is Agreement.DIFFERS
+    assert f"s: {name}: recorded " in verdict.lines[0] or kind == codec.PERCEPTION
+    if np.isfinite(change):
+        assert float(verdict.lines[0].removesuffix(" apart").rpartition(", ")[2]) == pytest.approx(change, rel=0.1)
+    assert verdict.lines[1].startswith("recorded on Another CPU")
+
+
+def _patched(message: bytes, offset: int, form: str, value: int) -> bytes:
+    return message[:offset] + struct.pack(form, value) + message[offset + struct.calcsize(form) :]
+
+
+@pytest.mark.parametrize(
+    ("kind", "offset", "form", "value"),
+    [
+        (codec.DECISION, struct.calcsize("<cqqII"), "<B", codec.HOLDING),
+        (codec.DECISION, struct.calcsize("<cqqIIB"), "<B", 1),
+        (codec.DECISION, struct.calcsize("<cqqIIBB"), "<h", 3),
+        (codec.DECISION, struct.calcsize("<cqqIIBBh"), "<h", 0),
+        (codec.DECISION, struct.calcsize("<cq"), "<q", 5),
+        (codec.PERCEPTION, -6 * 24 - 2, "<B", 1),
+        (codec.PERCEPTION, -24, "<24s", 0),
+    ],
+    ids=["phase", "status", "limb", "link", "look", "camera", "digest"],
+)
+def test_a_changed_decision_differs_on_any_machine(
+    tmp_path: Path, elsewhere: list[bytes], kind: bytes, offset: int, form: str, value: int
+) -> None:
+    changed, at = list(elsewhere), _at(elsewhere, kind, 7)
+    message = changed[at]
+    if form == "<24s":
+        changed[at] = message[:offset] + bytes(24)
+    else:
+        changed[at] = _patched(message, offset % len(message), form, value)
+    assert changed[at] != message
+    verdict = _verdict(tmp_path, changed, Rounding)
+    assert verdict.agreement is Agreement.DIFFERS
+    assert verdict.lines[0].startswith("tick 7 at ")
+
+
+def test_a_reply_that_says_another_angle_differs_on_any_machine(tmp_path: Path, elsewhere: list[bytes]) -> None:
+    at = _at(elsewhere, codec.REPLY, 7)
+    for change, outcome in ((1e-6, Agreement.DIFFERS), (1e-13, Agreement.SAME_DECISIONS)):
+        reply = egm.SensorMessage.FromString(codec.decode_reply(elsewhere[at])[1])
+        reply.planned.joints.joints[2] += change
+        changed = list(elsewhere)
+        changed[at] = codec.encode_reply(codec.clock_ns(elsewhere[at]), reply.SerializeToString(), sent=True)
+        verdict = _verdict(tmp_path, changed, Rounding)
+        assert verdict.agreement is outcome
+    reply.header.seqno += 1
+    changed[at] = codec.encode_reply(codec.clock_ns(elsewhere[at]), reply.SerializeToString(), sent=True)
+    assert _verdict(tmp_path, changed, Rounding).agreement is Agreement.DIFFERS
+
+
+def test_a_replay_of_another_machine(replayed: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(replayed, run)
+    original = pq.read_table(run / "motion.parquet")
+    meta = json.loads((run / "run.json").read_text())
+    assert meta["machine"] == describe_machine()
+
+    def tell(name: str, row: int, value: object) -> Verdict:
+        column = original.column(name).to_pylist()
+        column[row] = value
+        changed = pa.array(column, type=original.column(name).type)
+        table = original.set_column(original.column_names.index(name), name, changed)
+        pq.write_table(table, run / "motion.parquet")
+        outputs = meta["outputs"] | {"motion.parquet": run_folder.sha256(run / "motion.parquet")}
+        (run / "run.json").write_text(json.dumps(meta | {"machine": OTHER, "outputs": outputs}))
+        return verify(run)
+
+    q3 = original.column("q3")[7].as_py()
+    verdict = tell("q3", 7, q3 + 1e-12)
+    assert verdict.agreement is Agreement.SAME_DECISIONS
+    assert "motion.parquet: row 7, q3: " in verdict.lines[-1]
+    verdict = tell("q3", 7, q3 + 1e-6)
+    assert verdict.agreement is Agreement.DIFFERS
+    assert verdict.lines[0].startswith(f"motion.parquet: row 7, q3: recorded {q3 + 1e-6!r}, again {q3!r}")
+    assert tell("status", 7, "braking").agreement is Agreement.DIFFERS
+
+
+_FLY = """
+import sys
+from pathlib import Path
+from hrcreplay.live.record import codec
+from tests.live import made
+from tests.live.flights import BEGIN_NS, Flight
+
+flight = Flight()
+flight.fly(1.5)
+made.record(Path(sys.argv[1]), [codec.encode_event(BEGIN_NS - 1, flight.start), *flight.messages], chunk=500)
+"""
+
+
+@pytest.mark.skipif(not describe_machine()["blas"]["core"], reason="this BLAS does not choose its kernels by a name")
+def test_a_session_recorded_with_other_blas_kernels_has_the_same_decisions(tmp_path: Path) -> None:
+    run = tmp_path / "run.partial"
+    run.mkdir()
+    here = describe_machine()["blas"]["core"]
+    kernels = {"OPENBLAS_CORETYPE": "Nehalem" if here != "Nehalem" else "Sandybridge"}
+    subprocess.run([sys.executable, "-c", _FLY, str(run / "log.mcap")], check=True, env={**os.environ, **kernels})
+    start = SessionLogReader(run / "log.mcap").start()
+    assert start["machine"]["blas"]["core"] == kernels["OPENBLAS_CORETYPE"]
+    assert start["machine"]["environment"].items() >= kernels.items()
+    verdict = verify(run)
+    assert verdict.agreement in (Agreement.IDENTICAL, Agreement.SAME_DECISIONS), verdict.lines

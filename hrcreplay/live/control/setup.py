@@ -120,6 +120,7 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         "hrcreplay": __version__,
         "settings": known["settings"],
         "versions": known["versions"],
+        "machine": known["machine"],
         "limits": known["limits"],
         "cell": known["cell"],
         "cameras": {name: T.tolist() for name, T in zip(header.cameras, fusion_stage.T_world_camera, strict=True)},

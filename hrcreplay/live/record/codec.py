@@ -138,6 +138,10 @@ _VOLUMES = struct.Struct("<cqHId")
 _ANSWER = struct.Struct("<cqqIIBBhhH")
 _SILENCE = struct.Struct("<cqI")
 _DIGEST = 8
+_DIGESTS = 3  #: of a limb: of its bits, and of its numbers on the two grids
+#: Width of both grids [m]; the second lies half of it further, so that a number between two cells of the one is in the
+#: midst of a cell of the other.
+GRID_M = 1e-7
 
 
 def kind(message: bytes) -> bytes:
@@ -204,13 +208,13 @@ class RecordedPerception:
     skeletons: int  #: used by it: the SKELETON messages right before it
     state: Floats  #: all numbers of the state's row, in the order of the record's fields
     valid: bytes  #: a byte a camera
-    digests: tuple[bytes, ...]  #: of vertices and radius, a limb each
+    digests: tuple[bytes, ...]  #: of vertices and radius, a limb each, as of ``volume_digests``
 
 
 def encode_perception(states: HumanStates, volumes: SweptVolumes, skeletons: int) -> bytes:
     """Encodes a perception update that used so many skeletons."""
     state = state_numbers(states)
-    digests = [volume_digest(volumes, limb) for limb in range(len(volumes.limbs))]
+    digests = volume_digests(volumes)
     valid = states.valid[0].tobytes()
     head = _LOOK.pack(PERCEPTION, int(states.t_ns[0]), skeletons, len(state), len(valid), len(digests))
     return b"".join([head, state.tobytes(), valid, *digests])
@@ -224,7 +228,8 @@ def decode_perception(message: bytes) -> RecordedPerception:
     at += 8 * numbers
     valid = message[at : at + cameras]
     at += cameras
-    digests = tuple(message[at + _DIGEST * i : at + _DIGEST * (i + 1)] for i in range(limbs))
+    width = _DIGEST * _DIGESTS
+    digests = tuple(message[at + width * i : at + width * (i + 1)] for i in range(limbs))
     return RecordedPerception(t_ns, skeletons, state, valid, digests)
 
 
@@ -234,11 +239,35 @@ def state_numbers(states: HumanStates) -> Floats:
     return np.concatenate([value[0].ravel() for value in found if value.dtype == np.float64])
 
 
-def volume_digest(volumes: SweptVolumes, limb: int) -> bytes:
-    """Hash of one limb's volume at a single tick."""
-    what = hashlib.blake2b(volumes.vertices(0, limb).data, digest_size=_DIGEST)
-    what.update(volumes.radius_m[0, limb].tobytes())
-    return what.digest()
+def volume_digests(volumes: SweptVolumes) -> tuple[bytes, ...]:
+    """Hashes of each limb's volume at a single tick: of its bits, and of its numbers on two grids.
+
+    Where a hash on a grid is the same, no coordinate is further off than the grid is wide.
+    """
+    points, radius = np.ascontiguousarray(volumes.vertices_m, dtype=np.float64), volumes.radius_m[0]
+    grids = [
+        (np.floor(points / GRID_M + shift) + 0.0, np.floor(radius / GRID_M + shift) + 0.0)  # + 0.0: there is no -0.0
+        for shift in (0.0, 0.5)
+    ]
+    return tuple(
+        b"".join(
+            _hash(numbers[volumes.offsets[limb] : volumes.offsets[limb + 1]], radii[limb : limb + 1])
+            for numbers, radii in ((points, radius), *grids)
+        )
+        for limb in range(len(volumes.limbs))
+    )
+
+
+def _hash(points: Floats, radius: Floats) -> bytes:
+    found = hashlib.blake2b(points.data, digest_size=_DIGEST)
+    found.update(radius.tobytes())
+    return found.digest()
+
+
+def same_on_a_grid(recorded: bytes, again: bytes) -> bool:
+    """Whether two of ``volume_digests`` tell of the same volume, but for GRID_M."""
+    grids = [slice(_DIGEST * i, _DIGEST * (i + 1)) for i in range(1, _DIGESTS)]
+    return len(recorded) == len(again) and any(recorded[grid] == again[grid] for grid in grids)
 
 
 def encode_volumes(volumes: SweptVolumes, horizon_s: float) -> bytes:

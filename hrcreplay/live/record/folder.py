@@ -236,6 +236,7 @@ def _meta(
     return {
         **job.meta(),
         "versions": start["versions"],
+        "machine": start.get("machine"),  # of the session, wherever its folder is made
         "inputs": [{"path": LOG, "sha256": job.log_sha256}],  # beside it, wherever the folder is moved to
         "stages": {},  # a replay of the log has ticks of its own: it takes nothing over
         "T_world_base": start["T_world_base"],
