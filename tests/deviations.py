@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from hrcreplay.audit.recording import TRUTH, errors_in_deviations, fused_stretches, read_recording
+from hrcreplay.audit.recorded_motion import errors_in_deviations
 from hrcreplay.human.fusion.fuse import Trace
 from hrcreplay.human.fusion.reported_deviations import FITTED, KIND
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, Floats
 from hrcreplay.run import build
 from hrcreplay.run.job import resolve
+from hrcreplay.run.recording import TRUTH, fused_stretches, read_recording
 from hrcreplay.run.replay import span_ticks
 from tests.people import fused
 

@@ -14,14 +14,15 @@ from functools import cache
 import numpy as np
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.log_audit import SHORTER_S, RecordedFuture, check_containment, flesh_m, recorded_future
-from hrcreplay.audit.measures import InflatedHull, union_volume_m3
-from hrcreplay.audit.recording import TRUTH, Recording
+from hrcreplay.audit.log_audit import SHORTER_S
+from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, tubes
 from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.run.build import PredictionStage
+from hrcreplay.run.containment import RecordedFuture, check_containment, flesh_m, recorded_future
+from hrcreplay.run.recording import TRUTH, Recording
 
 #: Robots beside people stop within some 10 to 100 ms; nothing is known before the first horizon that is measured [s].
 _FIRST_S = 0.02
@@ -83,7 +84,7 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
     """
     horizon_s = np.array([*(h for h in (_FIRST_S, *SHORTER_S) if h < stage.horizon_s), stage.horizon_s])
     states, nothing = recording.states.rows(ticks), np.zeros(len(ticks), dtype=bool)
-    futures = [recorded_future(recording, ticks, h) for h in horizon_s.tolist()]
+    futures = [recorded_future(recording.t_ns, recording.points_m, states, h) for h in horizon_s.tolist()]
     bare = tube_stage(stage, _bare(horizon_s, 0.0, 0.0), residual=False)
     unknown_m = bare.occupancy.residual_unknown_m
     at = [tubes(states, bare.limits, True, unknown_m, h, stage.memory_s) for h in horizon_s.tolist()]

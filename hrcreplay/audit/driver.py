@@ -14,7 +14,6 @@ import pyarrow as pa
 from hrcreplay.audit import page
 from hrcreplay.audit.figures import draw_all
 from hrcreplay.audit.log_audit import (
-    AUDIT_HZ,
     EVERY,
     EVERY_SHORTER,
     LogAudit,
@@ -28,7 +27,6 @@ from hrcreplay.audit.log_audit import (
 )
 from hrcreplay.audit.measures import DRAWS, LEVEL, Resampling, block_ticks, resample
 from hrcreplay.audit.metrics import (
-    Outcome,
     checked_scope,
     curve_point,
     deviation_figures,
@@ -40,13 +38,15 @@ from hrcreplay.audit.metrics import (
     method_figures,
     unchecked_notes,
 )
-from hrcreplay.audit.recording import TRUTH, first_movements_ns
+from hrcreplay.audit.recorded_motion import first_movements_ns
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.run import build
 from hrcreplay.run.build import PredictionStage
+from hrcreplay.run.containment import AUDIT_HZ, Outcome
 from hrcreplay.run.job import Job, JobOptions, resolve
+from hrcreplay.run.recording import TRUTH
 from hrcreplay.run.stages import print_note
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch

@@ -21,7 +21,6 @@ from hrcreplay.audit.departure_fit import fit as fit_departures
 from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, not_recorded, union_m3
 from hrcreplay.audit.fit_limits import Fit, Futures
 from hrcreplay.audit.measures import Estimate, block_ticks, resample
-from hrcreplay.audit.recording import SMOOTHED, TRUTH, Recording, read_recording
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import Departure, LimitSet
 from hrcreplay.limits import load_limits, write_limits
@@ -30,6 +29,7 @@ from hrcreplay.records import JOINTS, LIMBS, Floats
 from hrcreplay.run import build
 from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.job import Job, JobOptions, resolve
+from hrcreplay.run.recording import SMOOTHED, TRUTH, Recording, read_recording
 from hrcreplay.run.stages import NS, ProgressBar, tick_times
 
 

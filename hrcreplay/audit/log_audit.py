@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -10,139 +10,34 @@ import numpy as np
 
 from hrcreplay.audit import baselines
 from hrcreplay.audit.fit_limits import ARMS
-from hrcreplay.audit.measures import InflatedHull, union_volume_m3
-from hrcreplay.audit.metrics import Outcome
-from hrcreplay.audit.recording import LIMB_POINTS, Recording, errors_in_deviations, read_recording
+from hrcreplay.audit.recorded_motion import errors_in_deviations
 from hrcreplay.errors import LogError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.human.prediction.sound_reach import THIGH_M
 from hrcreplay.human.prediction.swept_volumes import Reach, limb_radii
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import DOF, JOINTS, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report.metrics import ANGLES, difference
 from hrcreplay.run import build
 from hrcreplay.run.build import PredictionStage
+from hrcreplay.run.containment import (
+    AUDIT_HZ,
+    Outcome,
+    RecordedFuture,
+    asked_rows,
+    check_containment,
+    flesh_m,
+    recorded_future,
+)
 from hrcreplay.run.job import Job
+from hrcreplay.run.recording import Recording, read_recording
 from hrcreplay.run.stages import NS, ProgressBar, tick_times
 from hrcreplay.store.run_folder import Stopwatch
-
-#: The end of the horizon: its last quarter. A limb that was last seen before could have left later.
-_END = 0.75
-#: Points with which the union of a tick's volumes is counted out.
-_COUNT = 1024
-_SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
 
 
 def standstill_s(prediction_stage: PredictionStage) -> float:
     """How long the person must stay in what was predicted: until the robot has reacted and braked [s]."""
     return prediction_stage.horizon_s + prediction_stage.occupancy.latency_s
-
-
-@dataclass(frozen=True)
-class RecordedFuture:
-    """The recorded future of some ticks."""
-
-    states: HumanStates  #: (n,) the fused person at the ticks
-    limbs: dict[str, Floats]  #: limb -> (m, k, 3) its recorded points, world [m]
-    first: Ints  #: (n,) row of the first recorded instant after the tick
-    last: Ints  #: (n,) row past the last one within the horizon
-    seen: dict[str, Bools]  #: limb -> (n, k) whether a point was seen in the last quarter of the horizon
-
-    def rows(self, which: slice | Ints) -> RecordedFuture:
-        """The same for some of the ticks."""
-        seen = {limb: part[which] for limb, part in self.seen.items()}
-        return RecordedFuture(self.states.rows(which), self.limbs, self.first[which], self.last[which], seen)
-
-    def checked(self, limb: str) -> Bools:
-        """(n,) whether the limb can be checked: both its ends were seen near the horizon's end."""
-        return np.asarray(self.seen[limb][:, :2].all(axis=1))
-
-    def points(self) -> dict[str, dict[str, int]]:
-        """Limb -> each point beyond its ends -> at how many of the ticks that check the limb it was seen too."""
-        return {
-            limb: {
-                point: int((self.seen[limb][:, 2 + k] & self.checked(limb)).sum()) for k, point in enumerate(names[2:])
-            }
-            for limb, names in LIMB_POINTS.items()
-        }
-
-
-def recorded_future(recording: Recording, ticks: Ints, horizon_s: float) -> RecordedFuture:
-    """The recorded future (t, t + T] of some ticks.
-
-    Args:
-        recording: The log.
-        ticks: (n,) rows of ``recording.states``.
-        horizon_s: T, T_s and the latency [s].
-    """
-    points = recording.points_m.copy()
-    # the model's neck is the middle of the shoulders, not the bone that cameras call so
-    points[:, POINTS.index("neck")] = 0.5 * (points[:, _SHOULDERS[0]] + points[:, _SHOULDERS[1]])
-    limbs = {
-        limb: np.ascontiguousarray(points[:, [POINTS.index(n) for n in names]]) for limb, names in LIMB_POINTS.items()
-    }
-    states = recording.states.rows(ticks)
-    horizon_ns = round(horizon_s * 1e9)
-    first = np.searchsorted(recording.t_ns, states.t_ns, side="right")
-    last = np.searchsorted(recording.t_ns, states.t_ns + horizon_ns, side="right")
-    end = np.searchsorted(recording.t_ns, states.t_ns + round(_END * horizon_ns), side="right")
-    return RecordedFuture(states, limbs, first, last, {limb: _seen(part, end, last) for limb, part in limbs.items()})
-
-
-def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
-    """(n, k) whether each of the points (m, k, 3) was recorded in any row from ``first`` (n,) up to ``last`` (n,)."""
-    count = np.zeros((len(recorded) + 1, recorded.shape[1]), np.int64)
-    np.cumsum(np.isfinite(recorded).all(axis=2), axis=0, out=count[1:])
-    return np.asarray(count[last] > count[first])
-
-
-def flesh_m(prediction_stage: PredictionStage) -> dict[str, float]:
-    """Limb -> its radius, Table 2; of the legs that of a thigh [m]."""
-    return dict(zip(BODY, (*limb_radii(prediction_stage.occupancy).tolist(), THIGH_M), strict=True))
-
-
-def check_containment(
-    volumes: SweptVolumes, future: RecordedFuture, flesh: Mapping[str, float], counted: Bools, first_sample: int = 0
-) -> Outcome:
-    """Compares one method's volumes with the recorded future.
-
-    Args:
-        volumes: Of the n ticks.
-        future: Of the same ticks.
-        flesh: Limb -> its radius, as ``flesh_m`` gives it [m].
-        counted: (n,) the ticks whose union volume is estimated.
-        first_sample: Number of ticks counted before, see ``union_volume_m3``.
-    """
-    n, limbs = len(volumes), volumes.limbs
-    beyond, size = np.full((n, len(limbs)), np.nan), np.full((n, len(limbs)), np.nan)
-    union, union_std, upper, upper_std = np.full((4, n), np.nan)
-    checked = np.column_stack([future.checked(limb) for limb in limbs])
-    for i in range(n):
-        solids = []
-        for k, limb in enumerate(limbs):
-            vertices = volumes.vertices(i, k)
-            if np.isnan(vertices).any():
-                continue
-            solid = InflatedHull.around(vertices, float(volumes.radius_m[i, k]))
-            size[i, k] = solid.volume_m3()
-            solids.append(solid)
-            if checked[i, k]:
-                beyond[i, k] = _farthest(solid, future, i, limb)
-        if counted[i] and len(solids) == len(limbs):
-            upper[i], upper_std[i] = union_volume_m3(solids[: len(LIMBS)], _COUNT, _COUNT * (first_sample + i))
-            union[i], union_std[i] = upper[i], upper_std[i]
-            if len(limbs) > len(LIMBS):
-                union[i], union_std[i] = union_volume_m3(solids, _COUNT, _COUNT * (first_sample + i))
-    radius = np.array(volumes.radius_m)
-    thick = tuple(flesh[limb] for limb in limbs)
-    return Outcome(volumes.t_ns, beyond, radius, size, union, union_std, upper, upper_std, limbs, thick)
-
-
-def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str) -> float:
-    """How far the recorded points of a limb, some of them seen, get from a hull [m]."""
-    points = future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
-    return float(np.nanmax(solid.distances_m(points)))
 
 
 def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horizon_s: float) -> Floats:
@@ -181,9 +76,9 @@ def joint_travel(joints: Floats) -> Floats:
     return found
 
 
-#: Ticks a second that are audited [Hz]; the union is counted out at, and the curve rests on, one in so many. Shorter
+#: The union is counted out at, and the curve rests on, one in so many audited ticks. Shorter
 #: horizons rest on one in so many: out of step with cameras of 30 Hz, which else might never have a frame near the end.
-AUDIT_HZ, EVERY, EVERY_SHORTER = 25.0, 5, 4
+EVERY, EVERY_SHORTER = 5, 4
 #: Factors on the limit set's velocities and accelerations along the curve; ``positions`` grows with their cube.
 _FACTORS = {"positions": (0.25, 0.5, 1.0, 2.0)}
 _STANDARD_FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
@@ -280,10 +175,10 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         recording = read_recording(
             log, ticks_ns, build.fusion_stage(job, log), lambda n: bar.advance(f"reading {name}", n)
         )
-    rows = _audited(recording, job.settings.fusion.rate_hz, horizon_s)
+    rows = asked_rows(recording.states, int(recording.t_ns[-1]), job.settings.fusion.rate_hz, horizon_s)
     if not len(rows):
         raise LogError(f"{job.log}: nobody was seen for longer than the horizon of {horizon_s:g} s")
-    future = recorded_future(recording, rows, horizon_s)
+    future = recorded_future(recording.t_ns, recording.points_m, recording.states.rows(rows), horizon_s)
     outcomes, curve = {}, {}
     stage = f"auditing {name}"
     more = sum(len(factors(method)) - 1 for method in swept_volumes.METHODS)
@@ -311,16 +206,6 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
     notes = (*log.notes, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))
     errors = errors_in_deviations(recording, rows)
     return LogAudit(job, name, recording, outcomes, joints, curve, horizons, errors, future.points(), notes)
-
-
-def _audited(recording: Recording, rate_hz: float, horizon_s: float) -> Ints:
-    """Rows of the states that are audited: one in so many, with a person, and a whole horizon before the end."""
-    every = max(1.0, rate_hz / AUDIT_HZ)
-    number = np.arange(len(recording.states))
-    chosen = np.floor(number / every) != np.floor((number - 1) / every)
-    chosen &= np.isfinite(recording.states.p).all(axis=1)
-    chosen &= recording.states.t_ns + round(horizon_s * NS) <= max(recording.states.t_ns[-1], recording.t_ns[-1])
-    return np.flatnonzero(chosen)
 
 
 def _hold(
@@ -366,7 +251,8 @@ def _shorter(
     for horizon_s in shorter(prediction_stage):
         stop_s = horizon_s - prediction_stage.occupancy.latency_s
         occupancy = prediction_stage.occupancy.model_copy(update={"stop_s": stop_s})
-        stage, future = replace(prediction_stage, occupancy=occupancy), recorded_future(recording, rows, horizon_s)
+        stage, states = replace(prediction_stage, occupancy=occupancy), recording.states.rows(rows)
+        future = recorded_future(recording.t_ns, recording.points_m, states, horizon_s)
         found[horizon_s] = {m: _hold(stage, future, m, 1, progress) for m in compared_methods(stage)}
     return found
 

@@ -6,15 +6,15 @@ They also say which limbs and points could not be checked, since a coverage hold
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from hrcreplay.audit.measures import Estimate, Resampling
-from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats, Ints, Table
+from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
 from hrcreplay.report.metrics import Metric, MetricTable, true_runs
 from hrcreplay.report.tables import PageTable
+from hrcreplay.run.containment import Outcome
 
 
 def never_checked(part: Mapping[str, Any], method: str) -> list[str]:
@@ -109,44 +109,8 @@ WHAT = {
     "upper": "every limb that was checked, flesh and all, the lower body left out, in its own volume",
 }
 UNCHECKED = "not checked: not seen to the end of a horizon"
-#: Rounding of a distance [m].
-_ROUNDING_M = 1e-9
 #: Ticks of one escape may have so many ticks without one between them.
 _BREAK = 2
-
-
-@dataclass(frozen=True)
-class Outcome(Table):
-    """One method's volumes compared with the recorded motion, a row an audited tick."""
-
-    t_ns: Ints  #: (n,)
-    beyond_m: (
-        Floats  #: (n, l) farthest that a recorded point of the limb got from the hull, before the ball; NaN: unseen
-    )
-    radius_m: Floats  #: (n, l) of the ball
-    volume_m3: Floats  #: (n, l) NaN where the limb could not be predicted
-    union_m3: Floats  #: (n,) of all limbs together; NaN where not computed
-    union_std_m3: Floats  #: (n,) standard error of the counting behind it
-    upper_m3: Floats  #: (n,) of the six LIMBS together, for which every method has volumes
-    upper_std_m3: Floats  #: (n,)
-    limbs: tuple[str, ...]  #: LIMBS first
-    flesh_m: tuple[float, ...]  #: radius of each limb itself, Table 2 and a thigh's [m]
-
-    def escape_m(self, *, points_alone: bool = False) -> Floats:
-        """(n, l) how far the limb left its volume within the horizon; 0 inside, NaN where not audited [m].
-
-        The whole limb: the ball of its flesh around each of its recorded points. Volumes are convex, so what is between
-        two points is no further out than the worse of them. Or its points alone, which grants the flesh as tolerance.
-        """
-        flesh = np.zeros(len(self.limbs)) if points_alone else np.array(self.flesh_m)
-        depth = self.beyond_m + flesh - self.radius_m
-        return np.where(np.isnan(depth), np.nan, np.where(depth > _ROUNDING_M, depth, 0.0))
-
-    def worst_m(self, limbs: int | None = None, *, points_alone: bool = False) -> Floats:
-        """(n,) largest escape of all limbs or the first so many, each from its own volume; NaN: none checked [m]."""
-        escapes = self.escape_m(points_alone=points_alone)[:, :limbs]
-        known = np.isfinite(escapes).any(axis=1)
-        return np.where(known, np.where(np.isnan(escapes), -1.0, escapes).max(axis=1), np.nan)
 
 
 def method_figures(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:

@@ -134,7 +134,8 @@ def collect_tracks(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTra
     memory = PersonMemory()
     kept: list[CameraFrames] = []
     for frames in log.frames():
-        memory, mine, _ = select_person(frames, memory, alone, jump_m, memory_s)
+        memory, which, _ = select_person(frames, memory, alone, jump_m, memory_s)
+        mine = frames.rows(which)
         within = _in_window(mine, log.header.start_ns, log.header.end_ns)
         if len(rows := mine.rows(within)):
             kept.append(rows)

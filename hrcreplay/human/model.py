@@ -354,8 +354,10 @@ def _nearest_rows(p: Floats, reference: Floats) -> None:
 
 #: Thighs and shanks, of which the model of Eq. (37) knows nothing: there only where hip, knee and ankle were recorded.
 LEG_PARTS = ("THIGH_R", "SHANK_R", "THIGH_L", "SHANK_L")
+#: Hands and feet as a camera shows them; a forearm's capsule goes on beyond the wrist by itself.
+END_PARTS = ("HAND_R", "HAND_L", "FOOT_R", "FOOT_L")
 #: Parts of a recorded body.
-PARTS = (*LIMBS, *LEG_PARTS)
+PARTS = (*LIMBS, *LEG_PARTS, *END_PARTS)
 _ENDS = {
     "HD": ("neck", "head"),
     "THX": ("pelvis", "neck"),
@@ -367,6 +369,10 @@ _ENDS = {
     "SHANK_R": ("knee_r", "ankle_r"),
     "THIGH_L": ("hip_l", "knee_l"),
     "SHANK_L": ("knee_l", "ankle_l"),
+    "HAND_R": ("wrist_r", "hand_r"),
+    "HAND_L": ("wrist_l", "hand_l"),
+    "FOOT_R": ("ankle_r", "foot_r"),
+    "FOOT_L": ("ankle_l", "foot_l"),
 }
 _FROM, _TO = (np.array([POINTS.index(_ENDS[part][end]) for part in PARTS]) for end in (0, 1))
 _FOREARMS = np.array([PARTS.index("LRA"), PARTS.index("LLA")])
@@ -380,7 +386,7 @@ def part_axes(points_m: Floats, hand_m: float) -> Floats:
         hand_m: The forearm's capsule goes on beyond the wrist by so much, along the forearm [m].
 
     Returns:
-        (n, 10, 2, 3) ends of the axes of PARTS [m]; NaN where a point is missing.
+        (n, 14, 2, 3) ends of the axes of PARTS [m]; NaN where a point is missing.
     """
     axes = np.stack([points_m[:, _FROM], points_m[:, _TO]], axis=2)
     forearm = axes[:, _FOREARMS, 1] - axes[:, _FOREARMS, 0]
@@ -390,7 +396,8 @@ def part_axes(points_m: Floats, hand_m: float) -> Floats:
 
 
 def part_radii(occupancy: Occupancy, leg_m: float) -> Floats:
-    """(10,) radii of PARTS: Table 2, which has no legs, and ``leg_m`` for thighs and shanks [m]."""
+    """(14,) radii of PARTS: Table 2, a hand's that of the lower arm; ``leg_m`` for thighs, shanks and feet [m]."""
     upper, lower = occupancy.radius_upper_arm_m, occupancy.radius_lower_arm_m
     arms = (upper, lower, upper, lower)
-    return np.array([occupancy.radius_head_m, occupancy.radius_thorax_m, *arms, *(leg_m,) * len(LEG_PARTS)])
+    legs, ends = (leg_m,) * len(LEG_PARTS), (lower, lower, leg_m, leg_m)
+    return np.array([occupancy.radius_head_m, occupancy.radius_thorax_m, *arms, *legs, *ends])

@@ -48,8 +48,8 @@ def select_person(
     T_world_camera: Floats,
     jump_m: float,
     memory_s: float,
-) -> tuple[PersonMemory, CameraFrames, Counter[str]]:
-    """Keeps the one body of each frame that continues the person in space.
+) -> tuple[PersonMemory, Bools, Counter[str]]:
+    """Finds the one body of each frame that continues the person in space.
 
     A body further than ``jump_m`` from where the person was last seen is somebody else. After ``memory_s`` without
     the person, the body nearest to that place becomes the person; the first person is the body nearest to its camera.
@@ -63,8 +63,9 @@ def select_person(
         memory_s: [s].
 
     Returns:
-        The new memory, the frames with at most one body each, and counts: ``person_bodies_dropped``,
-        ``person_id_switches`` and ``person_frames_without`` (frames in which nobody was near enough).
+        The new memory; (n,) which rows are the person, at most one a frame; and counts: ``person_bodies_dropped``,
+        ``person_frames_beside_others`` (frames that show at least one other body), ``person_id_switches`` and
+        ``person_frames_without`` (frames in which nobody was near enough).
     """
     known: Bools = np.asarray(np.isfinite(T_world_camera).all(axis=(1, 2)))
     poses = np.where(known[:, None, None], T_world_camera, np.eye(4))
@@ -81,6 +82,8 @@ def select_person(
         remembered = last is not None and now_ns - last.arrival_ns <= memory_s * 1e9
         found = isfinite(apart_m) and (not remembered or apart_m <= jump_m)
         counts["person_bodies_dropped"] += len(rows) - found
+        others = [other for other in rows if not isnan(places_m[other][0]) and not (found and other == row)]
+        counts["person_frames_beside_others"] += bool(others)
         if not found:
             counts["person_frames_without"] += 1
             continue
@@ -91,7 +94,7 @@ def select_person(
         counts["person_id_switches"] += bodies.get(name, body) != body
         bodies[name] = body
     carried = PersonMemory(tuple(sorted(sightings.items())), tuple(sorted(bodies.items())))
-    return carried, frames.rows(keep), +counts
+    return carried, keep, +counts
 
 
 def _nearest(rows: list[int], places_m: list[Place], here_m: Place) -> tuple[float, int]:

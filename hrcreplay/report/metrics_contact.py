@@ -15,9 +15,20 @@ from hrcreplay.report.metrics import MetricTable, durations_s, times, true_runs
 from hrcreplay.report.metrics_plan import is_moving, numeric_column
 from hrcreplay.store.run_folder import Run
 
-#: What contact.parquet calls the recorded person, and what we call it.
-PERSONS = {"truth": "ground truth", "smoothed": "the smoothed person"}
+#: Where the recorded person is from, as contact.parquet has it, and that in words.
+PERSONS = {
+    "ground truth": "the ground truth of the log",
+    "camera points": "the points of every camera and the smoothed person, of which the nearest counts",
+    "smoothed estimate": "the smoothed person",
+}
 _NOT_COMPARED = "the run has no table of contact"
+#: What must be known of a recorded person, and the parts of the body that show it.
+SHOWN_PARTS = {
+    "legs": ("THIGH_R", "SHANK_R", "THIGH_L", "SHANK_L", "FOOT_R", "FOOT_L"),
+    "arms": ("URA", "LRA", "ULA", "LLA"),
+    "head": ("HD",),
+    "trunk": ("THX",),
+}
 
 
 def method_prefixes(run: Run) -> dict[str, str]:
@@ -40,12 +51,13 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
     person = None if run.contact is None or not len(run.contact) else str(run.contact["person"].iloc[0])
     metrics.add(
         "contact_person",
-        None if person is None else PERSONS.get(person, person),
+        person,
         "name",
-        "where the body is from with which the robot was compared: the log's ground truth, or the fused person "
-        "smoothed over the whole run, of which no legs are known",
+        "where the person is from with whom the robot was compared: the log's ground truth; else the points of every "
+        "camera and the fused person smoothed over the whole run; else the latter alone",
         reason=_NOT_COMPARED,
     )
+    _add_people(metrics, run)
     if run.motion is None:
         return
     for method, prefix in method_prefixes(run).items():
@@ -59,6 +71,30 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
             _add_faults(metrics, prefix, rows, what, motion, blind=method == "none")
     if run.contact is not None:
         _add_left(metrics, run.contact)
+
+
+def _add_people(metrics: MetricTable, run: Run) -> None:
+    """Who was there, and which limbs of the person were shown."""
+    frames = run.counts.get("person_frames_beside_others", 0)
+    metrics.add(
+        "others_frames",
+        frames,
+        "1",
+        "frames with at least one body that is not the person: asked for contact, neither planned for nor predicted",
+    )
+    for limb, parts in SHOWN_PARTS.items():
+        share = None
+        if run.body is not None and len(run.body):
+            columns = [f"{part}_{end}_{axis}" for part in parts for end in (0, 1) for axis in "xyz"]
+            known = [run.body[name].notna() for name in columns if name in run.body]
+            share = float(np.any(known, axis=0).mean()) if known else 0.0
+        metrics.add(
+            f"contact_{limb}_known_share",
+            share,
+            "1",
+            f"share of the time in which the {limb} of the recorded person are known, so that contact with them counts",
+            reason=_NOT_COMPARED,
+        )
 
 
 def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
@@ -105,25 +141,43 @@ def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: st
 
 
 def _add_touch(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str) -> None:
-    """How often, how long and how fast the robot touched the body."""
+    """How often, how long and how fast the robot touched anybody."""
     distance, moving = numeric_column(rows, "distance_m"), rows["moving"].to_numpy(dtype=bool)
+    person, other = (numeric_column(rows, f"{who}_m") for who in ("person", "other"))
     known = np.isfinite(distance)
     touch = known & (distance <= 0.0)
-    metrics.add(f"{prefix}_body_known_ticks", int(known.sum()), "1", f"ticks of {what} at which the body is known")
+    known_ticks = int(np.isfinite(person).sum())
+    metrics.add(f"{prefix}_body_known_ticks", known_ticks, "1", f"ticks of {what} at which the person is known")
+    for who, apart, of in (("person", person, "the person"), ("other", other, "a body that is not the person")):
+        metrics.add(
+            f"{prefix}_touch_{who}_ticks",
+            int((moving & (apart <= 0.0)).sum()) if known.any() else None,
+            "1",
+            f"ticks of {what} with a moving link in contact with {of}",
+            reason="no body is known at any tick",
+        )
+    near = other[moving & np.isfinite(other)]
+    metrics.add(
+        f"{prefix}_other_distance_min_moving_m",
+        float(near.min()) if len(near) else None,
+        "m",
+        f"smallest distance between the surfaces of the moving robot and a body that is not the person, {what}",
+        reason="no other body was seen while the robot moved",
+    )
     for name, which, state in (("moving", touch & moving, "moving"), ("rest", touch & ~moving, "at rest")):
         metrics.add(
             f"{prefix}_touch_{name}_ticks",
             int(which.sum()) if known.any() else None,
             "1",
-            f"ticks of {what} with a link of the robot, {state}, in contact with the recorded body",
-            reason="the body is not known at any tick",
+            f"ticks of {what} with a link of the robot, {state}, in contact with anybody recorded",
+            reason="no body is known at any tick",
         )
     metrics.add(
         f"{prefix}_touch_moving_s",
         float(durations_s(times(rows))[touch & moving].sum()) if known.any() else None,
         "s",
-        f"time in which a moving link of {what} was in contact with the recorded body",
-        reason="the body is not known at any tick",
+        f"time in which a moving link of {what} was in contact with anybody recorded",
+        reason="no body is known at any tick",
     )
     for name, column, of in (("contact", "contact_speed", "the link's surface there"), ("tcp", "tcp_speed", "the TCP")):
         speed = numeric_column(rows, column)[touch & moving]
@@ -147,12 +201,12 @@ def _add_nearest(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: st
             f"{stem}_m",
             None if k is None else float(distance[k]),
             "m",
-            f"smallest distance between the surfaces of robot ({state}) and recorded body, {what}; negative in overlap",
+            f"smallest distance between the robot ({state}) and anybody recorded, {what}; negative in overlap",
             reason=reason,
         )
         at_s = None if k is None else float((times(rows)[k] - times(rows)[0]) * 1e-9)
         metrics.add(f"{stem}_at_s", at_s, "s", f"its first instant, from the first tick of {what}", reason=reason)
-        for part in ("limb", "link"):
+        for part in ("limb", "link", "source"):
             value = None if k is None else str(rows[part].iloc[k])
             metrics.add(f"{stem}_{part}", value, "name", f"the {part} of that pair", reason=reason)
         if name == "moving":
@@ -188,7 +242,7 @@ def _add_faults(
     metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str, motion: pd.DataFrame, *, blind: bool
 ) -> None:
     """Of the contacts while moving: was the person where the prediction said?"""
-    touch = (numeric_column(rows, "distance_m") <= 0.0) & rows["moving"].to_numpy(dtype=bool)
+    touch = (numeric_column(rows, "person_m") <= 0.0) & rows["moving"].to_numpy(dtype=bool)
     outside, retreat = numeric_column(rows, "outside_m")[touch], retreats(motion, times(rows)[touch])
     inside = outside <= 0.0
     for name, which, meaning in (
@@ -209,40 +263,57 @@ def _add_faults(
             f"{prefix}_touch_{name}_ticks",
             None if blind else int(which.sum()),
             "1",
-            f"ticks of {what} with a moving link in contact with a part of the body that was {meaning}",
+            f"ticks of {what} with a moving link in contact with a part of the person that was {meaning}",
             reason="the programme run blind heeds no volumes",
         )
 
 
 def _add_left(metrics: MetricTable, contact: pd.DataFrame) -> None:
-    """How often the body left the stored volumes before their horizon."""
-    left = contact[np.isfinite(numeric_column(contact, "left_m"))]
-    reason = "no tick has stored volumes and a body"
-    out = numeric_column(left, "left_m")
-    metrics.add("volumes_checked_ticks", len(left) or None, "1", "ticks with stored volumes and a body", reason=reason)
-    metrics.add(
-        "volumes_left_ticks",
-        int((out > 0.0).sum()) if len(left) else None,
-        "1",
-        "of those, ticks with a part of the body outside its volume at some instant before the volume's horizon",
-        reason=reason,
-    )
-    metrics.add(
-        "volumes_left_max_m",
-        float(out.max()) if len(left) and out.max() > 0.0 else None,
-        "m",
-        "how far at most a part of the body was outside",
-        reason="the body never left a volume" if len(left) else reason,
-    )
-    limbs = left["left_limb"][out > 0.0].astype(str).value_counts()
-    found = ", ".join(f"{limb} {limbs[limb]}" for limb in sorted(limbs.index))
-    metrics.add(
-        "volumes_left_limbs",
-        found or None,
-        "name",
-        "the part that was furthest outside, and at how many of these ticks",
-        reason="the body never left a volume" if len(left) else reason,
-    )
+    """How often the person left the volumes before their horizon, and before the braking time."""
+    until = {"volumes": ("left", "the tick's horizon"), "volumes_full": ("left_full", "the braking time T_s")}
+    for prefix, (column, end) in until.items():
+        left = contact[np.isfinite(numeric_column(contact, f"{column}_m"))]
+        out = numeric_column(left, f"{column}_m")
+        reason = f"at no tick was a limb seen near the end of {end}"
+        metrics.add(
+            f"{prefix}_checked_ticks",
+            len(left) or None,
+            "1",
+            f"ticks, 25 a second, whose volumes until {end} were compared with the recorded person: those at which a "
+            "limb was seen in the last quarter of that time",
+            reason=reason,
+        )
+        metrics.add(
+            f"{prefix}_left_ticks",
+            int((out > 0.0).sum()) if len(left) else None,
+            "1",
+            "of those, ticks with a recorded point of a limb, the limb's radius about it, outside the limb's volume",
+            reason=reason,
+        )
+        metrics.add(
+            f"{prefix}_held_share",
+            float((out <= 0.0).mean()) if len(left) else None,
+            "1",
+            "share of those ticks at which every limb that was seen stayed whole inside its volume, as audit counts",
+            reason=reason,
+        )
+        never = "no limb left its volume" if len(left) else reason
+        metrics.add(
+            f"{prefix}_left_max_m",
+            float(out.max()) if len(left) and out.max() > 0.0 else None,
+            "m",
+            "how far at most a limb was outside",
+            reason=never,
+        )
+        limbs = left[f"{column}_limb"][out > 0.0].astype(str).value_counts()
+        found = ", ".join(f"{limb} {limbs[limb]}" for limb in sorted(limbs.index))
+        metrics.add(
+            f"{prefix}_left_limbs",
+            found or None,
+            "name",
+            "the limb that was furthest outside, and at how many of these ticks",
+            reason=never,
+        )
 
 
 #: Two events of one kind that are nearer to each other are one [s].

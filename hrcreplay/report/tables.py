@@ -322,12 +322,22 @@ LIMB_NAMES = {
 }
 
 #: What people call the parts of a recorded body that are no LIMBS.
-_LEG_NAMES = {"THIGH_R": "right thigh", "SHANK_R": "right shank", "THIGH_L": "left thigh", "SHANK_L": "left shank"}
+_PART_NAMES = {
+    "THIGH_R": "right thigh",
+    "SHANK_R": "right shank",
+    "THIGH_L": "left thigh",
+    "SHANK_L": "left shank",
+    "HAND_R": "right hand",
+    "HAND_L": "left hand",
+    "FOOT_R": "right foot",
+    "FOOT_L": "left foot",
+    "LEGS": "legs",
+}
 
 
 def part_name_text(part: str) -> str:
     """A part of a recorded body as a reader calls it."""
-    return LIMB_NAMES.get(part) or _LEG_NAMES.get(part, part)
+    return LIMB_NAMES.get(part) or _PART_NAMES.get(part, part)
 
 
 def limb_names_text(limbs: list[str]) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from hrcreplay.records import LIMBS
 from hrcreplay.report.metrics import Metric, MetricTable
-from hrcreplay.report.metrics_contact import PERSONS, method_prefixes
+from hrcreplay.report.metrics_contact import PERSONS, SHOWN_PARTS, method_prefixes
 from hrcreplay.report.metrics_data import add_limbs
 from hrcreplay.report.tables import PageTable, limb_names_text, part_name_text, percent, text_of
 from hrcreplay.store.run_folder import Run
@@ -32,42 +32,110 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class ContactSummary:
-    """Two sentences on the chosen method, and all methods beside each other."""
+    """The chosen method in a few sentences, and all methods beside each other."""
 
-    sentences: tuple[str, ...]
+    sentences: tuple[str, ...]  #: contact, then cost
+    scope: tuple[str, ...]  #: what was considered, and what was not
     held: str  #: how far the prediction they rest on can be trusted; empty: not known
     details: tuple[str, ...]  #: the same with places, instants and causes
     table: PageTable
 
 
 def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
-    """What the comparison with the recorded body says; None where there is none."""
+    """What the comparison with everybody recorded says; None where there is none."""
     if run.motion is None or metrics["contact_person"]["value"] is None:
         return None
     return ContactSummary(
-        (_safe_in_short(metrics), _cost_in_short(run, metrics)),
+        (_contact_in_short(metrics), _cost_in_short(run, metrics)),
+        scope(metrics),
         _held(metrics),
         (_touched(metrics), _cost(run, metrics)),
         _table(run, metrics),
     )
 
 
-def _safe_in_short(metrics: Metrics) -> str:
-    """Would the person have been safe? For who has no more time than that."""
+def _contact_in_short(metrics: Metrics) -> str:
+    """Whether the robot would have touched anybody, at the ticks at which somebody is known."""
     touch, near = metrics["plan_touch_moving_ticks"]["value"], metrics["plan_body_distance_min_moving_m"]["value"]
     if touch is None:
-        return "Nobody can say whether the robot would have touched the person: the recording does not show the person."
+        return "Whether the robot would have touched anybody is not known: the recording shows nobody."
     if touch:
         speed = text_of(metrics["plan_touch_contact_speed_max_m_per_s"])
         seconds = text_of(metrics["plan_touch_moving_s"])
-        return f"With this controller the moving robot would have touched the person: for {seconds}, at up to {speed}."
-    if near is None:
-        return "With this controller the robot would not have moved while the person was there."
-    known = "as far as the cameras saw the person, " if _as_measured(metrics) else ""
-    return (
-        f"With this controller, {known}the moving robot would never have touched the person: it kept "
-        f"{_centimetres(near)} away or more."
-    )
+        words = f"With this controller the moving robot would have touched {_whom(metrics)}: {seconds}, up to {speed}"
+    elif near is None:
+        words = "With this controller the robot would not have moved while anybody was known to be there"
+    else:
+        words = (
+            f"With this controller the moving robot would not have touched anybody {_at_known_ticks(metrics)}: it kept "
+            f"{_centimetres(near)} away or more"
+        )
+    return f"{words}.{_at_rest(metrics)}"
+
+
+def _whom(metrics: Metrics, prefix: str = "plan") -> str:
+    """Who was touched by the moving robot."""
+    person, other = (metrics[f"{prefix}_touch_{who}_ticks"]["value"] for who in ("person", "other"))
+    if person and other:
+        return f"the person ({_count(person)}) and another body ({_count(other)})"
+    return f"another body than the person it heeds ({_count(other)})" if other else f"the person ({_count(person)})"
+
+
+def _count(ticks: int) -> str:
+    return f"{ticks:,} tick{'' if ticks == 1 else 's'}".replace(",", "\u202f")
+
+
+def _at_known_ticks(metrics: Metrics) -> str:
+    """At which ticks, and judged by what."""
+    known, ticks = metrics["plan_body_known_ticks"], metrics["plan_ticks"]
+    which = f"at the {text_of(known)} of {text_of(ticks)} ticks" if known["value"] != ticks["value"] else "at any tick"
+    where = " at which the person is known" if known["value"] != ticks["value"] else ""
+    return f"{which}{where}, judged by the {metrics['contact_person']['value']}"
+
+
+def _at_rest(metrics: Metrics) -> str:
+    """Contacts of a robot at rest."""
+    rest, deep = metrics["plan_touch_rest_ticks"]["value"], metrics["plan_body_distance_min_rest_m"]["value"]
+    if not rest:
+        return ""
+    return f" The robot at rest was in contact at {_count(rest)}, up to {-100 * deep:.0f} cm deep."
+
+
+#: What no run looks at.
+NOT_CONSIDERED = (
+    "objects, table and fixtures",
+    "the robot's own links",
+    "people whom no camera tracked",
+    "what people would do differently beside another motion",
+)
+
+
+def scope(metrics: Metrics) -> tuple[str, ...]:
+    """What the verdict considers, and what it does not."""
+    others = metrics["others_frames"]["value"]
+    people = "One person is planned for"
+    if others:
+        frames = f"{others:,} frame{'' if others == 1 else 's'}".replace(",", "\u202f")
+        people += (
+            f"; {frames} show at least one other body, which counts for contact, but the robot did not heed it and "
+            "nothing was predicted of it"
+        )
+    return (f"{people}.", f"Not considered: {', '.join((*NOT_CONSIDERED, *unseen_limbs(metrics)))}.")
+
+
+def unseen_limbs(metrics: Metrics) -> list[str]:
+    """Limbs of the recorded person that are not known, or only part of the time."""
+    found = []
+    for limb in SHOWN_PARTS:
+        share = metrics[f"contact_{limb}_known_share"]["value"]
+        if share is None or share >= 0.995:
+            continue
+        found.append(
+            f"the {limb}, which were not seen"
+            if share == 0.0
+            else f"the {limb} at {100 * (1 - share):.0f} % of the time"
+        )
+    return found
 
 
 def _cost_in_short(run: Run, metrics: Metrics) -> str:
@@ -78,22 +146,31 @@ def _cost_in_short(run: Run, metrics: Metrics) -> str:
         cost = f"The task would have run at {100 * pace:.0f} % of its pace"
         if 0.05 < pace < 0.95:
             cost = f"The task would have taken {1 / pace:.1f} times as long ({100 * pace:.0f} % of its pace)"
-    if "none" not in run.baselines:
+    if "none" not in run.baselines or metrics["baseline_none_touch_moving_ticks"]["value"] is None:
         return f"{cost}."
-    touch = metrics["baseline_none_touch_moving_s"]["value"]
-    if not touch:
-        return f"{cost}; without a controller the robot would not have touched the person either."
+    if not metrics["baseline_none_touch_moving_ticks"]["value"]:
+        return f"{cost}; without a controller the robot would not have touched anybody at these ticks either."
     speed = text_of(metrics["baseline_none_touch_contact_speed_max_m_per_s"])
-    return f"{cost}; without a controller the robot would have hit the person at up to {speed}."
+    return f"{cost}; without a controller the robot would have hit {_whom(metrics, 'baseline_none')} at up to {speed}."
 
 
 def _held(metrics: Metrics) -> str:
-    """How often the prediction held the person, as ``audit`` counts it."""
-    checked, left = metrics["volumes_checked_ticks"]["value"], metrics["volumes_left_ticks"]["value"]
-    if not checked or left is None:
+    """How often the prediction held the recorded person, as ``audit`` counts it."""
+    parts = []
+    for prefix, until in (("volumes", "their horizon"), ("volumes_full", "the braking time")):
+        checked, left = metrics[f"{prefix}_checked_ticks"]["value"], metrics[f"{prefix}_left_ticks"]["value"]
+        if checked and left is not None:
+            share = f"all {checked}" if left == 0 else f"{_floor_percent(1 - left / checked)} of {checked}"
+            parts.append(f"until {until} at {share} checked ticks")
+    if not parts:
         return ""
-    share = f"all {checked}" if left == 0 else f"{100 * (checked - left) / checked:.1f} % of {checked}"
-    return f"The predicted volumes held the whole person until their horizon at {share} ticks that were checked."
+    judge = metrics["contact_person"]["value"]
+    return f"The predicted volumes held every limb that was seen ({judge}) {', and '.join(parts)}."
+
+
+def _floor_percent(share: float) -> str:
+    """Rounded down, so that nothing but all is 100 %."""
+    return f"{int(1000 * share) / 10:.1f} %"
 
 
 def _centimetres(metres: float) -> str:
@@ -102,38 +179,37 @@ def _centimetres(metres: float) -> str:
 
 
 def _touched(metrics: Metrics) -> str:
-    """The first sentence: whether the moving robot would have touched the person."""
+    """The first sentence: whether the moving robot would have touched anybody."""
     touch = metrics["plan_touch_moving_ticks"]["value"]
     if touch is None:
-        return f"{_HAD}it is not known whether the robot would have touched the person: the person is not known."
+        return f"{_HAD}it is not known whether the robot would have touched anybody: nobody is known."
     if touch:
         words = (
-            f"the moving robot would have touched the person for {text_of(metrics['plan_touch_moving_s'])} in all, at "
-            f"up to {text_of(metrics['plan_touch_contact_speed_max_m_per_s'])}; the deepest contact was of its "
+            f"the moving robot would have touched {_whom(metrics)} for {text_of(metrics['plan_touch_moving_s'])} in "
+            f"all, at up to {text_of(metrics['plan_touch_contact_speed_max_m_per_s'])}; the deepest contact was of its "
             f"{_pair(metrics)} {_when(metrics)}"
         )
         return f"{_HAD}{words}{_fault(metrics)}."
     if metrics["plan_body_distance_min_moving_m"]["value"] is None:
-        return f"{_HAD}the robot would not have moved while the person was there, and a robot at rest touches nobody."
+        return f"{_HAD}the robot would not have moved while anybody was known to be there."
     return (
-        f"{_HAD}{_as_measured(metrics)}no moving part of the robot would have touched the person: the smallest "
-        "distance was "
-        f"{text_of(metrics['plan_body_distance_min_moving_m'])}, between its {_pair(metrics)}, {_when(metrics)}; that "
-        f"link then moved at {text_of(metrics['plan_body_distance_min_moving_contact_speed_m_per_s'])}."
+        f"{_HAD}no moving part of the robot would have touched anybody {_at_known_ticks(metrics)}: the smallest "
+        f"distance was {text_of(metrics['plan_body_distance_min_moving_m'])}, between its {_pair(metrics)}, "
+        f"{_when(metrics)}; that link then moved at "
+        f"{text_of(metrics['plan_body_distance_min_moving_contact_speed_m_per_s'])}."
     )
 
 
-def _as_measured(metrics: Metrics) -> str:
-    """What must stand before 'nobody was touched': limbs that nobody saw are only where the model supposes them."""
-    never = unmeasured(metrics)[0]
-    if not never or metrics["contact_person"]["value"] == PERSONS["truth"]:
-        return ""
-    return f"as far as the person was measured (never: {', '.join(part_name_text(limb) for limb in never)}), "
-
-
 def _pair(metrics: Metrics) -> str:
-    link, limb = (metrics[f"plan_body_distance_min_moving_{part}"]["value"] for part in ("link", "limb"))
-    return f"{link} and the person's {part_name_text(limb)}"
+    link, limb, source = (
+        metrics[f"plan_body_distance_min_moving_{part}"]["value"] for part in ("link", "limb", "source")
+    )
+    whose = f"body of {source}" if ", body " in source else "person"
+    return (
+        f"{link} and the {whose}'s {part_name_text(limb)}"
+        if whose == "person"
+        else f"{link} and the {part_name_text(limb)} of the {whose}"
+    )
 
 
 def _when(metrics: Metrics) -> str:
@@ -167,15 +243,15 @@ def _cost(run: Run, metrics: Metrics) -> str:
     if metrics["plan_stationary_share"]["value"] is not None:
         words.append(f"stood still in {percent(metrics['plan_stationary_share'])} of the time near the person")
     cost = f"It would have {' and '.join(words)}" if words else "What it would have cost the task is not known"
-    if "none" not in run.baselines:
+    if "none" not in run.baselines or metrics["baseline_none_touch_moving_ticks"]["value"] is None:
         return f"{cost}."
     touch, speed = (metrics[f"baseline_none_touch_{name}"] for name in ("moving_s", "contact_speed_max_m_per_s"))
     if touch["value"]:
         return (
-            f"{cost}; without any controller the robot would have touched the person for {text_of(touch)} in all, "
-            f"at up to {text_of(speed)}."
+            f"{cost}; without any controller the robot would have touched {_whom(metrics, 'baseline_none')} for "
+            f"{text_of(touch)} in all, at up to {text_of(speed)}."
         )
-    return f"{cost}; without any controller the robot would not have touched the person either."
+    return f"{cost}; without any controller the robot would not have touched anybody at these ticks either."
 
 
 def _table(run: Run, metrics: Metrics) -> PageTable:
@@ -197,7 +273,7 @@ def _table(run: Run, metrics: Metrics) -> PageTable:
                 percent(metrics[f"{prefix}_full_stop_share"]),
             )
         )
-    return PageTable("Robot against the recorded person", _COLUMNS, tuple(rows), _note(run, metrics))
+    return PageTable("Robot against everybody recorded", _COLUMNS, tuple(rows), _note(run, metrics))
 
 
 def _signed(metric: Metric) -> str:
@@ -213,20 +289,21 @@ def _note(run: Run, metrics: Metrics) -> str:
     """Which person and which body it was."""
     settings = run.meta.get("settings", {})
     hand_m, leg_m = settings.get("occupancy", {}).get("hand_m"), settings.get("report", {}).get("leg_radius_m")
-    person = metrics["contact_person"]["value"]
+    person = str(metrics["contact_person"]["value"])
     hand = "" if hand_m is None else f", the forearms prolonged by a hand of {hand_m:g} m"
-    source = "the ground truth of the log" if person == PERSONS["truth"] else "the fused one, smoothed"
-    words = f"The person is {source}: head, trunk and arms with the radii of Table 2{hand}"
-    if person == PERSONS["truth"]:
-        words += ", and thighs and shanks" + ("" if leg_m is None else f" with a radius of {leg_m:g} m") + " where seen"
-    else:
-        words += "; of the legs nothing is known"
-        if never := unmeasured(metrics)[0]:
-            words += f"; never measured, so not known: the {', '.join(part_name_text(limb) for limb in never)}"
-    words += (
-        ". Distances are between surfaces, at the ticks; negative in overlap. Only ticks at which the person is known "
+    leg = "" if leg_m is None else f" with a radius of {leg_m:g} m"
+    words = (
+        f"The person is {PERSONS.get(person, person)}: head, trunk and arms with the radii of Table 2{hand}, and "
+        f"thighs, shanks and feet{leg} where they were seen"
     )
-    words += f"count: {text_of(metrics['plan_body_known_ticks'])} of {text_of(metrics['plan_ticks'])}."
+    if gaps := unseen_limbs(metrics):
+        words += f"; not known: {', '.join(gaps)}"
+    if metrics["others_frames"]["value"]:
+        words += "; every other body of every camera counts, too"
+    words += (
+        ". Distances are between surfaces, at the ticks; negative in overlap. The person is known at "
+        f"{text_of(metrics['plan_body_known_ticks'])} of {text_of(metrics['plan_ticks'])} ticks."
+    )
     return words + _left(metrics)
 
 
@@ -235,9 +312,7 @@ def _left(metrics: Metrics) -> str:
     checked, left = metrics["volumes_checked_ticks"]["value"], metrics["volumes_left_ticks"]["value"]
     if checked is None or left is None:
         return ""
-    words = (
-        f" The person left the predicted volumes before their horizon at {left} of {checked} ticks with stored volumes"
-    )
+    words = f" A limb left the predicted volumes before their horizon at {left} of {checked} checked ticks"
     if left:
         parts = [found.split(" ") for found in str(metrics["volumes_left_limbs"]["value"]).split(", ")]
         names = ", ".join(f"{part_name_text(part)} {count}" for part, count in parts)
@@ -254,12 +329,14 @@ def line(run: Run, metrics: Metrics) -> str:
         touch, near = metrics[f"{prefix}_touch_moving_ticks"], metrics[f"{prefix}_body_distance_min_moving_m"]
         if touch["value"]:
             speed = text_of(metrics[f"{prefix}_touch_contact_speed_max_m_per_s"])
-            parts.append(f"{method} in {_ticks(touch)}, at up to {speed}")
+            parts.append(f"{method} touched {_whom(metrics, prefix)}, at up to {speed}")
         elif near["value"] is not None:
-            parts.append(f"{method} never (nearest {text_of(near)})")
+            parts.append(f"{method} touched nobody (nearest {text_of(near)})")
         else:
-            parts.append(f"{method} never moved beside a known person")
-    return f"moving robot touched the recorded person ({metrics['contact_person']['value']}): {'; '.join(parts)}."
+            parts.append(f"{method} did not move beside a known person")
+    known = f"{text_of(metrics['plan_body_known_ticks'])} of {text_of(metrics['plan_ticks'])} ticks"
+    judged = f"moving robot against everybody recorded ({metrics['contact_person']['value']}, person known at {known})"
+    return f"{judged}: {'; '.join(parts)}. {' '.join(scope(metrics))}"
 
 
 #: A limb unmeasured at more than this share of the time has to be spoken of.

@@ -6,7 +6,7 @@ The rooms of the stages get plain values and never see a settings model.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Protocol
@@ -45,11 +45,22 @@ class FusionStage:
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
         """Measurements of the person, by the clock of the reference camera; see ``clean.select_person``."""
+        memory, measured, _, found = self.measure_all(frames, memory)
+        return memory, measured, found
+
+    def measure_all(
+        self, frames: CameraFrames, memory: PersonMemory
+    ) -> tuple[PersonMemory, Measurements, CameraFrames, Counter[str]]:
+        """The same, and the frames of all other bodies, their points in the world [m]."""
         memory, mine, found = select_person(
             frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
         )
-        mine = replace(mine, capture_ns=mine.capture_ns - self.clock_offset_ns[mine.camera])
-        return memory, inverse_kinematics.measure(mine, self.T_world_camera, self.filter), found
+        frames = replace(frames, capture_ns=frames.capture_ns - self.clock_offset_ns[frames.camera])
+        others = frames.rows(~mine)
+        T = self.T_world_camera[others.camera]
+        points_m = np.einsum("nij,npj->npi", T[:, :3, :3], others.points_m) + T[:, None, :3, 3]
+        measured = inverse_kinematics.measure(frames.rows(mine), self.T_world_camera, self.filter)
+        return memory, measured, replace(others, points_m=points_m), found
 
 
 @dataclass(frozen=True)
@@ -118,17 +129,6 @@ class Forecast:
         if horizon_s == self.stage.horizon_s:
             return obstacles(self.full, tick, horizon_s)
         return obstacles(self.stage.volumes(self.states.rows(slice(tick, tick + 1)), horizon_s), 0, horizon_s)
-
-    def asking(self, tick: int, asked: dict[float, Obstacles] | None) -> Callable[[float], Obstacles]:
-        """``obstacles`` of one tick; keeps those that are asked for, by their horizon, where they are wanted later."""
-
-        def predict(horizon_s: float) -> Obstacles:
-            found = self.obstacles(tick, horizon_s)
-            if asked is not None:
-                asked[horizon_s] = found
-            return found
-
-        return predict
 
 
 class LogLike(Protocol):

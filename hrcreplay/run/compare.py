@@ -7,7 +7,6 @@ earlier run made by the same settings is taken over; what is computed of it is c
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import shutil
@@ -29,15 +28,16 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import Floats, Ints
 from hrcreplay.report import comparison
 from hrcreplay.report.comparison import Variant
-from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference
 from hrcreplay.run import build, replay
 from hrcreplay.run.build import Forecast
-from hrcreplay.run.contact import Predicted, RecordedPerson, Volumes, contact_table, recorded_person, solids
+from hrcreplay.run.contact import Predicted, contact_table, full_coverage, own_coverage, recorded_people
+from hrcreplay.run.containment import Outcome
 from hrcreplay.run.followers import Planner
 from hrcreplay.run.job import Job, JobOptions, resolve
-from hrcreplay.run.stages import ProgressBar, Sink, print_note, stored_ticks
+from hrcreplay.run.recording import RecordedPeople
+from hrcreplay.run.stages import ProgressBar, Sink, print_note
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Occupancy, Plan
 from hrcreplay.store.columns import motion_columns, read_states
@@ -71,7 +71,8 @@ class VariantTask:
     job: Job  #: its settings are those of the variant
     variant: Variant
     folder: Path  #: with state.parquet; gets motion and contact
-    person: RecordedPerson
+    people: RecordedPeople
+    full: Outcome | None  #: how its volumes hold until the braking time, the same for all with its occupancy
     programme: PlacedProgramme
     ready: bool  #: whether the motion is there already
     size: int  #: ticks of a batch
@@ -189,12 +190,16 @@ def _compare_log(
         sink = Sink(part, watch, _silent)
         found = replay.run_stages(fusing, log, ticks_ns, size, sink, reused, smooth=not log.header.has_truth)
         part.close_tables()
-        person = recorded_person(job, log, part)
+        people = recorded_people(job, log, part)
         part.close_tables()
         have = _motions(job, log, variants, ticks_ns, part)
         programme = _programme(job, log, int(ticks_ns[0]))
+        full = _full_coverages(job, variants, people, part.partial)
         tasks = [
-            VariantTask(variant_job(job, variant), variant, part.partial, person, programme, variant in have, size)
+            VariantTask(
+                *(variant_job(job, variant), variant, part.partial, people, full[variant.occupancy]),
+                *(programme, variant in have, size),
+            )
             for variant in variants
         ]
         took = _plan_all(tasks, processes, partial(bar.advance, name))
@@ -206,8 +211,22 @@ def _compare_log(
         for motion, contact in [tables(part.folder, variant)]
     }
     return comparison.LogResult(
-        name, job.log_sha256, person.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, tuple(found["notes"]), rows
+        name, job.log_sha256, people.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, tuple(found["notes"]), rows
     )
+
+
+def _full_coverages(
+    job: Job, variants: Sequence[Variant], people: RecordedPeople, folder: Path
+) -> dict[str, Outcome | None]:
+    """How the volumes of each occupancy hold the person until the braking time."""
+    found: dict[str, Outcome | None] = {}
+    for variant in sorted(variants, key=lambda variant: variant.method == "none"):
+        if variant.occupancy not in found:
+            mine = variant_job(job, variant)
+            found[variant.occupancy] = full_coverage(
+                mine, people, Predicted(build.prediction_stage(mine), folder / "state.parquet")
+            )
+    return found
 
 
 def _programme(job: Job, log: Log, start_ns: int) -> PlacedProgramme:
@@ -325,18 +344,11 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     stage, states, writer = build.prediction_stage(job), task.folder / "state.parquet", _TablesOf(task.folder)
     robot = build.robot(job, task.programme.T_world_base)
     done, planner = 0, None if task.ready else _planner(task, robot)
-    used: list[tuple[int, float, Volumes]] = []
     for batch in read_states(states, task.size):
         if planner is not None:
             forecast = Forecast(stage, batch)
-            asked: dict[int, dict[float, Obstacles]] = {tick: {} for tick in _checked(job, done, len(batch))}
-            around = [forecast.asking(tick, asked.get(tick)) for tick in range(len(batch))]
+            around = [partial(forecast.obstacles, tick) for tick in range(len(batch))]
             made = planner.follow(batch, around, stage.limbs)
-            used += [
-                (int(made.t_ns[i]), horizon_s, solids(found[horizon_s], stage.limbs))
-                for i, found in asked.items()
-                for horizon_s in [float(made.horizon_s[i])]
-            ]
             writer.table(f"motion_{slug}", motion_columns(made))
         done += len(batch)
         if progress is not None:
@@ -344,11 +356,9 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     writer.close_tables()
     motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
     predicted = Predicted(stage, states)
-    if planner is None:
-        used = _predicted_again(motion, predicted, job)
-    volumes = () if task.variant.method == "none" else (part for part in used if part[2])
-    hand_m = job.settings.occupancy.hand_m if stage.method == "sound" else 0.0  # the others know of no hand
-    rows = contact_table(job, robot, task.variant.method, motion, task.person, predicted, iter(volumes), hand_m)
+    own = own_coverage(job, task.people, predicted, motion)
+    full = None if task.variant.method == "none" else task.full
+    rows = contact_table(job, robot, task.variant.method, motion, task.people, predicted, own, full)
     writer.table(f"contact_{slug}", rows)
     writer.close_tables()
     return done, time.perf_counter() - began_s
@@ -370,19 +380,6 @@ class _TablesOf(RunWriter):
     def partial(self) -> Path:
         """The folder itself."""
         return self.folder
-
-
-def _checked(job: Job, first: int, count: int) -> list[int]:
-    """Of some ticks those at which the person is compared with the volumes: as many as a run stores."""
-    every = replay.store_every(job)
-    return stored_ticks(first, count, 1.0 if math.isinf(every) else every).tolist()
-
-
-def _predicted_again(motion: pd.DataFrame, predicted: Predicted, job: Job) -> list[tuple[int, float, Volumes]]:
-    """The volumes that a motion was decided with, of the ticks at which the person is compared with them."""
-    t_ns, horizon_s = motion["t_ns"].tolist(), motion["horizon_s"].tolist()
-    ticks = _checked(job, 0, len(motion))
-    return [(t_ns[i], horizon_s[i], predicted.volumes(t_ns[i], horizon_s[i])) for i in ticks]
 
 
 def _meta(jobs: Sequence[Job], variants: Sequence[Variant], began: datetime) -> dict[str, Any]:

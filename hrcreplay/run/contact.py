@@ -1,14 +1,17 @@
-"""The person as recorded, and the robot against them: a row a tick and method in contact.parquet.
+"""The robot against everybody recorded: a row a tick and method in contact.parquet.
 
-The links' capsules at the commanded joint positions, and the recorded body's capsules: neither knows of predictions.
-Where they overlap while the robot moves, the row also says whether the part of the body that is touched was inside the
-volume by which the motion had been certified: then the robot is at fault, else the prediction.
+The links' capsules at the commanded joint positions, and the capsules of every recorded body by every source: the
+ground truth, else the smoothed person and each camera's points; and every other body of every camera. None of them
+knows of predictions, and the worst counts. Where the moving robot touches the person, the row also says whether the
+part that is touched was inside the volume by which the motion had been certified: then the robot is at fault, else the
+prediction.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,138 +20,29 @@ import pyarrow.parquet as pq
 
 from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.fusion import fuse
-from hrcreplay.human.model import LEG_PARTS, PARTS, part_axes, part_radii, skeleton
+from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import Bools, Floats, HumanStates, Ints
+from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints
 from hrcreplay.report.metrics_contact import deciding_rows
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import PredictionStage
+from hrcreplay.run.containment import Outcome, coverage
 from hrcreplay.run.job import Job
+from hrcreplay.run.recording import BodyTrack, RecordedPeople, read_people
 from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter
 
-#: Between samples of the recorded person further apart nothing is known [s].
-GAP_S = 0.1
-_TICKS = 4096
-
-
-@dataclass(frozen=True)
-class RecordedPerson:
-    """Body points over time, from one source."""
-
-    source: str  #: "truth", or "smoothed"
-    t_ns: Ints  #: (n,) increasing
-    points_m: Floats  #: (n, 20, 3) POINTS, world [m]; NaN where they are not known
-
-    def part_axes(self, at_ns: Ints, hand_m: float) -> Floats:
-        """(m, 10, 2, 3) axes of the capsules of ``PARTS`` at some instants [m]."""
-        points_m = at_instants(self.t_ns, self.points_m, at_ns, GAP_S)
-        return part_axes(points_m, hand_m)
-
-
-def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float) -> Floats:
-    """Body points between the two samples around each instant, linear.
-
-    Args:
-        t_ns: (n,) instants of the samples, increasing [ns].
-        points_m: (n, 20, 3) samples, world [m].
-        at_ns: (m,) instants asked for [ns].
-        gap_s: Between samples further apart nothing is known [s].
-
-    Returns:
-        (m, 20, 3); NaN outside the samples, in a gap, and where one of the two samples lacks the point. An instant
-        that meets a sample gets that sample.
-    """
-    found = np.full((len(at_ns), *points_m.shape[1:]), np.nan)
-    if not len(t_ns):
-        return found
-    right = np.searchsorted(t_ns, at_ns, side="left")
-    inside = (at_ns >= t_ns[0]) & (at_ns <= t_ns[-1])
-    right = np.clip(right, 0, len(t_ns) - 1)
-    met = inside & (t_ns[right] == at_ns)
-    found[met] = points_m[right[met]]
-    left = np.maximum(right - 1, 0)
-    step_ns = t_ns[right] - t_ns[left]
-    between = inside & ~met & (step_ns > 0) & (step_ns * 1e-9 <= gap_s)
-    share = ((at_ns - t_ns[left])[between] / step_ns[between])[:, None, None]
-    found[between] = (1.0 - share) * points_m[left[between]] + share * points_m[right[between]]
-    return found
-
-
-def recorded_person(job: Job, log: Log, writer: RunWriter) -> RecordedPerson:
-    """The person of a run. Without ground truth and smooth.parquet the log is fused again, and smooth.parquet written.
-
-    Args:
-        job: What was asked for.
-        log: Log of the job.
-        writer: Run folder, its tables complete.
-    """
-    if log.header.has_truth:
-        parts = list(log.truth())
-        t_ns, first = np.unique(np.concatenate([part.t_ns for part in parts]), return_index=True)
-        return RecordedPerson("truth", t_ns, np.concatenate([part.points_m for part in parts])[first])
-    path = writer.partial / "smooth.parquet"
-    if path.exists():
-        states = HumanStates.join(list(read_states(path, _TICKS)))
-    else:
-        states = _smoothed(job, log, _ticks_of(writer))
-        writer.table("smooth", state_columns(states))
-    return from_states(states, job.settings.fusion.memory_s)
-
-
-def from_states(states: HumanStates, memory_s: float) -> RecordedPerson:
-    """The smoothed person, but for where no camera saw them: there is nothing to smooth.
-
-    Args:
-        states: The smoothed states.
-        memory_s: Between two ticks that used a camera further apart than this, nothing is known [s].
-    """
-    points_m = skeleton(states.p, states.lengths_m)
-    points_m[~_seen(states, memory_s)] = np.nan
-    return RecordedPerson("smoothed", states.t_ns, points_m)
-
-
-def _seen(states: HumanStates, memory_s: float) -> Bools:
-    """(n,) ticks that lie between two ticks with a camera not further apart than ``memory_s`` [s], both included."""
-    used = np.flatnonzero(states.valid.any(axis=1))
-    if not len(used):
-        return np.zeros(len(states), dtype=np.bool_)
-    ticks = np.arange(len(states))
-    before = used[np.maximum(np.searchsorted(used, ticks, side="right") - 1, 0)]
-    after = used[np.minimum(np.searchsorted(used, ticks, side="left"), len(used) - 1)]
-    apart_s = (states.t_ns[after] - states.t_ns[before]) * 1e-9
-    return np.asarray((before <= ticks) & (ticks <= after) & (apart_s <= memory_s))
-
-
-def _ticks_of(writer: RunWriter) -> Ints:
-    """The ticks of the fused person."""
-    return np.concatenate([states.t_ns for states in read_states(writer.partial / "state.parquet", _TICKS)])
-
-
-def _smoothed(job: Job, log: Log, ticks_ns: Ints) -> HumanStates:
-    """The person fused and smoothed, where the stage was not run or was taken over."""
-    fusion_stage, cameras = build.fusion_stage(job, log), log.header.cameras
-    state, memory = fuse.start(cameras), PersonMemory()
-    passed = []
-    for ticks, seen in stages.batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _TICKS):
-        measured = stages.no_frames(cameras)
-        if seen is not None:
-            memory, measured, _ = fusion_stage.measure(seen, memory)
-        state, states, _, trace = fuse.fuse(
-            state, ticks, measured, fusion_stage.filter, fusion_stage.limits, traced=True
-        )
-        passed.append((states, trace))
-    return stages.smoothed(passed, fusion_stage.filter)
-
+_BATCH = 4096
 
 #: Part of the body -> limb whose volume it has to be in.
-VOLUME_OF = {part: "LEGS" if part in LEG_PARTS else part for part in PARTS}
-
-#: Of the ticks until a horizon, the last and one in so many are looked at: people do not tremble that fast.
-_EVERY = 4
+VOLUME_OF = (
+    {part: part for part in PARTS}
+    | dict.fromkeys((*LEG_PARTS, "FOOT_R", "FOOT_L"), "LEGS")
+    | {"HAND_R": "LRA", "HAND_L": "LLA"}
+)
 
 #: Rows of body.parquet a second, for those who draw it.
 _BODY_HZ = 25.0
@@ -157,8 +51,45 @@ _BODY_HZ = 25.0
 Volumes = Mapping[str, tuple[Floats, float]]
 
 
+def recorded_people(job: Job, log: Log, writer: RunWriter) -> RecordedPeople:
+    """Everybody in the log of a run. Without ground truth and smooth.parquet the log is fused again, and that written.
+
+    Args:
+        job: What was asked for.
+        log: Log of the job.
+        writer: Run folder, its tables complete.
+    """
+    ticks_ns = np.concatenate([states.t_ns for states in read_states(writer.partial / "state.parquet", _BATCH)])
+    fusion_stage = build.fusion_stage(job, log)
+    path = writer.partial / "smooth.parquet"
+
+    def smoothed() -> HumanStates:
+        if not path.exists():
+            for part in _smooth(job, log, ticks_ns):
+                writer.table("smooth", state_columns(part))
+            writer.close_tables()
+        return HumanStates.join(list(read_states(path, _BATCH)))
+
+    return read_people(log, ticks_ns, fusion_stage, smoothed)
+
+
+def _smooth(job: Job, log: Log, ticks_ns: Ints) -> Iterator[HumanStates]:
+    """The person fused and smoothed, where the stage was not run or was taken over."""
+    fusion_stage, cameras = build.fusion_stage(job, log), log.header.cameras
+    state, memory, smoother = fuse.start(cameras), PersonMemory(), stages.StretchSmoother(fusion_stage.filter)
+    for ticks, seen in stages.batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
+        measured = stages.no_frames(cameras)
+        if seen is not None:
+            memory, measured, _ = fusion_stage.measure(seen, memory)
+        state, states, _, trace = fuse.fuse(
+            state, ticks, measured, fusion_stage.filter, fusion_stage.limits, traced=True
+        )
+        yield from smoother.add(states, trace)
+    yield from smoother.finish()
+
+
 def write_contact(job: Job, log: Log, writer: RunWriter, T_world_base: Floats) -> None:
-    """Writes contact.parquet for every motion table of a run.
+    """Writes contact.parquet for every motion table of a run, and the recorded body for those who draw it.
 
     Args:
         job: What was asked for.
@@ -166,20 +97,47 @@ def write_contact(job: Job, log: Log, writer: RunWriter, T_world_base: Floats) -
         writer: Run folder, its tables complete.
         T_world_base: (4, 4) robot base in the world.
     """
-    robot, occupancy = build.robot(job, T_world_base), job.settings.occupancy
-    person = recorded_person(job, log, writer)
+    robot = build.robot(job, T_world_base)
+    people = recorded_people(job, log, writer)
     predicted = Predicted(build.prediction_stage(job), writer.partial / "state.parquet")
     chosen = job.settings.plan.method
     for path in sorted(writer.partial.glob("motion*.parquet")):
         method = path.stem.removeprefix("motion").removeprefix("_") or chosen
         motion = pq.read_table(path).to_pandas()
-        volumes: Iterator[tuple[int, float, Volumes]] = iter(())
+        own = full = None
         if path.stem == "motion":
-            volumes = stored_volumes(writer, occupancy.stop_s)
+            own, full = own_coverage(job, people, predicted, motion), full_coverage(job, people, predicted)
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(job.settings.fusion.rate_hz / _BODY_HZ))]
-            writer.table("body", body_columns(shown_ns, person.part_axes(shown_ns, occupancy.hand_m), PARTS))
-        writer.table("contact", contact_table(job, robot, method, motion, person, predicted, volumes))
+            axes_m = body_axes(people.person, shown_ns, job.settings.occupancy.hand_m)
+            writer.table("body", body_columns(shown_ns, axes_m, PARTS))
+        writer.table("contact", contact_table(job, robot, method, motion, people, predicted, own, full))
     writer.close_tables()
+
+
+def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats:
+    """(m, 14, 2, 3) axes of the person's capsules, of each part by the first source that knows it [m]."""
+    axes_m = person[0].axes_m(at_ns, hand_m)
+    for track in person[1:]:
+        axes_m = np.where(np.isnan(axes_m), track.axes_m(at_ns, hand_m), axes_m)
+    return axes_m
+
+
+def own_coverage(job: Job, people: RecordedPeople, predicted: Predicted, motion: pd.DataFrame) -> Outcome | None:
+    """How the volumes of every asked tick hold until the horizon that the motion's tick was decided with."""
+    if job.settings.plan.method == "none":
+        return None
+    states = predicted.all_states
+    horizon_s = _at(states.t_ns, motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float))
+    return coverage(predicted.stage, people, states, job.settings.fusion.rate_hz, horizon_s)
+
+
+def full_coverage(job: Job, people: RecordedPeople, predicted: Predicted) -> Outcome | None:
+    """How the volumes of every asked tick hold until the braking time T_s, as ``audit`` asks."""
+    if job.settings.plan.method == "none":
+        return None
+    states = predicted.all_states
+    horizon_s = np.full(len(states), predicted.stage.horizon_s)
+    return coverage(predicted.stage, people, states, job.settings.fusion.rate_hz, horizon_s)
 
 
 def contact_table(
@@ -187,10 +145,10 @@ def contact_table(
     robot: RobotModel,
     method: str,
     motion: pd.DataFrame,
-    person: RecordedPerson,
+    people: RecordedPeople,
     predicted: Predicted,
-    volumes: Iterator[tuple[int, float, Volumes]],
-    lines_m: float | None = None,
+    own: Outcome | None,
+    full: Outcome | None,
 ) -> Columns:
     """The rows of contact.parquet for one motion.
 
@@ -199,92 +157,125 @@ def contact_table(
         robot: At its place in the world.
         method: That made the motion.
         motion: Rows of a motion table.
-        person: As recorded.
+        people: As recorded.
         predicted: Volumes of any tick.
-        volumes: Instant [ns], horizon [s] and volumes of the ticks at which the person may be found to have left them.
-        lines_m: None: the parts with their radii leave them; else their lines, with a hand of this length [m].
+        own: What ``own_coverage`` found; None where it was not asked.
+        full: What ``full_coverage`` found; None likewise.
     """
-    radii_m = part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
-    t_ns = motion["t_ns"].to_numpy()
-    body = Body(person.source, person.part_axes(t_ns, job.settings.occupancy.hand_m), radii_m)
-    found = compare(robot, motion, body)
+    occupancy, t_ns = job.settings.occupancy, motion["t_ns"].to_numpy()
+    radii_m = part_radii(occupancy, job.settings.report.leg_radius_m)
+    person, other = nearest(robot, motion, (people.person, people.others), radii_m, occupancy.hand_m)
+    worst, of_other = worse(person, other)
+    outside_m = np.full(len(t_ns), np.nan)
     if method != "none":
-        found.by_volume_m[:] = by_volume(motion, found, body, predicted)
-    if lines_m is not None:
-        body = Body(person.source, person.part_axes(t_ns, lines_m), np.zeros(len(radii_m)))
-    mark_left(found, t_ns, body, volumes)
-    return _columns(motion, method, body.source, found, tuple(segment.name for segment in robot.segments))
-
-
-@dataclass(frozen=True)
-class Body:
-    """The recorded person's capsules at the ticks of a motion."""
-
-    source: str  #: as ``RecordedPerson`` has it
-    axes_m: Floats  #: (n, 10, 2, 3) of PARTS, world [m]; NaN where not known
-    radius_m: Floats  #: (10,) [m]
-
-
-@dataclass(frozen=True)
-class Contact:
-    """What is nearest between robot and body, a row a tick."""
-
-    distance_m: Floats  #: (n,) surface to surface, negative in overlap; NaN where the body is not known [m]
-    link: Ints  #: (n,) index into the robot's segments; -1 where the body is not known
-    part: Ints  #: (n,) index into PARTS; -1 likewise
-    moving: Bools  #: (n,) whether any axis turns
-    speed: Floats  #: (n,) of the link's surface where it is nearest to the body [m/s]
-    #: (n,) how far the part was outside the volume by which the motion had been certified, negative inside; NaN where
-    #: robot and body do not overlap, the robot stands, or nothing was predicted [m]
-    by_volume_m: Floats
-    #: (n,) how far, at most, a part left the stored volume of this tick until its horizon; NaN without one [m]
-    left_m: Floats
-    left_part: Ints  #: (n,) index into PARTS of that part; -1 without one
-
-
-def _columns(motion: pd.DataFrame, method: str, person: str, found: Contact, links: tuple[str, ...]) -> Columns:
+        outside_m = by_volume(motion, person, people.person, radii_m, occupancy.hand_m, predicted)
+    sources = tuple(track.source for track in people.tracks)
     return contact_columns(
-        t_ns=motion["t_ns"].to_numpy(),
+        t_ns=t_ns,
         method=method,
-        person=person,
-        moving=found.moving,
-        distance_m=found.distance_m,
-        part=(found.part, PARTS),
-        link=(found.link, links),
-        speeds=(motion["tcp_speed"].to_numpy(dtype=float), found.speed),
-        outside_m=found.by_volume_m,
-        left=(found.left_m, found.left_part, PARTS),
+        person=people.source,
+        moving=_is_turning(motion),
+        distance_m=worst.distance_m,
+        part=(worst.part, PARTS),
+        link=(worst.link, tuple(segment.name for segment in robot.segments)),
+        speeds=(motion["tcp_speed"].to_numpy(dtype=float), worst.speed),
+        source=(np.where(of_other, len(people.person) + worst.track, worst.track), sources),
+        apart=(person.distance_m, other.distance_m),
+        outside_m=outside_m,
+        left=(*_left(own, t_ns), BODY),
+        left_full=(*_left(full, t_ns), BODY),
     )
 
 
-def compare(robot: RobotModel, motion: pd.DataFrame, body: Body) -> Contact:
-    """The distance between robot and body at every tick of a motion.
+@dataclass(frozen=True)
+class Nearest:
+    """What is nearest between the robot and some bodies, a row a tick."""
+
+    distance_m: Floats  #: (n,) surface to surface, negative in overlap; NaN where no body is known [m]
+    link: Ints  #: (n,) index into the robot's segments; -1 where no body is known
+    part: Ints  #: (n,) index into PARTS; -1 likewise
+    track: Ints  #: (n,) index into the bodies' tracks; -1 likewise
+    speed: Floats  #: (n,) of the link's surface where it is nearest to the body [m/s]
+
+
+def worse(first: Nearest, second: Nearest) -> tuple[Nearest, Bools]:
+    """Of two at the same ticks the nearer one, tick by tick, and (n,) where that is the second."""
+    is_second: Bools = np.asarray(~(first.distance_m <= second.distance_m) & np.isfinite(second.distance_m))
+    pairs = ((getattr(first, name), getattr(second, name)) for name in first.__dataclass_fields__)
+    return Nearest(*(np.where(is_second, b, a) for a, b in pairs)), is_second
+
+
+def nearest(
+    robot: RobotModel, motion: pd.DataFrame, groups: Sequence[Sequence[BodyTrack]], radii_m: Floats, hand_m: float
+) -> tuple[Nearest, ...]:
+    """The nearest pair of link and body of each group of tracks, at every tick of a motion.
 
     Args:
         robot: The manipulator.
         motion: Rows of a motion table.
-        body: At the same ticks.
+        groups: Of bodies.
+        radii_m: (14,) radii of PARTS [m].
+        hand_m: Length of a hand beyond the wrist [m].
     """
     q, dq = (motion[[f"{name}{i + 1}" for i in range(robot.nv)]].to_numpy(dtype=float) for name in ("q", "dq"))
-    links = robot.link_motion(q, dq)
-    radius_m = np.array([segment.radius_m for segment in robot.segments])
-    pair = nearest_pair(links.ends_m, radius_m, body.axes_m, body.radius_m)
-    apart = pair.at_second_m - pair.at_first_m
-    length = np.linalg.norm(apart, axis=1, keepdims=True)
-    towards = apart / np.where(length > 0.0, length, np.inf)  # on the axis itself where the axes cross
-    at_m = pair.at_first_m + radius_m[pair.first][:, None] * towards
-    nothing = np.full(len(motion), np.nan)
-    moving = np.asarray((dq != 0.0).any(axis=1))
-    return Contact(
-        pair.distance_m,
-        pair.first,
-        pair.second,
-        moving,
-        links.speed(pair.first, at_m),
-        nothing,
-        nothing.copy(),
-        np.full(len(motion), -1),
-    )
+    t_ns, parts = motion["t_ns"].to_numpy(), []
+    for first in range(0, len(t_ns), _BATCH):
+        rows = slice(first, first + _BATCH)
+        links = robot.link_motion(q[rows], dq[rows])
+        parts.append([_nearest(robot, links, t_ns[rows], tracks, radii_m, hand_m) for tracks in groups])
+    return tuple(_join(batches) for batches in zip(*parts, strict=True))
+
+
+def _nearest(
+    robot: RobotModel, links: LinkMotion, t_ns: Ints, tracks: Sequence[BodyTrack], radii_m: Floats, hand_m: float
+) -> Nearest:
+    """The nearest pair among some tracks, at a batch of ticks."""
+    unknown, nothing = np.full(len(t_ns), np.nan), np.full(len(t_ns), -1)
+    found = Nearest(unknown, nothing, nothing, nothing, unknown)
+    link_radius_m = np.array([segment.radius_m for segment in robot.segments])
+    for k, track in enumerate(tracks):
+        if not track.is_near(int(t_ns[0]), int(t_ns[-1])):
+            continue
+        pair = nearest_pair(links.ends_m, link_radius_m, track.axes_m(t_ns, hand_m), radii_m)
+        apart = pair.at_second_m - pair.at_first_m
+        length = np.linalg.norm(apart, axis=1, keepdims=True)
+        towards = apart / np.where(length > 0.0, length, np.inf)  # on the axis itself where the axes cross
+        at_m = pair.at_first_m + link_radius_m[pair.first][:, None] * towards
+        index = np.where(pair.first >= 0, k, -1)
+        speed = links.speed(pair.first, at_m)
+        found, _ = worse(found, Nearest(pair.distance_m, pair.first, pair.second, index, speed))
+    return found
+
+
+def _join(batches: Sequence[Nearest]) -> Nearest:
+    """Those of consecutive ticks as one."""
+    return Nearest(*(np.concatenate([getattr(b, name) for b in batches]) for name in Nearest.__dataclass_fields__))
+
+
+def _is_turning(motion: pd.DataFrame) -> Bools:
+    """(n,) whether any axis turns."""
+    joints = [name for name in motion.columns if name[:2] == "dq" and name[2:].isdigit()]
+    return np.asarray((motion[joints].to_numpy(dtype=float) != 0.0).any(axis=1))
+
+
+def _at(from_ns: Ints, motion_ns: Ints, values: Floats) -> Floats:
+    """Values of a motion's ticks at other instants: those of the same instant, else NaN."""
+    row = np.clip(np.searchsorted(motion_ns, from_ns), 0, len(motion_ns) - 1)
+    return np.where(motion_ns[row] == from_ns, values[row], np.nan)
+
+
+def _left(outcome: Outcome | None, t_ns: Ints) -> tuple[Floats, Ints]:
+    """(n,) how far at most a limb left its volume, 0 where all were held, NaN where not asked [m]; (n,) that limb."""
+    out_m, limb = np.full(len(t_ns), np.nan), np.full(len(t_ns), -1)
+    if outcome is None:
+        return out_m, limb
+    row = np.clip(np.searchsorted(t_ns, outcome.t_ns), 0, len(t_ns) - 1)
+    same = t_ns[row] == outcome.t_ns
+    escape_m = outcome.escape_m()
+    out_m[row[same]] = outcome.worst_m()[same]
+    worst = np.argmax(np.where(np.isnan(escape_m), -1.0, escape_m), axis=1)
+    limb[row[same]] = np.where(outcome.worst_m() > 0.0, [BODY.index(outcome.limbs[k]) for k in worst], -1)[same]
+    return out_m, limb
 
 
 @dataclass
@@ -293,16 +284,18 @@ class Predicted:
 
     stage: PredictionStage
     states: Path  #: state.parquet
-    _states: HumanStates | None = field(default=None, init=False)
+
+    @cached_property
+    def all_states(self) -> HumanStates:
+        """The fused person at every tick."""
+        return HumanStates.join(list(read_states(self.states, _BATCH)))
 
     def volumes(self, t_ns: int, horizon_s: float) -> Volumes:
         """Those of the last state that is not later than ``t_ns``; none where the person was not known."""
-        if self._states is None:
-            self._states = HumanStates.join(list(read_states(self.states, 4096)))
-        row = int(np.searchsorted(self._states.t_ns, t_ns, side="right")) - 1
+        row = int(np.searchsorted(self.all_states.t_ns, t_ns, side="right")) - 1
         if row < 0:
             return {}
-        volumes = self.stage.volumes(self._states.rows(slice(row, row + 1)), horizon_s)
+        volumes = self.stage.volumes(self.all_states.rows(slice(row, row + 1)), horizon_s)
         return solids(obstacles(volumes, 0), volumes.limbs)
 
 
@@ -315,16 +308,25 @@ def solids(around: Obstacles, limbs: tuple[str, ...]) -> Volumes:
     return {limb: solid for limb, solid in found.items() if np.isfinite(solid[0]).all() and np.isfinite(solid[1])}
 
 
-def by_volume(motion: pd.DataFrame, found: Contact, body: Body, predicted: Predicted) -> Floats:
-    """``Contact.by_volume_m``.
+def by_volume(
+    motion: pd.DataFrame,
+    found: Nearest,
+    tracks: Sequence[BodyTrack],
+    radii_m: Floats,
+    hand_m: float,
+    predicted: Predicted,
+) -> Floats:
+    """(n,) how far the touched part was outside the volume by which the motion had been certified, negative inside [m].
 
     The volumes of the tick at which it was decided what moves the robot hold until the stop that was found clear of
-    them has ended.
+    them has ended. NaN where the robot touches nobody or stands, or nothing was predicted.
 
     Args:
         motion: Rows of a motion table.
-        found: Distances at the same ticks.
-        body: At the same ticks.
+        found: The nearest of the person's tracks at the same ticks.
+        tracks: Of the person.
+        radii_m: (14,) radii of PARTS [m].
+        hand_m: Length of a hand beyond the wrist [m].
         predicted: Volumes of any tick.
     """
     outside_m = np.full(len(motion), np.nan)
@@ -332,7 +334,7 @@ def by_volume(motion: pd.DataFrame, found: Contact, body: Body, predicted: Predi
     decided = deciding_rows(motion)
     volumes: Volumes = {}
     last = -1
-    for i in np.flatnonzero(found.moving & (found.distance_m <= 0.0)).tolist():
+    for i in np.flatnonzero(_is_turning(motion) & (found.distance_m <= 0.0)).tolist():
         k = int(decided[i])
         if k < 0:
             continue
@@ -341,48 +343,6 @@ def by_volume(motion: pd.DataFrame, found: Contact, body: Body, predicted: Predi
         part = int(found.part[i])
         solid = volumes.get(VOLUME_OF[PARTS[part]])
         if solid is not None:
-            outside_m[i] = protrusion_m(body.axes_m[i : i + 1, part], float(body.radius_m[part]), *solid)[0]
+            axes_m = tracks[int(found.track[i])].axes_m(t_ns[i : i + 1], hand_m)[:, part]
+            outside_m[i] = protrusion_m(axes_m, float(radii_m[part]), *solid)[0]
     return outside_m
-
-
-def stored_volumes(writer: RunWriter, stop_s: float) -> Iterator[tuple[int, float, Volumes]]:
-    """The volumes of occupancy.parquet, tick by tick: instant [ns], horizon [s], volumes."""
-    path = writer.partial / "occupancy.parquet"
-    if not path.exists():
-        return
-    table = pq.read_table(path)
-    t_ns, radius_m, limbs = table["t_ns"].to_numpy(), table["radius_m"].to_numpy(), table["limb"].to_pylist()
-    stored = "horizon_s" in table.column_names
-    horizon_s = table["horizon_s"].to_numpy() if stored else np.full(len(t_ns), stop_s)
-    vertices = table["vertices"].combine_chunks()
-    ends, numbers = vertices.offsets.to_numpy(), vertices.values.to_numpy()
-    starts = np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))
-    for first, last in zip(starts, [*starts[1:], len(t_ns)], strict=True):
-        rows = range(first, last)
-        solids = {limbs[i]: (numbers[ends[i] : ends[i + 1]].reshape(-1, 3), float(radius_m[i])) for i in rows}
-        yield int(t_ns[first]), float(horizon_s[first]), solids
-
-
-def mark_left(found: Contact, t_ns: Ints, body: Body, volumes: Iterator[tuple[int, float, Volumes]]) -> None:
-    """Writes ``left_m`` and ``left_part`` of a contact.
-
-    Args:
-        found: Its rows are the ticks.
-        t_ns: (n,) ticks of the motion [ns].
-        body: At the same ticks.
-        volumes: Instant [ns], horizon [s] and volumes of the stored ticks.
-    """
-    for at_ns, horizon_s, solids in volumes:
-        first = int(np.searchsorted(t_ns, at_ns, side="left"))
-        last = int(np.searchsorted(t_ns, at_ns + round(horizon_s * 1e9), side="right"))
-        if first >= last:
-            continue
-        ticks = np.unique(np.append(np.arange(first, last, _EVERY), last - 1))
-        for part, name in enumerate(PARTS):
-            axes_m = body.axes_m[ticks, part]
-            axes_m = axes_m[np.isfinite(axes_m).all(axis=(1, 2))]
-            if VOLUME_OF[name] not in solids or not len(axes_m):
-                continue
-            out_m = float(protrusion_m(axes_m, float(body.radius_m[part]), *solids[VOLUME_OF[name]]).max())
-            if not out_m <= found.left_m[first]:  # the first one meets NaN
-                found.left_m[first], found.left_part[first] = out_m, part

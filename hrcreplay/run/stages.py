@@ -103,7 +103,7 @@ def fused(
     state = fuse.start(log.header.cameras)
     memory = PersonMemory()
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
-    passed: list[tuple[HumanStates, fuse.Trace]] = []
+    smoother = StretchSmoother(fusion_stage.filter)
     stands = [BodyPosture() for _ in log.header.cameras]
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
@@ -120,7 +120,8 @@ def fused(
                 state, ticks, measured, fusion_stage.filter, fusion_stage.limits, traced=smooth
             )
         if smooth:
-            passed.append((states, trace))
+            for part in smoother.add(states, trace):
+                sink.run.table("smooth", state_columns(part))
         sink.counts.update(events)
         ever = ever or bool(states.valid.any())
         sink.run.table("state", state_columns(states))
@@ -131,13 +132,49 @@ def fused(
         raise _nobody(log, sink.counts)
     sink.notes["fuse"].extend(_oddities(log, stands))
     if smooth:
-        sink.run.table("smooth", state_columns(smoothed(passed, fusion_stage.filter)))
+        for part in smoother.finish():
+            sink.run.table("smooth", state_columns(part))
 
 
-def smoothed(passed: list[tuple[HumanStates, fuse.Trace]], settings: Fusion) -> HumanStates:
-    """Every tick given all measurements of the run, from the batches of a whole run in order."""
-    states, traces = zip(*passed, strict=True)
-    return fuse.smooth(HumanStates.join(states), fuse.Trace.join(traces), settings)
+class StretchSmoother:
+    """Smooths a run stretch by stretch: each tick given all measurements of its stretch and some of what came later.
+
+    A stretch knows 500 ticks of the next one, and what comes later tells no more. The result does not depend on the
+    batches in which the ticks come; a trace takes 1.5 kB a tick, so it holds two stretches at most.
+    """
+
+    TICKS, LATER = 15_000, 500
+
+    def __init__(self, settings: Fusion) -> None:
+        self._settings = settings
+        self._parts: list[tuple[HumanStates, fuse.Trace]] = []
+        self._count = 0
+
+    def add(self, states: HumanStates, trace: fuse.Trace) -> list[HumanStates]:
+        """Takes the next ticks; returns the stretches that are complete with them, smoothed."""
+        self._parts.append((states, trace))
+        self._count += len(states)
+        found = []
+        while self._count >= self.TICKS + self.LATER:
+            found.append(self._smooth(self.TICKS))
+        return found
+
+    def finish(self) -> list[HumanStates]:
+        """The smoothed ticks that are left."""
+        found = []
+        while self._count:
+            found.append(self._smooth(min(self._count, self.TICKS)))
+        return found
+
+    def _smooth(self, count: int) -> HumanStates:
+        """The next so many ticks, smoothed, and no longer held."""
+        states = HumanStates.join([part for part, _ in self._parts])
+        trace = fuse.Trace.join([part for _, part in self._parts])
+        known = slice(0, count + self.LATER)
+        smoothed = fuse.smooth(states.rows(known), trace.rows(known), self._settings).rows(slice(0, count))
+        self._parts = [(states.rows(slice(count, None)), trace.rows(slice(count, None)))]
+        self._count -= count
+        return smoothed
 
 
 def _nobody(log: Log, found: Counter[str]) -> LogError:

@@ -89,7 +89,7 @@ COLUMNS = {
     ),
     "contact": (
         *("t_ns", "method", "person", "moving", "distance_m", "limb", "link", "tcp_speed", "contact_speed"),
-        *("outside_m", "left_m", "left_limb"),
+        *("source", "person_m", "other_m", "outside_m", "left_m", "left_limb", "left_full_m", "left_full_limb"),
     ),
 }
 
@@ -184,24 +184,30 @@ def contact_columns(
     part: tuple[Ints, tuple[str, ...]],
     link: tuple[Ints, tuple[str, ...]],
     speeds: tuple[Floats, Floats],
+    source: tuple[Ints, tuple[str, ...]],
+    apart: tuple[Floats, Floats],
     outside_m: Floats,
     left: tuple[Floats, Ints, tuple[str, ...]],
+    left_full: tuple[Floats, Ints, tuple[str, ...]],
 ) -> Columns:
-    """A row a tick of a method: robot against recorded person.
+    """A row a tick of a method: robot against everybody recorded. The worst of all bodies and sources counts.
 
     Args:
         t_ns: (n,) [ns].
         method: That moved the robot.
-        person: Where the recorded person is from: ``truth`` or ``smoothed``.
+        person: Where the recorded person is from.
         moving: (n,) whether any axis turns.
-        distance_m: (n,) between the surfaces of robot and body, negative in overlap; NaN: body not known [m].
+        distance_m: (n,) between the surfaces of robot and nearest body, negative in overlap; NaN: none is known [m].
         part: (n,) indices of the nearest part of the body, -1 without one, and the names of all parts.
         link: (n,) indices of the nearest link, -1 without one, and the names of all links.
         speeds: (n,) each: of the TCP, and of the link's surface where it is nearest to the body [m/s].
-        outside_m: (n,) how far the touched part was outside the volume by which the motion had been certified; NaN
-            where nothing moving was in contact, or nothing predicted [m].
-        left: (n,) how far at most a part left the stored volume of the tick until its horizon, NaN without one [m];
-            (n,) indices of that part, -1 without one, and the names of all parts.
+        source: (n,) indices of what shows the nearest body, -1 without one, and the names of all sources.
+        apart: (n,) each: the distance of the person, and of the nearest other body; NaN: not known [m].
+        outside_m: (n,) how far the touched part of the person was outside the volume by which the motion had been
+            certified; NaN where nothing moving touched the person, or nothing was predicted [m].
+        left: (n,) how far at most a limb left the volume of the tick until its horizon, 0 where all were held, NaN
+            where not asked [m]; (n,) indices of that limb, -1 without one, and the names of all limbs.
+        left_full: The same until the braking time T_s, whatever the tick's horizon.
     """
     return {
         "t_ns": t_ns,
@@ -213,9 +219,14 @@ def contact_columns(
         "link": _names(*link),
         "tcp_speed": speeds[0],
         "contact_speed": speeds[1],
+        "source": _names(*source),
+        "person_m": apart[0],
+        "other_m": apart[1],
         "outside_m": outside_m,
         "left_m": left[0],
         "left_limb": _names(left[1], left[2]),
+        "left_full_m": left_full[0],
+        "left_full_limb": _names(left_full[1], left_full[2]),
     }
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit import baselines
-from hrcreplay.audit.measures import InflatedHull
 from hrcreplay.errors import SettingsError
+from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit.departures import LimbDepartures, departures
-from hrcreplay.audit.recording import CAMERAS, TRUTH, Recording
 from hrcreplay.human.model import Departure, skeleton
 from hrcreplay.records import BODY, DOF, LIMBS, Floats
 from hrcreplay.run import build, replay
 from hrcreplay.run.job import resolve
+from hrcreplay.run.recording import CAMERAS, TRUTH, Recording
 from tests.human.people import states
 
 #: What people do upwards [m/s], how often it is recorded [s], and the residual that they are said to have [m].

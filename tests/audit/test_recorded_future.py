@@ -7,17 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hrcreplay.audit import recording
-from hrcreplay.audit.log_audit import check_containment, joint_travel, joints_inside, recorded_future
-from hrcreplay.audit.recording import Recording
+from hrcreplay.audit.log_audit import joint_travel, joints_inside
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
+from hrcreplay.run import recording
+from hrcreplay.run.containment import RecordedFuture, check_containment, recorded_future
+from hrcreplay.run.recording import Recording
 from tests.human.people import states
 
 
 def _recording(points: Floats, joints: Floats, people: HumanStates) -> Recording:
     t_ns = people.t_ns[0] + np.arange(len(points)) * 100_000_000
     return Recording(people, t_ns, points, t_ns, joints, recording.TRUTH, {})
+
+
+def _future(points: Floats, people: HumanStates) -> RecordedFuture:
+    """Of the first tick, 0.4 s."""
+    recorded = _recording(points, np.zeros((10, DOF)), people)
+    return recorded_future(recorded.t_ns, recorded.points_m, people.rows(np.array([0])), 0.4)
 
 
 def _balls(people: HumanStates, radius_m: float) -> SweptVolumes:
@@ -32,7 +39,7 @@ def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
     people = states(np.zeros((1, DOF)), np.zeros((1, DOF)))
     points = np.zeros((10, len(POINTS), 3))
     points[:, :, 0] = np.arange(10)[:, None]
-    future = recorded_future(_recording(points, np.zeros((10, DOF)), people), np.array([0]), 0.4)
+    future = _future(points, people)
     flesh = dict.fromkeys(BODY, 0.07)
     outcome = check_containment(_balls(people, 1.5), future, flesh, np.array([True]))
     np.testing.assert_allclose(outcome.beyond_m, 4.0)  # the sample at the horizon counts, the next does not
@@ -40,7 +47,7 @@ def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
     np.testing.assert_allclose(outcome.escape_m()[0], [2.5 + flesh[limb] for limb in LIMBS])
     assert outcome.union_m3[0] == pytest.approx(4.0 / 3.0 * np.pi * 1.5**3, rel=0.05)
     points[4, POINTS.index("wrist_l")] = np.nan  # not seen near the end: the lower arm cannot be audited
-    future = recorded_future(_recording(points, np.zeros((10, DOF)), people), np.array([0]), 0.4)
+    future = _future(points, people)
     outcome = check_containment(_balls(people, 1.5), future, dict.fromkeys(BODY, 0.0), np.array([False]))
     assert np.isnan(outcome.beyond_m[0]).tolist() == [limb == "LLA" for limb in LIMBS]
     assert outcome.worst_m()[0] == pytest.approx(2.5)
@@ -48,9 +55,7 @@ def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
     assert future.points()["LLA"] == {"hand_l": 0}  # seen, but its limb is not checked
     assert future.points()["LRA"] == {"hand_r": 1}
     points[4, POINTS.index("hand_r")] = np.nan
-    assert recorded_future(_recording(points, np.zeros((10, DOF)), people), np.array([0]), 0.4).points()["LRA"] == {
-        "hand_r": 0
-    }
+    assert _future(points, people).points()["LRA"] == {"hand_r": 0}
     assert np.isnan(outcome.union_m3[0])
 
 

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.audit import driver, recording
+from hrcreplay.audit import driver, recorded_motion
 from hrcreplay.audit import metrics as audit_metrics
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Bools, Floats, Ints, Measurements
+from hrcreplay.run import recording
 from hrcreplay.run.build import FusionStage
 from hrcreplay.settings.sections import Fusion
 from tests.audit.standing import frames, standing
@@ -143,7 +144,7 @@ def test_a_limb_first_moves_when_one_of_its_ends_is_ten_centimetres_away() -> No
     t_ns = 1_000_000_000 + 33_000_000 * np.arange(60)
     best = states(np.zeros((4, DOF)), np.zeros((4, DOF)))
     recorded = recording.Recording(best, t_ns, points, best.t_ns, best.p, recording.CAMERAS, {})
-    found = recording.first_movements_ns(recorded)
+    found = recorded_motion.first_movements_ns(recorded)
     assert {limb: at for limb, at in found.items() if at is not None} == {"LRA": t_ns[40], "LEGS": t_ns[58]}
 
 
@@ -168,7 +169,7 @@ def test_errors_are_told_in_their_standard_deviations() -> None:
     gap = (t_ns > 5_000_000_000) & (t_ns < 5_200_000_000)
     joints = swing(t_ns)[0]
     recorded = recording.Recording(fused, t_ns[~gap], standing(1), t_ns[~gap], joints[~gap], recording.TRUTH, {})
-    errors = recording.errors_in_deviations(recorded, np.arange(n))
+    errors = recorded_motion.errors_in_deviations(recorded, np.arange(n))
     inside_gap = (at_ns > 5_030_000_000) & (at_ns < 5_170_000_000)
     assert np.isnan(errors[:, inside_gap]).all()
     lower = [JOINTS.index("ar3"), JOINTS.index("ar4")]

@@ -32,13 +32,13 @@ def _bodies(*rows: tuple[float, int, int, float], cameras: tuple[str, ...] = ("a
 
 def _pick(frames: CameraFrames, T: Floats = UNKNOWN, memory: PersonMemory | None = None) -> tuple[Floats, Counter[str]]:
     _, mine, counts = select_person(frames, memory or PersonMemory(), T, 0.8, 2.0)
-    return mine.points_m[:, 0, 0], counts
+    return frames.points_m[mine, 0, 0], counts
 
 
 def test_follows_the_place_not_the_id() -> None:
     xs, counts = _pick(_bodies((0, 0, 1, 0.0), (0, 0, 2, 5.0), (1, 0, 1, 5.1), (1, 0, 2, 0.1), (2, 0, 7, 0.2)))
     np.testing.assert_array_equal(xs, [0.0, 0.1, 0.2])
-    assert counts == {"person_bodies_dropped": 2, "person_id_switches": 2}
+    assert counts == {"person_bodies_dropped": 2, "person_frames_beside_others": 2, "person_id_switches": 2}
 
 
 def test_first_person_is_nearest_to_the_camera() -> None:
@@ -53,7 +53,8 @@ def test_somebody_far_away_is_somebody_else_until_the_memory_fades() -> None:
     frames = _bodies((0, 0, 1, 0.0), (1, 0, 2, 3.0), (1.9, 0, 2, 3.0), (2.2, 0, 2, 3.0))
     xs, counts = _pick(frames)
     np.testing.assert_array_equal(xs, [0.0, 3.0])
-    assert counts == {"person_bodies_dropped": 2, "person_frames_without": 2, "person_id_switches": 1}
+    expected = {"person_bodies_dropped": 2, "person_frames_without": 2, "person_id_switches": 1}
+    assert counts == expected | {"person_frames_beside_others": 2}
 
 
 def test_cameras_with_poses_share_one_memory() -> None:
@@ -76,6 +77,7 @@ def test_bodies_without_points_are_nobody() -> None:
     xs, counts = _pick(frames)
     np.testing.assert_array_equal(xs, [0.0])
     assert counts["person_frames_without"] == 2
+    assert "person_frames_beside_others" not in counts
 
 
 def test_place_needs_no_torso() -> None:
@@ -105,12 +107,14 @@ def test_one_frame_and_many_give_the_same(seed: int) -> None:
         rows += [(k * 0.15, camera, int(rng.integers(4)), float(rng.normal(0, 1.5))) for _ in range(rng.integers(1, 4))]
     frames = _bodies(*rows)
     T = np.stack([np.eye(4), np.full((4, 4), np.nan)])
-    memory, whole, counts = select_person(frames, PersonMemory(), T, 0.8, 2.0)
+    memory, mine, counts = select_person(frames, PersonMemory(), T, 0.8, 2.0)
+    whole = frames.rows(mine)
     starts = np.flatnonzero(np.diff(frames.capture_ns, prepend=-1))
     pieces, total, carried = [], Counter[str](), PersonMemory()
     for first, last in zip(starts, [*starts[1:], len(frames)], strict=True):
-        carried, piece, some = select_person(frames.rows(slice(int(first), int(last))), carried, T, 0.8, 2.0)
-        pieces.append(piece)
+        piece = frames.rows(slice(int(first), int(last)))
+        carried, mine, some = select_person(piece, carried, T, 0.8, 2.0)
+        pieces.append(piece.rows(mine))
         total.update(some)
     parts = CameraFrames.join(pieces)
     assert carried == memory

@@ -44,7 +44,7 @@ def demo() -> tuple[Measurements, Ints]:
     poses, memory, parts = np.array([log.header.T_world_camera[c] for c in log.header.cameras]), PersonMemory(), []
     for chunk in log.frames():
         memory, mine, _ = select_person(chunk, memory, poses, 0.8, 2.0)
-        parts.append(measure(mine, poses, Fusion()))
+        parts.append(measure(chunk.rows(mine), poses, Fusion()))
     m = Measurements.join(parts)
     first = int(m.arrival_ns[0]) - 100_000_000
     return m, first + ticks((m.arrival_ns[-1] - first) * 1e-9)

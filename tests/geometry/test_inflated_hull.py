@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.audit.measures import InflatedHull, union_volume_m3
+from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.records import DOF, Floats
 
 

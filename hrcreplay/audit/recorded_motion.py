@@ -1,0 +1,59 @@
+"""What an audit asks of the recorded motion alone: when limbs first moved, and how far the filter's state was off."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hrcreplay.human.model import SHOWN_BY
+from hrcreplay.records import POINTS, Floats, Ints
+from hrcreplay.report.metrics import difference
+from hrcreplay.run.recording import LIMB_POINTS, Recording
+
+#: A limb has moved once one of its ends is so far from where it was first, the middle of so many sightings [m].
+_MOVED_M, _FIRST = 0.1, 10
+
+
+def first_movements_ns(recording: Recording) -> dict[str, int | None]:
+    """Limb -> when it first moved [ns]; None where it never did: a filter has seen no movement of its kind before."""
+    found: dict[str, int | None] = {}
+    for limb, names in LIMB_POINTS.items():
+        moved = np.zeros(len(recording.t_ns), dtype=bool)
+        for name in names[:2]:
+            points = recording.points_m[:, POINTS.index(name)]
+            seen = points[np.isfinite(points).all(axis=1)]
+            if len(seen):
+                moved |= np.linalg.norm(points - np.median(seen[:_FIRST], axis=0), axis=1) > _MOVED_M
+        found[limb] = int(recording.t_ns[np.argmax(moved)]) if moved.any() else None
+    return found
+
+
+#: Recorded velocities are differences over so long, of joints recorded without a longer gap; a limb that no camera has
+#: seen for longer is where nobody knows [ns], [s].
+_ACROSS_NS, _GAP_NS, _SEEN_S = 40_000_000, 100_000_000, 0.25
+
+
+def errors_in_deviations(recording: Recording, ticks: Ints) -> Floats:
+    """How far the fused positions and velocities were from the recorded ones, in their standard deviations.
+
+    Args:
+        recording: The log.
+        ticks: (n,) rows of ``recording.states``.
+
+    Returns:
+        (2, n, 13), positions before velocities; NaN where the joint was not recorded, or not seen lately.
+    """
+    t_ns, joints, states = recording.joints_t_ns, recording.joints, recording.states.rows(ticks)
+
+    def recorded(at_ns: Ints) -> Floats:
+        before = np.clip(np.searchsorted(t_ns, at_ns, side="right") - 1, 0, max(0, len(t_ns) - 2))
+        after = np.minimum(before + 1, len(t_ns) - 1)
+        apart = np.maximum(t_ns[after] - t_ns[before], 1)
+        share = (at_ns - t_ns[before]) / apart
+        known = (share >= 0.0) & (share <= 1.0) & (apart <= _GAP_NS)
+        between = joints[before] + share[:, None] * difference(joints[after], joints[before])
+        return np.where(known[:, None], between, np.nan)
+
+    later, earlier = recorded(states.t_ns + _ACROSS_NS // 2), recorded(states.t_ns - _ACROSS_NS // 2)
+    velocity = difference(later, earlier) / (_ACROSS_NS * 1e-9)
+    found = np.stack([difference(states.p, recorded(states.t_ns)) / states.p_std, (states.v - velocity) / states.v_std])
+    return np.where((states.unseen_s <= _SEEN_S)[:, SHOWN_BY], found, np.nan)
