@@ -24,7 +24,7 @@ PERSONS = {
 _NOT_COMPARED = "the run has no table of contact"
 #: What must be known of a recorded person, and the parts of the body that show it.
 SHOWN_PARTS = {
-    "legs": ("THIGH_R", "SHANK_R", "THIGH_L", "SHANK_L", "FOOT_R", "FOOT_L"),
+    "legs": ("THIGH_R", "SHANK_R", "THIGH_L", "SHANK_L"),
     "arms": ("URA", "LRA", "ULA", "LLA"),
     "head": ("HD",),
     "trunk": ("THX",),
@@ -85,16 +85,21 @@ def _add_people(metrics: MetricTable, run: Run) -> None:
     for limb, parts in SHOWN_PARTS.items():
         share = None
         if run.body is not None and len(run.body):
-            columns = [f"{part}_{end}_{axis}" for part in parts for end in (0, 1) for axis in "xyz"]
-            known = [run.body[name].notna() for name in columns if name in run.body]
-            share = float(np.any(known, axis=0).mean()) if known else 0.0
+            share = float(np.all([_is_whole(run.body, part) for part in parts], axis=0).mean())
         metrics.add(
             f"contact_{limb}_known_share",
             share,
             "1",
-            f"share of the time in which the {limb} of the recorded person are known, so that contact with them counts",
+            f"share of the time in which the whole {limb} of the recorded person, {' '.join(parts)}, are known",
             reason=_NOT_COMPARED,
         )
+
+
+def _is_whole(body: pd.DataFrame, part: str) -> Bools:
+    """(n,) whether both ends of a part are known; one that is known at one end alone stands there as a ball."""
+    first, second = ([numeric_column(body, f"{part}_{end}_{axis}") for axis in "xyz"] for end in (0, 1))
+    apart = np.abs(np.subtract(first, second)).sum(axis=0)
+    return np.asarray(apart > 0.0)
 
 
 def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:

@@ -16,6 +16,10 @@ from hrcreplay.report.tables import PageTable, limb_names_text, part_name_text, 
 from hrcreplay.store.run_folder import Run
 
 Metrics = Mapping[str, Metric]
+#: How contact.parquet calls a person from the log's ground truth.
+TRUTH = "ground truth"
+#: A limb that is known for so long counts as seen throughout.
+_WHOLE = 0.995
 _HAD = "Had this controller been running, "
 _COLUMNS = (
     "",
@@ -67,10 +71,15 @@ def _contact_in_short(metrics: Metrics) -> str:
         words = "With this controller the robot would not have moved while anybody was known to be there"
     else:
         words = (
-            f"With this controller the moving robot would not have touched anybody {_at_known_ticks(metrics)}: it kept "
-            f"{_centimetres(near)} away or more"
+            f"With this controller{_as_far_as(metrics)} the moving robot would not have touched anybody "
+            f"{_at_known_ticks(metrics)}: it kept {_centimetres(near)} away or more"
         )
     return f"{words}.{_at_rest(metrics)}"
+
+
+def _as_far_as(metrics: Metrics) -> str:
+    """What must stand before 'touched nobody' where a limb was not seen."""
+    return ", as far as the person was seen," if unseen_limbs(metrics) else ""
 
 
 def _whom(metrics: Metrics, prefix: str = "plan") -> str:
@@ -124,18 +133,17 @@ def scope(metrics: Metrics) -> tuple[str, ...]:
 
 
 def unseen_limbs(metrics: Metrics) -> list[str]:
-    """Limbs of the recorded person that are not known, or only part of the time."""
-    found = []
-    for limb in SHOWN_PARTS:
-        share = metrics[f"contact_{limb}_known_share"]["value"]
-        if share is None or share >= 0.995:
-            continue
-        found.append(
-            f"the {limb}, which were not seen"
-            if share == 0.0
-            else f"the {limb} at {100 * (1 - share):.0f} % of the time"
-        )
-    return found
+    """Limbs of the recorded person that were not seen, or only part of the time, each in words."""
+    shares = {f"the {limb}": metrics[f"contact_{limb}_known_share"]["value"] for limb in SHOWN_PARTS}
+    found = {limb: share for limb, share in shares.items() if share is not None and share < _WHOLE}
+    if metrics["contact_person"]["value"] != TRUTH:
+        never, mostly = unmeasured(metrics)
+        found |= {f"the {part_name_text(limb)}": 0.0 for limb in never}
+        found |= {f"the {part_name_text(limb)}": 1.0 - share for limb, share in mostly.items()}
+    return [
+        f"{limb} (never seen)" if share == 0.0 else f"{limb} (not seen {100 * (1 - share):.0f} % of the time)"
+        for limb, share in found.items()
+    ]
 
 
 def _cost_in_short(run: Run, metrics: Metrics) -> str:
@@ -192,11 +200,12 @@ def _touched(metrics: Metrics) -> str:
         return f"{_HAD}{words}{_fault(metrics)}."
     if metrics["plan_body_distance_min_moving_m"]["value"] is None:
         return f"{_HAD}the robot would not have moved while anybody was known to be there."
+    seen = "as far as the person was seen, " if unseen_limbs(metrics) else ""
+    nearest = text_of(metrics["plan_body_distance_min_moving_m"])
+    speed = text_of(metrics["plan_body_distance_min_moving_contact_speed_m_per_s"])
     return (
-        f"{_HAD}no moving part of the robot would have touched anybody {_at_known_ticks(metrics)}: the smallest "
-        f"distance was {text_of(metrics['plan_body_distance_min_moving_m'])}, between its {_pair(metrics)}, "
-        f"{_when(metrics)}; that link then moved at "
-        f"{text_of(metrics['plan_body_distance_min_moving_contact_speed_m_per_s'])}."
+        f"{_HAD}{seen}no moving part of the robot would have touched anybody {_at_known_ticks(metrics)}: the smallest "
+        f"distance was {nearest}, between its {_pair(metrics)}, {_when(metrics)}; that link then moved at {speed}."
     )
 
 
@@ -204,12 +213,9 @@ def _pair(metrics: Metrics) -> str:
     link, limb, source = (
         metrics[f"plan_body_distance_min_moving_{part}"]["value"] for part in ("link", "limb", "source")
     )
-    whose = f"body of {source}" if ", body " in source else "person"
-    return (
-        f"{link} and the {whose}'s {part_name_text(limb)}"
-        if whose == "person"
-        else f"{link} and the {part_name_text(limb)} of the {whose}"
-    )
+    if ", body " in source:
+        return f"{link} and the {part_name_text(limb)} of another body ({source})"
+    return f"{link} and the person's {part_name_text(limb)}"
 
 
 def _when(metrics: Metrics) -> str:
@@ -224,6 +230,8 @@ def _fault(metrics: Metrics) -> str:
     if inside is None:
         return "; it heeds nobody"
     parts = []
+    if other := metrics["plan_touch_other_ticks"]["value"]:
+        parts.append(f"at {other} it touched a body that it did not heed")
     if inside:
         parts.append(f"at {inside} of these ticks the person was where the prediction said, so the robot is at fault")
     if retreating:
@@ -232,7 +240,7 @@ def _fault(metrics: Metrics) -> str:
         parts.append(f"at {outside} the person was not where the prediction said, so the prediction is at fault")
     if unknown:
         parts.append(f"at {unknown} nothing was predicted")
-    return "; " + "; ".join(parts)
+    return "".join(f"; {part}" for part in parts)
 
 
 def _cost(run: Run, metrics: Metrics) -> str:

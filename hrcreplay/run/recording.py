@@ -208,6 +208,8 @@ def read_people(
 
 def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
     """The ground truth within a span; None where the log has none there."""
+    if not log.header.has_truth:
+        return None
     truth = [part.rows((part.t_ns >= ticks_ns[0]) & (part.t_ns <= ticks_ns[-1])) for part in log.truth()]
     truth = [part for part in truth if len(part)]
     if not truth:

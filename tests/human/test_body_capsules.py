@@ -6,7 +6,7 @@ import numpy as np
 
 from hrcreplay.human.model import PARTS, part_axes, part_radii, skeleton
 from hrcreplay.records import JOINTS, POINTS
-from hrcreplay.run.contact import at_instants
+from hrcreplay.run.recording import at_instants
 from hrcreplay.settings.sections import Occupancy
 
 LENGTHS_M = np.array([[0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.26]])
@@ -24,7 +24,7 @@ def test_the_hand_prolongs_the_forearm() -> None:
         np.testing.assert_array_equal(start, elbow)
         np.testing.assert_allclose(end, elbow + (wrist - elbow) * (length + 0.19) / length)
     np.testing.assert_allclose(np.linalg.norm(axes[PARTS.index("THX"), 1] - axes[PARTS.index("THX"), 0]), 0.52)
-    assert np.isnan(axes[PARTS.index("THIGH_R") :]).all()  # the model has no legs
+    assert np.isnan(axes[PARTS.index("THIGH_R") :]).any(axis=(1, 2)).all()  # the model has no legs, hands or feet
     assert np.isfinite(axes[: PARTS.index("THIGH_R")]).all()
 
 
@@ -37,7 +37,8 @@ def test_radii_are_those_of_table_2() -> None:
         "LRA": 0.07,
         "ULA": 0.07,
         "LLA": 0.07,
-        **dict.fromkeys(("THIGH_R", "SHANK_R", "THIGH_L", "SHANK_L"), 0.08),
+        **dict.fromkeys(("THIGH_R", "SHANK_R", "THIGH_L", "SHANK_L", "FOOT_R", "FOOT_L"), 0.08),
+        **dict.fromkeys(("HAND_R", "HAND_L"), 0.07),
     }
 
 
@@ -51,3 +52,6 @@ def test_between_samples() -> None:
     np.testing.assert_allclose(found[:, 0, 0], [nan, 0, 0.5, 1, 1.5, 2, nan, nan, 3, 3.4, 4, nan])
     np.testing.assert_allclose(found[:, 3, 0], [nan, 0, nan, nan, nan, 2, nan, nan, 3, 3.4, 4, nan])
     assert np.isnan(at_instants(t_ns[:0], points[:0], at_ns, 0.1)).all()
+    held = at_instants(t_ns, points, at_ns, 0.1, hold_s=0.006)  # 6 ms around a sample, where nothing is between two
+    np.testing.assert_allclose(held[:, 0, 0], [0, 0, 0.5, 1, 1.5, 2, 2, nan, 3, 3.4, 4, 4])
+    np.testing.assert_allclose(held[:, 3, 0], [0, 0, 0, nan, 2, 2, 2, nan, 3, 3.4, 4, 4])

@@ -67,13 +67,17 @@ def _with_joints(motion: pd.DataFrame) -> pd.DataFrame:
 
 def _contact(t_ns: np.ndarray, t_s: Floats, method: str) -> pd.DataFrame:
     touching = (t_s >= 3.0) & (t_s < 3.5) & (method != "qp")
+    distance_m = np.where(touching, -0.02 - 0.01 * (t_s - 3.0), 0.4)
     return pd.DataFrame(
         {
             "t_ns": t_ns,
             "method": method,
-            "person": "truth",
+            "person": "ground truth",
             "moving": True,
-            "distance_m": np.where(touching, -0.02 - 0.01 * (t_s - 3.0), 0.4),
+            "distance_m": distance_m,
+            "person_m": distance_m,
+            "other_m": np.nan,
+            "source": "ground truth",
             "limb": "LRA",
             "link": "tool",
             "tcp_speed": 0.3,
@@ -81,5 +85,7 @@ def _contact(t_ns: np.ndarray, t_s: Floats, method: str) -> pd.DataFrame:
             "outside_m": np.nan,
             "left_m": np.nan,
             "left_limb": None,
+            "left_full_m": np.nan,
+            "left_full_limb": None,
         }
     )
