@@ -260,6 +260,8 @@ def _shorter(
 def _remarks(recording: Recording, audited_s: float, horizon_s: float) -> tuple[str, ...]:
     """What the reader of one log's figures must know."""
     notes = [f"the recorded future is the {recording.source}"]
+    if others := recording.counts.get("person_frames_beside_others"):
+        notes.append(f"{others} frames show at least one other body: nothing was predicted of it, and nothing audited")
     went = joint_travel(recording.joints)
     still = [
         f"{joint} ({went[j]:.2f} m)" if joint not in ANGLES else f"{joint} ({np.degrees(went[j]):.0f} deg)"

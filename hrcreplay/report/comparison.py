@@ -65,7 +65,7 @@ class LogResult:
 
     name: str
     sha256: str
-    person: str  #: ``truth`` or ``smoothed``
+    person: str  #: where the recorded person is from, as contact.parquet has it
     seconds: float
     notes: tuple[str, ...]
     figures: Mapping[Variant, Mapping[str, Any]]
@@ -83,14 +83,23 @@ class Field:
 
 FIELDS = (
     Field("ticks", "sum", "1", "ticks"),
-    Field("known_ticks", "sum", "1", "ticks at which the recorded body is known; only these can be contacts"),
-    Field("touch_ticks", "sum", "1", "ticks with a moving link in contact with the recorded body"),
+    Field("known_ticks", "sum", "1", "ticks at which the person is known"),
+    Field("touch_ticks", "sum", "1", "ticks with a moving link in contact with anybody recorded"),
+    Field("touch_person_ticks", "sum", "1", "of these, with the person"),
+    Field("touch_other_ticks", "sum", "1", "of these, with another body, which the robot did not heed"),
     Field("touch_s", "sum", "s", "the time of these"),
-    Field("touch_inside_ticks", "sum", "1", "of these, the body was inside the volumes: the robot is at fault"),
-    Field("touch_retreating_ticks", "sum", "1", "of these, the robot was moving out of the volumes: the person came"),
-    Field("touch_outside_ticks", "sum", "1", "of these, the body had left the volumes: the prediction is at fault"),
-    Field("touch_unpredicted_ticks", "sum", "1", "of these, the motion rested on no volume of that limb"),
-    Field("touch_rest_ticks", "sum", "1", "ticks with a link at rest in contact with the recorded body"),
+    Field("touch_inside_ticks", "sum", "1", "of those with the person, inside the volumes: the robot is at fault"),
+    Field("touch_retreating_ticks", "sum", "1", "of those with the person, moving out of the volumes: the person came"),
+    Field(
+        "touch_outside_ticks",
+        "sum",
+        "1",
+        "of those with the person, who had left the volumes: the prediction is at fault",
+    ),
+    Field(
+        "touch_unpredicted_ticks", "sum", "1", "of those with the person, the motion rested on no volume of that limb"
+    ),
+    Field("touch_rest_ticks", "sum", "1", "ticks with a link at rest in contact with anybody recorded"),
     Field("touch_speed_m_per_s", "max", "m/s", "largest speed of the touching surface while moving"),
     Field("nearest_moving_m", "min", "m", "smallest distance, surface to surface, while moving; negative in overlap"),
     Field("nearest_rest_m", "min", "m", "the same at rest"),
@@ -114,17 +123,22 @@ FIELDS = (
         "checked_ticks",
         "sum",
         "1",
-        "ticks whose volumes were compared with the body until their horizon, with a hand for sound alone",
+        "ticks, 25 a second, at which a limb was seen near the end of the tick's horizon",
     ),
-    Field("held_ticks", "sum", "1", "of these, the line of every limb stayed inside its volume, as audit counts it"),
+    Field("held_ticks", "sum", "1", "of these, every limb that was seen stayed whole inside its volume"),
     Field("coverage", "held_ticks / checked_ticks", "1", "held ticks / checked ticks"),
-    Field("left_max_m", "max", "m", "how far the line of a limb left its volume at most"),
+    Field("left_max_m", "max", "m", "how far a limb left its volume at most"),
+    Field("full_checked_ticks", "sum", "1", "the same until the braking time T_s, as audit asks: ticks"),
+    Field("full_held_ticks", "sum", "1", "of these, every limb that was seen stayed whole inside its volume"),
+    Field("full_coverage", "full_held_ticks / full_checked_ticks", "1", "as audit counts it until T_s"),
 )
 #: Where a figure is a metric of the report: its name there, after ``plan_`` but for those of the volumes.
 _METRICS = {
     "ticks": "plan_ticks",
     "known_ticks": "plan_body_known_ticks",
     "touch_ticks": "plan_touch_moving_ticks",
+    "touch_person_ticks": "plan_touch_person_ticks",
+    "touch_other_ticks": "plan_touch_other_ticks",
     "touch_s": "plan_touch_moving_s",
     "touch_inside_ticks": "plan_touch_inside_ticks",
     "touch_retreating_ticks": "plan_touch_retreating_ticks",
@@ -143,6 +157,7 @@ _METRICS = {
     "deviation_max_m": "plan_deviation_max_m",
     "checked_ticks": "volumes_checked_ticks",
     "left_max_m": "volumes_left_max_m",
+    "full_checked_ticks": "volumes_full_checked_ticks",
 }
 
 
@@ -167,8 +182,9 @@ def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bound
     jerk = _jerk(motion)
     found["jerk_rms_rad_per_s3"] = float(np.sqrt(np.mean(jerk**2))) if jerk.size else None
     found["jerk_max_rad_per_s3"] = float(np.abs(jerk).max()) if jerk.size else None
-    left, checked = metrics["volumes_left_ticks"]["value"], found["checked_ticks"]
-    found["held_ticks"] = None if checked is None else checked - left
+    for prefix, until in (("", "volumes"), ("full_", "volumes_full")):
+        left, checked = metrics[f"{until}_left_ticks"]["value"], found[f"{prefix}checked_ticks"]
+        found[f"{prefix}held_ticks"] = None if checked is None else checked - left
     return _with_ratios(found) | {"braking_events_by_cause": causes}
 
 
@@ -253,7 +269,7 @@ def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str,
             {
                 "log": log.name,
                 "sha256": log.sha256,
-                "person": PERSONS[log.person],
+                "person": log.person,
                 "seconds": log.seconds,
                 "notes": list(log.notes),
                 "methods": {variant.label: dict(log.figures[variant]) for variant in variants},
@@ -319,17 +335,21 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
 
 def _note(found: Mapping[str, Any]) -> str:
     """What the numbers are of, and the paper's own beside them."""
-    persons = sorted({log["person"] for log in found["logs"]})
+    persons = sorted({PERSONS.get(log["person"], log["person"]) for log in found["logs"]})
     known, ticks = (
         sum(next(iter(log["methods"].values()))[name] for log in found["logs"]) for name in ("known_ticks", "ticks")
     )
     qp, scaling = (f"{100 * found['paper'][name]['value']:.2f} %" for name in ("qp", "scaling"))
-    outside = sum(row["touch_outside_ticks"] or 0 for row in found["total"].values())
+    outside, other = (
+        sum(row[f"touch_{of}_ticks"] or 0 for row in found["total"].values()) for of in ("outside", "other")
+    )
     fault = (
         f" At {outside:,} of the ticks in contact the person was outside the volumes that the motion was certified by."
         if outside
         else ""
     )
+    if other:
+        fault += f" At {other:,} of them it was another body than the person, which the robot did not heed."
     return (
         f"The person is {' or '.join(persons)}, known at {known:,} of {ticks:,} ticks. Contact: while the robot "
         f"moves.{fault} Near: at most report.near_m from the volumes. Stands near: though its programme moves; no "

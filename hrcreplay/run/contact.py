@@ -123,7 +123,14 @@ def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats
 
 
 def own_coverage(job: Job, people: RecordedPeople, predicted: Predicted, motion: pd.DataFrame) -> Outcome | None:
-    """How the volumes of every asked tick hold until the horizon that the motion's tick was decided with."""
+    """How the volumes of every asked tick hold until the horizon that the motion's tick was decided with.
+
+    Args:
+        job: What was asked for.
+        people: As recorded.
+        predicted: Volumes of any tick.
+        motion: Rows of a motion table.
+    """
     if job.settings.plan.method == "none":
         return None
     states = predicted.all_states

@@ -131,6 +131,11 @@ def fused(
     if not ever:
         raise _nobody(log, sink.counts)
     sink.notes["fuse"].extend(_oddities(log, stands))
+    if others := sink.counts["person_frames_beside_others"]:
+        sink.notes["fuse"].append(
+            f"{others} frames show at least one other body than the person: it counts for contact, but nothing is "
+            "predicted of it and the robot does not heed it"
+        )
     if smooth:
         for part in smoother.finish():
             sink.run.table("smooth", state_columns(part))

@@ -43,9 +43,9 @@ def contact_table(run: Run, method: str, touching: range, *, person: str = "grou
             "contact_speed": 0.002 * tick,
             "outside_m": np.where(touch & (tick >= 100), np.where(tick % 3 == 0, -0.02, 0.01), np.nan),
             "left_m": left_m,
-            "left_limb": np.where(left_m > 0.0, "ULA", None),
+            "left_limb": ["ULA" if out_m > 0.0 else None for out_m in left_m],
             "left_full_m": np.where(tick % 20 == 0, left_m, np.nan),
-            "left_full_limb": np.where(left_m > 0.0, "ULA", None),
+            "left_full_limb": ["ULA" if out_m > 0.0 else None for out_m in left_m],
         }
     )
 

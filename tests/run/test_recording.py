@@ -27,8 +27,14 @@ BLIND = ("plan.method=none", "plan.baselines=[]")
 ASIDE_M = np.array([-2.4, 0.0, 0.0])
 
 
-def rewritten(path: Path, *, bystander: bool = False, legs: bool = True, truth: bool = False) -> Path:
-    """The demo log anew, by default without ground truth; with a second person, or with cameras that see no legs."""
+def rewritten(
+    path: Path, *, bystander: bool = False, legs: bool = True, truth: bool = False, apart_m: float = 0.0
+) -> Path:
+    """The demo log anew, by default without ground truth.
+
+    With a second person, with cameras that see no legs, or with a second camera that shows forearms nearer to the robot
+    than the first does.
+    """
     log = open_log(replay.demo_log())
     first_ns = log.header.start_ns
     frames = CameraFrames.join(list(log.frames(first_ns + 7_900_000_000, first_ns + 12_100_000_000)))
@@ -37,6 +43,13 @@ def rewritten(path: Path, *, bystander: bool = False, legs: bool = True, truth: 
         points, confidence = frames.points_m.copy(), frames.confidence.copy()
         points[:, hidden], confidence[:, hidden] = np.nan, 0.0
         frames = replace(frames, points_m=points, confidence=confidence)
+    if apart_m:
+        points = frames.points_m.copy()
+        second = np.flatnonzero(frames.camera == 1)
+        nearer = log.header.T_world_camera[frames.cameras[1]][:3, :3].T @ [-apart_m, 0.0, 0.0]
+        for name in ("wrist_l", "hand_l", "wrist_r", "hand_r"):
+            points[second, POINTS.index(name)] += nearer
+        frames = replace(frames, points_m=points)
     if bystander:
         T = np.array([log.header.T_world_camera[camera] for camera in frames.cameras])[frames.camera]
         aside = np.einsum("nji,j->ni", T[:, :3, :3], ASIDE_M)
@@ -71,7 +84,8 @@ def nearest_by_hand(log: Path, motion: pd.DataFrame, *, bodies: range) -> dict[i
     header = open_log(log).header
     robot = irb140(header.T_world_base, stop_s=0.377) if header.T_world_base is not None else None
     assert robot is not None
-    t_ns, found = motion["t_ns"].to_numpy(), {}
+    t_ns = motion["t_ns"].to_numpy()
+    found: dict[int, float] = {}
     for frames in open_log(log).frames():
         for i in range(len(frames)):
             tick = int(np.argmin(np.abs(t_ns - frames.capture_ns[i])))
@@ -140,6 +154,21 @@ def test_legs_that_no_camera_shows_are_told_and_those_it_shows_count(tmp_path: P
     assert hidden["contact_legs_known_share"] == 0.0
     assert "the legs (never seen)" in summary(tmp_path / "none")[-1]
     assert "the legs (never seen)" not in summary(tmp_path / "legs")[-1]
+
+
+def test_of_two_cameras_that_disagree_both_count(tmp_path: Path) -> None:
+    """Contact and coverage are asked of what each camera shows, not of their mean."""
+    log = rewritten(tmp_path / "apart.mcap", apart_m=0.18)
+    metrics, contact, motion = reported(log, tmp_path / "run", "plan.baselines=[]")
+    by_hand = nearest_by_hand(log, motion, bodies=range(50))
+    near = {tick: least_m for tick, least_m in by_hand.items() if least_m <= 0.3}
+    assert len(near) > 5
+    for tick, least_m in near.items():
+        assert contact["person_m"].iloc[tick] <= least_m + 0.02
+    assert contact["source"].isin(["xtion"]).sum() > 100  # it shows the forearms nearest
+    together, _, _ = reported(rewritten(tmp_path / "together.mcap"), tmp_path / "together", "plan.baselines=[]")
+    shares = [float(str(found["volumes_full_held_share"])) for found in (metrics, together)]
+    assert shares[0] <= shares[1]
 
 
 def test_report_compare_and_audit_have_one_coverage(tmp_path: Path) -> None:
