@@ -88,16 +88,16 @@ FIELDS = (
     Field("touch_person_ticks", "sum", "1", "of these, with the person"),
     Field("touch_other_ticks", "sum", "1", "of these, with another body, which the robot did not heed"),
     Field("touch_s", "sum", "s", "the time of these"),
-    Field("touch_inside_ticks", "sum", "1", "of those with the person, inside the volumes: the robot is at fault"),
-    Field("touch_retreating_ticks", "sum", "1", "of those with the person, moving out of the volumes: the person came"),
+    Field("touch_inside_ticks", "sum", "1", "with the person inside the volumes: the robot is at fault"),
+    Field("touch_retreating_ticks", "sum", "1", "with the robot moving out of the volumes: the person came"),
     Field(
         "touch_outside_ticks",
         "sum",
         "1",
-        "of those with the person, who had left the volumes: the prediction is at fault",
+        "with the person outside the volumes: the prediction is at fault",
     ),
     Field(
-        "touch_unpredicted_ticks", "sum", "1", "of those with the person, the motion rested on no volume of that limb"
+        "touch_unpredicted_ticks", "sum", "1", "with the person, where the motion rested on no volume of that limb"
     ),
     Field("touch_rest_ticks", "sum", "1", "ticks with a link at rest in contact with anybody recorded"),
     Field("touch_speed_m_per_s", "max", "m/s", "largest speed of the touching surface while moving"),
