@@ -96,9 +96,7 @@ FIELDS = (
         "1",
         "with the person outside the volumes: the prediction is at fault",
     ),
-    Field(
-        "touch_unpredicted_ticks", "sum", "1", "with the person, where the motion rested on no volume of that limb"
-    ),
+    Field("touch_unpredicted_ticks", "sum", "1", "with the person, where the motion rested on no volume of that limb"),
     Field("touch_rest_ticks", "sum", "1", "ticks with a link at rest in contact with anybody recorded"),
     Field("touch_speed_m_per_s", "max", "m/s", "largest speed of the touching surface while moving"),
     Field("nearest_moving_m", "min", "m", "smallest distance, surface to surface, while moving; negative in overlap"),

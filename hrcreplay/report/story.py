@@ -116,8 +116,10 @@ def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
     without = metrics["plan_uncertified_moving_ticks"]["value"]
     kept = (
         "its step and the stop after it were clear of all that the person was predicted to reach until that stop had "
-        "ended: as long as people stay within that, no moving link touches them"
+        "ended: as long as that person stays within it, no moving link touches them"
     )
+    if others := metrics["others_frames"]["value"]:
+        kept += f". Of the other bodies in {others:,} frames nothing was predicted".replace(",", NARROW)
     stops = (
         f"It was in a full stop at {text_of(metrics['plan_braking_moving_ticks'])} ticks "
         f"({percent(metrics['plan_full_stop_share'])}), each of them certified before it began."
@@ -129,13 +131,15 @@ def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
         return short, f"At the other ticks at which it moved, {kept}."
     retreat = metrics["plan_retreating_share"]
     away = (
-        f" But at {percent(retreat)} of all ticks it retreated: a link was already where the person could reach, and "
-        "moved so slowly and in such a way that no point of it came nearer to any point there."
+        f" But at {percent(retreat)} of all ticks it retreated: that step began inside a volume, with a link already "
+        "where the person could reach, and moved so slowly and in such a way that no point of it came nearer to any "
+        "point there."
         if retreat["value"]
         else ""
     )
+    begun = f"; the retreating ones ({percent(retreat)} of all ticks) began inside a volume" if retreat["value"] else ""
     return (
-        "At every tick of this replay, and certified.",
+        f"Certified at every moving tick against what was predicted{begun}.",
         f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}.{away} {stops}",
     )
 
@@ -152,7 +156,7 @@ def _by_inequality(metrics: Mapping[str, Metric]) -> tuple[str, str]:
         short = "The robot never moved."
         words = f"It stood at all {ticks} ticks."
     elif late == 0:
-        short = "At every tick of this replay, by the paper's criterion."
+        short = "By the paper's criterion at every moving tick, against what was predicted."
         words = f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}."
     else:
         share = 100 * late / metrics["plan_moving_ticks"]["value"]

@@ -143,7 +143,7 @@ def test_the_first_sentences_of_a_robot_that_touched_nobody(run: Run, tmp_path: 
     assert html.index(found.sentences[0]) < html.index(touched[:40])
     assert html.index(found.sentences[1]) < html.index(found.held) < html.index(touched[:40])
     assert html.index(touched[:40]) < html.index("Robot against everybody recorded") < html.index("What would it have")
-    assert "At every tick of this replay, and certified." in html
+    assert "Certified at every moving tick against what was predicted" in html
 
 
 def test_contacts_while_the_robot_retreats_have_a_count_of_their_own(run: Run) -> None:

@@ -153,7 +153,7 @@ def test_a_robot_that_kept_the_constraint_throughout(tmp_path: Path) -> None:
     assert run.motion is not None
     kept = dataclasses.replace(run, motion=run.motion.assign(status="tracking", reason=""))
     text = " ".join(read(rendered(kept, tmp_path)).text)
-    assert "At every tick of this replay, by the paper's criterion." in text
+    assert "By the paper's criterion at every moving tick" in text
     assert "Not at every tick" not in text
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,13 @@ from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, HumanStates, Ints
 from hrcreplay.report import comparison
 from hrcreplay.report.comparison import FIELDS, Variant
 from hrcreplay.run import build, compare, replay
+from hrcreplay.run.contact import recorded_people
 from hrcreplay.run.job import resolve
+from hrcreplay.run.recording import at_instants
 from hrcreplay.settings.load import load_settings
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
+from hrcreplay.store.run_folder import RunWriter
 from tests import bases
 from tests.robot.checker import RADII, links
 from tests.robot.distances import axis_distance
@@ -39,6 +43,8 @@ BODY = (
     *(("elbow_" + s, "wrist_" + s, 0.07, True) for s in "rl"),
     *(("hip_" + s, "knee_" + s, 0.08, False) for s in "rl"),
     *(("knee_" + s, "ankle_" + s, 0.08, False) for s in "rl"),
+    *(("wrist_" + s, "hand_" + s, 0.07, False) for s in "rl"),
+    *(("ankle_" + s, "foot_" + s, 0.08, False) for s in "rl"),
 )
 HAND_M, TOOL_M, NEAR_M, SLOW = 0.19, 0.10, 0.5, 0.001
 
@@ -134,18 +140,19 @@ def segment_distance(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:
     return np.where(inside, np.fmin(between, least), least)
 
 
-def body_distance(motion: pd.DataFrame, points: Floats, T_world_base: Floats) -> tuple[Floats, Floats, Floats]:
-    """(n,) distance of the surfaces [m], and bounds on the speed of the link's surface there [m/s]."""
+def body_distance(motion: pd.DataFrame, sources: list[Floats], T_world_base: Floats) -> tuple[Floats, Floats, Floats]:
+    """(n,) distance of the surfaces to the nearest source [m], and bounds on the speed of the link's surface [m/s]."""
     q, dq = (motion[[f"{name}{i}" for i in range(1, 7)]].to_numpy() for name in ("q", "dq"))
     ends, speeds = links(q, dq, T_world_base, TOOL_M)
     best = np.full(len(q), np.inf)
     slow, fast = np.full(len(q), np.nan), np.full(len(q), np.nan)
     turning = np.abs(dq).sum(axis=1)
     for link, radius in enumerate(RADII):
-        for first, last, around, hand in BODY:
+        for points, (first, last, around, hand) in product(sources, BODY):
             c, d = (points[:, POINTS.index(name)] for name in (first, last))
             if hand:
                 d = d + HAND_M * (d - c) / np.linalg.norm(d - c, axis=1, keepdims=True)
+            c, d = np.where(np.isnan(c), d, c), np.where(np.isnan(d), c, d)  # of one known end: a ball
             gap = segment_distance(ends[:, link, 0], ends[:, link, 1], c, d) - radius - around
             nearer = gap < best
             best[nearer] = gap[nearer]
@@ -155,9 +162,9 @@ def body_distance(motion: pd.DataFrame, points: Floats, T_world_base: Floats) ->
     return np.where(np.isfinite(best), best, np.nan), slow, fast
 
 
-def checked(motion: pd.DataFrame, points: Floats, T_world_base: Floats) -> dict[str, Any]:
+def checked(motion: pd.DataFrame, sources: list[Floats], T_world_base: Floats) -> dict[str, Any]:
     """What the table says of a motion, worked out from its table and the person's points alone."""
-    gap, slow, fast = body_distance(motion, points, T_world_base)
+    gap, slow, fast = body_distance(motion, sources, T_world_base)
     dq, u = (motion[[f"{name}{i}" for i in range(1, 7)]].to_numpy() for name in ("dq", "u"))
     turns, known = (dq != 0).any(axis=1), np.isfinite(gap)
     touch = known & (gap <= 0)
@@ -209,7 +216,7 @@ def test_the_table_is_that_of_a_checker_of_its_own(folder: Path) -> None:
     rows = found["logs"][0]["methods"]
     for label, row in rows.items():
         motion = pq.read_table(folder / "demo" / f"motion_{label.replace(':', '_')}.parquet").to_pandas()
-        assert_agrees(row, checked(motion, points_of_truth(motion["t_ns"].to_numpy()), base), label.split(":")[0])
+        assert_agrees(row, checked(motion, [points_of_truth(motion["t_ns"].to_numpy())], base), label.split(":")[0])
     assert rows["none"]["touch_ticks"] > 0
     assert rows["none"]["coverage"] is None
     assert all(row["touch_ticks"] == 0 for label, row in rows.items() if label != "none")
@@ -251,6 +258,8 @@ def _all_inside(
     """Whether every limb, point by point, is whole inside its volume until the horizon; None where none was seen."""
     now_ns, until_ns = int(state.t_ns[0]), round(1e9 * horizon_s)
     volumes = stage.volumes(state, float(horizon_s))
+    if np.isnan(volumes.vertices_m).any():
+        return None
     within = points[(at_ns > now_ns) & (at_ns <= now_ns + until_ns)]
     late = points[(at_ns > now_ns + 0.75 * until_ns) & (at_ns <= now_ns + until_ns)]
     found: list[bool] = []
@@ -323,6 +332,14 @@ def smoothed_points(folder: Path) -> Floats:
     return points
 
 
+class _Written(RunWriter):
+    """A folder whose tables are there."""
+
+    @property
+    def partial(self) -> Path:
+        return self.folder
+
+
 @pytest.mark.parametrize("name", ["azure moving", "kinect 2 lines", "exp_box"])
 def test_a_recording_with_the_robot_in_the_way_by_the_same_checker(tmp_path: Path, name: str) -> None:
     log, cell, config = bases.recorded(name, tmp_path)
@@ -343,9 +360,14 @@ def test_a_recording_with_the_robot_in_the_way_by_the_same_checker(tmp_path: Pat
     (of_log,) = found["logs"]
     job = resolve("plan", fused, cell_file=place)
     base = build.robot_base(job, open_log(job.log, job.settings.logs))
-    points = smoothed_points(out / of_log["log"])
+    smoothed = smoothed_points(out / of_log["log"])
+    people = recorded_people(job, open_log(job.log, job.settings.logs), _Written(out / of_log["log"]))
+    assert {track.source for track in people.person} > {"smoothed estimate"}
     for label, row in of_log["methods"].items():
         motion = pq.read_table(out / of_log["log"] / f"motion_{label.replace(':', '_')}.parquet").to_pandas()
-        assert_agrees(row, checked(motion, points, base), label.split(":")[0])
+        cameras = [
+            at_instants(track.t_ns, track.points_m, motion["t_ns"].to_numpy(), 0.1, 0.02) for track in people.person[1:]
+        ]
+        assert_agrees(row, checked(motion, [smoothed, *cameras], base), label.split(":")[0])
         assert label == "none" or row["touch_inside_ticks"] == 0
         assert row["uncertified_ticks"] == (row["moving_ticks"] if label == "none" else 0)
