@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 #: recordings take longest and come first, so that no process has a long one left when the others are done.
 GROUPS = {
     "sessions": ("tests/live/test_killed.py", "tests/live/test_session.py", "tests/live/test_zenoh_session.py"),
-    "demo": ("tests/run/test_replay.py", "tests/readme/test_readme.py", "tests/run/test_why.py"),
+    "demo": (
+        "tests/run/test_replay.py",
+        "tests/readme/test_readme.py",
+        "tests/run/test_why.py",
+        "tests/run/test_speed_limit.py",
+    ),
     "soundness": ("tests/soundness/test_motion.py", "tests/soundness/test_soundness.py"),
     "recordings": ("tests/test_recordings.py",),
 }

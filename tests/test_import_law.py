@@ -14,7 +14,7 @@ PACKAGE = Path(hrcreplay.__file__).parent
 
 FOUNDATION = {"errors", "records"}
 #: Sections of settings may be passed to these rooms as they are; none of them loads a setting.
-TAKERS = ("human", "robot", "logs", "egm")
+TAKERS = ("human", "robot", "logs", "egm", "calibration", "report")
 #: Room -> the rooms that it may import.
 MAY_IMPORT = {
     "errors": set(),
@@ -23,12 +23,12 @@ MAY_IMPORT = {
     "human": FOUNDATION | {"geometry", "settings"},
     "robot": FOUNDATION | {"geometry", "settings"},
     "logs": FOUNDATION | {"settings"},
-    "egm": FOUNDATION | {"robot"},
+    "egm": FOUNDATION | {"robot", "settings"},
     "settings": FOUNDATION,
     "store": FOUNDATION,
     "limits": FOUNDATION | {"human", "store"},
-    "calibration": FOUNDATION | {"geometry", "logs", "store"},
-    "report": FOUNDATION | {"geometry", "human", "robot", "logs", "store"},
+    "calibration": FOUNDATION | {"geometry", "logs", "settings", "store"},
+    "report": FOUNDATION | {"geometry", "human", "robot", "logs", "settings", "store"},
     "run": FOUNDATION
     | {"geometry", "human", "robot", "logs", "settings", "store", "limits", "calibration", "report", "__version__"},
     "audit": FOUNDATION | {"geometry", "human", "logs", "store", "limits", "report", "run", "__version__"},

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Unpack
 import numpy as np
 
 from hrcreplay import __version__
-from hrcreplay.audit import fit_limits
+from hrcreplay.audit import COVER, COVERAGE, HELD_BACK, fit_limits
 from hrcreplay.audit.departure_fit import EACH, counted
 from hrcreplay.audit.departure_fit import fit as fit_departures
 from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, not_recorded, union_m3
@@ -132,9 +132,9 @@ def run(
     logs: Sequence[Path],
     *,
     out: Path,
-    coverage: float = 0.99,
-    held_back: float = 0.3,
-    cover: str = "joints",
+    coverage: float = COVERAGE,
+    held_back: float = HELD_BACK,
+    cover: str = COVER,
     **options: Unpack[JobOptions],
 ) -> FitReport:
     """Fits velocity and acceleration bounds to logs and writes them as a limit set.

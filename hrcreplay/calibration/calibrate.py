@@ -14,6 +14,7 @@ from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import POINTS, CameraFrames, Floats
+from hrcreplay.settings.sections import Logs
 
 _WINDOW_S = 10.0  # a long log is looked at in windows, long enough for clock offsets
 _WINDOWS = 60  # evenly spaced: ten minutes in all, so a log of any length fits in memory
@@ -50,8 +51,8 @@ def survey(
     up: Sequence[float] | None = None,
     height_m: float | None = None,
     *,
-    jump_m: float = 0.8,
-    memory_s: float = 2.0,
+    jump_m: float = Logs().person_jump_m,
+    memory_s: float = Logs().person_memory_s,
     search_s: float = 2.0,
 ) -> Survey:
     """Estimates the poses of a log's cameras and the offsets of their clocks.

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from hrcreplay import __version__
+from hrcreplay.audit import COVER, COVERAGE, HELD_BACK
 from hrcreplay.cli import (
     CellFile,
     Chunk,
@@ -326,14 +327,14 @@ def fit_limits(
     out: Annotated[Path, typer.Option("--out", metavar="LIMITS.toml", help="Limit set to write.")],
     coverage: Annotated[
         float, typer.Option("--coverage", metavar="SHARE", help="Share of the ticks to cover, between 0 and 1.")
-    ] = 0.99,
+    ] = COVERAGE,
     held_back: Annotated[
         float,
         typer.Option("--held-back", metavar="SHARE", help="Share of each log's time, its end, that is not fitted to."),
-    ] = 0.3,
+    ] = HELD_BACK,
     cover: Annotated[
         str, typer.Option("--cover", metavar="WHAT", help="joints in their intervals, or limbs in their volumes.")
-    ] = "limbs",
+    ] = COVER,
     config: Config = None,
     settings: Set = None,
     topic: Topic = None,

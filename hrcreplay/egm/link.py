@@ -30,6 +30,7 @@ import numpy as np
 from hrcreplay.egm.codec import WRAP, Correction, Mci, Motors, Rapid, RobotPacket
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
+from hrcreplay.settings.sections import Live
 
 #: Lost packets that a session survives: 4 s of them, far more than a silence allows.
 LEAP: Final = 1000
@@ -76,9 +77,9 @@ class EgmSession:
         q_max: Floats,
         dq_max: Floats,
         *,
-        utilization_max: float = 100.0,
+        utilization_max: float = Live().utilization_max,
         utilization_packets: int = 5,
-        silence_s: float = 0.1,
+        silence_s: float = Live().silent_s,
     ) -> None:
         """Begin before the first packet.
 

@@ -22,10 +22,13 @@ from hrcreplay.records import Floats
 from hrcreplay.report import drawing, figures_robot
 from hrcreplay.report.metrics import Metric, MetricTable, times, true_runs
 from hrcreplay.report.metrics_contact import PERSONS, add_contact
-from hrcreplay.report.metrics_plan import PAPER, add_plan, is_moving, numeric_column
+from hrcreplay.report.metrics_plan import PAPER, add_plan, is_moving
 from hrcreplay.report.tables import PageTable
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
+
+#: A smaller pace is shown as 0.0 %: the robot made no way.
+NO_WAY = 0.0005
 
 #: Name of the row over several logs.
 ALL = "all"
@@ -103,10 +106,16 @@ FIELDS = (
     Field("nearest_rest_m", "min", "m", "the same at rest"),
     Field("moving_ticks", "sum", "1", "ticks with the robot moving"),
     Field("uncertified_ticks", "sum", "1", "of these, ticks without a certificate"),
+    Field("still_logs", "sum", "1", "logs on which the robot never moved, or made no way: neither safe nor useful"),
+    Field("tcp_speed_max_m_per_s", "max", "m/s", "greatest speed of the TCP"),
+    Field("tcp_speed_near_body_m_per_s", "max", "m/s", "the same within report.near_m of the recorded body"),
+    Field("programme_speed_max_m_per_s", "max", "m/s", "greatest programmed speed of the TCP, where the reference was"),
+    Field("retreating_ticks", "sum", "1", "ticks in retreat: they begin inside a volume"),
+    Field("retreating_share", "retreating_ticks / ticks", "1", "retreating ticks / ticks"),
     Field("near_ticks", "sum", "1", "ticks with at most report.near_m between robot and volumes"),
     Field("standing_ticks", "sum", "1", "of these, the robot stands though its programme moves or waits for it"),
     Field("standing_share", "standing_ticks / near_ticks", "1", "standing ticks / near ticks"),
-    Field("null_speed_ticks", "sum", "1", "near ticks with a TCP that stands, whatever the programme does"),
+    Field("null_speed_ticks", "sum", "1", "near ticks with a TCP that stands, programmed dwells included"),
     Field("null_speed_share", "null_speed_ticks / near_ticks", "1", "null velocity when near, as the paper defines it"),
     Field("made_s", "sum", "s", "programmed time of the way that the robot made"),
     Field("given_s", "sum", "s", "time that it had"),
@@ -148,8 +157,12 @@ _METRICS = {
     "nearest_rest_m": "plan_body_distance_min_rest_m",
     "moving_ticks": "plan_moving_ticks",
     "uncertified_ticks": "plan_uncertified_moving_ticks",
+    "tcp_speed_max_m_per_s": "plan_tcp_speed_max_m_per_s",
+    "tcp_speed_near_body_m_per_s": "plan_tcp_speed_near_body_max_m_per_s",
+    "programme_speed_max_m_per_s": "plan_ref_speed_max_m_per_s",
     "near_ticks": "plan_near_ticks",
     "standing_ticks": "plan_stationary_ticks",
+    "null_speed_ticks": "plan_null_speed_ticks",
     "cycles": "plan_cycles",
     "deviation_mean_m": "plan_deviation_mean_m",
     "deviation_max_m": "plan_deviation_max_m",
@@ -172,9 +185,9 @@ def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bound
     found = {name: metrics[key]["value"] for name, key in _METRICS.items()}
     given_s, lost_s = float(times(motion)[-1] - times(motion)[0]) * 1e-9, metrics["plan_time_lost_s"]["value"]
     found["given_s"], found["made_s"] = (None, None) if lost_s is None else (given_s, given_s - lost_s)
-    near = numeric_column(motion, "distance_m") <= bounds.near_m
-    null = numeric_column(motion, "tcp_speed") < bounds.stationary_m_per_s
-    found["null_speed_ticks"] = int((near & null).sum())
+    found["retreating_ticks"] = int((motion["status"].astype(str) == "retreating").sum())
+    pace = None if found["made_s"] is None or not given_s else found["made_s"] / given_s
+    found["still_logs"] = int(not found["moving_ticks"] or (pace is not None and pace < NO_WAY))
     causes = braking_events(motion, bounds.stationary_m_per_s)
     found["braking_events"] = sum(causes.values())
     jerk = _jerk(motion)
@@ -198,6 +211,7 @@ def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, boun
         near_m=bounds.near_m,
         stationary_m_per_s=bounds.stationary_m_per_s,
         leash_m=bounds.leash_m,
+        contact=contact,
     )
     run = Run(Path(), {"settings": settings}, motion=motion, contact=contact)
     add_contact(table, run, bounds.stationary_m_per_s)
@@ -270,16 +284,23 @@ def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str,
                 "person": log.person,
                 "seconds": log.seconds,
                 "notes": list(log.notes),
-                "methods": {variant.label: dict(log.figures[variant]) for variant in variants},
+                "methods": {variant.label: _told(log.figures[variant], 1) for variant in variants},
             }
             for log in logs
         ],
-        "total": {variant.label: total([log.figures[variant] for log in logs]) for variant in variants},
+        "total": {
+            variant.label: _told(total([log.figures[variant] for log in logs]), len(logs)) for variant in variants
+        },
         "paper": {
             name: {"value": PAPER[f"paper_stationary_share_{name}"][0], "unit": "1", "meaning": _PAPER}
             for name in ("qp", "scaling")
         },
     }
+
+
+def _told(row: Mapping[str, Any], logs: int) -> dict[str, Any]:
+    """The figures of a variant with what they say of its motion, in words; None where it made its way."""
+    return {**row, "stillness": stillness(row, logs) or None}
 
 
 _PAPER = (
@@ -291,6 +312,8 @@ _PAPER = (
 _COLUMNS = (
     ("ticks in\ncontact", "touch_ticks", 1, 0),
     ("fastest\nm/s", "touch_speed_m_per_s", 1, 2),
+    ("TCP up to\nm/s", "tcp_speed_max_m_per_s", 1, 2),
+    ("near body\nm/s", "tcp_speed_near_body_m_per_s", 1, 2),
     ("nearest\nmoving m", "nearest_moving_m", 1, 3),
     ("nearest\nat rest m", "nearest_rest_m", 1, 3),
     ("pace\n%", "pace", 100, 1),
@@ -309,6 +332,25 @@ def _cell(value: float | None, factor: int, decimals: int) -> str:
     return "\u2013" if value is None else f"{factor * value:,.{decimals}f}".replace("-", "\u2212")
 
 
+def stillness(row: Mapping[str, Any], logs: int) -> str:
+    """That a method never moved, or made no way, on one log or on how many of several; empty where it did.
+
+    Args:
+        row: Its figures.
+        logs: How many logs they are of.
+    """
+    if not row["still_logs"]:
+        return ""
+    if row["still_logs"] < logs:
+        return f"no way on {row['still_logs']} of {logs} logs"
+    return "made no way" if row["moving_ticks"] else "never moved"
+
+
+def notes(found: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The notes of all logs, each with the log's name."""
+    return [(log["log"], note) for log in found["logs"] for note in log["notes"]]
+
+
 def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
     """What terminal and Markdown show: the methods side by side, and why they braked."""
     logs = [(log["log"], log["methods"]) for log in found["logs"]]
@@ -320,7 +362,10 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
     for log, methods in logs:
         for label, row in methods.items():
             head = (log, label) if len(logs) > 1 else (label,)
-            rows.append((*head, *(_cell(row[name], *how) for _, name, *how in _COLUMNS)))
+            cells = [_cell(row[name], *how) for _, name, *how in _COLUMNS]
+            if row["stillness"]:  # lest it be taken for a success
+                cells[0] += f" ({row['stillness']})"
+            rows.append((*head, *cells))
             by_cause = row["braking_events_by_cause"]
             brakings.append((*head, *(f"{by_cause.get(cause, 0):,}" for cause in causes)))
     tables = [PageTable("Methods", (*lead, *(column[0] for column in _COLUMNS)), tuple(rows), _note(found))]
@@ -348,10 +393,14 @@ def _note(found: Mapping[str, Any]) -> str:
     )
     if other:
         fault += f" At {other:,} of them it was another body than the person, which the robot did not heed."
+    still = [label for label, row in found["total"].items() if row["still_logs"]]
+    fault += f" No contact of a robot that makes no way is a success: {', '.join(still)}." if still else ""
+    programmed = [row["programme_speed_max_m_per_s"] or 0.0 for row in found["total"].values()]
     return (
         f"The person is {' or '.join(persons)}, known at {known:,} of {ticks:,} ticks. Contact: while the robot "
-        f"moves.{fault} Near: at most report.near_m from the volumes. Stands near: though its programme moves; no "
-        "speed near, as the paper counts: whatever the programme does. The paper's robot stood in "
+        f"moves.{fault} The programme's TCP makes up to {max(programmed):.2f} m/s; near body: within report.near_m "
+        "of the recorded person. Near: at most report.near_m from the volumes. Stands near: though its programme "
+        "moves; no speed near, as the paper counts: programmed dwells, too. The paper's robot stood in "
         f"{scaling} (scaling) and {qp} (QP) of the ticks near people, on its own data: compare in kind only."
     )
 
@@ -388,19 +437,20 @@ def as_csv(found: Mapping[str, Any]) -> str:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     named = [f"braking_events_{cause.replace(' ', '_') or 'unnamed'}" for cause in causes]
-    table.writerow(["log", "variant", "method", "occupancy", "horizon", *(field.name for field in FIELDS), *named])
+    lead = ["log", "variant", "method", "occupancy", "horizon", "stillness"]
+    table.writerow([*lead, *(field.name for field in FIELDS), *named])
     for log, methods in (*((log["log"], log["methods"]) for log in found["logs"]), (ALL, found["total"])):
         for label, row in methods.items():
             of = found["methods"][label]
             values = ["" if row[field.name] is None else row[field.name] for field in FIELDS]
             by_cause = [row["braking_events_by_cause"].get(cause, 0) for cause in causes]
-            who = [of["method"], of.get("occupancy", ""), of.get("horizon", "")]
+            who = [of["method"], of.get("occupancy", ""), of.get("horizon", ""), row["stillness"] or ""]
             table.writerow([log, label, *who, *values, *by_cause])
     return text.getvalue()
 
 
 def as_markdown(found: Mapping[str, Any]) -> str:
-    """The tables of the terminal."""
+    """The tables and the notes of the terminal."""
     parts = []
     for table in page_tables(found):
         head = [
@@ -410,4 +460,7 @@ def as_markdown(found: Mapping[str, Any]) -> str:
             f"|{'---|' * len(table.columns)}",
         ]
         parts.append("\n".join([*head, *(f"| {' | '.join(row)} |" for row in table.rows), "", table.note, ""]))
+    several = len(found["logs"]) > 1
+    told = [f"- {log}: {note}" if several else f"- {note}" for log, note in notes(found)]
+    parts += ["\n".join(["## Notes", "", *told, ""])] if told else []
     return "\n".join(parts)

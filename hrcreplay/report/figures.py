@@ -18,6 +18,7 @@ from hrcreplay.report.figures_robot import SHORTEST_M, Deviation
 from hrcreplay.report.figures_scene import LinkPose, Storyboard
 from hrcreplay.report.metrics import Metric, instants, known_ticks_ns, moment_ns, start_ns
 from hrcreplay.report.metrics_data import cameras
+from hrcreplay.settings.sections import Logs
 from hrcreplay.store.run_folder import Run
 
 _T = TypeVar("_T")
@@ -31,7 +32,7 @@ class FigureData:
     metrics: Mapping[str, Metric]
     near_m: float  #: the stationary share counts ticks with a separation of at most this
     stationary_m_per_s: float  #: a TCP slower than this stands
-    gap_s: float = 0.2  #: a camera silent for longer has a gap
+    gap_s: float = Logs().gap_s  #: a camera silent for longer has a gap
     instants: Sequence[Instant] = ()  #: the swept volumes by several methods at the ticks that ``instants`` names
     walk: Walk | None = None
     sweep: Sweep | None = None

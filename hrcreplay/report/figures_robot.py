@@ -354,9 +354,11 @@ def methods(found: Mapping[str, Any]) -> Figure:
         colour, marker = _COLOURS[of["method"]], _MARKERS.get(of.get("occupancy", ""), "X")
         for other in alone:
             ax.plot(*_place(other), ".", ms=5, color=colour, alpha=0.45)
+        words = label.replace(":", ", ") + (f": {row['stillness']}" if row["stillness"] else "")
         if row["pace"] is None or row["nearest_moving_m"] is None:
+            if row["stillness"]:  # it has no place, but is not left out
+                ax.plot([], [], "x", ms=8, color=colour, label=words)
             continue
-        words = label.replace(":", ", ")
         if row["touch_ticks"]:
             words += f": {row['touch_ticks']:,} ticks in contact,\nup to {row['touch_speed_m_per_s']:.2f} m/s"
         face = "white" if of.get("horizon") == "fixed" else colour

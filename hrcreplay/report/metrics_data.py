@@ -25,6 +25,7 @@ from hrcreplay.report.metrics import (
     true_runs,
 )
 from hrcreplay.report.tables import LIMB_NAMES
+from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
 
 
@@ -342,7 +343,7 @@ def add_limbs(metrics: MetricTable, run: Run) -> None:
     """Adds for how much of the time each limb was not measured, and which of its joints never were."""
     names = list(LIMB_COLUMNS["state"])
     shares = np.full(len(LIMBS), np.nan)
-    memory_s = float(run.meta.get("settings", {}).get("fusion", {}).get("memory_s", 0.5))
+    memory_s = float(setting(run.meta.get("settings", {}), "fusion", "memory_s"))
     if run.state is not None and set(names) <= set(run.state.columns):
         shares = unmeasured_shares(run.state[names].to_numpy(dtype=float), memory_s)
     never = _never_measured(run.measurements)

@@ -185,6 +185,7 @@ def add_plan(
     near_m: float,
     stationary_m_per_s: float,
     leash_m: float,
+    contact: pd.DataFrame | None = None,
 ) -> None:
     """Everything about the motion, the baselines' likewise, and the paper's own figures beside them.
 
@@ -196,6 +197,7 @@ def add_plan(
         near_m: The person is near at a separation of at most this [m].
         stationary_m_per_s: The robot stands where its TCP is slower than this [m/s].
         leash_m: How far the TCP may be from the reference before the reference waits [m].
+        contact: Rows of contact.parquet; None where the recorded body was not looked for.
     """
     if motion is None:
         metrics.add("plan_method", None, "name", "method of the plan", reason="not planned")
@@ -209,6 +211,9 @@ def add_plan(
         _add_stationary(metrics, prefix, table, what, near_m, stationary_m_per_s)
         _add_path(metrics, prefix, table, what)
         _add_progress(metrics, prefix, table, what, leash_m)
+        by = method if prefix == "plan" else prefix.removeprefix("baseline_")
+        rows = None if contact is None else contact[contact["method"] == by]
+        _add_fastest(metrics, prefix, table, rows, what, near_m)
     for name, (value, unit, meaning) in PAPER.items():
         metrics.add(name, value, unit, meaning)
 
@@ -303,7 +308,22 @@ def _add_stationary(
         f"{prefix}_stationary_share",
         both / int(near.sum()) if near.any() else None,
         "1",
-        f"stationary ticks / near ticks of {what}; compare only runs on the same log",
+        f"stationary ticks / near ticks of {what}: ticks at which its programme stands, as in a dwell, do not count as "
+        f"standing; {prefix}_null_speed_share counts them; compare only runs on the same log",
+        reason=f"the separation never was <= {near_m:g} m",
+    )
+    null = int((near & (numeric_column(motion, "tcp_speed") < slow)).sum())
+    metrics.add(
+        f"{prefix}_null_speed_ticks",
+        null,
+        "1",
+        f"near ticks of {what} with the TCP below {slow:g} m/s, whatever its programme does: dwells count",
+    )
+    metrics.add(
+        f"{prefix}_null_speed_share",
+        null / int(near.sum()) if near.any() else None,
+        "1",
+        f"those / near ticks of {what}: null velocity when near, as the paper counts",
         reason=f"the separation never was <= {near_m:g} m",
     )
 
@@ -322,6 +342,35 @@ def _add_path(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str
 
 def _p95(values: Floats) -> float:
     return float(np.quantile(values, 0.95))
+
+
+def _add_fastest(
+    metrics: MetricTable, prefix: str, motion: pd.DataFrame, contact: pd.DataFrame | None, what: str, near_m: float
+) -> None:
+    """The greatest speeds: of the TCP at all and near the recorded body, and of the programme."""
+    speeds = {
+        "tcp_speed_max": (numeric_column(motion, "tcp_speed"), "speed of the TCP"),
+        "ref_speed_max": (
+            numeric_column(motion, "ref_speed"),
+            "programmed speed of the TCP where the reference is; the programme's own where it went all the way",
+        ),
+    }
+    close = np.zeros(0)
+    if contact is not None:
+        close = numeric_column(contact, "tcp_speed")[numeric_column(contact, "distance_m") <= near_m]
+    speeds["tcp_speed_near_body_max"] = (
+        close,
+        f"speed of the TCP at ticks with a link within {near_m:g} m of the recorded body, surface to surface",
+    )
+    for name, (speed, meaning) in speeds.items():
+        known = speed[np.isfinite(speed)]
+        metrics.add(
+            f"{prefix}_{name}_m_per_s",
+            float(known.max()) if len(known) else None,
+            "m/s",
+            f"greatest over the ticks of {what}: {meaning}",
+            reason="the recorded body was never known to be that near" if name.endswith("body_max") else "no tick",
+        )
 
 
 def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, leash_m: float) -> None:

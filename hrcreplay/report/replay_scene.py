@@ -17,6 +17,7 @@ from hrcreplay.report.metrics_contact import StopEvent, method_prefixes, stop_ev
 from hrcreplay.report.metrics_plan import numeric_column
 from hrcreplay.robot.control.control_step import axis_by_axis
 from hrcreplay.robot.model import RobotModel
+from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
 
 #: Instants of the replay a second.
@@ -221,7 +222,7 @@ def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, 
         method: run.motion if prefix == "plan" else run.baselines[method]
         for method, prefix in method_prefixes(run).items()
     }
-    slow = float(run.meta.get("settings", {}).get("report", {}).get("stationary_m_per_s", 1e-3))
+    slow = float(setting(run.meta.get("settings", {}), "report", "stationary_m_per_s"))
     return ReplayScene(
         t0_ns=t0_ns,
         t_ns=t_ns,
@@ -358,7 +359,7 @@ def _stops(
     """
     straight = q + dq * (0.5 * tau_s)[:, None]
     if method == _LEAVES_PATH:
-        if run.meta.get("settings", {}).get("plan", {}).get("certify", True):
+        if setting(run.meta.get("settings", {}), "plan", "certify"):
             return straight
         dt_s = float(np.median(np.diff(times(motion)))) * 1e-9
         ends = [axis_by_axis(*row, robot.ddq_max, dt_s).q[-1] for row in zip(q, dq, strict=True)]  # Eq. (67)

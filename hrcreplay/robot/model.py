@@ -21,6 +21,7 @@ from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot import irb140 as irb140_data
 from hrcreplay.robot.link_capsules import Extent, Segment, Vector, capsules, distance_m
 from hrcreplay.robot.urdf import Description, describe, own_extent, unreadable, with_shapes
+from hrcreplay.settings.sections import Robot
 
 __all__ = ["RobotModel", "RobotPose", "Segment", "from_urdf", "irb140"]
 
@@ -181,7 +182,7 @@ def irb140(
     T_world_base: Floats,
     *,
     stop_s: float,
-    tool_m: float = 0.10,
+    tool_m: float = Robot().tool_m,
     T_tool_tcp: Floats | None = None,
     acceleration: Sequence[float] = (),
 ) -> RobotModel:

@@ -191,14 +191,16 @@ def programmed(task: Task, model: RobotModel, where: str = "task") -> Reference:
     """
     start = _joints(model, task, 0, np.clip(np.zeros(model.nv), model.q_min, model.q_max), where)
     tracks = [_stand(start, task.waypoints[0].dwell_s)]
-    arrivals_s, end = [0.0], 0
+    arrivals_s, limits, end = [0.0], [_speed_limit(task, 0)], 0
     for index in range(1, len(task.waypoints)):
         tracks.append(_move(model, task, index, tracks[-1].q[-1], where))
         arrivals_s.append(_steps(tracks) * STEP_S)
         tracks.append(_stand(tracks[-1].q[-1], task.waypoints[index].dwell_s))
+        limits += 2 * [_speed_limit(task, index)]
         end = _steps(tracks)
     if task.repeat or task.cycles > 1:
         tracks.append(_move(model, task, 0, tracks[-1].q[-1], where, start))
+        limits.append(limits[0])
     if _steps(tracks) == 0:
         raise SettingsError(f"{where}: every waypoint is where the robot starts; at least one must differ")
     return Reference(
@@ -208,6 +210,7 @@ def programmed(task: Task, model: RobotModel, where: str = "task") -> Reference:
         end=end,
         cycles=math.inf if task.repeat else float(task.cycles),
         waypoints_s=tuple(arrivals_s),
+        tcp_speed_max=np.repeat([limits[0], *limits], [1, *(len(track.q) - 1 for track in tracks)]),
     )
 
 
@@ -249,7 +252,7 @@ def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
         else np.gradient(even, STEP_S, axis=0)
     )
     _check(model, grid * 1e9, dq, "speed", "rad/s", -model.dq_max, model.dq_max)
-    return Reference(model, smooth, dq, end=len(grid) - 1, cycles=1.0, waypoints_s=())
+    return _by_itself(model, smooth, dq, ())
 
 
 def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Reference:
@@ -271,7 +274,15 @@ def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Re
     r = np.arange(end + 1) / end
     share, rate = r**3 * (10 - 15 * r + 6 * r**2), 30 * r**2 * (1 - r) ** 2 / (end * STEP_S)
     q, dq = start + np.outer(share, way), np.outer(rate, way)
-    return Reference(model, q, dq, end=end, cycles=1.0, waypoints_s=(end * STEP_S,))
+    return _by_itself(model, q, dq, (end * STEP_S,))
+
+
+def _by_itself(model: RobotModel, q: Floats, dq: Floats, waypoints_s: tuple[float, ...]) -> Reference:
+    """A path that runs once, and whose own greatest speed is its speed limit, since nobody programmed one."""
+    fastest = max(float(np.linalg.norm(model.pose(*row).J_tcp[:3] @ row[1])) for row in zip(q, dq, strict=True))
+    return Reference(
+        model, q, dq, end=len(q) - 1, cycles=1.0, waypoints_s=waypoints_s, tcp_speed_max=np.full(len(q), fastest)
+    )
 
 
 def _check(
@@ -304,7 +315,7 @@ def _move(
     pace = Pace(
         dq_max=task.speed * model.dq_max,
         ddq_max=task.acceleration * model.ddq_max,
-        tcp_speed=min(task.tcp_speed_m_per_s, waypoint.tcp_speed_m_per_s or math.inf),
+        tcp_speed=_speed_limit(task, index),
         tcp_acceleration=task.tcp_acceleration_m_per_s2,
         step_s=STEP_S,
     )
@@ -321,6 +332,11 @@ def _move(
             f'and not at {math.degrees(goal[axis]):.1f} deg; use move = "joint"'
         )
     return track
+
+
+def _speed_limit(task: Task, index: int) -> float:
+    """Programmed speed limit of the TCP on the way to a waypoint [m/s]."""
+    return min(task.tcp_speed_m_per_s, task.waypoints[index].tcp_speed_m_per_s or math.inf)
 
 
 def _joints(model: RobotModel, task: Task, index: int, near: Floats, where: str) -> Floats:

@@ -265,6 +265,9 @@ def _unwind(model: RobotModel, q: Floats, near: Floats) -> Floats:
 #: Time grid that a reference is computed on once; between its points it is a cubic [s].
 STEP_S = 0.004
 
+#: A programmed time this near to a grid point is at it, of a step: a reference waits at a waypoint but for rounding.
+_ON_GRID = 1e-6
+
 
 @dataclass(frozen=True, slots=True)
 class ReferencePoint:
@@ -299,6 +302,7 @@ class Reference:
     end: int  #: grid point of the last waypoint
     cycles: float  #: inf: until the log ends
     waypoints_s: tuple[float, ...]  #: arrival at each waypoint of the first cycle [s]
+    tcp_speed_max: Floats  #: (n,) limit of the move, and of the dwell after it, that leads to each grid point [m/s]
 
     @property
     def q0(self) -> Floats:
@@ -327,6 +331,16 @@ class Reference:
         cycle = math.floor(s_s / self.cycle_s)
         arrivals = (n * self.cycle_s + at_s for n in (cycle, cycle + 1) for at_s in self.waypoints_s)
         return next((arrival for arrival in arrivals if arrival >= s_s), math.inf)
+
+    def tcp_speed_limit(self, s_s: float) -> float:
+        """Programmed speed limit of the TCP at a programmed time [s]: that of the move until the next one begins [m/s].
+
+        A task gives it for each move; other paths have their own greatest speed.
+        """
+        if not 0.0 <= s_s < self.duration_s:
+            return float(self.tcp_speed_max[0 if s_s < 0.0 else self.end])
+        at = math.ceil(s_s % self.cycle_s / STEP_S - _ON_GRID)
+        return float(self.tcp_speed_max[min(at, len(self.q) - 1)])
 
     def sample(self, s_s: float) -> ReferencePoint:
         """The reference ``s_s`` seconds of programmed time after its start.
@@ -391,3 +405,22 @@ def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, p
     if not tcp_error_m <= plan.waypoint_m:
         ahead_s = min(ahead_s, reference.next_waypoint(s_s))
     return ahead_s, (ahead_s - s_s) / dt_s
+
+
+def tcp_speed_cap(reference: Reference, s_s: float, plan: Plan) -> float:
+    """Speed that the TCP of a robot may reach that follows a reference, however far it is behind [m/s].
+
+    A reference that waits leaves a waypoint only when the TCP has come near, so the robot is on the same move as its
+    reference and keeps the limit of that move. One that runs with the clock may be any number of moves ahead; then the
+    greatest limit of all moves holds.
+
+    Args:
+        reference: The programmed path.
+        s_s: Programmed time [s].
+        plan: Whether the reference waits, and what speed is allowed beside the programme's.
+    """
+    if plan.catch_up_speed_m_per_s == "free":
+        return math.inf
+    waits = plan.reference == "path"
+    limit = reference.tcp_speed_limit(s_s) if waits else float(reference.tcp_speed_max.max())
+    return max(limit, plan.catch_up_speed_m_per_s)

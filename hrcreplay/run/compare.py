@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -28,6 +28,7 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import Floats, Ints
 from hrcreplay.report import comparison
 from hrcreplay.report.comparison import Variant
+from hrcreplay.report.story import defect_notes
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference
 from hrcreplay.run import build, replay
@@ -36,6 +37,7 @@ from hrcreplay.run.contact import Predicted, contact_table, full_coverage, own_c
 from hrcreplay.run.containment import Outcome
 from hrcreplay.run.followers import Planner
 from hrcreplay.run.job import Job, JobOptions, resolve
+from hrcreplay.run.notes import notes_of
 from hrcreplay.run.recording import RecordedPeople
 from hrcreplay.run.stages import ProgressBar, Sink, print_note
 from hrcreplay.settings.load import Settings
@@ -119,6 +121,8 @@ def run(
             for job, name in zip(jobs, _names(jobs), strict=True)
         ]
         found = comparison.results(per_job[0], logs)
+        for log_name, note in comparison.notes(found):
+            print_note(f"{log_name}: {note}" if len(logs) > 1 else note)
         comparison.write(found, writer)
         comparison.print_tables(found)
         writer.timing.update(watch.summary(1.0 / jobs[0].settings.fusion.rate_hz))
@@ -188,7 +192,7 @@ def _compare_log(
     reused = replay.take_over(fusing, replay.dependencies(fusing, log, ticks_ns), part, smooth=False)
     with ProgressBar(name, len(ticks_ns) * len(variants)) as bar:
         sink = Sink(part, watch, _silent)
-        found = replay.run_stages(fusing, log, ticks_ns, size, sink, reused, smooth=not log.header.has_truth)
+        replay.run_stages(fusing, log, ticks_ns, size, sink, reused, smooth=not log.header.has_truth)
         part.close_tables()
         people = recorded_people(job, log, part)
         part.close_tables()
@@ -203,6 +207,7 @@ def _compare_log(
             for variant in variants
         ]
         took = _plan_all(tasks, processes, partial(bar.advance, name))
+    told = _notes(job, part.partial, variants, programme, replay.findings(job, log, sink, reused))
     writer.timing[f"plan {name}"] = {variant.label: {"seconds": took[variant]} for variant in variants}
     part.partial.rename(part.folder)
     rows = {
@@ -211,7 +216,7 @@ def _compare_log(
         for motion, contact in [tables(part.folder, variant)]
     }
     return comparison.LogResult(
-        name, job.log_sha256, people.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, tuple(found["notes"]), rows
+        name, job.log_sha256, people.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, told, rows
     )
 
 
@@ -227,6 +232,28 @@ def _full_coverages(
                 mine, people, Predicted(build.prediction_stage(mine), folder / "state.parquet")
             )
     return found
+
+
+def _notes(
+    job: Job,
+    folder: Path,
+    variants: Sequence[Variant],
+    programme: PlacedProgramme,
+    found: Mapping[str, Any],
+) -> tuple[str, ...]:
+    """What a report on the log says of it and of its robot, and where a method's robot stands inside the person.
+
+    Args:
+        job: What was asked for.
+        folder: Tables of the log.
+        variants: That were run.
+        programme: Where the robot stands.
+        found: What the stages found in the log.
+    """
+    motions = {v.label: folder / f"motion_{v.slug}.parquet" for v in variants if v.method != "none"}
+    robot = build.robot(job, programme.T_world_base)
+    notes = notes_of(folder, job.meta(), found["notes"], motions, robot, job.settings.fusion.rate_hz)
+    return defect_notes(found["counts"], notes)
 
 
 def _programme(job: Job, log: Log, start_ns: int) -> PlacedProgramme:

@@ -30,9 +30,7 @@ from hrcreplay.robot.control.control_step import (
 )
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.task import Reference, ReferencePoint, advance
-
-_FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
+from hrcreplay.robot.task import Reference, ReferencePoint, advance, tcp_speed_cap
 
 
 class FollowerTick(NamedTuple):
@@ -129,7 +127,8 @@ class QpFollower(Follower):
         error_m = float(np.linalg.norm(seen.sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3]))
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
-        target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q)
+        cap = tcp_speed_cap(self.reference, self.s_s, self.settings.plan)
+        target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q, cap)
         return self.robot, self.state, self.u, target, seen.sight, seen.around, seen.horizon_s
 
     def _move_on(self) -> None:
@@ -261,35 +260,3 @@ class Planner:
 def unknown(predict: Predict, horizon_s: float) -> Obstacles:
     """Volumes that may not be relied on."""
     return replace(predict(horizon_s), known=False)
-
-
-@dataclass
-class InitialOverlap:
-    """Whether robot and person overlap from the start: at every tick of the first second with a person in view."""
-
-    dt_s: float
-    ticks: int = 0
-    inside: bool = True
-    pair: tuple[str, str] = ("", "")  #: link and limb at the first of them
-
-    def add(self, states: HumanStates, motion: Motion) -> None:
-        """Takes a batch of ticks into account."""
-        rows = np.flatnonzero(np.isfinite(states.p[:, 0]) & (motion.limb >= 0))
-        rows = rows[: max(0, round(_FIRST_S / self.dt_s) - self.ticks)]
-        if not len(rows):
-            return
-        if not self.ticks:
-            self.pair = (motion.links[motion.link[rows[0]]], motion.limbs[motion.limb[rows[0]]])
-        self.ticks += len(rows)
-        self.inside = self.inside and bool((motion.distance_m[rows] <= 0.0).all())
-
-    def remark(self) -> str | None:
-        """The note for the user; None where there is a distance between the two."""
-        if not self.ticks or not self.inside:
-            return None
-        link, limb = self.pair
-        return (
-            f"the robot's link {link} stands inside the volume of the person's {limb} from the first tick with a "
-            f"person on, for {self.ticks * self.dt_s:.2f} s at least; is T_world_base right? "
-            "hrcreplay calibrate tells where the person stood"
-        )

@@ -191,7 +191,11 @@ def _limits(task: Problem) -> tuple[Floats, Floats, tuple[dict[str, Any], ...]]:
     A = np.vstack([np.eye(nv), -np.eye(nv), limits.J, -limits.J])
     b = np.concatenate([limits.high, -limits.low, limits.J_high, -limits.J_low])
     names = [{"kind": "axis", "axis": j + 1, "side": side} for side in ("upper", "lower") for j in range(nv)]
-    names += [{"kind": "tcp", "direction": j, "side": side} for side in ("upper", "lower") for j in range(6)]
+    names += [
+        {"kind": "tcp", "direction": j, "side": side} if j < 6 else {"kind": "speed"}
+        for side in ("upper", "lower")
+        for j in range(len(limits.J))
+    ]
     kept = np.isfinite(b) & (A.any(axis=1))
     return A[kept], b[kept], tuple(name for name, keep in zip(names, kept, strict=True) if keep)
 

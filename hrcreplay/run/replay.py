@@ -17,22 +17,21 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Unpack
 
-import pyarrow.parquet as pq
-
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import HumanStates, Ints
-from hrcreplay.report import metrics_data, tables, verdict
+from hrcreplay.report import tables
 from hrcreplay.report.story import defect_notes
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import LogLike
 from hrcreplay.run.contact import write_contact
 from hrcreplay.run.job import TABLES, Job, JobOptions, resolve, urdf_digest, versions
+from hrcreplay.run.notes import notes_of
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import missing_columns, read_states
-from hrcreplay.store.run_folder import Run, RunWriter, Stopwatch
+from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 REPORTS = Path("reports")
 
@@ -139,7 +138,7 @@ def run_stages(
     if todo:
         for _ in flow:
             pass
-    return _findings(job, log, sink, reused)
+    return findings(job, log, sink, reused)
 
 
 def _about_results(job: Job, log: Log, folder: Path, meta: dict[str, Any], told: list[str]) -> dict[str, Any]:
@@ -155,29 +154,23 @@ def _about_results(job: Job, log: Log, folder: Path, meta: dict[str, Any], told:
     Returns:
         ``notes``, those told before among them, and ``robot``.
     """
-    notes = [*told, *_unmeasured(folder, meta, told)]
-    found: dict[str, Any] = {}
-    if "plan" in job.stages:
-        robot = build.robot(job, build.robot_base(job, log))
-        notes += tables.remarks(robot)
-        found["robot"] = tables.summary(robot)
-    return found | {"notes": list(dict.fromkeys(notes))}
+    robot = build.robot(job, build.robot_base(job, log)) if "plan" in job.stages else None
+    method = job.settings.plan.method
+    motions = {} if robot is None or method == "none" else {str(method): folder / "motion.parquet"}
+    notes = notes_of(folder, meta, told, motions, robot, job.settings.fusion.rate_hz)
+    return {"notes": notes} | ({} if robot is None else {"robot": tables.summary(robot)})
 
 
-def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str]:
-    """Remarks on limbs that were not measured, from the tables of the first stage."""
-
-    def table(name: str) -> Any:
-        path = folder / f"{name}.parquet"
-        return pq.read_table(path, columns=list(metrics_data.LIMB_COLUMNS[name])).to_pandas() if path.exists() else None
-
-    return verdict.limb_remarks(Run(folder, meta, state=table("state"), measurements=table("measurements")), told)
-
-
-def _findings(job: Job, log: Log, sink: Sink, reused: tuple[str, ...]) -> dict[str, Any]:
+def findings(job: Job, log: Log, sink: Sink, reused: tuple[str, ...]) -> dict[str, Any]:
     """What the stages found in the log; of a stage taken over, what the earlier run found.
 
     Damage to the files that only this run met is told all the same.
+
+    Args:
+        job: What was asked for.
+        log: Log of the job, read.
+        sink: What the stages counted and noted.
+        reused: Stages whose tables were taken over from an earlier run.
     """
     joints = log.joint_defects
     found: dict[str, tuple[Counter[str], list[str]]] = {

@@ -26,6 +26,7 @@ from hrcreplay.run import build
 from hrcreplay.run.figure_data import computed
 from hrcreplay.run.job import Job, job_of_run
 from hrcreplay.run.why import Record, stop_table
+from hrcreplay.settings.sections import Logs, setting
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
 
@@ -113,7 +114,7 @@ def _bounds(settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float = 0.2) -> dict[str, Metric]:
+def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float = Logs().gap_s) -> dict[str, Metric]:
     """Metrics of a run: name -> value, unit, meaning; null with a reason where one does not apply, never 0.
 
     Args:
@@ -125,7 +126,7 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
     Returns:
         Sorted by name, plain Python values, finite numbers only.
     """
-    plan = run.meta.get("settings", {}).get("plan", {})
+    recorded = run.meta.get("settings", {})
     metrics = MetricTable()
     add_quality(metrics, run, gap_s)
     add_limbs(metrics, run)
@@ -135,10 +136,11 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
         metrics,
         run.motion,
         run.baselines,
-        method=str(plan.get("method", "qp")),
+        method=str(setting(recorded, "plan", "method")),
         near_m=near_m,
         stationary_m_per_s=stationary_m_per_s,
-        leash_m=float(plan.get("leash_m", 0.25)),
+        leash_m=float(setting(recorded, "plan", "leash_m")),
+        contact=run.contact,
     )
     add_contact(metrics, run, stationary_m_per_s)
     return metrics.sorted()

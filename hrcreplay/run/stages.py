@@ -26,7 +26,7 @@ from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.run.build import Forecast, FusionStage, PredictionStage
-from hrcreplay.run.followers import InitialOverlap, Planner
+from hrcreplay.run.followers import Planner
 from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.columns import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
@@ -315,8 +315,7 @@ def planned(
         store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole; inf: none are.
         sink: Where rows and times go.
     """
-    beside, done = InitialOverlap(next(iter(planners.values())).dt_s), 0
-    limbs = prediction_stage.limbs
+    done, limbs = 0, prediction_stage.limbs
     for batch in states:
         forecast = Forecast(prediction_stage, batch)
         with sink.watch.stage("predict", len(batch)):
@@ -326,7 +325,6 @@ def planned(
                 motion = planner.follow(batch, around, limbs)
             sink.run.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
             if planner.chosen:
-                beside.add(batch, motion)
                 stored = stored_ticks(done, len(batch), store_every)
                 with sink.watch.stage("hulls", len(stored)):
                     for tick in stored.tolist():
@@ -336,9 +334,6 @@ def planned(
         done += len(batch)
         sink.progress("plan", len(batch))
         yield
-    remark = beside.remark()
-    if remark is not None:
-        sink.notes["plan"].append(remark)
 
 
 def print_note(text: str) -> None:

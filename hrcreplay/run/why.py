@@ -351,6 +351,8 @@ def _row(row: Mapping[str, Any]) -> str:
     if row["kind"] == "tcp":
         turn = "turning about" if row["direction"] >= 3 else "along"
         return f"TCP {turn} {'xyz'[row['direction'] % 3]}, {row['side']} bound"
+    if row["kind"] == "speed":
+        return "TCP, the programme's speed limit"
     if row["kind"] == "path":
         return str(row["what"])
     at = ", ".join(f"{value:.3f}" for value in row["vertex_m"])

@@ -14,26 +14,15 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.settings.sections import Fusion, LimitNames, Live, Logs, Occupancy, Plan, Report, Robot, Section
+from hrcreplay.settings.sections import Settings
+
+__all__ = ["SHIPPED", "Settings", "as_overrides", "load_settings"]
 
 #: Settings files that ship with the package: ``--config paper``.
 SHIPPED = {"paper": Path(__file__).with_name("paper.toml")}
 
 #: Words that TOML takes for something else than a text.
 _WORDS = frozenset({"true", "false", "inf", "nan"})
-
-
-class Settings(Section):
-    """Everything a run depends on beside the log and the cell."""
-
-    logs: Logs = Logs()
-    fusion: Fusion = Fusion()
-    limits: LimitNames = LimitNames()
-    occupancy: Occupancy = Occupancy()
-    robot: Robot = Robot()
-    plan: Plan = Plan()
-    report: Report = Report()
-    live: Live = Live()
 
 
 def load_settings(

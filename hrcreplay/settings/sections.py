@@ -6,6 +6,7 @@ corrected, docs/paper.md says how.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -273,6 +274,9 @@ class Plan(Section):
     """time: the reference runs with the clock; path: only as far as the robot has followed."""
     leash_m: Positive = 0.4
     """path: the reference waits when the TCP is this far away, so no way round a person leads further off [m]."""
+    catch_up_speed_m_per_s: NotNegative | Literal["free"] = 0.0
+    """qp: the TCP is never faster than the programme's speed limit where the reference is, not even to catch up; this
+    speed is allowed where that limit is lower; free: only tcp_speed_max bounds it [m/s]."""
     waypoint_m: Positive = 0.02
     """path: the reference leaves a waypoint when the TCP has come this close [m]."""
     q_p: tuple[NotNegative, NotNegative] = (0.10, 0.10)
@@ -378,3 +382,27 @@ class Live(Section):
     """Whether to ask the system to run the control loop before all else and to keep it in memory."""
     zenoh: Zenoh = Zenoh()
     """Where live skeletons come from when no recording is played."""
+
+
+class Settings(Section):
+    """Everything a run depends on beside the log and the cell."""
+
+    logs: Logs = Logs()
+    fusion: Fusion = Fusion()
+    limits: LimitNames = LimitNames()
+    occupancy: Occupancy = Occupancy()
+    robot: Robot = Robot()
+    plan: Plan = Plan()
+    report: Report = Report()
+    live: Live = Live()
+
+
+def setting(recorded: Mapping[str, Any], section: str, key: str) -> Any:
+    """A setting as a run recorded it, or its default where the run did not.
+
+    Args:
+        recorded: ``settings`` of run.json.
+        section: Name of the section.
+        key: Name of the setting.
+    """
+    return recorded.get(section, {}).get(key, getattr(getattr(Settings(), section), key))

@@ -27,7 +27,7 @@ __all__ = ["run"]  # the fixture
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     out = tmp_path_factory.mktemp("fit") / "worker.toml"
-    return out, fit.run([replay.demo_log()], out=out, coverage=0.99).lines
+    return out, fit.run([replay.demo_log()], out=out, coverage=0.99, cover="joints").lines
 
 
 @pytest.fixture(scope="module")
@@ -81,13 +81,13 @@ def test_a_stage_takes_the_file(tmp_path: Path, fitted: tuple[Path, list[str]]) 
 
 
 def test_the_same_logs_give_the_same_bytes(tmp_path: Path, fitted: tuple[Path, list[str]]) -> None:
-    fit.run([replay.demo_log()], out=tmp_path / "again.toml")
+    fit.run([replay.demo_log()], out=tmp_path / "again.toml", cover="joints")
     assert (tmp_path / "again.toml").read_bytes() == fitted[0].read_bytes()
 
 
 def test_the_part_held_back_changes_no_bound(tmp_path: Path, fitted: tuple[Path, list[str]]) -> None:
     """Cut at 42 s, where the held-back part of 60 s begins, with no more than a horizon held back."""
-    fit.run([replay.demo_log()], out=tmp_path / "cut.toml", end_s=43.0, held_back=0.9999 / 43.0)
+    fit.run([replay.demo_log()], out=tmp_path / "cut.toml", cover="joints", end_s=43.0, held_back=0.9999 / 43.0)
     cut, whole = load_limits(tmp_path / "cut.toml"), load_limits(fitted[0])
     for name in ("v_min", "v_max", "a_min", "a_max"):
         np.testing.assert_array_equal(getattr(cut, name), getattr(whole, name))
@@ -96,7 +96,9 @@ def test_the_part_held_back_changes_no_bound(tmp_path: Path, fitted: tuple[Path,
 def test_several_logs_are_each_left_out_once(tmp_path: Path) -> None:
     shutil.copy(replay.demo_log(), tmp_path / "copy.mcap")
     out = tmp_path / "two.toml"
-    lines = fit.run([replay.demo_log(), tmp_path / "copy.mcap"], out=out, end_s=20.0, coverage=0.95).lines
+    lines = fit.run(
+        [replay.demo_log(), tmp_path / "copy.mcap"], out=out, cover="joints", end_s=20.0, coverage=0.95
+    ).lines
     logs = tomllib.loads(out.read_text())["provenance"]["logs"]
     assert [log["name"] for log in logs] == ["demo.mcap", "copy.mcap"]
     for log in logs:
@@ -165,21 +167,21 @@ def test_another_kind_of_coverage_is_refused(tmp_path: Path) -> None:
 def test_an_existing_file_is_not_written_over(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text("mine")
     with pytest.raises(SettingsError, match="exists already"):
-        fit.run([replay.demo_log()], out=tmp_path / "x.toml")
+        fit.run([replay.demo_log()], out=tmp_path / "x.toml", cover="joints")
     assert (tmp_path / "x.toml").read_text() == "mine"
 
 
 @pytest.mark.parametrize("end_s", [0.2, 1.0])
 def test_a_log_shorter_than_its_parts_need_is_refused(tmp_path: Path, end_s: float) -> None:
     with pytest.raises(LogError, match=r"found .* s; .* both need more than the horizon of 0.377 s"):
-        fit.run([replay.demo_log()], out=tmp_path / "x.toml", end_s=end_s)
+        fit.run([replay.demo_log()], out=tmp_path / "x.toml", cover="joints", end_s=end_s)
     assert not list(tmp_path.iterdir())
 
 
 def test_no_arm_motion_is_refused_in_one_line(tmp_path: Path) -> None:
     log = log_of_one_who_does_not_stir(tmp_path / "still.mcap")
     with pytest.raises(LogError, match=r"still.mcap: found no arm motion") as caught:
-        fit.run([log], out=tmp_path / "x.toml")
+        fit.run([log], out=tmp_path / "x.toml", cover="joints")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "x.toml").exists()
 
@@ -190,7 +192,7 @@ def test_a_real_recording(tmp_path: Path, name: str) -> None:
     settings, cell, out = tmp_path / "s.toml", tmp_path / "cell.toml", tmp_path / "person.toml"
     settings.write_text(SARA)
     cell.write_text(SARA_CELL)
-    lines = fit.run([bag], out=out, config=settings, cell_file=cell).lines
+    lines = fit.run([bag], out=out, cover="joints", config=settings, cell_file=cell).lines
     limits, human = load_limits(out), load_limits("human")
     found = tomllib.loads(out.read_text())["provenance"]
     assert found["logs"][0]["recorded_future"] == "smoothed estimate"

@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from hrcreplay.records import JOINTS
-from hrcreplay.report.metrics import path_feet
-from hrcreplay.report.metrics_plan import cycles, waited_s
+from hrcreplay.report.metrics import MetricTable, path_feet
+from hrcreplay.report.metrics_plan import add_plan, cycles, waited_s
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
 from tests.report.synthetic import T0_NS, make_run
@@ -167,6 +167,44 @@ def test_a_robot_that_dwells_as_programmed_is_not_stationary(run: Run) -> None:
     found = metrics_of(dataclasses.replace(run, motion=motion))
     assert found["plan_near_ticks"]["value"] == n
     assert found["plan_stationary_share"]["value"] == 0.0
+
+
+def test_both_standing_shares_are_told_and_dwells_count_in_one(run: Run) -> None:
+    """A robot that dwells for the first 60 ticks, and stands for 40 more while its programme would go on."""
+    assert run.motion is not None
+    n, tick = len(run.motion), np.arange(len(run.motion))
+    ref_speed, tcp_speed = np.where(tick < 60, 0.0, 0.3), np.where(tick < 100, 0.0, 0.3)
+    motion = run.motion.assign(
+        tcp_speed=tcp_speed, ref_speed=ref_speed, distance_m=0.4, programme_s=1e-9 * (run.motion["t_ns"] - T0_NS)
+    )
+    found = metrics_of(dataclasses.replace(run, motion=motion))
+    assert found["plan_stationary_share"]["value"] == pytest.approx(40 / n)
+    assert found["plan_null_speed_ticks"]["value"] == 100
+    assert found["plan_null_speed_share"]["value"] == pytest.approx(100 / n)
+    assert "dwell" in found["plan_stationary_share"]["meaning"]
+
+
+def test_the_greatest_speeds_at_all_and_near_the_body(run: Run) -> None:
+    """The TCP is fastest away from the body; a tick without a known body is near nothing."""
+    assert run.motion is not None
+    n = len(run.motion)
+    speed = 0.2 + 0.001 * (np.arange(n) % 100)
+    speed[[5, 6, 7]] = 1.4, 0.9, 1.2
+    apart = np.full(n, 0.8)
+    apart[10:60], apart[6], apart[7] = 0.3, -0.01, np.nan
+    motion = run.motion.assign(tcp_speed=speed, ref_speed=np.where(np.arange(n) == 3, 0.7, 0.1))
+    rows = pd.DataFrame(
+        {"t_ns": motion["t_ns"], "method": "qp", "tcp_speed": speed, "distance_m": apart, "moving": True}
+    )
+    metrics = MetricTable()
+    bounds = {"near_m": 0.5, "stationary_m_per_s": 0.001, "leash_m": 0.4}
+    add_plan(metrics, motion, {"scaling": motion}, method="qp", contact=rows, **bounds)
+    found = metrics.sorted()
+    assert found["plan_tcp_speed_max_m_per_s"]["value"] == 1.4
+    assert found["plan_ref_speed_max_m_per_s"]["value"] == 0.7
+    assert found["plan_tcp_speed_near_body_max_m_per_s"]["value"] == 0.9
+    assert found["baseline_scaling_tcp_speed_max_m_per_s"]["value"] == 1.4
+    assert found["baseline_scaling_tcp_speed_near_body_max_m_per_s"]["value"] is None  # it has no row of contact
 
 
 def test_a_robot_whose_programme_waits_for_it_at_a_waypoint_is_stationary(run: Run) -> None:

@@ -18,7 +18,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, HumanStates, Ints
-from hrcreplay.report import comparison
+from hrcreplay.report import comparison, figures_robot
 from hrcreplay.report.comparison import FIELDS, Variant
 from hrcreplay.run import build, compare, replay
 from hrcreplay.run.contact import recorded_people
@@ -288,6 +288,69 @@ def test_logs_add_up() -> None:
     assert both["jerk_rms_rad_per_s3"] == pytest.approx(math.sqrt((100 * 4 + 300 * 36) / 400))
     assert both["pace"] == pytest.approx(3.0 / 6.0)
     assert both["braking_events_by_cause"] == {"a": 3, "b": 5}
+
+
+CELL = "T_world_base = { position_m = [1.28, 0.0, 0.65], yaw_deg = 0.0 }\n"
+
+
+def test_a_report_and_a_comparison_tell_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The robot stands inside the person: said by both, in print and in what they leave behind."""
+    cell = tmp_path / "cell.toml"
+    span: dict[str, Any] = {"start_s": 8.0, "end_s": 9.3}
+    cell.write_text(CELL)
+    plan = replay.run("plan", replay.demo_log(), out=tmp_path / "plan", cell_file=cell, **span)
+    first = capsys.readouterr().err.splitlines()
+    both = "qp,scaling,none"
+    out = compare.run([replay.demo_log()], methods=both, out=tmp_path / "one", processes=1, cell_file=cell, **span)
+    again = compare.run([plan], methods=both, out=tmp_path / "two", processes=1)
+    second = capsys.readouterr().err
+    told = [line.removeprefix("hrcreplay: ") for line in first if not line.startswith("/")]
+    assert any("stands inside the volume" in line for line in told)
+    notes = json.loads((out / "compare.json").read_text())["logs"][0]["notes"]
+    assert notes == told
+    assert notes == json.loads((again / "compare.json").read_text())["logs"][0]["notes"]
+    assert all(f"hrcreplay: {line}" in second for line in told)
+    assert all(f"- {line}" in (out / "compare.md").read_text().splitlines() for line in told)
+
+
+def still(folder: Path) -> dict[str, Any]:
+    """What a comparison says of two methods of which one is inside the volumes for all of the time."""
+    cell = folder / "cell.toml"
+    cell.write_text(CELL)
+    span: dict[str, Any] = {"start_s": 8.0, "end_s": 9.3, "cell_file": cell}
+    out = compare.run([replay.demo_log()], methods="none,scaling", out=folder / "one", processes=1, **span)
+    found: dict[str, Any] = json.loads((out / "compare.json").read_text())
+    return {**found, "folder": out}
+
+
+def test_a_method_that_never_moved_is_not_taken_for_a_success(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, label = still(tmp_path), "scaling:sound:adaptive"
+    motion = pq.read_table(found["folder"] / "demo" / "motion_scaling_sound_adaptive.parquet").to_pandas()
+    assert not motion[[f"dq{i}" for i in range(1, 7)]].to_numpy().any()
+    for row in (found["logs"][0]["methods"][label], found["total"][label]):
+        assert (row["touch_ticks"], row["still_logs"], row["stillness"]) == (0, 1, "never moved")
+    assert found["total"]["none"]["stillness"] is None
+    said = capsys.readouterr().err
+    lines = [line for text in (said, (found["folder"] / "compare.md").read_text()) for line in text.splitlines()]
+    rows = [line for line in lines if label in line and "\u2013" in line]  # it has no smallest distance in motion
+    assert len(rows) == 2
+    assert all("0 (never moved)" in line for line in rows)
+    with (found["folder"] / "compare.csv").open() as file:
+        assert {row["variant"]: row["stillness"] for row in csv.DictReader(file)} == {"none": "", label: "never moved"}
+    legend = figures_robot.methods(found).axes[0].get_legend()
+    assert legend is not None
+    assert any("scaling" in t.get_text() and "never moved" in t.get_text() for t in legend.get_texts())
+
+
+def test_on_how_many_logs_a_method_made_no_way() -> None:
+    row = {"still_logs": 1, "moving_ticks": 7}
+    assert comparison.stillness(row, 1) == "made no way"
+    assert comparison.stillness({**row, "moving_ticks": 0}, 1) == "never moved"
+    assert comparison.stillness(row, 3) == "no way on 1 of 3 logs"
+    assert comparison.stillness({**row, "still_logs": 3}, 3) == "made no way"
+    assert not comparison.stillness({"still_logs": 0, "moving_ticks": 900}, 3)
 
 
 def test_brakings_are_counted_where_they_begin() -> None:

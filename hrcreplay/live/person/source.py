@@ -37,7 +37,7 @@ from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
 from hrcreplay.logs.decoders import GenericDecoder, OwnDecoder, TfDecoder
 from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder
 from hrcreplay.logs.messages import Message, RawSkeleton, SkeletonDecoder, Topic, Undecodable
-from hrcreplay.settings.sections import Decoder, ZenohKey
+from hrcreplay.settings.sections import Decoder, Zenoh, ZenohKey
 
 _OWN = "hrcreplay.Skeleton"
 _RMW_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")  # in the keys of rmw_zenoh: <domain>/<topic>/<type>/<hash>
@@ -223,13 +223,13 @@ def open_session(settings: Mapping[str, Any]) -> Any:
         raise SettingsError(
             "live.zenoh: eclipse-zenoh is not installed; would be right: pip install 'hrcreplay[zenoh]'"
         ) from error
-    config = zenoh.Config()
+    config, wanted = zenoh.Config(), Zenoh.model_validate(settings)
     given = {
-        "mode": settings.get("mode", "peer"),
-        "connect/endpoints": list(settings.get("connect", ())),
+        "mode": wanted.mode,
+        "connect/endpoints": list(wanted.connect),
         "connect/retry": {"period_init_ms": 250, "period_max_ms": 1000},
-        "listen/endpoints": list(settings.get("listen", ())),
-        "scouting/multicast/enabled": bool(settings.get("scouting", False)),
+        "listen/endpoints": list(wanted.listen),
+        "scouting/multicast/enabled": wanted.scouting,
     }
     try:
         for key, value in given.items():

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hrcreplay.geometry.vectors import to_vector
+from hrcreplay.geometry.vectors import dot_n, norm_n, to_vector
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import RETREAT_SPEED
@@ -125,6 +125,7 @@ class Target(NamedTuple):
     T_world_tcp: Floats  #: (4, 4)
     twist: Floats  #: (6,) velocity in the world, linear first [m/s, rad/s]
     q: Floats  #: (nv,) joint positions that the programme has there [rad]
+    tcp_speed_max: float = math.inf  #: on the way there, however far it is [m/s]
 
 
 def pose_error(T_world_tcp: Floats, T_world_ref: Floats) -> Floats:
@@ -219,7 +220,8 @@ def problem(
 ) -> Problem:
     """Eq. (66) at one instant; building it is separate from solving it.
 
-    Beside what is printed the posture counts a little (`with_posture`), and the acceleration may be bound to change by
+    Beside what is printed the posture counts a little (`with_posture`), the TCP keeps the programme's speed limit
+    (`add_speed_row`), and the acceleration may be bound to change by
     a share of its limit in a tick (``plan.jerk_s``). Where the variable is the velocity that the robot heads for
     (``plan.smooth_s``), cost and rows are as printed, and the bounds lie further out by as much as it goes beyond the
     next tick's velocity (`dq_after`).
@@ -239,7 +241,7 @@ def problem(
     error = pose_error(pose.T_world_tcp, target.T_world_tcp)
     H, g = tracking_cost(error, J, dJdq, state.dq, target.twist, plan.q_p, plan.q_v, plan.path_gain_per_s, dt_s)
     H, g = with_posture(H, g, state.q - target.q, plan.posture)
-    low, high = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
+    low, high = axes = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
     if plan.jerk_s > dt_s:
         low, high = smooth_bounds(low, high, state.dq + dt_s * u_before, dt_s**2 / plan.jerk_s * robot.ddq_max)
     speed_max = min(plan.tcp_speed_max, RETREAT_SPEED) if settings.retreats(sight.overlap_m) else plan.tcp_speed_max
@@ -249,13 +251,107 @@ def problem(
         now + further * (bound - now)
         for bound, now in ((low, state.dq), (high, state.dq), (J_low, twist), (J_high, twist))
     )
+    limits = Limits(low, high, J, J_low, J_high)
+    if math.isfinite(target.tcp_speed_max):
+        within = tuple(state.dq + further * (bound - state.dq) for bound in axes)
+        limits = add_speed_row(limits, twist, further * dt_s * dJdq, target.tcp_speed_max, *within)
     pairs = sight.pairs
     if pairs is None:
         raise ValueError("problem: the distances from people are not known")
     rows = tick_rows(
         pose, obstacles, pairs.room_m2(plan.room, plan.give_way_m), pairs.distance_m, horizon_s + plan.lead_s
     )
-    return Problem(H, g, Limits(low, high, J, J_low, J_high), rows, plan.rows == "soft")
+    return Problem(H, g, limits, rows, plan.rows == "soft")
+
+
+#: A TCP that is slower than this has no direction [m/s].
+SLOW_M_PER_S = 1e-6
+#: Rounds of looking for a velocity that keeps the speed limit: the arm at the end of the tick hardly depends on it.
+SPEED_ROUNDS = 4
+
+
+@njit(cache=True)
+def add_speed_row(limits: Limits, twist: Floats, drift: Floats, speed_max: float, low: Floats, high: Floats) -> Limits:
+    """Bounds the TCP's velocity along the direction in which it moves: the bound on its speed, linearised.
+
+    What is bounded is the velocity that the robot heads for, so that the TCP nears the bound smoothly. The bound is
+    never lower than what the axes can do, nor than what Eq. (66h) lets the TCP do, so that it never forbids to brake.
+    `limit_speed` sees to what the linearisation misses.
+
+    Args:
+        limits: Of axes and TCP.
+        twist: (6,) velocity of the TCP at the tick, linear first [m/s, rad/s].
+        drift: (6,) by which it changes at constant joint velocities until the velocity headed for [m/s, rad/s].
+        speed_max: [m/s].
+        low: (nv,) least velocities that the axes can head for [rad/s].
+        high: (nv,) largest ones [rad/s].
+    """
+    nv, speed = len(low), norm_n(twist[:3])
+    row, bound, least, least_tcp = np.zeros((1, nv)), speed_max, 0.0, 0.0
+    if speed > SLOW_M_PER_S:
+        for i in range(3):
+            along = twist[i] / speed
+            bound -= along * drift[i]
+            least_tcp += min(along * limits.J_low[i], along * limits.J_high[i])
+            for j in range(nv):
+                row[0, j] += along * limits.J[i, j]
+        for j in range(nv):
+            least += min(row[0, j] * low[j], row[0, j] * high[j])
+    J_low, J_high = np.append(limits.J_low, -np.inf), np.append(limits.J_high, max(bound, least, least_tcp))
+    return Limits(limits.low, limits.high, np.concatenate((limits.J, row)), J_low, J_high)
+
+
+def limit_speed(
+    robot: RobotModel, state: RobotState, J: Floats, dq_next: Floats, speed_max: float, settings: PlanSettings
+) -> Floats:
+    """The velocity between a proposed one and that of the hardest braking with which the TCP keeps a speed limit.
+
+    It holds at the end of the tick, where the arm is then. A TCP that is faster already, since a slower move begins or
+    its stop let it be, slows down with the time constant ``plan.smooth_s``.
+
+    Args:
+        robot: The manipulator.
+        state: At the tick.
+        J: (6, nv) of the TCP at the tick [m/rad, rad/rad].
+        dq_next: (nv,) proposed for the end of the tick [rad/s].
+        speed_max: Of the TCP [m/s].
+        settings: Length of a tick, and the time constant.
+
+    Returns:
+        (nv,) the proposed one itself where it keeps the limit [rad/s].
+    """
+    if not math.isfinite(speed_max):
+        return dq_next
+    dt_s = settings.dt_s
+    now, _ = _speed_and_share(J, np.zeros(robot.nv), state.dq, 1.0, 0.0)
+    allowed = max(speed_max, now + (speed_max - now) / (1.0 + settings.plan.smooth_s / dt_s))
+    brake = np.copysign(np.maximum(np.abs(state.dq) - robot.ddq_max * dt_s, 0.0), state.dq)
+    dq, share = dq_next, 1.0
+    for _ in range(SPEED_ROUNDS):
+        J = robot.pose(state.q + 0.5 * dt_s * (state.dq + dq), dq).J_tcp
+        speed, less = _speed_and_share(J, brake, dq_next - brake, share, allowed)
+        if speed <= allowed or less == share:
+            break
+        share = less
+        dq = brake + share * (dq_next - brake)
+    return dq
+
+
+@njit(cache=True)
+def _speed_and_share(J: Floats, brake: Floats, way: Floats, share: float, allowed: float) -> tuple[float, float]:
+    """Speed of the TCP at ``brake + share * way``, and the share in [0, 1] up to which it is at most ``allowed``.
+
+    Where it is faster at every share, that of the lowest speed.
+    """
+    aa, ab, bb, square = 0.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        a, b = dot_n(J[i], brake), dot_n(J[i], way)
+        aa, ab, bb, square = aa + a * a, ab + a * b, bb + b * b, square + (a + share * b) ** 2
+    if bb == 0.0:
+        return math.sqrt(square), share
+    within = ab * ab - bb * (aa - allowed * allowed)
+    most = (math.sqrt(within) - ab if within > 0.0 else -ab) / bb
+    return math.sqrt(square), min(max(most, 0.0), 1.0)
 
 
 def dq_after(dq: Floats, aim: Floats, settings: PlanSettings) -> Floats:
@@ -314,6 +410,7 @@ def propose(
         too_fast = settings.retreats(sight.overlap_m)  # for a retreat
         return control_step.INSIDE if too_fast else control_step.NO_SOLUTION
     dq_next = dq_after(state.dq, found.dq_next, settings)
+    dq_next = limit_speed(robot, state, sight.pose.J_tcp, dq_next, target.tcp_speed_max, settings)
     q_next = state.q + 0.5 * settings.dt_s * (state.dq + dq_next)  # Eq. (68), (69)
     status = control_step.LIMITED if found.held else control_step.TRACKING
     # a straight stop may leave the range of an axis, one by Eq. (67) does not
