@@ -194,7 +194,7 @@ class SweptVolumes:
         return self.vertices_m[self.offsets[first] : self.offsets[first + 1]]
 
 
-#: What a tick of the plan was: free tracking, held by a safety constraint or a limit, or Eq. (67).
+#: What a tick of the plan was: free tracking, held by a safety constraint or a limit, a stop, or a way out of a volume.
 STATUSES = ("tracking", "limited", "braking", "retreating")
 
 

@@ -1,1 +1,1 @@
-"""Convex hulls, support polytopes, distances, rotations and a QP solver. Knows no person and no robot. Pure."""
+"""Convex hulls, support polytopes, distances and rotations. Knows no person and no robot. Pure."""

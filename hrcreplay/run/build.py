@@ -1,6 +1,6 @@
 """The stages with their settings, and the robot, built from settings, cell and log.
 
-The rooms of the stages get plain values and never see a settings model.
+The rooms of the stages take sections of the settings as they are, and plain values of the rest; only drivers load them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Loads the settings: defaults < settings file (TOML) < command line (``--set section.key=value``).
 
-The rooms of the stages never see these models: the drivers hand them plain values.
+Rooms that need settings take a section as it is (``sections``); none of them loads one.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ def all_rows(robot: RobotModel, tick: Asked) -> tuple[Floats, Floats, Floats]:
     """Every row of Eq. (66g)-(66i), written down; the last column is that of the slack."""
     task, pose, seen = tick
     limits = task.limits
-    A, low, high = [np.hstack([limits.J, np.zeros((6, 1))])], [limits.J_low], [limits.J_high]
+    A, low, high = [np.hstack([limits.J, np.zeros((len(limits.J), 1))])], [limits.J_low], [limits.J_high]
     distance, offsets = by_coal(pose, seen), seen.offsets
     for link, segment in enumerate(robot.segments):
         for limb, radius in enumerate(seen.radius_m):

@@ -74,13 +74,13 @@ def by_daqp(task: Problem) -> tuple[Floats, Floats, list[tuple[int, int, int, in
     limits, n = task.limits, len(task.g)
     H, g, low, high, J = task.H, task.g, limits.low, limits.high, limits.J
     if task.soft:
-        A, J = np.hstack([A, -np.ones((len(A), 1))]), np.hstack([J, np.zeros((6, 1))])
+        A, J = np.hstack([A, -np.ones((len(A), 1))]), np.hstack([J, np.zeros((len(J), 1))])
         H = np.block([[H, np.zeros((n, 1))], [np.zeros((1, n)), np.full((1, 1), SLACK)]])
         g, low, high = np.append(g, 0.0), np.append(low, 0.0), np.append(high, 1e30)
     A[np.abs(A) < 1e-13] = 0.0
     rows = np.ascontiguousarray(np.vstack([J, A]))
     upper = np.concatenate([high, limits.J_high, b])
-    lower = np.concatenate([low, limits.J_low, np.full(len(b), -1e30)])
+    lower = np.concatenate([low, np.maximum(limits.J_low, -1e30), np.full(len(b), -1e30)])
     x, _, flag, _ = daqp.solve(H, g, rows, upper, lower, primal_tol=1e-11, dual_tol=1e-12)
     assert flag == 1
     every = np.vstack([np.eye(len(g)), -np.eye(len(g)), J, -J, A])

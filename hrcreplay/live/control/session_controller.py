@@ -91,7 +91,7 @@ _STILL = np.zeros(AXES)
 
 
 class SessionController:
-    """Answers the robot's packets: waits, approaches, follows its programme, brakes by Eq. (67) and holds.
+    """Answers the robot's packets: waits, approaches, follows its programme, stops and holds.
 
     Between two answers ``update_perception`` brings in what the cameras saw. The robot moves only while the watchdog
     has no reason against it. A reason that appears is kept until the session ends, or, where ``resume`` is set, until

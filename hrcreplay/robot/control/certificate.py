@@ -6,9 +6,12 @@ that from a volume, the motion between is clear. The distance at a position is b
 link and volume, found by coal; one pass over the vertices proves it, wherever the plane came from. Nothing is shared
 with the distances of the rows of Eq. (66i), so that a fault in them is no fault here.
 
-By induction from standstill no link touches the person while the robot moves, as long as the person stays inside the
-volumes of each tick until their horizon, the end of the stop that would follow. A robot that a volume has reached may
-retreat: then no point of a link comes nearer to any point of it, so that who touched it at rest is let go.
+By induction from standstill no link touches the person while the robot moves, as long as it does not retreat and the
+person stays inside the volumes of each tick until their horizon, the end of the stop that would follow.
+
+A robot that a volume has reached may retreat. A retreating step begins inside a volume, so that the link may touch the
+person already: it is not clear of them. What is certified is that no point of the link comes nearer to any point of the
+volume, and slowly, so that who touched it at rest is let go.
 """
 
 from __future__ import annotations
