@@ -212,6 +212,7 @@ class Motion(Table):
     ref_speed: Floats  #: (n,) [m/s]
     programme_s: Floats  #: (n,) programmed time of the reference; behind the clock by what it has waited [s]
     distance_m: Floats  #: (n,) surface to surface, smallest over all pairs; 0 in contact [m]
+    overlap_m: Floats  #: (n,) how deep that link is inside that volume, as far as their radii go; NaN: not known [m]
     limb: Ints  #: (n,) index into ``limbs`` of the nearest pair; -1 without one
     link: Ints  #: (n,) index into ``links`` of the nearest pair; -1 without one
     status: Ints  #: (n,) index into STATUSES

@@ -226,6 +226,15 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
     for name in STATUSES:
         share = float((status == name).mean()) if len(status) else None
         metrics.add(f"{prefix}_{name}_share", share, "1", f"share of all ticks of {what} with status '{name}'")
+    deep = numeric_column(motion, "overlap_m")[status == "retreating"] if "overlap_m" in motion else np.zeros(0)
+    metrics.add(
+        f"{prefix}_retreating_overlap_max_m",
+        float(np.nanmax(deep)) if np.isfinite(deep).any() else None,
+        "m",
+        f"how deep, at most, a link was inside a swept volume where a retreating step of {what} began: such a step is "
+        "certified to bring no point of the link nearer to any point of the volume, not to be clear of it",
+        reason="the table of motion does not say" if (status == "retreating").any() else "it never retreated",
+    )
     reasons = motion["reason"].astype(str).to_numpy()
     for reason in sorted(set(reasons[braking])):
         count = int((reasons[braking] == reason).sum())

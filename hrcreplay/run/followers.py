@@ -238,6 +238,7 @@ class Planner:
             ref_speed=np.array([np.linalg.norm(point.twist[:3]) for point in points]),
             programme_s=np.array([row.programme_s for row in rows]),
             distance_m=np.array([step.distance_m for step in steps]),
+            overlap_m=np.array([step.overlap_m for step in steps]),
             limb=np.array([step.limb for step in steps]),
             link=np.array([step.link for step in steps]),
             status=np.array([step.status for step in steps]),

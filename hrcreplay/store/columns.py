@@ -84,7 +84,7 @@ COLUMNS = {
     "motion": (
         "t_ns",
         *(f"{point}_{axis}" for point in ("ref", "tcp") for axis in "xyz"),
-        *("tcp_speed", "ref_speed", "programme_s", "distance_m", "limb", "link", "status", "reason"),
+        *("tcp_speed", "ref_speed", "programme_s", "distance_m", "overlap_m", "limb", "link", "status", "reason"),
         *("horizon_s", "tau_s", "certified"),
     ),
     "contact": (
@@ -164,6 +164,7 @@ def motion_columns(motion: Motion) -> Columns:
         "ref_speed": motion.ref_speed,
         "programme_s": motion.programme_s,
         "distance_m": motion.distance_m,
+        "overlap_m": motion.overlap_m,
         "limb": _names(motion.limb, motion.limbs),
         "link": _names(motion.link, motion.links),
         "status": _names(motion.status, STATUSES),

@@ -207,6 +207,20 @@ def test_the_greatest_speeds_at_all_and_near_the_body(run: Run) -> None:
     assert found["baseline_scaling_tcp_speed_near_body_max_m_per_s"]["value"] is None  # it has no row of contact
 
 
+def test_a_retreat_begins_inside_a_volume(run: Run) -> None:
+    assert run.motion is not None
+    assert metrics_of(run)["plan_retreating_overlap_max_m"]["value"] is None
+    status = run.motion["status"].astype(str).to_numpy()
+    status[[100, 101, 102]] = "retreating"
+    overlap = np.zeros(len(status))
+    overlap[[99, 100, 101, 102]] = 0.05, 0.01, 0.02, np.nan  # at the first one it still stood
+    found = metrics_of(dataclasses.replace(run, motion=run.motion.assign(status=status, overlap_m=overlap)))
+    assert found["plan_retreating_overlap_max_m"]["value"] == 0.02
+    assert found["plan_retreating_share"]["value"] == pytest.approx(3 / len(status))
+    without = metrics_of(dataclasses.replace(run, motion=run.motion.assign(status=status)))
+    assert "does not say" in without["plan_retreating_overlap_max_m"]["reason"]
+
+
 def test_a_robot_whose_programme_waits_for_it_at_a_waypoint_is_stationary(run: Run) -> None:
     assert run.motion is not None
     n = len(run.motion)

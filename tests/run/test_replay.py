@@ -53,7 +53,7 @@ def test_a_run_leaves_what_the_contract_says(demo_folder: Path, demo: Run) -> No
     assert set(demo.occupancy["limb"]) == {*LIMBS, "LEGS"}
     axes = [f"{name}{axis}" for name in ("q", "dq", "u") for axis in range(1, 7)]
     places = [f"{name}_{axis}" for name in ("ref", "tcp") for axis in "xyz"]
-    others = ["tcp_speed", "ref_speed", "programme_s", "distance_m", "limb", "link", "status", "reason"]
+    others = ["tcp_speed", "ref_speed", "programme_s", "distance_m", "overlap_m", "limb", "link", "status", "reason"]
     stops = ["horizon_s", "tau_s", "certified"]
     assert list(demo.motion.columns) == ["t_ns", *axes, *places, *others, *stops]
     assert set(demo.motion["status"]) == {"tracking", "limited", "braking", "retreating"}

@@ -129,6 +129,7 @@ def _motion(answers: list[codec.RecordedDecision], limbs: tuple[str, ...], links
         t_ns=np.array([answered.t_ns for answered in answers]),
         **{name: values for name, values in column.items() if name not in ("q_measured", "certified")},
         certified=column["certified"] != 0.0,
+        overlap_m=np.full(len(rows), np.nan),  # not recorded; a report on the session's log has it
         limb=np.array([answered.limb for answered in answers]),
         link=np.array([answered.link for answered in answers]),
         status=np.array([answered.status for answered in answers]),

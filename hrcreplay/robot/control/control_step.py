@@ -251,6 +251,7 @@ class Step:
     u: Floats  #: (nv,) applied from the tick on [rad/s^2]
     next: RobotState  #: one tick later, Eq. (68), (69)
     distance_m: float  #: surface to surface, smallest over all pairs; 0 in contact, NaN where not known [m]
+    overlap_m: float  #: how deep the link is inside the volume, as far as their radii go; NaN where not known [m]
     limb: int  #: of the nearest pair; -1 without one
     link: int  #: of the nearest pair; -1 without one
     status: int  #: index into ``records.STATUSES``
@@ -339,6 +340,7 @@ def made(sight: Sight, going: Stop, taken: Taken, horizon_s: float, dt_s: float)
         u=np.asarray((after.dq - going.dq[0]) / dt_s),
         next=after,
         distance_m=sight.distance_m,
+        overlap_m=math.nan if math.isnan(sight.distance_m) else sight.overlap_m,
         limb=sight.limb,
         link=sight.link,
         status=taken.status,
