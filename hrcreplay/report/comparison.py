@@ -106,7 +106,12 @@ FIELDS = (
     Field("nearest_rest_m", "min", "m", "the same at rest"),
     Field("moving_ticks", "sum", "1", "ticks with the robot moving"),
     Field("uncertified_ticks", "sum", "1", "of these, ticks without a certificate"),
-    Field("still_logs", "sum", "1", "logs on which the robot never moved, or made no way: neither safe nor useful"),
+    Field(
+        "still_logs",
+        "sum",
+        "1",
+        "logs on which the robot never moved, or made no way: without contact there is no success",
+    ),
     Field("tcp_speed_max_m_per_s", "max", "m/s", "greatest speed of the TCP"),
     Field("tcp_speed_near_body_m_per_s", "max", "m/s", "the same within report.near_m of the recorded body"),
     Field("programme_speed_max_m_per_s", "max", "m/s", "greatest programmed speed of the TCP, where the reference was"),
@@ -366,7 +371,7 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
             head = (log, label) if len(logs) > 1 else (label,)
             cells = [_cell(row[name], *how) for _, name, *how in _COLUMNS]
             if row["stillness"]:  # lest it be taken for a success
-                cells[0] += f" ({row['stillness']})"
+                cells[0] += f"\n({row['stillness']})"
             rows.append((*head, *cells))
             by_cause = row["braking_events_by_cause"]
             brakings.append((*head, *(f"{by_cause.get(cause, 0):,}" for cause in causes)))
@@ -411,7 +416,7 @@ def print_tables(found: Mapping[str, Any]) -> None:
     """The tables on standard error, where they do not mix with the result."""
     console = Console(stderr=True, markup=False, emoji=False, highlight=False)
     if not console.is_terminal:
-        console.width = 170
+        console.width = 190
     for table in page_tables(found):
         shown = Table(title=table.title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
         for column in table.columns:
@@ -461,7 +466,8 @@ def as_markdown(found: Mapping[str, Any]) -> str:
             f"| {' | '.join(' '.join(column.split()) for column in table.columns)} |",
             f"|{'---|' * len(table.columns)}",
         ]
-        parts.append("\n".join([*head, *(f"| {' | '.join(row)} |" for row in table.rows), "", table.note, ""]))
+        parts.append("\n".join([*head, *(f"| {' | '.join(row)} |".replace("\n", " ") for row in table.rows)]))
+        parts[-1] += f"\n\n{table.note}\n"
     several = len(found["logs"]) > 1
     told = [f"- {log}: {note}" if several else f"- {note}" for log, note in notes(found)]
     parts += ["\n".join(["## Notes", "", *told, ""])] if told else []
