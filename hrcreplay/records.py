@@ -163,6 +163,7 @@ class HumanStates(Table):
     valid: Bools  #: (n, c) whether a row of this camera entered the update of this tick
     residual_m: Floats  #: (n, 7) high quantile of how far BODY was from the model lately [m]; NaN until known
     unseen_s: Floats  #: (n, 7) since a camera last saw the joints of BODY, of the legs [s]; inf before the first time
+    frame_age_s: Floats  #: (n,) since the newest frame that entered the filter was captured [s]; inf before the first
     points_m: Floats  #: (n, 20, 3) POINTS where cameras show them beside the model, world [m]; NaN: not shown lately
     cameras: tuple[str, ...]
 

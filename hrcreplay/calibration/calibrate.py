@@ -13,7 +13,7 @@ from hrcreplay.calibration.registration import Registration, SkeletonTrack, disa
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import POINTS, CameraFrames, Floats
+from hrcreplay.records import POINTS, Bools, CameraFrames, Floats
 from hrcreplay.settings.sections import Logs
 
 _WINDOW_S = 10.0  # a long log is looked at in windows, long enough for clock offsets
@@ -137,7 +137,7 @@ def collect_tracks(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTra
     for frames in log.frames():
         memory, which, _ = select_person(frames, memory, alone, jump_m, memory_s)
         mine = frames.rows(which)
-        within = _in_window(mine, log.header.start_ns, log.header.end_ns)
+        within = in_window(mine, log.header.start_ns, log.header.end_ns)
         if len(rows := mine.rows(within)):
             kept.append(rows)
     log.check()
@@ -147,7 +147,7 @@ def collect_tracks(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTra
     return [_track(table, i) for i in range(len(cameras))]
 
 
-def _in_window(frames: CameraFrames, start_ns: int, end_ns: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def in_window(frames: CameraFrames, start_ns: int, end_ns: int) -> Bools:
     """(n,) rows that arrived in one of the windows; all rows of a log that is short enough."""
     window_ns = round(_WINDOW_S * 1e9)
     every_ns = max(window_ns, (end_ns - start_ns) // _WINDOWS)

@@ -8,6 +8,7 @@ one camera, and pose and clock offset are estimated together by a robust Gauss-N
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -29,6 +30,9 @@ _ITERATIONS = 60
 _INSTANTS = 5000  # at most, evenly spaced, at which the tracks are compared
 _LIKE = 0.1  # correlation of speeds that is no chance
 _COARSE = 1200  # and of these at most, while offsets are only searched
+_ROUGH = 400  # and of these where an offset is wanted to a frame only
+_TOGETHER = 20  # frames of both in which a point must be seen
+_OVERLAP = 0.4  # of the most point pairs that any offset has
 
 
 @dataclass(frozen=True)
@@ -126,6 +130,53 @@ def register(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float = 2.0) -> Re
         if np.abs(step).max() < 1e-6:
             break
     return Registration(T, offset_s)
+
+
+class ClockOffset(NamedTuple):
+    """The clock of a sensor b beside that of a sensor a, by what both saw."""
+
+    offset_s: float  #: clock of b minus clock of a, to a frame [s]
+    apart_m: float  #: how far the two movements are from each other with this offset, median [m]
+    without_m: float  #: and with none; NaN where the two do not overlap then [m]
+    frame_s: float  #: time between two frames of the slower one [s]
+
+
+def find_clock_offset(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float) -> ClockOffset | None:
+    """The offset of two clocks at which two sensors see most nearly the same movement; to a frame, and fast.
+
+    Places that differ by the same all the time, as by an error of a pose or of a tracker, make no difference.
+
+    Args:
+        a: The person as sensor a saw it, in a frame whose axes are those of b's.
+        b: The same person as sensor b saw it.
+        search_s: Offsets are searched within plus and minus this [s].
+
+    Returns:
+        The offset; None where the two never saw the person together for long enough.
+    """
+    if min(len(a), len(b)) < _TOGETHER:
+        return None
+    a, b = _without_jumps(a), _without_jumps(b)
+    width_s = max(float(np.median(np.diff(a.t_ns))), float(np.median(np.diff(b.t_ns)))) * _NS
+    t_ns = a.t_ns[:: -(-len(a) // _ROUGH)]
+    points_a, _, weight_a = _smoothed(a, t_ns, width_s)
+    steps = int(np.ceil(search_s / width_s))
+    offsets_s = np.array(sorted(range(-steps, steps + 1), key=abs)) * width_s
+    apart_m, pairs = np.full(len(offsets_s), np.nan), np.zeros(len(offsets_s))
+    for i, offset_s in enumerate(offsets_s):
+        points_b, _, weight_b = _smoothed(b, t_ns + round(offset_s / _NS), width_s)
+        both = (weight_a > 0) & (weight_b > 0)
+        both &= both.sum(axis=0) >= _TOGETHER
+        pairs[i] = both.sum()
+        if pairs[i]:
+            seen = both.any(axis=0)
+            beside = np.where(both[..., None], points_a - points_b, np.nan)[:, seen]
+            apart_m[i] = np.nanmedian(np.linalg.norm(beside - np.nanmedian(beside, axis=0), axis=2))
+    usable = np.where(pairs >= _OVERLAP * pairs.max(), apart_m, np.nan)
+    if not np.isfinite(usable).any():
+        return None
+    best = int(np.nanargmin(usable))
+    return ClockOffset(float(offsets_s[best]), float(apart_m[best]), float(usable[0]), width_s)
 
 
 def disagreement(a: SkeletonTrack, b: SkeletonTrack, found: Registration) -> Disagreement | None:

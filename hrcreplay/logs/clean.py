@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hrcreplay.logs.clocks import CameraClock
 from hrcreplay.logs.messages import RawSkeleton
 from hrcreplay.records import POINTS, Bools, CameraFrames, Floats
 
@@ -135,7 +136,9 @@ DEFECTS: Mapping[str, str] = {
     "frames_header_stamp_zero": "rows with a capture time of zero; their arrival is used",
     "frames_out_of_order": "rows captured before an earlier delivered one of the same camera and body; dropped",
     "frames_repeated": "rows with a new capture time and the very points of the row before; dropped, as not seen anew",
-    "frames_stamp_far": "rows captured too far from their arrival by their stamp; their arrival is used",
+    "frames_stamp_ahead": "frames captured after their arrival by their stamp; arrival less usual delay used",
+    "frames_stamp_far": "frames captured too far from their arrival by their stamp; arrival less usual delay used",
+    "frames_stamp_set_back": "frames by a clock that was set back or stands still; arrival less usual delay used",
     "gaps_<camera>": "silences of a camera longer than logs.gap_s",
     "joints_incomplete": "joint states that lack a joint of the first; left out",
     "joints_out_of_order": "joint states not later than the one before; dropped",
@@ -153,12 +156,12 @@ DEFECTS: Mapping[str, str] = {
 FAR_M = 100.0
 #: Two ends of a bone that are nearer than this are one place [m].
 TOGETHER_M = 1e-3
-#: A capture further than this from its arrival is no capture time: no robot waits so long, no clock is so wrong [s].
-STAMP_FAR_S = 10.0
+
+#: What ``CameraClock`` calls a stamp that is not believed -> its name in DEFECTS.
+_REPLACED = {"ahead": "frames_stamp_ahead", "far": "frames_stamp_far", "set back": "frames_stamp_set_back"}
 
 _ALWAYS = ("frames_duplicate", "frames_header_stamp_zero", "frames_out_of_order", "points_not_finite")
 _CHUNK_NS = 10**9
-_FAR_NS = round(STAMP_FAR_S * 1e9)
 
 #: The two ends of the bones that the person's model is measured by. Hands, hips and legs are not among them: trackers
 #: that know no hand put it where the wrist is.
@@ -240,6 +243,7 @@ class Cleaner:
         self.rows: Counter[str] = Counter()  #: camera -> rows that came
         self.flaws: Counter[tuple[str, str]] = Counter()  #: (camera, name in DEFECTS) -> points or rows
         self.frozen: dict[str, RepeatedSkeleton] = {}  #: camera -> its longest standstill
+        self.clocks = {name: CameraClock() for name in cameras}
         for name in (*_ALWAYS, *(f"{kind}_{camera}" for kind in ("frames", "gaps") for camera in cameras)):
             defects[name] += 0
 
@@ -259,7 +263,7 @@ class Cleaner:
         self.rows[row.camera] += 1
         if newest_ns is not None and capture_ns <= newest_ns:
             if capture_ns < newest_ns:
-                self._defects["frames_out_of_order"] += 1
+                self._flaw(row.camera, "frames_out_of_order", 1)
             elif self._agrees(row):
                 self._defects["frames_duplicate"] += 1
             else:
@@ -285,13 +289,15 @@ class Cleaner:
         return np.array_equal(before.points_m, clean_skeleton(row).row.points_m, equal_nan=True)
 
     def _captured(self, row: RawSkeleton, arrival_ns: int) -> int:
-        """When the row was captured; its arrival where its stamp cannot be right."""
+        """When the row was captured; by its arrival where its stamp cannot be right."""
         if row.capture_ns is None:
             return arrival_ns
-        if abs(row.capture_ns - arrival_ns) > _FAR_NS:
-            self._flaw(row.camera, "frames_stamp_far", 1)
-            return arrival_ns
-        return row.capture_ns
+        clock = self.clocks[row.camera]
+        before = clock.replaced.copy()
+        capture_ns = clock.capture_ns(row.capture_ns, arrival_ns)
+        for why, count in (clock.replaced - before).items():
+            self._flaw(row.camera, _REPLACED[why], count)
+        return capture_ns
 
     def _repeats(self, row: RawSkeleton, arrival_ns: int) -> bool:
         """Whether the row shows the very skeleton of the one before it, which no sensor measures twice."""

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs import log_files, messages, plausibility
-from hrcreplay.logs.clean import DEFECTS, STAMP_FAR_S, Cleaner
+from hrcreplay.logs.clean import DEFECTS, Cleaner
+from hrcreplay.logs.clocks import clock_remarks
 from hrcreplay.logs.decoders import (
     TF_TYPES,
     GenericDecoder,
@@ -317,9 +318,7 @@ def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
         if count:
             share = 100.0 * count / (count + cleaner.points[camera])
             yield f"camera {camera}: {count} {DEFECTS[name]} ({share:.2g} % of its points)"
-    far = cleaner.flaws[(camera, "frames_stamp_far")]
-    if far:
-        yield f"camera {camera}: {far} rows have a stamp over {STAMP_FAR_S:g} s from their arrival; arrival used"
+    yield from clock_remarks(camera, cleaner.clocks[camera], begin_ns, cleaner.flaws[(camera, "frames_out_of_order")])
     longest = cleaner.frozen.get(camera)
     if longest is not None and longest.seconds > _FROZEN_S:
         rows = cleaner.flaws[(camera, "frames_repeated")]

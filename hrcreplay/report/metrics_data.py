@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from hrcreplay.records import JOINTS, LIMBS, Bools, Floats, Ints
+from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats, Ints
 from hrcreplay.report.metrics import (
     ANGLES,
     IS_ANGLE,
@@ -47,6 +47,7 @@ def add_quality(metrics: MetricTable, run: Run, gap_s: float) -> None:
         _add_validity(metrics, run.state, camera, gap_s)
     if run.state is not None:
         _add_coverage(metrics, run.state)
+        _add_known(metrics, run.state, run.meta.get("settings", {}).get("fusion", {}).get("fresh_s"))
     for name, count in run.counts.items():
         metrics.add(f"count_{name}", int(count), "1", f"data quality counter '{name.replace('_', ' ')}'")
 
@@ -127,6 +128,40 @@ def _add_coverage(metrics: MetricTable, state: pd.DataFrame) -> None:
     lost[: int(np.argmax(finite)) if finite.any() else len(lost)] = False
     metrics.add("ticks_before_first_state", int((~finite).sum() - lost.sum()), "1", "ticks before the first full state")
     metrics.add("ticks_state_lost", int(lost.sum()), "1", "ticks after the first full state without a finite one")
+
+
+def _add_known(metrics: MetricTable, state: pd.DataFrame, fresh_s: float | None) -> None:
+    """At how many of all ticks the person, and each limb, was known from frames that were fresh."""
+    known = fresh_s is not None and "frame_age_s" in state
+    fresh = state["frame_age_s"].to_numpy(dtype=float) <= fresh_s if known else None
+    longest = "fusion.fresh_s" if fresh_s is None else f"{fresh_s:g} s"
+    reason = "the run does not say how old its frames were"
+    metrics.add(
+        "person_known_share",
+        None if fresh is None or not len(fresh) else float(fresh.mean()),
+        "1",
+        f"share of all ticks whose newest frame of the person was captured at most {longest} before",
+        reason=reason,
+    )
+    metrics.add(
+        "ticks_person_unknown",
+        None if fresh is None else int((~fresh).sum()),
+        "1",
+        f"ticks whose newest frame of the person was older than {longest}, or that had none",
+        reason=reason,
+    )
+    for limb in BODY:
+        limb_name = LIMB_NAMES.get(limb, "legs")
+        share = None
+        if fresh is not None and len(fresh) and f"unseen_{limb}" in state:
+            share = float((fresh & (state[f"unseen_{limb}"].to_numpy(dtype=float) <= fresh_s)).mean())
+        metrics.add(
+            f"limb_{limb}_known_share",
+            share,
+            "1",
+            f"the same of the {limb_name}: share of all ticks at most {longest} after one that measured it",
+            reason=reason,
+        )
 
 
 def add_occupancy(metrics: MetricTable, occupancy: pd.DataFrame | None) -> None:

@@ -73,7 +73,9 @@ FUSION = (
 #: What happened at the ticks at which the robot braked, or stood where it was, by the reason that its record gives
 #: (``control_step.REASONS``).
 REASONS = {
-    "no human state": "it was not known where the person is: no camera had shown them lately, or none yet",
+    "no human state": (
+        "it was not known where the person is: their newest frame was older than fusion.fresh_s, or none had come yet"
+    ),
     "no solution": "no motion satisfied all constraints",
     "separation failed": (
         "the distance from the robot to what the person could reach could not be computed as surely as the constraint "

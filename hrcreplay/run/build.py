@@ -44,7 +44,11 @@ class FusionStage:
     person_memory_s: float
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
-        """Measurements of the person, by the clock of the reference camera; see ``clean.select_person``."""
+        """Measurements of the person, by the clock of the reference camera; see ``clean.select_person``.
+
+        A frame that was captured more than ``fresh_s`` before its arrival shows where the person was, not where they
+        are: it is left out, and counted as ``frames_late_<camera>``.
+        """
         memory, measured, _, found = self.measure_all(frames, memory)
         return memory, measured, found
 
@@ -52,15 +56,23 @@ class FusionStage:
         self, frames: CameraFrames, memory: PersonMemory
     ) -> tuple[PersonMemory, Measurements, CameraFrames, Counter[str]]:
         """The same, and the frames of all other bodies, their points in the world [m]."""
+        frames = self.on_one_clock(frames)
+        late = np.asarray(frames.arrival_ns - frames.capture_ns > self.filter.fresh_s * 1e9)
+        counts = Counter(f"frames_late_{frames.cameras[camera]}" for camera in frames.camera[late])
+        frames = frames.rows(~late)
         memory, mine, found = select_person(
             frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
         )
-        frames = replace(frames, capture_ns=frames.capture_ns - self.clock_offset_ns[frames.camera])
         others = frames.rows(~mine)
         T = self.T_world_camera[others.camera]
         points_m = np.einsum("nij,npj->npi", T[:, :3, :3], others.points_m) + T[:, None, :3, 3]
         measured = inverse_kinematics.measure(frames.rows(mine), self.T_world_camera, self.filter)
-        return memory, measured, replace(others, points_m=points_m), found
+        return memory, measured, replace(others, points_m=points_m), found + counts
+
+    def on_one_clock(self, frames: CameraFrames) -> CameraFrames:
+        """Frames with captures by the clock of the reference camera, none of them after its arrival."""
+        capture_ns = frames.capture_ns - self.clock_offset_ns[frames.camera]
+        return replace(frames, capture_ns=np.minimum(capture_ns, frames.arrival_ns))
 
 
 @dataclass(frozen=True)
@@ -269,7 +281,7 @@ def planners(job: Job, log: LogLike, start_ns: int) -> dict[str, Planner]:
 
     def planner(name: str) -> Planner:
         follower = make_follower(name, model, path, plan_settings(job, dt_s, name), s_s)
-        return Planner(follower, chosen=name == plan.method, memory_s=job.settings.fusion.memory_s)
+        return Planner(follower, chosen=name == plan.method, fresh_s=job.settings.fusion.fresh_s)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
 

@@ -397,7 +397,7 @@ def _planner(task: VariantTask, robot: RobotModel) -> Planner:
     settings = build.plan_settings(job, 1.0 / job.settings.fusion.rate_hz, task.variant.method)
     path = replace(programme.path, model=robot)
     follower = build.make_follower(task.variant.method, robot, path, settings, programme.start_s)
-    return Planner(follower, chosen=True, memory_s=job.settings.fusion.memory_s)
+    return Planner(follower, chosen=True, fresh_s=job.settings.fusion.fresh_s)
 
 
 class _TablesOf(RunWriter):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.records import Floats, HumanStates, Motion
+from hrcreplay.records import Bools, Floats, HumanStates, Motion
 from hrcreplay.robot.control import control_step, path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
 from hrcreplay.robot.control.control_step import (
@@ -206,12 +206,11 @@ FOLLOWERS: dict[str, type[Follower]] = {
 
 @dataclass
 class Planner:
-    """One method beside the people of each tick; brakes when nobody has seen them for too long."""
+    """One method beside the people of each tick; brakes while what is known of them is too old."""
 
     follower: Follower
     chosen: bool  #: the run's method, not a baseline
-    memory_s: float  #: without a camera for longer than this the person counts as lost [s]
-    seen_ns: int | None = None
+    fresh_s: float  #: a person whose newest frame was captured longer ago is not known [s]
 
     @property
     def dt_s(self) -> float:
@@ -221,8 +220,8 @@ class Planner:
     def follow(self, states: HumanStates, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
         """The motion of a batch of ticks, beside the volumes that are predicted for each."""
         robot = self.follower.robot
-        seen = np.any(states.valid, axis=1)
-        rows = [self._tick(around[i], int(t), bool(seen[i])) for i, t in enumerate(states.t_ns)]
+        known = fresh(states, self.fresh_s)
+        rows = [self.follower.step(around[i] if known[i] else partial(unknown, around[i])) for i in range(len(states))]
         found, points, steps = ([getattr(row, name) for row in rows] for name in ("state", "point", "step"))
         poses = [step.pose for step in steps]
         return Motion(
@@ -251,11 +250,10 @@ class Planner:
             reasons=control_step.REASONS,
         )
 
-    def _tick(self, around: Predict, t_ns: int, seen: bool) -> FollowerTick:
-        if seen:
-            self.seen_ns = t_ns
-        lost = self.seen_ns is None or t_ns - self.seen_ns > self.memory_s * 1e9
-        return self.follower.step(partial(unknown, around) if lost else around)
+
+def fresh(states: HumanStates, fresh_s: float) -> Bools:
+    """(n,) ticks at which the person is known: their newest frame was captured at most ``fresh_s`` [s] before."""
+    return np.asarray(states.frame_age_s <= fresh_s)
 
 
 def unknown(predict: Predict, horizon_s: float) -> Obstacles:

@@ -18,6 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from hrcreplay.calibration.clock_check import ClockCheck
 from hrcreplay.errors import LogError
 from hrcreplay.geometry import convex_hull
 from hrcreplay.human.fusion import fuse, inverse_kinematics
@@ -33,7 +34,7 @@ from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 NS = 1_000_000_000
 #: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
-_LOST = ("points_", "person_frames_without", "frames_repeated", "frames_out_of_order")
+_LOST = ("points_", "person_frames_without", "frames_late", "frames_repeated", "frames_out_of_order")
 
 #: Of a session; a longer log has an arrival of another clock among its messages [s].
 LONGEST_S = 24 * 3600
@@ -105,12 +106,14 @@ def fused(
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
     smoother = StretchSmoother(fusion_stage.filter)
     stands = [BodyPosture() for _ in log.header.cameras]
+    clocks = ClockCheck(log.header.cameras, fusion_stage.T_world_camera, int(ticks_ns[0]), int(ticks_ns[-1]))
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
         measured = no_frames(log.header.cameras)
         if seen is not None:
             with sink.watch.stage("angles", len(ticks)):
                 memory, measured, found = fusion_stage.measure(seen, memory)
+            clocks.add(fusion_stage.on_one_clock(seen))
             sink.counts.update(found)
             sink.run.table("measurements", measurement_columns(measured))
             for stand, c in zip(stands, range(len(stands)), strict=True):
@@ -130,7 +133,9 @@ def fused(
     log.check()
     if not ever:
         raise _nobody(log, sink.counts)
-    sink.notes["fuse"].extend(_oddities(log, stands))
+    with sink.watch.stage("clocks", len(ticks_ns)):
+        sink.notes["fuse"].extend(clocks.remarks())
+    sink.notes["fuse"].extend(_oddities(log, stands, sink.counts))
     if others := sink.counts["person_frames_beside_others"]:
         sink.notes["fuse"].append(
             f"{others} frames show at least one other body than the person: it counts for contact, but nothing is "
@@ -197,8 +202,15 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
     )
 
 
-def _oddities(log: Log, stands: list[BodyPosture]) -> Iterator[str]:
-    """Notes on an unusual posture of the person in the world."""
+def _oddities(log: Log, stands: list[BodyPosture], counts: Counter[str]) -> Iterator[str]:
+    """Notes on frames that came too late, and on an unusual posture of the person in the world."""
+    for camera in log.header.cameras:
+        late = counts[f"frames_late_{camera}"]
+        if late:
+            yield (
+                f"camera {camera}: {late} of {log.defects[f'frames_{camera}']} rows are not used, as they came more "
+                "than fusion.fresh_s after their capture"
+            )
     for camera, stand in zip(log.header.cameras, stands, strict=True):
         remark = stand.remark(camera)
         if remark is not None:

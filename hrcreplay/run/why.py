@@ -27,7 +27,7 @@ from hrcreplay.robot.control.certificate import NO_PLANES
 from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, stands, straight
 from hrcreplay.run import build
 from hrcreplay.run.build import Forecast
-from hrcreplay.run.followers import Follower, Predict, QpFollower, unknown
+from hrcreplay.run.followers import Follower, Predict, QpFollower, fresh, unknown
 from hrcreplay.run.holding import Moment, asked, refused
 from hrcreplay.run.job import Job, resolve
 from hrcreplay.store.columns import read_states
@@ -68,13 +68,11 @@ class Record:
         return planner.follower
 
     def predict(self, tick: int) -> Predict:
-        """The volumes of a tick, known where a camera had seen the person lately."""
+        """The volumes of a tick, known where the newest frame of the person was fresh."""
         stage = build.prediction_stage(self.job)
-        around = partial(Forecast(stage, self.states.rows(slice(tick, tick + 1))).obstacles, 0)
-        seen = np.flatnonzero(self.states.valid[: tick + 1].any(axis=1))
-        t_ns = self.states.t_ns
-        lost = not len(seen) or t_ns[tick] - t_ns[seen[-1]] > self.job.settings.fusion.memory_s * 1e9
-        return partial(unknown, around) if lost else around
+        states = self.states.rows(slice(tick, tick + 1))
+        around = partial(Forecast(stage, states).obstacles, 0)
+        return around if fresh(states, self.job.settings.fusion.fresh_s)[0] else partial(unknown, around)
 
     def again(self, tick: int) -> Moment | None:
         """The tick made again; None where no attempt gives the recorded step to the last bit."""

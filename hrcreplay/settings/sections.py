@@ -139,7 +139,11 @@ class Fusion(Section):
     spread_most: Positive = 30.0
     """Largest such factor."""
     memory_s: Positive = 0.5
-    """Without a valid row for longer than this the person counts as lost [s]."""
+    """A joint without a valid row for longer is lost: it starts anew from the next one, and its limb may have moved as
+    far as the limits allow [s]."""
+    fresh_s: Positive = 0.3
+    """An older frame, by its capture, is not used, and a person whose newest frame is older is not known: the robot
+    brakes, in a live session too [s]."""
 
 
 class LimitNames(Section):
@@ -360,8 +364,6 @@ class Live(Section):
     """Whether motion goes on by itself once the reason of a stop is gone."""
     resume_s: Positive = 1.0
     """How long it must be gone before that [s]."""
-    fresh_s: Positive = 0.3
-    """No frame of the person for longer stops the robot [s]."""
     uncertain_m: Positive = 0.2
     """A larger standard deviation of the person's position stops the robot [m]."""
     uncertain_rad: Positive = 0.8

@@ -53,6 +53,7 @@ def truth_columns(t_ns: Ints, angles: Floats, lengths_m: Floats) -> Columns:
 _STATE = (("p", ""), ("v", "_vel"), ("a", "_acc"), ("j", "_jerk"), ("p_std", "_std"), ("v_std", "_vel_std"))
 _RESIDUAL = tuple(f"residual_{limb}" for limb in BODY)
 _UNSEEN = tuple(f"unseen_{limb}" for limb in BODY)
+_FRAME_AGE = "frame_age_s"
 _SHOWN = tuple(f"point_{point}_{axis}" for point in POINTS for axis in "xyz")
 
 
@@ -63,7 +64,7 @@ def state_columns(states: HumanStates) -> Columns:
         columns |= _spread(getattr(states, field), JOINTS, suffix)
     columns |= _spread(states.lengths_m, LENGTHS) | _spread(states.lengths_std_m, LENGTHS, "_std")
     columns |= _spread(states.residual_m, _RESIDUAL) | _spread(states.unseen_s, _UNSEEN)
-    columns |= _spread(states.points_m.reshape(len(states), -1), _SHOWN)
+    columns |= {_FRAME_AGE: states.frame_age_s} | _spread(states.points_m.reshape(len(states), -1), _SHOWN)
     columns |= {_AS_LENGTH: states.p[:, _HEIGHT], f"{_AS_LENGTH}_std": states.p_std[:, _HEIGHT]}
     return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
 
@@ -78,6 +79,7 @@ COLUMNS = {
         *(f"{length}{suffix}" for suffix in ("", "_std") for length in _LENGTHS),
         *_RESIDUAL,
         *_UNSEEN,
+        _FRAME_AGE,
         *_SHOWN,
     ),
     "occupancy": ("t_ns", "limb", "method", "radius_m", "volume_m3", "vertices", "horizon_s"),
@@ -114,6 +116,7 @@ def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
                 valid=np.column_stack([column[f"valid_{camera}"] for camera in cameras]),
                 residual_m=_gather(column, _RESIDUAL),
                 unseen_s=_gather(column, _UNSEEN),
+                frame_age_s=column[_FRAME_AGE],
                 points_m=_gather(column, _SHOWN).reshape(-1, len(POINTS), 3),
                 cameras=cameras,
             )

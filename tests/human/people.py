@@ -30,6 +30,7 @@ def states(p: Floats, v: Floats, lengths_m: Floats = LENGTHS_M) -> HumanStates:
         valid=valid,
         residual_m=np.zeros((len(p), len(BODY))),
         unseen_s=np.zeros((len(p), len(BODY))),
+        frame_age_s=np.zeros(len(p)),
         points_m=skeleton(p, lengths),
         cameras=("camera",),
     )

@@ -52,6 +52,7 @@ class MadeController:
             valid=np.array([[bool(skeletons), False]]),
             residual_m=np.full((1, 7), np.nan),
             unseen_s=np.full((1, 7), np.inf),
+            frame_age_s=np.full(1, np.inf),
             points_m=np.full((1, 20, 3), np.nan),
             cameras=("left", "right"),
         )

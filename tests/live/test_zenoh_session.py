@@ -79,7 +79,7 @@ def cell(folder: Path, endpoint: str) -> list[object]:
 def test_a_publisher_that_dies_stops_the_robot_and_one_that_comes_back_does_not_make_it_jump(tmp_path: Path) -> None:
     pytest.importorskip("zenoh")
     endpoint, port = free_endpoint(), free_port()
-    patient = (*PATIENT, f"live.fresh_s={FRESH_S}")
+    patient = (*PATIENT, f"fusion.fresh_s={FRESH_S}")
     arguments = [*cell(tmp_path, endpoint), "--send"]
     with Session(tmp_path / "run", port, *arguments, settings=patient, human=None, figures=False) as session:
         session.until("no frame yet", lambda status: status["phase"] == "waiting")

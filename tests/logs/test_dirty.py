@@ -40,7 +40,7 @@ def test_frames_that_come_twice_are_dropped(tmp_path: Path) -> None:
 
 def test_frames_older_than_the_newest_are_dropped(tmp_path: Path) -> None:
     table = own.frames(10, cameras=("one",), which=[0, 1, 4, 2, 3, 5])
-    table = changed(table, arrival_ns=BEGIN + np.arange(6) * PERIOD)
+    table = changed(table, arrival_ns=BEGIN + np.arange(4, 10) * PERIOD)
     log = opened(tmp_path, table)
     assert own.read(log).capture_ns.tolist() == [BEGIN + k * PERIOD for k in (0, 1, 4, 5)]
     assert (log.defects["frames_duplicate"], log.defects["frames_out_of_order"]) == (0, 2)
@@ -146,7 +146,8 @@ def test_stamps_that_cannot_be_give_way_to_arrival(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames.capture_ns[1:4], frames.arrival_ns[1:4])
     np.testing.assert_array_equal(frames.capture_ns[[0, 4, 5]], captures[[0, 4, 5]])
     assert log.defects["frames_stamp_far"] == 3
-    assert "camera one: 3 rows have a stamp over 10 s from their arrival; arrival used" in log.notes
+    (told,) = (note for note in log.notes if "stamp" in note)
+    assert all(part in told for part in ("camera one", "3 frames", "over 10 s", "arrival used"))
 
 
 def test_gaps_are_counted_by_camera(tmp_path: Path) -> None:

@@ -97,6 +97,7 @@ def states_of(estimates: list[Estimate], unseen_s: float = 0.0) -> HumanStates:
         valid=np.ones((n, 1), dtype=bool),
         residual_m=np.zeros((n, len(BODY))),
         unseen_s=np.full((n, len(BODY)), unseen_s),
+        frame_age_s=np.full(n, unseen_s),
         points_m=skeleton(np.array([e.q for e in estimates]), np.array([e.lengths for e in estimates])),
         cameras=("camera",),
     )

@@ -77,6 +77,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
         bone_ns=np.full(len(LENGTHS), NEVER_NS),
         capture_ns=np.full(c, NEVER_NS),
         uses=np.full(c, -1),
+        newest_ns=np.full(1, NEVER_NS),
         z=np.full((c, ROWS), np.nan),
         z_var=np.full((c, ROWS), np.nan),
         points=np.full((c, len(POINTS), 3), np.nan),
@@ -155,6 +156,7 @@ def fuse(
         valid=track.valid,
         residual_m=track.residual,
         unseen_s=track.unseen,
+        frame_age_s=track.frame_age,
         points_m=track.points,
         cameras=measurements.cameras,
     )
@@ -238,6 +240,7 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         valid=np.zeros((n, cameras), dtype=np.bool_),
         residual=np.full((n, len(BODY)), np.nan),
         unseen=np.full((n, len(BODY)), np.inf),
+        frame_age=np.full(n, np.inf),
         points=np.full((n, len(POINTS), 3), np.nan),
         cov=np.full((rows, DOF, 4, 4), np.nan),
         damping=np.ones((rows, DOF)),

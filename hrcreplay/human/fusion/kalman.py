@@ -34,6 +34,7 @@ class Filter(NamedTuple):
     bone_ns: Ints  #: (7,) tick at which a camera last saw a length that agreed with the filter
     capture_ns: Ints  #: (c,) of the frame held for each camera
     uses: Ints  #: (c,) ticks that frame was used in; -1 without one
+    newest_ns: Ints  #: (1,) capture of the newest frame of any camera that entered the filter
     z: Floats  #: (c, 20) its rows
     z_var: Floats  #: (c, 20) sigma_z^2
     points: Floats  #: (c, 20, 3)
@@ -111,6 +112,7 @@ class Track(NamedTuple):
     valid: Bools  #: (n, c)
     residual: Floats  #: (n, 7)
     unseen: Floats  #: (n, 7)
+    frame_age: Floats  #: (n,)
     points: Floats  #: (n, 20, 3)
     cov: Floats  #: (n or 0, 13, 4, 4)
     damping: Floats  #: (n or 0, 13) of the derivatives, on the way to the tick

@@ -127,6 +127,7 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
             add_innovation(filter_, c, row, innovation, now, rules)
         if filter_.uses[c] == 1:
             filter_.row_ns[row] = now
+    filter_.newest_ns[0] = max(filter_.newest_ns[0], filter_.capture_ns[c])
     return True
 
 
@@ -190,6 +191,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
     track.lengths[1, k] = np.sqrt(filter_.lengths_var)
     told(filter_, filter_.tick_ns[0], rules, track.residual[k])
     unseen(filter_, track.unseen[k])
+    track.frame_age[k] = (filter_.tick_ns[0] - filter_.newest_ns[0]) * 1e-9
     place(filter_, filter_.mean[:, 0].copy(), track.points[k])
     if len(track.cov) > 0:
         track.cov[k] = filter_.cov

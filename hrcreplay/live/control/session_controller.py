@@ -69,9 +69,16 @@ def reason_of_robot(packet_status: PacketStatus) -> str:
     return "" if packet_status.allowed else "robot not ready"
 
 
-def reason_of_person(perception: Perception | None, age_s: float, bounds: Live) -> str:
-    """The reason that lies with what is known of the person, or none."""
-    if perception is None or not age_s <= bounds.fresh_s:
+def reason_of_person(perception: Perception | None, age_s: float, fresh_s: float, bounds: Live) -> str:
+    """The reason that lies with what is known of the person, or none.
+
+    Args:
+        perception: The last look; None before the first.
+        age_s: How old the newest frame of the person is by now [s].
+        fresh_s: The oldest that may be relied on [s].
+        bounds: Of the person's uncertainty.
+    """
+    if perception is None or not age_s <= fresh_s:
         return NO_FRAME
     std = perception.states.p_std[0, :_BASE]
     if not math.isfinite(perception.states.p.sum() + perception.states.v.sum()):
@@ -249,7 +256,8 @@ class SessionController:
         if not why and behind_ns > self.setup.bounds.overrun_s * 1e9:
             why = OVERRUN
         if not why:
-            why = reason_of_person(self.perception, self.observer.age_s(event.t_ns), self.setup.bounds)
+            age_s = self.observer.age_s(event.t_ns)
+            why = reason_of_person(self.perception, age_s, self.setup.fresh_s, self.setup.bounds)
         if not why and self.setup.sending and self._motion is not None and self.phase != codec.ECHO:
             why = _reason_of_tracking(measured, self._motion.state.q, self.setup.bounds)
         return why
@@ -300,7 +308,7 @@ class SessionController:
         """
         if self.perception is None:
             return _UNSEEN
-        seen = self.observer.age_s(self.perception.t_ns) <= self.setup.memory_s and not self._late
+        seen = self.observer.age_s(self.perception.t_ns) <= self.setup.fresh_s and not self._late
         found = self.perception.obstacles if horizon_s else self.observer.present(self.perception.states)
         return found if seen else replace(found, known=False)
 

@@ -198,7 +198,7 @@ def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
         waypoint_m=plan.waypoint_m,
         approach_speed=live.approach_speed,
         bounds=live,
-        memory_s=job.settings.fusion.memory_s,
+        fresh_s=job.settings.fusion.fresh_s,
         sending=sending,
     )
 

@@ -61,6 +61,7 @@ class Observer:
         self.counts: Counter[str] = Counter()
         self._cleaner = Cleaner(cameras, gap_s, self.counts)
         self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
+        self._look_ns, self._frame_age_s = 0, float("inf")  # of the last update
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes], horizon_s: float) -> Perception:
         """Fused person and swept volumes at ``t_ns``, which must be later than that of the update before.
@@ -82,6 +83,7 @@ class Observer:
             self._fusion, ticks, measured, self._fusion_stage.filter, self._fusion_stage.limits
         )
         self.counts.update(events)
+        self._look_ns, self._frame_age_s = t_ns, float(states.frame_age_s[0])
         volumes = self._prediction_stage.volumes(states, horizon_s)
         return Perception(t_ns, states, volumes, obstacles(volumes, 0, horizon_s), horizon_s)
 
@@ -90,8 +92,8 @@ class Observer:
         return obstacles(self._prediction_stage.volumes(states, 0.0), 0)
 
     def age_s(self, t_ns: int) -> float:
-        """How old the newest frame of the person is; inf before the first [s]."""
-        return (t_ns - max(self.newest_ns.values())) / NS if self.newest_ns else float("inf")
+        """How old the newest frame that entered the filter is; inf before the first [s]."""
+        return self._frame_age_s + (t_ns - self._look_ns) / NS
 
     def _frames(self, t_ns: int, skeletons: Sequence[bytes]) -> CameraFrames | None:
         for data in skeletons:
@@ -104,8 +106,7 @@ class Observer:
             if row.camera not in self._cameras:
                 self.counts["skeletons_of_unknown_cameras"] += 1
                 continue
-            # a camera whose clock is ahead has seen nothing of the future
-            self._cleaner.add(row._replace(capture_ns=min(row.capture_ns or t_ns, t_ns)), t_ns)
+            self._cleaner.add(row, t_ns)
         return self._cleaner.flush()
 
 
@@ -120,7 +121,7 @@ class ControlSetup:
     waypoint_m: float  #: the approach is over when the TCP is this close to its end [m]
     approach_speed: float  #: share of the axes' top speeds on the way to the programme
     bounds: Live
-    memory_s: float  #: a person unseen for longer counts as unknown [s]
+    fresh_s: float  #: a person whose newest frame is older is not known, which stops the robot [s]
     sending: bool  #: False in shadow mode: the robot does not follow
 
     def stop_from(self, state: RobotState) -> Stop:

@@ -104,7 +104,7 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
     numbers = np.array([look.state for look in looks])
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), DOF)
     widths |= dict.fromkeys(("lengths_m", "lengths_std_m"), len(LENGTHS))
-    widths |= {"residual_m": len(BODY), "unseen_s": len(BODY), "points_m": 3 * len(POINTS)}
+    widths |= {"residual_m": len(BODY), "unseen_s": len(BODY), "frame_age_s": 1, "points_m": 3 * len(POINTS)}
     ends = np.cumsum(list(widths.values()))
     if numbers.shape[1] != ends[-1]:
         raise LogError(
@@ -112,6 +112,7 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
             "would be right: the version of hrcreplay that recorded the session"
         )
     parts = dict(zip(widths, np.split(numbers, ends[:-1], axis=1), strict=True))
+    parts["frame_age_s"] = parts["frame_age_s"][:, 0]
     parts["points_m"] = parts["points_m"].reshape(len(looks), len(POINTS), 3)
     return HumanStates(
         t_ns=np.array([look.t_ns for look in looks]),

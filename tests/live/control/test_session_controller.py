@@ -66,7 +66,7 @@ STOPS: dict[str, dict[str, Any]] = {
     session_controller.OVERRUN: after_start(Signal.OVERRUN, 2.0, 0.004),
     session_controller.NO_FRAME: {"walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0)},
     session_controller.UNCERTAIN: {
-        "overrides": ("live.uncertain_m=0.012", "live.fresh_s=9"),
+        "overrides": ("live.uncertain_m=0.012", "fusion.fresh_s=9"),
         "walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0),
     },
     session_controller.TRACKING: {"faults": (Fault("teleport", 2.0, 0.5, angle_deg=20.0),)},
