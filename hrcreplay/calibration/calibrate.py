@@ -67,7 +67,8 @@ def survey(
         height_m: Reference camera's origin above the floor [m]; None to find it from the feet.
         jump_m: A body further than this from the person's last place is somebody else [m].
         memory_s: After this long without the person, the nearest body becomes the person [s].
-        search_s: Clock offsets are searched within plus and minus this [s].
+        search_s: Clock offsets are searched within plus and minus this, and by so much further as the delays of two
+            cameras, from stamp to arrival, differ [s].
 
     Returns:
         Poses of all cameras, clock offsets, and residuals of every pair that saw the person together.
@@ -144,7 +145,7 @@ def collect_tracks(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTra
     if not kept:
         raise LogError(f"{log.header.path}: no skeleton; would be right: a log with a person in it")
     table = CameraFrames.join(kept)
-    return [_track(table, i) for i in range(len(cameras))]
+    return [track_of(table, i) for i in range(len(cameras))]
 
 
 def in_window(frames: CameraFrames, start_ns: int, end_ns: int) -> Bools:
@@ -154,11 +155,13 @@ def in_window(frames: CameraFrames, start_ns: int, end_ns: int) -> Bools:
     return np.asarray((frames.arrival_ns - start_ns) % every_ns < window_ns)
 
 
-def _track(table: CameraFrames, camera: int) -> SkeletonTrack:
+def track_of(table: CameraFrames, camera: int) -> SkeletonTrack:
+    """The frames of one camera, in its own frame, in order of capture; bodies are taken for one person."""
     mine = table.rows(table.camera == camera)
     _, first = np.unique(mine.capture_ns, return_index=True)  # in order of capture, a frame that came twice once
     mine = mine.rows(first.astype(np.int64))
-    return SkeletonTrack(mine.capture_ns, mine.points_m, mine.confidence)
+    delay_s = float(np.median(mine.arrival_ns - mine.capture_ns)) / 1e9 if len(mine) else 0.0
+    return SkeletonTrack(mine.capture_ns, mine.points_m, mine.confidence, delay_s)
 
 
 def _root(cameras: tuple[str, ...], reference: str | None, log: Log) -> int:
@@ -206,6 +209,7 @@ def _tree(tracks: list[SkeletonTrack], root: int) -> list[Pair]:
 def _tie(tracks: list[SkeletonTrack], pair: Pair, known: Registration, search_s: float, log: Log) -> Registration:
     """How camera b stands to the root, by way of camera a."""
     a, b = (tracks[i] for i in pair)
+    search_s += round(abs(b.delay_s - a.delay_s), 1)
     names = " and ".join(log.header.cameras[i] for i in pair)
     found = register(a, b, search_s=search_s)
     rest = disagreement(a, b, found) if found is not None else None

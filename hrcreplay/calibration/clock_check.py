@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
-from hrcreplay.calibration.calibrate import in_window
+from hrcreplay.calibration.calibrate import in_window, track_of
 from hrcreplay.calibration.registration import ClockOffset, SkeletonTrack, find_clock_offset, transform
 from hrcreplay.records import CameraFrames, Floats
 
 #: Clocks that differ by more frames of the slower camera, and by more than this, are told [frames], [s].
 _FRAMES, _LEAST_S = 3.0, 0.1
 #: With the offset the movements must be nearer to one another by this share, and by this.
-_NEARER, _NEARER_M = 0.7, 0.01
+_NEARER, _NEARER_M = 0.85, 0.003
 #: Offsets are searched so far beyond those of the stamps from their arrivals [s].
 _SEARCH_S = 1.0
-
-
-@dataclass(frozen=True)
-class CameraDelay:
-    """What one camera delivered, alone in its frames."""
-
-    name: str
-    track: SkeletonTrack
-    delay_s: float  #: median from capture to arrival [s]
 
 
 class ClockCheck:
@@ -51,40 +42,41 @@ class ClockCheck:
 
     def remarks(self) -> Iterator[str]:
         """Notes on cameras whose clocks differ from that of the camera with the least delay."""
-        found = sorted(self._delays(), key=lambda camera: abs(camera.delay_s))
-        for other in found[1:]:
-            search_s = abs(other.delay_s - found[0].delay_s) + _SEARCH_S
-            offset = find_clock_offset(found[0].track, other.track, search_s=search_s)
+        tracks = self._tracks()
+        first, *others = sorted(tracks, key=lambda name: abs(tracks[name].delay_s)) or [""]
+        for name in others:
+            a, b = tracks[first], tracks[name]
+            offset = find_clock_offset(a, b, search_s=abs(b.delay_s - a.delay_s) + _SEARCH_S)
             if offset is not None and _disagrees(offset):
-                yield _remark(found[0], other, offset)
+                yield _remark((first, a.delay_s), (name, b.delay_s), offset)
 
-    def _delays(self) -> Iterator[CameraDelay]:
+    def _tracks(self) -> dict[str, SkeletonTrack]:
+        """What each camera saw, in the world."""
         table = CameraFrames.join(self._kept) if self._kept else None
-        for i, name in enumerate(self._cameras):
-            mine = table.rows(table.camera == i) if table is not None else None
-            if mine is None or not len(mine):
-                continue
-            _, first = np.unique(mine.capture_ns, return_index=True)  # in order of capture
-            mine = mine.rows(first.astype(np.int64))
-            delay_s = float(np.median(mine.arrival_ns - mine.capture_ns)) / 1e9
-            yield CameraDelay(
-                name, SkeletonTrack(mine.capture_ns, transform(self._poses[i], mine.points_m), mine.confidence), delay_s
-            )
+        if table is None:
+            return {}
+        found = {name: track_of(table, i) for i, name in enumerate(self._cameras)}
+        poses = dict(zip(self._cameras, self._poses, strict=True))
+        return {
+            name: replace(track, points_m=transform(poses[name], track.points_m))
+            for name, track in found.items()
+            if len(track)
+        }
 
 
 def _disagrees(offset: ClockOffset) -> bool:
     far = abs(offset.offset_s) > max(_LEAST_S, _FRAMES * offset.frame_s)
     nearer = offset.apart_m < min(_NEARER * offset.without_m, offset.without_m - _NEARER_M)
-    return far and (nearer or np.isnan(offset.without_m))
+    return far and (nearer or bool(np.isnan(offset.without_m)))
 
 
-def _remark(reference: CameraDelay, other: CameraDelay, offset: ClockOffset) -> str:
-    without = "" if np.isnan(offset.without_m) else f", {100 * offset.without_m:.1f} cm without"
+def _remark(reference: tuple[str, float], other: tuple[str, float], offset: ClockOffset) -> str:
+    """The note on a camera; both by name and delay [s]."""
     behind = "behind" if offset.offset_s < 0.0 else "ahead of"
+    without = "" if np.isnan(offset.without_m) else f", {100 * offset.without_m:.1f} cm without"
     return (
-        f"camera {other.name}: by what both see, its clock is {abs(offset.offset_s):.2f} s {behind} that of "
-        f"{reference.name} (frames arrive {other.delay_s:.2f} and {reference.delay_s:.2f} s after their stamps; the "
-        f"movements are {100 * offset.apart_m:.1f} cm apart with this offset{without}); would be right: "
-        f"clock_offset_s = {offset.offset_s:.2f} for {other.name} in the cell file; hrcreplay calibrate finds it to a "
-        "few milliseconds"
+        f"camera {other[0]}: by what both see, its clock is {abs(offset.offset_s):.2f} s {behind} that of "
+        f"{reference[0]} (frames arrive {other[1]:.2f} and {reference[1]:.2f} s after their stamps; the movements are "
+        f"{100 * offset.apart_m:.1f} cm apart with this offset{without}); would be right: clock_offset_s = "
+        f"{offset.offset_s:.2f} for {other[0]} in the cell file; hrcreplay calibrate finds it to a few milliseconds"
     )

@@ -42,6 +42,7 @@ class SkeletonTrack(Table):
     t_ns: Ints  #: (n,) capture time on the sensor's own clock
     points_m: Floats  #: (n, 20, 3) POINTS in the sensor's frame [m]
     confidence: Floats  #: (n, 20) in [0, 1]
+    delay_s: float = 0.0  #: median from capture to arrival [s]
 
 
 @dataclass(frozen=True)
@@ -115,18 +116,41 @@ def register(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float = 2.0) -> Re
     offset_s, likeness = _coarse_offset(t_ns[few], velocity_a[few], b, width_s, search_s)
     if likeness < _LIKE:  # nobody moved: the clocks cannot be compared, and a velocity of zero keeps them as they are
         offset_s, velocity_a = 0.0, np.zeros_like(velocity_a)
-    points_b, _, weight_b = _smoothed(b, t_ns + round(offset_s / _NS), width_s)
-    T = _start(points_a, points_b, np.sqrt(weight_a * weight_b))
+    at_a = _AtA(t_ns, points_a, velocity_a, weight_a, width_s)
+    found = _refine(at_a, b, offset_s)
+    if found is None or likeness < _LIKE:
+        return found
+    # Speeds may be alike by chance where the person moved little; places, once the pose is known about, are not.
+    there = SkeletonTrack(b.t_ns, transform(found.T_a_b, b.points_m), b.confidence)
+    better = find_clock_offset(a, there, search_s=search_s)
+    if better is None or abs(better.offset_s - found.offset_s) <= width_s:
+        return found
+    return _refine(at_a, b, better.offset_s) or found
+
+
+class _AtA(NamedTuple):
+    """Sensor a's track at its own instants, smoothed."""
+
+    t_ns: Ints
+    points: Floats
+    velocity: Floats
+    weight: Floats
+    width_s: float
+
+
+def _refine(a: _AtA, b: SkeletonTrack, offset_s: float) -> Registration | None:
+    """Pose and offset from a first offset on; None where the tracks share too few points to tell."""
+    points_b, _, weight_b = _smoothed(b, a.t_ns + round(offset_s / _NS), a.width_s)
+    T = _start(a.points, points_b, np.sqrt(a.weight * weight_b))
     if T is None:
         return None
-    step = np.full(7, np.inf)
     for _ in range(_ITERATIONS):
-        points_b, _, weight_b = _smoothed(b, t_ns + round(offset_s / _NS), width_s)
-        weight = np.sqrt(weight_a * weight_b)
+        points_b, _, weight_b = _smoothed(b, a.t_ns + round(offset_s / _NS), a.width_s)
+        weight = np.sqrt(a.weight * weight_b)
         if not weight.any():
             return None
-        T, step = _gauss_newton(T, points_a, points_b, velocity_a, weight)
-        offset_s += float(np.clip(step[6], -width_s, width_s))
+        T, step = _gauss_newton(T, a.points, points_b, a.velocity, weight)
+        offset_s += float(np.clip(step[6], -a.width_s, a.width_s))
         if np.abs(step).max() < 1e-6:
             break
     return Registration(T, offset_s)

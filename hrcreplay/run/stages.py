@@ -196,6 +196,11 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
     )
     why = [f"{name} {count}" for name, count in sorted((log.defects + found).items()) if name.startswith(_LOST)]
     text += f" ({', '.join(why)})" if why else ""
+    if any(found[f"frames_late_{camera}"] for camera in log.header.cameras):
+        return LogError(
+            f"{text}: by their stamps the frames came more than fusion.fresh_s after their capture; would be right: "
+            "the clocks of cameras and recorder set, or what is wrong with them as clock_offset_s in the cell file"
+        )
     return LogError(
         f"{text}; would be right: a person's pelvis, shoulders and arms, confidence at least fusion.confidence_min. "
         "Look at it with hrcreplay info"
