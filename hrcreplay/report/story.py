@@ -131,13 +131,18 @@ def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
         return short, f"At the other ticks at which it moved, {kept}."
     retreat = metrics["plan_retreating_share"]
     away = (
-        f" But at {percent(retreat)} of all ticks it retreated: that step began inside a volume, with a link already "
-        "where the person could reach, and moved so slowly and in such a way that no point of it came nearer to any "
-        "point there."
+        f" But at {percent(retreat)} of all ticks it retreated: that step began inside a volume, with a link up to "
+        f"{text_of(metrics['plan_retreating_overlap_max_m'])} deep where the person could reach, and moved so slowly "
+        "and in such a way that no point of it came nearer to any point there."
         if retreat["value"]
         else ""
     )
-    begun = f"; the retreating ones ({percent(retreat)} of all ticks) began inside a volume" if retreat["value"] else ""
+    deep = text_of(metrics["plan_retreating_overlap_max_m"])
+    begun = (
+        f"; the retreating ones ({percent(retreat)} of all ticks) began inside a volume, up to {deep} deep"
+        if retreat["value"]
+        else ""
+    )
     return (
         f"Certified at every moving tick against what was predicted{begun}.",
         f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}.{away} {stops}",

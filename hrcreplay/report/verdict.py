@@ -39,6 +39,7 @@ class ContactSummary:
     """The chosen method in a few sentences, and all methods beside each other."""
 
     sentences: tuple[str, ...]  #: contact, then cost
+    speeds: str  #: greatest speeds, and what standing means
     scope: tuple[str, ...]  #: what was considered, and what was not
     held: str  #: how far the prediction they rest on can be trusted; empty: not known
     details: tuple[str, ...]  #: the same with places, instants and causes
@@ -51,6 +52,7 @@ def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
         return None
     return ContactSummary(
         (_contact_in_short(metrics), _cost_in_short(run, metrics)),
+        _speeds(run, metrics),
         scope(metrics),
         _held(metrics),
         (_touched(metrics), _cost(run, metrics)),
@@ -108,6 +110,25 @@ def _at_rest(metrics: Metrics) -> str:
     if not rest:
         return ""
     return f" The robot at rest was in contact at {_count(rest)}, up to {-100 * deep:.0f} cm deep."
+
+
+def _speeds(run: Run, metrics: Metrics) -> str:
+    """The greatest speeds beside the programme's, and how often the robot stood, by two counts."""
+    fastest, near, programmed = (
+        metrics[f"plan_{name}_max_m_per_s"] for name in ("tcp_speed", "tcp_speed_near_body", "ref_speed")
+    )
+    words = f"The TCP moved at up to {text_of(fastest)} (its programme at up to {text_of(programmed)})"
+    if near["value"] is not None:
+        near_m = run.meta.get("settings", {}).get("report", {}).get("near_m")
+        where = "near anybody" if near_m is None else f"with anybody within {near_m:g} m"
+        words += f", and {where} at up to {text_of(near)}"
+    stood, null = metrics["plan_stationary_share"], metrics["plan_null_speed_share"]
+    if stood["value"] is not None:
+        words += (
+            f". Near the volumes it stood at {percent(stood)} of the ticks while its programme moved or waited for it, "
+            f"and at {percent(null)} with the programme's own dwells"
+        )
+    return f"{words}."
 
 
 #: What no run looks at.
