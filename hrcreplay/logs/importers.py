@@ -2,7 +2,7 @@
 
 Azure Kinect: ``;``, a header row, microseconds, millimetres, one file a camera. Kinect v2: no header, 100-ns ticks,
 metres, a tracking state for each of 25 joints, one file a camera. KERAAL: a Kinect v2 and optical targets of one
-movement, without time stamps.
+movement, without time stamps. Times may be in another unit where their steps say so.
 
 Optical targets lie on the skin. The joint centre is the point that stays fixed in both neighbouring segments, by the
 symmetrical centre of rotation estimation of Ehrig et al. (2006), A survey of formal methods for determining the centre
@@ -64,14 +64,18 @@ def import_azure(paths: Mapping[str, Path], out: Path) -> list[str]:
     Points stay in each camera's own depth frame (x right, y down, z forward) [m]. Confidence 0, 1, 2, 3 becomes
     0, 0.5, 1, 1. The device's time is the capture time.
     """
-    return import_cameras(paths, out, _azure_rows)
+    return import_cameras(paths, out, _azure_rows, ";", _AZURE_NS)
 
 
-def _azure_rows(path: Path) -> Iterator[ImportedSkeleton]:
+_AZURE_NS = 1000  # the SDK counts microseconds
+
+
+def _azure_rows(path: Path, unit_ns: int) -> Iterator[ImportedSkeleton]:
     stream = lines(path)
     where, header = next(stream)
     columns = header.lstrip("\ufeff").split(";")
-    read = partial(_row, width=len(columns), at=_places(where, columns), joints=_joints(where, columns))
+    count, joints = _places(where, columns), _joints(where, columns)
+    read = partial(_row, width=len(columns), at=count, joints=joints, unit_ns=unit_ns)
     before_ns = 0
     for where, text in stream:
         found = read(where, text, before_ns=before_ns)
@@ -102,10 +106,12 @@ def _places(where: str, columns: list[str]) -> int:
     return count
 
 
-def _row(where: str, text: str, before_ns: int, width: int, at: int, joints: dict[str, int]) -> ImportedSkeleton:
+def _row(
+    where: str, text: str, before_ns: int, width: int, at: int, joints: dict[str, int], unit_ns: int
+) -> ImportedSkeleton:
     fields = text.split(";")
     values = numbers(where, fields, width)
-    t_ns = time_stamp_ns(where, fields[0], 1000, before_ns)
+    t_ns = time_stamp_ns(where, fields[0], unit_ns, before_ns)
     table = values[2:].reshape(at, 4)
     confidence = table[:, 0].copy()
     for level in set(confidence.tolist()):
@@ -141,15 +147,18 @@ def import_kinect2(paths: Mapping[str, Path], out: Path) -> list[str]:
     Points stay in each camera's own frame (x to the sensor's left, y up, z forward) [m]. Tracking states 0, 1, 2
     become confidence 0, 0.5, 1. The sensor's time is the capture time.
     """
-    return import_cameras(paths, out, _kinect2_rows)
+    return import_cameras(paths, out, _kinect2_rows, ",", _KINECT2_NS)
 
 
-def _kinect2_rows(path: Path) -> Iterator[ImportedSkeleton]:
+_KINECT2_NS = 100  # the sensor counts ticks of 100 ns
+
+
+def _kinect2_rows(path: Path, unit_ns: int) -> Iterator[ImportedSkeleton]:
     before_ns = 0
     for where, text in lines(path):
         fields = text.removesuffix(",").split(",")
         values = numbers(where, fields, 1 + 4 * _COUNT)
-        before_ns = time_stamp_ns(where, fields[0], 100, before_ns)
+        before_ns = time_stamp_ns(where, fields[0], unit_ns, before_ns)
         table = values[1:].reshape(_COUNT, 4)
         state = table[:, 3]
         wrong = ~np.isin(state, (0, 1, 2))

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import gzip
 import heapq
+import itertools
 import json
 import os
+import statistics
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from decimal import Decimal
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, NamedTuple, Self
@@ -243,6 +246,56 @@ def _is_number(text: str) -> bool:
     return True
 
 
+#: Units of time stamps by their length [ns].
+_UNITS: Mapping[int, str] = {1: "ns", 1000: "us", 10**6: "ms", 10**9: "s"}
+_OWN_FRAME_NS = (4_000_000, 250_000_000)  # from a frame to the next, in the format's own unit: 4 to 250 Hz
+_FRAME_NS = (15_000_000, 150_000_000)  # in another unit: 7 to 67 Hz
+_ANY_FRAME_NS = (1_000_000, 10_000_000_000)  # in the own unit, where no other fits
+_STAMPS = 400  # by which the unit is found
+_FEW_STEPS = 5  # say too little
+
+
+def time_unit_ns(path: Path, stamps: Iterable[str], own_ns: int) -> int:
+    """Length of the unit in which a file counts time, by the usual step from one frame to the next [ns].
+
+    The format's own unit has priority where the step is a camera's in it.
+
+    Args:
+        path: File, for messages.
+        stamps: First time stamps of the file.
+        own_ns: The format's own unit [ns].
+
+    Raises:
+        LogError: There is no unit in which the steps are those of a camera.
+    """
+    times = sorted({float(text) for text in stamps if _is_number(text)})
+    steps = [after - before for before, after in itertools.pairwise(times)]
+    if len(steps) < _FEW_STEPS:
+        return own_ns
+    step = statistics.median(steps)
+    candidates = [(own_ns, _OWN_FRAME_NS), *((unit, _FRAME_NS) for unit in _UNITS), (own_ns, _ANY_FRAME_NS)]
+    for unit, (least_ns, most_ns) in candidates:
+        if least_ns <= step * unit <= most_ns:
+            return unit
+    raise LogError(
+        f"{path}: time: found steps of {step:g} (median); would be right: {_unit_name(own_ns)}, or one of "
+        f"{', '.join(_UNITS.values())} in which frames follow one another in {_FRAME_NS[0] / 1e9:g} to "
+        f"{_FRAME_NS[1] / 1e9:g} s"
+    )
+
+
+def time_unit_note(camera: str, unit_ns: int, own_ns: int) -> str | None:
+    """A remark where times are not in the format's own unit."""
+    if unit_ns == own_ns:
+        return None
+    taken, usual = _unit_name(unit_ns), _unit_name(own_ns)
+    return f"camera {camera}: its times are taken as {taken}, by their steps, and not as {usual}"
+
+
+def _unit_name(unit_ns: int) -> str:
+    return _UNITS.get(unit_ns, f"{unit_ns} ns")
+
+
 def time_stamp_ns(where: str, text: str, unit_ns: int, before_ns: int) -> int:
     """A time stamp [ns], not negative, that must not be before ``before_ns``.
 
@@ -253,11 +306,11 @@ def time_stamp_ns(where: str, text: str, unit_ns: int, before_ns: int) -> int:
         before_ns: Time stamp of the row before [ns].
 
     Raises:
-        LogError: Not a whole number, negative or going backwards.
+        LogError: No number, in units of less than a millisecond no whole one, negative or going backwards.
     """
     try:
-        t_ns = int(text) * unit_ns
-    except ValueError:
+        t_ns = int(Decimal(text) * unit_ns) if unit_ns >= 10**6 else int(text) * unit_ns
+    except (ValueError, ArithmeticError):
         raise LogError(f"{where}: time: found {text!r}; would be right: a whole number") from None
     if t_ns < 0:
         raise LogError(f"{where}: time: found {text!r}; would be right: 0 or later")
@@ -314,14 +367,20 @@ def write_log(sources: Mapping[str, Iterator[ImportedSkeleton]], out: Path) -> d
 
 
 def import_cameras(
-    paths: Mapping[str, Path], out: Path, read: Callable[[Path], Iterator[ImportedSkeleton]]
+    paths: Mapping[str, Path],
+    out: Path,
+    read: Callable[[Path, int], Iterator[ImportedSkeleton]],
+    separator: str,
+    own_ns: int,
 ) -> list[str]:
     """Makes our log from one file a camera, whose times are those of the captures.
 
     Args:
         paths: Camera -> file.
         out: Log to write.
-        read: The rows of a file.
+        read: The rows of a file whose time unit has a length [ns].
+        separator: Of the columns; time is the first.
+        own_ns: The unit in which the format counts time [ns].
 
     Returns:
         Remarks for the user.
@@ -330,8 +389,16 @@ def import_cameras(
         LogError: A file that cannot be read as its format.
         SettingsError: ``out`` exists or cannot be written.
     """
-    spans = write_log({name: read(path) for name, path in paths.items()}, out)
-    return [_ARRIVAL_NOTE, *_overlap_notes(spans)]
+    units = {name: time_unit_ns(path, _first_column(path, separator), own_ns) for name, path in paths.items()}
+    spans = write_log({name: read(path, units[name]) for name, path in paths.items()}, out)
+    told = [note for name, unit in units.items() if (note := time_unit_note(name, unit, own_ns)) is not None]
+    return [_ARRIVAL_NOTE, *told, *_overlap_notes(spans)]
+
+
+def _first_column(path: Path, separator: str) -> Iterator[str]:
+    """The first column of the first rows."""
+    for _, text in itertools.islice(lines(path), _STAMPS):
+        yield text.partition(separator)[0]
 
 
 def _overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.importers import find_pivot, import_azure, import_keraal, import_kinect2, rotations
+from hrcreplay.logs.log_files import open_source
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import POINTS, CameraFrames
 from tests.realdata import data_path
@@ -185,15 +187,44 @@ def _azure(path: Path, out: Path) -> None:
     import_azure({"a": path}, out)
 
 
+HEADER = _azure_header()
+
+
+@pytest.mark.parametrize(
+    ("step", "unit_ns", "name"),
+    [
+        ("33333", 1000, None),
+        ("200000", 1000, None),
+        ("1000000", 1000, None),
+        ("33", 10**6, "ms"),
+        ("0.033", 10**9, "s"),
+        ("33333333", 1, "ns"),
+    ],
+)
+def test_azure_times_in_other_units(step: str, unit_ns: int, name: str | None, tmp_path: Path) -> None:
+    rows = [_azure_row(str(Decimal(7000) + number * Decimal(step))) for number in range(30)]
+    (tmp_path / "a.csv").write_text("\n".join([HEADER, *rows]))
+    notes = import_azure({"a": tmp_path / "a.csv"}, tmp_path / "log.mcap")
+    times = [message.arrival_ns for message in open_source(tmp_path / "log.mcap").messages(["/camera/a/skeleton"])]
+    assert times == [int((7000 + number * Decimal(step)) * unit_ns) for number in range(30)]
+    told = [note for note in notes if "camera a: its times" in note]
+    assert [f"as {name}," in note for note in told] == ([] if name is None else [True])
+
+
+def test_times_of_no_camera_are_refused(tmp_path: Path) -> None:
+    rows = [_azure_row(7000 + 3 * number) for number in range(30)]
+    (tmp_path / "a.csv").write_text("\n".join([HEADER, *rows]))
+    with pytest.raises(LogError, match=r"a\.csv: time: found steps of 3 \(median\).*us.*ms"):
+        import_azure({"a": tmp_path / "a.csv"}, tmp_path / "log.mcap")
+    assert not (tmp_path / "log.mcap").exists()
+
+
 def _kinect2(path: Path, out: Path) -> None:
     import_kinect2({"k": path}, out)
 
 
 def _kinect_text(path: Path, out: Path) -> None:
     import_keraal(path, None, out, 30.0)
-
-
-HEADER = _azure_header()
 
 
 @pytest.mark.parametrize(
