@@ -9,6 +9,14 @@ from __future__ import annotations
 #: differs but numbers, by no more than 1e-9, and the run was recorded on another machine.
 EXIT_DIFFERS, EXIT_SAME_DECISIONS = 1, 6
 
+_SHOWN = 200
+
+
+def shown(value: object) -> str:
+    """A value as messages show it: its repr, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
 
 class HrcReplayError(Exception):
     """Something the user can mend. The command prints the message and leaves with ``exit_code``."""

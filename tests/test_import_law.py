@@ -12,13 +12,14 @@ import hrcreplay
 
 PACKAGE = Path(hrcreplay.__file__).parent
 
-FOUNDATION = {"errors", "records"}
+FOUNDATION = {"errors", "records", "toml_file"}
 #: Sections of settings may be passed to these rooms as they are; none of them loads a setting.
 TAKERS = ("human", "robot", "logs", "egm", "calibration", "report")
 #: Room -> the rooms that it may import.
 MAY_IMPORT = {
     "errors": set(),
     "records": set(),
+    "toml_file": {"errors"},
     "geometry": {"records"},
     "human": FOUNDATION | {"geometry", "settings"},
     "robot": FOUNDATION | {"geometry", "settings"},

@@ -7,7 +7,6 @@ of the sensor's axes.
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +16,10 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, ValidationError
 
 from hrcreplay.calibration.registration import SkeletonTrack, rigid
-from hrcreplay.errors import SettingsError
+from hrcreplay.errors import SettingsError, shown
 from hrcreplay.records import POINTS, Bools, Floats
 from hrcreplay.store.run_folder import write_whole
+from hrcreplay.toml_file import read_toml
 
 _TOLERANCE = 1e-6
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -96,13 +96,7 @@ def load_cell(path: Path) -> Cell:
     Raises:
         SettingsError: The file cannot be read, or a key or value is not as it should be.
     """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a cell file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not TOML ({error})") from error
-    return Cell.from_dict(table, str(path))
+    return Cell.from_dict(read_toml(path, "name a cell file"), str(path))
 
 
 def write_cell(cell: Cell, path: Path) -> None:
@@ -152,7 +146,7 @@ def _matrix(rows: list[list[float]]) -> str:
 def _check_rows(rows: Any) -> Any:
     """Before the rows themselves, so that a matrix of another size is shown whole."""
     if not isinstance(rows, list) or len(rows) != 4:
-        raise ValueError(f"found {rows!r}; would be right: {_POSE}")
+        raise ValueError(f"found {shown(rows)}; would be right: {_POSE}")
     return rows
 
 
@@ -228,14 +222,14 @@ def _first_problem(error: ValidationError, table: Mapping[str, Any], where: str)
         models: dict[str, type[BaseModel]] = {"cameras": _Camera, "T_world_base": _Upright}
         model = models[keys[0]] if len(keys) > 1 else _CellFile
         above = ": ".join([where, *filter(None, [".".join(keys[:-1])])])
-        return f"{above}: found {keys[-1]!r}; would be right: {', '.join(model.model_fields)}"
+        return f"{above}: found {shown(keys[-1])}; would be right: {', '.join(model.model_fields)}"
     if kind == "value_error":
         return f"{at}: {problem['ctx']['error']}"
     if kind == "missing" and keys[-1] == "T_world_camera":
         return f"{where}: {'.'.join(keys[:-1])}: no T_world_camera; would be right: {right}"
     if kind in ("float_type", "finite_number"):
         right = "a finite number"
-    return f"{at}: found {None if kind == 'missing' else found!r}; would be right: {right}"
+    return f"{at}: found {None if kind == 'missing' else shown(found)}; would be right: {right}"
 
 
 _SOLE_M = 0.03  # foot point above the floor, Winter's foot with a shoe's sole

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +13,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import Departure, LimitSet, alpha_2_bounds, alpha_3_bounds
 from hrcreplay.records import BODY, JOINTS, Floats
 from hrcreplay.store.run_folder import write_whole
+from hrcreplay.toml_file import read_toml
 
 _HERE = Path(__file__).parent
 NAMES = ("paper", "human", "people")
@@ -54,21 +54,16 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
         SettingsError: The file cannot be read, or a key or a bound is not what it should be.
     """
     path = _HERE / f"{name_or_path}.toml" if name_or_path in NAMES else Path(name_or_path)
-    try:
-        table = tomllib.loads(path.read_text())
-    except OSError as error:
-        known = ", ".join(NAMES)
-        raise SettingsError(
-            f"{name_or_path}: no limit set ({error.strerror}); name one of {known} or a file"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not TOML ({error})") from error
+    known = f"name one of {', '.join(NAMES)} or a file"
+    if not path.exists():
+        raise SettingsError(f"{name_or_path}: no limit set (there is no such file); {known}")
+    table = read_toml(path, known)
     try:
         file = _LimitFile.model_validate(table).model_dump()
     except ValidationError as error:
         raise SettingsError(_first_problem(error, table, str(path))) from error
     rows, coupled = file["joints"], file["coupled"]
-    rows["z"] = rows["z"] or tomllib.loads((_HERE / "human.toml").read_text())["joints"]["z"]
+    rows["z"] = rows["z"] or read_toml(_HERE / "human.toml", "")["joints"]["z"]
     bounds = np.array([_bounds(rows[joint], joint, f"{path}: joints.{joint}", coupled) for joint in JOINTS])
     if coupled:
         _enclose(bounds)

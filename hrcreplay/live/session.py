@@ -6,6 +6,7 @@ import gc
 import json
 import shutil
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -129,6 +130,9 @@ def _prepare(request: Request, stack: ExitStack) -> _Prepared:
     port = job.settings.live.port if request.port is None else request.port
     start = start_table(job, header, sending=request.send)
     controller = build_controller(start)
+    unguarded = controller.setup.robot.unguarded_tool
+    if unguarded is not None:
+        sys.stderr.write(f"hrcreplay: {unguarded}\n")
     link = stack.enter_context(closing(EgmServer("", port, WAIT_S)))
     compile_kernels(start)
     return _Prepared(job.settings, start, controller, link)

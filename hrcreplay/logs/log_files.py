@@ -314,7 +314,7 @@ def latched(source: LogFiles) -> Latched:
 def _task(text: str, message: Message) -> dict[str, Any]:
     try:
         return dict(json.loads(text))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise LogError(
             f"{message.topic.name}: the task in the log is not JSON ({error}); import the log again"
         ) from error

@@ -275,11 +275,8 @@ def remarks(robot: RobotModel) -> tuple[str, ...]:
         found.append(
             f"robot {robot.name}: locked at zero, or at the end of their range next to it: {', '.join(robot.locked)}"
         )
-    if robot.tcp_outside_m > 1e-3:
-        found.append(
-            f"robot {robot.name}: the TCP lies {robot.tcp_outside_m:.3f} m outside the capsules of the last link, and "
-            "what is mounted there is not guarded; give it in robot.links, or set robot.tool_m"
-        )
+    if robot.unguarded_tool is not None:
+        found.append(robot.unguarded_tool)
     return tuple(found)
 
 

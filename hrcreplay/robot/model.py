@@ -49,6 +49,11 @@ class LinkMotion(NamedTuple):
         return np.asarray(np.linalg.norm(twist[:, :3] + np.cross(twist[:, 3:], points_m), axis=1))
 
 
+#: A TCP this far from all capsules is not guarded [m].
+_OUTSIDE_M = 1e-3
+_TOOL_RADIUS_M = 0.05  # a gripper's, of the capsule that the remedy proposes
+
+
 @dataclass(frozen=True)
 class RobotModel:
     """A serial robot on its base. Arrays are (nv,) [rad] and derivatives; an endless axis has infinite ``q_max``.
@@ -69,6 +74,7 @@ class RobotModel:
     base_frame: str  #: link that stands on ``T_world_base``
     tcp_frame: str  #: link that carries the tool
     locked: tuple[str, ...]  #: joints off the chain, held at zero or the end of their range next to it
+    tcp_in_frame_m: Floats  #: (3,) TCP in the frame of that link [m]
     tcp_outside_m: float  #: how far the TCP is from the capsules of the last link; 0 inside one, NaN without one [m]
     axis_reach_m: Floats  #: (nv, s) no point of a segment's axis is ever further than this from an axis of rotation [m]
     _kinematics: _Kinematics = field(repr=False, compare=False)
@@ -77,6 +83,19 @@ class RobotModel:
     def nv(self) -> int:
         """Number of axes."""
         return len(self.joint_names)
+
+    @property
+    def unguarded_tool(self) -> str | None:
+        """What is told where the TCP is outside of every capsule, with the setting that guards it; else None."""
+        if not self.tcp_outside_m > _OUTSIDE_M:
+            return None
+        end = ", ".join(f"{at:.4g}" for at in (self.tcp_in_frame_m + 0.0).tolist())
+        capsule = f'{{name = "tool", body = "{self.tcp_frame}", start_m = [0.0, 0.0, 0.0], end_m = [{end}]'
+        return (
+            f"robot {self.name}: the TCP lies {self.tcp_outside_m:.3f} m outside the capsules of the last link, and "
+            f"what is mounted there is not guarded; a capsule to it guards it: robot.tool_links = [{capsule}, "
+            f"radius_m = {_TOOL_RADIUS_M}}}]"
+        )
 
     def pose(self, q: Floats, dq: Floats) -> RobotPose:
         """Forward kinematics, Jacobians and Jdot dq of Eq. (66b), corrected, and Eq. (66c) at one instant.
@@ -184,6 +203,7 @@ def irb140(
     stop_s: float,
     tool_m: float = Robot().tool_m,
     T_tool_tcp: Floats | None = None,
+    tool_segments: Sequence[Segment] = (),
     acceleration: Sequence[float] = (),
 ) -> RobotModel:
     """The ABB IRB 140; its TCP lies ``tool_m`` beyond the flange, along the flange's z axis.
@@ -193,6 +213,7 @@ def irb140(
         stop_s: T_s of Eq. (70) [s].
         tool_m: [m].
         T_tool_tcp: (4, 4) TCP from there; none: there itself [m].
+        tool_segments: Capsules of what is mounted there, beside its own.
         acceleration: (6,) limits [rad/s^2]; none: top speed / T_s, so that every axis can stop within T_s.
     """
     return from_urdf(
@@ -202,7 +223,7 @@ def irb140(
         tcp_frame="flange",
         tool_m=tool_m,
         T_tool_tcp=T_tool_tcp,
-        segments=[Segment(*capsule) for capsule in irb140_data.capsules(tool_m)],
+        segments=[*(Segment(*capsule) for capsule in irb140_data.capsules(tool_m)), *tool_segments],
         acceleration=acceleration,
     )
 
@@ -260,6 +281,7 @@ def from_urdf(
         base_frame=robot.base,
         tcp_frame=robot.tcp,
         locked=robot.locked,
+        tcp_in_frame_m=np.array(offset.translation),
         tcp_outside_m=_outside(model, segments, points, tcp),
         axis_reach_m=_axis_reach_m(model, points),
         _kinematics=_Kinematics(model, points, tcp),

@@ -18,7 +18,7 @@ from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.geometry.vectors import to_vector
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.task import STEP_S, Missed, Reference, Task, Waypoint, descend, solve
+from hrcreplay.robot.task import CYCLE_S, STEP_S, Missed, Reference, Task, Waypoint, descend, solve
 
 #: Limits rise to their full acceleration in this time: jerk limit = acceleration limit / RAMP_S [s].
 RAMP_S = 0.1
@@ -39,6 +39,18 @@ class Pace:
     tcp_speed: float  #: [m/s]
     tcp_acceleration: float  #: along straight lines [m/s^2]
     step_s: float  #: time grid [s]
+
+
+#: The longest move [s].
+MOVE_S = 300.0
+
+
+class _TooSlow(Exception):
+    """A move would take too long."""
+
+    def __init__(self, duration_s: float) -> None:
+        super().__init__()
+        self.duration_s = duration_s
 
 
 @dataclass(frozen=True)
@@ -143,7 +155,14 @@ def _paced(
 
 
 def _profile(length: float, speed: float, acceleration: float, step_s: float) -> tuple[Floats, Floats]:
-    """Position and speed along a path on the time grid, stretched to a whole number of its steps."""
+    """Position and speed along a path on the time grid, stretched to a whole number of its steps.
+
+    Raises:
+        _TooSlow: It would take longer than MOVE_S.
+    """
+    least_s = max(length / speed, math.sqrt(length / acceleration))  # before a grid is made, or ruckig gives up
+    if not least_s <= MOVE_S:
+        raise _TooSlow(least_s)
     task = InputParameter(1)
     task.current_position, task.target_position = [0.0], [length]
     task.max_velocity, task.max_acceleration, task.max_jerk = [speed], [acceleration], [acceleration / RAMP_S]
@@ -151,6 +170,8 @@ def _profile(length: float, speed: float, acceleration: float, step_s: float) ->
     result = Ruckig(1).calculate(task, fastest)
     if result != Result.Working:
         raise RuntimeError(f"ruckig: {result} for {length} m or rad at {speed}, {acceleration}")
+    if fastest.duration > MOVE_S:
+        raise _TooSlow(fastest.duration)
     steps = max(1, math.ceil(fastest.duration / step_s))
     stretch = steps * step_s / fastest.duration
     states = [fastest.at_time(fastest.duration * i / steps) for i in range(steps + 1)]
@@ -193,13 +214,18 @@ def programmed(task: Task, model: RobotModel, where: str = "task") -> Reference:
     tracks = [_stand(start, task.waypoints[0].dwell_s)]
     arrivals_s, limits, end = [0.0], [_speed_limit(task, 0)], 0
     for index in range(1, len(task.waypoints)):
-        tracks.append(_move(model, task, index, tracks[-1].q[-1], where))
+        tracks.append(_timed_move(model, task, index, tracks[-1].q[-1], where))
+        if _steps(tracks) * STEP_S > CYCLE_S:
+            raise SettingsError(
+                f"{where}: a cycle of over {CYCLE_S:.0f} s at {task.label(index)}; at most that is planned, so make it "
+                "faster or shorter"
+            )
         arrivals_s.append(_steps(tracks) * STEP_S)
         tracks.append(_stand(tracks[-1].q[-1], task.waypoints[index].dwell_s))
         limits += 2 * [_speed_limit(task, index)]
         end = _steps(tracks)
     if task.repeat or task.cycles > 1:
-        tracks.append(_move(model, task, 0, tracks[-1].q[-1], where, start))
+        tracks.append(_timed_move(model, task, 0, tracks[-1].q[-1], where, start))
         limits.append(limits[0])
     if _steps(tracks) == 0:
         raise SettingsError(f"{where}: every waypoint is where the robot starts; at least one must differ")
@@ -304,6 +330,23 @@ def _steps(tracks: list[JointTrajectory]) -> int:
 def _stand(q: Floats, dwell_s: float) -> JointTrajectory:
     rows = np.repeat(q[None], round(dwell_s / STEP_S) + 1, axis=0)
     return JointTrajectory(rows, np.zeros_like(rows))
+
+
+def _timed_move(
+    model: RobotModel, task: Task, index: int, now: Floats, where: str, goal: Floats | None = None
+) -> JointTrajectory:
+    """``_move``, and a SettingsError where it would take longer than MOVE_S."""
+    try:
+        return _move(model, task, index, now, where, goal)
+    except _TooSlow as error:
+        waypoint = task.waypoints[index]
+        tcp_m_per_s = min(task.tcp_speed_m_per_s, waypoint.tcp_speed_m_per_s or math.inf)
+        raise SettingsError(
+            f"{where}: {task.label(index)}: the move to it takes over {error.duration_s:.3g} s with speed "
+            f"{task.speed:g}, acceleration {task.acceleration:g}, tcp_speed_m_per_s {tcp_m_per_s:g} and "
+            f"tcp_acceleration_m_per_s2 {task.tcp_acceleration_m_per_s2:g}; at most {MOVE_S:.0f} s are planned, so "
+            "raise the smallest"
+        ) from error
 
 
 def _move(

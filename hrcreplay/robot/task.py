@@ -47,11 +47,14 @@ import numpy as np
 from numba import njit
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from hrcreplay.errors import SettingsError
+from hrcreplay.errors import SettingsError, shown
 from hrcreplay.geometry.vectors import to_vector
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import Plan
+
+#: The longest cycle of a task [s].
+CYCLE_S = 7200.0
 
 _Share = Annotated[float, Field(gt=0, le=1)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -106,7 +109,7 @@ class Task(_Strict):
 
     name: str = "task"
     """Shown in the report."""
-    waypoints: Annotated[tuple[Waypoint, ...], Field(min_length=2)]
+    waypoints: Annotated[tuple[Waypoint, ...], Field(min_length=2, max_length=1000)]
     """In order; the first is the start."""
     repeat: bool = False
     """Start over until the log ends."""
@@ -120,6 +123,13 @@ class Task(_Strict):
     """Top speed of the TCP [m/s]."""
     tcp_acceleration_m_per_s2: _Positive = 4.0
     """Top acceleration of the TCP on linear moves [m/s^2]."""
+
+    @model_validator(mode="after")
+    def _not_endless(self) -> Task:
+        dwell_s = sum(waypoint.dwell_s for waypoint in self.waypoints)
+        if dwell_s > CYCLE_S:
+            raise ValueError(f"found dwells of {dwell_s:.0f} s in all; a cycle takes at most {CYCLE_S:.0f} s")
+        return self
 
     @model_validator(mode="after")
     def _repeat_or_cycles(self) -> Task:
@@ -154,13 +164,13 @@ def _first_problem(error: ValidationError) -> str:
     at, key = _place(problem["loc"])
     if problem["type"] == "extra_forbidden":
         known = Waypoint.model_fields if at else Task.model_fields
-        return f"{at}unknown key {key!r}; known here: {', '.join(known)}"
+        return f"{at}unknown key {shown(key)}; known here: {', '.join(known)}"
     if problem["type"] == "missing":
         return f"{at}{key} is missing; the task needs it"
     if problem["type"] == "value_error":
         return f"{at}{problem['ctx']['error']}"
     wanted = problem["msg"].removeprefix("Input ").replace("valid tuple", "list").replace("valid dictionary", "table")
-    return f"{at}{key}: found {problem['input']!r}; it {wanted}"
+    return f"{at}{key}: found {shown(problem['input'])}; it {wanted}"
 
 
 def _place(loc: tuple[int | str, ...]) -> tuple[str, str]:

@@ -23,6 +23,9 @@ from hrcreplay.robot.link_capsules import KINDS, Extent, Shape, shapes
 
 _TURNING = ("revolute", "continuous")
 
+#: The most links that a URDF may have; humanoids with hands have some 150.
+MOST_LINKS = 500
+
 
 @dataclass(frozen=True)
 class Description:
@@ -178,7 +181,7 @@ class _Tree:
         found: list[ET.Element] = []
         while link in self._below:
             joint = self._below[link]
-            if joint in found:
+            if len(found) > len(self.links):
                 raise SettingsError(f"robot: joint {joint.get('name')!r} closes a loop; a URDF is a tree")
             found.append(joint)
             link = str(joint.find("parent").get("link"))  # type: ignore[union-attr]  # _parse has checked it
@@ -231,10 +234,14 @@ def _parse(xml: str) -> ET.Element:
     if robot.tag != "robot" or robot.find("link") is None:
         raise SettingsError(f"robot: found <{robot.tag}> without links; a URDF is a <robot> of links and joints")
     links = [link.get("name") for link in robot.findall("link")]
-    below = []
+    if len(links) > MOST_LINKS:
+        raise SettingsError(
+            f"robot: found {len(links)} links; at most {MOST_LINKS} are read, so leave out what is not the arm"
+        )
+    known, below = set(links), []
     for joint in robot.findall("joint"):
         ends = [None if end is None else end.get("link") for end in (joint.find("parent"), joint.find("child"))]
-        if not set(ends) <= set(links):
+        if not set(ends) <= known:
             raise SettingsError(
                 f"robot: joint {joint.get('name')!r} is between {ends[0]} and {ends[1]}; name two links"
             )

@@ -24,7 +24,7 @@ from hrcreplay.logs.log_files import Header, JointTrack
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.model import RobotModel, from_urdf, irb140
+from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.path import programmed, recorded
 from hrcreplay.robot.task import Reference, Task, parse_task
 from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
@@ -214,6 +214,7 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
     T_tool_tcp = np.eye(4)
     T_tool_tcp[:3, :3] = Rotation.from_euler("xyz", settings.tcp_offset.rpy_deg, degrees=True).as_matrix()
     T_tool_tcp[:3, 3] = settings.tcp_offset.position_m
+    tool_segments = tuple(Segment(**dict(link)) for link in settings.tool_links)
     if files is None:
         other = [key for key in ("links", "tcp_frame", "base_frame", "packages") if getattr(settings, key)]
         if other:
@@ -223,6 +224,7 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
             stop_s=stop_s,
             tool_m=settings.tool_m,
             T_tool_tcp=T_tool_tcp,
+            tool_segments=tool_segments,
             acceleration=settings.acceleration,
         )
     return from_urdf(
@@ -233,7 +235,7 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
         base_frame=settings.base_frame,
         tool_m=settings.tool_m,
         T_tool_tcp=T_tool_tcp,
-        segments=link_capsules(settings, files),
+        segments=(*link_capsules(settings, files), *tool_segments),
         acceleration=settings.acceleration,
     )
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tomllib
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
@@ -27,6 +26,7 @@ from hrcreplay.settings.load import Settings, as_overrides, load_settings
 from hrcreplay.settings.sections import LinkSettings, Robot
 from hrcreplay.store import run_folder
 from hrcreplay.store.machine import describe_machine
+from hrcreplay.toml_file import read_toml
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ def read_urdf(robot: Robot) -> UrdfFiles | None:
         return None
     if not path.is_file():
         raise SettingsError(f"robot.urdf: {path} is not a file; name a URDF, or leave it out for the IRB 140")
+    _check_size(path, _URDF_BYTES)
     try:
         text = path.read_text()
     except UnicodeDecodeError as error:
@@ -62,7 +63,22 @@ def read_urdf(robot: Robot) -> UrdfFiles | None:
             if shape.mesh is not None and shape.mesh not in meshes:
                 meshes[shape.mesh] = str(_find(shape.mesh, shape.link, path, robot.packages))
     files = [path, *(Path(mesh) for mesh in meshes.values())]
+    for mesh in files[1:]:
+        _check_size(mesh, _MESH_BYTES)
     return UrdfFiles(text, tuple(meshes.items()), tuple((str(file), run_folder.sha256(file)) for file in files))
+
+
+#: The longest URDF that is read, and the largest mesh: 400,000 triangles of a binary STL [bytes].
+_URDF_BYTES, _MESH_BYTES = 8 << 20, 20 << 20
+
+
+def _check_size(path: Path, most: int) -> None:
+    size = path.stat().st_size
+    if size > most:
+        raise SettingsError(
+            f"robot.urdf: {path} has {size / (1 << 20):.0f} MB; at most {most >> 20} MB are read, so simplify the mesh "
+            "or give robot.links"
+        )
 
 
 def _find(name: str, link: str, urdf: Path, packages: tuple[Path, ...]) -> Path:
@@ -327,12 +343,7 @@ def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] 
     path = settings.plan.task
     if path is None:
         return earlier["task"] if earlier is not None else None
-    try:
-        return tomllib.loads(path.read_text())
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror}); plan.task names a TOML file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not TOML ({error})") from error
+    return read_toml(path, "plan.task names a TOML file")
 
 
 def urdf_digest(settings: Settings) -> str | None:

@@ -13,8 +13,9 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from hrcreplay.errors import SettingsError
+from hrcreplay.errors import SettingsError, shown
 from hrcreplay.settings.sections import Settings
+from hrcreplay.toml_file import read_toml
 
 __all__ = ["SHIPPED", "Settings", "as_overrides", "load_settings"]
 
@@ -23,6 +24,10 @@ SHIPPED = {"paper": Path(__file__).with_name("paper.toml")}
 
 #: Words that TOML takes for something else than a text.
 _WORDS = frozenset({"true", "false", "inf", "nan"})
+
+
+#: Settings that name files; in a settings file a relative one is looked for beside that file first.
+_PATHS = (("robot", "urdf"), ("robot", "packages"), ("plan", "task"), ("limits", "tracking"), ("limits", "prediction"))
 
 
 def load_settings(
@@ -43,21 +48,35 @@ def load_settings(
     if path is not None:
         where = str(path)
         file = SHIPPED.get(where, path) if not path.exists() else path
-        try:
-            for name, section in tomllib.loads(file.read_text()).items():
-                table[name] = table.get(name, {}) | section if isinstance(section, dict) else section
-        except OSError as error:
-            raise SettingsError(
-                f"{path}: cannot be read ({error.strerror}); name a TOML file, or {', '.join(SHIPPED)}"
-            ) from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise SettingsError(f"{path}: not TOML ({error})") from error
+        given = read_toml(file, f"name a TOML file, or {', '.join(SHIPPED)}")
+        for name, section in _beside(given, file.parent).items():
+            table[name] = table.get(name, {}) | section if isinstance(section, dict) else section
     for override in overrides:
         _override(table, override)
     try:
         return Settings.model_validate(table)
     except ValidationError as error:
         raise SettingsError(f"{where}: {_first_problem(error)}") from error
+
+
+def _beside(table: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The settings of a file, in which relative paths of files beside it become paths from here."""
+    found = dict(table)
+    for name, key in _PATHS:
+        section = found.get(name)
+        if not isinstance(section, dict) or key not in section:
+            continue
+        given = section[key]
+        if isinstance(given, list):
+            found[name] = found[name] | {key: [_beside_or_same(one, folder) for one in given]}
+        else:
+            found[name] = found[name] | {key: _beside_or_same(given, folder)}
+    return found
+
+
+def _beside_or_same(given: Any, folder: Path) -> Any:
+    named = isinstance(given, str) and given not in ("paper", "human", "people", "none", "")
+    return str(folder / given) if named and (folder / given).exists() else given
 
 
 def as_overrides(settings: Settings) -> tuple[str, ...]:
@@ -98,6 +117,8 @@ def _override(table: dict[str, Any], text: str) -> None:
         parsed = tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
+    except RecursionError as error:
+        raise SettingsError(f"--set {key}=...: nested too deep; at most some hundred brackets are read") from error
     section = table.setdefault(parts[0], {})
     if not isinstance(section, dict):
         raise SettingsError(f"--set {text}: {parts[0]} is not a section of the settings file")
@@ -109,8 +130,8 @@ def _first_problem(error: ValidationError) -> str:
     loc = [str(part) for part in problem["loc"]]
     if problem["type"] == "extra_forbidden":
         known = Settings.model_fields if len(loc) == 1 else _section_keys(loc[0])
-        return f"unknown setting {'.'.join(loc)!r}; known here: {', '.join(known)}"
-    return f"{'.'.join(loc)}: found {problem['input']!r}; {problem['msg'][0].lower()}{problem['msg'][1:]}"
+        return f"unknown setting {shown('.'.join(loc))}; known here: {', '.join(known)}"
+    return f"{'.'.join(loc)}: found {shown(problem['input'])}; {problem['msg'][0].lower()}{problem['msg'][1:]}"
 
 
 def _section_keys(name: str) -> list[str]:

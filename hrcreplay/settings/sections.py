@@ -93,7 +93,7 @@ class Fusion(Section):
     while people stand, compensating them while they move; what matters for safety is the latter.
     """
 
-    rate_hz: Positive = 250.0
+    rate_hz: Annotated[float, Field(gt=0, le=2000, allow_inf_nan=False)] = 250.0
     """Ticks a second of the filter and the controller [Hz]."""
     stale: Literal["skip", "reuse"] = "skip"
     """Between two frames: skip the camera's rows, or re-use them with the sawtooth covariance of 4.1.1."""
@@ -220,7 +220,9 @@ class Robot(Section):
     """The manipulator. Default: ABB IRB 140."""
 
     urdf: Path | None = None
-    """Another robot's URDF; none: the IRB 140. Joints that do not lie between base and tool are locked at zero."""
+    """Another robot's URDF; none: the IRB 140. Joints that do not lie between base and tool are locked at zero. In a
+    settings file a relative path is looked for beside that file first, as are packages, plan.task and files of
+    limits."""
     packages: tuple[Path, ...] = ()
     """Directories of the packages whose meshes that URDF names (package://); searched before the directories at and
     above the URDF, and those of ROS_PACKAGE_PATH."""
@@ -234,6 +236,8 @@ class Robot(Section):
     """TCP from there, for a tool that is not straight."""
     links: tuple[LinkSettings, ...] = ()
     """Link segments; none: the IRB 140's, or derived from the URDF's collision shapes, meshes among them."""
+    tool_links: tuple[LinkSettings, ...] = ()
+    """Further link segments, of what is mounted at the tool; also beside the IRB 140's."""
     acceleration: tuple[Positive, ...] = ()
     """Joint acceleration limits [rad/s^2]; none: top speed / T_s of every axis."""
 
@@ -351,7 +355,7 @@ class Live(Section):
 
     port: Annotated[int, Field(ge=0, le=65535)] = 6510
     """UDP port at which the robot's packets arrive."""
-    cycle_s: Positive = 0.004032
+    cycle_s: Annotated[float, Field(ge=0.001, le=0.1)] = 0.004032
     """The robot's cycle: every answer moves the reference by this much time [s]."""
     reaction_s: NotNegative = 0.05
     """From a look at the person to the robot's obedience: up to two cycles until it is used, an answer's delay, a cycle

@@ -9,6 +9,9 @@ from numpy.testing import assert_allclose
 from hrcreplay.errors import SettingsError
 from hrcreplay.robot.model import from_urdf
 from hrcreplay.robot.urdf import describe
+from hrcreplay.run.build import _robot as build_robot
+from hrcreplay.run.job import UrdfFiles
+from hrcreplay.settings.load import load_settings
 from tests.robot.test_model import AT_ORIGIN, joint, link, pedestal, robot_xml
 
 BALL = "<sphere radius='0.05'/>"
@@ -119,6 +122,23 @@ def test_the_tcp_is_beyond_the_flange_by_the_offset_too() -> None:
     assert_allclose(tcp[:3, :3], T[:3, :3])
     assert robot.tcp_outside_m == pytest.approx(np.sqrt(0.1**2 + 0.2**2 + 0.35**2) - 0.05)
     assert from_urdf(arm(), AT_ORIGIN, stop_s=0.5).tcp_outside_m == 0.0
+
+
+@pytest.mark.parametrize("text", ["", arm()])
+def test_the_capsule_that_is_proposed_guards_the_tool(text: str) -> None:
+    files = UrdfFiles(text, (), ()) if text else None
+    offset = "robot.tcp_offset={position_m = [0.1, 0.2, 0.3]}"
+    bare = build_robot(load_settings(None, (offset,)).robot, files, 0.5, AT_ORIGIN)
+    assert bare.unguarded_tool is not None
+    assert f"{bare.tcp_outside_m:.3f} m" in bare.unguarded_tool
+    setting = bare.unguarded_tool[bare.unguarded_tool.index("robot.tool_links") :].replace(" = ", "=", 1)
+    guarded = build_robot(load_settings(None, (offset, setting)).robot, files, 0.5, AT_ORIGIN)
+    assert guarded.unguarded_tool is None
+    assert guarded.segments[:-1] == bare.segments
+    q = np.linspace(0.1, 0.6, guarded.nv)
+    tcp, ends = guarded.pose(q, q).T_world_tcp[:3, 3], guarded.ends_m(q)[-1]
+    assert_allclose(ends[1], tcp, atol=1e-3)
+    assert build_robot(load_settings().robot, None, 0.5, AT_ORIGIN).unguarded_tool is None
 
 
 def test_macros_are_no_urdf() -> None:

@@ -107,3 +107,35 @@ def test_a_wrong_override_is_one_clear_line(override: str, message: str) -> None
 def test_a_missing_file_says_so(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"none\.toml: cannot be read"):
         load_settings(tmp_path / "none.toml")
+
+
+def test_paths_in_a_file_are_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As are those of a colleague who gives a folder away; from the command line they are from where it runs."""
+    (tmp_path / "cell" / "meshes").mkdir(parents=True)
+    for name in ("arm.urdf", "task.toml", "mine.toml"):
+        (tmp_path / "cell" / name).write_text("")
+    text = '[robot]\nurdf = "arm.urdf"\npackages = ["meshes", "none"]\n'
+    text += '[plan]\ntask = "task.toml"\n[limits]\ntracking = "mine.toml"\nprediction = "people"\n'
+    (tmp_path / "cell" / "settings.toml").write_text(text)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    found = load_settings(Path("../cell/settings.toml"))
+    assert found.robot.urdf is not None
+    assert found.robot.urdf.samefile(tmp_path / "cell" / "arm.urdf")
+    assert [path.name for path in found.robot.packages] == ["meshes", "none"]
+    assert found.robot.packages[0].samefile(tmp_path / "cell" / "meshes")
+    assert found.robot.packages[1] == Path("none")
+    assert found.plan.task is not None
+    assert found.plan.task.samefile(tmp_path / "cell" / "task.toml")
+    assert Path(found.limits.tracking).samefile(tmp_path / "cell" / "mine.toml")
+    assert found.limits.prediction == "people"
+    assert load_settings(None, ("robot.urdf=arm.urdf",)).robot.urdf == Path("arm.urdf")
+
+
+def test_the_word_none_stands_for_no_value_where_there_may_be_none() -> None:
+    decoder = '{topic = "/a", camera = "c", points = "p", index = {head = 0}, stamp = "none"}'
+    found = load_settings(None, (f"logs.decoders=[{decoder}]", "logs.joints_topic=none", "plan.method=none"))
+    assert found.logs.decoders[0].stamp is None
+    assert found.logs.joints_topic is None
+    assert found.plan.method == "none"
+    assert load_settings(None, as_overrides(found)) == found  # a command line that makes the same run again

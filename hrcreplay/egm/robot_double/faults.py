@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Bools, Floats
+from hrcreplay.toml_file import read_toml
 
 
 class Datagram(NamedTuple):
@@ -177,12 +177,7 @@ def load_faults(path: Path, *, seed: int, duration_s: float) -> tuple[Fault, ...
     Raises:
         SettingsError: It cannot be read, or something in it is not right.
     """
-    try:
-        script = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a script of faults") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: is no TOML ({error}); write [[fault]] tables") from error
+    script = read_toml(path, "name a script of faults, with [[fault]] tables")
     unknown = sorted(set(script) - {"fault", "random"})
     if unknown:
         raise SettingsError(f"{path}: unknown key {unknown[0]!r}; [[fault]] or [random] would be right")
