@@ -99,7 +99,7 @@ class TfDecoder:
     )
     shows_camera_alive: ClassVar[bool] = False
 
-    def __init__(self, topic: str, cameras: tuple[str, ...], unit: str = "m") -> None:
+    def __init__(self, topic: str, cameras: tuple[str, ...], unit: str) -> None:
         self.topic = topic
         self.cameras = cameras
         self._unit = unit

@@ -233,7 +233,7 @@ class MarkerDecoder:
     that is 1.
     """
 
-    def __init__(self, topic: str, layout: MarkerLayout | None = None, unit: str = "m") -> None:
+    def __init__(self, topic: str, layout: MarkerLayout | None = None, *, unit: str) -> None:
         self.topic = topic
         self._layout = layout or MarkerLayout()
         self._scale = METRES[unit]

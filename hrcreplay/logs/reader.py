@@ -108,7 +108,7 @@ def _markers(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) 
     """The decoder of a marker topic; None, with a remark, where its markers are no bodies."""
     layout = survey_markers(source.messages([topic.name]), options.marker_ids_per_body)
     if isinstance(layout, MarkerLayout):
-        return MarkerDecoder(topic.name, layout, options.unit)
+        return MarkerDecoder(topic.name, layout, unit=options.unit)
     expected = bool(options.topics) or _BODIES in topic.name
     if layout.certain and _BODIES in topic.name:
         raise LogError(
@@ -118,7 +118,7 @@ def _markers(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) 
     if layout.certain:
         remarks.append(f"{topic.name} is left out, as its markers are no skeletons: found {layout.found}")
         return None
-    return MarkerDecoder(topic.name, layout.layout, options.unit) if expected else None
+    return MarkerDecoder(topic.name, layout.layout, unit=options.unit) if expected else None
 
 
 def _descriptions(source: LogFiles) -> Iterator[str]:
