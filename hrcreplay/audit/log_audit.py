@@ -175,7 +175,8 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         recording = read_recording(
             log, ticks_ns, build.fusion_stage(job, log), lambda n: bar.advance(f"reading {name}", n)
         )
-    rows = asked_rows(recording.states, int(recording.t_ns[-1]), job.settings.fusion.rate_hz, horizon_s)
+    fusion = job.settings.fusion
+    rows = asked_rows(recording.states, int(recording.t_ns[-1]), fusion.rate_hz, horizon_s, fusion.fresh_s)
     if not len(rows):
         raise LogError(f"{job.log}: nobody was seen for longer than the horizon of {horizon_s:g} s")
     future = recorded_future(recording.t_ns, recording.points_m, recording.states.rows(rows), horizon_s)

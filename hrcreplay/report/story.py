@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hrcreplay.logs.clean import DEFECTS
+from hrcreplay.records import BODY
 from hrcreplay.report import verdict
 from hrcreplay.report.metrics import Metric
 from hrcreplay.report.metrics_data import cameras
@@ -352,12 +353,17 @@ def lines(run: Run, metrics: Metrics) -> list[str]:
 
 
 def _fuse(run: Run, metrics: Metrics) -> str:
-    ticks = metrics["ticks"]["value"]
-    unknown = metrics["ticks_before_first_state"]["value"] + metrics["ticks_state_lost"]["value"]
+    known = metrics["person_known_share"]["value"]
+    limbs = {limb: metrics[f"limb_{limb}_known_share"]["value"] for limb in BODY}
+    less = [
+        f"{limb} {100 * share:.1f} %" for limb, share in limbs.items() if share is not None and share < known - 0.005
+    ]
+    of_limbs = f" ({', '.join(less)})" if less else ""
     frames = ", ".join(f"{name} {text_of(metrics[f'camera_{name}_frames'])}" for name in cameras(run))
     outliers = sum(count for name, count in run.counts.items() if name.startswith("outlier_points_"))
     return (
-        f"{text_of(metrics['ticks'])} ticks, person known in {100 * (1 - unknown / ticks):.1f} %; "
+        f"{text_of(metrics['ticks'])} ticks, person known from fresh frames in {percent(metrics['person_known_share'])}"
+        f"{of_limbs}; "
         f"frames with the person: {frames}; {outliers:,} outlier points"
     )
 

@@ -135,7 +135,7 @@ def own_coverage(job: Job, people: RecordedPeople, predicted: Predicted, motion:
         return None
     states = predicted.all_states
     horizon_s = _at(states.t_ns, motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float))
-    return coverage(predicted.stage, people, states, job.settings.fusion.rate_hz, horizon_s)
+    return coverage(predicted.stage, people, states, job.settings.fusion, horizon_s)
 
 
 def full_coverage(job: Job, people: RecordedPeople, predicted: Predicted) -> Outcome | None:
@@ -144,7 +144,7 @@ def full_coverage(job: Job, people: RecordedPeople, predicted: Predicted) -> Out
         return None
     states = predicted.all_states
     horizon_s = np.full(len(states), predicted.stage.horizon_s)
-    return coverage(predicted.stage, people, states, job.settings.fusion.rate_hz, horizon_s)
+    return coverage(predicted.stage, people, states, job.settings.fusion, horizon_s)
 
 
 def contact_table(

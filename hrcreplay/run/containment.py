@@ -17,6 +17,7 @@ from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
 from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.recording import LIMB_POINTS, RecordedPeople
+from hrcreplay.settings.sections import Fusion
 
 #: Ticks a second that are asked [Hz].
 AUDIT_HZ = 25.0
@@ -177,26 +178,27 @@ def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str)
     return float(np.nanmax(solid.distances_m(points)))
 
 
-def asked_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: float | Floats) -> Ints:
-    """Rows of the states that are asked: one in so many, with a person, and a whole horizon before the end.
+def asked_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: float | Floats, fresh_s: float) -> Ints:
+    """Rows of the states that are asked: one in so many, with a known person, a whole horizon before the end.
 
     Args:
         states: (n,) every tick of a run.
         last_ns: The last instant of the recording [ns].
         rate_hz: Ticks a second of ``states`` [Hz].
         horizon_s: Of all ticks or of each, with the latency [s].
+        fresh_s: A person whose newest frame is older is not known [s].
     """
     every = max(1.0, rate_hz / AUDIT_HZ)
     number = np.arange(len(states))
     chosen = np.floor(number / every) != np.floor((number - 1) / every)
-    chosen &= np.isfinite(states.p).all(axis=1)
+    chosen &= np.isfinite(states.p).all(axis=1) & (states.frame_age_s <= fresh_s)
     left_ns = max(int(states.t_ns[-1]), last_ns) - states.t_ns
     chosen &= np.round(np.asarray(horizon_s) * 1e9) <= left_ns
     return np.flatnonzero(chosen)
 
 
 def coverage(
-    stage: PredictionStage, people: RecordedPeople, states: HumanStates, rate_hz: float, horizon_s: Floats
+    stage: PredictionStage, people: RecordedPeople, states: HumanStates, fusion: Fusion, horizon_s: Floats
 ) -> Outcome | None:
     """How the volumes of a run held the recorded person, at the ticks that are asked; None where none is.
 
@@ -204,12 +206,12 @@ def coverage(
         stage: That predicts.
         people: As recorded.
         states: (n,) every tick of the run.
-        rate_hz: Ticks a second [Hz].
+        fusion: Settings of stage 1.
         horizon_s: (n,) for which each tick's volumes were predicted, without the latency; NaN: not asked [s].
     """
     until_s = horizon_s + stage.occupancy.latency_s
     last_ns = int(people.t_ns[-1]) if len(people.t_ns) else 0
-    rows = asked_rows(states, last_ns, rate_hz, np.where(np.isfinite(until_s), until_s, np.inf))
+    rows = asked_rows(states, last_ns, fusion.rate_hz, np.where(np.isfinite(until_s), until_s, np.inf), fusion.fresh_s)
     asked = states.rows(rows)
     future = recorded_future(people.t_ns, people.points_m, asked, until_s[rows])
     radii_m, nothing = flesh_m(stage), np.zeros(1, dtype=np.bool_)

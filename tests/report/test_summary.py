@@ -30,10 +30,14 @@ def _lines(run: Run) -> dict[str, str]:
 def test_fuse(run: Run) -> None:
     assert run.state is not None
     assert run.measurements is not None
-    known = 100.0 * np.isfinite(run.state["x"]).mean()
+    n = len(run.state)
+    age_s = np.where(np.arange(n) < n // 4, 0.5, 0.02)  # of the first quarter too old
+    unseen_s = np.where(np.arange(n) < n // 2, 0.5, 0.02)
+    run = dataclasses.replace(run, state=run.state.assign(frame_age_s=age_s, unseen_LEGS=unseen_s, unseen_HD=age_s))
+    run.meta["settings"]["fusion"]["fresh_s"] = 0.3
     frames = run.measurements.groupby("camera").size()
     assert _lines(run)["fuse"] == (
-        f"1,200 ticks, person known in {known:.1f} %; frames with the person: "
+        "1,200 ticks, person known from fresh frames in 75.0 % (LEGS 50.0 %); frames with the person: "
         f"kinect {frames['kinect']}, xtion {frames['xtion']}; 1,234 outlier points"
     )
 
