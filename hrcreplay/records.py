@@ -65,6 +65,12 @@ POINTS = (
     "foot_r",
 )
 
+#: POINTS with left and right exchanged.
+MIRROR = tuple(
+    POINTS.index(name[:-1] + {"l": "r", "r": "l"}[name[-1]]) if name[-2:] in ("_l", "_r") else i
+    for i, name in enumerate(POINTS)
+)
+
 
 def _protect(record: Any) -> None:
     """Gives a record that is being made views of its arrays through which nobody writes."""
@@ -111,6 +117,16 @@ class CameraFrames(Table):
     points_m: Floats  #: (n, 20, 3) POINTS in that camera's own frame [m]
     confidence: Floats  #: (n, 20) in [0, 1]
     cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SkeletonTrack(Table):
+    """One person as one camera saw them, a row a frame, in order of capture."""
+
+    t_ns: Ints  #: (n,) capture time
+    points_m: Floats  #: (n, 20, 3) POINTS in one frame, the camera's or the world's [m]
+    confidence: Floats  #: (n, 20) in [0, 1]
+    delay_s: float = 0.0  #: median from capture to arrival [s]
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.calibration.registration import MIRROR, SkeletonTrack, rigid
-from hrcreplay.records import POINTS, Floats
+from hrcreplay.calibration.registration import rigid
+from hrcreplay.records import MIRROR, POINTS, Floats, SkeletonTrack
 
 _ARM = ("CLAVICLE", "SHOULDER", "ELBOW", "WRIST", "HAND", "HANDTIP", "THUMB")
 _LEG = ("HIP", "KNEE", "ANKLE", "FOOT")

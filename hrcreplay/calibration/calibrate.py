@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hrcreplay.calibration.cell import LEVEL_VIEW, Cell, Floor, Residual, find_floor, floor_frame, up_direction
-from hrcreplay.calibration.registration import Registration, SkeletonTrack, disagreement, register, transform
+from hrcreplay.calibration.registration import Registration, disagreement, register, transform
 from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.logs.camera_checks import CameraChecks, agreement_lines, body_line
 from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import POINTS, Bools, CameraFrames, Floats
+from hrcreplay.records import POINTS, Bools, CameraFrames, Floats, SkeletonTrack
 from hrcreplay.settings.sections import Logs
 
 _WINDOW_S = 10.0  # a long log is looked at in windows, long enough for clock offsets
@@ -27,7 +28,7 @@ _APART_M, _DOUBTFUL_M = 0.15, 0.06
 
 
 class Survey(NamedTuple):
-    """A calibration, and where in its world the person stood."""
+    """A calibration, where in its world the person stood, and how well the cameras agree about that."""
 
     cell: Cell
     lines: tuple[str, ...]  #: main figures, and what --base needs: where the person stood, which way the axes point
@@ -102,9 +103,24 @@ def survey(
         T_world_camera=poses,
         clock_offset_s={name: found[i].offset_s for i, name in enumerate(cameras)},
         residuals=residuals,
-        notes=(*_notes(floor, cameras[root]), *_doubts(residuals)),
     )
-    return Survey(cell, person_positions(cell, tracks, cameras[root]))
+    checks = _checks(cell, tracks)
+    bodies, agreements = checks.figures()
+    notes = (*_notes(floor, cameras[root]), *checks.remarks(), *_doubts(residuals))
+    lines = (*person_positions(cell, tracks, cameras[root]), *map(body_line, bodies), *agreement_lines(agreements))
+    return Survey(replace(cell, notes=notes), lines)
+
+
+def _checks(cell: Cell, tracks: list[SkeletonTrack]) -> CameraChecks:
+    """The tracks in the calibrated world, by one clock, checked as ``info`` and a run check them."""
+    checks = CameraChecks(tuple(cell.T_world_camera))
+    there = [
+        replace(track, t_ns=track.t_ns - round(1e9 * offset_s), points_m=transform(T, track.points_m))
+        for track, T, offset_s in zip(tracks, cell.T_world_camera.values(), cell.clock_offset_s.values(), strict=True)
+    ]
+    camera = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
+    checks.add(camera, SkeletonTrack.join(there))
+    return checks
 
 
 def person_positions(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tuple[str, ...]:

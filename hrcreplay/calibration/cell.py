@@ -15,9 +15,10 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, ValidationError
 
-from hrcreplay.calibration.registration import SkeletonTrack, rigid
+from hrcreplay.calibration.registration import rigid
 from hrcreplay.errors import SettingsError, shown
-from hrcreplay.records import POINTS, Bools, Floats
+from hrcreplay.logs.camera_checks import SOLE_M, SURE
+from hrcreplay.records import POINTS, Bools, Floats, SkeletonTrack
 from hrcreplay.store.run_folder import write_whole
 from hrcreplay.toml_file import read_toml
 
@@ -232,7 +233,6 @@ def _first_problem(error: ValidationError, table: Mapping[str, Any], where: str)
     return f"{at}: found {None if kind == 'missing' else shown(found)}; would be right: {right}"
 
 
-_SOLE_M = 0.03  # foot point above the floor, Winter's foot with a shoe's sole
 _LEG = ("knee", "ankle", "foot")
 _UPRIGHT = 0.9  # neck to ankles, straight over along the bones: a chair gives 0.75 to 0.85
 _STANDING_STD = np.radians(3.0)  # sway, and errors of the trackers' feet
@@ -243,7 +243,6 @@ _REST_S = 0.3  # a foot that is shorter at a place only passes there
 _MANY_S = 1.0  # rows worth this long are needed to tell anything
 #: A view whose z is less points along the floor enough to give it a direction: 60 degrees up or down.
 LEVEL_VIEW = float(np.sin(np.radians(60)))
-_SURE = 0.5  # feet of at most this confidence are guesses of the tracker
 
 
 @dataclass(frozen=True)
@@ -316,7 +315,7 @@ def find_floor(track: SkeletonTrack, up: Floats | None = None) -> Floor | None:
     # Where the person walks, the feet's plane is `level` along the first guess.
     on_plane = middle[0] * e1 + middle[1] * e2 + level[0] * normal
     tilt_std = _FOOT_STD_M * float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(H)[:2, :2])[-1]))
-    return Floor(found, _SOLE_M - float(found @ on_plane), tilt_std)
+    return Floor(found, SOLE_M - float(found @ on_plane), tilt_std)
 
 
 def floor_frame(floor: Floor) -> Floats:
@@ -366,7 +365,7 @@ def _feet(track: SkeletonTrack) -> tuple[Floats, Bools]:
     places, kinds = [], []
     for name in ("ankle_l", "ankle_r", "foot_l", "foot_r"):
         points = _point(track, name)
-        sure = (track.confidence[:, POINTS.index(name)] > _SURE) & np.isfinite(points).all(axis=1)
+        sure = (track.confidence[:, POINTS.index(name)] > SURE) & np.isfinite(points).all(axis=1)
         places.append(points[sure])
         kinds.append(np.full(int(sure.sum()), name.startswith("ankle")))
     return np.concatenate(places), np.concatenate(kinds)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from hrcreplay.calibration.calibrate import in_window, track_of
-from hrcreplay.calibration.registration import ClockOffset, SkeletonTrack, find_clock_offset, transform
-from hrcreplay.records import CameraFrames, Floats
+from hrcreplay.calibration.registration import ClockOffset, find_clock_offset, transform
+from hrcreplay.records import CameraFrames, Floats, SkeletonTrack
 
 #: Clocks that differ by more frames of the slower camera, and by more than this, are told [frames], [s].
 _FRAMES, _LEAST_S = 3.0, 0.1

@@ -14,16 +14,10 @@ import numpy as np
 from numba import njit
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.records import POINTS, Bools, Floats, Ints, Table
-
-#: POINTS with left and right exchanged.
-MIRROR = tuple(
-    POINTS.index(name[:-1] + {"l": "r", "r": "l"}[name[-1]]) if name[-2:] in ("_l", "_r") else i
-    for i, name in enumerate(POINTS)
-)
+from hrcreplay.logs.camera_checks import find_mirrored, interpolate
+from hrcreplay.records import MIRROR, POINTS, Floats, Ints, SkeletonTrack
 
 _NS = 1e-9
-_GAP_S = 0.1  # no interpolation across longer silences
 _SPEED_MAX = 4.0  # m/s: faster is a jump of the tracker, not the person
 _STARTS = 40  # frames whose own alignment is tried as the start
 _ITERATIONS = 60
@@ -33,16 +27,6 @@ _COARSE = 1200  # and of these at most, while offsets are only searched
 _ROUGH = 400  # and of these where an offset is wanted to a frame only
 _TOGETHER = 20  # frames of both in which a point must be seen
 _OVERLAP = 0.4  # of the most point pairs that any offset has
-
-
-@dataclass(frozen=True)
-class SkeletonTrack(Table):
-    """One person as one sensor saw it, a row a frame, in order of capture."""
-
-    t_ns: Ints  #: (n,) capture time on the sensor's own clock
-    points_m: Floats  #: (n, 20, 3) POINTS in the sensor's frame [m]
-    confidence: Floats  #: (n, 20) in [0, 1]
-    delay_s: float = 0.0  #: median from capture to arrival [s]
 
 
 @dataclass(frozen=True)
@@ -209,21 +193,13 @@ def disagreement(a: SkeletonTrack, b: SkeletonTrack, found: Registration) -> Dis
     Returns:
         Median and 95th percentile over all point pairs of positive confidence [m]; None where there is no pair.
     """
-    t_b = a.t_ns + round(found.offset_s / _NS)
-    inside = (t_b >= b.t_ns[0]) & (t_b <= b.t_ns[-1])
-    after = np.clip(np.searchsorted(b.t_ns, t_b), 1, len(b) - 1)
-    gap_ns = b.t_ns[after] - b.t_ns[after - 1]
-    share = ((t_b - b.t_ns[after - 1]) / np.maximum(gap_ns, 1))[:, None]
-    points_b = (1 - share[..., None]) * b.points_m[after - 1] + share[..., None] * b.points_m[after]
-    seen = (a.confidence > 0) & (b.confidence[after - 1] > 0) & (b.confidence[after] > 0)
-    seen &= (inside & (gap_ns <= _GAP_S / _NS))[:, None]
-    there = transform(found.T_a_b, points_b)
+    there = transform(found.T_a_b, interpolate(b, a.t_ns + round(found.offset_s / _NS)))
     apart_m = np.linalg.norm(a.points_m - there, axis=2)
-    seen &= np.isfinite(apart_m)
+    seen = (a.confidence > 0) & np.isfinite(apart_m)
     if not seen.any():
         return None
     scale_m = float(np.median(apart_m[seen]))
-    mirrored = _mirrored(a.points_m, there, seen.astype(np.float64), max(scale_m, 1e-3))
+    mirrored = find_mirrored(a.points_m, there, seen.astype(np.float64), max(scale_m, 1e-3))
     median_m, p95_m = np.percentile(apart_m[seen], [50, 95])
     return Disagreement(float(median_m), float(p95_m), int(seen.sum()), float(mirrored[seen.any(axis=1)].mean()))
 
@@ -329,26 +305,13 @@ def _start(points_a: Floats, points_b: Floats, weight: Floats) -> Floats | None:
     return T_best
 
 
-def _mirrored(points_a: Floats, points_b: Floats, weight: Floats, scale_m: float) -> Bools:
-    """(n,) frames that agree far better with left and right of b exchanged."""
-
-    def cost(other: Floats, w: Floats) -> Floats:
-        squares = np.sum((points_a - other) ** 2, axis=2) / scale_m**2
-        squares = np.where(w > 0, squares, 0.0)
-        return (w * np.log1p(squares)).sum(axis=1) / np.maximum(w.sum(axis=1), 1e-12)
-
-    mirror = list(MIRROR)
-    direct, exchanged = cost(points_b, weight), cost(points_b[:, mirror], weight * weight[:, mirror])
-    return exchanged < 0.5 * direct
-
-
 def _gauss_newton(
     T: Floats, points_a: Floats, points_b: Floats, velocity_a: Floats, weight: Floats
 ) -> tuple[Floats, Floats]:
     """One step on rotation, translation and offset under Cauchy weights: the new T and the step (7,) [rad, m, s]."""
     there = transform(T, points_b)
     scale_m = max(float(np.median(np.linalg.norm(points_a - there, axis=2)[weight > 0])), 1e-6)
-    flip = _mirrored(points_a, there, weight, scale_m)
+    flip = find_mirrored(points_a, there, weight, scale_m)
     mirror = list(MIRROR)
     there = np.where(flip[:, None, None], there[:, mirror], there)
     use = weight > 0

@@ -67,9 +67,10 @@ def info(
     config: Config = None,
     settings: Set = None,
     topic: Topic = None,
+    cell: CellFile = None,
 ) -> None:
     """What a log holds, and what is missing for the next step."""
-    sys.stdout.write("\n".join(commands.describe(log, config, as_overrides(settings, topic))) + "\n")
+    sys.stdout.write("\n".join(commands.describe(log, config, as_overrides(settings, topic), cell)) + "\n")
 
 
 @app.command(name="import")

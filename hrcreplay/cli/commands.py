@@ -159,19 +159,35 @@ def _degrees(text: str) -> tuple[float, ...]:
 KINDS = ("azure", "kinect2", "keraal")
 
 
-def describe(path: Path, config: Path | None, overrides: tuple[str, ...]) -> list[str]:
+def describe(path: Path, config: Path | None, overrides: tuple[str, ...], cell_file: Path | None = None) -> list[str]:
     """What a log holds, line by line.
+
+    Args:
+        path: The log.
+        config: Settings file, or none.
+        overrides: ``section.key=value`` of the command line, which win over the file.
+        cell_file: Poses and clock offsets of the cameras, which win over the log's.
 
     Raises:
         SettingsError: A setting cannot be used.
         LogError: The log cannot be read.
     """
+    from hrcreplay.calibration.cell import Cell, load_cell
     from hrcreplay.logs import info
     from hrcreplay.logs.reader import open_log
     from hrcreplay.settings.load import load_settings
 
     settings = load_settings(config, overrides)
-    return info.lines(info.summarize(open_log(path, settings.logs, skeletons=False)))
+    cell = load_cell(cell_file) if cell_file is not None else Cell()
+    log = open_log(path, settings.logs, skeletons=False)
+    summary = info.summarize(
+        log,
+        options=settings.logs,
+        T_world_camera=cell.T_world_camera,
+        clock_offset_s=cell.clock_offset_s,
+        T_world_base=cell.T_world_base,
+    )
+    return info.lines(summary)
 
 
 def import_files(kind: str, files: list[str], out: Path, rate_hz: float) -> list[str]:

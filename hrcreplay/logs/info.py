@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from hrcreplay.logs.plausibility import BodyPosture
-from hrcreplay.logs.reader import Log
-from hrcreplay.records import CameraFrames, Floats
+from hrcreplay.logs.camera_checks import BodyInWorld, CameraChecks, LimbAgreement, agreement_lines, body_line
+from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.reader import DEFAULT, Log
+from hrcreplay.records import CameraFrames, Floats, SkeletonTrack
+from hrcreplay.settings.sections import Logs
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,14 @@ class CameraSummary:
     longest_gap_s: float  #: between arrivals of frames with a body in them [s]; NaN below two frames
     delay_s: float  #: median from capture to arrival, with the offset of the two clocks in it [s]
     bodies: dict[int, int]  #: body id -> rows
-    posed: bool  #: whether its extrinsics are in the log
+    pose_from: str  #: where its extrinsics are from: the log, the cell; none
     stature_m: float  #: how tall its bodies are by their bones, median [m]; NaN where no bone was seen
+    side_cue: str | None  #: by what its left and right were told apart; None: not checked
+
+    @property
+    def posed(self) -> bool:
+        """Whether its extrinsics are known."""
+        return self.pose_from != "none"
 
 
 @dataclass(frozen=True)
@@ -51,10 +59,12 @@ class Summary:
     topics: tuple[TopicSummary, ...]
     cameras: tuple[CameraSummary, ...]
     has_task: bool
-    has_base: bool
+    base_from: str
     has_truth: bool
     joint_names: tuple[str, ...]
     defects: dict[str, int]
+    bodies: tuple[BodyInWorld, ...]  #: the person on the floor, of each camera whose pose is known
+    agreements: tuple[LimbAgreement, ...]  #: limb by limb, of each two such cameras
     notes: tuple[str, ...]
     missing: tuple[str, ...]  #: what the next step needs and the log lacks, each with what to do
 
@@ -88,29 +98,42 @@ class _Tally:
         self.delays_ns.append(arrival_ns - capture_ns)
 
 
-def summarize(log: Log) -> Summary:
+def summarize(
+    log: Log,
+    *,
+    options: Logs = DEFAULT,
+    T_world_camera: Mapping[str, Floats] | None = None,
+    clock_offset_s: Mapping[str, float] | None = None,
+    T_world_base: Floats | None = None,
+) -> Summary:
     """Summarizes a log in one pass over it.
 
     Args:
         log: An open log; also one without skeletons (``open_log(path, options, skeletons=False)``).
+        options: How the person is told from other bodies.
+        T_world_camera: (4, 4) poses of a cell, which have priority over those of the log.
+        clock_offset_s: Each camera's clock minus the reference camera's, of a cell [s].
+        T_world_base: (4, 4) pose of the robot's base of a cell, which has priority over that of the log.
 
     Raises:
         LogError: The log is broken in a way that cannot be worked around.
     """
     header = log.header
+    base = header.T_world_base if T_world_base is None else T_world_base
     tallies = [_Tally() for _ in header.cameras]
-    stands = {name: BodyPosture() for name in header.cameras if name in header.T_world_camera}
+    cell = T_world_camera or {}
+    poses = {**header.T_world_camera, **cell}
+    person = _PersonInWorld(log, poses, clock_offset_s or {}, options)
     for frames in log.frames():
         _count(frames, tallies)
-        for name, stand in stands.items():
-            rows = frames.points_m[frames.camera == header.cameras.index(name)]
-            stand.add(_taken(header.T_world_camera[name], rows))
+        person.add(frames)
     for _ in log.joints():
         pass  # for the defects of the joint track
     cameras = tuple(
-        _camera(name, tally, log.stature_m[name], posed=name in header.T_world_camera)
+        _camera(name, tally, log, "the cell" if name in cell else "the log" if name in poses else "none")
         for name, tally in zip(header.cameras, tallies, strict=True)
     )
+    bodies, agreements = person.checks.figures()
     return Summary(
         path=header.path,
         kind=header.kind,
@@ -119,17 +142,44 @@ def summarize(log: Log) -> Summary:
         topics=tuple(TopicSummary(topic.name, topic.type, topic.count) for topic in log.topics),
         cameras=cameras,
         has_task=header.task is not None,
-        has_base=header.T_world_base is not None,
+        base_from="none" if base is None else "in the log" if T_world_base is None else "in the cell",
         has_truth=header.has_truth,
         joint_names=header.joint_names,
         defects=dict(log.defects),
-        notes=(*log.notes, *(remark for name, stand in stands.items() if (remark := stand.remark(name)))),
-        missing=tuple(_missing(log, cameras)),
+        bodies=tuple(body for body in bodies if body.camera in poses),
+        agreements=agreements,
+        notes=(*log.notes, *person.checks.remarks(), *_strangers(header.cameras, cell)),
+        missing=tuple(_missing(log, cameras, has_base=base is not None)),
     )
 
 
-def _taken(T: Floats, points_m: Floats) -> Floats:
-    return np.asarray(points_m @ T[:3, :3].T + T[:3, 3])
+def _strangers(cameras: Sequence[str], cell: Mapping[str, Floats]) -> Iterator[str]:
+    """A note on each camera of a cell that the log lacks."""
+    for name in sorted(set(cell) - set(cameras)):
+        there = ", ".join(cameras) or "none"
+        yield f"the cell's camera {name} is not in the log; its cameras are {there}; no other command takes such a cell"
+
+
+class _PersonInWorld:
+    """The person as the cameras whose poses are known show them in the world."""
+
+    def __init__(
+        self, log: Log, poses: Mapping[str, Floats], clock_offset_s: Mapping[str, float], options: Logs
+    ) -> None:
+        cameras = log.header.cameras
+        self.checks = CameraChecks(cameras)
+        unknown = np.full((4, 4), np.nan)
+        self._poses = np.array([poses.get(name, unknown) for name in cameras]).reshape(-1, 4, 4)
+        self._offset_ns = np.array([round(1e9 * clock_offset_s.get(name, 0.0)) for name in cameras], dtype=np.int64)
+        self._memory, self._options = PersonMemory(), options
+
+    def add(self, frames: CameraFrames) -> None:
+        jump_m, memory_s = self._options.person_jump_m, self._options.person_memory_s
+        self._memory, mine, _ = select_person(frames, self._memory, self._poses, jump_m, memory_s)
+        T = self._poses[mine.camera]
+        points_m = np.einsum("nij,npj->npi", T[:, :3, :3], mine.points_m) + T[:, None, :3, 3]
+        track = SkeletonTrack(mine.capture_ns - self._offset_ns[mine.camera], points_m, mine.confidence)
+        self.checks.add(mine.camera, track)
 
 
 def _count(frames: CameraFrames, tallies: list[_Tally]) -> None:
@@ -138,7 +188,7 @@ def _count(frames: CameraFrames, tallies: list[_Tally]) -> None:
         tallies[camera].add(capture_ns, arrival_ns, body)
 
 
-def _camera(name: str, tally: _Tally, stature_m: float, *, posed: bool) -> CameraSummary:
+def _camera(name: str, tally: _Tally, log: Log, pose_from: str) -> CameraSummary:
     several = tally.frames > 1
     return CameraSummary(
         name=name,
@@ -149,12 +199,13 @@ def _camera(name: str, tally: _Tally, stature_m: float, *, posed: bool) -> Camer
         longest_gap_s=tally.longest_ns / 1e9 if several else float("nan"),
         delay_s=float(np.median(tally.delays_ns)) / 1e9 if tally.frames else float("nan"),
         bodies=dict(sorted(tally.bodies.items())),
-        posed=posed,
-        stature_m=stature_m,
+        pose_from=pose_from,
+        stature_m=log.stature_m[name],
+        side_cue=log.side_cue[name],
     )
 
 
-def _missing(log: Log, cameras: tuple[CameraSummary, ...]) -> Iterator[str]:
+def _missing(log: Log, cameras: tuple[CameraSummary, ...], *, has_base: bool) -> Iterator[str]:
     header = log.header
     if not cameras:
         yield "skeletons: name a topic with --topic NAME, or a decoder for it in [logs.decoders] of the settings file"
@@ -163,7 +214,7 @@ def _missing(log: Log, cameras: tuple[CameraSummary, ...]) -> Iterator[str]:
             yield f"frames of camera {camera.name}: it is named but delivers nothing"
         elif not camera.posed:
             yield f"extrinsics of camera {camera.name}: run hrcreplay calibrate, or give a cell file with --cell"
-    if header.T_world_base is None:
+    if not has_base:
         yield "the robot's base pose: give a cell file with --cell"
     if header.task is None and not header.joint_names:
         yield "the robot's task: name a task file with --set plan.task=FILE"
@@ -185,11 +236,14 @@ def lines(summary: Summary) -> list[str]:
         out.append("  none")
     out += [
         f"task     {'in the log' if summary.has_task else 'none'}",
-        f"base     {'in the log' if summary.has_base else 'none'}",
+        f"base     {summary.base_from}",
         f"truth    {'in the log' if summary.has_truth else 'none'}",
         f"joints   {', '.join(summary.joint_names) or 'none'}",
         f"person   {', '.join(_tall(camera) for camera in summary.cameras) or 'none'}",
     ]
+    out += [f"sides    {', '.join(_sided(camera) for camera in summary.cameras) or 'none'}"]
+    out += ["floor", *(f"  {body_line(body)}" for body in summary.bodies)] if summary.bodies else ["floor    not known"]
+    out += ["agreement", *(f"  {line}" for line in agreement_lines(summary.agreements))] if summary.agreements else []
     delivered = {f"frames_{camera.name}" for camera in summary.cameras}  # counted with the defects, but none
     found = {name: n for name, n in summary.defects.items() if n and name not in delivered}
     out += ["defects", *(f"  {name}  {n}" for name, n in found.items())] if found else ["defects  none"]
@@ -205,6 +259,11 @@ def _tall(camera: CameraSummary) -> str:
     return f"{tall} ({camera.name})"
 
 
+def _sided(camera: CameraSummary) -> str:
+    checked = f"checked as the {camera.side_cue}" if camera.side_cue else "not checked, no feet or bent knees seen"
+    return f"left and right {checked} ({camera.name})"
+
+
 def _camera_line(camera: CameraSummary, start_ns: int) -> str:
     if camera.first_ns is None or camera.last_ns is None:
         return f"  {camera.name}: no frames"
@@ -214,5 +273,5 @@ def _camera_line(camera: CameraSummary, start_ns: int) -> str:
         f"  {camera.name}: {camera.frames} frames at {camera.rate_hz:.2f} Hz, "
         f"from {(camera.first_ns - start_ns) / 1e9:.3f} to {(camera.last_ns - start_ns) / 1e9:.3f} s, "
         f"longest gap {camera.longest_gap_s:.3f} s, delay {1e3 * camera.delay_s:.1f} ms, bodies {bodies}, "
-        f"extrinsics {'in the log' if camera.posed else 'none'}"
+        f"extrinsics {f'in {camera.pose_from}' if camera.posed else 'none'}"
     )

@@ -1,4 +1,4 @@
-"""Checks whether the bodies of a log can be a person: size, proportions, left and right, uprightness, limbs never seen.
+"""Checks whether the bodies of a log can be a person: size, bones, left and right, uprightness, limbs never seen.
 
 What is unusual becomes a note. What is certainly no person (a wrong unit) is refused, with what would correct it. All
 checks use medians, so that occasional errors of a tracker change nothing.
@@ -7,7 +7,7 @@ checks use medians, so that occasional errors of a tracker change nothing.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -27,6 +27,20 @@ _SHARES = {
 }
 _FROM, _TO = (np.array([POINTS.index(bone[end]) for bone in _SHARES]) for end in (0, 1))
 _SHARE = np.array(list(_SHARES.values()))
+#: Statures of adults: 5th percentile of women, 95th of men [m] (Gordon et al., 1988 Anthropometric Survey of U.S. Army
+#: Personnel, NATICK/TR-89/044).
+ADULT_M = (1.528, 1.867)
+#: Bones of recorded people, as trackers see them, lie up to a fifth outside the shares of a stature.
+_BONE_MARGIN = 0.25
+#: Left and right of one person differ by less, on recordings by up to a sixth.
+_UNEQUAL = 1.25
+_BONE_NAMES = {
+    "pelvis": "trunk (pelvis to neck)",
+    "shoulder": "upper arm",
+    "elbow": "forearm",
+    "hip": "thigh",
+    "knee": "shank",
+}
 #: What a body is wrong by where its unit is: factor on metres -> name of the unit that was taken for metres.
 _UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches"}
 #: Points that place the limbs of the model; the volume of a limb without them holds all that its joints allow.
@@ -41,22 +55,25 @@ _PLACED_BY = {
 _FEW = 10  # rows that say too little for a refusal
 _BATCH = 256
 _MIRRORED = 0.3  # of the volume that three unit vectors span: feet point out, shoulders turn
+_BENT_M = 0.05  # a knee that is further from the line between hip and ankle shows where ahead is
+_OFTEN = 0.1  # of the frames: a tracker mixes up left and right now and then
 _PELVIS_M = (0.0, 1.6)  # above the floor: of who sits on it, of who stands on a step
 _UPRIGHT = np.cos(np.radians(60.0))
 
 
 class BodyShape:
-    """Size and handedness of the bodies of one camera, from the points before cleaning."""
+    """Size, bones and sides of the bodies of one camera, from the points before cleaning."""
 
     def __init__(self) -> None:
         self._waiting: list[Floats] = []
         self._statures: list[Floats] = []
-        self._sides: list[Floats] = []
         self._bones: list[Floats] = []
+        self._sides: dict[str, list[Floats]] = {cue: [] for cue in _AHEAD}
+        self._twists: list[Floats] = []
 
-    def add(self, points: Floats) -> None:
-        """Takes a body (20, 3) in the camera's frame, in what was said to be metres."""
-        self._waiting.append(points)
+    def add(self, points: Floats, confidence: Floats) -> None:
+        """Takes a body (20, 3) in the camera's frame, in what was said to be metres; of confidence 0 is not seen."""
+        self._waiting.append(np.where((confidence > 0)[:, None], points, np.nan))
         if len(self._waiting) >= _BATCH:
             self._flush()
 
@@ -67,8 +84,10 @@ class BodyShape:
             there = np.isfinite(points).all(axis=2) & (np.abs(points).max(axis=2) > 0.0)
             points = np.where(there[..., None] & (np.abs(points) < 1e12), points, np.nan)  # so that squares are numbers
             self._statures.append(statures(points))
-            self._sides.append(handedness(points))
             self._bones.append(_heights(points))
+            for cue, sides in self._sides.items():
+                sides.append(handedness(points, cue))
+            self._twists.append(twist(points))
 
     @property
     def ratio(self) -> float:
@@ -89,14 +108,42 @@ class BodyShape:
         return sum(int(np.isfinite(part).sum()) for part in self._statures) >= _FEW
 
     @property
-    def side(self) -> float:
-        """Median of ``handedness``: 1 a person, -1 a mirror image; NaN where no foot was seen."""
+    def bones_m(self) -> dict[tuple[str, str], float]:
+        """Median length of every bone of _SHARES [m]; NaN where it was seen in too few frames."""
         self._flush()
-        return _median(self._sides)
+        heights = np.concatenate(self._bones) if self._bones else np.empty((0, len(_SHARES)))
+        columns = [column[np.isfinite(column)] for column in heights.T]
+        return {
+            bone: share * float(np.median(column)) if len(column) >= _FEW else float("nan")
+            for (bone, share), column in zip(_SHARES.items(), columns, strict=True)
+        }
+
+    @property
+    def side_cue(self) -> str | None:
+        """By what left and right are told apart: the surest of _AHEAD that was seen; None where none was."""
+        self._flush()
+        return next((cue for cue, parts in self._sides.items() if len(_finite(parts)) >= _FEW), None)
+
+    def remarks(self, camera: str) -> Iterator[str]:
+        """Notes on bones that no adult has, and on left and right."""
+        if PERSON_M[0] <= self.stature_m <= PERSON_M[1]:  # in another unit every bone is wrong, which is told as such
+            yield from bone_remarks(camera, self.bones_m)
+        if self.side_cue is not None:
+            yield from mirror_remarks(camera, _finite(self._sides[self.side_cue]), self.side_cue)
+        twists = _finite(self._twists)
+        if len(twists) >= _FEW and np.median(twists) < 0.0:
+            yield (
+                f"camera {camera}: the shoulders' left is the hips' right (median); would be right: left is the "
+                "person's own left at arms and legs"
+            )
+
+
+def _finite(parts: list[Floats]) -> Floats:
+    return np.concatenate([part[np.isfinite(part)] for part in parts]) if parts else np.empty(0)
 
 
 def _median(parts: list[Floats]) -> float:
-    known = np.concatenate([part[np.isfinite(part)] for part in parts]) if parts else np.empty(0)
+    known = _finite(parts)
     return float(np.median(known)) if len(known) else float("nan")
 
 
@@ -135,16 +182,51 @@ def looks_like_person(points: Floats) -> bool:
     return bone_ratio(points) <= PROPORTION
 
 
-def handedness(points: Floats) -> Floats:
-    """(n,) the volume that forward (ankle to foot), left and up span, of unit vectors: negative in a mirror image."""
+def _at(points: Floats, name: str) -> Floats:
+    return points[:, POINTS.index(name)]
 
-    def at(name: str) -> Floats:
-        return points[:, POINTS.index(name)]
 
-    up = _unit(at("neck") - at("pelvis"))
-    left = _unit(at("shoulder_l") - at("shoulder_r"))
-    ahead = _unit(at("foot_l") - at("ankle_l") + at("foot_r") - at("ankle_r"))
-    return np.asarray(np.einsum("ni,ni->n", np.cross(ahead, left), up))
+def _feet(points: Floats) -> Floats:
+    """(n, 3) from the ankles to the feet, both sides added [m]."""
+    left, right = (_at(points, f"foot_{s}") - _at(points, f"ankle_{s}") for s in "lr")
+    return left + right
+
+
+def _knees(points: Floats) -> Floats:
+    """(n, 3) from the line between hip and ankle to the knee, both sides added [m]; NaN for a straight leg."""
+    total = np.zeros((len(points), 3))
+    for s in "lr":
+        hip, knee, ankle = (_at(points, f"{name}_{s}") for name in ("hip", "knee", "ankle"))
+        along = _unit(ankle - hip)
+        off = knee - hip - np.einsum("ni,ni->n", knee - hip, along)[:, None] * along
+        total += np.where(np.linalg.norm(off, axis=1, keepdims=True) > _BENT_M, off, np.nan)
+    return total
+
+
+#: What shows where a body's front is, the surest first: how it is called -> (n, 3) a direction ahead. Elbows do not:
+#: in two of ten recordings they bend backwards most of the time, by the turning of the upper arm.
+_AHEAD: dict[str, Callable[[Floats], Floats]] = {
+    "feet point": _feet,
+    "knees bend": _knees,
+}
+
+
+def handedness(points: Floats, cue: str = "feet point") -> Floats:
+    """(n,) the volume that ahead, left and up span, of unit vectors: negative in a mirror image.
+
+    Args:
+        points: (n, 20, 3) in any right-handed frame [m].
+        cue: What shows where ahead is: feet or knees.
+    """
+    up = _unit(_at(points, "neck") - _at(points, "pelvis"))
+    left = _unit(_at(points, "shoulder_l") - _at(points, "shoulder_r"))
+    return np.asarray(np.einsum("ni,ni->n", np.cross(_unit(_AHEAD[cue](points)), left), up))
+
+
+def twist(points: Floats) -> Floats:
+    """(n,) cosine between left of the shoulders and left of the hips: negative where one of the two is exchanged."""
+    shoulders, hips = (_unit(_at(points, f"{name}_l") - _at(points, f"{name}_r")) for name in ("shoulder", "hip"))
+    return np.asarray(np.einsum("ni,ni->n", shoulders, hips))
 
 
 def _unit(vectors: Floats) -> Floats:
@@ -181,14 +263,60 @@ def impossible_size(stature_m: float) -> bool:
     return stature_m > _CERTAIN * PERSON_M[1] or stature_m < PERSON_M[0] / _CERTAIN
 
 
-def mirror_remark(camera: str, side: float) -> str | None:
-    """A note where a camera sees mirror images; None where it does not."""
-    if not side < -_MIRRORED:
-        return None
-    return (
-        f"camera {camera}: left and right of the body are exchanged as its feet point (one axis mirrored, or "
-        "left-handed coordinates); would be right: x, y, z right-handed, left is the person's own left"
-    )
+def mirror_remarks(camera: str, sides: Floats, cue: str) -> Iterator[str]:
+    """A note where a camera sees mirror images, always or often.
+
+    Args:
+        camera: Its name.
+        sides: (n,) ``handedness`` of its frames.
+        cue: By what.
+    """
+    often = float((sides < -_MIRRORED).mean())
+    always = np.median(sides) < -_MIRRORED
+    if always or often > _OFTEN:
+        share = "" if always else f" in {100 * often:.0f} % of the frames"
+        yield (
+            f"camera {camera}: left and right of the body are exchanged as its {cue}{share} (names exchanged, one axis "
+            "mirrored, or left-handed coordinates); would be right: x, y, z right-handed, left is the person's own left"
+        )
+
+
+def bone_range_m(bone: tuple[str, str]) -> tuple[float, float]:
+    """How long a bone of an adult is as trackers see it: its share of ADULT_M, and a margin [m]."""
+    share = _SHARES[bone]
+    return share * ADULT_M[0] * (1.0 - _BONE_MARGIN), share * ADULT_M[1] * (1.0 + _BONE_MARGIN)
+
+
+def bone_remarks(camera: str, bones_m: Mapping[tuple[str, str], float]) -> Iterator[str]:
+    """A note on the bones that are none of an adult, and one on those that differ from left to right."""
+    odd = {
+        bone: f"{_bone_name(bone)} {length_m:.2f} m (an adult's: {low_m:.2f} to {high_m:.2f})"
+        for bone, length_m in bones_m.items()
+        for low_m, high_m in [bone_range_m(bone)]
+        if length_m < low_m or length_m > high_m
+    }
+    if odd:
+        yield (
+            f"camera {camera}: {', '.join(odd.values())} (medians); would be right: points that are the person's "
+            "joints, in metres, of an adult"
+        )
+    unequal = []
+    for (start, end), left_m in bones_m.items():
+        other = (start.replace("_l", "_r"), end.replace("_l", "_r"))
+        right_m = bones_m[other]
+        told = (start, end) in odd or other in odd
+        if start.endswith("_l") and not told and max(left_m, right_m) > _UNEQUAL * min(left_m, right_m):
+            unequal.append(f"{_BONE_NAMES[start[:-2]]} {left_m:.2f} m left, {right_m:.2f} m right")
+    if unequal:
+        yield (
+            f"camera {camera}: {', '.join(unequal)} (medians); would be right: equal within "
+            f"{100 * (_UNEQUAL - 1):.0f} %"
+        )
+
+
+def _bone_name(bone: tuple[str, str]) -> str:
+    name, _, side = bone[0].partition("_")
+    return {"l": "left ", "r": "right "}.get(side, "") + _BONE_NAMES[name]
 
 
 def unmeasured_limbs(seen: Mapping[str, Bools]) -> Iterator[str]:

@@ -169,6 +169,9 @@ class Log:
         self._refusals: list[str] = []
         self._track: Counter[str] = Counter()
         self.stature_m: dict[str, float] = {}  #: camera -> how tall its bodies are, of the latest pass; NaN: not known
+        self.side_cue: dict[
+            str, str | None
+        ] = {}  #: camera -> by what left and right were told apart; None: not checked
         self.points_seen = 0  #: points with a place and a confidence, of the latest pass
         self.header = _header(source, decoders, self._joints, self._truth, chosen=bool(options.topics))
 
@@ -217,7 +220,7 @@ class Log:
             if decoder.shows_camera_alive:
                 cleaner.note_arrival(decoder.cameras[0], message.arrival_ns)
             for row in rows:
-                shapes[row.camera].add(row.points_m)
+                shapes[row.camera].add(row.points_m, row.confidence)
                 places.add(row.camera, row.body, message.arrival_ns, row.points_m)
                 chunk = cleaner.add(row, message.arrival_ns)
                 if chunk is not None:
@@ -242,6 +245,7 @@ class Log:
     def _judge(self, cleaner: Cleaner, shapes: dict[str, plausibility.BodyShape]) -> None:
         self.points_seen = cleaner.points.total()
         self.stature_m = {camera: shape.stature_m for camera, shape in shapes.items()}
+        self.side_cue = {camera: shape.side_cue for camera, shape in shapes.items()}
         for camera, shape in shapes.items():
             size = plausibility.size_remark(camera, shape.stature_m, self._unit_of(camera))
             if size is not None:
@@ -251,9 +255,7 @@ class Log:
             proportion = plausibility.proportion_remark(camera, shape.ratio)
             if proportion is not None and shape.certain:
                 self._remarks.append(proportion)
-            side = plausibility.mirror_remark(camera, shape.side)
-            if side is not None:
-                self._remarks.append(side)
+            self._remarks.extend(shape.remarks(camera))
         self._remarks.extend(plausibility.unmeasured_limbs(cleaner.seen))
 
     def _refuse(self, remarks: Iterator[str]) -> None:

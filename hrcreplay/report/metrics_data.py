@@ -45,6 +45,8 @@ def add_quality(metrics: MetricTable, run: Run, gap_s: float) -> None:
     for camera in cameras(run):
         _add_frames(metrics, run.measurements, camera, gap_s)
         _add_validity(metrics, run.state, camera, gap_s)
+        _add_heights(metrics, run.bodies, camera)
+    add_agreement(metrics, run.agreement)
     if run.state is not None:
         _add_coverage(metrics, run.state)
         _add_known(metrics, run.state, run.meta.get("settings", {}).get("fusion", {}).get("fresh_s"))
@@ -99,6 +101,36 @@ def _add_validity(metrics: MetricTable, state: pd.DataFrame | None, camera: str,
         f"share of ticks at most {gap_s:g} s after a tick whose update used a row of {camera}",
         reason="not fused",
     )
+
+
+def _add_heights(metrics: MetricTable, bodies: pd.DataFrame | None, camera: str) -> None:
+    found = None if bodies is None else bodies[bodies["camera"] == camera]
+    texts = {
+        "floor_m": "how far the person's lowest foot is above the floor z = 0",
+        "floor_p95_m": "distance of the person's lowest foot from the floor z = 0, 95th percentile",
+        "head_m": "the person's head above the floor, upright",
+        "bones_m": "the person's bones from floor to head added up, upright",
+    }
+    for name, text in texts.items():
+        value = None if found is None or found.empty else float(found[name].iloc[0])
+        middle = "" if "p95" in name else ", median"
+        reason = "no such table, or it was not seen"
+        metrics.add(f"camera_{camera}_{name}", value, "m", f"{text}, by {camera}{middle}", reason=reason)
+
+
+def add_agreement(metrics: MetricTable, agreement: pd.DataFrame | None) -> None:
+    """How far any two cameras show each limb of BODY apart at the same instants."""
+    for limb in BODY:
+        rows = None if agreement is None else agreement[agreement["limb"] == limb]
+        for name, text in (("median_m", "median"), ("p95_m", "95th percentile")):
+            metrics.add(
+                f"cameras_{limb}_apart_{name}",
+                None if rows is None or rows.empty else float(rows[name].max()),
+                "m",
+                f"distance at the same instant between the points of {limb} that two cameras show, {text}; "
+                "of the two that differ most",
+                reason="no two cameras showed it at the same instant, or no such table",
+            )
 
 
 def seconds_since(state: pd.DataFrame, valid: Bools) -> Floats:

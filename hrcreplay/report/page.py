@@ -28,6 +28,7 @@ from hrcreplay.report.tables import (
     PLAN_COST,
     PLAN_SAFETY,
     PageTable,
+    agreement_table,
     compare,
     limb_names_text,
     percent,
@@ -159,6 +160,7 @@ def _parts(
             _figures(figures_dir, "data"),
             (
                 compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA),
+                *agreement_table(run.agreement),
                 *_limbs(metrics),
                 *_counters(run),
             ),

@@ -9,9 +9,11 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hrcreplay.human.model import LimitSet
-from hrcreplay.records import JOINTS
+from hrcreplay.logs import camera_checks
+from hrcreplay.records import BODY, JOINTS
 from hrcreplay.report.metrics import ANGLES, Metric
 from hrcreplay.robot.model import RobotModel
 
@@ -58,6 +60,10 @@ CAMERA = (
     ("longest gap", "gap_max_s"),
     ("ticks whose update used it", "valid_share"),
     ("time available", "available_share"),
+    ("lowest foot above the floor, median", "floor_m"),
+    ("\u2026 its distance from the floor, 95th percentile", "floor_p95_m"),
+    ("standing upright: head above the floor, median", "head_m"),
+    ("\u2026 by the sum of the bones", "bones_m"),
 )
 FUSION = (
     ("angle RMSE, 10 angles pooled", "angle_rmse"),
@@ -233,6 +239,31 @@ def compare(
     return PageTable(title, ("", *columns), tuple(body), note)
 
 
+def agreement_table(agreement: pd.DataFrame | None) -> tuple[PageTable, ...]:
+    """How far two cameras show each limb apart; nothing where there are no two."""
+    if agreement is None:
+        return ()
+    pairs = list(dict.fromkeys(zip(agreement["a"], agreement["b"], strict=True)))
+    body = []
+    for limb in BODY:
+        cells = []
+        for a, b in pairs:
+            found = agreement[(agreement["a"] == a) & (agreement["b"] == b) & (agreement["limb"] == limb)]
+            cells.append(
+                f"{found['median_m'].iloc[0]:.3f} / {found['p95_m'].iloc[0]:.3f} m" if len(found) else "\u2013"
+            )
+        body.append((limb_names_text([limb]), *cells))
+    return (
+        PageTable(
+            "How far two cameras show a limb apart at the same instant, median / 95th percentile",
+            ("", *(f"{a} \u2013 {b}" for a, b in pairs)),
+            tuple(body),
+            "Over the points in which the limb ends, hands and feet included, clocks corrected; a dash: never shown by "
+            "both.",
+        ),
+    )
+
+
 _LITRES = 1000.0  # a cubic metre
 
 
@@ -310,15 +341,8 @@ def robot_table(robot: Mapping[str, Any]) -> PageTable:
     )
 
 
-#: What people call LIMBS.
-LIMB_NAMES = {
-    "HD": "head",
-    "THX": "trunk",
-    "URA": "right upper arm",
-    "LRA": "right lower arm",
-    "ULA": "left upper arm",
-    "LLA": "left lower arm",
-}
+#: What people call BODY.
+LIMB_NAMES = camera_checks.LIMB_NAMES
 
 #: What people call the parts of a recorded body that are no LIMBS.
 _PART_NAMES = {

@@ -117,7 +117,7 @@ STAGES = ("fuse", "predict", "plan")
 
 #: What each stage leaves behind.
 TABLES = {
-    "fuse": ("measurements.parquet", "state.parquet", "truth.parquet"),
+    "fuse": ("measurements.parquet", "state.parquet", "truth.parquet", "bodies.parquet", "agreement.parquet"),
     "predict": ("occupancy.parquet",),
     "plan": ("motion.parquet", "motion_*.parquet"),
 }

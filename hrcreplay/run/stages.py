@@ -22,14 +22,21 @@ from hrcreplay.calibration.clock_check import ClockCheck
 from hrcreplay.errors import LogError
 from hrcreplay.geometry import convex_hull
 from hrcreplay.human.fusion import fuse, inverse_kinematics
+from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clean import PersonMemory
-from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SkeletonTrack, SweptVolumes
 from hrcreplay.run.build import Forecast, FusionStage, PredictionStage
 from hrcreplay.run.followers import Planner
 from hrcreplay.settings.sections import Fusion
-from hrcreplay.store.columns import measurement_columns, motion_columns, occupancy_columns, state_columns, truth_columns
+from hrcreplay.store.columns import (
+    measurement_columns,
+    motion_columns,
+    occupancy_columns,
+    record_columns,
+    state_columns,
+    truth_columns,
+)
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 NS = 1_000_000_000
@@ -105,7 +112,7 @@ def fused(
     memory = PersonMemory()
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
     smoother = StretchSmoother(fusion_stage.filter)
-    stands = [BodyPosture() for _ in log.header.cameras]
+    checks = CameraChecks(log.header.cameras)
     clocks = ClockCheck(log.header.cameras, fusion_stage.T_world_camera, int(ticks_ns[0]), int(ticks_ns[-1]))
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
@@ -116,8 +123,8 @@ def fused(
             clocks.add(fusion_stage.on_one_clock(seen))
             sink.counts.update(found)
             sink.run.table("measurements", measurement_columns(measured))
-            for stand, c in zip(stands, range(len(stands)), strict=True):
-                stand.add(measured.points_m[measured.camera == c])
+            track = SkeletonTrack(measured.capture_ns, measured.points_m, measured.confidence)
+            checks.add(measured.camera, track)
         with sink.watch.stage("fuse", len(ticks)):
             state, states, events, trace = fuse.fuse(
                 state, ticks, measured, fusion_stage.filter, fusion_stage.limits, traced=smooth
@@ -135,7 +142,11 @@ def fused(
         raise _nobody(log, sink.counts)
     with sink.watch.stage("clocks", len(ticks_ns)):
         sink.notes["fuse"].extend(clocks.remarks())
-    sink.notes["fuse"].extend(_oddities(log, stands, sink.counts))
+    sink.notes["fuse"].extend(_late(log, sink.counts))
+    sink.notes["fuse"].extend(checks.remarks())
+    for name, rows in zip(("bodies", "agreement"), checks.figures(), strict=True):
+        if rows:
+            sink.run.table(name, record_columns(rows))
     if others := sink.counts["person_frames_beside_others"]:
         sink.notes["fuse"].append(
             f"{others} frames show at least one other body than the person: it counts for contact, but nothing is "
@@ -207,8 +218,8 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
     )
 
 
-def _oddities(log: Log, stands: list[BodyPosture], counts: Counter[str]) -> Iterator[str]:
-    """Notes on frames that came too late, and on an unusual posture of the person in the world."""
+def _late(log: Log, counts: Counter[str]) -> Iterator[str]:
+    """Notes on frames that came too late."""
     for camera in log.header.cameras:
         late = counts[f"frames_late_{camera}"]
         if late:
@@ -216,10 +227,6 @@ def _oddities(log: Log, stands: list[BodyPosture], counts: Counter[str]) -> Iter
                 f"camera {camera}: {late} of {log.defects[f'frames_{camera}']} rows are not used, as they came more "
                 "than fusion.fresh_s after their capture"
             )
-    for camera, stand in zip(log.header.cameras, stands, strict=True):
-        remark = stand.remark(camera)
-        if remark is not None:
-            yield remark
 
 
 def no_frames(cameras: tuple[str, ...]) -> Measurements:

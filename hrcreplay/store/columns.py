@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,8 @@ def state_columns(states: HumanStates) -> Columns:
 #: Columns that a table of a run folder has whatever the cameras and the robot; who reads one counts on them.
 COLUMNS = {
     "measurements": ("capture_ns", "arrival_ns", "camera", *JOINTS, *(f"{joint}_std" for joint in JOINTS), *_LENGTHS),
+    "bodies": ("camera", "frames", "floor_m", "floor_p95_m", "by_ankles", "head_m", "bones_m"),
+    "agreement": ("a", "b", "limb", "median_m", "p95_m", "pairs", "mirrored"),
     "truth": ("t_ns", *JOINTS, *_LENGTHS),
     "state": (
         "t_ns",
@@ -232,6 +235,12 @@ def contact_columns(
         "left_full_m": left_full[0],
         "left_full_limb": _names(left_full[1], left_full[2]),
     }
+
+
+def record_columns(rows: Sequence[Any]) -> Columns:
+    """A row a record: flat dataclasses of one kind, a column a field."""
+    columns = {spec.name: [getattr(row, spec.name) for row in rows] for spec in fields(rows[0])}
+    return {name: _text(values) if isinstance(values[0], str) else np.array(values) for name, values in columns.items()}
 
 
 def body_columns(t_ns: Ints, axes_m: Floats, parts: tuple[str, ...]) -> Columns:

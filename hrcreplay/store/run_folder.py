@@ -174,6 +174,8 @@ class Run:
     state: pd.DataFrame | None = None
     measurements: pd.DataFrame | None = None
     truth: pd.DataFrame | None = None
+    bodies: pd.DataFrame | None = None
+    agreement: pd.DataFrame | None = None
     occupancy: pd.DataFrame | None = None
     motion: pd.DataFrame | None = None
     contact: pd.DataFrame | None = None
@@ -243,6 +245,8 @@ def read(folder: Path, meta: dict[str, Any] | None = None, *, shown: bool = Fals
         state=table("state", NOT_SHOWN if shown else None),
         measurements=table("measurements"),
         truth=table("truth"),
+        bodies=table("bodies"),
+        agreement=table("agreement"),
         occupancy=table("occupancy"),
         motion=table("motion"),
         contact=table("contact"),

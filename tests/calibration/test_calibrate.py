@@ -10,12 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration.calibrate import calibrate, collect_tracks, survey
-from hrcreplay.calibration.registration import Disagreement, Registration, SkeletonTrack, rigid, transform
+from hrcreplay.calibration.registration import Disagreement, Registration, rigid, transform
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.importers import import_azure, import_keraal, import_kinect2
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.records import CameraFrames, Floats
+from hrcreplay.records import POINTS, CameraFrames, Floats, SkeletonTrack
 from tests.realdata import data_path
 from tests.reobserve import POSE, Truth, angle_deg, read_azure, reobserve, walker, write_azure
 
@@ -269,6 +269,30 @@ def test_cameras_that_hardly_fit_are_doubted(tmp_path: Path) -> None:
     (rest,) = cell.residuals
     assert 0.06 < rest.median_m < 0.15
     assert f"a and b stay {1e3 * rest.median_m:.0f} mm apart (median), where one movement leaves" in cell.notes[-1]
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.4])
+def test_limbs_on_which_cameras_differ_are_told_with_floor_and_height(off_m: float, tmp_path: Path) -> None:
+    """Arms and trunk fit, the legs of one camera are elsewhere; the figures against a comparison of every frame."""
+    a = _by_camera_a()
+    b = reobserve(a, Truth(POSE, 0.03), 5)
+    points = b.points_m.copy()
+    legs = [i for i, name in enumerate(POINTS) if name.split("_")[0] in ("hip", "knee", "ankle", "foot")]
+    points[:, legs] += [0.0, 0.6 * off_m, 0.8 * off_m]
+    cell, lines = survey(_log(tmp_path / "log.mcap", {"a": a, "b": SkeletonTrack(b.t_ns, points, b.confidence)}), "a")
+    (line,) = [line for line in lines if line.startswith("a - b, legs")]
+    median_m = float(line.split("apart by ")[1].split(" mm")[0]) / 1e3
+    T_a_b = np.linalg.inv(cell.T_world_camera["a"]) @ cell.T_world_camera["b"]
+    there = transform(np.asarray(T_a_b), points)
+    nearest = np.abs(b.t_ns - 30_000_000 - a.t_ns[:, None]).argmin(axis=1)
+    apart_m = np.linalg.norm(a.points_m[:, legs] - there[nearest][:, legs], axis=2)
+    assert median_m == pytest.approx(np.median(apart_m), abs=0.01)  # it interpolates
+    assert median_m == pytest.approx(off_m, abs=0.05)
+    told = [note for note in cell.notes if "cameras a and b show a limb apart" in note]
+    assert [("legs" in note, "arm" in note) for note in told] == ([(True, False)] if off_m else [])
+    (floor,) = [line for line in lines if line.startswith("a: lowest foot")]
+    assert abs(float(re.findall(r"[-+]\d+\.\d", floor)[0])) < 2.0
+    assert float(re.findall(r"head (\d\.\d\d) m above the floor", floor)[0]) == pytest.approx(1.65, abs=0.06)
 
 
 def test_millimetres_are_no_person_to_calibrate_by(tmp_path: Path) -> None:

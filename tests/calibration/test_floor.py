@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration.cell import find_floor, floor_frame, up_direction
-from hrcreplay.calibration.registration import SkeletonTrack, rigid, transform
-from hrcreplay.records import POINTS, Floats
+from hrcreplay.calibration.registration import rigid, transform
+from hrcreplay.records import POINTS, Floats, SkeletonTrack
 from tests.reobserve import angle_deg, walker
 
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x right, y down, z ahead
