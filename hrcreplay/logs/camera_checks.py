@@ -49,6 +49,7 @@ _HEIGHT_M = 0.15
 SURE = 0.5
 _MIRRORED = 0.2  # share of the frames; a tracker mixes up left and right now and then
 _FEW = 10  # frames that are too few to judge by
+_FEW_PAIRS = 100  # points that are too few for a 95th percentile: it would rest on less than five
 _GAP_NS = 100_000_000  # no interpolation across longer silences
 _SCALE_M = 0.05  # by how much two cameras differ at one point
 _UPRIGHT = 0.95  # neck to ankles, straight over along the bones
@@ -249,7 +250,7 @@ def pair_remarks(agreements: Sequence[LimbAgreement]) -> Iterator[str]:
     """The limbs that two cameras show too far apart, and pairs of which one exchanges left and right."""
     for a, b in dict.fromkeys((found.a, found.b) for found in agreements):
         limbs = [found for found in agreements if (found.a, found.b) == (a, b) and found.pairs >= _FEW]
-        far = [f"{LIMB_NAMES[found.limb]} {found.p95_m:.2f} m" for found in limbs if found.p95_m > APART_M]
+        far = [f"{LIMB_NAMES[found.limb]} {found.p95_m:.2f} m" for found in limbs if _is_far(found)]
         if limbs and limbs[0].mirrored > _MIRRORED:
             yield (
                 f"cameras {a} and {b}: one shows left and right of the body exchanged against the other in "
@@ -260,6 +261,11 @@ def pair_remarks(agreements: Sequence[LimbAgreement]) -> Iterator[str]:
                 f"cameras {a} and {b} show a limb apart at the same instant: {', '.join(far)} (95th percentile); would "
                 f"be right: at most {APART_M:g} m; look at their poses, their clocks, and whether both see the person"
             )
+
+
+def _is_far(found: LimbAgreement) -> bool:
+    """Whether a limb is told; of few points a percentile says nothing, so the median has to be that far."""
+    return (found.p95_m if found.pairs >= _FEW_PAIRS else found.median_m) > APART_M
 
 
 def agreement_lines(agreements: Sequence[LimbAgreement]) -> list[str]:

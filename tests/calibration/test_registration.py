@@ -7,16 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration.registration import (
-    MIRROR,
     Registration,
-    SkeletonTrack,
     disagreement,
     kabsch,
     register,
     rigid,
     transform,
 )
-from hrcreplay.records import POINTS
+from hrcreplay.records import MIRROR, POINTS, SkeletonTrack
 from tests.realdata import data_path
 from tests.reobserve import POSE, Truth, angle_deg, read_azure, reobserve, walker
 
