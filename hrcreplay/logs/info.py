@@ -175,7 +175,8 @@ class _PersonInWorld:
 
     def add(self, frames: CameraFrames) -> None:
         jump_m, memory_s = self._options.person_jump_m, self._options.person_memory_s
-        self._memory, mine, _ = select_person(frames, self._memory, self._poses, jump_m, memory_s)
+        self._memory, which, _ = select_person(frames, self._memory, self._poses, jump_m, memory_s)
+        mine = frames.rows(which)
         T = self._poses[mine.camera]
         points_m = np.einsum("nij,npj->npi", T[:, :3, :3], mine.points_m) + T[:, None, :3, 3]
         track = SkeletonTrack(mine.capture_ns - self._offset_ns[mine.camera], points_m, mine.confidence)

@@ -143,10 +143,7 @@ def fused(
     with sink.watch.stage("clocks", len(ticks_ns)):
         sink.notes["fuse"].extend(clocks.remarks())
     sink.notes["fuse"].extend(_late(log, sink.counts))
-    sink.notes["fuse"].extend(checks.remarks())
-    for name, rows in zip(("bodies", "agreement"), checks.figures(), strict=True):
-        if rows:
-            sink.run.table(name, record_columns(rows))
+    write_checks(checks, sink)
     if others := sink.counts["person_frames_beside_others"]:
         sink.notes["fuse"].append(
             f"{others} frames show at least one other body than the person: it counts for contact, but nothing is "
@@ -155,6 +152,14 @@ def fused(
     if smooth:
         for part in smoother.finish():
             sink.run.table("smooth", state_columns(part))
+
+
+def write_checks(checks: CameraChecks, sink: Sink) -> None:
+    """Writes how each camera's person stands and how far two cameras differ, and notes what is out of bounds."""
+    sink.notes["fuse"].extend(checks.remarks())
+    for name, rows in zip(("bodies", "agreement"), checks.figures(), strict=True):
+        if rows:
+            sink.run.table(name, record_columns(rows))
 
 
 class StretchSmoother:
