@@ -220,11 +220,11 @@ def test_ankles_stand_in_for_feet(tmp_path: Path) -> None:
 
 
 def test_a_cell_corrects_clocks_and_poses_in_info(tmp_path: Path) -> None:
-    """The right camera's clock is 0.4 s ahead: the walker is a step away until the cell says so."""
-    log = log_of(tmp_path / "a.mcap", later_ns=400_000_000)
+    """The right camera's clock is 0.4 s behind: the walker is a step away until the cell says so."""
+    log = log_of(tmp_path / "a.mcap", later_ns=-400_000_000)
     cell = tmp_path / "cell.toml"
     cell.write_text(
-        f"[cameras.right]\nT_world_camera = {POSES['right'].tolist()}\nclock_offset_s = 0.4\n"
+        f"[cameras.right]\nT_world_camera = {POSES['right'].tolist()}\nclock_offset_s = -0.4\n"
         f"[cameras.attic]\nT_world_camera = {np.eye(4).tolist()}\n"
     )
     without, corrected = commands.describe(log, None, ()), commands.describe(log, None, (), cell)
