@@ -19,8 +19,6 @@ from tests.robot.checker import links
 
 #: Beyond a limit, of it: the programme itself keeps its own only at its grid points.
 TOLERANCE = 1e-3
-#: Of the TCP around a waypoint, within which the reference may have begun the next move [m].
-THERE_M = 0.021
 
 
 def tcp(folder: Path, motion: pd.DataFrame) -> tuple[Floats, Floats]:
@@ -40,11 +38,10 @@ def task() -> dict[str, Any]:
 def limits(folder: Path, motion: pd.DataFrame) -> Floats:
     """(n,) the task's limit of the move that the reference is on, from where the reference is [m/s].
 
-    It is on a linear move of the task where it is right above or below that move's waypoint, and has come there from
-    the one before.
+    It is on the way to a waypoint once it has left the one before, and stays on it while it dwells there.
     """
     base = np.array(run_folder.read_meta(folder)["T_world_base"])
-    waypoints = task()["waypoints"]
+    waypoints, fastest = task()["waypoints"], task()["tcp_speed_m_per_s"]
     places = np.array([base[:3, :3] @ w["position_m"] + base[:3, 3] for w in waypoints])
     at, found = 0, np.empty(len(motion))
     going = False
@@ -55,7 +52,7 @@ def limits(folder: Path, motion: pd.DataFrame) -> Floats:
         if going and np.linalg.norm(here - places[following]) <= 1e-4:
             at, going = following, False
         move = waypoints[(at + 1) % len(waypoints) if going else at]
-        found[i] = min(task()["tcp_speed_m_per_s"], move.get("tcp_speed_m_per_s", np.inf))
+        found[i] = min(fastest, move.get("tcp_speed_m_per_s", np.inf))
     return found
 
 
