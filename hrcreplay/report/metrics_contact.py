@@ -13,6 +13,7 @@ import pandas as pd
 from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.report.metrics import MetricTable, durations_s, times, true_runs
 from hrcreplay.report.metrics_plan import is_moving, numeric_column
+from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
 
 #: Where the recorded person is from, as contact.parquet has it, and that in words.
@@ -33,7 +34,7 @@ SHOWN_PARTS = {
 
 def method_prefixes(run: Run) -> dict[str, str]:
     """Method -> prefix of its metrics; the run's own first, the programme run blind last."""
-    own = str(run.meta.get("settings", {}).get("plan", {}).get("method", "qp"))
+    own = str(setting(run.meta.get("settings", {}), "plan", "method"))
     return {
         own: "plan",
         **{name: f"baseline_{name}" for name in sorted(run.baselines, key=lambda name: (name == "none", name))},

@@ -13,6 +13,7 @@ from hrcreplay.report.metrics import Metric, MetricTable
 from hrcreplay.report.metrics_contact import PERSONS, SHOWN_PARTS, method_prefixes
 from hrcreplay.report.metrics_data import add_limbs
 from hrcreplay.report.tables import PageTable, limb_names_text, part_name_text, percent, text_of
+from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
 
 Metrics = Mapping[str, Metric]
@@ -119,9 +120,8 @@ def _speeds(run: Run, metrics: Metrics) -> str:
     )
     words = f"The TCP moved at up to {text_of(fastest)} (its programme at up to {text_of(programmed)})"
     if near["value"] is not None:
-        near_m = run.meta.get("settings", {}).get("report", {}).get("near_m")
-        where = "near anybody" if near_m is None else f"with anybody within {near_m:g} m"
-        words += f", and {where} at up to {text_of(near)}"
+        near_m = setting(run.meta.get("settings", {}), "report", "near_m")
+        words += f", and with anybody within {near_m:g} m at up to {text_of(near)}"
     stood, null = metrics["plan_stationary_share"], metrics["plan_null_speed_share"]
     if stood["value"] is not None:
         words += (
