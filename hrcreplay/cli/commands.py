@@ -175,6 +175,7 @@ def describe(path: Path, config: Path | None, overrides: tuple[str, ...], cell_f
     from hrcreplay.calibration.cell import Cell, load_cell
     from hrcreplay.logs import info
     from hrcreplay.logs.reader import open_log
+    from hrcreplay.run.job import robot_axes
     from hrcreplay.settings.load import load_settings
 
     settings = load_settings(config, overrides)
@@ -182,6 +183,7 @@ def describe(path: Path, config: Path | None, overrides: tuple[str, ...], cell_f
     log = open_log(path, settings.logs, skeletons=False)
     summary = info.summarize(
         log,
+        axes=robot_axes(settings.robot),
         options=settings.logs,
         T_world_camera=cell.T_world_camera,
         clock_offset_s=cell.clock_offset_s,

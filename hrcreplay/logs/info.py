@@ -10,8 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.logs import joints
 from hrcreplay.logs.camera_checks import BodyInWorld, CameraChecks, LimbAgreement, agreement_lines, body_line
 from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.joints import Clock
 from hrcreplay.logs.reader import DEFAULT, Log
 from hrcreplay.records import CameraFrames, Floats, SkeletonTrack
 from hrcreplay.settings.sections import Logs
@@ -49,6 +52,18 @@ class CameraSummary:
 
 
 @dataclass(frozen=True)
+class JointSummary:
+    """What one topic tells of the robot's joints."""
+
+    topic: str
+    names: tuple[str, ...]
+    axes: dict[str, int]  #: name in the log -> number of the robot's axis that is read from it, counted from 1
+    rate_hz: float  #: by the median time between arrivals [Hz]; NaN below two messages
+    longest_gap_s: float  #: between arrivals of one joint [s]; NaN below two messages
+    clock: Clock
+
+
+@dataclass(frozen=True)
 class Summary:
     """Everything that ``hrcreplay info`` prints."""
 
@@ -61,7 +76,7 @@ class Summary:
     has_task: bool
     base_from: str
     has_truth: bool
-    joint_names: tuple[str, ...]
+    joints: tuple[JointSummary, ...]
     defects: dict[str, int]
     bodies: tuple[BodyInWorld, ...]  #: the person on the floor, of each camera whose pose is known
     agreements: tuple[LimbAgreement, ...]  #: limb by limb, of each two such cameras
@@ -101,15 +116,17 @@ class _Tally:
 def summarize(
     log: Log,
     *,
+    axes: Sequence[str] = (),
     options: Logs = DEFAULT,
     T_world_camera: Mapping[str, Floats] | None = None,
     clock_offset_s: Mapping[str, float] | None = None,
     T_world_base: Floats | None = None,
 ) -> Summary:
-    """Summarizes a log in one pass over it.
+    """Summarizes a log in one pass over its frames and one over its joints.
 
     Args:
         log: An open log; also one without skeletons (``open_log(path, options, skeletons=False)``).
+        axes: The robot's joints, to say which joint of the log is which axis; () where they are not known.
         options: How the person is told from other bodies.
         T_world_camera: (4, 4) poses of a cell, which have priority over those of the log.
         clock_offset_s: Each camera's clock minus the reference camera's, of a cell [s].
@@ -127,8 +144,7 @@ def summarize(
     for frames in log.frames():
         _count(frames, tallies)
         person.add(frames)
-    for _ in log.joints():
-        pass  # for the defects of the joint track
+    joint_topics, joint_notes = _joints(log, axes)
     cameras = tuple(
         _camera(name, tally, log, "the cell" if name in cell else "the log" if name in poses else "none")
         for name, tally in zip(header.cameras, tallies, strict=True)
@@ -144,12 +160,12 @@ def summarize(
         has_task=header.task is not None,
         base_from="none" if base is None else "in the log" if T_world_base is None else "in the cell",
         has_truth=header.has_truth,
-        joint_names=header.joint_names,
+        joints=joint_topics,
         defects=dict(log.defects),
         bodies=tuple(body for body in bodies if body.camera in poses),
         agreements=agreements,
-        notes=(*log.notes, *person.checks.remarks(), *_strangers(header.cameras, cell)),
-        missing=tuple(_missing(log, cameras, has_base=base is not None)),
+        notes=(*log.notes, *joint_notes, *person.checks.remarks(), *_strangers(header.cameras, cell)),
+        missing=tuple(_missing(log, cameras, joint_topics, has_base=base is not None)),
     )
 
 
@@ -183,6 +199,31 @@ class _PersonInWorld:
         self.checks.add(mine.camera, track)
 
 
+def _joints(log: Log, axes: Sequence[str]) -> tuple[tuple[JointSummary, ...], tuple[str, ...]]:
+    """The topics of the robot's joints, and remarks: on what reading them tells, or on why they cannot be read."""
+    states, reading = log.joint_states(), None
+    notes: tuple[str, ...] = ()
+    if states and axes:
+        try:
+            reading = log.read_joints(states, axes)
+            notes = log.joint_notes
+        except (LogError, SettingsError) as error:
+            notes = (str(error).removeprefix(f"{log.header.path}: "),)
+    clocks = {clock.topic: clock for clock in reading.clocks} if reading else {}
+    sources = reading.sources if reading else {}
+    return tuple(
+        JointSummary(
+            topic=topic.name,
+            names=tuple(topic.joints),
+            axes={name: axes.index(axis) + 1 for axis, (of, name) in sources.items() if of == topic.name},
+            rate_hz=1.0 / joints.wait_s(topic, np.median),
+            longest_gap_s=joints.wait_s(topic, np.max),
+            clock=clocks.get(topic.name) or joints.place_in_time(topic, tuple(topic.joints), None, Counter())[0],
+        )
+        for topic in states
+    ), notes
+
+
 def _count(frames: CameraFrames, tallies: list[_Tally]) -> None:
     rows = (frames.camera.tolist(), frames.capture_ns.tolist(), frames.arrival_ns.tolist(), frames.body.tolist())
     for camera, capture_ns, arrival_ns, body in zip(*rows, strict=True):
@@ -206,7 +247,9 @@ def _camera(name: str, tally: _Tally, log: Log, pose_from: str) -> CameraSummary
     )
 
 
-def _missing(log: Log, cameras: tuple[CameraSummary, ...], *, has_base: bool) -> Iterator[str]:
+def _missing(
+    log: Log, cameras: tuple[CameraSummary, ...], joint_topics: tuple[JointSummary, ...], *, has_base: bool
+) -> Iterator[str]:
     header = log.header
     if not cameras:
         yield "skeletons: name a topic with --topic NAME, or a decoder for it in [logs.decoders] of the settings file"
@@ -217,7 +260,7 @@ def _missing(log: Log, cameras: tuple[CameraSummary, ...], *, has_base: bool) ->
             yield f"extrinsics of camera {camera.name}: run hrcreplay calibrate, or give a cell file with --cell"
     if not has_base:
         yield "the robot's base pose: give a cell file with --cell"
-    if header.task is None and not header.joint_names:
+    if header.task is None and not joint_topics:
         yield "the robot's task: name a task file with --set plan.task=FILE"
 
 
@@ -239,7 +282,7 @@ def lines(summary: Summary) -> list[str]:
         f"task     {'in the log' if summary.has_task else 'none'}",
         f"base     {summary.base_from}",
         f"truth    {'in the log' if summary.has_truth else 'none'}",
-        f"joints   {', '.join(summary.joint_names) or 'none'}",
+        *(["joints", *map(_joint_line, summary.joints)] if summary.joints else ["joints   none"]),
         f"person   {', '.join(_tall(camera) for camera in summary.cameras) or 'none'}",
     ]
     out += [f"sides    {', '.join(_sided(camera) for camera in summary.cameras) or 'none'}"]
@@ -263,6 +306,17 @@ def _tall(camera: CameraSummary) -> str:
 def _sided(camera: CameraSummary) -> str:
     checked = f"checked as the {camera.side_cue}" if camera.side_cue else "not checked, no feet or bent knees seen"
     return f"left and right {checked} ({camera.name})"
+
+
+def _joint_line(topic: JointSummary) -> str:
+    names = ", ".join(f"{name} = axis {topic.axes[name]}" if name in topic.axes else name for name in topic.names[:20])
+    more = f" and {len(topic.names) - 20} more" if len(topic.names) > 20 else ""
+    median_ms, low_ms, high_ms = (1e3 * delay_s for delay_s in topic.clock.delay_s)
+    shift = f" by {topic.clock.shift_s:.6g} s" if topic.clock.basis == "stamps, shifted" else ""
+    return (
+        f"  {topic.topic}: {names}{more}; {topic.rate_hz:.2f} Hz, longest gap {topic.longest_gap_s:.3f} s, arrival - "
+        f"stamp {median_ms:.1f} ms (5 to 95 %: {low_ms:.1f} to {high_ms:.1f}), instants are {topic.clock.basis}{shift}"
+    )
 
 
 def _camera_line(camera: CameraSummary, start_ns: int) -> str:

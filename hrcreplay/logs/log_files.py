@@ -1,6 +1,6 @@
 """The files of a log: detection of their format, the files as streams of messages, and what is beside the skeletons.
 
-That is camera poses, task, robot base, recorded joints, ground truth.
+That is camera poses, task, robot base, ground truth.
 """
 
 from __future__ import annotations
@@ -32,10 +32,7 @@ from hrcreplay.logs.messages import (
     Message,
     MessageStream,
     Topic,
-    Undecodable,
     merge_by_arrival,
-    stamp_ns,
-    topic_list,
 )
 from hrcreplay.logs.ros_bags import Db3Stream, open_bag
 from hrcreplay.logs.unpack import ZSTD_MAGIC, unpack_file
@@ -255,16 +252,7 @@ class Header:
     end_ns: int  #: last arrival of anything
     T_world_base: Floats | None  #: (4, 4) robot base, where the log knows it
     has_truth: bool
-    joint_names: tuple[str, ...]  #: of the joint track; () where there is none
-
-
-@dataclass(frozen=True)
-class JointTrack(Table):
-    """Robot joints as the log has them, a row a message."""
-
-    t_ns: Ints  #: (n,)
-    q: Floats  #: (n, nv) [rad]
-    names: tuple[str, ...]
+    joint_topics: tuple[str, ...]  #: of the robot's joint states
 
 
 @dataclass(frozen=True)
@@ -275,7 +263,7 @@ class Truth(Table):
     points_m: Floats  #: (n, 20, 3) POINTS in the world [m]
 
 
-_ROS_JOINTS, _OWN_JOINTS, _OWN_TRUTH = "sensor_msgs/JointState", "hrcreplay.JointState", "hrcreplay.Truth"
+_OWN_TRUTH = "hrcreplay.Truth"
 _OWN_CAMERA, _OWN_TASK, _OWN_BASE = "hrcreplay.Camera", "hrcreplay.Task", "hrcreplay.Base"
 _CHUNK_NS = 10**9
 _RIGID = 1e-2  # of the axes of a pose: those of a recording may have been rounded, those of a cell file not so much
@@ -333,68 +321,6 @@ def _pose(values: Any, message: Message) -> Floats:
         raise LogError(f"{message.topic.name}: a pose with {what}; a rotation and a place are right")
     pose.flags.writeable = False
     return pose
-
-
-@dataclass(frozen=True)
-class JointTopic:
-    """The topic of the robot's joints, and the joints of its first message."""
-
-    topic: Topic
-    names: tuple[str, ...]
-
-
-def find_joints(source: LogFiles, name: str | None) -> JointTopic | None:
-    """The joint track: of the topic named, else of the first that carries one.
-
-    Raises:
-        LogError: The topic named is not there or carries none.
-    """
-    found = [topic for topic in source.topics() if topic.type in (_ROS_JOINTS, _OWN_JOINTS)]
-    if name is not None:
-        found = [topic for topic in found if topic.name == name]
-        if not found:
-            raise LogError(f"{source.path}: no joint states on {name}; found {topic_list(source.topics())}")
-    for topic in found:
-        for message in source.messages([topic.name]):
-            _, q = _joint_state(message)
-            if q:
-                return JointTopic(topic, tuple(q))
-    return None
-
-
-def joints(source: LogFiles, track: JointTopic, defects: Counter[str]) -> Iterator[JointTrack]:
-    """The joint track in chunks of at most a second."""
-    times: list[int] = []
-    rows: list[list[float]] = []
-    last_ns = None
-    for message in source.messages([track.topic.name]):
-        try:
-            t_ns, q = _joint_state(message)
-        except Undecodable:
-            defects["messages_undecodable"] += 1
-            continue
-        if not q.keys() >= set(track.names):
-            defects["joints_incomplete"] += 1
-            continue
-        if last_ns is not None and t_ns <= last_ns:
-            defects["joints_out_of_order"] += 1
-            continue
-        last_ns = t_ns
-        if times and t_ns - times[0] >= _CHUNK_NS:
-            yield JointTrack(np.array(times, dtype=np.int64), np.array(rows, dtype=np.float64), track.names)
-            times, rows = [], []
-        times.append(t_ns)
-        rows.append([q[joint] for joint in track.names])
-    if times:
-        yield JointTrack(np.array(times, dtype=np.int64), np.array(rows, dtype=np.float64), track.names)
-
-
-def _joint_state(message: Message) -> tuple[int, dict[str, float]]:
-    content = message.read()
-    if message.topic.type == _OWN_JOINTS:
-        return content.t_ns, dict(zip(content.names, content.q, strict=False))
-    t_ns = stamp_ns(content.header.stamp, message.topic.name) or message.arrival_ns
-    return t_ns, {str(name): float(q) for name, q in zip(content.name, content.position, strict=False)}
 
 
 def truth_topic(source: LogFiles) -> str | None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs import log_files, messages, plausibility
+from hrcreplay.logs import joints, log_files, messages, plausibility
 from hrcreplay.logs.clean import DEFECTS, Cleaner
 from hrcreplay.logs.clocks import clock_remarks
 from hrcreplay.logs.decoders import (
@@ -20,7 +20,8 @@ from hrcreplay.logs.decoders import (
     describe_transforms,
     find_cameras,
 )
-from hrcreplay.logs.log_files import Header, JointTopic, JointTrack, LogFiles, Truth, open_source
+from hrcreplay.logs.joints import JointReading, JointTopic, JointTrack
+from hrcreplay.logs.log_files import Header, LogFiles, Truth, open_source
 from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder, MarkerLayout, survey_markers
 from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, topic_list
 from hrcreplay.records import CameraFrames
@@ -162,18 +163,19 @@ class Log:
         self._decoders = decoders = chosen.decoders
         self._topic_remarks = chosen.remarks
         self._options = options
-        self._joints = log_files.find_joints(source, options.joints_topic)
+        self._joint_topics = joints.find_topics(source, options.joints_topic)
         self._truth = log_files.truth_topic(source)
         self._reading: Counter[str] = Counter()
         self._remarks: list[str] = []
         self._refusals: list[str] = []
         self._track: Counter[str] = Counter()
+        self.joint_notes: tuple[str, ...] = ()  #: remarks of the latest reading of the joints
         self.stature_m: dict[str, float] = {}  #: camera -> how tall its bodies are, of the latest pass; NaN: not known
         self.side_cue: dict[
             str, str | None
         ] = {}  #: camera -> by what left and right were told apart; None: not checked
         self.points_seen = 0  #: points with a place and a confidence, of the latest pass
-        self.header = _header(source, decoders, self._joints, self._truth, chosen=bool(options.topics))
+        self.header = _header(source, decoders, self._joint_topics, self._truth, chosen=bool(options.topics))
 
     @property
     def defects(self) -> Counter[str]:
@@ -274,11 +276,31 @@ class Log:
                 return f"would be right: --set logs.unit={other}, or points in {self._options.unit}"
         return "would be right: points in metres"
 
-    def joints(self) -> Iterator[JointTrack]:
-        """The robot's joint track in order of time, in chunks of at most 1 s; nothing where there is none."""
+    def joints(self, axes: Sequence[str]) -> JointTrack | None:
+        """The recorded track of the robot's axes; None where the log has no joint positions.
+
+        Args:
+            axes: The robot's joints, from the base on.
+
+        Raises:
+            LogError: The joints of the log do not fit the robot.
+            SettingsError: ``logs.joint_names`` does not.
+        """
+        topics = self.joint_states()
+        return self.read_joints(topics, axes).track if topics else None
+
+    def read_joints(self, topics: Sequence[JointTopic], axes: Sequence[str]) -> JointReading:
+        """The track of the robot's axes from what ``joint_states`` found; raises as ``joints``."""
+        reading = joints.read_track(topics, axes, self._options, str(self.header.path), self._track)
+        covered = joints.coverage_remarks(reading, self.header.start_ns, self.header.end_ns)
+        self.joint_notes = (*reading.notes, *covered)
+        return reading
+
+    def joint_states(self) -> list[JointTopic]:
+        """The joint states of each topic that has positions, as they are in the log."""
         self._track.clear()
-        if self._joints is not None:
-            yield from log_files.joints(self._source, self._joints, self._track)
+        self.joint_notes = ()
+        return joints.read_topics(self._source, self._joint_topics, self._track)
 
     def truth(self) -> Iterator[Truth]:
         """The true person in order of time, in chunks of at most 1 s; nothing where there is none."""
@@ -350,16 +372,14 @@ def open_log(path: Path, options: Logs = DEFAULT, *, skeletons: bool = True) -> 
 
 
 def _header(
-    source: LogFiles, decoders: list[SkeletonDecoder], joints: JointTopic | None, truth: str | None, *, chosen: bool
+    source: LogFiles, decoders: list[SkeletonDecoder], joint_topics: tuple[str, ...], truth: str | None, *, chosen: bool
 ) -> Header:
     known = log_files.latched(source)
     seen = [camera for decoder in decoders for camera in decoder.cameras]
     declared = [camera for camera in known.cameras if camera in seen or not chosen]  # one may be silent all along
     cameras = tuple(dict.fromkeys([*declared, *seen]))
     # Not the first message of all: recorders stamp with zero what came before a simulation's clock.
-    used = (
-        [decoder.topic for decoder in decoders] + ([joints.topic.name] if joints else []) + ([truth] if truth else [])
-    )
+    used = [*(decoder.topic for decoder in decoders), *joint_topics, *([truth] if truth else [])]
     first = next(source.messages(used), None)
     return Header(
         path=source.path,
@@ -371,5 +391,5 @@ def _header(
         end_ns=source.end_ns,
         T_world_base=known.T_world_base,
         has_truth=truth is not None,
-        joint_names=joints.names if joints else (),
+        joint_topics=joint_topics,
     )

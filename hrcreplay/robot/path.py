@@ -196,7 +196,16 @@ def _excess(model: RobotModel, track: JointTrajectory, pace: Pace) -> tuple[floa
 _SMOOTH_S = 0.1
 
 #: A recorded position may be this far outside the range: encoders are noisy where an axis rests on its stop [rad].
-_NOISE_RAD = 0.01
+_NOISE_RAD = math.radians(1.0)
+
+#: A recorded axis may be faster than its limit by this share of it: stamps tremble. It is told.
+_NOISE_SPEED = 0.1
+
+#: Positions look like degrees where more than this share of the rows is outside as radians and none as degrees.
+_MOSTLY = 0.1
+
+#: An endless axis that turns further than this on one side was more likely recorded in degrees [rad].
+_TURNS_RAD = 6 * math.pi
 
 
 def programmed(task: Task, model: RobotModel, where: str = "task") -> Reference:
@@ -244,7 +253,8 @@ def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
     """The path of a recorded joint track, smoothed by cubics over 0.1 s on a regular time grid.
 
     Programmed time 0 is ``t_ns[0]``. Gaps are bridged on straight lines. Positions and velocities are held against the
-    robot's limits; accelerations are not, since the controller follows only as fast as its own allow.
+    robot's limits; accelerations are not, since the controller follows only as fast as its own allow, and
+    ``recorded_remarks`` tells of them.
 
     Args:
         t_ns: (n,) instants, in any order; of rows with the same instant the first counts.
@@ -252,7 +262,8 @@ def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
         model: The robot that is to follow.
 
     Raises:
-        LogError: Another number of axes, too few rows, or a position or speed that the robot does not have.
+        LogError: Another number of axes, too few rows, or a position more than a degree outside the range of its axis,
+            or a speed more than a tenth above its limit.
     """
     from scipy.signal import savgol_filter  # takes a second to import, and few logs have a joint track
 
@@ -265,7 +276,8 @@ def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
     rows = q[whole][first]
     endless = np.isinf(model.q_max)
     rows[:, endless] = np.unwrap(rows[:, endless], axis=0)
-    _check(model, instants - t_ns[0], rows, "position", "rad", model.q_min - _NOISE_RAD, model.q_max + _NOISE_RAD)
+    margin = np.full(model.nv, _NOISE_RAD)
+    _check(model, instants - t_ns[0], rows, "position", "rad", (model.q_min, model.q_max, margin))
     seconds = (instants - instants[0]) * 1e-9
     grid = np.arange(max(2, math.ceil(seconds[-1] / STEP_S) + 1)) * STEP_S
     even = np.column_stack([np.interp(grid, seconds, rows[:, axis]) for axis in range(model.nv)])
@@ -277,7 +289,7 @@ def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
         if order
         else np.gradient(even, STEP_S, axis=0)
     )
-    _check(model, grid * 1e9, dq, "speed", "rad/s", -model.dq_max, model.dq_max)
+    _check(model, grid * 1e9, dq, "speed", "rad/s", (-model.dq_max, model.dq_max, _NOISE_SPEED * model.dq_max))
     return _by_itself(model, smooth, dq, ())
 
 
@@ -311,16 +323,58 @@ def _by_itself(model: RobotModel, q: Floats, dq: Floats, waypoints_s: tuple[floa
     )
 
 
-def _check(
-    model: RobotModel, t_ns: Ints | Floats, rows: Floats, what: str, unit: str, low: Floats, high: Floats
-) -> None:
-    over = np.argwhere((rows < low) | (rows > high))
-    if len(over):
-        row, axis = over[0]
-        raise LogError(
-            f"joint track: {model.joint_names[axis]} has {what} {rows[row, axis]:.3f} {unit} "
-            f"after {t_ns[row] * 1e-9:.3f} s; {model.name} allows {low[axis]:.3f} to {high[axis]:.3f}"
+def recorded_remarks(path: Reference) -> list[str]:
+    """What a recorded path asks of the robot that it cannot do, and what looks like another unit.
+
+    Args:
+        path: What ``recorded`` made.
+    """
+    model, found = path.model, []
+    turned_rad = np.where(np.isinf(model.q_max), np.abs(path.q).max(axis=0), 0.0)
+    axis = int(np.argmax(turned_rad))
+    if turned_rad[axis] > _TURNS_RAD:
+        found.append(
+            f"robot joints: {model.joint_names[axis]} turns to {turned_rad[axis]:.1f} rad; if the log is in degrees, "
+            "set logs.joints_unit = deg"
         )
+    lag = min(round(_SMOOTH_S / STEP_S), len(path.dq) - 1)  # cubics overshoot at a kink: mean accelerations are sound
+    ddq = (path.dq[lag:] - path.dq[:-lag]) / (lag * STEP_S)
+    for what, unit, rows, limit, setting in (
+        ("move", "rad/s", path.dq, model.dq_max, "limit of the robot"),
+        ("speed up or brake", "rad/s^2", ddq, model.ddq_max, "limit, robot.acceleration"),
+    ):
+        share = np.abs(rows) / limit
+        row, axis = divmod(int(np.argmax(share)), model.nv)
+        if share[row, axis] > 1.0 + 1e-9:
+            found.append(
+                f"robot joints: they {what} faster than the robot may, {model.joint_names[axis]} by up to "
+                f"{abs(rows[row, axis]):.2f} {unit} {row * STEP_S:.2f} s after their begin ({setting}: "
+                f"{limit[axis]:.2f}), {(share.max(axis=1) > 1.0).mean():.1%} of the time; the replayed robot stays "
+                "within its limits and lags behind there"
+            )
+    return found
+
+
+def _check(
+    model: RobotModel, t_ns: Ints | Floats, rows: Floats, what: str, unit: str, limits: tuple[Floats, Floats, Floats]
+) -> None:
+    """Refuses what is further outside the limits (low, high) than the margin, their third."""
+    low, high, margin = limits
+    over = np.argwhere((rows < low - margin) | (rows > high + margin))
+    if not len(over):
+        return
+    row, axis = over[0]
+    as_degrees = np.radians(rows)
+    many = len(np.unique(over[:, 0])) > _MOSTLY * len(rows) and np.abs(rows).max() > 2 * math.pi
+    remedy = (
+        "divided by 57.3 all fit: if they are degrees, set logs.joints_unit = deg"
+        if many and ((as_degrees >= low) & (as_degrees <= high)).all()
+        else "is it another robot (robot.urdf), other joints (logs.joint_names), or a wrong stamp or position?"
+    )
+    raise LogError(
+        f"joint track: {model.joint_names[axis]} has {what} {rows[row, axis]:.3f} {unit} "
+        f"after {t_ns[row] * 1e-9:.3f} s; {model.name} allows {low[axis]:.3f} to {high[axis]:.3f}; {remedy}"
+    )
 
 
 def _steps(tracks: list[JointTrajectory]) -> int:

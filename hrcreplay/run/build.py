@@ -6,7 +6,7 @@ The rooms of the stages take sections of the settings as they are, and plain val
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Protocol
@@ -20,12 +20,13 @@ from hrcreplay.human.fusion import inverse_kinematics
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.logs.clean import PersonMemory, select_person
-from hrcreplay.logs.log_files import Header, JointTrack
+from hrcreplay.logs.joints import JointTrack
+from hrcreplay.logs.log_files import Header
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
-from hrcreplay.robot.path import programmed, recorded
+from hrcreplay.robot.path import programmed, recorded, recorded_remarks
 from hrcreplay.robot.task import Reference, Task, parse_task
 from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
 from hrcreplay.run.job import Job, UrdfFiles, link_capsules
@@ -150,8 +151,12 @@ class LogLike(Protocol):
     def header(self) -> Header:
         """Cameras, task and robot base as far as they are known."""
 
-    def joints(self) -> Iterator[JointTrack]:
-        """The recorded joints, where there are any."""
+    @property
+    def joint_notes(self) -> tuple[str, ...]:
+        """Remarks of the latest reading of the joints."""
+
+    def joints(self, axes: Sequence[str], /) -> JointTrack | None:
+        """The recorded track of the robot's axes, where there is one."""
 
 
 def fusion_stage(job: Job, log: LogLike) -> FusionStage:
@@ -256,13 +261,25 @@ def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int
         parts = job.settings.robot, job.urdf, job.settings.occupancy.stop_s
         path = _programme(parse_task(table, where), where, *parts, model.T_world_base.tobytes())
         return replace(path, model=model), None
-    track = list(log.joints())
-    if not track:
+    track = log.joints(model.joint_names)
+    if track is None:
         raise SettingsError(
             f"{log.header.path}: no task and no joint track; name a task file with --set plan.task=FILE.toml"
         )
-    whole = JointTrack.join(track)
-    return recorded(whole.t_ns, whole.q, model), int(whole.t_ns.min())
+    return recorded(track.t_ns, track.q, model), int(track.t_ns[0])
+
+
+def programme_notes(job: Job, log: LogLike, path: Reference) -> list[str]:
+    """Remarks on a recorded joint track that is the programme; none on a task.
+
+    Args:
+        job: What was asked for.
+        log: Log of the job; its joints were read for the path.
+        path: What ``reference`` made.
+    """
+    if job.task or log.header.task:
+        return []
+    return [*log.joint_notes, *recorded_remarks(path)]
 
 
 @lru_cache(maxsize=4)  # a live session makes its controller twice: to compile the kernels, and to fly

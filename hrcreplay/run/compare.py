@@ -198,6 +198,7 @@ def _compare_log(
         part.close_tables()
         have = _motions(job, log, variants, ticks_ns, part)
         programme = _programme(job, log, int(ticks_ns[0]))
+        sink.notes["plan"].extend(build.programme_notes(job, log, programme.path))
         full = _full_coverages(job, variants, people, part.partial)
         tasks = [
             VariantTask(

@@ -20,6 +20,7 @@ from hrcreplay.calibration.cell import Cell, load_cell
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.limits import load_limits
+from hrcreplay.robot import irb140
 from hrcreplay.robot.model import Segment, from_urdf
 from hrcreplay.robot.urdf import describe
 from hrcreplay.settings.load import Settings, as_overrides, load_settings
@@ -37,6 +38,17 @@ class UrdfFiles:
     meshes: tuple[tuple[str, str], ...]  #: file that a collision mesh names, and its path
     inputs: tuple[tuple[str, str], ...]  #: path and SHA-256 of each file that was read, the URDF first
     capsules: tuple[LinkSettings, ...] = ()  #: of the links, where a run has recorded them: no mesh is read then
+
+
+def robot_axes(robot: Robot) -> tuple[str, ...]:
+    """The joints of the robot that the settings name, from the base on.
+
+    Raises:
+        SettingsError: The URDF cannot be used.
+    """
+    files = read_urdf(robot)
+    xml, tcp_frame = (irb140.urdf(), "flange") if files is None else (files.text, robot.tcp_frame)
+    return describe(xml, tcp_frame, robot.base_frame).joints
 
 
 def read_urdf(robot: Robot) -> UrdfFiles | None:

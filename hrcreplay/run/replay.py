@@ -29,6 +29,7 @@ from hrcreplay.run.job import TABLES, Job, JobOptions, resolve, urdf_digest, ver
 from hrcreplay.run.notes import notes_of
 from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
+from hrcreplay.settings.sections import Logs
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import missing_columns, read_states
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
@@ -131,6 +132,8 @@ def run_stages(
     flow: Iterable[Any] = states
     if "plan" in todo:
         chosen = build.planners(job, log, int(ticks_ns[0]))
+        path = next(iter(chosen.values())).follower.reference
+        sink.notes["plan"].extend(build.programme_notes(job, log, path))
         every = store_every(job) if "predict" in todo else math.inf
         flow = stages.planned(states, build.prediction_stage(job), chosen, every, sink)
     elif "predict" in todo:
@@ -253,6 +256,7 @@ def demo_log() -> Path:
 _PERSON = ("versions", "log", "ticks", "cameras", "settings logs", "settings fusion", "limits.tracking")
 _VOLUMES = (*_PERSON, "settings occupancy", "limits.prediction")
 _PROGRAMME = ("base", "programme", "settings robot", "settings plan")
+_JOINT_SETTINGS = tuple(key for key in Logs.model_fields if key.startswith("joint"))
 #: Stage -> the parts that its tables, counts and notes depend on. The plan takes the volumes of every tick: how many
 #: of them are stored changes nothing for it.
 PARTS = {
@@ -275,7 +279,7 @@ def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
     """Digest of every part that a stage of the job depends on.
 
     A section of the settings counts whole, so that a new setting cannot be forgotten, but for the keys that stand here
-    by themselves: a file counts by its content, ``joints_topic`` as the programme, for want of a task.
+    by themselves: a file counts by its content, what is set of the joints as the programme, for want of a task.
 
     Args:
         job: What was asked for.
@@ -293,7 +297,7 @@ def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
         "log": job.log_sha256,
         "ticks": [int(ticks_ns[0]), int(ticks_ns[-1]), len(ticks_ns)],
         "cameras": [log.header.cameras, fusion_stage.T_world_camera.tolist(), fusion_stage.clock_offset_ns.tolist()],
-        "settings logs": _without(settings["logs"], "joints_topic", "gap_s"),
+        "settings logs": _without(settings["logs"], *_JOINT_SETTINGS, "gap_s"),
         "logs.gap_s": settings["logs"]["gap_s"],
         "settings fusion": settings["fusion"],
         "limits.tracking": _without(job.tracking.plain(), "name"),
@@ -305,7 +309,7 @@ def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
         base = build.known_robot_base(job, log)
         found |= {
             "base": None if base is None else base.tolist(),
-            "programme": job.task or log.header.task or {"joints_topic": settings["logs"]["joints_topic"]},
+            "programme": job.task or log.header.task or {key: settings["logs"][key] for key in _JOINT_SETTINGS},
             "settings robot": [_without(settings["robot"], "urdf", "packages"), urdf_digest(job.settings)],
             "settings plan": _without(settings["plan"], "task"),
         }

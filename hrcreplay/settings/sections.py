@@ -75,13 +75,25 @@ class Logs(Section):
     """Ids of markers from one body to the next, of which the first are the joints; none: 100, or 33 or 32 where only
     that fits the ids in the log."""
     joints_topic: str | None = None
-    """Topic of the robot's joint states; none: the first sensor_msgs/JointState or our own."""
+    """Topic of the robot's joint states; none: all of sensor_msgs/JointState and our own, joined by joint."""
+    joint_names: tuple[str, ...] = ()
+    """The log's names of the robot's joints, in the order of the axes; none: those of the robot."""
+    joints_unit: Literal["rad", "deg"] = "rad"
+    """Unit of the joint positions."""
+    joints_offset_s: Finite | None = None
+    """The robot's clock minus the log's; none: 0, or estimated where the stamps cannot be on the log's clock [s]."""
     person_jump_m: Positive = 0.8
     """A body further than this from where the person was last seen is somebody else [m]."""
     person_memory_s: Positive = 2.0
     """After this long without the person, the nearest body becomes the person [s]."""
     gap_s: Positive = 0.2
     """A camera silent for longer has a gap [s]."""
+
+    def model_post_init(self, _context: Any) -> None:
+        """Refuses a joint that is named for two axes."""
+        twice = [name for name in self.joint_names if self.joint_names.count(name) > 1]
+        if twice:
+            raise ValueError(f"logs.joint_names: {twice[0]!r} stands for two axes; name each joint once")
 
 
 class Fusion(Section):

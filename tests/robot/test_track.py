@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -9,7 +11,7 @@ from numpy.testing import assert_allclose
 from hrcreplay.errors import LogError
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, from_urdf
-from hrcreplay.robot.path import recorded
+from hrcreplay.robot.path import recorded, recorded_remarks
 from hrcreplay.robot.task import STEP_S
 from tests.realdata import data_path
 from tests.robot.tasks import robot
@@ -46,13 +48,62 @@ def test_recorded_rows_without_values_are_left_out(robot: RobotModel) -> None:
     [
         (np.zeros((50, 7)), "joint track: found 7 joints; irb140 has 6 axes"),
         (np.full((50, 6), np.nan), "joint track: found 0 instants"),
-        (np.full((50, 6), 1.0), "joint_3 has position 1.000 rad after 0.000 s; irb140 allows -4.024 to 0.883"),
+        (np.full((50, 6), 1.0), "joint_3 has position 1.000 rad after 0.000 s; irb140 allows -4.014 to 0.873"),
         (np.outer(np.linspace(0, 2, 50), [1, 0, 0, 0, 0, 0]), "joint_1 has speed 4.* rad/s .* allows -3.491 to 3.491"),
     ],
 )
 def test_a_track_of_another_robot_is_refused(robot: RobotModel, q: Floats, message: str) -> None:
     with pytest.raises(LogError, match=message):
         recorded(np.arange(50) * 10_000_000, q, robot)
+
+
+def _turned(t_s: Floats, amplitude_rad: float, rate: float) -> Floats:
+    """One axis that turns to and fro; the others rest."""
+    return np.outer(amplitude_rad * np.sin(rate * t_s), [1.0, 0, 0, 0, 0, 0])
+
+
+def test_degrees_taken_for_radians_are_named_as_such(robot: RobotModel) -> None:
+    t_s = np.arange(0, 6, 0.01)
+    degrees = np.degrees(_turned(t_s, 1.3, 1.0))
+    with pytest.raises(LogError, match=r"joint_1 has position .*logs\.joints_unit = deg"):
+        recorded((t_s * 1e9).astype(np.int64), degrees, robot)
+    spike = _turned(t_s, 1.3, 1.0)
+    spike[300, 1] = 60.0
+    with pytest.raises(LogError, match=r"joint_2 has position 60\.000 rad after 3\.000 s") as caught:
+        recorded((t_s * 1e9).astype(np.int64), spike, robot)
+    assert "joints_unit" not in str(caught.value), "one wrong row is no unit"
+
+
+def test_small_degrees_are_told_by_their_speed_and_of_an_endless_axis_by_its_turns() -> None:
+    arm = from_urdf(
+        "<robot name='arm'><link name='l0'/><link name='l1'><collision><geometry><sphere radius='0.1'/></geometry>"
+        "</collision></link><joint name='j' type='continuous'><parent link='l0'/>"
+        "<child link='l1'/><origin xyz='0 0 0.2'/><axis xyz='0 0 1'/><limit velocity='2' effort='0'/></joint></robot>",
+        np.eye(4),
+        stop_s=0.377,
+    )
+    t_s = np.arange(0, 20, 0.01)
+    t_ns = (t_s * 1e9).astype(np.int64)
+    with pytest.raises(LogError, match=r"j has speed .*logs\.joints_unit = deg"):
+        recorded(t_ns, np.degrees(np.sin(0.5 * t_s))[:, None], arm)
+    (remark,) = recorded_remarks(recorded(t_ns, np.degrees(0.025 * t_s)[:, None], arm))
+    assert "logs.joints_unit = deg" in remark
+    assert "28." in remark
+    assert recorded_remarks(recorded(t_ns, (1.5 * np.sin(0.5 * t_s))[:, None], arm)) == []
+
+
+def test_what_the_robot_cannot_follow_is_told_with_axis_and_number(robot: RobotModel) -> None:
+    """Of a sine of amplitude a and rate w the greatest acceleration is a w^2: of 0.1 and 12 that is 14.4."""
+    t_s = np.arange(0, 6, 0.004)
+    t_ns = np.round(t_s * 1e9).astype(np.int64)
+    assert recorded_remarks(recorded(t_ns, _turned(t_s, 1.0, 2.0), robot)) == []
+    (remark,) = recorded_remarks(recorded(t_ns, _turned(t_s, 0.1, 12.0), robot))
+    assert "joint_1" in remark
+    assert "robot.acceleration" in remark
+    found = float(re.findall(r"by up to ([\d.]+) rad/s\^2", remark)[0])
+    assert 0.85 * 14.4 < found < 14.4, "a mean over a tenth of a second is less than the peak"
+    fast = recorded(t_ns, _turned(t_s, 1.8, 2.0), robot)
+    assert any("move faster" in one and "3.6" in one for one in recorded_remarks(fast))
 
 
 @pytest.mark.parametrize("measurement", [1, 33])

@@ -32,6 +32,9 @@ STALE = {
     "logs.topics": ALL,
     "logs.decoders": ALL,
     "logs.joints_topic": "plan",  # where the log has no task
+    "logs.joint_names": "plan",
+    "logs.joints_unit": "plan",
+    "logs.joints_offset_s": "plan",
     "logs.person_jump_m": ALL,
     "logs.person_memory_s": ALL,
     "logs.gap_s": "fuse",  # its counts
@@ -132,6 +135,9 @@ OTHER: dict[str, Any] = {
     "logs.topics": ("/camera/kinect/skeleton",),
     "logs.decoders": ({"topic": "/a", "camera": "a", "points": "p", "index": {"neck": 0}},),
     "logs.joints_topic": "/robot/joints",
+    "logs.joint_names": ("a", "b", "c", "d", "e", "f"),
+    "logs.joints_unit": "deg",
+    "logs.joints_offset_s": 0.5,
     "fusion.stale": "reuse",
     "fusion.delay": "ignore",
     "limits.tracking": "paper",
@@ -228,7 +234,7 @@ def test_a_setting_makes_the_stages_stale_that_depend_on_it(
     monkeypatch.chdir(tmp_path)
     Path("robot.urdf").write_text(ONE_AXIS)
     source: Any = log
-    if name == "logs.joints_topic":  # nobody asks for joints where there is a task
+    if name.startswith("logs.joint"):  # nobody asks for joints where there is a task
         source = SimpleNamespace(header=replace(log.header, task=None))
     before, after = _job(Settings(), tmp_path), _job(_changed(name), tmp_path)
     expected = "predict plan" if STALE[name] in ("plan", "predict") else STALE[name]
@@ -244,7 +250,7 @@ def _handed(job: Job, log: Log) -> dict[str, str]:
     fusion_stage, prediction_stage = asdict(build.fusion_stage(job, log)), asdict(build.prediction_stage(job))
     for limits in (fusion_stage["limits"], prediction_stage["limits"]):
         del limits["name"]
-    reading = job.settings.logs.model_dump(exclude={"joints_topic"})
+    reading = {key: value for key, value in job.settings.logs.model_dump().items() if not key.startswith("joint")}
     first = repr((fusion_stage, reading, _ticks(job, log).tolist()))
     second = repr((prediction_stage, replay.store_every(job)))
     return {"fuse": first, "predict": second, "plan": repr(build.plan_settings(job, 0.004, job.settings.plan.method))}
@@ -373,7 +379,7 @@ def _with_joints(path: Path, log: Log) -> Path:
             writer.camera(name, T)
         assert log.header.T_world_base is not None
         writer.base(log.header.T_world_base)
-        writer.joints([f"joint_{i}" for i in range(6)], t_ns, q)
+        writer.joints([f"joint_{i}" for i in range(1, 7)], t_ns, q)
         for frames in log.frames(begin_ns, begin_ns + 500_000_000):
             writer.frames(frames)
     return path

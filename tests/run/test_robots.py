@@ -75,6 +75,32 @@ def test_a_recorded_joint_track_is_the_programme_where_there_is_no_task(tmp_path
     assert run.motion["programme_s"].iloc[-1] > 0.5 * (t_ns[-1] - t_ns[0]) * 1e-9
 
 
+def test_the_order_of_a_message_changes_nothing_and_gaps_are_told(tmp_path: Path) -> None:
+    """Alphabetical order, and one that drivers have: the same motion to the last bit, as names decide."""
+    t_s = np.concatenate([np.arange(8.0, 8.3, 0.01), np.arange(8.6, 9.5, 0.01)])
+    q = np.array([0, 0.3, 0.1, 0, 0.9, 0]) + np.outer(0.2 * np.sin(1.5 * (t_s - 8.0)), [1, 0.3, -0.2, 0.5, 0.4, 1])
+    t_ns = np.round(t_s * 1e9).astype(np.int64)
+    motions, notes = [], []
+    for name, order in (
+        ("right", [0, 1, 2, 3, 4, 5]),
+        ("shuffled", [0, 1, 3, 4, 2, 5]),
+        ("turned", [5, 4, 3, 2, 1, 0]),
+    ):
+        log = _without_task(
+            tmp_path / f"{name}.mcap", names=[f"joint_{i + 1}" for i in order], t_ns=t_ns, q=q[:, order]
+        )
+        folder = replay.run(
+            "plan", log, out=tmp_path / name, overrides=("plan.method=none", "plan.baselines=[]"), end_s=1.0
+        )
+        run = run_folder.read(folder)
+        assert run.motion is not None
+        motions.append(run.motion[AXES].to_numpy())
+        notes.append(run.meta["notes"])
+    np.testing.assert_array_equal(motions[1], motions[0])
+    np.testing.assert_array_equal(motions[2], motions[0])
+    assert all(any("of 0.30 s from 0.30 s" in note for note in told) for told in notes)
+
+
 def test_a_joint_track_of_another_robot_is_refused(tmp_path: Path) -> None:
     track = {"names": ["a", "b"], "t_ns": np.arange(100) * 10_000_000 + 8_000_000_000, "q": np.zeros((100, 2))}
     log = _without_task(tmp_path / "track.mcap", **track)

@@ -6,7 +6,7 @@ again. ``compile_kernels`` compiles every kernel and loads every library before 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,8 @@ from hrcreplay.live.control.stages import ControlSetup, Observer
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
-from hrcreplay.logs.log_files import Header, JointTrack
+from hrcreplay.logs.joints import JointTrack
+from hrcreplay.logs.log_files import Header
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.minimiser import compile_denied
@@ -43,9 +44,11 @@ class HeaderOnlyLog:
 
     header: Header
 
-    def joints(self) -> Iterator[JointTrack]:
+    joint_notes: tuple[str, ...] = ()
+
+    def joints(self, _axes: Sequence[str]) -> JointTrack | None:
         """None: a live robot follows a task."""
-        return iter(())
+        return None
 
 
 def live_job(
@@ -92,7 +95,7 @@ def _header(
         end_ns=0,
         T_world_base=T_world_base,
         has_truth=False,
-        joint_names=(),
+        joint_topics=(),
     )
 
 

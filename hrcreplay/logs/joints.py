@@ -1,0 +1,578 @@
+"""The recorded robot joints: joint states of all topics, joined by name into one track of the robot's axes.
+
+Names decide which joint is which axis, never the order in a message. Each axis is read on its own clock, and all that
+is not as it should be is told in a note.
+"""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.logs.log_files import LogFiles
+from hrcreplay.logs.messages import Message, Undecodable, stamp_ns, topic_list
+from hrcreplay.records import Bools, Floats, Ints, Table
+from hrcreplay.settings.sections import Logs
+
+_ROS, _OWN = "sensor_msgs/JointState", "hrcreplay.JointState"
+_NS = 1_000_000_000
+
+#: A robot whose axis is not heard of for longer has a gap [s].
+GAP_S = 0.2
+#: A message stamped so much ahead of its neighbours has a wrong stamp; so far apart may they be on the wire [s].
+_APART_S = 0.1
+#: A clock that moves on by so much more than the log's between two messages was set anew [s].
+_STEP_S = 0.25
+#: A message needs no longer than this from robot to logger, or its stamp is of another clock [s].
+_LATE_S = 0.25
+#: Stamps may be so far ahead of their arrival: two clocks are never quite the same [s].
+_AHEAD_S = 1e-3
+#: Two clocks are apart by a constant where the least delays all over the log differ by no more [s].
+_CONSTANT_S = 0.05
+#: Two topics that tell one axis agree where they are nowhere further apart [rad].
+_AGREE_RAD = 0.05
+#: A joint that is no axis of the robot rests where it moves by no more [rad or m].
+_AT_REST = 1e-3
+#: What stands for the name of a joint that has none, before its place in the message.
+_NAMELESS = "#"
+
+
+@dataclass(frozen=True)
+class JointTrack(Table):
+    """Positions of the robot's axes as the log has them, a row an instant at which one of them is told."""
+
+    t_ns: Ints  #: (n,) on the log's clock, increasing
+    q: Floats  #: (n, nv) [rad]
+    names: tuple[str, ...]  #: the robot's axes
+
+
+class Samples(NamedTuple):
+    """One joint on one topic."""
+
+    message: Ints  #: (n,) row of the topic's ``arrival_ns`` and ``stamp_ns``
+    position: Floats  #: (n,) in the log's unit
+
+
+@dataclass(frozen=True)
+class JointTopic:
+    """All joint states of one topic."""
+
+    name: str
+    arrival_ns: Ints  #: (m,)
+    stamp_ns: Ints  #: (m,) 0 where a message has none
+    joints: Mapping[str, Samples]  #: by name, in the order in which they are met; without names '#1', '#2', ...
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How the stamps of a topic stand to the log's clock, and what its instants are."""
+
+    topic: str
+    delay_s: tuple[float, float, float]  #: arrival - stamp: median, 5th and 95th percentile; NaN without stamps [s]
+    basis: str  #: "stamps", "stamps, shifted" or "arrival"
+    shift_s: float  #: added to the stamps [s]
+    remark: str  #: for the user; empty where all is well
+
+
+@dataclass(frozen=True)
+class JointReading:
+    """The joint track, and how it was read."""
+
+    track: JointTrack
+    sources: Mapping[str, tuple[str, str]]  #: axis -> topic and name in the log
+    clocks: tuple[Clock, ...]  #: of the topics that are read
+    gaps_ns: Ints  #: (g, 2) begin and end of each silence of an axis, in order
+    notes: tuple[str, ...]  #: for the user
+
+
+def find_topics(source: LogFiles, name: str | None) -> tuple[str, ...]:
+    """Topics of joint states: that named, else all.
+
+    Raises:
+        LogError: The topic named is not there or carries none.
+    """
+    found = dict.fromkeys(t.name for t in source.topics() if t.type in (_ROS, _OWN) and t.count)
+    if name is None:
+        return tuple(found)
+    if name not in found:
+        raise LogError(f"{source.path}: no joint states on {name}; found {topic_list(source.topics())}")
+    return (name,)
+
+
+def read_topics(source: LogFiles, names: Sequence[str], defects: Counter[str]) -> list[JointTopic]:
+    """The joint states of the topics that hold positions.
+
+    Args:
+        source: The log's files.
+        names: Topics of joint states.
+        defects: Counts messages that are left out.
+    """
+    return [topic for name in names if (topic := _read_topic(source, name, defects)).joints]
+
+
+def _read_topic(source: LogFiles, name: str, defects: Counter[str]) -> JointTopic:
+    arrival, stamp = array("q"), array("q")
+    joints: dict[str, tuple[array[int], array[float]]] = {}
+    for message in source.messages([name]):
+        try:
+            t_ns, names, positions = _joint_state(message)
+        except Undecodable:
+            defects["messages_undecodable"] += 1
+            continue
+        if not len(positions):
+            continue  # velocities or efforts alone
+        names = names or [f"{_NAMELESS}{i}" for i in range(1, len(positions) + 1)]
+        if len(names) != len(positions) or len(set(names)) != len(names):
+            defects["joints_malformed"] += 1
+            continue
+        for joint, position in zip(names, positions, strict=True):
+            rows, values = joints.setdefault(joint, (array("q"), array("d")))
+            rows.append(len(arrival))
+            values.append(position)
+        arrival.append(message.arrival_ns)
+        stamp.append(t_ns if 0 < t_ns < 1 << 62 else 0)
+    series = {
+        joint: Samples(_ints(rows), np.array(values, dtype=np.float64)) for joint, (rows, values) in joints.items()
+    }
+    return JointTopic(name, _ints(arrival), _ints(stamp), series)
+
+
+def _ints(values: array[int]) -> Ints:
+    return np.array(values, dtype=np.int64)
+
+
+def _joint_state(message: Message) -> tuple[int, list[str], list[float]]:
+    content = message.read()
+    if message.topic.type == _OWN:
+        return content.t_ns, list(content.names), list(content.q)
+    names, positions = [str(name) for name in content.name], [float(q) for q in content.position]
+    return stamp_ns(content.header.stamp, message.topic.name), names, positions
+
+
+def read_track(
+    topics: Sequence[JointTopic], axes: Sequence[str], options: Logs, where: str, defects: Counter[str]
+) -> JointReading:
+    """One track of the robot's axes.
+
+    Args:
+        topics: What ``read_topics`` found.
+        axes: The robot's joints, from the base on.
+        options: How names, unit and clock are set.
+        where: What messages begin with: the log.
+        defects: Counts messages and positions that are left out.
+
+    Raises:
+        LogError: The joints do not fit the robot, two topics contradict each other, or an axis has no position.
+        SettingsError: ``logs.joint_names`` does not fit robot or log.
+    """
+    names = match_names(topics, axes, options.joint_names, where)
+    chosen = _choose(topics, names)
+    clocks: dict[str, Clock] = {}
+    instants: dict[str, Ints] = {}
+    for topic in topics:
+        used = [joint for joint in names.values() if joint in topic.joints]
+        if used:
+            clocks[topic.name], instants[topic.name] = place_in_time(topic, used, options.joints_offset_s, defects)
+    scale = np.pi / 180.0 if options.joints_unit == "deg" else 1.0
+    tracks: dict[tuple[str, str], tuple[Ints, Floats]] = {}
+    for topic in topics:
+        late: Bools = np.zeros(len(topic.arrival_ns), dtype=np.bool_)
+        for joint in set(names.values()) & set(topic.joints):
+            tracks[(topic.name, joint)] = _in_order(topic.joints[joint], instants[topic.name], scale, late, defects)
+        defects["joints_out_of_order"] += int(late.sum())
+    agreed = _agree(topics, names, chosen, tracks, where)
+    series = [tracks[(chosen[axis].name, names[axis])] for axis in axes]
+    track = _join(series, tuple(axes), where)
+    gaps_ns = _gaps(series, track)
+    read = dict.fromkeys(topic.name for topic in chosen.values())
+    notes = [
+        *_named(topics, names, chosen),
+        *agreed,
+        *(clocks[name].remark for name in read if clocks[name].remark),
+        *_small_degrees(track, options.joints_unit),
+    ]
+    sources = {axis: (chosen[axis].name, names[axis]) for axis in axes}
+    return JointReading(track, sources, tuple(clocks[name] for name in read), gaps_ns, tuple(notes))
+
+
+def match_names(topics: Sequence[JointTopic], axes: Sequence[str], given: Sequence[str], where: str) -> dict[str, str]:
+    """Axis -> the joint in the log that it is, by name.
+
+    A joint is the axis of the same name, but for case and what is no letter or digit: joint1 is joint_1. Only where
+    a message has no names at all, and as many positions as the robot has axes, its order is believed. A log that
+    counts its joints from 0, or goes on counting where the robot ends, is of another robot until names are given.
+
+    Args:
+        topics: What ``read_topics`` found.
+        axes: The robot's joints, from the base on.
+        given: The log's names in that order; () where they are the robot's.
+        where: What messages begin with: the log.
+
+    Raises:
+        LogError: The names do not fit.
+        SettingsError: The names given do not fit.
+    """
+    found = dict.fromkeys(name for topic in topics for name in topic.joints)
+    if given:
+        return _given(list(found), axes, given)
+    plain: dict[str, list[str]] = {}
+    for name in found:
+        plain.setdefault(_plain(name), []).append(name)
+    names = {}
+    for axis in axes:
+        alike = plain.get(_plain(axis), [])
+        if axis in found or len(alike) == 1:
+            names[axis] = axis if axis in found else alike[0]
+    more = _beyond(list(found), axes)
+    if len(set(names.values())) == len(axes) and not more:
+        return names
+    nameless = [name for name in found if name.startswith(_NAMELESS)]
+    if not names and len(nameless) == len(axes):
+        return dict(zip(axes, nameless, strict=True))
+    raise _unfit(topics, axes, more, where)
+
+
+def _given(found: Sequence[str], axes: Sequence[str], given: Sequence[str]) -> dict[str, str]:
+    setting = "logs.joint_names"
+    if len(given) != len(axes):
+        raise SettingsError(
+            f"{setting}: found {len(given)} names; the robot has {len(axes)} axes, {', '.join(axes)}: name the log's "
+            "joint of each, in this order"
+        )
+    missing = [name for name in given if name not in found]
+    if missing:
+        raise SettingsError(f"{setting}: {missing[0]!r} is not in the log; its joints are {_listed(found)}")
+    return dict(zip(axes, given, strict=True))
+
+
+def _plain(name: str) -> str:
+    return "".join(letter for letter in name.casefold() if letter.isalnum())
+
+
+def _beyond(found: Sequence[str], axes: Sequence[str]) -> list[str]:
+    """Joints that are numbered like the axes and are none of them."""
+    numbered = [re.fullmatch(r"(.*?)(\d+)", _plain(axis)) for axis in axes]
+    stems = {match[1] for match in numbered if match}
+    if not all(numbered) or len(stems) != 1:
+        return []
+    known = {(match[1], int(match[2])) for match in numbered if match}
+    others = ((name, re.fullmatch(r"(.*?)(\d{1,3})", _plain(name))) for name in found)
+    return [name for name, match in others if match and match[1] in stems and (match[1], int(match[2])) not in known]
+
+
+def _unfit(topics: Sequence[JointTopic], axes: Sequence[str], more: Sequence[str], where: str) -> LogError:
+    found = list(dict.fromkeys(name for topic in topics for name in topic.joints))
+    nameless = sum(name.startswith(_NAMELESS) for name in found)
+    told = f"{nameless} positions without names" if nameless == len(found) else f"joints {_listed(found)}"
+    ends = [[name for name in found if _plain(name).endswith(_plain(axis))] for axis in axes]
+    likely = [names[0] for names in ends if len(names) == 1]
+    example = likely if len(set(likely)) == len(axes) else [f"name of {axis}" for axis in axes]
+    setting = ", ".join(f'"{name}"' for name in example)
+    why = f" ({_listed(more)} would be one more of them)" if more else ""
+    return LogError(
+        f"{where}: {', '.join(topic.name for topic in topics)}: found {told}; the robot's axes are "
+        f"{', '.join(axes)}{why}. Name the log's joints in the order of the axes, "
+        f"--set 'logs.joint_names=[{setting}]', or the robot that was recorded, --set robot.urdf=FILE"
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    most = 20
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _choose(topics: Sequence[JointTopic], names: Mapping[str, str]) -> dict[str, JointTopic]:
+    """Axis -> the topic that it is read from: that with the most axes, then with the most messages."""
+
+    def rank(topic: JointTopic) -> tuple[int, int, str]:
+        held = [topic.joints[name] for name in names.values() if name in topic.joints]
+        return -len(held), -sum(len(samples.message) for samples in held), topic.name
+
+    ranked = sorted(topics, key=rank)
+    return {axis: next(topic for topic in ranked if name in topic.joints) for axis, name in names.items()}
+
+
+def _agree(
+    topics: Sequence[JointTopic],
+    names: Mapping[str, str],
+    chosen: Mapping[str, JointTopic],
+    tracks: Mapping[tuple[str, str], tuple[Ints, Floats]],
+    where: str,
+) -> Iterator[str]:
+    """Remarks on axes that several topics tell, which must tell the same."""
+    beside: dict[tuple[str, str], float] = {}
+    for axis, name in names.items():
+        t_ns, q = tracks[(chosen[axis].name, name)]
+        for topic in topics:
+            if topic is chosen[axis] or name not in topic.joints:
+                continue
+            other_ns, other = tracks[(topic.name, name)]
+            within = (other_ns >= t_ns[0]) & (other_ns <= t_ns[-1]) if len(t_ns) else np.zeros(0, dtype=np.bool_)
+            apart = np.abs(_at(other_ns[within], t_ns, q) - other[within]) if within.any() else np.zeros(1)
+            pair = chosen[axis].name, topic.name
+            beside[pair] = max(beside.get(pair, 0.0), float(apart.max()))
+            if beside[pair] > _AGREE_RAD:
+                raise LogError(
+                    f"{where}: {name} is on {pair[0]} and on {pair[1]}, up to {np.degrees(apart.max()):.1f} deg apart; "
+                    f"choose with --set logs.joints_topic={pair[0]} (or {pair[1]})"
+                )
+    for (read, other_name), apart_rad in beside.items():
+        yield (
+            f"robot joints: read from {read}; {other_name} holds some of them too, at most "
+            f"{np.degrees(apart_rad):.2g} deg apart"
+        )
+
+
+def place_in_time(
+    topic: JointTopic, joints: Sequence[str], offset_s: float | None, defects: Counter[str]
+) -> tuple[Clock, Ints]:
+    """The instants of a topic's messages on the log's clock.
+
+    A stamp is better than an arrival: it knows no delay and no trembling of the network. So stamps are used where
+    they can be on the log's clock: never ahead of their arrival, and as a rule not more than 0.25 s before it. Where
+    they cannot, but are apart from it by a constant, they are shifted so that the quickest messages (the 5th
+    percentile of arrival - stamp) have no delay: that keeps the stamps' even spacing, and is late by no more than the
+    least delay, as arrival itself would be. Where the two clocks are apart by no constant (a clock that was set anew,
+    a simulation at another pace), no shift is right, and arrival is what remains. An offset that the user gives is
+    taken as it is.
+
+    A single stamp ahead of its neighbours, or none, has the delay of its neighbours. One that comes late keeps its
+    stamp: it was held up on the way.
+
+    Args:
+        topic: All messages.
+        joints: Joints that are axes; messages with none of them say nothing of the robot's clock.
+        offset_s: The robot's clock minus the log's, where it is given [s].
+        defects: Counts wrong stamps.
+
+    Returns:
+        What was found, and (m,) instants [ns].
+    """
+    mine = np.unique(np.concatenate([topic.joints[joint].message for joint in joints]))
+    arrival, stamp = topic.arrival_ns[mine], topic.stamp_ns[mine]
+    known = stamp > 0
+    t_ns = topic.arrival_ns.copy()
+    if not known.any():
+        remark = f"robot joints: the stamps of {topic.name} are all zero; arrival times are used instead"
+        return Clock(topic.name, (np.nan, np.nan, np.nan), "arrival", 0.0, remark), t_ns
+    given_ns = round((offset_s or 0.0) * _NS)
+    delays, wrong = _delays(arrival, stamp - given_ns, known)
+    defects["joints_stamp_wrong"] += int(wrong.sum())
+    stamp = np.where(wrong, arrival - delays, stamp - given_ns)
+    match = _match_clocks(arrival, stamp, delays, wrong)
+    basis, remark = _judge(match, f"robot joints: the stamps of {topic.name}", offset_s)
+    shift_ns = match.quickest_ns if basis == "stamps, shifted" else 0
+    if basis != "arrival":
+        t_ns[mine] = stamp + shift_ns
+    return Clock(topic.name, match.delay_s, basis, (shift_ns - given_ns) / _NS, remark), t_ns
+
+
+class _Match(NamedTuple):
+    """Stamps against arrivals."""
+
+    delay_s: tuple[float, float, float]  #: arrival - stamp: median, 5th and 95th percentile [s]
+    quickest_ns: int  #: the 5th percentile
+    least_s: list[float]  #: what the quickest messages of each part of the log need [s]
+    steps: int  #: how often the robot's clock was set
+    step_at_s: float  #: the first time, after the first message [s]
+    step_by_s: float  #: by so much [s]
+
+
+def _match_clocks(arrival_ns: Ints, stamp_ns: Ints, delays_ns: Ints, wrong: Bools) -> _Match:
+    late = arrival_ns - stamp_ns
+    order = np.sort(late)
+    low, high = (int(order[round(share * (len(late) - 1))]) for share in (0.05, 0.95))
+    steady = ~wrong & (np.abs(late - delays_ns) <= _APART_S * _NS)
+    steady = steady if steady.any() else ~wrong
+    steps = _steps(arrival_ns[steady], stamp_ns[steady])
+    at_s = by_s = 0.0
+    if len(steps):
+        at_s = float(arrival_ns[steady][steps[0]] - arrival_ns[0]) / _NS
+        by_s = float(late[steady][steps[0] - 1] - late[steady][steps[0]]) / _NS
+    least_s = [float(np.sort(part)[len(part) // 4]) / _NS for part in _parts(late[steady])]
+    return _Match((float(np.median(late)) / _NS, low / _NS, high / _NS), low, least_s, len(steps), at_s, by_s)
+
+
+def _judge(match: _Match, stamps: str, offset_s: float | None) -> tuple[str, str]:
+    """What the instants are taken from (see ``Clock.basis``), and the remark."""
+    median_s, low_s, high_s = match.delay_s
+    least_s, most_s = min(match.least_s), max(match.least_s)
+    told = (
+        f"{stamps} (arrival - stamp: median {_seconds(median_s)}, "
+        f"5th to 95th percentile {_seconds(low_s)} to {_seconds(high_s)})"
+    )
+    if least_s >= -_AHEAD_S and float(np.median(match.least_s)) <= _LATE_S and not match.steps:
+        over = f"{told} are used, though 5 % of the messages arrive later than {_LATE_S:g} s after them"
+        return "stamps", over if high_s > _LATE_S else ""
+    if offset_s is not None:
+        return "stamps", (
+            f"{told} do not fit the log's clock with logs.joints_offset_s = {offset_s:g}, and are used as you set it"
+        )
+    if match.steps:
+        return "arrival", (
+            f"{stamps} jump by {_seconds(match.step_by_s)} at {match.step_at_s:.2f} s"
+            + (f", and {match.steps - 1} times more" if match.steps > 1 else "")
+            + ": the robot's clock was set while the log was written; arrival times are used instead"
+        )
+    if most_s - least_s <= _CONSTANT_S:
+        side = "ahead of" if low_s < 0 else "behind"
+        return "stamps, shifted", (
+            f"{told} are {_seconds(abs(low_s))} {side} the log's clock{_epoch(low_s)}; they are shifted by that much, "
+            "as if the quickest messages took no time. If you know the offset of the robot's clock, set "
+            "logs.joints_offset_s"
+        )
+    return "arrival", (
+        f"{told} keep another pace than the log's clock, {_seconds(least_s)} to {_seconds(most_s)} from it; arrival "
+        "times are used instead"
+    )
+
+
+def _seconds(value_s: float) -> str:
+    return f"{value_s:.3f} s" if abs(value_s) < 1e5 else f"{value_s:.6g} s"
+
+
+def _epoch(apart_s: float) -> str:
+    """A word on clocks that are years apart."""
+    years = abs(apart_s) > 365 * 86_400
+    return ": they count from another epoch, as simulation time or the time since start-up does" if years else ""
+
+
+def _delays(arrival_ns: Ints, stamp_ns: Ints, known: Bools) -> tuple[Ints, Bools]:
+    """(n,) the running median of arrival - stamp over five messages, and which stamps are wrong or missing."""
+    at = np.flatnonzero(known)
+    delay = arrival_ns[at] - stamp_ns[at]
+    padded = np.pad(delay, 2, mode="reflect" if len(delay) > 2 else "edge")
+    middle = np.sort(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)[:, 2]
+    nearest = np.clip(np.searchsorted(at, np.arange(len(arrival_ns))), 0, len(at) - 1)
+    delays = middle[nearest]
+    usual = np.sort(delay)[round(0.05 * (len(delay) - 1))]
+    ahead = arrival_ns - stamp_ns < np.minimum(delays, usual) - round(_APART_S * _NS)
+    return delays, ~known | ahead
+
+
+def _steps(arrival_ns: Ints, stamp_ns: Ints) -> Ints:
+    """Messages before which the robot's clock was set: further on than the log's, or back."""
+    way, passed = np.diff(stamp_ns), np.diff(arrival_ns)
+    return np.flatnonzero((way - passed > _STEP_S * _NS) | (way < -_APART_S * _NS)) + 1
+
+
+def _parts(delay_ns: Ints) -> list[Ints]:
+    """Delays in up to 20 parts of the log of at least 20 messages each."""
+    return np.array_split(delay_ns, int(np.clip(len(delay_ns) // 20, 1, 20)))
+
+
+def _in_order(samples: Samples, t_ns: Ints, scale: float, late: Bools, defects: Counter[str]) -> tuple[Ints, Floats]:
+    """Instants and positions [rad] of a joint, without those that are no number or not later than one before."""
+    finite: Bools = np.isfinite(samples.position)
+    defects["joints_not_finite"] += int((~finite).sum())
+    messages = samples.message[finite]
+    times, q = t_ns[messages], samples.position[finite] * scale
+    before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(times)[:-1]]) if len(times) else times
+    increasing = times > before
+    late[messages[~increasing]] = True
+    return times[increasing], q[increasing]
+
+
+def _at(t_ns: Ints, known_ns: Ints, q: Floats) -> Floats:
+    """Positions between known ones, on straight lines."""
+    return np.asarray(np.interp((t_ns - known_ns[0]).astype(float), (known_ns - known_ns[0]).astype(float), q))
+
+
+def _join(series: Sequence[tuple[Ints, Floats]], axes: tuple[str, ...], where: str) -> JointTrack:
+    """All axes at each instant at which one is told, from when all are known until one no longer is."""
+    for axis, (times, _) in zip(axes, series, strict=True):
+        if not len(times):
+            raise LogError(f"{where}: {axis} has no position that is a number; a joint track needs two of every axis")
+    first, last = max(int(t[0]) for t, _ in series), min(int(t[-1]) for t, _ in series)
+    if first > last:
+        raise LogError(f"{where}: the robot's axes {', '.join(axes)} are never known at one time")
+    union = np.unique(np.concatenate([t for t, _ in series]))
+    union = union[(union >= first) & (union <= last)]
+    columns = [q if np.array_equal(t, union) else _at(union, t, q) for t, q in series]
+    return JointTrack(union, np.column_stack(columns), axes)
+
+
+def _gaps(series: Sequence[tuple[Ints, Floats]], track: JointTrack) -> Ints:
+    """(g, 2) instants between which an axis is not told for longer than GAP_S, in order."""
+    found: set[tuple[int, int]] = set()
+    for times, _ in series:
+        at = np.flatnonzero(np.diff(times) > GAP_S * _NS)
+        found |= {(int(a), int(b)) for a, b in zip(times[at], times[at + 1], strict=True)}
+    first, last = int(track.t_ns[0]), int(track.t_ns[-1])
+    inside = sorted((max(a, first), min(b, last)) for a, b in found if b > first and a < last)
+    return np.array(inside, dtype=np.int64).reshape(-1, 2)
+
+
+def coverage_remarks(reading: JointReading, start_ns: int, end_ns: int) -> Iterator[str]:
+    """Remarks on a track with gaps, or that begins later or ends earlier than the log.
+
+    Args:
+        reading: The track and its gaps.
+        start_ns: First arrival of the log.
+        end_ns: Last one.
+    """
+    gaps_ns, times = reading.gaps_ns, reading.track.t_ns
+    begin_s, last_s, length_s = ((int(t) - start_ns) / _NS for t in (times[0], times[-1], end_ns))
+    if begin_s > GAP_S or length_s - last_s > GAP_S:
+        yield (
+            f"robot joints: known from {begin_s:.2f} s to {last_s:.2f} s of the log, which lasts {length_s:.2f} s; "
+            "before and after, the programme stands still"
+        )
+    if not len(gaps_ns):
+        return
+    covered, until = 0, int(gaps_ns[0, 0])
+    for begin, end in gaps_ns.tolist():
+        covered += max(0, end - max(begin, until))
+        until = max(until, end)
+    longest = gaps_ns[np.argmax(gaps_ns[:, 1] - gaps_ns[:, 0])]
+    yield (
+        f"robot joints: gaps of more than {GAP_S:g} s: {len(gaps_ns)}, {covered / _NS:.2f} s in all, the longest of "
+        f"{(longest[1] - longest[0]) / _NS:.2f} s from {(longest[0] - start_ns) / _NS:.2f} s of the log on. There the "
+        "programme is a straight line in joint space from the last known position to the next: nobody measured it"
+    )
+
+
+def _named(topics: Sequence[JointTopic], names: Mapping[str, str], chosen: Mapping[str, JointTopic]) -> Iterator[str]:
+    """Remarks on names that are not the robot's, and on joints that are no axis."""
+    if all(name.startswith(_NAMELESS) for name in names.values()):
+        order = ", ".join(names)
+        yield f"robot joints: {next(iter(chosen.values())).name} has no names; its order is believed to be {order}"
+    elif list(names.values()) != list(names):
+        yield f"robot joints: read as {', '.join(f'{axis} = {name}' for axis, name in names.items())}"
+    others: dict[str, float] = {}
+    for topic in topics:
+        for name, samples in topic.joints.items():
+            finite = samples.position[np.isfinite(samples.position)]
+            if name not in names.values():
+                others[name] = max(others.get(name, 0.0), float(np.ptp(finite)) if len(finite) else 0.0)
+    if others:
+        moving = {name: f"{name} (moves by {way:.3g})" for name, way in others.items() if way > _AT_REST}
+        carrying = "; if one that moves carries the arm, the robot's base is not where it is taken to be"
+        yield (
+            f"robot joints: ignored, as no axis of the robot: {_listed([moving.get(name, name) for name in others])}"
+            f"{carrying if moving else ''}"
+        )
+
+
+def _small_degrees(track: JointTrack, unit: str) -> Iterator[str]:
+    """A remark on degrees that are small enough to be radians."""
+    most_deg = float(np.degrees(np.abs(track.q).max()))
+    if unit == "deg" and 0.0 < most_deg <= 2 * np.pi:
+        yield (
+            f"robot joints: with logs.joints_unit = deg no axis is ever beyond {most_deg:.2f} deg; if the log is in "
+            "radians, leave the setting out"
+        )
+
+
+def wait_s(topic: JointTopic, of: Callable[[Ints], float]) -> float:
+    """The median, or the longest, time between two arrivals of a joint [s]; NaN where none arrives twice."""
+    waits = [np.diff(topic.arrival_ns[samples.message]) for samples in topic.joints.values()]
+    every = np.concatenate(waits) if waits else np.zeros(0, dtype=np.int64)
+    return float(of(every)) / _NS if len(every) else float("nan")
