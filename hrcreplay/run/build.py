@@ -263,8 +263,10 @@ def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int
         return replace(path, model=model), None
     track = log.joints(model.joint_names)
     if track is None:
+        empty = f" ({', '.join(log.header.joint_topics)}: no positions that go with their names)"
         raise SettingsError(
-            f"{log.header.path}: no task and no joint track; name a task file with --set plan.task=FILE.toml"
+            f"{log.header.path}: no task and no joint track{empty if log.header.joint_topics else ''}; "
+            "name a task file with --set plan.task=FILE.toml"
         )
     return recorded(track.t_ns, track.q, model), int(track.t_ns[0])
 

@@ -115,6 +115,14 @@ def test_no_programme_at_all_says_how_to_give_one(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+def test_joint_states_without_usable_positions_are_no_programme_and_named(tmp_path: Path) -> None:
+    """Three names and two positions: which joint has none, nobody can say."""
+    track = {"names": ["a", "b", "c"], "t_ns": np.arange(100) * 10_000_000 + 8_000_000_000, "q": np.zeros((100, 2))}
+    log = _without_task(tmp_path / "track.mcap", **track)
+    with pytest.raises(SettingsError, match=r"/robot/joints.*plan\.task"):
+        replay.run("plan", log, out=tmp_path / "run")
+
+
 def test_the_reference_runs_with_the_clock_where_asked(tmp_path: Path) -> None:
     run = _plan(replay.demo_log(), tmp_path / "run", "plan.reference=time")
     assert run.motion is not None
