@@ -233,7 +233,7 @@ def test_stamps_of_another_clock_are_shifted_by_the_least_delay(tmp_path: Path, 
     delays = np.random.default_rng(5).integers(MS, 31 * MS, 400).tolist()
     sent = [(s + delay, s + ahead_ns, q, topic) for (_, s, q, topic), delay in zip(regular(), delays, strict=True)]
     log, track = read(write(tmp_path / "a", sorted(sent, key=lambda one: one[0])))
-    shift_s = summarize(log, AXES).joints[0].clock.shift_s
+    shift_s = summarize(log, axes=AXES).joints[0].clock.shift_s
     assert shift_s == pytest.approx(-ahead_ns / 1e9, abs=0.004)
     assert error_rad(track) < 1.1 * 0.004, "at most 1.1 rad/s"
     assert any("logs.joints_offset_s" in note for note in log.joint_notes)
@@ -310,7 +310,7 @@ def test_gaps_and_ends_are_told_with_where_and_how_long(tmp_path: Path) -> None:
 def test_info_says_which_joint_is_which_axis_and_how_the_clock_stands(tmp_path: Path) -> None:
     ahead = [(a, s + 2 * SECOND, {"finger": 0.0, **q}, topic) for a, s, q, topic in regular(delay_ns=5 * MS)]
     path = write(tmp_path / "a", ahead)
-    summary = summarize(open_log(path), AXES)
+    summary = summarize(open_log(path), axes=AXES)
     (topic,) = summary.joints
     assert topic.axes == {"base_turn": 1, "lift": 2, "elbow": 3}
     assert topic.rate_hz == pytest.approx(100.0)
@@ -319,6 +319,6 @@ def test_info_says_which_joint_is_which_axis_and_how_the_clock_stands(tmp_path: 
     text = "\n".join(lines(summary))
     assert "finger, base_turn = axis 1, lift = axis 2, elbow = axis 3" in text
     assert "-1995.0 ms" in text
-    other = summarize(open_log(path), ("a", "b", "c"))
+    other = summarize(open_log(path), axes=("a", "b", "c"))
     assert other.joints[0].axes == {}
     assert any("logs.joint_names" in note for note in other.notes), "told, and the rest is described"
