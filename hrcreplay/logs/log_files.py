@@ -38,6 +38,7 @@ from hrcreplay.logs.ros_bags import Db3Stream, open_bag
 from hrcreplay.logs.unpack import ZSTD_MAGIC, unpack_file
 from hrcreplay.records import Floats, Ints, Table
 
+_TABLES = ("csv", "tsv", "txt")  # endings of what the importers read
 _SQLITE = b"SQLite format 3\0"
 _KNOWN = "known are MCAP files, ROS 1 bags (.bag) and ROS 2 bags (a folder with metadata.yaml, or a .db3 file)"
 
@@ -153,13 +154,15 @@ def _unpacked(source: LogFiles, file: Path) -> Path:
 
 
 def _is_text(path: Path) -> bool:
-    """Whether a file begins with lines of text, plain or gzipped."""
+    """Whether a file may be a tracker's table: it is called so, and begins with lines of text, plain or gzipped."""
+    if path.name.lower().removesuffix(".gz").rpartition(".")[2] not in _TABLES:
+        return False
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             head = file.read(4096)
     except (OSError, EOFError, zlib.error):
         return False
-    return path.suffix.lower() != ".bag" and bool(head) and all(byte >= 32 or byte in b"\t\r\n" for byte in head)
+    return bool(head) and all(byte >= 32 or byte in b"\t\r\n" for byte in head)
 
 
 #: A metadata.yaml is some kB, with a line or two a file [bytes].

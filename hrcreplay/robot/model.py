@@ -90,7 +90,7 @@ class RobotModel:
         if not self.tcp_outside_m > _OUTSIDE_M:
             return None
         end = ", ".join(f"{at:.4g}" for at in (self.tcp_in_frame_m + 0.0).tolist())
-        capsule = f'{{name = "tool", body = "{self.tcp_frame}", start_m = [0.0, 0.0, 0.0], end_m = [{end}]'
+        capsule = f'{{name = "mounted", body = "{self.tcp_frame}", start_m = [0.0, 0.0, 0.0], end_m = [{end}]'
         return (
             f"robot {self.name}: the TCP lies {self.tcp_outside_m:.3f} m outside the capsules of the last link, and "
             f"what is mounted there is not guarded; a capsule to it guards it: robot.tool_links = [{capsule}, "

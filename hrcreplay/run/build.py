@@ -256,7 +256,8 @@ def reference(job: Job, log: LogLike, model: RobotModel) -> tuple[Reference, int
         LogError: The joint track does not fit the robot.
     """
     own = (log.header.task, f"{log.header.path}: task")
-    table, where = (job.task, str(job.settings.plan.task)) if job.task else own
+    file = job.settings.plan.task
+    table, where = (job.task, own[1] if file is None else str(file)) if job.task else own
     if table is not None:
         parts = job.settings.robot, job.urdf, job.settings.occupancy.stop_s
         path = _programme(parse_task(table, where), where, *parts, model.T_world_base.tobytes())
