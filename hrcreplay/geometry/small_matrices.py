@@ -1,0 +1,171 @@
+"""Products, solutions and singular values of small matrices, in an order of operations that no processor changes.
+
+BLAS and LAPACK choose their code by the processor, and with it the order in which they add up: the last bits differ
+from one machine to the next, and with them a robot's whole path. So what decides is computed in here. Kernels without
+fastmath neither reorder sums nor fuse a product with a sum.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from hrcreplay.geometry.vectors import dot_n, norm_n
+from hrcreplay.records import Floats
+
+_EPS = float(np.finfo(np.float64).eps)
+_SWEEPS = 60  #: of Jacobi's rotations; some ten are enough
+
+
+@njit(cache=True)
+def multiply(A: Floats, B: Floats) -> Floats:
+    """(n, m) product of (n, k) and (k, m)."""
+    C = np.zeros((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
+            for k in range(A.shape[1]):
+                C[i, j] += A[i, k] * B[k, j]
+    return C
+
+
+@njit(cache=True)
+def apply(A: Floats, x: Floats) -> Floats:
+    """(n,) product of (n, k) and (k,)."""
+    y = np.empty(len(A))
+    for i in range(len(A)):
+        y[i] = dot_n(A[i], x)
+    return y
+
+
+@njit(cache=True, error_model="numpy")
+def solve(A: Floats, b: Floats) -> Floats:
+    """(n,) with ``A @ x = b`` by elimination with row pivots; not finite where A (n, n) is singular."""
+    n, U, x = len(b), A.copy(), b.copy()
+    for k in range(n):
+        pivot = k
+        for i in range(k + 1, n):
+            if abs(U[i, k]) > abs(U[pivot, k]):
+                pivot = i
+        for j in range(n):
+            U[k, j], U[pivot, j] = U[pivot, j], U[k, j]
+        x[k], x[pivot] = x[pivot], x[k]
+        for i in range(k + 1, n):
+            share = U[i, k] / U[k, k]
+            for j in range(k, n):
+                U[i, j] -= share * U[k, j]
+            x[i] -= share * x[k]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            x[k] -= U[k, j] * x[j]
+        x[k] /= U[k, k]
+    return x
+
+
+@njit(cache=True, error_model="numpy")
+def cholesky(H: Floats) -> Floats:
+    """(n, n) lower triangle L with ``L @ L.T = H``; NaN where H is not positive definite."""
+    n = len(H)
+    L = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            rest = H[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
+    return L
+
+
+@njit(cache=True, error_model="numpy")
+def solve_lower(L: Floats, b: Floats) -> Floats:
+    """(n,) with ``L @ y = b`` for a lower triangle."""
+    y = np.empty(len(b))
+    for i in range(len(b)):
+        rest = b[i]
+        for k in range(i):
+            rest -= L[i, k] * y[k]
+        y[i] = rest / L[i, i]
+    return y
+
+
+@njit(cache=True, error_model="numpy")
+def solve_transposed(L: Floats, y: Floats) -> Floats:
+    """(n,) with ``L.T @ x = y`` for a lower triangle."""
+    x = np.empty(len(y))
+    for i in range(len(y) - 1, -1, -1):
+        rest = y[i]
+        for k in range(i + 1, len(y)):
+            rest -= L[k, i] * x[k]
+        x[i] = rest / L[i, i]
+    return x
+
+
+@njit(cache=True)
+def singular_values(A: Floats) -> tuple[Floats, Floats, Floats]:
+    """``A = U @ diag(s) @ V.T`` by Jacobi's one-sided rotations (Hestenes).
+
+    Args:
+        A: (n, m), of any shape.
+
+    Returns:
+        ``U`` (n, m), its columns zero where s is; ``s`` (m,), the largest first; ``V`` (m, m).
+    """
+    rows, m = np.ascontiguousarray(A.T), A.shape[1]  # of A's columns
+    turns = np.eye(m)
+    for _ in range(_SWEEPS):
+        turned = False
+        for p in range(m):
+            for q in range(p + 1, m):
+                turned = _make_orthogonal(rows, turns, p, q) or turned
+        if not turned:
+            break
+    s = np.empty(m)
+    for j in range(m):
+        s[j] = norm_n(rows[j])
+    order = np.argsort(-s, kind="mergesort")
+    U, V = np.zeros((A.shape[0], m)), np.empty((m, m))
+    for k in range(m):
+        j = order[k]
+        V[:, k] = turns[j]
+        if s[j] > 0.0:
+            U[:, k] = rows[j] / s[j]
+    return U, s[order], V
+
+
+@njit(cache=True)
+def _make_orthogonal(rows: Floats, turns: Floats, p: int, q: int) -> bool:
+    """Turns two rows in their plane until they are orthogonal, in place; says whether they were not."""
+    a, b, c = dot_n(rows[p], rows[p]), dot_n(rows[q], rows[q]), dot_n(rows[p], rows[q])
+    if not abs(c) > _EPS * math.sqrt(a * b):
+        return False
+    zeta = (b - a) / (2.0 * c)
+    t = math.copysign(1.0, zeta) / (abs(zeta) + math.sqrt(1.0 + zeta * zeta))
+    cosine = 1.0 / math.sqrt(1.0 + t * t)
+    sine = cosine * t
+    for matrix in (rows, turns):
+        for k in range(matrix.shape[1]):
+            u, v = matrix[p, k], matrix[q, k]
+            matrix[p, k], matrix[q, k] = cosine * u - sine * v, sine * u + cosine * v
+    return True
+
+
+@njit(cache=True)
+def least_norm(A: Floats, b: Floats, smallest: float) -> Floats:
+    """(m,) shortest of the x with the least ``|A @ x - b|``, as by the pseudoinverse of A (n, m).
+
+    Args:
+        A: (n, m).
+        b: (n,).
+        smallest: Singular values below this share of the largest count as zero.
+    """
+    U, s, V = singular_values(A)
+    x = np.zeros(A.shape[1])
+    for k in range(len(s)):
+        if s[k] > smallest * s[0]:
+            share = 0.0
+            for i in range(len(b)):
+                share += U[i, k] * b[i]
+            for j in range(len(x)):
+                x[j] += share / s[k] * V[j, k]
+    return x
