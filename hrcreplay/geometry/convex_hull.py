@@ -14,13 +14,15 @@ How far a point gets along a direction while it turns about an axis is exact, so
 
 from __future__ import annotations
 
+import math
 from itertools import combinations
 
 import numpy as np
 from numba import njit
 from scipy.spatial import ConvexHull, QhullError
 
-from hrcreplay.geometry.vectors import cross, dot, edge, norm
+from hrcreplay.geometry.small_matrices import apply, multiply, singular_values
+from hrcreplay.geometry.vectors import cross, dot, edge, norm, norm_n
 from hrcreplay.records import Floats, Ints
 
 #: A set thinner than this in a direction has no extent in it [m].
@@ -47,7 +49,7 @@ def hull(points_m: Floats) -> tuple[Floats, Ints]:
         except QhullError:  # too thin to be told from a flat set in floating point: then it is one
             axes = axes[:-1]
     if len(axes) == 1:
-        along = (points_m - points_m[0]) @ axes[0]
+        along = apply(points_m - points_m[0], axes[0])
         return points_m[np.sort([along.argmin(), along.argmax()])], np.empty((0, 3), np.int64)
     return points_m[:1], np.empty((0, 3), np.int64)
 
@@ -62,7 +64,7 @@ def _solid(points_m: Floats) -> tuple[Floats, Ints]:
 
 def _flat(points_m: Floats, axes: Floats) -> tuple[Floats, Ints]:
     """The polygon in the plane of two axes (2, 3), with both sides."""
-    around = ConvexHull((points_m - points_m[0]) @ axes.T).vertices  # counterclockwise
+    around = ConvexHull(multiply(points_m - points_m[0], axes.T)).vertices  # counterclockwise
     corners = np.sort(around)
     loop = np.searchsorted(corners, around)
     # from different corners, so that no two triangles lie left of one edge
@@ -122,7 +124,7 @@ def sphere_swept_volume_m3(points_m: Floats, radius_m: float, faces: Ints | None
     if len(faces):
         volume, area, bend = _measures(points_m, faces)
     else:
-        volume, area, bend = 0.0, 0.0, np.pi * float(np.linalg.norm(points_m[-1] - points_m[0]))
+        volume, area, bend = 0.0, 0.0, np.pi * norm_n(points_m[-1] - points_m[0])
     return float(volume + area * radius_m + bend * radius_m**2 + 4.0 / 3.0 * np.pi * radius_m**3)
 
 
@@ -150,16 +152,16 @@ def _measures(vertices: Floats, faces: Ints) -> tuple[float, float, float]:
 def _axes(points_m: Floats) -> Floats:
     """(0 to 3, 3) principal directions in which the set has an extent, the longest first."""
     centred = points_m - points_m.mean(axis=0)
-    _, _, directions = np.linalg.svd(centred, full_matrices=False)
-    extents = np.ptp(centred @ directions.T, axis=0)
+    directions = singular_values(centred)[2].T
+    extents = np.ptp(multiply(centred, directions.T), axis=0)
     axes: Floats = directions[extents > max(_THIN_M, _COARSE * float(np.abs(points_m).max()))]
     return axes
 
 
 def _directions() -> Floats:
     """(92, 3) unit vectors: an icosahedron's corners, two of them up and down, thirds of its edges, its faces."""
-    around = 2.0 * np.pi * np.arange(5) / 5.0
-    ring = [np.column_stack([np.cos(around + turn), np.sin(around + turn)]) * 2.0 for turn in (0.0, np.pi / 5.0)]
+    around = [2.0 * math.pi * k / 5.0 for k in range(5)]  # numpy's own cosine is another one on another processor
+    ring = [np.array([(2.0 * math.cos(a + t), 2.0 * math.sin(a + t)) for a in around]) for t in (0.0, math.pi / 5.0)]
     upper, lower = (np.column_stack([ring[k], np.full(5, 1.0 - 2.0 * k)]) / np.sqrt(5.0) for k in range(2))
     corners = np.concatenate([[[0.0, 0.0, 1.0]], upper, lower, [[0.0, 0.0, -1.0]]])
     near = corners @ corners.T > 0.4
@@ -174,11 +176,18 @@ def _directions() -> Floats:
     return unit
 
 
+def _inverses(A: Floats) -> Floats:
+    """(n, 3, 3) inverses of matrices, by the cross products of their rows."""
+    a, b, c = A[:, 0], A[:, 1], A[:, 2]
+    columns = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+    return np.asarray(columns / (a * columns[:, :, 0]).sum(axis=1)[:, None, None])
+
+
 DIRECTIONS = _directions()
 _TRIANGLES = ConvexHull(DIRECTIONS).simplices.astype(np.int64)
 _TRIANGLES = _TRIANGLES[np.lexsort(np.sort(_TRIANGLES).T)]
 #: (corners, 3, 3): from how far along its three directions a corner is to where it is.
-_SOLUTIONS = np.linalg.inv(DIRECTIONS[_TRIANGLES])
+_SOLUTIONS = _inverses(DIRECTIONS[_TRIANGLES])
 CORNERS = len(_TRIANGLES)
 #: The directions as (3, directions), and how far each is across each axis.
 _COLUMNS = np.ascontiguousarray(DIRECTIONS.T)

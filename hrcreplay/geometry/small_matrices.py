@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from hrcreplay.geometry.vectors import dot_n, norm_n
-from hrcreplay.records import Floats
+from hrcreplay.records import Floats, Ints
 
 _EPS = float(np.finfo(np.float64).eps)
 _SWEEPS = 60  #: of Jacobi's rotations; some ten are enough
@@ -111,8 +111,9 @@ def singular_values(A: Floats) -> tuple[Floats, Floats, Floats]:
     Returns:
         ``U`` (n, m), its columns zero where s is; ``s`` (m,), the largest first; ``V`` (m, m).
     """
-    rows, m = np.ascontiguousarray(A.T), A.shape[1]  # of A's columns
-    turns = np.eye(m)
+    m = A.shape[1]
+    rows, turns = np.empty((m, A.shape[0])), np.eye(m)
+    rows[:] = A.T  # a copy, whatever A's order in memory
     for _ in range(_SWEEPS):
         turned = False
         for p in range(m):
@@ -169,3 +170,90 @@ def least_norm(A: Floats, b: Floats, smallest: float) -> Floats:
             for j in range(len(x)):
                 x[j] += share / s[k] * V[j, k]
     return x
+
+
+@njit(cache=True, error_model="numpy")
+def least_squares(A: Floats, b: Floats) -> Floats:
+    """(m,) with the least ``|A @ x - b|`` by Householder's reflections; not finite where columns of A (n, m) depend."""
+    R, y, m = A.copy(), b.copy(), A.shape[1]
+    v = np.zeros(len(b))
+    for k in range(m):
+        v[:] = 0.0
+        v[k:] = R[k:, k]
+        v[k] += math.copysign(norm_n(v), v[k])
+        length = dot_n(v, v)
+        if length == 0.0:
+            return np.full(m, np.nan)
+        for j in range(k, m):
+            share = 2.0 * dot_n(v, R[:, j]) / length
+            for i in range(k, len(b)):
+                R[i, j] -= share * v[i]
+        share = 2.0 * dot_n(v, y) / length
+        for i in range(k, len(b)):
+            y[i] -= share * v[i]
+    x = y[:m].copy()
+    for k in range(m - 1, -1, -1):
+        for j in range(k + 1, m):
+            x[k] -= R[k, j] * x[j]
+        x[k] /= R[k, k]
+    return x
+
+
+@njit(cache=True)
+def nonnegative_least_squares(A: Floats, b: Floats, most: int) -> tuple[Floats, bool]:
+    """The x >= 0 (m,) with the least ``|A @ x - b|``, by Lawson and Hanson.
+
+    Args:
+        A: (n, m).
+        b: (n,).
+        most: How many columns may join in, one after the other.
+
+    Returns:
+        x, and whether it is the minimiser.
+    """
+    m = A.shape[1]
+    x, chosen = np.zeros(m), np.zeros(0, np.int64)
+    enough = 10.0 * _EPS * max(A.shape[0], m) * norm_n(b) * max(1.0, np.abs(A).max())
+    for _ in range(most):
+        wider, z = _join_steepest(A, b, x, chosen, enough)
+        if len(wider) == len(chosen):
+            return x, True
+        chosen = wider
+        while len(chosen) and not z.min() > 0.0:
+            chosen = _leave_first(x, chosen, z)
+            z = least_squares(A[:, chosen], b)
+        for i, k in enumerate(chosen):
+            x[k] = z[i]
+    return x, False
+
+
+@njit(cache=True)
+def _join_steepest(A: Floats, b: Floats, x: Floats, chosen: Ints, enough: float) -> tuple[Ints, Floats]:
+    """The chosen columns with the steepest that does not depend on them, and their solution; without it if none is."""
+    rest = b.copy()
+    for k in chosen:
+        rest -= A[:, k] * x[k]
+    slopes = np.array([dot_n(A[:, k], rest) for k in range(len(x))])
+    slopes[chosen] = -np.inf
+    while True:
+        best = int(np.argmax(slopes))
+        if not slopes[best] > enough:
+            return chosen, x[chosen]
+        wider = np.append(chosen, best)
+        z = least_squares(A[:, wider], b)
+        if z[-1] > 0.0 and np.isfinite(z).all():
+            return wider, z
+        slopes[best] = -np.inf
+
+
+@njit(cache=True)
+def _leave_first(x: Floats, chosen: Ints, z: Floats) -> Ints:
+    """Goes from x towards z until the first column is not needed any more, in place; the columns that stay."""
+    share, leaves = 1.0, 0
+    for i, k in enumerate(chosen):
+        if z[i] <= 0.0 and x[k] <= share * (x[k] - z[i]):
+            share, leaves = x[k] / (x[k] - z[i]), i
+    for i, k in enumerate(chosen):
+        x[k] += share * (z[i] - x[k])
+    x[chosen[leaves]] = 0.0
+    return np.concatenate((chosen[:leaves], chosen[leaves + 1 :]))

@@ -57,21 +57,36 @@ def norm_n(v: Floats) -> float:
     return math.sqrt(dot_n(v, v))
 
 
+@njit(cache=True)
 def to_vector(R: Floats) -> Floats:
     """(3,) rotation vector of (3, 3), its length in [0, pi] [rad]; exact near both ends.
 
-    scipy's ``Rotation`` does the same in eleven times the time; this runs in every tick of the controller.
+    scipy's ``Rotation`` does the same in many times the time; this runs in every tick of the controller.
     """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
     # four times the unit quaternion (w, x, y, z) times one of its elements: the row of the largest has no cancellation
-    w, x, y, z = max(
-        (
-            (1 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
-            (zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx),
-            (xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy),
-            (yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz),
-        ),
-        key=lambda row: sum(v * v for v in row),
+    rows = (
+        (1.0 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
+        (zy - yz, 1.0 + xx - yy - zz, xy + yx, xz + zx),
+        (xz - zx, xy + yx, 1.0 - xx + yy - zz, yz + zy),
+        (yx - xy, xz + zx, yz + zy, 1.0 - xx - yy + zz),
     )
+    w, x, y, z = rows[0]
+    most = w * w + x * x + y * y + z * z
+    for row in rows[1:]:
+        size = row[0] * row[0] + row[1] * row[1] + row[2] * row[2] + row[3] * row[3]
+        if size > most:
+            most, (w, x, y, z) = size, row
     sine = math.copysign(math.sqrt(x * x + y * y + z * z), w)
-    return np.array([x, y, z]) * (2 * math.atan2(abs(sine), abs(w)) / sine if sine else 0.0)
+    turn = 2.0 * math.atan2(abs(sine), abs(w)) / sine if sine != 0.0 else 0.0
+    return np.array([x * turn, y * turn, z * turn])
+
+
+@njit(cache=True)
+def turn_between(T_from: Floats, T_to: Floats) -> Floats:
+    """(3,) rotation vector that turns the axes of one pose (4, 4) into those of another, world frame [rad]."""
+    R = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = T_to[i, 0] * T_from[j, 0] + T_to[i, 1] * T_from[j, 1] + T_to[i, 2] * T_from[j, 2]
+    return to_vector(R)

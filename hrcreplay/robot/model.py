@@ -17,6 +17,8 @@ import pinocchio as pin
 from numba import njit
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.geometry.small_matrices import apply, multiply
+from hrcreplay.geometry.vectors import dot_n, norm_n
 from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot import irb140 as irb140_data
 from hrcreplay.robot.link_capsules import Extent, Segment, Vector, capsules, distance_m
@@ -35,6 +37,10 @@ class RobotPose:
     dJdq_tcp: Floats  # noqa: N815  #: (6,) acceleration of the TCP at zero joint acceleration [m/s^2, rad/s^2]
     ends_m: Floats  #: (s, 2, 3) ends of the segments [m]
     J_ends: Floats  #: (s, 2, 3, nv) their position Jacobians [m/rad]
+
+    def tcp_speed(self, dq: Floats) -> float:
+        """Speed of the TCP at joint velocities (nv,) [rad/s] [m/s]."""
+        return norm_n(apply(self.J_tcp[:3], dq))
 
 
 class LinkMotion(NamedTuple):
@@ -163,7 +169,7 @@ class _Kinematics:
             pin.computeJointJacobians(self._model, self._data, q[i])
             pin.updateFramePlacements(self._model, self._data)
             ends[i] = np.array(self._points).reshape(-1, 2, 3)
-            twists[i] = (moves * dq[i]) @ self._J.T
+            twists[i] = multiply(moves * dq[i], self._J.T)
         return LinkMotion(ends, twists)
 
 
@@ -378,7 +384,7 @@ def _body(model: Any, body: str, where: str) -> Any:
 def _reach_m(model: Any, tcp: int) -> float:
     """The arm stretched: the offsets from the second joint to the TCP one after another [m]."""
     links = (*model.jointPlacements[2:], model.frames[tcp].placement)
-    return sum(float(np.linalg.norm(link.translation)) for link in links)
+    return sum(norm_n(link.translation) for link in links)
 
 
 def _axis_reach_m(model: Any, points: Sequence[int]) -> Floats:
@@ -395,8 +401,8 @@ def _axis_reach_m(model: Any, points: Sequence[int]) -> Floats:
         joint, far, offset = frame.parentJoint, 0.0, frame.placement.translation
         while joint > 0:
             axis = data.oMi[joint].actInv(pin.Motion(data.J.reshape(6, model.nv)[:, joint - 1])).angular
-            reach[joint - 1, i] = far + np.linalg.norm(offset - axis * (axis @ offset))
-            far, offset = far + float(np.linalg.norm(offset)), model.jointPlacements[joint].translation
+            reach[joint - 1, i] = far + norm_n(offset - axis * dot_n(axis, offset))
+            far, offset = far + norm_n(offset), model.jointPlacements[joint].translation
             joint = model.parents[joint]
     return reach.reshape(model.nv, -1, 2).max(axis=2)
 

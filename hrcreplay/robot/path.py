@@ -15,7 +15,8 @@ from ruckig import InputParameter, Result, Ruckig, Trajectory
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.geometry.vectors import to_vector
+from hrcreplay.geometry.small_matrices import least_norm, multiply
+from hrcreplay.geometry.vectors import norm_n, turn_between
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import CYCLE_S, STEP_S, Missed, Reference, Task, Waypoint, descend, solve
@@ -97,8 +98,8 @@ def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pac
     """
     T_start = model.pose(start, np.zeros(model.nv)).T_world_tcp
     way_m = T_world_end[:3, 3] - T_start[:3, 3]
-    turn_rad = to_vector(T_world_end[:3, :3] @ T_start[:3, :3].T)
-    length = max(float(np.linalg.norm(way_m)), float(np.linalg.norm(turn_rad)) / TURN_RAD_PER_M)
+    turn_rad = turn_between(T_start, T_world_end)
+    length = max(norm_n(way_m), norm_n(turn_rad) / TURN_RAD_PER_M)
     if length < 1e-9:
         return JointTrajectory(start[None], np.zeros_like(start)[None])
     twist_per_m = np.concatenate([way_m, turn_rad]) / length
@@ -109,7 +110,7 @@ def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pac
         T = np.eye(4)
         for i, s in enumerate(s_m):
             T[:3, 3] = T_start[:3, 3] + s / length * way_m
-            T[:3, :3] = Rotation.from_rotvec(s / length * turn_rad).as_matrix() @ T_start[:3, :3]
+            T[:3, :3] = multiply(Rotation.from_rotvec(s / length * turn_rad).as_matrix(), T_start[:3, :3])
             now, error = descend(model, T, now)
             if np.abs(error).max() > 1e-6:
                 raise SettingsError(
@@ -117,7 +118,7 @@ def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pac
                     'use move = "joint" or start from another posture'
                 )
             q[i] = now
-            dq[i] = np.linalg.pinv(model.pose(now, np.zeros(model.nv)).J_tcp, rcond=1e-9) @ twist_per_m * rate[i]
+            dq[i] = least_norm(model.pose(now, np.zeros(model.nv)).J_tcp, twist_per_m, 1e-9) * rate[i]
         return JointTrajectory(q, dq)
 
     return _paced(model, pace, along, length, pace.tcp_speed, pace.tcp_acceleration, where)
@@ -185,9 +186,9 @@ def _excess(model: RobotModel, track: JointTrajectory, pace: Pace) -> tuple[floa
     way, first, last = np.diff(track.q, axis=0) / pace.step_s, track.dq[:-1], track.dq[1:]
     speeds = np.concatenate([track.dq, 1.5 * way - 0.25 * (first + last)])  # of the cubics between grid points
     accelerations = np.concatenate([6 * way - 4 * first - 2 * last, 2 * first + 4 * last - 6 * way]) / pace.step_s
-    tcp = [np.linalg.norm(model.pose(q, dq).J_tcp[:3] @ dq) for q, dq in zip(track.q, track.dq, strict=True)]
+    tcp = [model.pose(q, dq).tcp_speed(dq) for q, dq in zip(track.q, track.dq, strict=True)]
     return (
-        max(float((np.abs(speeds) / pace.dq_max).max()), float(max(tcp)) / pace.tcp_speed),
+        max(float((np.abs(speeds) / pace.dq_max).max()), max(tcp) / pace.tcp_speed),
         float((np.abs(accelerations) / pace.ddq_max).max()),
     )
 
@@ -310,14 +311,14 @@ def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Re
     for_acceleration_s = math.sqrt((10 / math.sqrt(3) * np.abs(way) / (speed * model.ddq_max)).max())
     end = max(1, math.ceil(max(for_speed_s, for_acceleration_s) / STEP_S))
     r = np.arange(end + 1) / end
-    share, rate = r**3 * (10 - 15 * r + 6 * r**2), 30 * r**2 * (1 - r) ** 2 / (end * STEP_S)
+    share, rate = r * r * r * (10 - 15 * r + 6 * r**2), 30 * r**2 * (1 - r) ** 2 / (end * STEP_S)
     q, dq = start + np.outer(share, way), np.outer(rate, way)
     return _by_itself(model, q, dq, (end * STEP_S,))
 
 
 def _by_itself(model: RobotModel, q: Floats, dq: Floats, waypoints_s: tuple[float, ...]) -> Reference:
     """A path that runs once, and whose own greatest speed is its speed limit, since nobody programmed one."""
-    fastest = max(float(np.linalg.norm(model.pose(*row).J_tcp[:3] @ row[1])) for row in zip(q, dq, strict=True))
+    fastest = max(float(model.pose(*row).tcp_speed(row[1])) for row in zip(q, dq, strict=True))
     return Reference(
         model, q, dq, end=len(q) - 1, cycles=1.0, waypoints_s=waypoints_s, tcp_speed_max=np.full(len(q), fastest)
     )
@@ -463,8 +464,8 @@ def _target(model: RobotModel, waypoint: Waypoint, at: str) -> Floats:
     else:
         turn = Rotation.from_quat(waypoint.quaternion_wxyz, scalar_first=True)
     T_base_tcp[:3, :3] = turn.as_matrix()
-    T_world_tcp = model.T_world_base @ T_base_tcp
-    distance_m = float(np.linalg.norm(T_world_tcp[:3, 3] - model.shoulder_m))
+    T_world_tcp = multiply(model.T_world_base, T_base_tcp)
+    distance_m = norm_n(T_world_tcp[:3, 3] - model.shoulder_m)
     if distance_m > model.reach_m:
         raise SettingsError(
             f"{at}: out of reach, {distance_m:.3f} m from the first axis; "
@@ -476,7 +477,7 @@ def _target(model: RobotModel, waypoint: Waypoint, at: str) -> Floats:
 def _reached(model: RobotModel, T_world_tcp: Floats, near: Floats, at: str) -> Floats:
     solution = solve(model, T_world_tcp, near)
     if isinstance(solution, Missed):
-        distance_m = float(np.linalg.norm(T_world_tcp[:3, 3] - model.shoulder_m))
+        distance_m = norm_n(T_world_tcp[:3, 3] - model.shoulder_m)
         raise SettingsError(
             f"{at}: no joint position within the limits reaches it; the nearest misses it by "
             f"{solution.position_m * 1e3:.0f} mm and {math.degrees(solution.angle_rad):.0f} deg. "

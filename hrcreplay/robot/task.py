@@ -48,7 +48,9 @@ from numba import njit
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from hrcreplay.errors import SettingsError, shown
-from hrcreplay.geometry.vectors import to_vector
+from hrcreplay.geometry import small_matrices
+from hrcreplay.geometry.small_matrices import apply, multiply
+from hrcreplay.geometry.vectors import dot_n, norm_n, turn_between
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import Plan
@@ -217,7 +219,7 @@ def solve(model: RobotModel, T_world_tcp: Floats, near: Floats) -> Floats | Miss
         else:
             missed = min(
                 missed,
-                Missed(float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))),
+                Missed(norm_n(error[:3]), norm_n(error[3:])),
                 key=lambda m: m.position_m + m.angle_rad,
             )
     return min(found, key=lambda q: float(np.abs((q - near) / model.dq_max).max())) if found else missed
@@ -247,9 +249,9 @@ def descend(model: RobotModel, T_world_tcp: Floats, seed: Floats) -> tuple[Float
 def _step(q: Floats, J: Floats, T: Floats, T_goal: Floats, q_min: Floats, q_max: Floats) -> tuple[Floats, Floats]:
     error = np.empty(6)
     error[:3] = T_goal[:3, 3] - T[:3, 3]
-    error[3:] = to_vector(T_goal[:3, :3] @ T[:3, :3].T)
-    damping = 0.1 * (error @ error) + 1e-12  # vanishes at the solution: Newton's speed there
-    dq = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), error)
+    error[3:] = turn_between(T, T_goal)
+    damping = 0.1 * dot_n(error, error) + 1e-12  # vanishes at the solution: Newton's speed there
+    dq = apply(J.T, small_matrices.solve(multiply(J, J.T) + damping * np.eye(6), error))
     return np.minimum(np.maximum(q + dq, q_min), q_max), error
 
 
@@ -258,7 +260,7 @@ def _seeds(model: RobotModel) -> Floats:
     ratio = 2.0
     for _ in range(60):
         ratio = (1 + ratio) ** (1 / (model.nv + 1))
-    share = (0.5 + np.outer(np.arange(1, _SEEDS + 1), ratio ** -np.arange(1.0, model.nv + 1))) % 1
+    share = (0.5 + np.outer(np.arange(1, _SEEDS + 1), [ratio**-axis for axis in range(1, model.nv + 1)])) % 1
     low, high = np.maximum(model.q_min, -np.pi), np.minimum(model.q_max, np.pi)
     return np.where(low < high, low + share * (high - low), model.q_min)
 
@@ -288,6 +290,11 @@ class ReferencePoint:
     ddq: Floats  #: (nv,) [rad/s^2]
     T_world_tcp: Floats  #: (4, 4)
     twist: Floats  #: (6,) linear and angular velocity of the TCP [m/s, rad/s]
+
+    @property
+    def tcp_speed(self) -> float:
+        """Speed of the TCP [m/s]."""
+        return norm_n(self.twist[:3])
 
 
 class Grid(NamedTuple):
@@ -361,7 +368,7 @@ class Reference:
         """
         q, dq, ddq = place(self.grid, s_s)
         pose = self.model.pose(q, dq)
-        return ReferencePoint(q, dq, ddq, pose.T_world_tcp, pose.J_tcp @ dq)
+        return ReferencePoint(q, dq, ddq, pose.T_world_tcp, apply(pose.J_tcp, dq))
 
 
 @njit(cache=True)

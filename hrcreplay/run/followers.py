@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hrcreplay.geometry.vectors import norm_n
 from hrcreplay.records import Bools, Floats, HumanStates, Motion
 from hrcreplay.robot.control import control_step, path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
@@ -124,7 +125,7 @@ class QpFollower(Follower):
 
     def programme(self, seen: Observation) -> Programme:
         """What Eq. (66) is made of. Its target is the reference one tick later, to which the reference moves on."""
-        error_m = float(np.linalg.norm(seen.sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3]))
+        error_m = norm_n(seen.sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3])
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
         cap = tcp_speed_cap(self.reference, self.s_s, self.settings.plan)
@@ -231,10 +232,8 @@ class Planner:
             u=np.array([step.u for step in steps]),
             ref_m=np.array([point.T_world_tcp[:3, 3] for point in points]),
             tcp_m=np.array([pose.T_world_tcp[:3, 3] for pose in poses]),
-            tcp_speed=np.array(
-                [np.linalg.norm(pose.J_tcp[:3] @ state.dq) for pose, state in zip(poses, found, strict=True)]
-            ),
-            ref_speed=np.array([np.linalg.norm(point.twist[:3]) for point in points]),
+            tcp_speed=np.array([pose.tcp_speed(state.dq) for pose, state in zip(poses, found, strict=True)]),
+            ref_speed=np.array([point.tcp_speed for point in points]),
             programme_s=np.array([row.programme_s for row in rows]),
             distance_m=np.array([step.distance_m for step in steps]),
             overlap_m=np.array([step.overlap_m for step in steps]),

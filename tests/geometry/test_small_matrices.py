@@ -6,9 +6,11 @@ import os
 import subprocess
 import sys
 from fractions import Fraction
+from typing import Literal
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from hrcreplay.geometry import small_matrices as sm
 from hrcreplay.records import Floats
@@ -74,12 +76,49 @@ def test_small_singular_values_count_until_they_are_too_small() -> None:
     np.testing.assert_allclose(sm.least_norm(A, np.ones(3), 1e-9), [1.0, 1e8, 0.0])
 
 
+@pytest.mark.parametrize("shape", [(8, 1), (8, 3), (7, 7), (9, 30)])
+@pytest.mark.parametrize("seed", range(6))
+def test_least_squares(shape: tuple[int, int], seed: int) -> None:
+    A, b = _random(seed, *shape), _random(seed + 3, shape[0])
+    if shape[1] <= shape[0]:
+        np.testing.assert_allclose(sm.least_squares(A, b), np.linalg.lstsq(A, b)[0], rtol=1e-9, atol=1e-11)
+    found, proven = sm.nonnegative_least_squares(A, b, 100)
+    assert proven
+    np.testing.assert_allclose(found, nnls(A, b)[0], atol=1e-10)
+    slopes = A.T @ (b - A @ found)  # the conditions of Kuhn and Tucker
+    assert (found >= 0.0).all()
+    assert (slopes < 1e-12).all()
+    assert np.abs(slopes[found > 0.0]).max(initial=0.0) < 1e-12
+
+
+def test_columns_that_repeat_one_another() -> None:
+    A = np.repeat(np.abs(_random(4, 7, 5)), 3, axis=1)
+    b = A @ np.abs(_random(5, 15))
+    found, proven = sm.nonnegative_least_squares(A, b, 100)
+    assert proven
+    assert (found >= 0.0).all()
+    np.testing.assert_allclose(A @ found, b, atol=1e-10)
+    assert not np.isfinite(sm.least_squares(np.zeros((3, 2)), np.ones(3))).all()
+    assert not sm.nonnegative_least_squares(A, b, 1)[1]
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_arguments_stay_as_they_are(order: Literal["C", "F"]) -> None:
+    A, b = np.array(_random(2, 6, 6), order=order), _random(3, 6)
+    before = A.copy(), b.copy()
+    sm.singular_values(A), sm.solve(A, b), sm.least_norm(A, b, 1e-9), sm.least_squares(A, b)
+    sm.nonnegative_least_squares(A, b, 20)
+    assert np.array_equal(A, before[0])
+    assert np.array_equal(b, before[1])
+
+
 _PRINT = """
 import numpy as np
 from hrcreplay.geometry import small_matrices as sm
 A, b = np.random.default_rng(1).normal(size=(6, 6)), np.arange(6.0)
 H = sm.multiply(A, A.T)
 parts = [H, sm.solve(A, b), sm.cholesky(H), *sm.singular_values(A), sm.least_norm(A, b, 1e-9)]
+parts += [sm.least_squares(A, b), sm.nonnegative_least_squares(A, b, 20)[0]]
 print(b"".join(part.tobytes() for part in parts).hex())
 """
 

@@ -329,7 +329,7 @@ def _row(measured: Floats, before: MotionState, result: MotionStep) -> MotionRow
         u=result.step.u,
         ref_m=result.reference_m,
         tcp_m=pose.T_world_tcp[:3, 3],
-        tcp_speed=float(np.linalg.norm(pose.J_tcp[:3] @ state.dq)),
+        tcp_speed=pose.tcp_speed(state.dq),
         ref_speed=result.reference_speed,
         programme_s=result.after.programme_s,
         distance_m=result.step.distance_m,

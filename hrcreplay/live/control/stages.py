@@ -9,6 +9,7 @@ skeleton may become that of the frame before it, and a capture is judged by the 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -176,7 +177,7 @@ def follow(setup: ControlSetup, motion: MotionState, predict: Predict) -> Motion
         follower = setup.follow(setup.programme, motion.programme_s)
         follower.take_over(tick.step.stop)
         after = replace(after, follower=follower, arrived=True)
-    return MotionStep(tick.point.T_world_tcp[:3, 3], float(np.linalg.norm(tick.point.twist[:3])), tick.step, after)
+    return MotionStep(tick.point.T_world_tcp[:3, 3], tick.point.tcp_speed, tick.step, after)
 
 
 def _at_the_end(setup: ControlSetup, follower: Follower) -> bool:
@@ -185,7 +186,7 @@ def _at_the_end(setup: ControlSetup, follower: Follower) -> bool:
         return False
     goal = follower.reference.sample(follower.s_s).T_world_tcp[:3, 3]
     pose = setup.robot.pose(follower.state.q, follower.state.dq)
-    return float(np.linalg.norm(pose.T_world_tcp[:3, 3] - goal)) <= setup.waypoint_m
+    return math.dist(pose.T_world_tcp[:3, 3], goal) <= setup.waypoint_m
 
 
 def brake(setup: ControlSetup, motion: MotionState, predict: Predict) -> MotionStep:

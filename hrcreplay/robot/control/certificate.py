@@ -23,7 +23,8 @@ import coal
 import numpy as np
 from numba import njit
 
-from hrcreplay.geometry.vectors import dot3, norm_n
+from hrcreplay.geometry.small_matrices import apply
+from hrcreplay.geometry.vectors import dot3, dot_n, norm_n
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.control_step import (
     BRAKING,
@@ -326,12 +327,12 @@ def separating_normal(a: Floats, b: Floats, vertices_m: Floats) -> Floats | None
             above, normal = _gjk(segment, _polytope(vertices_m[chosen]))
         except (RuntimeError, ValueError):
             return best
-        if not above > 0.0 or not abs(normal @ normal - 1.0) < 1e-6:
+        if not above > 0.0 or not abs(dot_n(normal, normal) - 1.0) < 1e-6:
             return best if above > 0.0 else None
-        normal = normal / math.sqrt(normal @ normal)
-        along = vertices_m @ normal
+        normal = normal / norm_n(normal)
+        along = apply(vertices_m, normal)
         furthest = int(np.argmin(along))
-        below = along[furthest] - max(a @ normal, b @ normal)
+        below = along[furthest] - max(dot_n(a, normal), dot_n(b, normal))
         if below > most:
             best, most = normal, below
         if above - below <= ENOUGH_M * min(1.0, above) or furthest in chosen:

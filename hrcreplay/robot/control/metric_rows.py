@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from hrcreplay.geometry.small_matrices import cholesky, solve_lower, solve_transposed
 from hrcreplay.geometry.vectors import dot_n, norm_n
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.separation import Approach, worst_rows
@@ -96,7 +97,7 @@ def in_metric(H: Floats, g: Floats, limits: Limits, soft: bool, slack_weight: fl
     for i in range(nv):
         scale = max(scale, H[i, i])
     L, b = np.zeros((n, n)), np.zeros(n)
-    L[:nv, :nv], b[:nv] = _cholesky(H / scale), g / scale
+    L[:nv, :nv], b[:nv] = cholesky(H / scale), g / scale
     if soft:
         L[nv, nv] = math.sqrt(slack_weight / scale)
     m = nv + len(limits.J)
@@ -107,11 +108,11 @@ def in_metric(H: Floats, g: Floats, limits: Limits, soft: bool, slack_weight: fl
             row[i], low[i], high[i] = 1.0, limits.low[i], limits.high[i]
         else:
             row[:nv], low[i], high[i] = limits.J[i - nv], limits.J_low[i - nv], limits.J_high[i - nv]
-        e = _forward(L, row)
+        e = solve_lower(L, row)
         length = norm_n(e)
         length = length if length > EMPTY else 1.0
         E[i], low[i], high[i] = e / length, max(low[i] / length, -NONE), min(high[i] / length, NONE)
-    return Metric(L, _forward(L, b), E, low, high)
+    return Metric(L, solve_lower(L, b), E, low, high)
 
 
 @njit(cache=True)
@@ -212,7 +213,7 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
         known: (k, 4) which ones are known.
     """
     L, nv, n = problem.L, len(limits.low), len(y)
-    x = _backward(L, y)
+    x = solve_transposed(L, y)
     w = np.minimum(np.maximum(x[:nv], limits.low), limits.high)
     slack = max(0.0, x[nv]) if n > nv else 0.0
     loose = rows.room_m2 + rows.per_speed * slack
@@ -225,7 +226,7 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
         row[:nv] = A[i] / per_speed[pair]
         if n > nv:
             row[nv] = -1.0
-        e = _forward(L, row)
+        e = solve_lower(L, row)
         length = norm_n(e)
         if not length > EMPTY:
             if values[i] > loose[pair] + per_speed[pair] * HELD:
@@ -292,40 +293,3 @@ def _among(known: Ints, key: Ints) -> bool:
     for i in range(len(known)):
         found = found or bool(np.all(known[i] == key))
     return found
-
-
-@njit(cache=True, error_model="numpy")
-def _cholesky(H: Floats) -> Floats:
-    n = len(H)
-    L = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            rest = H[i, j]
-            for k in range(j):
-                rest -= L[i, k] * L[j, k]
-            L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
-    return L
-
-
-@njit(cache=True, error_model="numpy")
-def _forward(L: Floats, b: Floats) -> Floats:
-    """(n,) with ``L @ y = b``."""
-    y = np.empty(len(b))
-    for i in range(len(b)):
-        rest = b[i]
-        for k in range(i):
-            rest -= L[i, k] * y[k]
-        y[i] = rest / L[i, i]
-    return y
-
-
-@njit(cache=True, error_model="numpy")
-def _backward(L: Floats, y: Floats) -> Floats:
-    """(n,) with ``L.T @ x = y``."""
-    x = np.empty(len(y))
-    for i in range(len(y) - 1, -1, -1):
-        rest = y[i]
-        for k in range(i + 1, len(y)):
-            rest -= L[k, i] * x[k]
-        x[i] = rest / L[i, i]
-    return x

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import proxsuite
-from scipy.optimize import nnls
 
+from hrcreplay.geometry.small_matrices import apply, nonnegative_least_squares
+from hrcreplay.geometry.vectors import dot_n
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.metric_rows import (
     CLEAR,
@@ -126,7 +127,7 @@ def compile_denied() -> None:
 
 def _keeps(limits: Limits, w: Floats) -> bool:
     """Whether a velocity, rounded into the axes' bounds, also keeps those of the TCP."""
-    twist = limits.J @ w
+    twist = apply(limits.J, w)
     return bool(np.all((limits.J_low - KEPT <= twist) & (twist <= limits.J_high + KEPT)))
 
 
@@ -161,19 +162,19 @@ def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
     n, m = len(b), len(E)
     above, below = high < NONE, low > -NONE
     G = np.concatenate((-E[above], E[below]))
-    f = np.concatenate((-(high + E @ b)[above], (low + E @ b)[below]))
-    try:
-        pull, _ = nnls(np.vstack((G.T, f)), np.append(np.zeros(n), 1.0))
-    except (RuntimeError, ValueError):
+    at = apply(E, b)
+    f = np.concatenate((-(high + at)[above], (low + at)[below]))
+    pull, found = nonnegative_least_squares(np.vstack((G.T, f)), np.append(np.zeros(n), 1.0), 3 * m)
+    if not found:
         return -b, np.zeros(m)
     z = np.zeros(m)
     z[above] += pull[: np.count_nonzero(above)]
     z[below] -= pull[np.count_nonzero(above) :]
-    left = 1.0 - f @ pull
+    left = 1.0 - dot_n(f, pull)
     if not left > EMPTY:
         return -b, z
     z /= left
-    return -b - z @ E, z
+    return -b - apply(E.T, z), z
 
 
 def _by_proxqp(problem: Metric, y: Floats, z: Floats, penalty: float, rounds: int) -> tuple[Floats, Floats, str]:

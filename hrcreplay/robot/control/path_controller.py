@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from hrcreplay.geometry.small_matrices import apply
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Sight, Stop, along_path
@@ -92,7 +93,8 @@ def protective_distance_m(pose: RobotPose, stop: Stop, human_speed: float, laten
         latency_s: Reaction time T_r beside the tick [s].
         dt_s: Length of a tick [s].
     """
-    speed = float(np.linalg.norm(pose.J_ends @ stop.dq[0], axis=2).max())
+    speeds = apply(pose.J_ends.reshape(-1, pose.J_ends.shape[3]), stop.dq[0]).reshape(-1, 3)
+    speed = float(np.linalg.norm(speeds, axis=1).max())
     reaction_s, stop_s = latency_s + dt_s, stop.ticks * dt_s
     return human_speed * (reaction_s + stop_s) + speed * reaction_s + 0.5 * speed * stop_s
 
@@ -124,7 +126,7 @@ def _fastest(
     def most(rate: float) -> float:
         nonlocal slowed
         towards = place(grid, ahead(rate))[1]
-        free = min(1.0, rates(towards, low, high)[1], rates(pose.J_tcp @ towards, J_low, J_high)[1])
+        free = min(1.0, rates(towards, low, high)[1], rates(apply(pose.J_tcp, towards), J_low, J_high)[1])
         safe = free
         if obstacles is not None and free >= 0.0:
             safe = _safe_rate(sight, obstacles, towards, free, horizon_s + settings.plan.lead_s, settings)

@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hrcreplay.geometry.vectors import dot_n, norm_n, to_vector
+from hrcreplay.geometry.small_matrices import apply
+from hrcreplay.geometry.vectors import dot_n, norm_n, turn_between
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import RETREAT_SPEED
@@ -130,7 +131,7 @@ class Target(NamedTuple):
 
 def pose_error(T_world_tcp: Floats, T_world_ref: Floats) -> Floats:
     """(6,) from the reference to the TCP: way [m], then rotation vector in the world [rad]."""
-    turn = to_vector(T_world_tcp[:3, :3] @ T_world_ref[:3, :3].T)
+    turn = turn_between(T_world_ref, T_world_tcp)
     return np.concatenate([T_world_tcp[:3, 3] - T_world_ref[:3, 3], turn])
 
 
@@ -246,7 +247,7 @@ def problem(
         low, high = smooth_bounds(low, high, state.dq + dt_s * u_before, dt_s**2 / plan.jerk_s * robot.ddq_max)
     speed_max = min(plan.tcp_speed_max, RETREAT_SPEED) if settings.retreats(sight.overlap_m) else plan.tcp_speed_max
     J_low, J_high = cartesian_bounds(J, dJdq, state.dq, speed_max, plan.tcp_acceleration_max, dt_s)
-    twist, further = J @ state.dq, 1.0 + plan.smooth_s / dt_s
+    twist, further = apply(J, state.dq), 1.0 + plan.smooth_s / dt_s
     low, high, J_low, J_high = (
         now + further * (bound - now)
         for bound, now in ((low, state.dq), (high, state.dq), (J_low, twist), (J_high, twist))
