@@ -3,6 +3,7 @@
 import hashlib
 import os
 import shutil
+import sys
 from pathlib import Path
 
 __version__ = "0.1.0"
@@ -37,4 +38,14 @@ def share_kernels(have: Path, lack: Path) -> None:
             shutil.copy2(index, copy)
 
 
+def _choose_one_proxsuite() -> None:
+    """Has proxsuite take its AVX2 library where the processor would do AVX-512, too.
+
+    It comes in three, takes the widest and rounds otherwise in each: a robot would move otherwise by the last bits on
+    every other computer. Without the name of one of them it takes the next.
+    """
+    sys.modules.setdefault("proxsuite.proxsuite_pywrap_avx512", None)  # type: ignore[arg-type]
+
+
 _keep_kernels_apart()
+_choose_one_proxsuite()

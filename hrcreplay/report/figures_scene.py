@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +17,7 @@ from matplotlib.patches import Patch
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.geometry.convex_hull import visible_front
+from hrcreplay.geometry.small_matrices import apply, multiply
 from hrcreplay.records import POINTS, Floats
 from hrcreplay.report import drawing
 from hrcreplay.report.drawing import figure_in
@@ -47,12 +49,12 @@ class View:
 
     def flat(self, points_m: Floats) -> Floats:
         """(n, 2) of (n, 3) world points [m]."""
-        return np.asarray(points_m @ np.column_stack([self.right, self.up]))
+        return multiply(np.asarray(points_m, dtype=float).reshape(-1, 3), np.column_stack([self.right, self.up]))
 
 
 def view_from(azimuth_rad: float, elevation_rad: float) -> View:
     """The view of someone who looks at the origin from there; z stays up on the page."""
-    ca, sa, ce, se = np.cos(azimuth_rad), np.sin(azimuth_rad), np.cos(elevation_rad), np.sin(elevation_rad)
+    ca, sa, ce, se = (turn(angle) for angle in (azimuth_rad, elevation_rad) for turn in (math.cos, math.sin))
     return View(
         right=np.array([-sa, ca, 0.0]), up=np.array([-se * ca, -se * sa, ce]), toward=np.array([ce * ca, ce * sa, se])
     )
@@ -109,15 +111,15 @@ def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: 
         hull = solid.hull
         if hull is None:
             continue
-        triangles = (hull.points @ axes)[hull.simplices]
-        inward = np.einsum(
-            "ij,ij->i", np.cross(*(triangles[:, k] - triangles[:, 0] for k in (1, 2))), hull.equations[:, :3] @ axes
-        )
+        triangles = multiply(hull.points, axes)[hull.simplices]
+        normals = np.ascontiguousarray(hull.equations[:, :3])
+        across = np.cross(*(triangles[:, k] - triangles[:, 0] for k in (1, 2)))
+        inward = (across * multiply(normals, axes)).sum(axis=1)
         triangles[inward < 0.0] = triangles[inward < 0.0][:, ::-1]  # qhull's corners are in no order
         low_uv, high_uv = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         rows = slice(*np.searchsorted(v, [low_uv[1], high_uv[1]]))
         columns = slice(*np.searchsorted(u, [low_uv[0], high_uv[0]]))
-        depth, light = visible_front(triangles, hull.equations[:, :3] @ sun, u[columns], v[rows])
+        depth, light = visible_front(triangles, apply(normals, sun), u[columns], v[rows])
         ahead = depth > nearest[rows, columns]
         shade = (0.62 + 0.38 * np.clip(light / np.linalg.norm(sun), 0.0, 1.0))[..., None] * np.asarray(solid.colour)
         nearest[rows, columns][ahead] = depth[ahead]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import platform
 import subprocess
 import sys
 from dataclasses import replace
@@ -282,3 +283,20 @@ def test_two_processes_find_the_same_bits() -> None:
         said.append(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     assert said[0] == said[1]
     assert len(said[0].strip()) == 64
+
+
+_WIDEST = """
+import sys, types
+import hrcreplay
+every = types.ModuleType("proxsuite.instructionset")  # of a processor that does it all
+every.has_AVX2 = every.has_AVX512F = lambda: True
+sys.modules["proxsuite.instructionset"] = every
+import proxsuite
+print(proxsuite._submodule.__name__)
+"""
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="proxsuite has one library here")
+def test_proxsuite_is_the_same_library_on_every_processor_of_today() -> None:
+    told = subprocess.run([sys.executable, "-c", _WIDEST], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "proxsuite.proxsuite_pywrap_avx2"
