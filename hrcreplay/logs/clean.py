@@ -139,6 +139,7 @@ DEFECTS: Mapping[str, str] = {
     "frames_stamp_ahead": "frames captured after their arrival by their stamp; arrival less usual delay used",
     "frames_stamp_far": "frames captured too far from their arrival by their stamp; arrival less usual delay used",
     "frames_stamp_set_back": "frames by a clock that was set back or stands still; arrival less usual delay used",
+    "frames_trembling": "rows in which no point has moved for long, as of an old image with noise; dropped, as not new",
     "gaps_<camera>": "silences of a camera longer than logs.gap_s",
     "joints_malformed": "joint states with positions that do not go with their names; left out",
     "joints_not_finite": "joint positions that are no number; left out",
@@ -156,6 +157,9 @@ DEFECTS: Mapping[str, str] = {
 
 #: A coordinate beyond this was not measured by a depth camera in a robot's cell [m].
 FAR_M = 100.0
+#: A person of whom no point moves by more for longer is an old image: on recordings of people who stand, sit and work,
+#: by five trackers, that lasted 0.17 s at most [m], [s].
+STILL_M, STILL_S = 2e-3, 0.5
 #: Two ends of a bone that are nearer than this are one place [m].
 TOGETHER_M = 1e-3
 
@@ -219,11 +223,23 @@ def _together(points: Floats) -> Bools:
     return found
 
 
+def _moved(before_m: Floats, now_m: Floats) -> bool:
+    """Whether any point (20, 3) has moved by more than STILL_M; without points to compare, it counts as moved."""
+    by_m = np.linalg.norm(now_m - before_m, axis=1)
+    return not np.isfinite(by_m).any() or bool(np.nanmax(by_m) > STILL_M)
+
+
 class RepeatedSkeleton(NamedTuple):
-    """The longest time for which a camera gave one and the same skeleton."""
+    """The longest time for which a camera gave one and the same skeleton, exactly or but for noise."""
 
     seconds: float
     begin_ns: int  #: its first arrival
+
+
+def _keep_longest(found: dict[str, RepeatedSkeleton], camera: str, begin_ns: int, arrival_ns: int) -> None:
+    lasted_s = (arrival_ns - begin_ns) / 1e9
+    if lasted_s > found.get(camera, RepeatedSkeleton(0.0, 0)).seconds:
+        found[camera] = RepeatedSkeleton(lasted_s, begin_ns)
 
 
 class Cleaner:
@@ -245,6 +261,8 @@ class Cleaner:
         self.rows: Counter[str] = Counter()  #: camera -> rows that came
         self.flaws: Counter[tuple[str, str]] = Counter()  #: (camera, name in DEFECTS) -> points or rows
         self.frozen: dict[str, RepeatedSkeleton] = {}  #: camera -> its longest standstill
+        self.trembling: dict[str, RepeatedSkeleton] = {}  #: camera -> its longest time without a movement
+        self._still: dict[tuple[str, int], tuple[Floats, int]] = {}  # of each body: where it stands, and since when
         self.clocks = {name: CameraClock() for name in cameras}
         for name in (*_ALWAYS, *(f"{kind}_{camera}" for kind in ("frames", "gaps") for camera in cameras)):
             defects[name] += 0
@@ -275,7 +293,7 @@ class Cleaner:
         whole, flaws = clean_skeleton(row)
         for name, count in flaws:
             self._flaw(row.camera, name, count)
-        if self._repeats(whole, arrival_ns):
+        if self._repeats(whole, arrival_ns) or self._trembles(whole, arrival_ns):
             return None
         known = whole.confidence > 0
         self.seen[row.camera] = self.seen.get(row.camera, False) | known
@@ -314,9 +332,20 @@ class Cleaner:
             self._last[key] = (row, arrival_ns)
             return False
         self._flaw(row.camera, "frames_repeated", 1)
-        lasted_s = (arrival_ns - before[1]) / 1e9
-        if lasted_s > self.frozen.get(row.camera, RepeatedSkeleton(0.0, 0)).seconds:
-            self.frozen[row.camera] = RepeatedSkeleton(lasted_s, before[1])
+        _keep_longest(self.frozen, row.camera, before[1], arrival_ns)
+        return True
+
+    def _trembles(self, row: RawSkeleton, arrival_ns: int) -> bool:
+        """Whether the row shows a body of which no point has moved for so long that its image must be an old one."""
+        key = (row.camera, row.body)
+        before = self._still.get(key)
+        if before is None or _moved(before[0], row.points_m):
+            self._still[key] = (row.points_m, arrival_ns)
+            return False
+        if (arrival_ns - before[1]) / 1e9 <= STILL_S:
+            return False
+        self._flaw(row.camera, "frames_trembling", 1)
+        _keep_longest(self.trembling, row.camera, before[1], arrival_ns)
         return True
 
     def _flaw(self, camera: str, name: str, count: int) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs import joints, log_files, messages, plausibility
-from hrcreplay.logs.clean import DEFECTS, Cleaner
+from hrcreplay.logs.clean import DEFECTS, STILL_M, STILL_S, Cleaner
 from hrcreplay.logs.clocks import clock_remarks
 from hrcreplay.logs.decoders import (
     TF_TYPES,
@@ -350,6 +350,15 @@ def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
         yield (
             f"camera {camera} froze: for {longest.seconds:.2f} s from {begin_s:.2f} s on it gave one and the same "
             f"skeleton with new stamps; its {rows} rows that repeat count as silence"
+        )
+    still = cleaner.trembling.get(camera)
+    if still is not None:
+        rows = cleaner.flaws[(camera, "frames_trembling")]
+        begin_s = (still.begin_ns - begin_ns) / 1e9
+        yield (
+            f"camera {camera} only trembles: for {still.seconds:.2f} s from {begin_s:.2f} s on no point of the body "
+            f"moved by more than {1e3 * STILL_M:g} mm, which nobody can; the {rows} rows after the first {STILL_S:g} s "
+            "count as silence"
         )
 
 

@@ -41,7 +41,14 @@ from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 NS = 1_000_000_000
 #: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
-_LOST = ("points_", "person_frames_without", "frames_late", "frames_repeated", "frames_out_of_order")
+_LOST = (
+    "points_",
+    "person_frames_without",
+    "frames_late",
+    "frames_repeated",
+    "frames_trembling",
+    "frames_out_of_order",
+)
 
 #: Of a session; a longer log has an arrival of another clock among its messages [s].
 LONGEST_S = 24 * 3600

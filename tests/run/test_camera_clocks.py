@@ -149,6 +149,29 @@ def test_all_clocks_behind_are_named_where_nobody_is_known(tmp_path: Path) -> No
         _fused(tmp_path, lambda table: replace(table, capture_ns=table.capture_ns - 2 * 10**9))
 
 
+def test_a_camera_that_only_trembles_is_silent(tmp_path: Path, clean: run_folder.Run) -> None:
+    """Its image froze for three seconds, and noise of 0.1 mm makes each frame a new one."""
+    begin_s, end_s = 2.0, 5.0
+
+    def spoil(table: CameraFrames) -> CameraFrames:
+        at_s = (table.arrival_ns - table.arrival_ns[0]) / 1e9
+        stuck = np.flatnonzero(_of(table, "xtion") & (at_s > begin_s) & (at_s < end_s))
+        points = table.points_m.copy()
+        points[stuck] = points[stuck[0]] + np.random.default_rng(3).normal(0.0, 1e-4, (len(stuck), 20, 3))
+        return replace(table, points_m=points)
+
+    run = _fused(tmp_path, spoil)
+    (told,) = (note for note in run.meta["notes"] if "tremble" in note)
+    assert "camera xtion" in told
+    assert float(told.partition("for ")[2].split()[0]) == pytest.approx(end_s - begin_s, abs=0.15)
+    assert run.counts["frames_trembling"] == pytest.approx((end_s - begin_s - 0.5) * 25, abs=8)
+    at_s = run.state["t_ns"].to_numpy() / 1e9 - run.state["t_ns"].iloc[0] / 1e9
+    silent = (at_s > begin_s + 0.6) & (at_s < end_s - 0.1)
+    assert not run.state["valid_xtion"][silent].any()
+    assert run.state["valid_kinect"][silent].any()
+    assert np.nanpercentile(_apart_m(run, clean)[silent[: len(clean.state)]], 50) < 0.05
+
+
 def test_a_person_whose_frames_are_old_is_not_known(tmp_path: Path) -> None:
     """Nothing from any camera for 0.6 s: the robot brakes once the newest capture is 0.3 s old, and says why."""
 
