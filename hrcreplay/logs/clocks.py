@@ -7,7 +7,7 @@ that was set back or stands still. Instead of such a stamp the arrival less the 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from datetime import UTC, datetime
 
 import numpy as np
@@ -26,6 +26,7 @@ _STILL_NS = 500_000_000  # or such frames for so long
 _SETTLED = 5  # frames of like delay that make a jump
 _FEW = 5  # frames out of order that are not worth a remark, and the share of them that is
 _MUCH = 0.02
+_MIXED_NS = 1_000_000_000  # messages further apart in time than this stand in a file in order, whatever wrote it
 _YOUNG_NS = 10**17  # a stamp before 1973 counts from the start of a simulation or of a computer
 
 
@@ -128,6 +129,42 @@ class CameraClock:
         reached = np.cumsum(counts)
         index = [int(np.searchsorted(reached, p / 100.0 * reached[-1])) for p in percent]
         return tuple(delays[min(i, len(delays) - 1)] / 1e3 for i in index)
+
+
+class ArrivalOrder:
+    """Whether messages of one body come in the file as they arrived: a recorder's clock that is set back mixes times.
+
+    Bodies, topics and files may have been written one after the other; each has an order of its own.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[Hashable, deque[tuple[int, int]]] = {}  # of the last second: arrival, position
+        self._furthest: dict[Hashable, int] = {}  # the largest position of all before
+        self._mixed: list[int] = []  # first and last arrival of messages that stand before earlier ones in their file
+        self._count = 0
+
+    def add(self, body: Hashable, arrival_ns: int, position: int) -> None:
+        """Takes a message of a body, in order of arrival."""
+        waiting = self._waiting.setdefault(body, deque())
+        while waiting and arrival_ns - waiting[0][0] > _MIXED_NS:
+            self._furthest[body] = max(self._furthest.get(body, 0), waiting.popleft()[1])
+        if position < self._furthest.get(body, 0):
+            self._count += 1
+            self._mixed = [*self._mixed[:1], arrival_ns]
+        waiting.append((arrival_ns, position))
+
+    def remarks(self, start_ns: int) -> Iterator[str]:
+        """What was found, and where; ``start_ns`` is where the log begins [ns]."""
+        if self._count < _FEW:
+            return
+        begin_s = (self._mixed[0] - _MIXED_NS - start_ns) / 1e9
+        end_s = (self._mixed[-1] - start_ns) / 1e9
+        yield (
+            f"the recorder's clock was set back by about {end_s - begin_s:.1f} s: in the order of the file arrivals "
+            f"step back, and between {begin_s:.1f} and {end_s:.1f} s frames of two times are mixed; would be right: a "
+            f"span without them (--end {max(begin_s, 0.0):.1f} or --start {end_s:.1f}), or a recording whose clock was set "
+            "before"
+        )
 
 
 def clock_remarks(camera: str, clock: CameraClock, begin_ns: int, late: int) -> Iterator[str]:

@@ -126,8 +126,10 @@ class McapStream:
             self._leave_out(block.offset, str(error))
             return
         messages = [
-            Message(record.log_time, wanted[record.channel_id], self._unpacked(record, wanted))
-            for record in records
+            Message(
+                record.log_time, wanted[record.channel_id], self._unpacked(record, wanted), (block.offset << 32) + i
+            )
+            for i, record in enumerate(records)
             if isinstance(record, McapMessage)
             and record.channel_id in wanted
             and (start_ns is None or record.log_time >= start_ns)

@@ -46,6 +46,7 @@ class Message(NamedTuple):
     arrival_ns: int
     topic: Topic
     data: bytes
+    position: int = 0  #: a number that grows along its file; 0 where the order in the file is not known
 
     def read(self) -> Any:
         """Decodes the fields. Raises Undecodable."""

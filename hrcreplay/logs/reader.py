@@ -10,7 +10,7 @@ from pathlib import Path
 from hrcreplay.errors import LogError
 from hrcreplay.logs import joints, log_files, messages, plausibility
 from hrcreplay.logs.clean import DEFECTS, STILL_M, STILL_S, Cleaner
-from hrcreplay.logs.clocks import clock_remarks
+from hrcreplay.logs.clocks import ArrivalOrder, clock_remarks
 from hrcreplay.logs.decoders import (
     TF_TYPES,
     GenericDecoder,
@@ -211,7 +211,7 @@ class Log:
         self._refusals, self.points_seen = [], 0
         cleaner = Cleaner(self.header.cameras, self._options.gap_s, self._reading)
         shapes = {camera: plausibility.BodyShape() for camera in self.header.cameras}
-        places = plausibility.Alternation()
+        places, order = plausibility.Alternation(), ArrivalOrder()
         for message in self._source.messages(list(decoders), start_ns, end_ns):
             decoder = decoders[message.topic.name]
             try:
@@ -223,6 +223,7 @@ class Log:
                 cleaner.note_arrival(decoder.cameras[0], message.arrival_ns)
             for row in rows:
                 shapes[row.camera].add(row.points_m, row.confidence)
+                order.add((message.topic.parse, row.camera, row.body), message.arrival_ns, message.position)
                 places.add(row.camera, row.body, message.arrival_ns, row.points_m)
                 chunk = cleaner.add(row, message.arrival_ns)
                 if chunk is not None:
@@ -234,6 +235,7 @@ class Log:
         self._judge(cleaner, shapes)
         self._refuse(_contradictions(cleaner))
         self._refuse(places.remarks())
+        self._refuse(order.remarks(self.header.start_ns))
 
     def check(self) -> None:
         """Refuses a log whose latest complete pass showed bodies that are certainly no person.

@@ -205,8 +205,8 @@ class RecoveredBag:
         header = _fields(file) or {}
         data = file.read(struct.unpack("<L", file.read(4))[0])
         messages = [
-            Message(_time_ns(fields), wanted[_number(fields)], content)
-            for fields, content in _inner(unpack(header["compression"].decode(), data))
+            Message(_time_ns(fields), wanted[_number(fields)], content, (chunk.offset << 32) + i)
+            for i, (fields, content) in enumerate(_inner(unpack(header["compression"].decode(), data)))
             if fields["op"][0] == _MESSAGE and _number(fields) in wanted
         ]
         messages.sort(key=lambda message: message.arrival_ns)
@@ -401,7 +401,7 @@ class Db3Stream:
         if self._found is None:
             try:
                 for arrival_ns, row, number, data in self._whole(wanted, span):
-                    yield self._message(arrival_ns, wanted[number], data)
+                    yield self._message(arrival_ns, wanted[number], data, row)
                     given = (arrival_ns, row)
             except sqlite3.Error as error:
                 self._recover(Damage(self.defects, self.notes), error)
@@ -412,7 +412,7 @@ class Db3Stream:
             for arrival_ns, row, number in found:
                 if given is None or (arrival_ns, row) > given:
                     (data,) = database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()
-                    yield self._message(arrival_ns, wanted[number], data)
+                    yield self._message(arrival_ns, wanted[number], data, row)
 
     def _whole(self, wanted: Collection[int], span: tuple[int, int]) -> Iterator[tuple[int, int, int, Any]]:
         marks = ",".join("?" for _ in wanted)
@@ -423,9 +423,9 @@ class Db3Stream:
                 (*wanted, *span),
             )
 
-    def _message(self, arrival_ns: int, topic: Topic, data: Any) -> Message:
+    def _message(self, arrival_ns: int, topic: Topic, data: Any, row: int) -> Message:
         where = f"{self._path}: {topic.name}"
-        return Message(arrival_ns, topic, unpack_message(data, where) if isinstance(data, bytes) else b"")
+        return Message(arrival_ns, topic, unpack_message(data, where) if isinstance(data, bytes) else b"", row)
 
 
 def _database(path: Path) -> sqlite3.Connection:

@@ -5,12 +5,14 @@ Every log here is a true one, of which what the stamps mean is spoilt: the true 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hrcreplay.errors import LogError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import CameraFrames, Ints
 from tests.logs import own
@@ -24,7 +26,8 @@ def _table(seed: int = 1) -> CameraFrames:
     """One camera at 30 Hz, its frames 30 to 50 ms on the wire."""
     table = own.frames(N, cameras=("one",), seed=seed)
     jitter_ns = np.random.default_rng(seed).integers(-10_000_000, 10_000_000, N)
-    return changed(table, arrival_ns=np.maximum.accumulate(table.capture_ns + DELAY_NS + jitter_ns))
+    arrival_ns = np.maximum.accumulate(table.capture_ns + DELAY_NS + jitter_ns)
+    return changed(table, arrival_ns=arrival_ns, points_m=0.17 * table.points_m)  # of a person's size
 
 
 def _read(tmp_path: Path, table: CameraFrames) -> tuple[Log, CameraFrames]:
@@ -158,3 +161,40 @@ def test_bodies_of_one_frame_keep_one_capture(tmp_path: Path) -> None:
     _, frames = _read(tmp_path, both.rows(np.argsort(both.arrival_ns, kind="stable")))
     mine, theirs = (frames.rows(frames.body == body) for body in (7, 8))
     np.testing.assert_array_equal(mine.capture_ns, theirs.capture_ns)
+
+
+def _recorder_set_back(table: CameraFrames, by_s: float = 3.0) -> CameraFrames:
+    """All that came in the second half, stamps and arrivals, as by a clock that was set back."""
+    by_ns = int(by_s * 1e9) * (np.arange(N) >= HALF)
+    return changed(table, capture_ns=table.capture_ns - by_ns, arrival_ns=table.arrival_ns - by_ns)
+
+
+def test_a_recorder_whose_clock_was_set_back_is_refused_where_it_mixes_two_times(tmp_path: Path) -> None:
+    """4 s in order, then 4 s that begin again at 1 s: what is between 1 and 4 s is of two times."""
+    table = _table()
+    log, _ = _read(tmp_path, _recorder_set_back(table))
+    with pytest.raises(LogError, match="recorder's clock was set back") as refusal:
+        log.check()
+    begin_s, end_s = (float(part) for part in re.findall(r"--(?:end|start) ([\d.]+)", str(refusal.value)))
+    assert begin_s == pytest.approx(1.0, abs=0.1)
+    assert end_s == pytest.approx(4.0, abs=0.1)
+    first_ns = log.header.start_ns
+    for window in ({"end_ns": first_ns + int(begin_s * 1e9)}, {"start_ns": first_ns + int((end_s + 0.1) * 1e9)}):
+        captures = own.read(log, **window).capture_ns
+        log.check()
+        assert len(captures) >= 25
+        assert (np.diff(captures) > 0).all()
+
+
+@pytest.mark.parametrize("by_s", [0.2, 0.0])
+def test_a_recorder_that_writes_a_little_out_of_order_is_no_fault(tmp_path: Path, by_s: float) -> None:
+    log, _ = _read(tmp_path, _recorder_set_back(_table(), by_s))
+    log.check()
+
+
+def test_bodies_written_one_after_the_other_are_no_fault(tmp_path: Path) -> None:
+    table = _table()
+    other = changed(table, body=np.full(N, 8), points_m=_table(seed=2).points_m)
+    log, frames = _read(tmp_path, CameraFrames.join([table, other]))
+    log.check()
+    assert len(frames) == 2 * N

@@ -165,6 +165,7 @@ def test_a_camera_that_only_trembles_is_silent(tmp_path: Path, clean: run_folder
     assert "camera xtion" in told
     assert float(told.partition("for ")[2].split()[0]) == pytest.approx(end_s - begin_s, abs=0.15)
     assert run.counts["frames_trembling"] == pytest.approx((end_s - begin_s - 0.5) * 25, abs=8)
+    assert run.state is not None and clean.state is not None  # noqa: PT018 - for the type checker
     at_s = run.state["t_ns"].to_numpy() / 1e9 - run.state["t_ns"].iloc[0] / 1e9
     silent = (at_s > begin_s + 0.6) & (at_s < end_s - 0.1)
     assert not run.state["valid_xtion"][silent].any()
