@@ -162,8 +162,8 @@ class ArrivalOrder:
         yield (
             f"the recorder's clock was set back by about {end_s - begin_s:.1f} s: in the order of the file arrivals "
             f"step back, and between {begin_s:.1f} and {end_s:.1f} s frames of two times are mixed; would be right: a "
-            f"span without them (--end {max(begin_s, 0.0):.1f} or --start {end_s:.1f}), or a recording whose clock was set "
-            "before"
+            f"span without them (--end {max(begin_s, 0.0):.1f} or --start {end_s:.1f}), or a recording whose clock was "
+            "set before"
         )
 
 
