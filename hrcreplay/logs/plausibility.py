@@ -32,6 +32,8 @@ _SHARE = np.array(list(_SHARES.values()))
 ADULT_M = (1.528, 1.867)
 #: Bones of recorded people, as trackers see them, lie up to a fifth outside the shares of a stature.
 _BONE_MARGIN = 0.25
+#: Trackers after OpenNI give the middle of the hand for the wrist: half of Winter's share of a hand.
+_HALF_HAND = 0.054
 #: Left and right of one person differ by less, on recordings by up to a sixth.
 _UNEQUAL = 1.25
 _BONE_NAMES = {
@@ -284,7 +286,8 @@ def mirror_remarks(camera: str, sides: Floats, cue: str) -> Iterator[str]:
 def bone_range_m(bone: tuple[str, str]) -> tuple[float, float]:
     """How long a bone of an adult is as trackers see it: its share of ADULT_M, and a margin [m]."""
     share = _SHARES[bone]
-    return share * ADULT_M[0] * (1.0 - _BONE_MARGIN), share * ADULT_M[1] * (1.0 + _BONE_MARGIN)
+    longest = share + _HALF_HAND if bone[0].startswith("elbow") else share
+    return share * ADULT_M[0] * (1.0 - _BONE_MARGIN), longest * ADULT_M[1] * (1.0 + _BONE_MARGIN)
 
 
 def bone_remarks(camera: str, bones_m: Mapping[tuple[str, str], float]) -> Iterator[str]:

@@ -177,7 +177,7 @@ def test_legs_that_are_exchanged_against_the_arms_are_told(tmp_path: Path) -> No
     # The walker's forearm is 0.24 m down and 0.05 to 0.17 m ahead, 0.26 m in the middle; the trunk 0.45 m.
     # Winter's shares of a stature, of women of 1.528 m less a quarter to men of 1.867 m and a quarter more
     [
-        (short_forearm, "right forearm", 0.09, 0.146 * 1.146, 0.146 * 2.334),
+        (short_forearm, "right forearm", 0.09, 0.146 * 1.146, (0.146 + 0.108 / 2) * 2.334),
         (short_trunk, "trunk", 0.32, 0.288 * 1.146, 0.288 * 2.334),
     ],
 )
@@ -189,6 +189,19 @@ def test_a_bone_of_no_adult_is_told(
     assert f"{length_m:.2f} m (an adult's: {low_m:.2f} to {high_m:.2f})" in line
     assert "left" not in line
     assert not told(summary, "camera left", "adult")
+
+
+def test_a_wrist_in_the_middle_of_the_hand_is_not_told(tmp_path: Path) -> None:
+    """As trackers after OpenNI give it, also of a tall person: 0.36 m from the elbow."""
+
+    def in_the_hand(points: Floats) -> Floats:
+        elbow, wrist = points[:, at("elbow_l", "elbow_r")], points[:, at("wrist_l", "wrist_r")]
+        length_m = np.linalg.norm(wrist - elbow, axis=2, keepdims=True)
+        points[:, at("wrist_l", "wrist_r")] = elbow + 0.36 / length_m * (wrist - elbow)
+        points[:, at("hand_l", "hand_r")] = np.nan
+        return points
+
+    assert not told(found(tmp_path, left=in_the_hand, right=in_the_hand), "forearm")
 
 
 def test_arms_of_two_lengths_are_told(tmp_path: Path) -> None:
