@@ -198,15 +198,30 @@ def clock_remarks(camera: str, clock: CameraClock, begin_ns: int, late: int) -> 
             f"camera {camera}: {'; '.join(found)}; {usual + '; ' if ahead or back else ''}would be right: the clocks "
             "of camera and recorder set (NTP, PTP) before recording"
         )
-    median_s, p95_s, least_s, most_s = clock.delay_s(50.0, 95.0, 0.0, 100.0)
-    if median_s > LATE_S:
-        yield (
-            f"camera {camera}: its frames arrive {median_s:.2f} s after their stamps (median; 95 % within "
-            f"{p95_s:.2f} s, range {least_s:.2f} to {most_s:.2f} s): the camera is late, or its clock behind; would be "
-            "right: at most fusion.fresh_s; hrcreplay calibrate finds clock_offset_s for a clock that is behind"
-        )
     if late > _FEW and late > _MUCH * clock.frames:
         yield f"camera {camera}: {late} rows were captured before an earlier delivered one; dropped"
+
+
+def late_remark(camera: str, clock: CameraClock, offset_s: float) -> str | None:
+    """A note on a camera whose frames come long after their capture; None where most of them do not.
+
+    Args:
+        camera: Its name.
+        clock: After the last of its rows.
+        offset_s: Its clock minus the reference camera's, as the cell has it [s].
+    """
+    (median_s,) = clock.delay_s(50.0)
+    return f"camera {camera}: {delay_text(clock, offset_s)}" if median_s + offset_s > LATE_S else None
+
+
+def delay_text(clock: CameraClock, offset_s: float) -> str:
+    """How long after their capture a camera's frames come, what may be the cause, and what to do."""
+    median_s, p95_s, least_s, most_s = (s + offset_s for s in clock.delay_s(50.0, 95.0, 0.0, 100.0))
+    return (
+        f"its frames come {median_s:.2f} s after their capture by their stamps (median; 95 % within {p95_s:.2f} s, "
+        f"range {least_s:.2f} to {most_s:.2f} s): the camera is late, or its clock behind; would be right: at most "
+        "fusion.fresh_s; hrcreplay calibrate finds clock_offset_s for a clock that is behind"
+    )
 
 
 def _epoch(low_ns: int, high_ns: int) -> str:

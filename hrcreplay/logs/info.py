@@ -14,6 +14,7 @@ from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs import joints
 from hrcreplay.logs.camera_checks import BodyInWorld, CameraChecks, LimbAgreement, agreement_lines, body_line
 from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.clocks import late_remark
 from hrcreplay.logs.joints import Clock
 from hrcreplay.logs.reader import DEFAULT, Log
 from hrcreplay.records import CameraFrames, Floats, SkeletonTrack
@@ -40,6 +41,8 @@ class CameraSummary:
     last_ns: int | None  #: last arrival
     longest_gap_s: float  #: between arrivals of frames with a body in them [s]; NaN below two frames
     delay_s: float  #: median from capture to arrival, with the offset of the two clocks in it [s]
+    delay_p95_s: float  #: its 95th percentile [s]
+    delay_range_s: tuple[float, float]  #: the least and the largest [s]
     bodies: dict[int, int]  #: body id -> rows
     pose_from: str  #: where its extrinsics are from: the log, the cell; none
     stature_m: float  #: how tall its bodies are by their bones, median [m]; NaN where no bone was seen
@@ -164,9 +167,23 @@ def summarize(
         defects=dict(log.defects),
         bodies=tuple(body for body in bodies if body.camera in poses),
         agreements=agreements,
-        notes=(*log.notes, *joint_notes, *person.checks.remarks(), *_strangers(header.cameras, cell)),
+        notes=(
+            *log.notes,
+            *_late(log, clock_offset_s or {}),
+            *joint_notes,
+            *person.checks.remarks(),
+            *_strangers(header.cameras, cell),
+        ),
         missing=tuple(_missing(log, cameras, joint_topics, has_base=base is not None)),
     )
+
+
+def _late(log: Log, clock_offset_s: Mapping[str, float]) -> Iterator[str]:
+    """Notes on cameras whose frames come long after their capture."""
+    for name, clock in log.clocks.items():
+        remark = late_remark(name, clock, clock_offset_s.get(name, 0.0))
+        if remark is not None:
+            yield remark
 
 
 def _strangers(cameras: Sequence[str], cell: Mapping[str, Floats]) -> Iterator[str]:
@@ -239,12 +256,18 @@ def _camera(name: str, tally: _Tally, log: Log, pose_from: str) -> CameraSummary
         first_ns=tally.first_ns,
         last_ns=tally.last_ns,
         longest_gap_s=tally.longest_ns / 1e9 if several else float("nan"),
-        delay_s=float(np.median(tally.delays_ns)) / 1e9 if tally.frames else float("nan"),
+        delay_s=_percentile_s(tally.delays_ns, 50.0),
+        delay_p95_s=_percentile_s(tally.delays_ns, 95.0),
+        delay_range_s=(_percentile_s(tally.delays_ns, 0.0), _percentile_s(tally.delays_ns, 100.0)),
         bodies=dict(sorted(tally.bodies.items())),
         pose_from=pose_from,
         stature_m=log.stature_m[name],
         side_cue=log.side_cue[name],
     )
+
+
+def _percentile_s(values_ns: list[int], percent: float) -> float:
+    return float(np.percentile(values_ns, percent)) / 1e9 if values_ns else float("nan")
 
 
 def _missing(
@@ -322,11 +345,12 @@ def _joint_line(topic: JointSummary) -> str:
 def _camera_line(camera: CameraSummary, start_ns: int) -> str:
     if camera.first_ns is None or camera.last_ns is None:
         return f"  {camera.name}: no frames"
-    ids = list(camera.bodies)
+    ids, (low_s, high_s) = list(camera.bodies), camera.delay_range_s
     bodies = ", ".join(str(body) for body in ids[:8]) + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")
     return (
         f"  {camera.name}: {camera.frames} frames at {camera.rate_hz:.2f} Hz, "
         f"from {(camera.first_ns - start_ns) / 1e9:.3f} to {(camera.last_ns - start_ns) / 1e9:.3f} s, "
-        f"longest gap {camera.longest_gap_s:.3f} s, delay {1e3 * camera.delay_s:.1f} ms, bodies {bodies}, "
-        f"extrinsics {f'in {camera.pose_from}' if camera.posed else 'none'}"
+        f"longest gap {camera.longest_gap_s:.3f} s, delay {1e3 * camera.delay_s:.1f} ms "
+        f"(95 % within {1e3 * camera.delay_p95_s:.1f}, range {1e3 * low_s:.1f} to {1e3 * high_s:.1f}), "
+        f"bodies {bodies}, extrinsics {f'in {camera.pose_from}' if camera.posed else 'none'}"
     )

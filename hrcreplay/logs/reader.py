@@ -10,7 +10,7 @@ from pathlib import Path
 from hrcreplay.errors import LogError
 from hrcreplay.logs import joints, log_files, messages, plausibility
 from hrcreplay.logs.clean import DEFECTS, STILL_M, STILL_S, Cleaner
-from hrcreplay.logs.clocks import ArrivalOrder, clock_remarks
+from hrcreplay.logs.clocks import ArrivalOrder, CameraClock, clock_remarks
 from hrcreplay.logs.decoders import (
     TF_TYPES,
     GenericDecoder,
@@ -170,6 +170,7 @@ class Log:
         self._refusals: list[str] = []
         self._track: Counter[str] = Counter()
         self.joint_notes: tuple[str, ...] = ()  #: remarks of the latest reading of the joints
+        self.clocks: dict[str, CameraClock] = {}  #: camera -> its clock, of the latest pass
         self.stature_m: dict[str, float] = {}  #: camera -> how tall its bodies are, of the latest pass; NaN: not known
         self.side_cue: dict[
             str, str | None
@@ -232,6 +233,7 @@ class Log:
         if chunk is not None:
             yield chunk
         self._remark(cleaner, start_ns, end_ns)
+        self.clocks = cleaner.clocks
         self._judge(cleaner, shapes)
         self._refuse(_contradictions(cleaner))
         self._refuse(places.remarks())

@@ -24,6 +24,7 @@ from hrcreplay.geometry import convex_hull
 from hrcreplay.human.fusion import fuse, inverse_kinematics
 from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clean import PersonMemory
+from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SkeletonTrack, SweptVolumes
 from hrcreplay.run.build import Forecast, FusionStage, PredictionStage
@@ -149,7 +150,7 @@ def fused(
         raise _nobody(log, sink.counts)
     with sink.watch.stage("clocks", len(ticks_ns)):
         sink.notes["fuse"].extend(clocks.remarks())
-    sink.notes["fuse"].extend(_late(log, sink.counts))
+    sink.notes["fuse"].extend(_late(log, sink.counts, fusion_stage.clock_offset_ns))
     write_checks(checks, sink)
     if others := sink.counts["person_frames_beside_others"]:
         sink.notes["fuse"].append(
@@ -230,14 +231,14 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
     )
 
 
-def _late(log: Log, counts: Counter[str]) -> Iterator[str]:
+def _late(log: Log, counts: Counter[str], offsets_ns: Ints) -> Iterator[str]:
     """Notes on frames that came too late."""
-    for camera in log.header.cameras:
+    for camera, offset_ns in zip(log.header.cameras, offsets_ns.tolist(), strict=True):
         late = counts[f"frames_late_{camera}"]
         if late:
             yield (
-                f"camera {camera}: {late} of {log.defects[f'frames_{camera}']} rows are not used, as they came more "
-                "than fusion.fresh_s after their capture"
+                f"camera {camera}: {late} of {log.defects[f'frames_{camera}']} rows came more than fusion.fresh_s "
+                f"after their capture and are not used; {delay_text(log.clocks[camera], offset_ns / 1e9)}"
             )
 
 

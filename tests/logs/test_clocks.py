@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.errors import LogError
+from hrcreplay.logs.info import lines, summarize
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import CameraFrames, Ints
 from tests.logs import own
@@ -128,11 +129,24 @@ def test_a_clock_that_is_behind_is_told_with_its_delay(tmp_path: Path) -> None:
     table = _table()
     log, frames = _read(tmp_path, changed(table, capture_ns=table.capture_ns - 3 * 10**9))
     np.testing.assert_array_equal(frames.capture_ns, table.capture_ns - 3 * 10**9)
-    (told,) = _about_clock(log)
+    (told,) = (note for note in summarize(log).notes if "clock_offset_s" in note)
     assert "camera one" in told
-    assert "clock_offset_s" in told
     median_s = float(np.median(table.arrival_ns - frames.capture_ns)) / 1e9
-    assert float(told.partition("arrive ")[2].split()[0]) == pytest.approx(median_s, abs=0.006)
+    assert float(told.partition("come ")[2].split()[0]) == pytest.approx(median_s, abs=0.006)
+    mended = summarize(log, clock_offset_s={"one": -3.0})
+    assert not [note for note in mended.notes if "clock_offset_s" in note]
+
+
+def test_info_tells_the_delays_of_a_camera(tmp_path: Path) -> None:
+    table = _table()
+    log, _ = _read(tmp_path, table)
+    delays_s = (table.arrival_ns - table.capture_ns) / 1e9
+    (camera,) = summarize(log).cameras
+    assert camera.delay_s == pytest.approx(np.median(delays_s))
+    assert camera.delay_p95_s == pytest.approx(np.percentile(delays_s, 95))
+    assert camera.delay_range_s == pytest.approx((delays_s.min(), delays_s.max()))
+    (line,) = (line for line in lines(summarize(log)) if "one: 240 frames" in line)
+    assert f"delay {1e3 * np.median(delays_s):.1f} ms (95 % within {1e3 * np.percentile(delays_s, 95):.1f}" in line
 
 
 def test_frames_that_overtake_one_another_are_no_jump(tmp_path: Path) -> None:

@@ -61,8 +61,8 @@ def test_lines_tell_it_all(tmp_path: Path) -> None:
     assert "kind     hrcreplay" in text
     assert "  /camera/left/skeleton        270  hrcreplay.Skeleton" in text
     assert (
-        "  left: 270 frames at 15.00 Hz, from 0.005 to 19.938 s, longest gap 2.067 s, delay 5.0 ms, bodies 7, "
-        "extrinsics none" in text
+        "  left: 270 frames at 15.00 Hz, from 0.005 to 19.938 s, longest gap 2.067 s, "
+        "delay 5.0 ms (95 % within 5.0, range 5.0 to 5.0), bodies 7, extrinsics none" in text
     )
     assert any(
         line.startswith("  right: 255 frames") and "bodies 7, 11, extrinsics in the log" in line for line in text
