@@ -279,7 +279,8 @@ def _unfit(topics: Sequence[JointTopic], axes: Sequence[str], more: Sequence[str
     return LogError(
         f"{where}: {', '.join(topic.name for topic in topics)}: found {told}; the robot's axes are "
         f"{', '.join(axes)}{why}. Name the log's joints in the order of the axes, "
-        f"--set 'logs.joint_names=[{setting}]', or the robot that was recorded, --set robot.urdf=FILE"
+        f"--set 'logs.joint_names=[{setting}]', or the robot that was recorded, --set robot.urdf=FILE, "
+        "or give a task in their place, --set plan.task=FILE.toml"
     )
 
 
@@ -426,7 +427,7 @@ def _judge(match: _Match, stamps: str, offset_s: float | None) -> tuple[str, str
         return "stamps, shifted", (
             f"{told} are {_seconds(abs(low_s))} {side} the log's clock{_epoch(low_s)}; they are shifted by that much, "
             "as if the quickest messages took no time. If you know the offset of the robot's clock, set "
-            "logs.joints_offset_s"
+            "logs.joints_offset_s (0: the stamps are right as they are)"
         )
     return "arrival", (
         f"{told} keep another pace than the log's clock, {_seconds(least_s)} to {_seconds(most_s)} from it; arrival "
