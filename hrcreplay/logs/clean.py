@@ -144,7 +144,7 @@ DEFECTS: Mapping[str, str] = {
     "joints_malformed": "joint states with positions that do not go with their names; left out",
     "joints_not_finite": "joint positions that are no number; left out",
     "joints_out_of_order": "joint states not later than the one before; dropped",
-    "joints_stamp_wrong": "joint states without a stamp or stamped ahead of their neighbours; placed as those are",
+    "joints_stamp_wrong": "joint states without a stamp, or with one far from their neighbours'; placed as those are",
     "messages_missing": "messages that metadata.yaml promises and the files do not give",
     "messages_undecodable": "messages that do not follow their type; left out",
     "points_at_origin": "points exactly in the camera itself, as trackers write 'not tracked'; made missing",

@@ -28,6 +28,8 @@ _NS = 1_000_000_000
 GAP_S = 0.2
 #: A message stamped so much ahead of its neighbours has a wrong stamp; so far apart may they be on the wire [s].
 _APART_S = 0.1
+#: A message is held up on the way for no longer than this, or its stamp is wrong [s].
+_HELD_S = 10.0
 #: A clock that moves on by so much more than the log's between two messages was set anew [s].
 _STEP_S = 0.25
 #: A message needs no longer than this from robot to logger, or its stamp is of another clock [s].
@@ -342,10 +344,10 @@ def place_in_time(
     percentile of arrival - stamp) have no delay: that keeps the stamps' even spacing, and is late by no more than the
     least delay, as arrival itself would be. Where the two clocks are apart by no constant (a clock that was set anew,
     a simulation at another pace), no shift is right, and arrival is what remains. An offset that the user gives is
-    taken as it is.
+    taken as it is, unless the robot's clock was set anew.
 
-    A single stamp ahead of its neighbours, or none, has the delay of its neighbours. One that comes late keeps its
-    stamp: it was held up on the way.
+    A single stamp ahead of its neighbours, or over 10 s behind them, or none, has the delay of its neighbours. One
+    that comes late keeps its stamp: it was held up on the way.
 
     Args:
         topic: All messages.
@@ -412,15 +414,15 @@ def _judge(match: _Match, stamps: str, offset_s: float | None) -> tuple[str, str
     if least_s >= -_AHEAD_S and float(np.median(match.least_s)) <= _LATE_S and not match.steps:
         over = f"{told} are used, though 5 % of the messages arrive later than {_LATE_S:g} s after them"
         return "stamps", over if high_s > _LATE_S else ""
-    if offset_s is not None:
-        return "stamps", (
-            f"{told} do not fit the log's clock with logs.joints_offset_s = {offset_s:g}, and are used as you set it"
-        )
     if match.steps:
         return "arrival", (
             f"{stamps} jump by {_seconds(match.step_by_s)} at {match.step_at_s:.2f} s"
             + (f", and {match.steps - 1} times more" if match.steps > 1 else "")
-            + ": the robot's clock was set while the log was written; arrival times are used instead"
+            + ": the robot's clock, or the recorder's, was set meanwhile; arrival times are used instead"
+        )
+    if offset_s is not None:
+        return "stamps", (
+            f"{told} do not fit the log's clock with logs.joints_offset_s = {offset_s:g}, and are used as you set it"
         )
     if most_s - least_s <= _CONSTANT_S:
         side = "ahead of" if low_s < 0 else "behind"
@@ -455,7 +457,8 @@ def _delays(arrival_ns: Ints, stamp_ns: Ints, known: Bools) -> tuple[Ints, Bools
     delays = middle[nearest]
     usual = np.sort(delay)[round(0.05 * (len(delay) - 1))]
     ahead = arrival_ns - stamp_ns < np.minimum(delays, usual) - round(_APART_S * _NS)
-    return delays, ~known | ahead
+    behind = arrival_ns - stamp_ns > delays + round(_HELD_S * _NS)
+    return delays, ~known | ahead | behind
 
 
 def _steps(arrival_ns: Ints, stamp_ns: Ints) -> Ints:

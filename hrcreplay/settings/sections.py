@@ -80,7 +80,7 @@ class Logs(Section):
     """The log's names of the robot's joints, in the order of the axes; none: those of the robot."""
     joints_unit: Literal["rad", "deg"] = "rad"
     """Unit of the joint positions."""
-    joints_offset_s: Finite | None = None
+    joints_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] | None = None
     """The robot's clock minus the log's; none: 0, or estimated where the stamps cannot be on the log's clock [s]."""
     person_jump_m: Positive = 0.8
     """A body further than this from where the person was last seen is somebody else [m]."""

@@ -275,13 +275,14 @@ def test_a_stamp_alone_is_set_right_and_a_message_that_comes_late_keeps_its_own(
     sent = regular()
     sent[300] = (sent[300][0], sent[300][1] + 9 * SECOND, *sent[300][2:])  # every later stamp would be 'out of order'
     sent[200] = (sent[200][0], -BEGIN, *sent[200][2:])  # zero
+    sent[0] = (sent[0][0], SECOND - BEGIN, *sent[0][2:])  # of 1970: the track would last for 53 years
     sent = [
         (a + (390 * MS - s % (400 * MS) if 800 * MS <= s < 1200 * MS else 0), s, q, topic) for a, s, q, topic in sent
     ]
     log, track = read(write(tmp_path / "a", sent))
     np.testing.assert_array_equal(track.t_ns, BEGIN + np.arange(400) * 10 * MS)
     np.testing.assert_array_equal(track.q, true_q(track.t_ns))
-    assert log.defects["joints_stamp_wrong"] == 2
+    assert log.defects["joints_stamp_wrong"] == 3
 
 
 def test_stamps_that_are_all_zero_have_the_arrival_times(tmp_path: Path) -> None:

@@ -31,6 +31,8 @@ ALL = "fuse predict plan"
 STALE = {
     "logs.topics": ALL,
     "logs.decoders": ALL,
+    "logs.unit": ALL,
+    "logs.marker_ids_per_body": ALL,
     "logs.joints_topic": "plan",  # where the log has no task
     "logs.joint_names": "plan",
     "logs.joints_unit": "plan",
@@ -85,6 +87,7 @@ STALE = {
     "robot.tool_m": "plan",
     "robot.tcp_offset": "plan",
     "robot.links": "plan",
+    "robot.tool_links": "plan",
     "robot.acceleration": "plan",
     "plan.method": "plan",
     "plan.baselines": "plan",
@@ -102,6 +105,7 @@ STALE = {
     "plan.task": "plan",
     "plan.reference": "plan",
     "plan.leash_m": "plan",
+    "plan.catch_up_speed_m_per_s": "plan",
     "plan.waypoint_m": "plan",
     "plan.q_p": "plan",
     "plan.q_v": "plan",
@@ -134,6 +138,8 @@ STALE = {
 OTHER: dict[str, Any] = {
     "logs.topics": ("/camera/kinect/skeleton",),
     "logs.decoders": ({"topic": "/a", "camera": "a", "points": "p", "index": {"neck": 0}},),
+    "logs.unit": "mm",
+    "logs.marker_ids_per_body": 33,
     "logs.joints_topic": "/robot/joints",
     "logs.joint_names": ("a", "b", "c", "d", "e", "f"),
     "logs.joints_unit": "deg",
@@ -151,6 +157,7 @@ OTHER: dict[str, Any] = {
     "robot.tcp_frame": "tool",
     "robot.links": ({"name": "a", "body": "b", "start_m": (0, 0, 0), "end_m": (0, 0, 1), "radius_m": 0.1},),
     "robot.acceleration": (10.0,) * 6,
+    "robot.tool_links": ({"name": "t", "body": "b", "start_m": (0, 0, 0), "end_m": (0, 0, 1), "radius_m": 0.1},),
     "plan.method": "scaling",
     "plan.baselines": (),
     "plan.task": "task.toml",
