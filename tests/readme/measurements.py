@@ -34,8 +34,11 @@ DEMO_RUNS = {
 }
 PICTURE = "demo"
 #: What of metrics.json the README tells.
-_PLAN = ("stationary_share", "progress_share", "full_stop_share", "uncertified_moving_ticks")
-_TOUCH = ("touch_moving_ticks", "touch_contact_speed_max_m_per_s", "body_distance_min_moving_m")
+_PLAN = (
+    *("stationary_share", "null_speed_share", "progress_share", "full_stop_share", "uncertified_moving_ticks"),
+    "tcp_speed_max_m_per_s",
+)
+_TOUCH = ("touch_rest_ticks", "touch_moving_ticks", "touch_contact_speed_max_m_per_s", "body_distance_min_moving_m")
 REPORT_KEYS = (
     *("paper_stationary_share_qp", "paper_stationary_share_scaling", "plan_deviation_max_m", "plan_ticks"),
     *("fusion_angle_rmse_ratio", "fusion_velocity_rmse_ratio", "plan_horizon_median_s", "plan_horizon_max_s"),
