@@ -116,7 +116,7 @@ class Flight:
 
     def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
         base = np.array(self.start["T_world_base"])[:3, 3]
-        bend = 0.1 + 0.002 * np.sin(1e-9 * (t_ns - BEGIN_NS))  # nobody stands like a frozen picture
+        bend = 0.1 + 0.02 * np.sin(np.pi * 1e-9 * (t_ns - BEGIN_NS))  # nobody stands like a frozen picture
         joints = np.array([[base[0] + place_m[0], base[1] + place_m[1], np.pi, bend, *(0.1, 0.5, 0.0, 1.8) * 2, 0.94]])
         to_camera = np.linalg.inv(np.array(self.start["cameras"][camera]))
         points = skeleton(joints, LENGTHS_M)[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
