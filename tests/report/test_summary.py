@@ -35,6 +35,7 @@ def test_fuse(run: Run) -> None:
     unseen_s = np.where(np.arange(n) < n // 2, 0.5, 0.02)
     run = dataclasses.replace(run, state=run.state.assign(frame_age_s=age_s, unseen_LEGS=unseen_s, unseen_HD=age_s))
     run.meta["settings"]["fusion"]["fresh_s"] = 0.3
+    assert run.measurements is not None
     frames = run.measurements.groupby("camera").size()
     assert _lines(run)["fuse"] == (
         "1,200 ticks, person known from fresh frames in 75.0 % (LEGS 50.0 %); frames with the person: "

@@ -27,6 +27,7 @@ from threading import Thread
 from typing import Any, NoReturn, Protocol
 
 from google.protobuf.message import DecodeError
+from pydantic import ValidationError
 
 from hrcreplay.errors import HrcReplayError, LogError, SettingsError
 from hrcreplay.live.person.log_playback import Outgoing, frames_of, play, ready_note, same_frame
@@ -224,7 +225,15 @@ def open_session(settings: Mapping[str, Any]) -> Any:
         raise SettingsError(
             "live.zenoh: eclipse-zenoh is not installed; would be right: pip install 'hrcreplay[zenoh]'"
         ) from error
-    config, wanted = zenoh.Config(), Zenoh.model_validate(settings)
+    try:
+        wanted = Zenoh.model_validate(settings)
+    except ValidationError as error:
+        found = error.errors()[0]
+        where = ".".join(map(str, found["loc"]))
+        raise SettingsError(
+            f"live.zenoh: no session ({where}: {found['msg']}); check mode, connect and listen"
+        ) from error
+    config = zenoh.Config()
     given = {
         "mode": wanted.mode,
         "connect/endpoints": list(wanted.connect),
