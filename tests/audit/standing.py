@@ -28,9 +28,9 @@ def frames(points: Floats, rate_hz: float = 30.0) -> CameraFrames:
 
 
 def standing(n: int) -> Floats:
-    """(n, 20, 3) points of the model with slightly bent arms, swaying by 0.1 mm as nobody is frozen [m]."""
+    """(n, 20, 3) points of the model with slightly bent arms, swaying by 3 mm within a second, as people do [m]."""
     p = np.zeros((n, DOF))
-    p[:, 0] = 1e-4 * np.sin(np.arange(n))
+    p[:, 0] = 3e-3 * np.sin(0.2 * np.arange(n))
     p[:, [4, 8]], p[:, [7, 11]], p[:, 12] = 0.2, 2.5, 1.0
     return skeleton(p, np.tile(LENGTHS_M, (n, 1)))
 
