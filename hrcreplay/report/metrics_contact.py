@@ -98,6 +98,8 @@ def _add_people(metrics: MetricTable, run: Run) -> None:
 
 def _is_whole(body: pd.DataFrame, part: str) -> Bools:
     """(n,) whether both ends of a part are known; one that is known at one end alone stands there as a ball."""
+    if f"{part}_0_x" not in body:
+        return np.zeros(len(body), dtype=np.bool_)
     first, second = ([numeric_column(body, f"{part}_{end}_{axis}") for axis in "xyz"] for end in (0, 1))
     apart = np.abs(np.subtract(first, second)).sum(axis=0)
     return np.asarray(apart > 0.0)
