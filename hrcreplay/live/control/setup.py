@@ -30,7 +30,7 @@ from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.minimiser import compile_denied
+from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.task import Reference
 from hrcreplay.run import build
 from hrcreplay.run.followers import Follower
@@ -213,7 +213,7 @@ _FRAME_EVERY = 8
 
 def compile_kernels(start: dict[str, Any]) -> None:
     """Compiles every kernel by a simulated session of 1.6 s with a person who walks up to the robot."""
-    compile_denied()
+    compile_second_tries()
     controller = build_controller({**start, "sending": False})
     camera, T = next(iter(start["cameras"].items()))
     to_camera = np.linalg.inv(np.array(T))

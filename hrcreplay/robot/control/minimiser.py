@@ -118,11 +118,12 @@ def minimise(task: Problem) -> Solution | Unsolved:
     return Unsolved("too many rows")
 
 
-def compile_denied() -> None:
-    """Compiles ``denied``: it is asked only after a try of proxqp has failed, so a session might be the first to."""
+def compile_second_tries() -> None:
+    """Compiles what is asked only after a try of proxqp has failed, so that no session is the first to ask."""
     none, rows = np.zeros(1), np.zeros(2)
     problem = Metric(np.eye(1), none, np.zeros((2, 1)), rows, rows)
     denied(problem, rows, Limits(none, none, np.zeros((6, 1)), np.zeros(6), np.zeros(6)))
+    _least_distance(problem)
 
 
 def _keeps(limits: Limits, w: Floats) -> bool:
@@ -164,7 +165,8 @@ def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
     G = np.concatenate((-E[above], E[below]))
     at = apply(E, b)
     f = np.concatenate((-(high + at)[above], (low + at)[below]))
-    pull, found = nonnegative_least_squares(np.vstack((G.T, f)), np.append(np.zeros(n), 1.0), 3 * m)
+    columns = np.ascontiguousarray(np.vstack((G.T, f)))  # one order in memory, so one compiled kernel
+    pull, found = nonnegative_least_squares(columns, np.append(np.zeros(n), 1.0), 3 * m)
     if not found:
         return -b, np.zeros(m)
     z = np.zeros(m)
