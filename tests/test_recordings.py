@@ -12,6 +12,7 @@ import pytest
 from hrcreplay.cli import commands
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
+from tests.coverage_figures import assert_one_coverage
 from tests.realdata import data_path
 
 TASK = """
@@ -104,6 +105,7 @@ def test_an_imported_recording_from_import_to_page(tmp_path: Path, name: str) ->
         "report", log, out=tmp_path / "run", cell_file=cell, end_s=4.0, overrides=(f"plan.task={task}",)
     )
     metrics = _check(folder, 4.0)
+    assert assert_one_coverage(folder, tmp_path) > 0
     for camera in files:
         assert metrics[f"camera_{camera}_frames"]["value"] > 80
         assert metrics[f"camera_{camera}_valid_share"]["value"] > 0.05
@@ -126,6 +128,7 @@ def test_a_bag_with_a_message_type_of_its_own_to_page(tmp_path: Path, name: str)
         overrides=(f"plan.task={task}",),
     )
     metrics = _check(folder, 6.0)
+    assert assert_one_coverage(folder, tmp_path) > 0
     assert metrics["camera_mocap_rate_hz"]["value"] == pytest.approx(60.0, rel=0.02)
     assert metrics["count_frames_header_stamp_zero"]["value"] > 300
     assert any("header stamps are zero" in note for note in run_folder.read(folder).notes)

@@ -168,7 +168,7 @@ def read_track(
         axes: The robot's joints, from the base on.
         options: How names, unit and clock are set.
         where: What messages begin with: the log.
-        defects: Counts messages and positions that are left out.
+        defects: Counts messages and positions that are left out, and ``joint_gaps_ms`` of all gaps together.
 
     Raises:
         LogError: The joints do not fit the robot, two topics contradict each other, or an axis has no position.
@@ -193,6 +193,7 @@ def read_track(
     series = [tracks[(chosen[axis].name, names[axis])] for axis in axes]
     track = _join(series, tuple(axes), where)
     gaps_ns = _gaps(series, track)
+    defects["joint_gaps_ms"] += round(_covered_ns(gaps_ns) / 1e6)
     read = dict.fromkeys(topic.name for topic in chosen.values())
     notes = [
         *_named(topics, names, chosen),
@@ -514,6 +515,15 @@ def _gaps(series: Sequence[tuple[Ints, Floats]], track: JointTrack) -> Ints:
     return np.array(inside, dtype=np.int64).reshape(-1, 2)
 
 
+def _covered_ns(gaps_ns: Ints) -> int:
+    """How long at least one axis is not told [ns], of gaps (g, 2) in order."""
+    covered, until = 0, 0
+    for begin, end in gaps_ns.tolist():
+        covered += max(0, end - max(begin, until))
+        until = max(until, end)
+    return covered
+
+
 def coverage_remarks(reading: JointReading, start_ns: int, end_ns: int) -> Iterator[str]:
     """Remarks on a track with gaps, or that begins later or ends earlier than the log.
 
@@ -531,13 +541,10 @@ def coverage_remarks(reading: JointReading, start_ns: int, end_ns: int) -> Itera
         )
     if not len(gaps_ns):
         return
-    covered, until = 0, int(gaps_ns[0, 0])
-    for begin, end in gaps_ns.tolist():
-        covered += max(0, end - max(begin, until))
-        until = max(until, end)
+    covered_s = _covered_ns(gaps_ns) / _NS
     longest = gaps_ns[np.argmax(gaps_ns[:, 1] - gaps_ns[:, 0])]
     yield (
-        f"robot joints: gaps of more than {GAP_S:g} s: {len(gaps_ns)}, {covered / _NS:.2f} s in all, the longest of "
+        f"robot joints: gaps of more than {GAP_S:g} s: {len(gaps_ns)}, {covered_s:.2f} s in all, the longest of "
         f"{(longest[1] - longest[0]) / _NS:.2f} s from {(longest[0] - start_ns) / _NS:.2f} s of the log on. There the "
         "programme is a straight line in joint space from the last known position to the next: nobody measured it"
     )

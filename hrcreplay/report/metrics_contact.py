@@ -75,13 +75,19 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
 
 
 def _add_people(metrics: MetricTable, run: Run) -> None:
-    """Who was there, and which limbs of the person were shown."""
+    """Who was there, which limbs of the person were shown, and how much of a recorded robot was not."""
     frames = run.counts.get("person_frames_beside_others", 0)
     metrics.add(
         "others_frames",
         frames,
         "1",
         "frames with at least one body that is not the person: asked for contact, neither planned for nor predicted",
+    )
+    metrics.add(
+        "programme_gaps_s",
+        run.counts.get("joint_gaps_ms", 0) * 1e-3,
+        "s",
+        "of the programme, where that is the recorded robot's motion: a straight line over gaps in its joints",
     )
     for limb, parts in SHOWN_PARTS.items():
         share = None

@@ -150,7 +150,13 @@ def scope(metrics: Metrics) -> tuple[str, ...]:
             f"; {frames} show at least one other body, which counts for contact, but the robot did not heed it and "
             "nothing was predicted of it"
         )
-    return (f"{people}.", f"Not considered: {', '.join((*NOT_CONSIDERED, *unseen_limbs(metrics)))}.")
+    gaps_s, programme = metrics["programme_gaps_s"]["value"], []
+    if gaps_s:
+        programme.append(
+            f"The programme is the recorded robot's motion; {gaps_s:.2f} s of it were not recorded, and a straight "
+            "line that nobody measured stands for them."
+        )
+    return (f"{people}.", *programme, f"Not considered: {', '.join((*NOT_CONSIDERED, *unseen_limbs(metrics)))}.")
 
 
 def unseen_limbs(metrics: Metrics) -> list[str]:

@@ -300,6 +300,7 @@ def test_gaps_and_ends_are_told_with_where_and_how_long(tmp_path: Path) -> None:
     log, track = read(write(tmp_path / "a", sent + last))
     gap, ends = (next(note for note in log.joint_notes if word in note) for word in ("gaps", "stands still"))
     assert "1, 1.51 s in all" in gap
+    assert log.joint_defects["joint_gaps_ms"] == 1510
     assert "from 0.99 s" in gap
     assert "to 3.19 s" in ends
     assert len(track) == 100 + 70

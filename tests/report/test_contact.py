@@ -227,6 +227,16 @@ def test_another_body_counts_and_is_told_apart_from_the_person(run: Run) -> None
     assert "another body (25 ticks)" in lines(touching, found)[-1]
 
 
+def test_what_was_not_recorded_of_a_recorded_programme_is_told(run: Run) -> None:
+    whole, gaps = (dataclasses.replace(run, counts={"joint_gaps_ms": ms}) for ms in (0, 2004))
+    for told, one in ((False, whole), (True, gaps)):
+        found = metrics_of(one)
+        said = verdict.verdict(one, found)
+        assert said is not None
+        assert ("2.00 s of it were not recorded" in " ".join(said.scope)) == told
+        assert ("2.00 s of it were not recorded" in lines(one, found)[-1]) == told
+
+
 @pytest.mark.parametrize("shown", [0.0, 0.4, 1.0])
 def test_legs_that_were_not_seen_are_told(run: Run, shown: float) -> None:
     ticks = np.arange(100)
