@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -15,8 +16,8 @@ from google.protobuf.message import DecodeError
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, McapRecord, Schema
+from mcap.reader import FOOTER_SIZE
+from mcap.records import Channel, Chunk, ChunkIndex, Footer, McapRecord, Schema, Statistics
 from mcap.records import Header as McapHeader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
@@ -24,8 +25,17 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from hrcreplay.errors import LogError
 from hrcreplay.logs import ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.messages import MCAP_MAGIC, Damage, LazyChunk, Message, Topic, Undecodable, merge_by_arrival
-from hrcreplay.logs.unpack import CHUNK_BYTES, KNOWN, METHODS, CannotUnpack, unpack, unpack_message
+from hrcreplay.logs.messages import (
+    MCAP_MAGIC,
+    Damage,
+    LazyChunk,
+    Message,
+    Topic,
+    Undecodable,
+    merge_by_arrival,
+    note_damaged_chunks,
+)
+from hrcreplay.logs.unpack import CHUNK_BYTES, CHUNK_RECORDS, KNOWN, METHODS, CannotUnpack, unpack, unpack_message
 
 _RUN_BYTES = 1 << 20
 _OURS = {
@@ -142,7 +152,7 @@ class McapStream:
         if offset not in self._damaged:
             self._damaged[offset] = error
             self.defects["chunks_unreadable"] += 1
-            self.notes[self._described :] = [_damage_note(self._damaged)]
+            self.notes[self._described :] = [note_damaged_chunks(self._damaged)]
 
     def _unpacked(self, record: McapMessage, wanted: dict[int, Topic]) -> bytes:
         if record.channel_id not in self._cdr:
@@ -150,16 +160,9 @@ class McapStream:
         return unpack_message(record.data, f"{self._path}: {wanted[record.channel_id].name}")
 
 
-def _damage_note(damaged: dict[int, str]) -> str:
-    """A note on chunks that are left out, by the byte at which they begin."""
-    offset = min(damaged)
-    first = f"at byte {offset} is damaged and left out ({damaged[offset]})"
-    return f"the chunk {first}" if len(damaged) == 1 else f"{len(damaged)} chunks are damaged; the first {first}"
-
-
 def _profile(file: IO[bytes], path: Path) -> str:
     try:
-        header = next(StreamReader(file).records)
+        header = next(StreamReader(file, emit_chunks=True, record_size_limit=CHUNK_BYTES).records)
     except _BROKEN as error:
         raise LogError(f"{path}: breaks off within the MCAP header; record or copy it again") from error
     if not isinstance(header, McapHeader):
@@ -169,14 +172,16 @@ def _profile(file: IO[bytes], path: Path) -> str:
 
 def _summary(file: IO[bytes]) -> _Index | None:
     """What the file says of itself at its end; None where that is missing or too little."""
-    file.seek(0)
     try:
-        summary = SeekingReader(file).get_summary()
+        records = _summary_records(file)
     except (*_BROKEN, OSError, StopIteration):
         return None
-    if summary is None or summary.statistics is None or len(summary.channels) < summary.statistics.channel_count:
+    statistics = next((record for record in records if isinstance(record, Statistics)), None)
+    channels = {record.id: record for record in records if isinstance(record, Channel)}
+    chunks = [record for record in records if isinstance(record, ChunkIndex)]
+    if statistics is None or len(channels) < statistics.channel_count:
         return None
-    if not summary.chunk_indexes and summary.statistics.message_count:
+    if not chunks and statistics.message_count:
         return None
     blocks = [
         _Block(
@@ -186,11 +191,25 @@ def _summary(file: IO[bytes]) -> _Index | None:
             chunk.chunk_length,
             frozenset(chunk.message_index_offsets) or None,
         )
-        for chunk in summary.chunk_indexes
+        for chunk in chunks
     ]
-    counts = Counter(summary.statistics.channel_message_counts)
-    foreign = [chunk.compression for chunk in summary.chunk_indexes if chunk.compression not in METHODS]
-    return _Index(dict(summary.schemas), dict(summary.channels), counts, blocks, foreign)
+    foreign = [chunk.compression for chunk in chunks if chunk.compression not in METHODS]
+    schemas = {record.id: record for record in records if isinstance(record, Schema)}
+    return _Index(schemas, channels, Counter(statistics.channel_message_counts), blocks, foreign)
+
+
+def _summary_records(file: IO[bytes]) -> list[McapRecord]:
+    """The records at the end of a file to which its footer points; a chunk among them stays packed."""
+
+    def records() -> Iterator[McapRecord]:
+        return StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=CHUNK_BYTES).records
+
+    file.seek(-(FOOTER_SIZE + len(MCAP_MAGIC)), os.SEEK_END)
+    footer = next(records())
+    if not isinstance(footer, Footer) or not footer.summary_start:
+        return []
+    file.seek(footer.summary_start)
+    return list(records())
 
 
 def _scan(file: IO[bytes], size: int, damage: Damage) -> _Index:
@@ -278,7 +297,18 @@ def _unpacked_records(chunk: Chunk) -> list[McapRecord]:
     if chunk.compression not in METHODS:
         raise _UnknownCompression(chunk.compression)
     data = unpack(chunk.compression, chunk.data)
+    _check_count(data)
     return breakup_chunk(replace(chunk, compression="", data=data), validate_crc=True)
+
+
+def _check_count(data: bytes) -> None:
+    """Refuses a chunk of more than CHUNK_RECORDS records, which cost far more memory as objects than as bytes."""
+    at = count = 0
+    while at + 9 <= len(data):
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+        count += 1
+        if count > CHUNK_RECORDS:
+            raise CannotUnpack(f"holds more than {CHUNK_RECORDS} records, the most that are read of one")
 
 
 def _type(schema: Schema | None) -> str:

@@ -80,6 +80,13 @@ class Damage:
         self.notes.append(f"the file breaks off {(last_ns - start_ns) / 1e9:.3f} s after its first message")
 
 
+def note_damaged_chunks(damaged: Mapping[int, str]) -> str:
+    """A note on chunks that are left out: byte at which each begins -> what is wrong with it."""
+    offset = min(damaged)
+    first = f"at byte {offset} is damaged and left out ({damaged[offset]})"
+    return f"the chunk {first}" if len(damaged) == 1 else f"{len(damaged)} chunks are damaged; the first {first}"
+
+
 class LazyChunk(NamedTuple):
     """A sequence of messages that is opened only when the merged stream reaches it."""
 

@@ -26,8 +26,17 @@ from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
 from hrcreplay.errors import LogError
-from hrcreplay.logs.messages import Damage, LazyChunk, Message, MessageStream, Topic, Undecodable, merge_by_arrival
-from hrcreplay.logs.unpack import unpack, unpack_message
+from hrcreplay.logs.messages import (
+    Damage,
+    LazyChunk,
+    Message,
+    MessageStream,
+    Topic,
+    Undecodable,
+    merge_by_arrival,
+    note_damaged_chunks,
+)
+from hrcreplay.logs.unpack import CHUNK_RECORDS, CannotUnpack, unpack, unpack_message
 
 _IDL_RULE = "=" * 80 + "\n"
 _ROS1 = (Stores.ROS1_NOETIC,)
@@ -141,12 +150,17 @@ class RecoveredBag:
         damage.notes.append("the bag has no usable index: it was read once more to make one (rosbag reindex mends it)")
         damage.defects["unindexed"] = 1
         self._chunks: list[_BagChunk] = []
+        self._damaged: dict[int, str] = {}  # byte at which a chunk begins that is left out -> why
         connections: dict[int, tuple[str, Fields]] = {}
         counts: Counter[int] = Counter()
         with path.open("rb") as file:
             whole = self._scan(file, connections, counts)
         if not self._chunks:
-            raise LogError(f"{path}: the log holds no messages that are whole; copy the bag again")
+            found = f": {note_damaged_chunks(self._damaged)}" if self._damaged else ""
+            raise LogError(f"{path}: the log holds no messages that are whole{found}; {_ANEW}")
+        if self._damaged:
+            damage.defects["chunks_unreadable"] = len(self._damaged)
+            damage.notes.append(note_damaged_chunks(self._damaged))
         self.start_ns = min(chunk.start_ns for chunk in self._chunks)
         self.end_ns = max(chunk.end_ns for chunk in self._chunks)
         if not whole:
@@ -179,7 +193,7 @@ class RecoveredBag:
                 (length,) = struct.unpack("<L", file.read(4))
                 data = file.read(length)
                 if fields["op"][0] == _CHUNK:
-                    self._add(offset, unpack(fields["compression"].decode(), data), connections, counts)
+                    self._add_packed(offset, fields, data, connections, counts, whole=len(data) == length)
                 if len(data) < length:
                     return False
                 if fields["op"][0] == _CONNECTION:
@@ -188,6 +202,23 @@ class RecoveredBag:
         except _BROKEN_CHUNK:
             return False
         return True
+
+    def _add_packed(
+        self,
+        offset: int,
+        fields: Fields,
+        data: bytes,
+        connections: dict[int, tuple[str, Fields]],
+        counts: Counter[int],
+        *,
+        whole: bool,
+    ) -> None:
+        """Adds what a chunk holds; one that is all there but cannot be unpacked is left out."""
+        try:
+            self._add(offset, unpack(fields["compression"].decode(), data), connections, counts)
+        except CannotUnpack as error:
+            if whole:
+                self._damaged[offset] = str(error)
 
     def _add(self, offset: int, data: bytes, connections: dict[int, tuple[str, Fields]], counts: Counter[int]) -> None:
         times = []
@@ -233,10 +264,18 @@ def _fields(file: IO[bytes]) -> Fields | None:
 
 
 def _inner(data: bytes) -> Iterator[tuple[Fields, bytes]]:
-    """Whole records of a chunk; the last chunk of a bag that breaks off may itself break off."""
+    """Whole records of a chunk; the last chunk of a bag that breaks off may itself break off.
+
+    Raises:
+        CannotUnpack: There are more than CHUNK_RECORDS.
+    """
     file = BytesIO(data)
+    count = 0
     try:
         while (fields := _fields(file)) is not None:
+            count += 1
+            if count > CHUNK_RECORDS:
+                raise CannotUnpack(f"holds more than {CHUNK_RECORDS} records, the most that are read of one")
             (length,) = struct.unpack("<L", file.read(4))
             content = file.read(length)
             if len(content) < length:
@@ -267,6 +306,8 @@ def _topic(path: Path, name: str, fields: Fields, count: int) -> Topic:
     return Topic(name, plain(msgtype), count, parse)
 
 
+#: What helps against a chunk that is damaged or too large.
+_ANEW = "copy the bag again, or write it anew in small chunks with rosbag decompress"
 _NO_INDEX = (rosbag1.ReaderError, AssertionError, struct.error, ValueError, IndexError)
 _BROKEN = (*_NO_INDEX, RuntimeError, OSError)
 
@@ -321,6 +362,8 @@ class RosStream:
                     return
                 for c, arrival_ns, data in opened.messages(wanted, start_ns, end_ns):
                     yield Message(arrival_ns, self._topics[(c.topic, c.msgtype)], data)
+        except CannotUnpack as error:
+            raise LogError(f"{self._path}: a chunk of the bag {error}; {_ANEW}") from error
         except _BROKEN as error:
             found = str(error) or type(error).__name__  # struct and zlib say what they found, EOFError does not
             raise LogError(f"{self._path}: broken in the middle ({found}); copy it again") from error

@@ -18,6 +18,8 @@ from hrcreplay.errors import LogError
 CHUNK_BYTES: Final = 256 << 20
 #: The most that is unpacked of one message [bytes].
 MESSAGE_BYTES: Final = 64 << 20
+#: The most records in one chunk: each costs some hundred bytes and microseconds.
+CHUNK_RECORDS: Final = 1 << 19
 #: A compressed file unpacks to at most so many times its size, and SPARE_BYTES more.
 FILE_RATIO: Final = 1000
 #: See FILE_RATIO [bytes].
@@ -49,7 +51,7 @@ def unpack(method: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
     except CannotUnpack:
         raise
     except (zstandard.ZstdError, OSError, RuntimeError, ValueError, EOFError, struct.error) as error:
-        raise CannotUnpack(f"{method} data that cannot be decompressed: {error}") from error
+        raise CannotUnpack(f"holds {method} data that cannot be decompressed: {error}") from error
 
 
 def _limited(blocks: Iterator[bytes], limit: int) -> Iterator[bytes]:
