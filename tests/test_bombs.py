@@ -5,7 +5,9 @@ The same limits, asked of the functions that hold them, for all inputs; of the w
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from hrcreplay.calibration.cell import load_cell
 from hrcreplay.egm.robot_double.faults import load_faults
 from hrcreplay.errors import SettingsError
 from hrcreplay.limits import load_limits
-from hrcreplay.robot.model import irb140
+from hrcreplay.robot.model import from_urdf, irb140
 from hrcreplay.robot.path import MOVE_S, programmed
 from hrcreplay.robot.task import CYCLE_S, parse_task
 from hrcreplay.robot.urdf import MOST_LINKS
@@ -163,7 +165,51 @@ def test_a_mesh_of_millions_of_triangles_is_told(tmp_path: Path) -> None:
         read_urdf(Robot(urdf=tmp_path / "r.urdf"))
 
 
-@pytest.mark.parametrize("what", ["config", "cell", "task", "rate", "speed", "urdf"])
+def zipped(begin: bytes, megabytes: int) -> bytes:
+    """A zip file of one Collada file, which unpacks to so many spaces and an end."""
+    content = BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as file, file.open("a.dae", "w") as inner:
+        inner.write(begin)
+        for _ in range(megabytes):
+            inner.write(b" " * (1 << 20))
+        inner.write(b"</COLLADA>")
+    return content.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "begin", "fact"),
+    [
+        ("a.dae", b"PK\x03\x04", "packed"),
+        ("a.stl", b"\x1f\x8b\x08", "packed"),
+        ("a.stl.gz", b"\x1f\x8b\x08", "packed"),
+        ("a.obj", b"\x28\xb5\x2f\xfd", "packed"),
+        ("a.zae", b"PK\x03\x04", "packed"),
+        ("a.3mf", b"<model>", "of another format"),
+        ("a.blend", b"BLENDER-v280", "of another format"),
+        ("a", b"solid", "of another format"),
+    ],
+)
+def test_meshes_that_may_be_packed_are_told(name: str, begin: bytes, fact: str, tmp_path: Path) -> None:
+    """The library of meshes unpacks zip and gzip, and looks into files for what they are."""
+    (tmp_path / name).write_bytes(begin)
+    text = urdf(8).replace('<sphere radius="0.1"/>', f'<mesh filename="{name}"/>', 1)
+    (tmp_path / "r.urdf").write_text(text)
+    with pytest.raises(SettingsError, match=rf"{name} is {fact}; STL, Collada and OBJ .*robot\.links") as told:
+        read_urdf(Robot(urdf=tmp_path / "r.urdf"))
+    assert "\n" not in str(told.value)
+
+
+def test_a_mesh_that_cannot_be_read_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.stl").write_bytes(b"no mesh")
+    (tmp_path / "r.urdf").write_text(urdf(8).replace('<sphere radius="0.1"/>', '<mesh filename="a.stl"/>', 1))
+    files = read_urdf(Robot(urdf=tmp_path / "r.urdf"))
+    assert files is not None
+    with pytest.raises(SettingsError, match=r"a mesh of r cannot be read \(.*a\.stl.*\); give robot\.links") as told:
+        from_urdf(files.text, np.eye(4), stop_s=0.4, meshes=dict(files.meshes))
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("what", ["config", "cell", "task", "rate", "speed", "urdf", "mesh"])
 def test_the_command_tells_a_bomb_in_one_line(what: str, tmp_path: Path) -> None:
     log = own.write(tmp_path / "a.mcap", own.frames(20), cameras={"left": np.eye(4), "right": np.eye(4)})
     (tmp_path / "nested.toml").write_text(TOML["nested"][1])
@@ -173,6 +219,8 @@ def test_the_command_tells_a_bomb_in_one_line(what: str, tmp_path: Path) -> None
         "speed = 1e-9\n[[waypoints]]\njoints_deg = [0,0,0,0,30,0]\n[[waypoints]]\njoints_deg = [9,0,0,0,30,0]\n"
     )
     (tmp_path / "r.urdf").write_text(urdf(3000))
+    (tmp_path / "a.dae").write_bytes(zipped(b"<COLLADA>", 1000) if what == "mesh" else b"")
+    (tmp_path / "mesh.urdf").write_text(urdf(8).replace('<sphere radius="0.1"/>', '<mesh filename="a.dae"/>', 1))
     commands: dict[str, tuple[list[str | Path], str]] = {
         "config": (["fuse", log, "--config", tmp_path / "nested.toml"], "nested too deep"),
         "cell": (["fuse", log, "--cell", tmp_path / "long.toml"], "MB"),
@@ -183,6 +231,7 @@ def test_the_command_tells_a_bomb_in_one_line(what: str, tmp_path: Path) -> None
             "1e-09",
         ),
         "urdf": (["plan", log, "--set", f"robot.urdf={tmp_path / 'r.urdf'}"], "3000 links"),
+        "mesh": (["plan", log, "--set", f"robot.urdf={tmp_path / 'mesh.urdf'}"], "a.dae is packed"),
     }
     command, fact = commands[what]
     assert_one_line(run_bounded(*command, "--out", tmp_path / "out"), 2, fact)

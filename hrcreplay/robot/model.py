@@ -327,7 +327,8 @@ def _extents(whole: Any, robot: Description, meshes: Mapping[str, str]) -> dict[
     try:
         geometry = pin.buildGeomFromUrdfString(whole, text, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
-        raise SettingsError(f"robot: a mesh of {robot.name} cannot be read ({error}); give robot.links") from error
+        reason = " ".join(str(error).partition("message: ")[2].partition("Hint: ")[0].split() or str(error).split())
+        raise SettingsError(f"robot: a mesh of {robot.name} cannot be read ({reason}); give robot.links") from error
     found = {one.name: one for one in geometry.geometryObjects}
     extents = {}
     for shape in robot.shapes:

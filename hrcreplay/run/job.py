@@ -20,6 +20,7 @@ from hrcreplay.calibration.cell import Cell, load_cell
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
 from hrcreplay.limits import load_limits
+from hrcreplay.logs.unpack import ZSTD_MAGIC
 from hrcreplay.robot import irb140
 from hrcreplay.robot.model import Segment, from_urdf
 from hrcreplay.robot.urdf import describe
@@ -77,6 +78,7 @@ def read_urdf(robot: Robot) -> UrdfFiles | None:
     files = [path, *(Path(mesh) for mesh in meshes.values())]
     for mesh in files[1:]:
         _check_size(mesh, _MESH_BYTES)
+        _check_kind(mesh)
     return UrdfFiles(text, tuple(meshes.items()), tuple((str(file), run_folder.sha256(file)) for file in files))
 
 
@@ -90,6 +92,23 @@ def _check_size(path: Path, most: int) -> None:
         raise SettingsError(
             f"robot.urdf: {path} has {size / (1 << 20):.0f} MB; at most {most >> 20} MB are read, so simplify the mesh "
             "or give robot.links"
+        )
+
+
+#: Endings of meshes that are read, in formats whose data are no larger in memory than some times the file.
+_MESHES = (".stl", ".dae", ".obj")
+#: How packed files begin: of zip, gzip, zstd.
+_PACKED = (b"PK", b"\x1f\x8b", ZSTD_MAGIC)
+
+
+def _check_kind(mesh: Path) -> None:
+    """Refuses a mesh that may be packed: the library unpacks it whole, however much that is."""
+    with mesh.open("rb") as file:
+        packed = file.read(4).startswith(_PACKED)
+    if packed or mesh.suffix.lower() not in _MESHES:
+        raise SettingsError(
+            f"robot.urdf: {mesh} is {'packed' if packed else 'of another format'}; STL, Collada and OBJ (.stl, .dae, "
+            ".obj) are read, not packed, so convert it or give robot.links"
         )
 
 

@@ -247,7 +247,8 @@ class Robot(Section):
     tcp_offset: Offset = Offset()
     """TCP from there, for a tool that is not straight."""
     links: tuple[LinkSettings, ...] = ()
-    """Link segments; none: the IRB 140's, or derived from the URDF's collision shapes, meshes among them."""
+    """Link segments; none: the IRB 140's, or derived from the URDF's collision shapes, meshes (STL, Collada, OBJ) among
+    them."""
     tool_links: tuple[LinkSettings, ...] = ()
     """Further link segments, of what is mounted at the tool; also beside the IRB 140's."""
     acceleration: tuple[Positive, ...] = ()

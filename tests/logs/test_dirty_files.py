@@ -184,7 +184,10 @@ def test_bag_with_a_damaged_chunk(tmp_path: Path, form: rosbag1.Writer.Compressi
     data = bytearray(path.read_bytes())
     data[5000:6000] = b"\xff" * 1000
     path.write_bytes(data)
-    with pytest.raises(LogError, match=r"a\.bag: (broken in the middle|a chunk of the bag holds|the log holds no messages that are whole)"):
+    with pytest.raises(
+        LogError,
+        match=r"a\.bag: (broken in the middle|a chunk of the bag holds|the log holds no messages that are whole)",
+    ):
         list(open_log(path).frames())
 
 
