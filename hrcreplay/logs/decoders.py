@@ -254,6 +254,10 @@ def describe_transforms(messages: Iterable[Message]) -> str:
     )
 
 
+#: In the description of a topic that settings can make readable.
+DECODABLE = "[[logs.decoders]] can read"
+
+
 def describe_arrays(messages: Iterable[Message]) -> str:
     """The arrays of points that a described decoder could read in a topic, in a few words, by its first messages."""
     found: dict[str, int] = {}
@@ -261,12 +265,9 @@ def describe_arrays(messages: Iterable[Message]) -> str:
         for path, count in _point_arrays(message.read(), ""):
             found[path] = max(found.get(path, 0), count)
     if not found:
-        return (
-            "has no array of points with x, y, z that [[logs.decoders]] could read; write the bodies into a log of "
-            "ours with hrcreplay.logs.writer.LogWriter, or publish them as markers of the Azure Kinect"
-        )
+        return "has no array of points with x, y, z that [[logs.decoders]] could read"
     arrays = ", ".join(f"{path!r} (up to {count})" for path, count in found.items())
-    return f"has arrays of points, which [[logs.decoders]] can read if they are one body's: {arrays}"
+    return f"has arrays of points, which {DECODABLE} if they are one body's: {arrays}"
 
 
 def _point_arrays(content: Any, path: str) -> Iterator[tuple[str, int]]:

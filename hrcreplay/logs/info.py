@@ -275,7 +275,7 @@ def _missing(
 ) -> Iterator[str]:
     header = log.header
     if not cameras:
-        yield "skeletons: name a topic with --topic NAME, or a decoder for it in [logs.decoders] of the settings file"
+        yield f"skeletons: {log.skeletons_remedy[0].lower()}{log.skeletons_remedy[1:-1]}"
     for camera in cameras:
         if not camera.frames:
             yield f"frames of camera {camera.name}: it is named but delivers nothing"

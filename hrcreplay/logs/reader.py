@@ -12,6 +12,7 @@ from hrcreplay.logs import joints, log_files, messages, plausibility
 from hrcreplay.logs.clean import DEFECTS, STILL_M, STILL_S, Cleaner
 from hrcreplay.logs.clocks import ArrivalOrder, CameraClock, clock_remarks
 from hrcreplay.logs.decoders import (
+    DECODABLE,
     TF_TYPES,
     GenericDecoder,
     OwnDecoder,
@@ -36,7 +37,11 @@ _NO_BODIES = (
     "hrcreplay.Task",
     "rcl_interfaces/Log",
 )
-_HOW = "Name one with --topic NAME, or a decoder for it in [logs.decoders] of the settings file."
+_HOW = "Name a topic with --topic NAME, or a decoder for it in [[logs.decoders]] of the settings file."
+_NO_SETTING = (
+    "No setting makes bodies of these topics: write the bodies into a log of ours with "
+    "hrcreplay.logs.writer.LogWriter, or publish them as markers of the Azure Kinect."
+)
 
 
 #: How to read a log of which the settings say nothing.
@@ -89,7 +94,20 @@ def choose_decoders(source: LogFiles, options: Logs) -> Chosen:
 def no_skeletons_error(source: LogFiles, remarks: list[str]) -> LogError:
     """The error for a log in which no topic carries skeletons, with what the user can do."""
     told = "".join(f"\n{remark}." for remark in remarks)
-    return LogError(f"{source.path}: no skeleton topic; found {topic_list(source.topics())}.{told}\n{_HOW}")
+    how = skeletons_remedy(source.topics(), remarks)
+    text = f"{source.path}: no skeleton topic; found {topic_list(source.topics())}.{told}\n{how}"
+    return LogError(text if len(remarks) > 1 else text.replace("\n", " "))
+
+
+def skeletons_remedy(topics: Sequence[Topic], remarks: Sequence[str]) -> str:
+    """What the user of a log without skeletons can do.
+
+    Args:
+        topics: All topics of the log.
+        remarks: What was told of them.
+    """
+    helped = any(topic.type == MARKER_TYPE for topic in topics) or any(DECODABLE in remark for remark in remarks)
+    return _HOW if helped else _NO_SETTING
 
 
 def _known(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) -> SkeletonDecoder | None:
@@ -194,6 +212,11 @@ class Log:
     def notes(self) -> list[str]:
         """Remarks for the user."""
         return [*self._source.damage().notes, *self._topic_remarks, *self._remarks]
+
+    @property
+    def skeletons_remedy(self) -> str:
+        """What makes skeletons of a log that has none."""
+        return skeletons_remedy(self.topics, self._topic_remarks)
 
     @property
     def topics(self) -> list[Topic]:

@@ -80,7 +80,7 @@ def test_log_without_skeletons_is_described() -> None:
     assert found.kind == "ros1"
     assert {t.name: (t.type, t.messages) for t in found.topics}["/tf"] == ("tf/tfMessage", 2688)
     assert found.span_s == pytest.approx(21.7, abs=0.05)
-    assert found.missing[0].startswith("skeletons: name a topic with --topic NAME")
+    assert found.missing[0].startswith("skeletons: no setting makes bodies of these topics")
     text = lines(found)
     assert "  none" in text
     assert "defects  none" in text

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rosbags import rosbag1
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
+from rosbags.typesys.store import Typestore
 from ruamel.yaml import YAML
 
 from hrcreplay.errors import LogError
@@ -21,7 +22,7 @@ from hrcreplay.logs.messages import LazyChunk, Message, Topic, merge_by_arrival
 from hrcreplay.logs.reader import open_log
 from hrcreplay.settings.sections import Logs
 from tests.logs import own
-from tests.logs.bags import KINDS, bag, header, make, marker_array, write_openni
+from tests.logs.bags import KINDS, Write, bag, header, make, marker_array, transform, write_openni
 from tests.realdata import data_path
 
 BEGIN = own.BEGIN_NS
@@ -216,7 +217,9 @@ def test_topics_can_be_chosen(tmp_path: Path) -> None:
 
 
 def test_chosen_topic_without_skeletons() -> None:
-    with pytest.raises(LogError, match=r"example\.bag: no skeletons on /rosout \(rosgraph_msgs/Log\)\. Name one with"):
+    with pytest.raises(
+        LogError, match=r"example\.bag: no skeletons on /rosout \(rosgraph_msgs/Log\)\. Name a topic with"
+    ):
         open_log(data_path("ros_bags/example.bag"), Logs(topics=("/rosout",)))
 
 
@@ -225,7 +228,52 @@ def test_log_without_skeletons_is_refused_with_what_it_has() -> None:
         open_log(data_path("sara_human_robot_bags/exp_box.bag"))
     text = str(caught.value)
     assert ": no skeleton topic; found /SaRA_demo_robot_capsules (reachable_occupancy/ReachableOccupancy), " in text
-    assert text.endswith("\nName one with --topic NAME, or a decoder for it in [logs.decoders] of the settings file.")
+    assert text.endswith(
+        "Name a topic with --topic NAME, or a decoder for it in [[logs.decoders]] of the settings file."
+    )
+
+
+def numbers(write: Write, store: Typestore) -> None:
+    """Points as plain numbers."""
+    array = make(store, "std_msgs/msg/Float32MultiArray", data=np.zeros(60, dtype=np.float32))
+    write("/landmarks", "std_msgs/msg/Float32MultiArray", BEGIN, array)
+
+
+def frames_of_another_tracker(write: Write, store: Typestore) -> None:
+    """Transforms whose names are no body points of openni_tracker."""
+    for name in ("SpineMid_1", "Neck_1", "ElbowLeft_1"):
+        sent = make(store, "tf2_msgs/msg/TFMessage", transforms=[transform(store, BEGIN, "cam", name, (0, 0, 1))])
+        write("/tf", "tf2_msgs/msg/TFMessage", BEGIN, sent)
+
+
+def one_polygon(write: Write, store: Typestore) -> None:
+    """An array of points."""
+    polygon = make(store, "geometry_msgs/msg/Polygon", points=[make(store, "geometry_msgs/msg/Point32") for _ in "abc"])
+    write("/points", "geometry_msgs/msg/Polygon", BEGIN, polygon)
+
+
+@pytest.mark.parametrize(
+    ("write_bodies", "facts", "helps"),
+    [
+        (numbers, ("/landmarks (std_msgs/Float32MultiArray) has no array of points",), False),
+        (frames_of_another_tracker, ("SpineMid_1, Neck_1, ElbowLeft_1", "publish the joints under these names"), False),
+        (one_polygon, ("'points' (up to 3)",), True),
+    ],
+)
+def test_decoders_are_advised_only_where_they_help(
+    write_bodies: Callable[[Write, Typestore], None], facts: tuple[str, ...], helps: bool, tmp_path: Path
+) -> None:
+    with bag(tmp_path / "a", "mcap") as (write, store):
+        write_bodies(write, store)
+    with pytest.raises(LogError, match="no skeleton topic; found") as caught:
+        open_log(tmp_path / "a")
+    text = str(caught.value)
+    assert all(fact in text for fact in facts), text
+    assert "\n" not in text
+    assert ("Name a topic with --topic" in text) == helps
+    assert ("hrcreplay.logs.writer.LogWriter" in text) != helps
+    log = open_log(tmp_path / "a", skeletons=False)
+    assert text.endswith(log.skeletons_remedy)
 
 
 def test_two_topics_of_one_camera_name(tmp_path: Path) -> None:
