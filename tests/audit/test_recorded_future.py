@@ -9,7 +9,7 @@ import pytest
 
 from hrcreplay.audit.log_audit import joint_travel, joints_inside
 from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
+from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Floats, HumanStates, Measurements, SweptVolumes
 from hrcreplay.run import recording
 from hrcreplay.run.containment import RecordedFuture, check_containment, recorded_future
 from hrcreplay.run.recording import Recording
@@ -79,3 +79,32 @@ def test_a_joint_stays_inside_whatever_its_name_and_turn() -> None:
     assert late[0, 4] == 0.0
     assert np.isnan(late[1]).all()  # the recording is over
     assert joint_travel(joints[:6])[4] == pytest.approx(0.09)
+
+
+def test_every_camera_and_the_limbs_flesh_decide_whether_a_volume_held() -> None:
+    """Two cameras show a wrist 0.1 m apart: what holds it for one of them, or without its flesh, does not hold it."""
+    n = 8
+    both = np.zeros((2 * n, len(POINTS), 3))
+    both[1::2, POINTS.index("wrist_l"), 0] = 0.1
+    t_ns = 50_000_000 * np.arange(2 * n)
+    seen = Measurements(
+        capture_ns=t_ns,
+        arrival_ns=t_ns,
+        camera=np.arange(2 * n) % 2,
+        z=np.zeros((2 * n, 20)),
+        z_std=np.zeros((2 * n, 20)),
+        points_m=both,
+        confidence=np.ones((2 * n, len(POINTS))),
+        cameras=("one", "other"),
+    )
+    people = states(np.zeros((1, DOF)), np.zeros((1, DOF)))
+    people = replace(people, t_ns=np.zeros(1, np.int64))
+    arm = LIMBS.index("LLA")
+    for cameras, farthest_m in (([0], 0.0), ([1], 0.1), ([0, 1], 0.1)):
+        mine = np.isin(seen.camera, cameras)
+        source, at_ns, points_m = recording._recorded_points(seen.rows(mine), both[mine], people)
+        assert source == recording.CAMERAS
+        future = recorded_future(at_ns, points_m, people, 0.4)
+        outcome = check_containment(_balls(people, 0.12), future, dict.fromkeys(BODY, 0.05), np.array([False]))
+        assert outcome.beyond_m[0, arm] == pytest.approx(farthest_m)
+        assert outcome.escape_m()[0, arm] == pytest.approx(max(0.0, farthest_m + 0.05 - 0.12))
