@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from hrcreplay.calibration.cell import load_cell
 from hrcreplay.egm.robot_double.faults import load_faults
 from hrcreplay.errors import SettingsError
 from hrcreplay.limits import load_limits
+from hrcreplay.logs.reader import open_log
 from hrcreplay.robot.model import from_urdf, irb140
 from hrcreplay.robot.path import MOVE_S, programmed
 from hrcreplay.robot.task import CYCLE_S, parse_task
@@ -235,3 +237,13 @@ def test_the_command_tells_a_bomb_in_one_line(what: str, tmp_path: Path) -> None
     }
     command, fact = commands[what]
     assert_one_line(run_bounded(*command, "--out", tmp_path / "out"), 2, fact)
+
+
+def test_a_log_where_nothing_is_a_number_is_told(tmp_path: Path) -> None:
+    seen = own.frames(300)
+    nothing = replace(seen, points_m=np.full_like(seen.points_m, np.nan))
+    log = own.write(tmp_path / "a.mcap", nothing, cameras={"left": np.eye(4), "right": np.eye(4)})
+    assert_one_line(run_bounded("fuse", log, "--out", tmp_path / "out"), 3, "nobody was ever seen", "points_not_finite")
+    opened = open_log(log)
+    assert sum(map(len, opened.frames())) == 300
+    assert sum("(100 % of its points)" in note for note in opened.notes) == 2

@@ -27,9 +27,9 @@ _SHARES = {
 }
 _FROM, _TO = (np.array([POINTS.index(bone[end]) for bone in _SHARES]) for end in (0, 1))
 _SHARE = np.array(list(_SHARES.values()))
-#: Statures of adults: 5th percentile of women, 95th of men [m] (Gordon et al., 1988 Anthropometric Survey of U.S. Army
-#: Personnel, NATICK/TR-89/044).
-ADULT_M = (1.528, 1.867)
+#: Statures of adults: 5th percentile of women and 95th of men, aged 19 to 65, in the US [m] (City University of Hong
+#: Kong, Online Anthropometry, 2.1 Stature: http://personal.cityu.edu.hk/meachan/online%20anthropometry/Chapter2/Ch2-1.htm)
+ADULT_M = (1.52, 1.87)
 #: Bones of recorded people, as trackers see them, lie up to a fifth outside the shares of a stature.
 _BONE_MARGIN = 0.25
 #: Trackers after OpenNI give the middle of the hand for the wrist: half of Winter's share of a hand.

@@ -368,7 +368,8 @@ def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
         count = cleaner.flaws[(camera, name)]
         if count:
             share = 100.0 * count / (count + cleaner.points[camera])
-            yield f"camera {camera}: {count} {DEFECTS[name]} ({share:.2g} % of its points)"
+            shown = "100" if share >= 99.5 else f"{share:.2g}"
+            yield f"camera {camera}: {count} {DEFECTS[name]} ({shown} % of its points)"
     yield from clock_remarks(camera, cleaner.clocks[camera], begin_ns, cleaner.flaws[(camera, "frames_out_of_order")])
     longest = cleaner.frozen.get(camera)
     if longest is not None and longest.seconds > _FROZEN_S:

@@ -175,10 +175,10 @@ def test_legs_that_are_exchanged_against_the_arms_are_told(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("spoil", "bone", "length_m", "low_m", "high_m"),
     # The walker's forearm is 0.24 m down and 0.05 to 0.17 m ahead, 0.26 m in the middle; the trunk 0.45 m.
-    # Winter's shares of a stature, of women of 1.528 m less a quarter to men of 1.867 m and a quarter more
+    # Winter's shares of a stature, of women of 1.52 m less a quarter to men of 1.87 m and a quarter more
     [
-        (short_forearm, "right forearm", 0.09, 0.146 * 1.146, (0.146 + 0.108 / 2) * 2.334),
-        (short_trunk, "trunk", 0.32, 0.288 * 1.146, 0.288 * 2.334),
+        (short_forearm, "right forearm", 0.09, 0.146 * 1.14, (0.146 + 0.108 / 2) * 2.3375),
+        (short_trunk, "trunk", 0.32, 0.288 * 1.14, 0.288 * 2.3375),
     ],
 )
 def test_a_bone_of_no_adult_is_told(

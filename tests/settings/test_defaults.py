@@ -40,14 +40,40 @@ def repeats(name: str, node: ast.expr | None) -> bool:
     return (float if isinstance(node.value, int) else type(node.value)) in kinds
 
 
+def looked_up(node: ast.expr) -> str | None:
+    """The setting that an expression takes by name: x["name"], x.name, x.get("name", ...), getattr(x, "name", ...)."""
+    key: object = None
+    if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
+        key = node.slice.value
+    elif isinstance(node, ast.Attribute):
+        key = node.attr
+    elif isinstance(node, ast.Call):
+        function = node.func
+        method = function.attr if isinstance(function, ast.Attribute) else None
+        at = (
+            0
+            if method in ("get", "pop")
+            else 1
+            if isinstance(function, ast.Name) and function.id == "getattr"
+            else None
+        )
+        named = node.args[at] if at is not None and len(node.args) > at else None
+        key = named.value if isinstance(named, ast.Constant) else None
+    return key if isinstance(key, str) and key in NAMES else None
+
+
 def fallbacks(tree: ast.AST) -> Iterator[str]:
     """Names of settings that a source has a default of its own for: of a look-up, an argument or a field."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "get":
-            key = node.args[0].value if node.args and isinstance(node.args[0], ast.Constant) else None
-            own = node.args[1] if len(node.args) > 1 else None
+        if isinstance(node, ast.BoolOp) and isinstance(node.op, ast.Or):
+            yield from (key for key in map(looked_up, node.values[:-1]) if key and repeats(key, node.values[-1]))
+        elif isinstance(node, ast.IfExp):
+            keys = {looked_up(part) for part in ast.walk(node.body) if isinstance(part, ast.expr)}
+            yield from sorted(key for key in keys if key and repeats(key, node.orelse))
+        elif isinstance(node, ast.Call) and (key := looked_up(node)):
+            own = node.args[-1] if len(node.args) > 1 else None
             truth = isinstance(own, ast.Constant) and own.value is True
-            if isinstance(key, str) and key in NAMES and (repeats(key, own) or truth):
+            if repeats(key, own) or truth:
                 yield key
         elif isinstance(node, ast.FunctionDef):
             given = node.args.posonlyargs + node.args.args
@@ -79,6 +105,13 @@ def test_no_source_has_a_default_of_its_own() -> None:
         ('plan.get("certify", True)', ["certify"]),
         ('zenoh.get("mode", "peer")', ["mode"]),
         ('plan.get("leash_m")', []),
+        ('fusion.pop("memory_s", 0.5)', ["memory_s"]),
+        ('getattr(fusion, "memory_s", 0.5)', ["memory_s"]),
+        ('getattr(fusion, "memory_s")', []),
+        ('fusion.get("memory_s") or 0.5', ["memory_s"]),
+        ("fusion.memory_s if fusion else 0.5", ["memory_s"]),
+        ('float(fusion["memory_s"]) if "memory_s" in fusion else 0.5', ["memory_s"]),
+        ('fusion["memory_s"] if fusion else None', []),
         ('other.get("height", 3.0)', []),
         ("def f(run, gap_s=0.2): ...", ["gap_s"]),
         ("def f(run, *, near_m: float = 0.5, gap_s: float): ...", ["near_m"]),
