@@ -27,11 +27,11 @@ def _future(points: Floats, people: HumanStates) -> RecordedFuture:
     return recorded_future(recorded.t_ns, recorded.points_m, people.rows(np.array([0])), 0.4)
 
 
-def _balls(people: HumanStates, radius_m: float) -> SweptVolumes:
+def _balls(people: HumanStates, radius_m: float, limbs: tuple[str, ...] = LIMBS) -> SweptVolumes:
     """A ball at the world's origin for every limb."""
-    n = len(people) * len(LIMBS)
-    radius = np.full((len(people), len(LIMBS)), radius_m)
-    return SweptVolumes(people.t_ns, np.arange(n + 1), np.zeros((n, 3)), radius, LIMBS, "balls")
+    n = len(people) * len(limbs)
+    radius = np.full((len(people), len(limbs)), radius_m)
+    return SweptVolumes(people.t_ns, np.arange(n + 1), np.zeros((n, 3)), radius, limbs, "balls")
 
 
 def test_the_future_is_after_the_tick_and_within_the_horizon() -> None:
@@ -108,3 +108,25 @@ def test_every_camera_and_the_limbs_flesh_decide_whether_a_volume_held() -> None
         outcome = check_containment(_balls(people, 0.12), future, dict.fromkeys(BODY, 0.05), np.array([False]))
         assert outcome.beyond_m[0, arm] == pytest.approx(farthest_m)
         assert outcome.escape_m()[0, arm] == pytest.approx(max(0.0, farthest_m + 0.05 - 0.12))
+
+
+@pytest.mark.parametrize(
+    ("point", "limbs"),
+    [
+        ("head", {"HD"}),
+        ("pelvis", {"THX"}),
+        *((f"shoulder_{side}", {"HD", "THX", upper}) for side, upper in (("r", "URA"), ("l", "ULA"))),
+        *((f"elbow_{side}", {f"U{side.upper()}A", f"L{side.upper()}A"}) for side in "rl"),
+        *((f"{end}_{side}", {f"L{side.upper()}A"}) for end in ("wrist", "hand") for side in "rl"),
+        *((f"{part}_{side}", {"LEGS"}) for part in ("hip", "knee", "ankle", "foot") for side in "rl"),
+    ],
+)
+def test_every_point_of_a_body_decides_whether_its_limbs_are_held(point: str, limbs: set[str]) -> None:
+    """One point that is 1 m away once, and volumes of all limbs that hold the others; the neck is between shoulders."""
+    people = states(np.zeros((1, DOF)), np.zeros((1, DOF)))
+    points = np.zeros((10, len(POINTS), 3))
+    points[3, POINTS.index(point)] = [0.0, 0.0, 1.0]
+    volumes = _balls(people, 0.3, BODY)
+    outcome = check_containment(volumes, _future(points, people), dict.fromkeys(BODY, 0.0), np.array([False]))
+    assert {limb for limb, out_m in zip(BODY, outcome.escape_m()[0], strict=True) if out_m > 0.0} == limbs
+    assert np.isfinite(outcome.escape_m()).all()
