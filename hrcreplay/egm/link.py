@@ -6,10 +6,16 @@ The robot numbers its packets. How a packet is treated follows from its number, 
 - 1 to ``LEAP`` ahead, modulo 2**32: the next one; those between are lost.
 - the same number, clock and stamp: a duplicate. Not answered, for a second answer waits in the robot's queue and adds
   delay.
-- anything else, as 0, and any packet after a pause: a new session.
+- any packet after a pause: a new session.
+- anything else, as 0: perhaps a robot that was started again, perhaps somebody else who uses its address. It raises an
+  alarm, and is a new session only once packets that follow it come alone.
 
-A session begins with an echo: the first answer is what the robot measured, at speed 0, whatever is asked for. So is
-every answer while the robot may not move, since the last target is valid again as soon as it may.
+Joints from which the axes cannot have come since the last packet raise an alarm, too, and are never believed. What
+raises an alarm is answered by the motion that goes on, which is a stop, and never by an echo.
+
+A session after a pause begins with an echo: the first answer is what the robot measured, at speed 0, whatever is asked
+for. So is every answer while the robot may not move, since the last target is valid again as soon as it may. No echo
+leads further from the answer before than the axes can go in the time between: the rest follows with the next ones.
 
 The server is a blocking socket without a thread, because that has the shortest latency.
 """
@@ -39,8 +45,23 @@ LEAP: Final = 1000
 REFUSALS: Final = ("radians", "axes", "no packet", "stale", "duplicate")
 #: Why an answered robot must not be moved.
 STOPS: Final = ("motors off", "EGM error", "converged", "program stopped", "not answered yet", "utilization")
+#: What may be somebody else who uses the robot's address.
+RESTARTED: Final = "robot restarted"
+JUMPED: Final = "joints jump"
+ALARMS: Final = (RESTARTED, JUMPED)
 #: Every reason that ``classify`` gives.
-REASONS: Final = (*REFUSALS, *STOPS)
+REASONS: Final = (*REFUSALS, *STOPS, *ALARMS)
+
+#: What a robot may measure beyond its limits: this share of speed, and noise [rad].
+_FASTER, _NOISE_RAD = 1.1, 0.01
+#: A robot further outside the range of its axes than this is none [rad].
+_OUTSIDE_RAD = 1.0
+#: Lost packets, at most, in which the axes may have gone on.
+_MISSED = 25
+#: What raises an alarm is answered this many cycles after the last answer: not beside that of the robot itself.
+_APART = 0.75
+#: A new session without a pause is one once its packets come alone for so many cycles.
+_ALONE = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,24 +101,32 @@ class EgmSession:
         utilization_max: float = Live().utilization_max,
         utilization_packets: int = 5,
         silence_s: float = Live().silent_s,
+        cycle_s: float = Live().cycle_s,
     ) -> None:
         """Begin before the first packet.
 
         Args:
             q_min: (6,) smallest joints that are ever commanded [rad].
             q_max: (6,) largest ones [rad].
-            dq_max: (6,) largest speed reference [rad/s].
+            dq_max: (6,) largest speed reference, and what the axes can do [rad/s].
             utilization_max: The robot cannot follow above this [%].
             utilization_packets: It must say so this often in a row, because a lost packet lets it flare up.
             silence_s: After a longer pause of the robot the session is a new one [s].
+            cycle_s: The robot's cycle [s].
         """
         self.counts: Counter[str] = Counter()
         self._q_min, self._q_max, self._dq_max = q_min, q_max, dq_max
         self._utilization = (utilization_max, utilization_packets)
         self._silence_ns = round(silence_s * 1e9)
-        self._last: RobotPacket | None = None
-        self._last_ns = 0
+        self._cycle_s = cycle_s
+        self._last: RobotPacket | None = None  # that was believed
+        self._last_ns = self._heard_ns = 0  # when it came, and any that was answered
+        self._rival: RobotPacket | None = None  # that may be of a new session
+        self._rival_ns = 0  # when its first one came
+        self._alarm = ""  # of a packet since the last answer
         self._seqno = -1
+        self._told: Floats | None = None
+        self._told_ns = 0
         self._low, self._high = q_min, q_max
         self._due = self._fresh = self._allowed = self._answered = self._ran = False
         self._strained = 0
@@ -115,9 +144,12 @@ class EgmSession:
         kind, lost = self._place(packet, t_ns)
         if kind in REFUSALS:
             return self._refuse(kind)
-        if kind == "new":
-            self._begin()
-        self._last, self._last_ns, self._due = packet, t_ns, True
+        if kind in ALARMS:
+            return self._doubt(kind, packet, t_ns)
+        if kind in ("new", "again"):
+            self._begin(echo=kind == "new")
+        self._last, self._last_ns, self._heard_ns = packet, t_ns, t_ns
+        self._rival, self._due = None, True
         self.counts["packets"] += 1
         self.counts["lost"] += lost
         return self._judge(packet, lost)
@@ -154,40 +186,72 @@ class EgmSession:
         if q.shape != self._q_min.shape or dq.shape != q.shape or not finite:
             raise ValueError(f"reply: {q} rad, {dq} rad/s; {len(self._q_min)} finite joints each are right")
         if self._fresh or not self._allowed:
-            q, dq = self._last.q, np.zeros(len(q))
+            q, dq = self._towards(self._last.q, t_ns), np.zeros(len(q))
             self._low, self._high = np.minimum(self._q_min, q), np.maximum(self._q_max, q)
+            self._fresh = self._fresh and not np.array_equal(q, self._last.q)
         else:
             dq = np.minimum(
                 np.maximum(dq, np.where(q > self._low, -self._dq_max, 0.0)), np.where(q < self._high, self._dq_max, 0.0)
             )
             q = np.minimum(np.maximum(q, self._low), self._high)
         self._seqno = (self._seqno + 1) % WRAP
-        self._due = self._fresh = False
-        self._answered = True
+        self._due, self._answered, self._alarm = False, True, ""
+        self._told, self._told_ns = q, t_ns
         return Correction(seqno=self._seqno, tm_ms=t_ns // 1_000_000 % WRAP, q=q, dq=dq)
 
     def _place(self, packet: RobotPacket, t_ns: int) -> tuple[str, int]:
-        """What the packet is to the conversation, "new", "next" or a refusal, and how many are missing before it."""
-        last = self._last
-        if last is None or t_ns - self._last_ns > self._silence_ns:
-            return "new", 0
-        if packet.seqno is None or last.seqno is None:
-            return "next", 0
-        older = (packet.clock_ns or 0) < (last.clock_ns or 0)
-        if older and packet.seqno != 0:
-            return "stale", 0
-        ahead = (packet.seqno - last.seqno) % WRAP
-        if 1 <= ahead <= LEAP:
-            return "next", ahead - 1
-        same = packet.clock_ns == last.clock_ns
-        if ahead == 0 and same and packet.tm_ms == last.tm_ms:
-            return "duplicate", 0
-        return ("stale" if same and packet.seqno != 0 else "new"), 0
+        """What the packet is to the conversation, and how many are missing before it.
 
-    def _begin(self) -> None:
+        Returns:
+            "new" after a pause, "next", "again" where it makes its predecessor a new session, a refusal or an alarm.
+        """
+        if self._last is None:
+            outside = np.maximum(self._q_min - packet.q, packet.q - self._q_max)
+            return "new" if np.all(outside <= _OUTSIDE_RAD) else JUMPED, 0
+        paused = t_ns - self._heard_ns > self._silence_ns
+        kind, lost = ("new", 0) if paused else _follows(packet, self._last)
+        if kind in ("stale", RESTARTED) and self._follows_rival(packet):
+            kind = "again" if t_ns - self._rival_ns >= _ALONE * self._cycle_s * 1e9 else RESTARTED
+        if kind not in REFUSALS and not self._reaches(packet.q, lost, t_ns):
+            kind = JUMPED
+        return kind, lost
+
+    def _follows_rival(self, packet: RobotPacket) -> bool:
+        """Whether the packet goes on with what may be a new session."""
+        return self._rival is not None and _follows(packet, self._rival)[0] == "next"
+
+    def _reaches(self, q: Floats, lost: int, t_ns: int) -> bool:
+        """Whether the axes can have come to q (6,) [rad] since the last packet that was believed."""
+        assert self._last is not None  # noqa: S101 - for the type checker
+        cycles = 2 + min(lost, _MISSED)  # packets of a queue arrive at once, and arrivals vary
+        seconds = (t_ns - self._last_ns) * 1e-9 + cycles * self._cycle_s
+        return bool(np.all(np.abs(q - self._last.q) <= _FASTER * self._dq_max * seconds + _NOISE_RAD))
+
+    def _towards(self, q: Floats, t_ns: int) -> Floats:
+        """Joints q (6,) [rad], or as far as the axes can go to them since the last answer."""
+        if self._told is None:
+            return q
+        reach = self._dq_max * max(self._cycle_s, (t_ns - self._told_ns) * 1e-9)
+        way = q - self._told
+        return np.where(np.abs(way) <= reach, q, self._told + np.clip(way, -reach, reach))
+
+    def _doubt(self, alarm: str, packet: RobotPacket, t_ns: int) -> PacketStatus:
+        """Take a packet that is not believed: it is answered as if the robot had said nothing new."""
+        self.counts[alarm] += 1
+        self._alarm = alarm
+        if alarm == RESTARTED:
+            self._rival_ns = self._rival_ns if self._follows_rival(packet) else t_ns
+            self._rival = packet
+        live = t_ns - self._heard_ns <= self._silence_ns and self._answered
+        if not live or t_ns - self._told_ns < _APART * self._cycle_s * 1e9:
+            return PacketStatus(False, fresh=False, allowed=self._allowed, reason=alarm, ended=False, lost=0)
+        self._heard_ns, self._due = t_ns, True
+        return PacketStatus(True, fresh=False, allowed=self._allowed, reason=alarm, ended=False, lost=0)
+
+    def _begin(self, *, echo: bool) -> None:
         """Forget the last session. Our own counter goes on: the robot sees no gap that is none."""
         self.counts["sessions"] += 1
-        self._fresh = True
+        self._fresh = echo
         self._answered = self._ran = False
         self._strained = 0
 
@@ -204,8 +268,8 @@ class EgmSession:
         self._ran = self._ran or packet.mci == Mci.RUNNING
         most, often = self._utilization
         self._strained = self._strained + 1 if packet.utilization > most else 0
-        reason = "" if allowed else self._standing(packet)
-        if allowed and self._strained >= often:
+        reason = self._alarm or ("" if allowed else self._standing(packet))
+        if not reason and self._strained >= often:
             reason = "utilization"
         ended = packet.converged or (self._ran and packet.mci != Mci.RUNNING)
         return PacketStatus(answer=True, fresh=self._fresh, allowed=allowed, reason=reason, ended=ended, lost=lost)
@@ -221,6 +285,21 @@ class EgmSession:
         if packet.rapid == Rapid.STOPPED or self._answered or self._ran:
             return "program stopped"
         return "not answered yet"
+
+
+def _follows(packet: RobotPacket, last: RobotPacket) -> tuple[str, int]:
+    """What a packet is to one before it, "next", a refusal or a restart, and how many are missing between them."""
+    if packet.seqno is None or last.seqno is None:
+        return "next", 0
+    if (packet.clock_ns or 0) < (last.clock_ns or 0) and packet.seqno != 0:
+        return "stale", 0
+    ahead = (packet.seqno - last.seqno) % WRAP
+    if 1 <= ahead <= LEAP:
+        return "next", ahead - 1
+    same = packet.clock_ns == last.clock_ns
+    if ahead == 0 and same and packet.tm_ms == last.tm_ms:
+        return "duplicate", 0
+    return ("stale" if same and packet.seqno != 0 else RESTARTED), 0
 
 
 Address = tuple[str, int]
@@ -252,41 +331,55 @@ class Received:
     waited: bool
 
 
-class EgmServer:
-    """The server's socket, used from one thread.
+#: Senders beside the robot that are kept to be told of.
+_STRANGERS: Final = 4
 
-    Once a robot has been answered, other senders are not heard until it has been silent for the time-out: two robots
-    on one port must not be mixed, nor a stray datagram take the answer of the robot.
+
+class EgmServer:
+    """The server's socket, used from one thread. It hears one address, and within a session one port of it.
+
+    A robot that has been silent for so long that its session is over may call from another port.
 
     Attributes:
         port: The port in use, also where 0 was asked for.
+        robot: The only address that is heard.
         strangers: Datagrams of other senders, dropped.
         vanished: Answers that could not be sent, because the peer or the network was gone.
     """
 
-    def __init__(self, host: str, port: int, timeout_s: float) -> None:
+    def __init__(self, host: str, port: int, timeout_s: float, *, robot: str, silence_s: float) -> None:
         """Open the port.
 
         Args:
-            host: Address of ours to listen on; "" for all.
+            host: Address of ours to listen on; "" for that from which the robot is reached.
             port: UDP port the robot calls; 0 takes any free one.
             timeout_s: Longest wait of ``newest`` [s].
+            robot: IPv4 address of the robot.
+            silence_s: After a longer pause of the robot its session is over [s].
 
         Raises:
-            SettingsError: The port cannot be opened.
+            SettingsError: The port cannot be opened, or no network leads to the robot.
         """
-        self._timeout_ns = round(timeout_s * 1e9)
+        self._timeout_ns, self._silence_ns = round(timeout_s * 1e9), round(silence_s * 1e9)
         self._peer: Address | None = None
         self._heard_ns = 0
+        self._seen: list[Address] = []
+        self.robot = robot
         self.strangers = self.vanished = 0
+        host = host or _own_address(robot)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind((host, port))
         except (OSError, OverflowError) as error:
             self._socket.close()
-            where = f"EGM: UDP port {port} of {host or 'this machine'}"
-            raise SettingsError(f"{where} cannot be opened ({error}); a free port of this machine is right") from None
+            raise SettingsError(
+                f"EGM: UDP port {port} of {host} cannot be opened ({error}); a free port of this machine is right"
+            ) from None
         self.port: int = self._socket.getsockname()[1]
+
+    def strangers_seen(self) -> list[Address]:
+        """The first senders that were not heard, in order."""
+        return self._seen
 
     def newest(self) -> Received | None:
         """Wait for a datagram, then empty the queue. None when nothing came within the time-out."""
@@ -306,7 +399,6 @@ class EgmServer:
 
     def answer(self, data: bytes, to: Address) -> None:
         """Send, and go on whatever becomes of it: the robot's silence shows what went wrong."""
-        self._peer = to
         try:
             self._socket.sendto(data, socket.MSG_DONTWAIT, to)
         except OSError:
@@ -345,14 +437,38 @@ class EgmServer:
                 self.vanished += 1
 
     def _choose(self, lot: list[tuple[bytes, Address]], t_ns: int, *, waited: bool) -> Received | None:
-        """Those of the robot we talk to, or of the last sender while we talk to none."""
-        silent = t_ns - self._heard_ns >= self._timeout_ns
-        if silent and all(address != self._peer for _, address in lot):
+        """Those of the robot we talk to, or of its last call while we talk to none."""
+        calls = [address for _, address in lot if address[0] == self.robot]
+        if t_ns - self._heard_ns > self._silence_ns and self._peer not in calls:
             self._peer = None
-        sender = self._peer or lot[-1][1]
+        sender = self._peer or (calls[-1] if calls else None)
         own = [data for data, address in lot if address == sender]
-        self.strangers += len(lot) - len(own)
-        if not own:
+        self._count_strangers([address for _, address in lot if address != sender])
+        if not own or sender is None:
             return None
-        self._heard_ns = t_ns
+        self._peer, self._heard_ns = sender, t_ns
         return Received(data=own[-1], older=tuple(own[:-1]), sender=sender, t_ns=t_ns, count=len(own), waited=waited)
+
+    def _count_strangers(self, senders: list[Address]) -> None:
+        self.strangers += len(senders)
+        for sender in senders:
+            if len(self._seen) < _STRANGERS and sender not in self._seen:
+                self._seen.append(sender)
+
+
+def _own_address(robot: str) -> str:
+    """Our address on the network that leads to the robot.
+
+    Raises:
+        SettingsError: None does.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((robot, 9))  # sends nothing
+        except OSError as error:
+            raise SettingsError(
+                f"live.robot_address: no network leads to {robot} ({error.strerror}); would be right: the address of "
+                "the robot's controller, on a network of this machine"
+            ) from None
+        address: str = probe.getsockname()[0]
+        return address

@@ -72,6 +72,9 @@ def write_crash(folder: Path, part: str, error: BaseException | str) -> str:
         with _file(folder, part).open("a") as file:
             file.write(f"{said}\n\n{trace}")
     except OSError:
+        with suppress(OSError):  # of a full disk there is a file, and nothing in it
+            if not _file(folder, part).stat().st_size:
+                _file(folder, part).unlink()
         sys.stderr.write(f"{said}\n{trace}")  # better there than nowhere
         sys.stderr.flush()
     return said
@@ -97,6 +100,10 @@ def _file(folder: Path, part: str) -> Path:
 
 _LARGEST = 1 << 20  #: no message is larger; one that is would be cut, never split
 _LARGEST_RECORD = 1 << 22  #: nor one to the recorder
+
+
+#: Begins the last message of a helper that cannot go on: why, in UTF-8.
+LAST_WORDS = b"X"
 
 
 class ControlGoneError(Exception):
@@ -201,6 +208,8 @@ class HelperProcess:
         self._socket = near
         self.alive = True
         self.dropped = 0  #: messages that it did not take
+        self.last_words = ""  #: why it ends, where it has said so
+        self.crash = ""  #: what there is to say of its crash, once it is closed
         with far:
             self.process = subprocess.Popen(  # noqa: S603 - our own modules
                 [sys.executable, "-m", ENTRY, str(folder), part, module, "--fd", str(far.fileno()), *arguments],
@@ -235,14 +244,10 @@ class HelperProcess:
             if not message:
                 self.alive = False
                 return
-            yield message
-
-    def check_alive(self) -> bool:
-        """Whether the process still runs; for one that sends no messages."""
-        if self.alive:
-            for _ in self.messages():
-                pass
-        return self.alive
+            if message[:1] == LAST_WORDS:
+                self.last_words = message[1:].decode(errors="replace")
+            else:
+                yield message
 
     def crashed(self) -> bool:
         """Whether it has ended with an unexpected exit code; False while it runs or is about to end."""
@@ -253,6 +258,8 @@ class HelperProcess:
 
         A process that crashed has left a file in the run folder; of one that could not, this leaves it.
         """
+        for _ in self.messages():
+            pass  # last words may be among them
         self._socket.close()
         self.alive = False
         try:
@@ -262,7 +269,7 @@ class HelperProcess:
             self.process.wait()
             return None
         if self.crashed() and not has_crash_file(self._folder, self.part):
-            write_crash(self._folder, self.part, describe_exit(code))
+            self.crash = write_crash(self._folder, self.part, self.last_words or describe_exit(code))
         return code
 
 

@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from types import FrameType
 from typing import Any
 
 from hrcreplay.egm.link import EgmServer
+from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.errors import HrcReplayError, LiveStopped, LogError, SettingsError
 from hrcreplay.live import processes
 from hrcreplay.live.control.loop import ENDING, Loop, LoopSettings, bring_to_rest
@@ -31,6 +33,7 @@ from hrcreplay.live.control.setup import build_controller, compile_kernels, live
 from hrcreplay.live.processes import HelperProcess, raise_priority, restore_priority
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import Signal
+from hrcreplay.live.record.recorder import free_bytes
 from hrcreplay.live.view.status import StatusPublisher
 from hrcreplay.settings.load import Settings
 
@@ -72,7 +75,7 @@ def run(request: Request) -> Path:
     partial = folder.make_partial(request.out)
     try:
         with ExitStack() as stack:
-            prepared = _prepare(request, stack)
+            prepared = _prepare(request, partial, stack)
             loop, crashes = _run_processes(request, prepared, partial)
     except _CrashedError:
         raise _broken_off(partial, processes.read_crashes(partial)) from None
@@ -124,8 +127,8 @@ class _Prepared:
     link: EgmServer
 
 
-def _prepare(request: Request, stack: ExitStack) -> _Prepared:
-    """Settings, controller, port; every kernel compiled."""
+def _prepare(request: Request, partial: Path, stack: ExitStack) -> _Prepared:
+    """Settings, controller, port, space on the disk; every kernel compiled."""
     job, header = live_job(request.human, request.config, request.overrides, request.cell)
     port = job.settings.live.port if request.port is None else request.port
     start = start_table(job, header, sending=request.send)
@@ -133,16 +136,33 @@ def _prepare(request: Request, stack: ExitStack) -> _Prepared:
     unguarded = controller.setup.robot.unguarded_tool
     if unguarded is not None:
         sys.stderr.write(f"hrcreplay: {unguarded}\n")
-    link = stack.enter_context(closing(EgmServer("", port, WAIT_S)))
+    live = job.settings.live
+    link = EgmServer(live.listen_address, port, WAIT_S, robot=live.robot_address, silence_s=live.silent_s)
+    stack.enter_context(closing(link))
+    _check_disk(partial, live.disk_start_mb)
     compile_kernels(start)
     return _Prepared(job.settings, start, controller, link)
+
+
+def _check_disk(partial: Path, least_mb: float) -> None:
+    """Refuses to begin where the record may not find room.
+
+    Raises:
+        SettingsError: There is less space than ``least_mb`` [MB].
+    """
+    free_mb = free_bytes(partial) / 1e6
+    if free_mb < least_mb:
+        raise SettingsError(
+            f"{partial.parent}: {free_mb:.0f} MB are left on its disk; would be right: {least_mb:g} MB "
+            "(live.disk_start_mb), or --out on another disk"
+        )
 
 
 def _run_processes(request: Request, prepared: _Prepared, partial: Path) -> tuple[Loop, list[str]]:
     """The loop with the processes around it; the loop, which is over, and what is to be said of crashes."""
     settings = prepared.settings
     anchor_ns = time.time_ns() - time.monotonic_ns()
-    to_record = ["--path", str(partial / folder.LOG)]
+    to_record = ["--path", str(partial / folder.LOG), "--low", str(round(settings.live.disk_low_mb * 1e6))]
     recorder = HelperProcess(processes.RECORDER, "hrcreplay.live.record.recorder", to_record, partial)
     person_arguments = _person_arguments(request, settings, anchor_ns)
     person = HelperProcess(processes.PERSON, "hrcreplay.live.person.source", person_arguments, partial, expected=(2, 3))
@@ -152,7 +172,8 @@ def _run_processes(request: Request, prepared: _Prepared, partial: Path) -> tupl
         _await_person(person, request.human)
         begun, start_ns = True, time.monotonic_ns() + anchor_ns
         parts = prepared.controller, prepared.link, person, recorder
-        loop = Loop(*parts, _loop_settings(request, settings), anchor_ns, start_ns, screen)
+        gate = StepGate(prepared.controller.setup.robot.dq_max, settings.live.cycle_s)
+        loop = Loop(*parts, _loop_settings(request, settings), gate, anchor_ns, start_ns, screen)
         recorder.send(codec.encode_event(loop.start_ns, {"what": "start", **prepared.start}))
         crashes = _run_loop(
             loop, prepared.start, partial, real_time=settings.live.real_time, in_3d=bool(request.foxglove)
@@ -161,10 +182,11 @@ def _run_processes(request: Request, prepared: _Prepared, partial: Path) -> tupl
         screen.close(2.0)
         person.close(2.0)
         if recorder.close(PATIENCE_S) is None:
-            processes.write_crash(partial, processes.RECORDER, f"did not finish within {PATIENCE_S:g} s")
+            recorder.crash = processes.write_crash(partial, processes.RECORDER, f"did not finish in {PATIENCE_S:g} s")
         if not begun:
             (partial / folder.LOG).unlink(missing_ok=True)  # there is nothing in it
-    return loop, list(dict.fromkeys([*crashes, *processes.read_crashes(partial)]))
+    told = [helper.crash for helper in (recorder, person, screen) if helper.crash]  # a full disk keeps no file of them
+    return loop, list(dict.fromkeys([*crashes, *processes.read_crashes(partial), *told]))
 
 
 def _run_loop(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, in_3d: bool) -> list[str]:
@@ -207,8 +229,12 @@ def outcome(loop: Loop) -> dict[str, Any]:
         "answers": loop.answers,
         "looks_skipped": loop.skipped,
         "dropped": loop.recorder.dropped,
-        "counts": {name: int(count) for name, count in sorted(loop.controller.counts().items())},
+        "counts": {name: int(count) for name, count in sorted(_counts(loop).items())},
     }
+
+
+def _counts(loop: Loop) -> Counter[str]:
+    return loop.controller.counts() + Counter({"datagrams of others": loop.link.strangers})
 
 
 def _reason(loop: Loop) -> str:
@@ -228,20 +254,38 @@ def _verdict(loop: Loop, done: Path, crashes: list[str]) -> None:
         raise LiveStopped(f"stopped by: {reason}{why}{when}; the record is in {done}")
 
 
+#: Signals that end a session as the one of their name says.
+_MEANING: dict[int, Signal] = {
+    signal.SIGINT: Signal.INTERRUPT,
+    signal.SIGTERM: Signal.TERMINATE,
+    signal.SIGHUP: Signal.HANGUP,
+    signal.SIGQUIT: Signal.QUIT,
+    signal.SIGTSTP: Signal.SUSPEND,
+}
+#: Signals that end or suspend no process by themselves, and those of a process that cannot go on.
+_LEFT_ALONE = {
+    *("SIGCHLD", "SIGCONT", "SIGURG", "SIGWINCH", "SIGPIPE", "SIGXFSZ"),
+    *("SIGKILL", "SIGSTOP", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT", "SIGTRAP", "SIGSYS"),
+}
+
+
 @contextmanager
 def _signals(loop: Loop) -> Iterator[None]:
-    """Ctrl-C and SIGTERM become signals of the loop: the robot brakes before anything ends."""
-    meaning = {signal.SIGINT: Signal.INTERRUPT, signal.SIGTERM: Signal.TERMINATE}
+    """What would end or suspend the process becomes a signal of the loop: the robot brakes before anything ends."""
 
     def catch(number: int, _frame: FrameType | None) -> None:
-        loop.caught |= meaning[signal.Signals(number)]
+        loop.caught |= _MEANING.get(number, Signal.OTHER)
 
-    before = {number: signal.signal(number, catch) for number in meaning}
+    before = {
+        number: signal.signal(number, catch)
+        for number in sorted(signal.valid_signals())
+        if getattr(number, "name", "") not in _LEFT_ALONE
+    }
     try:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 def _await_person(person: HelperProcess, human: Path | None) -> None:

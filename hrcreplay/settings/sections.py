@@ -7,10 +7,11 @@ corrected, docs/paper.md says how.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from hrcreplay.records import POINTS
 
@@ -19,6 +20,14 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Sigmas = tuple[NotNegative, NotNegative, NotNegative, NotNegative]
 Share = Annotated[float, Field(ge=0, le=1)]
+
+
+def _ipv4(given: str) -> str:
+    return str(IPv4Address(given))
+
+
+Ipv4 = Annotated[str, AfterValidator(_ipv4)]
+Ipv4OrNone = Annotated[str, AfterValidator(lambda given: given and _ipv4(given))]
 
 
 class Section(BaseModel):
@@ -368,6 +377,10 @@ class Live(Section):
 
     port: Annotated[int, Field(ge=0, le=65535)] = 6510
     """UDP port at which the robot's packets arrive."""
+    robot_address: Ipv4 = "127.0.0.1"
+    """The robot's address, the only one that is heard; as it is, that of a robot double on this machine."""
+    listen_address: Ipv4OrNone = ""
+    """Address of ours to listen on; empty: that from which the robot is reached."""
     cycle_s: Annotated[float, Field(ge=0.001, le=0.1)] = 0.004032
     """The robot's cycle: every answer moves the reference by this much time [s]."""
     reaction_s: NotNegative = 0.05
@@ -397,6 +410,10 @@ class Live(Section):
     """A robot above this cannot follow, and stops [%]."""
     keep_recorder: bool = True
     """Whether the robot stops when nobody records any more."""
+    disk_start_mb: NotNegative = 1000.0
+    """A session does not begin with less space on the disk of its record, which takes some 10 MB a minute [MB]."""
+    disk_low_mb: NotNegative = 200.0
+    """With less the robot stops, so that the record of its stop finds room [MB]."""
     real_time: bool = True
     """Whether to ask the system to run the control loop before all else and to keep it in memory."""
     zenoh: Zenoh = Zenoh()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.egm.codec import RobotPacket
-from hrcreplay.egm.link import EgmSession, PacketStatus
+from hrcreplay.egm.link import EgmServer, EgmSession, PacketStatus
 
 CYCLE_NS = 4_032_000
 T0_NS = 1_700_000_000_000_000_000
@@ -19,6 +19,11 @@ ZERO = np.zeros(6)
 
 def session(**settings: Any) -> EgmSession:
     return EgmSession(-Q_MAX, Q_MAX, DQ_MAX, **settings)
+
+
+def server(port: int, timeout_s: float, *, silence_s: float = 0.1) -> EgmServer:
+    """Ours, on loopback."""
+    return EgmServer("127.0.0.1", port, timeout_s, robot="127.0.0.1", silence_s=silence_s)
 
 
 def packet(seqno: int | None, **fields: Any) -> RobotPacket:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay.egm.link import REASONS, PacketStatus
+from hrcreplay.egm.link import JUMPED, REASONS, RESTARTED, PacketStatus
 from tests.egm.talks import CYCLE_NS, T0_NS, ZERO, packet, session, talk
 
 
@@ -22,12 +22,13 @@ def test_a_session_begins_once_and_each_packet_is_answered() -> None:
     ("seqnos", "what"),
     [
         ([500, 501], ["fresh", ""]),
-        ([0, 1, 2, 0, 1], ["fresh", "", "", "fresh", ""]),
+        ([0, 1, 2, 0, 1, 2], ["fresh", "", "", "robot restarted", "robot restarted", ""]),
+        ([0, 1, 2, 0, 3], ["fresh", "", "", "robot restarted", ""]),
         ([5000, 5001, 3, 5002], ["fresh", "", "stale", ""]),
         ([10, 11, 11, 12], ["fresh", "", "duplicate", ""]),
         ([10, 12, 11, 13], ["fresh", "lost 1", "stale", ""]),
         ([10, 30, 31], ["fresh", "lost 19", ""]),
-        ([10, 1010, 2011], ["fresh", "lost 999", "fresh"]),
+        ([10, 1010, 2011, 2012, 2013], ["fresh", "lost 999", "robot restarted", "robot restarted", ""]),
         ([2**32 - 2, 2**32 - 1, 0, 1], ["fresh", "", "", ""]),
         ([2**32 - 2, 1, 2**32 - 1, 2], ["fresh", "lost 2", "stale", ""]),
     ],
@@ -37,9 +38,10 @@ def test_what_the_robot_s_counter_says(seqnos: list[int], what: list[str]) -> No
     clock = {seqno: step for step, seqno in enumerate(dict.fromkeys(sorted(seqnos, key=lambda n: (n + 2**31) % 2**32)))}
     talking = session()
     for cycle, seqno in enumerate(seqnos):
-        heard = talking.classify(packet(seqno, clock_ns=T0_NS + clock[seqno] * CYCLE_NS), cycle * CYCLE_NS)
+        step = cycle if 0 in seqnos[:cycle] else clock[seqno]  # where it starts again its clock goes on
+        heard = talking.classify(packet(seqno, clock_ns=T0_NS + step * CYCLE_NS), cycle * CYCLE_NS)
         said.append(heard.reason or ("fresh" if heard.fresh else f"lost {heard.lost}" if heard.lost else ""))
-        assert heard.answer == (heard.reason == "")
+        assert heard.answer == (heard.reason in ("", RESTARTED))
         if heard.answer:
             talking.reply(ZERO, ZERO, 0)
     assert said == what
@@ -47,19 +49,62 @@ def test_what_the_robot_s_counter_says(seqnos: list[int], what: list[str]) -> No
 
 def test_a_robot_started_again_within_its_first_packets_is_no_straggler() -> None:
     talking = session()
-    talk(talking, [0, 1, 2, 3, 4])
-    later = packet(3, clock_ns=T0_NS + 1000 * CYCLE_NS)  # its 0 to 2 were lost
-    assert talking.classify(later, 5 * CYCLE_NS).fresh
-    talking.reply(ZERO, ZERO, 5 * CYCLE_NS)
-    assert talking.classify(packet(4), 6 * CYCLE_NS).reason == "stale"  # of the session before
+    talk(talking, [*range(10)])
+    for seqno, reason in ((3, RESTARTED), (4, RESTARTED), (5, "")):  # its 0 to 2 were lost
+        heard = talking.classify(packet(seqno, clock_ns=T0_NS + (1000 + seqno) * CYCLE_NS), (seqno + 7) * CYCLE_NS)
+        assert (heard.answer, heard.fresh, heard.reason) == (True, False, reason)
+        talking.reply(ZERO, ZERO, (seqno + 7) * CYCLE_NS)
+    assert talking.counts["sessions"] == 2
+    assert talking.classify(packet(10), 13 * CYCLE_NS).reason == "stale"  # of the session before
+
+
+def test_one_packet_makes_no_new_session() -> None:
+    """Whoever sends it from the robot's address: neither an echo nor the robot's own next packet is lost to it."""
+    talking = session()
+    talk(talking, [40, 41])
+    forged = packet(0, clock_ns=T0_NS + 10**15)
+    heard = talking.classify(forged, 2 * CYCLE_NS)
+    assert (heard.answer, heard.fresh, heard.reason) == (True, False, RESTARTED)
+    assert talking.reply(np.full(6, 0.01), ZERO, 2 * CYCLE_NS).q.tolist() == [0.01] * 6
+    heard = talking.classify(packet(42), 3 * CYCLE_NS)
+    assert (heard.answer, heard.fresh, heard.reason) == (True, False, "")
+    assert talking.counts["sessions"] == 1
+
+
+def test_what_raises_an_alarm_takes_no_answer_from_the_robot() -> None:
+    """Right after an answer it gets none, and the next packet that is believed carries the reason."""
+    talking = session()
+    talk(talking, [40, 41])
+    assert not talking.classify(packet(0, clock_ns=T0_NS + 10**15), CYCLE_NS + 1_000_000).answer
+    assert talking.classify(packet(42), 2 * CYCLE_NS).reason == RESTARTED
+    talking.reply(ZERO, ZERO, 2 * CYCLE_NS)
+    assert talking.classify(packet(43), 3 * CYCLE_NS).reason == ""
+
+
+def test_joints_from_which_the_axes_cannot_have_come_are_not_believed() -> None:
+    """0.1 rad in a cycle; after a silence as far as 0.11 s allow, which is not 2 rad either."""
+    talking = session(silence_s=0.1)
+    talk(talking, [0, 1])
+    jumped = packet(2, q=np.full(6, 0.2))
+    heard = talking.classify(jumped, 2 * CYCLE_NS)
+    assert (heard.answer, heard.reason) == (True, JUMPED)
+    assert talking.reply(ZERO, ZERO, 2 * CYCLE_NS).q.tolist() == [0.0] * 6
+    later = 2 * CYCLE_NS + 110_000_000
+    assert not talking.classify(packet(3, q=np.full(6, 2.1)), later).answer
+    heard = talking.classify(packet(4, q=np.full(6, 0.3)), later)
+    assert (heard.answer, heard.fresh, heard.reason) == (True, True, JUMPED)
+    assert talking.classify(packet(5, q=np.full(6, 0.3)), later + CYCLE_NS).answer
 
 
 def test_a_robot_that_starts_again_twice_at_zero_is_heard_both_times() -> None:
     talking = session()
     assert talking.classify(packet(0), 0).fresh
     talking.reply(ZERO, ZERO, 0)
-    assert talking.classify(packet(0), 0).reason == "duplicate"
-    assert talking.classify(packet(0, clock_ns=T0_NS + 9), CYCLE_NS).fresh
+    assert talking.classify(packet(0), CYCLE_NS).reason == "duplicate"
+    for again in (1, 2):
+        heard = talking.classify(packet(0, clock_ns=T0_NS + 9 * again), again * CYCLE_NS)
+        assert (heard.answer, heard.reason) == (True, RESTARTED)
+        talking.reply(ZERO, ZERO, again * CYCLE_NS)
 
 
 def test_a_silence_makes_a_new_session_of_the_next_packet() -> None:
@@ -148,4 +193,4 @@ def test_the_end_is_told() -> None:
     assert not talking.classify(packet(1), CYCLE_NS).ended
     assert talking.classify(packet(2, converged=True), 2 * CYCLE_NS) == PacketStatus(True, True, True, "", True, 0)
     assert talking.classify(packet(3, mci=2), 3 * CYCLE_NS).ended
-    assert not talking.classify(packet(0), 4 * CYCLE_NS).ended
+    assert not talking.classify(packet(0, clock_ns=T0_NS + 4 * CYCLE_NS), 4 * CYCLE_NS).ended

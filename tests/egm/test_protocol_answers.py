@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hrcreplay.egm.codec import RobotPacket
-from hrcreplay.egm.link import REASONS, PacketStatus
-from tests.egm.talks import CYCLE_NS, DQ_MAX, Q_MAX, ZERO, packet, session, talk
+from hrcreplay.egm.link import JUMPED, REASONS, RESTARTED, PacketStatus
+from tests.egm.talks import CYCLE_NS, DQ_MAX, Q_MAX, T0_NS, ZERO, packet, session, talk
 
 
 def test_the_first_answer_is_an_echo_whatever_is_asked() -> None:
@@ -30,20 +30,50 @@ def test_the_first_answer_is_an_echo_whatever_is_asked() -> None:
 def test_the_echo_is_owed_until_it_is_given() -> None:
     talking = session()
     assert talking.classify(packet(0), 0).fresh
-    assert talking.classify(packet(1, q=np.full(6, 0.4)), CYCLE_NS).fresh
-    assert talking.reply(ZERO, ZERO, CYCLE_NS).q.tolist() == [0.4] * 6
+    assert talking.classify(packet(1, q=np.full(6, 0.11)), CYCLE_NS).fresh
+    assert talking.reply(ZERO, ZERO, CYCLE_NS).q.tolist() == [0.11] * 6
+
+
+def test_no_echo_leads_further_than_the_axes_go() -> None:
+    """A robot that is 0.05 rad behind what it was told, and stopped: 4.032 ms at 200 deg/s are 0.01407 rad."""
+    talking = session()
+    talking.classify(packet(0, q=ZERO), 0)
+    talking.reply(ZERO, ZERO, 0)
+    talking.classify(packet(1, q=ZERO), CYCLE_NS)
+    talking.reply(np.full(6, 0.05), ZERO, CYCLE_NS)
+    told = []
+    for cycle in range(2, 7):
+        talking.classify(packet(cycle, q=ZERO, motors=2), cycle * CYCLE_NS)
+        told.append(float(talking.reply(ZERO, ZERO, cycle * CYCLE_NS).q[0]))
+    step = DQ_MAX[0] * CYCLE_NS * 1e-9
+    np.testing.assert_allclose(told, [0.05 - step, 0.05 - 2 * step, 0.05 - 3 * step, 0.0, 0.0], atol=1e-12)
+
+
+def test_the_first_echo_is_owed_until_it_is_where_the_robot_is() -> None:
+    """After 0.11 s the first axis can have gone 0.384 rad; the robot says 0.39, which it may have measured."""
+    talking = session(silence_s=0.1)
+    talk(talking, [0, 1])
+    begin_ns, where = CYCLE_NS + 110_000_000, np.array([0.39, 0.0, 0.0, 0.0, 0.0, 0.0])
+    fresh = []
+    for cycle in range(3):
+        fresh.append(talking.classify(packet(cycle + 90, q=where), begin_ns + cycle * CYCLE_NS).fresh)
+        told = talking.reply(ZERO, np.ones(6), begin_ns + cycle * CYCLE_NS)
+    assert fresh == [True, True, False]
+    assert told.dq.tolist() == [1.0] * 6
 
 
 @pytest.mark.parametrize("state", [{"motors": 2}, {"mci": 2}, {"mci": 1}, {"rapid": 1}])
 def test_a_robot_that_may_not_move_hears_where_it_is(state: dict[str, int]) -> None:
     talking = session()
-    talk(talking, [0, 1])
-    for seqno, angle in ((2, 0.3), (3, 0.31)):
+    talk(talking, [0])
+    talking.classify(packet(1), CYCLE_NS)
+    talking.reply(np.full(6, 0.1), ZERO, CYCLE_NS)
+    for seqno, angle in ((2, 0.11), (3, 0.12)):
         talking.classify(packet(seqno, q=np.full(6, angle), **state), seqno * CYCLE_NS)
-        told = talking.reply(np.ones(6), np.ones(6), 0)
+        told = talking.reply(np.ones(6), np.ones(6), seqno * CYCLE_NS)
         assert (told.q.tolist(), told.dq.tolist()) == ([angle] * 6, [0.0] * 6)
-    assert talking.classify(packet(4, q=np.full(6, 0.32)), 4 * CYCLE_NS).fresh
-    assert talking.reply(np.ones(6), np.ones(6), 0).q.tolist() == [0.32] * 6
+    assert talking.classify(packet(4, q=np.full(6, 0.13)), 4 * CYCLE_NS).fresh
+    assert talking.reply(np.ones(6), np.ones(6), 4 * CYCLE_NS).q.tolist() == [0.13] * 6
     assert not talking.classify(packet(5), 5 * CYCLE_NS).fresh
 
 
@@ -103,10 +133,11 @@ def test_a_robot_outside_its_limits_is_not_thrown_back_in() -> None:
     assert talking.reply(ZERO, ZERO, 0).q.tolist() == outside.tolist()
     talking.classify(packet(1, q=outside), CYCLE_NS)
     assert talking.reply(outside + 0.1, np.full(6, 0.1), 0).q[1] == outside[1]
-    talking.classify(packet(0), 2 * CYCLE_NS)  # from inside, the limits are the limits again
-    talking.reply(ZERO, ZERO, 0)
-    talking.classify(packet(1), 3 * CYCLE_NS)
-    assert talking.reply(outside, ZERO, 0).q[1] == Q_MAX[1]
+    later = 10**9  # from inside, the limits are the limits again
+    talking.classify(packet(300), later)
+    talking.reply(ZERO, ZERO, later)
+    talking.classify(packet(301), later + CYCLE_NS)
+    assert talking.reply(outside, ZERO, later + CYCLE_NS).q[1] == Q_MAX[1]
 
 
 def test_a_queue_gets_one_answer_to_its_newest_packet() -> None:
@@ -123,11 +154,25 @@ def test_a_queue_gets_one_answer_to_its_newest_packet() -> None:
 
 
 def test_a_session_that_began_in_a_queue_is_echoed_from_its_newest_packet() -> None:
+    talking = session(silence_s=0.1)
+    talk(talking, [700, 701])
+    later = 10**9
+    lot = [packet(0, clock_ns=T0_NS + later), packet(1, clock_ns=T0_NS + later + CYCLE_NS, q=np.full(6, 0.11))]
+    assert [talking.classify(one, later).fresh for one in lot] == [True, True]
+    assert talking.reply(ZERO, ZERO, later).q.tolist() == [0.11] * 6
+
+
+def test_an_alarm_in_a_queue_is_told_with_the_answer_to_the_robot() -> None:
     talking = session()
     talk(talking, [700, 701])
-    lot = [packet(702), packet(0), packet(1, q=np.full(6, 0.2))]
-    assert [talking.classify(one, 2 * CYCLE_NS).fresh for one in lot] == [False, True, True]
-    assert talking.reply(ZERO, ZERO, 0).q.tolist() == [0.2] * 6
+    lot = [packet(0, clock_ns=T0_NS + 10**15), packet(702), packet(703, q=np.full(6, 3.0))]
+    heard, newest = talking.classify_all(lot[:2], 2 * CYCLE_NS)
+    assert newest is lot[1]
+    assert heard.reason == RESTARTED
+    talking.reply(ZERO, ZERO, 2 * CYCLE_NS)
+    heard, newest = talking.classify_all(lot[2:], 3 * CYCLE_NS)
+    assert heard.reason == JUMPED
+    assert talking.counts["packets"] == 3
 
 
 @pytest.mark.parametrize("lot", [[], [None, None], [replace(packet(0), clock_ns=None)]])

@@ -12,6 +12,7 @@ import pytest
 
 from hrcreplay.egm.link import EgmServer
 from hrcreplay.errors import SettingsError
+from tests.egm.talks import server
 
 LONG_S = 5.0
 
@@ -27,7 +28,7 @@ def robot(link: EgmServer) -> Iterator[socket.socket]:
 
 @pytest.fixture
 def link() -> Iterator[EgmServer]:
-    with closing(EgmServer("127.0.0.1", 0, LONG_S)) as made:
+    with closing(server(0, LONG_S)) as made:
         yield made
 
 
@@ -81,7 +82,7 @@ def test_it_wakes_as_soon_as_a_datagram_comes(link: EgmServer) -> None:
 
 
 def test_silence_is_none() -> None:
-    with closing(EgmServer("127.0.0.1", 0, 0.02)) as link:
+    with closing(server(0, 0.02)) as link:
         began = time.monotonic()
         assert link.newest() is None
         assert time.monotonic() - began >= 0.019
@@ -119,19 +120,52 @@ def test_a_stranger_takes_no_answer_and_joins_no_queue(link: EgmServer) -> None:
         assert link.strangers == 2
 
 
-def test_a_stranger_does_not_prolong_the_wait_and_is_heard_once_the_robot_is_silent() -> None:
-    with closing(EgmServer("127.0.0.1", 0, 0.3)) as link, robot(link) as own, robot(link) as stranger:
+def test_another_port_of_the_robot_is_heard_once_its_session_is_over_and_not_before() -> None:
+    """Waits of 20 ms that bring nothing are no end of a session that a silence of 0.3 s ends."""
+    with closing(server(0, 0.02, silence_s=0.3)) as link, robot(link) as own, robot(link) as stranger:
         own.send(b"one")
-        received = link.newest()
-        assert received is not None
-        link.answer(b"told", received.sender)
-        stranger.send(b"too soon")
-        assert link.newest() is None
-        assert link.strangers == 1
+        assert link.newest() is not None
+        for _ in range(5):
+            stranger.send(b"too soon")
+            assert link.newest() is None
+        assert link.strangers == 5
+        assert link.strangers_seen() == [stranger.getsockname()]
+        time.sleep(0.3)
         stranger.send(b"now")
         received = link.newest()
         assert received is not None
         assert (received.data, received.sender) == (b"now", stranger.getsockname())
+
+
+def test_only_the_robot_s_address_is_heard_however_long_it_is_silent() -> None:
+    with (
+        closing(EgmServer("127.0.0.1", 0, 0.02, robot="127.0.0.2", silence_s=0.05)) as link,
+        robot(link) as stranger,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own,
+    ):
+        stranger.send(b"first")
+        assert link.newest() is None
+        time.sleep(0.1)
+        stranger.send(b"again")
+        assert link.newest() is None
+        own.bind(("127.0.0.2", 0))
+        own.sendto(b"robot", ("127.0.0.1", link.port))
+        stranger.send(b"last")
+        received = link.newest()
+        assert received is not None
+        assert (received.data, received.older, received.sender) == (b"robot", (), own.getsockname())
+        assert link.strangers == 3
+        assert link.strangers_seen() == [stranger.getsockname()]
+
+
+def test_it_listens_where_the_robot_is_reached_and_nowhere_else() -> None:
+    with closing(EgmServer("", 0, 0.1, robot="127.0.0.1", silence_s=0.1)) as link:
+        assert link._socket.getsockname() == ("127.0.0.1", link.port)
+
+
+def test_a_robot_to_which_no_network_leads_is_a_setting_to_mend() -> None:
+    with pytest.raises(SettingsError, match=r"live\.robot_address: no network leads to 255\.255\.255\.255"):
+        EgmServer("", 0, 0.1, robot="255.255.255.255", silence_s=0.1)
 
 
 def test_without_a_robot_yet_the_last_sender_is_heard(link: EgmServer) -> None:
@@ -145,14 +179,14 @@ def test_without_a_robot_yet_the_last_sender_is_heard(link: EgmServer) -> None:
 
 def test_a_taken_port_is_a_setting_to_mend(link: EgmServer) -> None:
     with pytest.raises(SettingsError, match=rf"UDP port {link.port} of 127\.0\.0\.1 cannot be opened.*free port"):
-        EgmServer("127.0.0.1", link.port, 0.1)
+        server(link.port, 0.1)
     with pytest.raises(SettingsError, match="cannot be opened"):
-        EgmServer("127.0.0.1", 70_000, 0.1)
+        server(70_000, 0.1)
     with pytest.raises(SettingsError, match="cannot be opened"):
-        EgmServer("192.0.2.1", 0, 0.1)  # nobody's address
+        EgmServer("192.0.2.1", 0, 0.1, robot="127.0.0.1", silence_s=0.1)  # nobody's address
 
 
 def test_a_closed_link_gives_its_port_back() -> None:
-    link = EgmServer("127.0.0.1", 0, 0.1)
+    link = server(0, 0.1)
     link.close()
-    EgmServer("127.0.0.1", link.port, 0.1).close()
+    server(link.port, 0.1).close()

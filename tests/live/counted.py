@@ -11,6 +11,7 @@ from hrcreplay.egm.link import Address, Received
 from hrcreplay.egm.robot_double.faults import Datagram
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore
+from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.live.control.loop import Loop, LoopSettings
 from hrcreplay.live.record.codec import Decision, Perception, TickEvent
 from tests.live.flights import BEGIN_NS, FRAME_NS, RESPONSE_NS, Flight, far_away
@@ -66,6 +67,12 @@ class Cable:
         assert to == ROBOT
         self._answers.append(Datagram(self._clock.t_ns + RESPONSE_NS, data))
 
+    strangers = 0
+
+    def strangers_seen(self) -> list[Address]:
+        """There are none."""
+        return []
+
     def clear(self) -> None:
         """Nothing has queued up."""
 
@@ -105,15 +112,15 @@ class Recorder:
     dropped = 0
 
     def __init__(self) -> None:
-        self.messages: list[bytes] = []
+        self.kept: list[bytes] = []
 
     def send(self, message: bytes) -> None:
         """Keeps it."""
-        self.messages.append(message)
+        self.kept.append(message)
 
-    def check_alive(self) -> bool:
-        """It is there."""
-        return True
+    def messages(self) -> Iterator[bytes]:
+        """It has nothing to say."""
+        return iter(())
 
 
 @dataclass
@@ -146,7 +153,8 @@ def counted(
         duration_s, sending=True, person_late_s=9, overrun_s=0.02, keep_recorder=True, store_every_s=9
     )
     parts = Cable(flight.core, clock), Person(flight, clock), Recorder()
-    loop = CountedLoop(flight.controller, *parts, settings, 0, clock.t_ns, clock=clock)  # type: ignore[arg-type]
+    gate = StepGate(flight.robot.dq_max, flight.controller.setup.plan.dt_s)
+    loop = CountedLoop(flight.controller, *parts, settings, gate, 0, clock.t_ns, clock=clock)  # type: ignore[arg-type]
     loop.work_ns, loop.look_ns = round(work_s * 1e9), round(look_s * 1e9)
     answer, look = flight.controller.answer, flight.controller.update_perception
 

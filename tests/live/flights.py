@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -142,18 +141,22 @@ class Flight:
 
 
 def echoed(one: MotionRow, two: MotionRow) -> bool:
-    """Whether the second of two answers takes a robot that may not move, or begins a session, for where it is."""
-    return bool(np.array_equal(two.q, one.q_measured) and not np.any(two.dq))
+    """Whether the second of two answers takes a robot that may not move for where it is, or goes towards that."""
+    low, high = np.minimum(one.q, one.q_measured), np.maximum(one.q, one.q_measured)
+    return bool(np.all((low <= two.q) & (two.q <= high)) and not np.any(two.dq))
 
 
 def steps_keep_the_limits(flight: Flight) -> None:
-    """What was told while the robot may move: each step within speed and acceleration limits of every axis."""
+    """What was told: each step within the axes' speeds; while the robot may move, within their accelerations, too."""
     robot = flight.robot
-    rows = [(answer.row, PHASES[answer.phase]) for answer in flight.answers if answer.row is not None]
-    for (one, _), (two, phase) in pairwise(rows):
+    told = [answer for answer in flight.answers if answer.datagram is not None]
+    rows = [(answer.t_ns * 1e-9, answer.row, PHASES[answer.phase]) for answer in told if answer.row is not None]
+    said = [decode_correction(answer.datagram) for answer in told if answer.datagram is not None]
+    for (before_s, one, _), (now_s, two, phase), first, second in zip(rows, rows[1:], said, said[1:], strict=False):
+        step_s = max(CYCLE_S, now_s - before_s)
+        assert np.all(np.abs(second.q - first.q) <= robot.dq_max * step_s * (1 + 1e-6) + 1e-9)
         if phase == "echo" or echoed(one, two):
             continue
-        assert np.all(np.abs(two.q - one.q) <= robot.dq_max * CYCLE_S * (1 + 1e-9))
         assert np.all(np.abs(two.dq - one.dq) <= robot.ddq_max * CYCLE_S * (1 + 1e-9))
         assert np.all((two.q >= robot.q_min - 1e-9) & (two.q <= robot.q_max + 1e-9))
 

@@ -16,7 +16,7 @@ EXPECTED = {
     "stall": "robot silent",
     "silence": "robot silent",
     "nan": "robot silent",  # joints that are no numbers are not answered
-    "teleport": "tracking error",
+    "teleport": "joints jump",
     "motors_off": "motors off",
     "program_stop": "program stopped",
     "egm_error": "EGM error",

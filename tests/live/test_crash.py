@@ -181,7 +181,7 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
 ) -> None:
     found = Sent("reply", MOVING_S, tmp_path, monkeypatch)
     monkeypatch.undo()
-    messages: list[bytes] = found.loop.recorder.messages  # type: ignore[assignment]
+    messages: list[bytes] = found.loop.recorder.kept  # type: ignore[attr-defined]
     kinds = [codec.kind(message) for message in messages]
     events = [codec.decode_event(message) for message in messages if codec.kind(message) == codec.EVENT]
     assert [event["what"] for event in events] == ["crash", "end"]

@@ -38,7 +38,7 @@ def test_a_bare_tool_is_told_before_the_session_waits(
         cell=None,
     )
     with ExitStack() as stack:
-        prepared = session._prepare(request, stack)
+        prepared = session._prepare(request, tmp_path, stack)
         told = capsys.readouterr().err
     assert ("robot.tool_links" in told) is not guarded
     assert ("0.290 m outside" in told) is not guarded

@@ -22,10 +22,12 @@ from google.protobuf.message import DecodeError
 
 from hrcreplay.egm import motion_link_pb2 as messages
 from hrcreplay.egm.link import Address, EgmServer, Received
+from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.live.control.session_controller import FAULT, REFUSED, SessionController
 from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Signal, TickEvent
+from hrcreplay.live.record.recorder import LOW
 from hrcreplay.robot.control.control_step import BRAKING, Stop
 
 _BIN_NS = 5_000
@@ -55,6 +57,11 @@ class DurationHistogram:
 ENDING = (
     Signal.INTERRUPT
     | Signal.TERMINATE
+    | Signal.HANGUP
+    | Signal.QUIT
+    | Signal.SUSPEND
+    | Signal.OTHER
+    | Signal.DISK
     | Signal.DURATION
     | Signal.PERSON_ENDED
     | Signal.PERSON_DEAD
@@ -87,6 +94,7 @@ class Loop:
     person: HelperProcess
     recorder: HelperProcess
     settings: LoopSettings
+    gate: StepGate
     anchor_ns: int
     start_ns: int
     screen: HelperProcess | None = None
@@ -109,6 +117,8 @@ class Loop:
     _skipped: bool = False
     _ended: bool = False
     _stored_ns: int = 0
+    _low_disk: bool = False
+    _strangers: int = 0  # senders beside the robot that were told of
 
     def now_ns(self) -> int:
         """The session's clock: monotonic, beginning at the time of day."""
@@ -123,6 +133,7 @@ class Loop:
     def run_cycle(self) -> bool:
         """Runs one cycle: answers a packet and updates the perception; False when the session is over."""
         received = self.pending = self.link.newest()
+        self._tell_strangers()
         signals = self.signals = self._signals()
         if received is None:
             t_ns = self.now_ns()
@@ -142,7 +153,7 @@ class Loop:
         event = TickEvent(received.t_ns + self.anchor_ns, (*received.older, received.data), signals)
         answer = self.controller.answer(event)
         if answer.datagram is not None and self.settings.sending:
-            self.link.answer(answer.datagram, received.sender)
+            self.send(answer.datagram, received)
             self.sent, self.sender, self.stop = answer.datagram, received.sender, answer.stop
         self.pending = None
         took_ns = self.now_ns() - event.t_ns
@@ -156,6 +167,21 @@ class Loop:
             self.reply_times.add(took_ns)
             self.recorder.send(codec.encode_reply(event.t_ns, answer.datagram, sent=self.settings.sending))
         self.last = answer
+
+    def send(self, datagram: bytes, received: Received | None) -> None:
+        """Sends a command to where the robot's packets come from: the only way out of the process.
+
+        Raises:
+            UnsafeCommandError: It leads further than the axes can go.
+        """
+        measured = None
+        if received is not None and self.sent is None:
+            told = (_measured(data) for data in (received.data, *reversed(received.older)))
+            measured = next((np.radians(joints) for joints in told if joints is not None), None)
+        to = self.sender if received is None else received.sender
+        if to is not None:
+            self.gate.check(datagram, measured, self.now_ns() if received is None else received.t_ns + self.anchor_ns)
+            self.link.answer(datagram, to)
 
     def _update_perception(self) -> None:
         skeletons = self._receive_skeletons()
@@ -193,6 +219,14 @@ class Loop:
         self.notes.append(text)
         self.recorder.send(codec.encode_event(self.now_ns(), {"what": "note", "text": text}))
 
+    def _tell_strangers(self) -> None:
+        """Says who else sends to the robot's port: the first few senders, each once."""
+        for address, port in self.link.strangers_seen()[self._strangers :]:
+            self._strangers += 1
+            robot = self.link.robot
+            why = f"live.robot_address is {robot}" if address != robot else "another port of the robot is answered"
+            self.note(f"datagrams of {address}:{port} are not heard: {why}")
+
     def _signals(self) -> Signal:
         now_ns, found = self.now_ns(), self.caught
         if now_ns - self.start_ns >= self.settings.duration_s * 1e9:
@@ -203,7 +237,10 @@ class Loop:
             found |= Signal.PERSON_DEAD
         elif now_ns - self._beat_ns > self.settings.person_late_s * 1e9:
             found |= Signal.PERSON_LATE
-        if self.settings.keep_recorder and not self.recorder.check_alive():
+        self._low_disk |= any(message == LOW for message in self.recorder.messages())
+        if self._low_disk:
+            found |= Signal.DISK
+        if self.settings.keep_recorder and not self.recorder.alive:
             found |= Signal.RECORDER_DEAD
         if self.screen is not None and self.screen.crashed():
             found |= Signal.SCREEN_DEAD
@@ -287,8 +324,8 @@ def bring_to_rest(loop: Loop, why: str) -> None:
             loop.controller.stop = FAULT
             loop.controller.stops.append((loop.now_ns(), FAULT))
         loop.recorder.send(codec.encode_event(loop.now_ns(), {"what": "crash", "text": why}))
-    brake, sender = _brake(loop), loop.sender
-    if brake is None or sender is None:
+    brake = _brake(loop)
+    if brake is None or loop.sender is None:
         return
     standing = silences = 0
     received = loop.pending
@@ -301,17 +338,17 @@ def bring_to_rest(loop: Loop, why: str) -> None:
             if received is None:
                 silences += 1
                 continue
-        sender = received.sender if received is not None else sender
         measured = None if received is None else _measured(received.data)
         if received is None or measured is not None:
             if measured is not None:
                 brake.update_position(measured)
             before = list(brake.q), list(brake.dq)
-            data = brake.step(loop.now_ns() // 1_000_000)
+            data, sent = brake.step(loop.now_ns() // 1_000_000), False
             with suppress(Exception):
-                loop.link.answer(data, sender)
+                loop.send(data, received)
+                sent = True
             with suppress(Exception):  # the record is worth less than the stop
-                _record(loop, received, measured, before, brake, data)
+                _record(loop, received, measured, before, brake, data, sent=sent)
             standing = standing + 1 if brake.at_rest else 0
         received = None
 
@@ -346,6 +383,8 @@ def _record(
     before: tuple[list[float], list[float]],
     brake: FallbackBrake,
     data: bytes,
+    *,
+    sent: bool,
 ) -> None:
     """Records a row of the motion; what only the stages know is missing in it."""
     t_ns = loop.now_ns() if received is None else received.t_ns + loop.anchor_ns
@@ -360,4 +399,4 @@ def _record(
     phase = codec.HOLDING if brake.at_rest else codec.STOPPING
     answer = Decision(t_ns, 0, data, phase, BRAKING, FAULT, -1, -1, row, None)
     loop.recorder.send(codec.encode_decision(answer, Signal.NONE, len(datagrams), 0))
-    loop.recorder.send(codec.encode_reply(t_ns, data, sent=True))
+    loop.recorder.send(codec.encode_reply(t_ns, data, sent=sent))

@@ -28,7 +28,9 @@ from hrcreplay.settings.sections import Live
 #: What ends a session as it should; every other reason ends it as a stop.
 SESSION_OVER, RECORDING_OVER = "session over", "recording of the person over"
 
-INTERRUPTED, TERMINATED = "Ctrl-C", "SIGTERM"
+INTERRUPTED, TERMINATED, HUNG_UP, QUIT, SUSPENDED = "Ctrl-C", "SIGTERM", "SIGHUP", "SIGQUIT", "Ctrl-Z"
+OTHER_SIGNAL = "signal of the system"
+DISK_FULL = "disk nearly full"
 PERSON_DEAD, PERSON_LATE = "human side dead", "human side late"
 RECORDER_DEAD, SCREEN_DEAD = "recorder dead", "screen dead"
 OVERRUN, SILENT = "tick overrun", "robot silent"
@@ -36,7 +38,7 @@ NO_FRAME, UNCERTAIN, NOT_FINITE, TRACKING = "no fresh frame", "state uncertain",
 FAULT = "internal error"
 
 #: What ends a session whose robot may have been stopped for another reason.
-_ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED)
+_ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED, HUNG_UP, QUIT, SUSPENDED, OTHER_SIGNAL)
 
 #: Robots that are not answered at all.
 REFUSED = ("radians", "axes")
@@ -45,6 +47,11 @@ REFUSED = ("radians", "axes")
 SIGNALS = {
     Signal.INTERRUPT: INTERRUPTED,
     Signal.TERMINATE: TERMINATED,
+    Signal.HANGUP: HUNG_UP,
+    Signal.QUIT: QUIT,
+    Signal.SUSPEND: SUSPENDED,
+    Signal.OTHER: OTHER_SIGNAL,
+    Signal.DISK: DISK_FULL,
     Signal.DURATION: SESSION_OVER,
     Signal.PERSON_ENDED: RECORDING_OVER,
     Signal.PERSON_DEAD: PERSON_DEAD,

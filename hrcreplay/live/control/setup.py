@@ -152,7 +152,12 @@ def build_controller(start: dict[str, Any]) -> SessionController:
     )
     robot, live = setup.robot, job.settings.live
     session = EgmSession(
-        robot.q_min, robot.q_max, robot.dq_max, utilization_max=live.utilization_max, silence_s=live.silent_s
+        robot.q_min,
+        robot.q_max,
+        robot.dq_max,
+        utilization_max=live.utilization_max,
+        silence_s=live.silent_s,
+        cycle_s=live.cycle_s,
     )
     return SessionController(setup, observer, session)
 

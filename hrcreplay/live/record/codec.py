@@ -56,6 +56,11 @@ class Signal(IntFlag):
     RECORDER_DEAD = 64  #: the recorder's process has ended
     OVERRUN = 128  #: the answer before this one came too late
     SCREEN_DEAD = 256  #: the screen's process has crashed
+    HANGUP = 512  #: SIGHUP: the terminal was closed, or its connection lost
+    QUIT = 1024  #: SIGQUIT
+    SUSPEND = 2048  #: SIGTSTP: a process that is suspended answers no robot
+    OTHER = 4096  #: another signal that would have ended the process
+    DISK = 8192  #: there is too little space for the record
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -145,6 +146,8 @@ def _motion(answers: list[codec.RecordedDecision], limbs: tuple[str, ...], links
 
 
 LOG = "log.mcap"
+#: Of a session that was killed, or whose recorder was.
+NO_END = "the record has no end: how the robot came to rest after it is not on it"
 _PARTIAL = ".partial"
 
 
@@ -199,7 +202,9 @@ def keep_incomplete(partial: Path, crashes: list[str]) -> None:
             shutil.rmtree(path)
         elif path.name != LOG and not path.name.startswith(processes.PREFIX):
             path.unlink()
-    (partial / "run.json").write_text(run_folder.to_json(_crashed(crashes) | {"command": "live", "complete": False}))
+    found = _crashed(crashes) | {"command": "live", "complete": False, "notes": [NO_END]}
+    with suppress(OSError):  # a full disk: the log says by itself that it has no end
+        (partial / "run.json").write_text(run_folder.to_json(found))
 
 
 def _crashed(crashes: list[str]) -> dict[str, Any]:
@@ -230,8 +235,8 @@ def _meta(
     notes = [str(event["text"]) for event in tables.events if event.get("what") == "note"]
     notes += [f"{LOG}: {flaw}" for flaw in log.flaws]
     notes += [f"not complete: {line}" for line in crashes]
-    if not end and not crashes:
-        notes.append("the session was killed: its record has no end")
+    if not end:
+        notes.append(NO_END)
     counts = {name.replace(" ", "_"): int(count) for name, count in end.get("counts", {}).items()}
     counts |= dict(tables.counts) | {"messages_dropped": int(end.get("dropped", 0))}
     counts |= {"looks_skipped": int(end.get("looks_skipped", 0))}

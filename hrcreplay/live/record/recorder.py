@@ -1,7 +1,8 @@
 """The recorder process, which writes the messages of control to a session's log, and the reader of such a log.
 
-From control: the messages of ``codec``. To control: ``K`` once, when the file is open. Ends when control does, after it
-has finished the file; when the file cannot be written, ends at once with a line on standard error and exit code 1.
+From control: the messages of ``codec``. To control: ``K`` once, when the file is open; ``L`` once, when there is little
+space left on its disk; ``X`` + why, in UTF-8, when the file cannot be written: then it ends at once with exit code 1.
+Ends else when control does, after it has finished the file.
 Chunks are closed and handed to the operating system several times a second, so that a kill loses no more than that.
 
 Every byte of a finished file is under a checksum, and the messages are numbered. Of an unfinished file all but the
@@ -17,7 +18,6 @@ import os
 import signal
 import socket
 import struct
-import sys
 import time
 import zlib
 from collections.abc import Iterator, Sequence
@@ -38,7 +38,7 @@ from mcap.writer import CompressionType, Writer
 
 from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.errors import LogError
-from hrcreplay.live.processes import Inbox
+from hrcreplay.live.processes import LAST_WORDS, Inbox
 from hrcreplay.live.record import codec
 from hrcreplay.logs import messages as own
 from hrcreplay.logs import skeleton_pb2 as pb
@@ -255,7 +255,7 @@ def _contents(content: bytes, channels: dict[int, str]) -> tuple[list[tuple[int,
     return messages, builder.end()  # type: ignore[no-untyped-call]
 
 
-READY = b"K"
+READY, LOW = b"K", b"L"
 FLUSH_S = 0.2
 _BATCH_S = 0.05
 _CHUNK_BYTES = 1 << 20  # time closes chunks, not size
@@ -338,8 +338,19 @@ def _flat(pose: list[list[float]] | None) -> list[float]:
     return [] if pose is None else [float(number) for number in np.asarray(pose, dtype=np.float64).ravel()]
 
 
-def record(control: socket.socket, path: Path) -> None:
+def free_bytes(folder: Path) -> int:
+    """Space on the disk of a folder that we may use."""
+    disk = os.statvfs(folder)
+    return disk.f_bavail * disk.f_frsize
+
+
+def record(control: socket.socket, path: Path, low_bytes: int) -> None:
     """Writes a new log until control is gone.
+
+    Args:
+        control: Socket to it.
+        path: Of the log.
+        low_bytes: With less space left on the disk, control is told.
 
     Raises:
         OSError: The file exists or cannot be written; what is written stays.
@@ -350,12 +361,14 @@ def record(control: socket.socket, path: Path) -> None:
         writer.flush()
         with suppress(BrokenPipeError):  # whoever is gone already may have left messages
             control.send(READY)
-        due_s = time.monotonic() + FLUSH_S
+        due_s, told = time.monotonic() + FLUSH_S, False
         while not inbox.ended.wait(_BATCH_S):
             for message in inbox.take():
                 writer.add(message)
             if time.monotonic() >= due_s:
                 writer.flush()
+                if not told and free_bytes(path.parent) < low_bytes:
+                    told = bool(control.send(LOW))
                 due_s = time.monotonic() + FLUSH_S - _BATCH_S
         for message in inbox.take():
             writer.add(message)
@@ -367,15 +380,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="hrcreplay.live.record.recorder")
     parser.add_argument("--fd", type=int, required=True)
     parser.add_argument("--path", type=Path, required=True)
+    parser.add_argument("--low", type=int, default=0, help="space on the disk below which control is told [bytes]")
     options = parser.parse_args(arguments)
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.SIG_IGN)  # the record ends when the session does, and not before
     os.nice(_NICE)
+    control = socket.socket(fileno=options.fd)
     try:
-        record(socket.socket(fileno=options.fd), options.path)
+        record(control, options.path, options.low)
     except OSError as error:
-        sys.stderr.write(f"hrcreplay: {options.path}: the record cannot be written ({error.strerror})\n")
-        sys.stderr.flush()
+        with suppress(OSError):
+            control.send(LAST_WORDS + f"{options.path}: the record cannot be written ({error.strerror})".encode())
         os._exit(1)  # the interpreter would try to write the rest once more, and complain
 
 

@@ -18,7 +18,7 @@ SECONDS = 4.0
 
 def recorded(loop: CountedLoop) -> list[bytes]:
     """What the recorder was told."""
-    messages: list[bytes] = loop.recorder.messages  # type: ignore[assignment]
+    messages: list[bytes] = loop.recorder.kept  # type: ignore[attr-defined]
     return messages
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from hrcreplay.egm.link import JUMPED
 from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.human.fusion import fuse
 from hrcreplay.live.control import session_controller
@@ -69,7 +70,8 @@ STOPS: dict[str, dict[str, Any]] = {
         "overrides": ("live.uncertain_m=0.012", "fusion.fresh_s=9"),
         "walk": lambda s: None if 2.0 < s < 3.0 else (3.0, 0.0),
     },
-    session_controller.TRACKING: {"faults": (Fault("teleport", 2.0, 0.5, angle_deg=20.0),)},
+    session_controller.TRACKING: {"overrides": ("live.tracking_rad=1e-4",)},
+    JUMPED: {"faults": (Fault("teleport", 2.0, 0.5, angle_deg=20.0),)},
     "motors off": {"faults": (Fault("motors_off", 2.0, 0.5),)},
     "program stopped": {"faults": (Fault("program_stop", 2.0, 0.5),)},
     "EGM error": {"faults": (Fault("egm_error", 2.0),)},
@@ -102,7 +104,7 @@ def test_every_reason_of_the_watchdog_goes_on_with_the_certified_stop_and_holds(
         session_controller.OVERRUN,
         "motors off",
         "program stopped",
-        session_controller.TRACKING,
+        JUMPED,
     ],
 )
 def test_it_goes_on_by_a_setting_only_and_from_where_it_stands(reason: str) -> None:

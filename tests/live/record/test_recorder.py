@@ -82,7 +82,7 @@ def test_skeletons_that_cannot_be_read_are_on_record(tmp_path: Path) -> None:
 class Process:
     """The recorder as control sees it."""
 
-    def __init__(self, path: Path, before: Callable[[], None] | None = None) -> None:
+    def __init__(self, path: Path, before: Callable[[], None] | None = None, low_bytes: int = 0) -> None:
         self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command = [
             sys.executable,
@@ -92,6 +92,8 @@ class Process:
             str(theirs.fileno()),
             "--path",
             str(path),
+            "--low",
+            str(low_bytes),
         ]
         self.popen = subprocess.Popen(
             command,
@@ -110,8 +112,8 @@ class Process:
 
 
 @contextmanager
-def recording(path: Path, before: Callable[[], None] | None = None) -> Iterator[Process]:
-    process = Process(path, before)
+def recording(path: Path, before: Callable[[], None] | None = None, low_bytes: int = 0) -> Iterator[Process]:
+    process = Process(path, before, low_bytes)
     try:
         yield process
     finally:
@@ -171,16 +173,26 @@ def test_a_full_disk_ends_the_recorder_with_one_line(tmp_path: Path) -> None:
         for k in range(20):
             process.control.send(codec.encode_robot_packet(1000 + k, noise.bytes(5000)))
         code, said = process.end()
+        words = process.control.recv(1000).decode()
         assert process.control.recv(10) == b""  # this is how control knows
-    assert code == 1
-    assert said == f"hrcreplay: {path}: the record cannot be written (File too large)\n"
+    assert (code, said) == (1, "")
+    assert words == f"X{path}: the record cannot be written (File too large)"
+
+
+def test_little_space_is_told_once(tmp_path: Path) -> None:
+    with recording(tmp_path / "log.mcap", low_bytes=1 << 62) as process:
+        assert process.control.recv(10) == b"K"
+        assert process.control.recv(10) == b"L"
+        process.control.settimeout(1.0)
+        with pytest.raises(TimeoutError):
+            process.control.recv(10)
 
 
 def test_an_existing_file_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     path.write_text("precious")
     with recording(path) as process:
-        code, said = process.end()
+        code, _ = process.end()
+        assert b"File exists" in process.control.recv(1000)
     assert code == 1
-    assert "File exists" in said
     assert path.read_text() == "precious"
