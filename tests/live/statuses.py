@@ -28,6 +28,7 @@ def status(**change: Any) -> Status:
         ],
         "stops": {},
         "recorder": RecorderStatus(alive=True, dropped=0),
+        "outlook": "",
         "note": "",
     }
     return Status(**(values | change))  # type: ignore[typeddict-item]

@@ -40,6 +40,9 @@ FAULT = "internal error"
 #: What ends a session whose robot may have been stopped for another reason.
 _ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED, HUNG_UP, QUIT, SUSPENDED, OTHER_SIGNAL)
 
+#: What a robot does not move after, whatever the settings.
+_FINAL = (PERSON_DEAD, RECORDER_DEAD, SCREEN_DEAD, DISK_FULL, FAULT)
+
 #: Robots that are not answered at all.
 REFUSED = ("radians", "axes")
 
@@ -140,6 +143,17 @@ class SessionController:
     def connected(self) -> bool:
         """Whether a robot is being answered."""
         return self._motion is not None
+
+    @property
+    def outlook(self) -> str:
+        """What a robot that stands waits for; empty where it moves, or where the session ends."""
+        if self.phase == codec.WAITING and self.waiting:
+            return "it moves as soon as that is over"
+        if self.phase != codec.HOLDING or self.stop in (*_ENDINGS, *_FINAL):
+            return ""
+        if not self.setup.bounds.resume:
+            return "it does not move again in this session; live.resume=true would let it"
+        return f"it moves on once that has been over for {self.setup.bounds.resume_s:g} s"
 
     def counts(self) -> Counter[str]:
         """Counters of the person's frames and the robot's packets so far."""

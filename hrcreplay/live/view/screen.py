@@ -43,6 +43,8 @@ def panel(status: Status) -> RenderableType:
     rows.add_row("cameras", _cameras(status["cameras"]))
     rows.add_row("recorder", _recorder(status))
     rows.add_row("stops", _stops(status))
+    if status["outlook"]:
+        rows.add_row("next", Text(status["outlook"], style="yellow"))
     parts: list[RenderableType] = [rows]
     if status["note"]:
         parts.append(Text(status["note"], style="dim italic", no_wrap=True, overflow="ellipsis"))
@@ -161,15 +163,20 @@ Show = Callable[[Status], None]
 
 
 class Lines:
-    """A line a second, and one whenever the session's phase, decision or reason is another."""
+    """A line a second, and one whenever the session's phase or reason is another; each remark once."""
 
     def __init__(self, write: Callable[[str], object]) -> None:
         self._write = write
         self._next_s = 0.0
         self._last: tuple[str, str] | None = None
+        self._told = ("", "")
 
     def show(self, status: Status) -> None:
-        """Writes a line if one is due."""
+        """Writes what is due."""
+        told = (status["note"], status["outlook"])
+        for text in (new for new, old in zip(told, self._told, strict=True) if new and new != old):
+            self._write(f"{clock(status['t_s'])}  {text}\n")
+        self._told = told
         now = (status["phase"], status["reason"])
         if status["t_s"] < self._next_s and now == self._last:
             return

@@ -64,6 +64,7 @@ class Status(TypedDict):
     cameras: list[CameraStatus]
     stops: dict[str, int]  #: reasons of the session's stops so far, in order of their first time, with their number
     recorder: RecorderStatus
+    outlook: str  #: what a robot that stands waits for; empty where it moves or the session ends
     note: str  #: the latest remark
 
 
@@ -190,6 +191,7 @@ class StatusPublisher:
             cameras=[self._camera(name, now_ns) for name in self._names["cameras"]],
             stops=dict(Counter(reason for _, reason in controller.stops)),
             recorder={"alive": loop.recorder.alive, "dropped": loop.recorder.dropped},
+            outlook=controller.outlook,
             note=loop.notes[-1] if loop.notes else "",
         )
 

@@ -59,6 +59,11 @@ def after_start(signal: Signal, at_s: float, for_s: float = np.inf) -> dict[str,
 STOPS: dict[str, dict[str, Any]] = {
     session_controller.INTERRUPTED: after_start(Signal.INTERRUPT, 2.0),
     session_controller.TERMINATED: after_start(Signal.TERMINATE, 2.0),
+    session_controller.HUNG_UP: after_start(Signal.HANGUP, 2.0),
+    session_controller.QUIT: after_start(Signal.QUIT, 2.0),
+    session_controller.SUSPENDED: after_start(Signal.SUSPEND, 2.0),
+    session_controller.OTHER_SIGNAL: after_start(Signal.OTHER, 2.0),
+    session_controller.DISK_FULL: after_start(Signal.DISK, 2.0),
     session_controller.SESSION_OVER: after_start(Signal.DURATION, 2.0),
     session_controller.RECORDING_OVER: after_start(Signal.PERSON_ENDED, 2.0),
     session_controller.PERSON_DEAD: after_start(Signal.PERSON_DEAD, 2.0, 0.5),
@@ -94,6 +99,8 @@ def test_every_reason_of_the_watchdog_goes_on_with_the_certified_stop_and_holds(
     assert not np.any(speeds[still[0] :])  # and does not move again
     assert later[-1].reason == reason
     assert PHASES[later[-1].phase] in ("holding", "stopping", "echo")
+    final = reason in (*session_controller._ENDINGS, *session_controller._FINAL)
+    assert ("live.resume=true" in flight.controller.outlook) is not final
     assert len(flight.said()) >= 0.99 * len(flight.answers)  # it goes on answering
 
 

@@ -92,6 +92,14 @@ def test_a_pipe_gets_a_line_a_second_and_one_at_each_change() -> None:
     assert [text.split()[0] for text in written] == ["0:00.0", "0:01.0", "0:02.0", "0:02.5", "0:02.7"]
 
 
+def test_a_pipe_gets_each_remark_and_what_a_standing_robot_waits_for_once() -> None:
+    written: list[str] = []
+    lines = Lines(written.append)
+    for t_s, note, outlook in ((0.0, "", ""), (0.1, "a", "w"), (0.2, "a", "w"), (0.3, "b", ""), (0.4, "b", "w")):
+        lines.show(status(t_s=t_s, note=note, outlook=outlook))
+    assert [text.strip() for text in written[1:]] == ["0:00.1  a", "0:00.1  w", "0:00.3  b", "0:00.4  w"]
+
+
 # --- the process ---
 
 
