@@ -27,7 +27,15 @@ _WORDS = frozenset({"true", "false", "inf", "nan"})
 
 
 #: Settings that name files; in a settings file a relative one is looked for beside that file first.
-_PATHS = (("robot", "urdf"), ("robot", "packages"), ("plan", "task"), ("limits", "tracking"), ("limits", "prediction"))
+_PATHS = (
+    ("robot", "urdf"),
+    ("robot", "packages"),
+    ("plan", "task"),
+    ("limits", "tracking"),
+    ("limits", "prediction"),
+    ("live", "zenoh", "config"),
+    ("live", "zenoh", "secret"),
+)
 
 
 def load_settings(
@@ -61,17 +69,20 @@ def load_settings(
 
 def _beside(table: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The settings of a file, in which relative paths of files beside it become paths from here."""
-    found = dict(table)
-    for name, key in _PATHS:
-        section = found.get(name)
-        if not isinstance(section, dict) or key not in section:
-            continue
-        given = section[key]
-        if isinstance(given, list):
-            found[name] = found[name] | {key: [_beside_or_same(one, folder) for one in given]}
-        else:
-            found[name] = found[name] | {key: _beside_or_same(given, folder)}
-    return found
+    for path in _PATHS:
+        table = _one_beside(table, path, folder)
+    return table
+
+
+def _one_beside(table: dict[str, Any], path: tuple[str, ...], folder: Path) -> dict[str, Any]:
+    """The same of one setting, if it is there."""
+    name, rest = path[0], path[1:]
+    given = table.get(name)
+    if rest:
+        return table | {name: _one_beside(given, rest, folder)} if isinstance(given, dict) else table
+    if isinstance(given, list):
+        return table | {name: [_beside_or_same(one, folder) for one in given]}
+    return table | {name: _beside_or_same(given, folder)} if name in table else table
 
 
 def _beside_or_same(given: Any, folder: Path) -> Any:

@@ -370,6 +370,21 @@ class Zenoh(Section):
     """Whether to look for others by multicast."""
     keys: dict[str, ZenohKey] = Field(default_factory=dict)
     """Camera -> where its skeletons are."""
+    config: Path | None = None
+    """File of Zenoh's own configuration, with its authentication and encryption, in place of mode to scouting."""
+    secret: Path | None = None
+    """File of a secret shared with the cameras: then frames without a seal made with it are not used."""
+    sources: tuple[str, ...] = ()
+    """secret: names of the sources that may seal frames; empty: whoever has the secret."""
+    late_s: Positive = 0.3
+    """secret: a frame whose seal is older or newer by our clock is not used [s]."""
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Zenoh:
+        """Refuses what a configuration of its own would silently leave out."""
+        if self.config is not None and (self.connect or self.listen or self.scouting or self.mode != "peer"):
+            raise ValueError("config has mode, connect, listen and scouting in it; would be right: one of both")
+        return self
 
 
 class Live(Section):

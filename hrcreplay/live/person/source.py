@@ -30,6 +30,7 @@ from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
 from hrcreplay.errors import HrcReplayError, LogError, SettingsError
+from hrcreplay.live.person.envelope import SHORTEST_SECRET, Opener, UnverifiedError
 from hrcreplay.live.person.log_playback import Outgoing, frames_of, play, ready_note, same_frame
 from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.logs import decoders, ros_bags
@@ -53,15 +54,17 @@ _GAP_S = 0.2
 class CameraSubscription:
     """The keys of one camera: payloads in, cleaned skeletons out."""
 
-    def __init__(self, camera: str, settings: ZenohKey) -> None:
+    def __init__(self, camera: str, settings: ZenohKey, opener: Opener | None = None) -> None:
+        """Begin before the first payload; with an opener none is believed that is not sealed."""
         self._camera = camera
+        self._opener = opener
         self._settings = settings
         self._where = f"live.zenoh.keys.{camera}"
         self._readers: dict[str, tuple[Topic, SkeletonDecoder]] = {}  # of each type
         self._defects: Counter[str] = Counter()
         self._cleaner = Cleaner((camera,), _GAP_S, self._defects)
         self._told: set[str] = set()
-        self._undecodable = 0
+        self._unusable: Counter[str] = Counter()
 
     def prepare(self) -> None:
         """Makes the readers of the types that may come, which takes too long for the first message to wait for."""
@@ -74,11 +77,12 @@ class CameraSubscription:
     def take(self, key: str, data: bytes, now_ns: int) -> Iterator[Outgoing]:
         """Messages to control for one payload: its bodies, and notes, each once."""
         try:
-            rows = self._rows(key, data, now_ns)
+            rows = self._rows(key, data if self._opener is None else self._opener.open(data, now_ns), now_ns)
+        except UnverifiedError as error:
+            yield from self._refuse("not verified, not used", error)
+            return
         except Exception as error:  # whatever a stranger sends: it is not worth more than a remark
-            self._undecodable += 1
-            if str(self._undecodable).rstrip("0") == "1":  # 1, 10, 100...
-                yield self._note(f"{self._undecodable} undecodable: {error or type(error).__name__}")
+            yield from self._refuse("undecodable", error)
             return
         for row in rows:
             yield from self._clocks(row, now_ns)
@@ -94,6 +98,11 @@ class CameraSubscription:
             if count and name in DEFECTS and name not in self._told:
                 self._told.add(name)
                 yield self._note(f"{name}: {DEFECTS[name]}")
+
+    def _refuse(self, what: str, error: Exception) -> Iterator[Outgoing]:
+        self._unusable[what] += 1
+        if str(self._unusable[what]).rstrip("0") == "1":  # 1, 10, 100...
+            yield self._note(f"{self._unusable[what]} {what}: {error or type(error).__name__}")
 
     def _clocks(self, row: RawSkeleton, now_ns: int) -> Iterator[Outgoing]:
         age_ns = 0 if row.capture_ns is None else now_ns - row.capture_ns
@@ -186,14 +195,16 @@ class ZenohSource:
 
     def _begin(self) -> None:
         try:
-            keys = {name: ZenohKey.model_validate(given) for name, given in self._settings["keys"].items()}
+            wanted = _validated(self._settings)
+            secret = None if wanted.secret is None else _secret(wanted.secret)
             session = open_session(self._settings)
             self._open.append(session)
-            for name, given in keys.items():
-                stream = CameraSubscription(name, given)
+            for name, given in wanted.keys.items():
+                opener = None if secret is None else Opener(secret, wanted.sources, wanted.late_s)
+                stream = CameraSubscription(name, given, opener)
                 stream.prepare()
                 self._open.append(_subscribe(session, name, given, self._taker(stream)))
-            self._send(*ready_note(tuple(keys)))
+            self._send(*ready_note(tuple(wanted.keys)))
         except ControlGoneError:
             pass  # the main thread sees it too
         except Exception as error:  # raised again where the process can tell of it
@@ -225,14 +236,12 @@ def open_session(settings: Mapping[str, Any]) -> Any:
         raise SettingsError(
             "live.zenoh: eclipse-zenoh is not installed; would be right: pip install 'hrcreplay[zenoh]'"
         ) from error
+    wanted = _validated(settings)
     try:
-        wanted = Zenoh.model_validate(settings)
-    except ValidationError as error:
-        found = error.errors()[0]
-        where = ".".join(map(str, found["loc"]))
-        raise SettingsError(
-            f"live.zenoh: no session ({where}: {found['msg']}); check mode, connect and listen"
-        ) from error
+        if wanted.config is not None:
+            return zenoh.open(zenoh.Config.from_file(str(wanted.config)))
+    except (zenoh.ZError, OSError) as error:
+        raise SettingsError(f"live.zenoh.config: {wanted.config} cannot be used ({error})") from error
     config = zenoh.Config()
     given = {
         "mode": wanted.mode,
@@ -247,6 +256,35 @@ def open_session(settings: Mapping[str, Any]) -> Any:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise SettingsError(f"live.zenoh: no session ({error}); check mode, connect and listen") from error
+
+
+def _validated(settings: Mapping[str, Any]) -> Zenoh:
+    """The settings of the section; raises SettingsError."""
+    try:
+        return Zenoh.model_validate(settings)
+    except ValidationError as error:
+        found = error.errors()[0]
+        where = ".".join(map(str, found["loc"])) or "config"
+        raise SettingsError(
+            f"live.zenoh: no session ({where}: {found['msg']}); check mode, connect and listen"
+        ) from error
+
+
+def _secret(path: Path) -> bytes:
+    """The secret in a file, without the line's end.
+
+    Raises:
+        SettingsError: It cannot be read, or is too short.
+    """
+    try:
+        secret = path.read_bytes().rstrip(b"\r\n")
+    except OSError as error:
+        raise SettingsError(f"live.zenoh.secret: {path} cannot be read ({error.strerror})") from error
+    if len(secret) < SHORTEST_SECRET:
+        raise SettingsError(
+            f"live.zenoh.secret: {path} holds {len(secret)} bytes; would be right: {SHORTEST_SECRET} or more"
+        )
+    return secret
 
 
 def _subscribe(session: Any, camera: str, given: ZenohKey, take: Callable[[Any], None]) -> Any:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
@@ -253,6 +254,10 @@ def check(sent: list[Any]) -> None:
         ({"keys": {"left": {"key": "no//key"}}}, b"failed live.zenoh.keys.left: 'no//key' is no key expression"),
         ({"listen": ["tcp/somewhere"]}, b"failed live.zenoh: no session"),
         ({"mode": "pear"}, b"failed live.zenoh: no session"),
+        ({"secret": "/nowhere"}, b"failed live.zenoh.secret: /nowhere cannot be read"),
+        ({"secret": "/dev/null"}, b"failed live.zenoh.secret: /dev/null holds 0 bytes"),
+        ({"config": "/nowhere"}, b"failed live.zenoh: no session (config:"),
+        ({"config": "/nowhere", "listen": []}, b"failed live.zenoh.config: /nowhere cannot be used"),
     ],
 )
 def test_settings_that_cannot_be_used_are_told(change: dict[str, Any], told: bytes) -> None:
@@ -287,3 +292,22 @@ def test_it_ends_in_order_while_frames_pour_in() -> None:
             finally:
                 over.set()
                 pouring.join()
+
+
+def test_a_configuration_of_zenoh_s_own_is_used(tmp_path: Path) -> None:
+    """One that listens at an endpoint: whoever connects to it is heard."""
+    pytest.importorskip("zenoh")
+    endpoint, heard = free_endpoint(), Event()
+    path = tmp_path / "zenoh.json5"
+    path.write_text(
+        f'{{mode: "peer", listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
+    )
+    with source.open_session({"config": str(path)}) as ours:
+        subscriber = ours.declare_subscriber("a", lambda _sample: heard.set())
+        with source.open_session({"connect": [endpoint]}) as theirs:
+            for _ in range(600):
+                theirs.put("a", b"x")
+                if heard.wait(0.1):
+                    break
+        subscriber.undeclare()
+    assert heard.is_set()
