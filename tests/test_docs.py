@@ -14,7 +14,7 @@ from hrcreplay import errors
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.cli.app import app
 from hrcreplay.egm import motion_link_pb2
-from hrcreplay.egm.link import REFUSALS, STOPS, PacketStatus
+from hrcreplay.egm.link import ALARMS, REFUSALS, STOPS, PacketStatus
 from hrcreplay.egm.robot_double.faults import KINDS, load_faults
 from hrcreplay.live.control import session_controller
 from hrcreplay.live.record import codec
@@ -149,6 +149,7 @@ def test_every_stop_reason_is_in_the_table() -> None:
         *session_controller.SIGNALS.values(),
         *session_controller.REFUSED,
         *STOPS,
+        *ALARMS,
         session_controller.reason_of_robot(heard),
     }
     table = rows(section(7), "| reason |")

@@ -205,3 +205,23 @@ def test_measured_joints_trail_the_planned_ones() -> None:
 def test_settings_that_cannot_be_are_refused(name: str, value: float) -> None:
     with pytest.raises(SettingsError, match=rf"robot double: {name} is .*; .* would be right"):
         ServoSettings(**{name: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("speed_deg_per_s", "ramp_s", "way_deg"),
+    [(200.0, 0.5, 61.0), (200.0, 0.1, 39.0), (90.0, 0.5, 19.7), (90.0, 0.1, 13.0), (20.0, 0.5, 4.4), (20.0, 0.1, 2.9)],
+)
+def test_how_far_a_robot_goes_without_us(speed_deg_per_s: float, ramp_s: float, way_deg: float) -> None:
+    """The table of docs/live.md: the guide dies while the first axis moves steadily."""
+    servo = ServoController(ServoSettings(comm_timeout_s=0.2, ramp_s=ramp_s), np.radians([-120.0, 0, 0, 0, 30.0, 0]))
+    speed = np.radians([speed_deg_per_s, 0, 0, 0, 0, 0])
+    told, t_ns = servo.q, 0
+    for _ in range(200):
+        told = told + speed * PERIOD_NS * 1e-9
+        servo.step(t_ns, Correction(0, 0, told, speed))
+        t_ns += PERIOD_NS
+    begun = servo.q[0]
+    while servo.ended_ns is None or np.any(servo.dq):
+        servo.step(t_ns, None)
+        t_ns += PERIOD_NS
+    assert np.degrees(servo.q[0] - begun) == pytest.approx(way_deg, abs=0.05)
