@@ -111,7 +111,7 @@ class RobotPacket:
         seqno: The robot's counter, None where it sent none.
         tm_ms: The robot's own stamp [ms], goes round at 2**32.
         clock_ns: Instant of the feedback by the robot's clock; None below RobotWare 6.07, which sends radians.
-        q: (6,) measured joints, followed by external ones if there are any [rad].
+        q: (6,) measured joints, and external ones; of another robot as many as it says [rad].
         q_planned: (6,) where the controller itself wants to be [rad].
         motors: One of ``Motors``.
         mci: One of ``Mci``.
@@ -158,7 +158,7 @@ def decode_robot(data: bytes) -> RobotPacket:
     Without ``feedBack.time`` the joints are taken for radians, because RobotWare below 6.07 sends those.
 
     Raises:
-        BadPacket: Empty, garbage, another kind of message, not six joints, or a joint that is no finite number.
+        BadPacket: Empty, garbage, another kind of message, no joints, or a joint that is no finite number.
     """
     message = _parsed(messages.RobotMessage, data)
     header, feedback, planned = message.header, message.feed_back, message.planned
@@ -166,13 +166,15 @@ def decode_robot(data: bytes) -> RobotPacket:
         raise BadPacket(f"message type {header.mtype}: a robot sends {messages.TYPE_DATA}")
     clock_ns = _clock(feedback.time) if feedback.HasField("time") else None
     scale = 1.0 if clock_ns is None else _RAD_PER_DEG
-    joints = _joints(feedback.joints, "feedBack") + list(feedback.external_joints.joints)
+    joints = [*feedback.joints.joints, *feedback.external_joints.joints]
+    if not joints:
+        raise BadPacket("feedBack: no joints")
     return RobotPacket(
         seqno=header.seqno if header.HasField("seqno") else None,
         tm_ms=header.tm if header.HasField("tm") else None,
         clock_ns=clock_ns,
         q=_scaled(joints, scale, "feedBack"),
-        q_planned=_scaled(_joints(planned.joints, "planned"), scale, "planned") if planned.HasField("joints") else None,
+        q_planned=_scaled(list(planned.joints.joints), scale, "planned") if planned.HasField("joints") else None,
         motors=message.motor_state.state,
         mci=message.mci_state.state,
         rapid=message.rapid_state.state,

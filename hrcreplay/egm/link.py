@@ -48,7 +48,8 @@ STOPS: Final = ("motors off", "EGM error", "converged", "program stopped", "not 
 #: What may be somebody else who uses the robot's address.
 RESTARTED: Final = "robot restarted"
 JUMPED: Final = "joints jump"
-ALARMS: Final = (RESTARTED, JUMPED)
+OTHER: Final = "another robot"
+ALARMS: Final = (RESTARTED, JUMPED, OTHER)
 #: Every reason that ``classify`` gives.
 REASONS: Final = (*REFUSALS, *STOPS, *ALARMS)
 
@@ -135,12 +136,12 @@ class EgmSession:
         """Take one datagram in order of arrival; None stands for one that is no packet."""
         if packet is None:
             return self._refuse("no packet")
-        if packet.clock_ns is None:
+        other = "radians" if packet.clock_ns is None else "axes" if packet.q.shape != self._q_min.shape else ""
+        if other and self._live(t_ns):
+            return self._doubt(OTHER, packet, t_ns)
+        if other:
             self._allowed = False
-            return self._refuse("radians")
-        if packet.q.shape != self._q_min.shape:
-            self._allowed = False
-            return self._refuse("axes")
+            return self._refuse(other)
         kind, lost = self._place(packet, t_ns)
         if kind in REFUSALS:
             return self._refuse(kind)
@@ -216,6 +217,10 @@ class EgmSession:
             kind = JUMPED
         return kind, lost
 
+    def _live(self, t_ns: int) -> bool:
+        """Whether a robot is being answered."""
+        return self._answered and t_ns - self._heard_ns <= self._silence_ns
+
     def _follows_rival(self, packet: RobotPacket) -> bool:
         """Whether the packet goes on with what may be a new session."""
         return self._rival is not None and _follows(packet, self._rival)[0] == "next"
@@ -242,8 +247,8 @@ class EgmSession:
         if alarm == RESTARTED:
             self._rival_ns = self._rival_ns if self._follows_rival(packet) else t_ns
             self._rival = packet
-        live = t_ns - self._heard_ns <= self._silence_ns and self._answered
-        if not live or t_ns - self._told_ns < _APART * self._cycle_s * 1e9:
+        beside = t_ns - self._told_ns < _APART * self._cycle_s * 1e9
+        if beside or alarm == OTHER or not self._live(t_ns):
             return PacketStatus(False, fresh=False, allowed=self._allowed, reason=alarm, ended=False, lost=0)
         self._heard_ns, self._due = t_ns, True
         return PacketStatus(True, fresh=False, allowed=self._allowed, reason=alarm, ended=False, lost=0)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay.egm.link import JUMPED, REASONS, RESTARTED, PacketStatus
+from hrcreplay.egm.link import JUMPED, OTHER, REASONS, RESTARTED, PacketStatus
 from tests.egm.talks import CYCLE_NS, T0_NS, ZERO, packet, session, talk
 
 
@@ -160,15 +160,28 @@ def test_reasons_are_all_listed() -> None:
 
 def test_radians_are_refused_and_change_nothing() -> None:
     talking = session()
-    talk(talking, [0, 1])
-    heard = talking.classify(packet(2, clock_ns=None), 2 * CYCLE_NS)
+    heard = talking.classify(packet(0, clock_ns=None), 0)
     assert (heard.answer, heard.allowed, heard.reason) == (False, False, "radians")
     assert talking.counts["radians"] == 1
 
 
-def test_a_robot_with_other_axes_is_refused() -> None:
-    heard = session().classify(packet(0, q=np.zeros(7)), 0)
+@pytest.mark.parametrize("axes", [1, 5, 7, 12])
+def test_a_robot_with_other_axes_is_refused_at_its_first_packet(axes: int) -> None:
+    heard = session().classify(packet(0, q=np.zeros(axes)), 0)
     assert (heard.answer, heard.allowed, heard.reason) == (False, False, "axes")
+
+
+@pytest.mark.parametrize("fields", [{"clock_ns": None}, {"q": np.zeros(7)}])
+def test_another_robot_beside_ours_takes_no_answer_from_it(fields: dict[str, Any]) -> None:
+    """A robot that moves and is not answered goes on with its last reference: one datagram must not lead to that."""
+    talking = session()
+    talk(talking, [0, 1])
+    heard = talking.classify(packet(2, **fields), 2 * CYCLE_NS)
+    assert (heard.answer, heard.allowed, heard.reason) == (False, True, OTHER)
+    heard = talking.classify(packet(2), 3 * CYCLE_NS)
+    assert (heard.answer, heard.reason) == (True, OTHER)
+    talking.reply(ZERO, ZERO, 3 * CYCLE_NS)
+    assert talking.classify(packet(3), 4 * CYCLE_NS).reason == ""
 
 
 def test_what_is_no_packet_is_counted_and_changes_nothing() -> None:

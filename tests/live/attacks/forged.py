@@ -78,6 +78,12 @@ def flood(packet: RobotPacket) -> list[bytes]:
     return [encode_robot(replace(_moved(packet, 0.01 * n), seqno=0, clock_ns=n + 1)) for n in range(200)]
 
 
+def of_another_robot(packet: RobotPacket) -> list[bytes]:
+    """Seven axes, and radians of an old controller: robots that are not answered at all."""
+    seven = replace(packet, seqno=(packet.seqno or 0) + 1, q=np.append(packet.q, 0.0))
+    return [encode_robot(seven), encode_robot(packet, version="A", radians=True)]
+
+
 def _with_joints(packet: RobotPacket, degrees: float) -> bytes:
     message = messages.RobotMessage.FromString(encode_robot(packet))
     message.header.seqno += 1
@@ -100,5 +106,6 @@ KINDS: dict[str, Callable[[RobotPacket], list[bytes]]] = {
         not_a_number,
         longest,
         flood,
+        of_another_robot,
     )
 }

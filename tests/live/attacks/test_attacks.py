@@ -21,6 +21,7 @@ STOPS = {
     **dict.fromkeys(("restarted_here", "restarted_and_goes_on"), ALARMS),
     "creeping": (*ALARMS, "tracking error"),
     "huge": ALARMS,
+    "of_another_robot": ALARMS,
 }
 
 
