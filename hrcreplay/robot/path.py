@@ -291,7 +291,12 @@ def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
         else np.gradient(even, STEP_S, axis=0)
     )
     _check(model, grid * 1e9, dq, "speed", "rad/s", (-model.dq_max, model.dq_max, _NOISE_SPEED * model.dq_max))
-    return _by_itself(model, smooth, dq, ())
+    fastest = max(float(model.pose(*row).tcp_speed(row[1])) for row in zip(smooth, dq, strict=True))
+    return _by_itself(model, smooth, dq, (), fastest)
+
+
+#: Points of an approach at which its TCP is asked for, were it as fast there as in its middle.
+_STATIONS = 9
 
 
 def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Reference:
@@ -313,14 +318,23 @@ def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Re
     r = np.arange(end + 1) / end
     share, rate = r * r * r * (10 - 15 * r + 6 * r**2), 30 * r**2 * (1 - r) ** 2 / (end * STEP_S)
     q, dq = start + np.outer(share, way), np.outer(rate, way)
-    return _by_itself(model, q, dq, (end * STEP_S,))
+    stations = (start + s * way for s in np.linspace(0.0, 1.0, _STATIONS))  # few: a robot waits
+    fastest = float(rate.max()) * max(model.pose(station, way).tcp_speed(way) for station in stations)
+    return _by_itself(model, q, dq, (end * STEP_S,), fastest)
 
 
-def _by_itself(model: RobotModel, q: Floats, dq: Floats, waypoints_s: tuple[float, ...]) -> Reference:
+def _by_itself(
+    model: RobotModel, q: Floats, dq: Floats, waypoints_s: tuple[float, ...], fastest_m_per_s: float
+) -> Reference:
     """A path that runs once, and whose own greatest speed is its speed limit, since nobody programmed one."""
-    fastest = max(float(model.pose(*row).tcp_speed(row[1])) for row in zip(q, dq, strict=True))
     return Reference(
-        model, q, dq, end=len(q) - 1, cycles=1.0, waypoints_s=waypoints_s, tcp_speed_max=np.full(len(q), fastest)
+        model,
+        q,
+        dq,
+        end=len(q) - 1,
+        cycles=1.0,
+        waypoints_s=waypoints_s,
+        tcp_speed_max=np.full(len(q), fastest_m_per_s),
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from hrcreplay.egm.codec import BadPacket, decode_robot
 from hrcreplay.egm.robot_double.faults import KINDS, Fault, random_faults
+from hrcreplay.egm.step_gate import StepGate, UnsafeCommandError
 from hrcreplay.live.record.codec import PHASES
 from tests.live.flights import CYCLE_S, Flight, is_a_stop, steps_keep_the_limits
 
@@ -41,6 +42,13 @@ def violations(flight: Flight) -> list[str]:
         steps_keep_the_limits(flight)
     except AssertionError:
         found.append("a step beyond the limits")
+    gate = StepGate(flight.robot.dq_max, CYCLE_S)
+    for answer in flight.answers:
+        if answer.datagram is not None and answer.row is not None:
+            try:
+                gate.check(answer.datagram, answer.row.q_measured, answer.t_ns)
+            except UnsafeCommandError as error:
+                found.append(f"withheld: {error}")
     return [*found, *_motion_after_stops(flight), *_unanswered(flight)]
 
 

@@ -9,7 +9,6 @@ import pytest
 
 from hrcreplay.egm.codec import decode_robot
 from hrcreplay.egm.link import ALARMS
-from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.live.record.codec import PHASES, Decision
 from tests.live.attacks.forged import KINDS
 from tests.live.campaign import violations
@@ -55,13 +54,6 @@ def attacked(kind: str, beside: str, *at_s: float) -> Attacked:
     return flight
 
 
-def passes_the_gate(flight: Flight) -> None:
-    gate = StepGate(flight.robot.dq_max, CYCLE_S)
-    for answer in flight.answers:
-        if answer.datagram is not None and answer.row is not None:
-            gate.check(answer.datagram, answer.row.q_measured, answer.t_ns)
-
-
 def follows(answer: Decision) -> bool:
     return PHASES[answer.phase] in ("approach", "following")
 
@@ -73,7 +65,6 @@ def test_a_moving_robot_comes_to_rest_where_it_was_going_and_nowhere_else(kind: 
     at_ns = BEGIN_NS + 1_500_000_000
     assert any(np.any(answer.row.dq) for answer in flight.answers if answer.row is not None and answer.t_ns < at_ns)
     assert [line for line in violations(flight) if "unanswered" not in line] == []  # of the forged ones
-    passes_the_gate(flight)
     reasons = {reason for _, reason in flight.controller.stops}
     assert reasons <= set(STOPS.get(kind, ()))
     assert bool(reasons) == (kind in STOPS)
@@ -93,7 +84,7 @@ def test_a_standing_robot_is_not_moved(kind: str) -> None:
     flight.kind, flight.at_s = kind, times
     flight.fly(1.5)
     assert np.abs(np.array([told.q for told in flight.said()[-300:]]) - rest).max() < 0.03
-    passes_the_gate(flight)
+    assert not [line for line in violations(flight) if "withheld" in line or "limits" in line]
 
 
 def test_one_datagram_resumes_nothing() -> None:

@@ -13,11 +13,12 @@ from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.human.fusion import fuse
 from hrcreplay.live.control import session_controller
 from hrcreplay.live.control.setup import build_controller
-from hrcreplay.live.control.stages import Observer
+from hrcreplay.live.control.stages import Observer, start_approach
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.logs.clean import PersonMemory
-from hrcreplay.records import STATUSES, CameraFrames, HumanStates
+from hrcreplay.records import STATUSES, CameraFrames, Floats, HumanStates
+from hrcreplay.robot.model import RobotModel, RobotPose
 from hrcreplay.run.followers import QpFollower
 from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, far_away, is_a_stop, start, steps_keep_the_limits
 
@@ -145,6 +146,28 @@ def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
     replies = [answer for answer in flight.answers if answer.phase == codec.ECHO]
     assert_array_equal([answer.row.dq for answer in replies if answer.row is not None], 0.0)
     steps_keep_the_limits(flight)
+
+
+def test_a_robot_waits_for_few_poses_when_it_sets_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted, not timed: the way's greatest TCP speed from all of its 1,773 instants once cost each start 0.15 s."""
+    flight = Flight(walk=lambda s: None, overrides=("live.approach_speed=0.1",)).fly(0.1)
+    motion, setup = flight.controller._motion, flight.controller.setup
+    assert motion is not None
+    poses: list[int] = []
+    pose = RobotModel.pose
+
+    def counted(self: RobotModel, *state: Floats) -> RobotPose:
+        poses.append(1)
+        return pose(self, *state)
+
+    monkeypatch.setattr(RobotModel, "pose", counted)
+    way = start_approach(setup, motion).follower
+    assert len(poses) <= 12
+    monkeypatch.undo()
+    assert way is not None
+    path = way.reference
+    fastest = max(setup.robot.pose(q, dq).tcp_speed(dq) for q, dq in zip(path.q, path.dq, strict=True))
+    assert fastest <= path.tcp_speed_max[0] <= 1.5 * fastest
 
 
 class Suspended(Flight):
