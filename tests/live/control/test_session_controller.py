@@ -150,7 +150,7 @@ def test_a_silent_robot_is_started_anew_by_an_echo() -> None:
 
 def test_a_robot_waits_for_few_poses_when_it_sets_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Counted, not timed: the way's greatest TCP speed from all of its 1,773 instants once cost each start 0.15 s."""
-    flight = Flight(walk=lambda s: None, overrides=("live.approach_speed=0.1",)).fly(0.1)
+    flight = Flight(walk=lambda _s: None, overrides=("live.approach_speed=0.1",)).fly(0.1)
     motion, setup = flight.controller._motion, flight.controller.setup
     assert motion is not None
     poses: list[int] = []
