@@ -17,9 +17,11 @@ from hrcreplay.live.control.stages import Observer, start_approach
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.logs.clean import PersonMemory
+from hrcreplay.logs.skeleton_pb2 import Skeleton
 from hrcreplay.records import STATUSES, CameraFrames, Floats, HumanStates
 from hrcreplay.robot.model import RobotModel, RobotPose
 from hrcreplay.run.followers import QpFollower
+from tests.live.campaign import violations
 from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, far_away, is_a_stop, start, steps_keep_the_limits
 
 
@@ -168,6 +170,32 @@ def test_a_robot_waits_for_few_poses_when_it_sets_out(monkeypatch: pytest.Monkey
     path = way.reference
     fastest = max(setup.robot.pose(q, dq).tcp_speed(dq) for q, dq in zip(path.q, path.dq, strict=True))
     assert fastest <= path.tcp_speed_max[0] <= 1.5 * fastest
+
+
+class Stepped(Flight):
+    """The clock of the cameras' computer is set by an hour after 2 s; ours, which is monotonic, is not."""
+
+    hours = 1
+
+    def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
+        message = Skeleton.FromString(super()._skeleton(camera, place_m, t_ns))
+        if t_ns - BEGIN_NS > 2_000_000_000:
+            message.capture_ns += self.hours * 3_600_000_000_000
+        data: bytes = message.SerializeToString()
+        return data
+
+
+@pytest.mark.parametrize("hours", [-1, 1])
+def test_a_clock_that_is_set_by_an_hour_hides_nobody_and_shows_nobody(hours: int) -> None:
+    """Arrivals count from then on; who is in front of no camera is not known, whatever the clock says."""
+    flight = Stepped(walk=lambda s: (3.0, 0.0) if s < 3.0 else None)
+    flight.hours = hours
+    flight.fly(4.0)
+    age_s = {int(states.t_ns[0]) - BEGIN_NS: float(states.frame_age_s[0]) for states in flight.states}
+    assert all(0.0 <= age <= 0.15 for t_ns, age in age_s.items() if 0.1e9 < t_ns < 2.95e9)
+    assert all(age > 0.3 for t_ns, age in age_s.items() if t_ns > 3.4e9)
+    assert [why for _, why in flight.controller.stops] == [session_controller.NO_FRAME]
+    assert violations(flight) == []
 
 
 class Suspended(Flight):
