@@ -167,7 +167,8 @@ class EgmSession:
             lost, ended = lost + heard.lost, ended or heard.ended
             if heard.answer:
                 newest, answered = packet, heard
-        return replace(answered or heard, lost=lost, ended=ended), newest
+        found = answered or heard
+        return replace(found, lost=lost, ended=ended, reason=self._alarm or found.reason), newest
 
     def reply(self, q: Floats, dq: Floats, t_ns: int) -> Correction:
         """Answer the packet just classified. Returns what the robot is told, which may be less than what was asked for.
@@ -211,6 +212,8 @@ class EgmSession:
             return "new" if np.all(outside <= _OUTSIDE_RAD) else JUMPED, 0
         paused = t_ns - self._heard_ns > self._silence_ns
         kind, lost = ("new", 0) if paused else _follows(packet, self._last)
+        if kind == "next" and self._hurries(packet, lost, t_ns):
+            kind = RESTARTED
         if kind in ("stale", RESTARTED) and self._follows_rival(packet):
             kind = "again" if t_ns - self._rival_ns >= _ALONE * self._cycle_s * 1e9 else RESTARTED
         if kind not in REFUSALS and not self._reaches(packet.q, lost, t_ns):
@@ -225,12 +228,22 @@ class EgmSession:
         """Whether the packet goes on with what may be a new session."""
         return self._rival is not None and _follows(packet, self._rival)[0] == "next"
 
-    def _reaches(self, q: Floats, lost: int, t_ns: int) -> bool:
-        """Whether the axes can have come to q (6,) [rad] since the last packet that was believed."""
-        assert self._last is not None  # noqa: S101 - for the type checker
+    def _passed_s(self, lost: int, t_ns: int) -> float:
+        """The longest time that can have passed for the robot since the last packet that was believed [s]."""
         cycles = 2 + min(lost, _MISSED)  # packets of a queue arrive at once, and arrivals vary
-        seconds = (t_ns - self._last_ns) * 1e-9 + cycles * self._cycle_s
-        return bool(np.all(np.abs(q - self._last.q) <= _FASTER * self._dq_max * seconds + _NOISE_RAD))
+        return (t_ns - self._last_ns) * 1e-9 + cycles * self._cycle_s
+
+    def _reaches(self, q: Floats, lost: int, t_ns: int) -> bool:
+        """Whether the axes can have come to q (6,) [rad] since then."""
+        assert self._last is not None  # noqa: S101 - for the type checker
+        way = _FASTER * self._dq_max * self._passed_s(lost, t_ns) + _NOISE_RAD
+        return bool(np.all(np.abs(q - self._last.q) <= way))
+
+    def _hurries(self, packet: RobotPacket, lost: int, t_ns: int) -> bool:
+        """Whether its clock runs ahead: believed, it would make those of the robot itself look stale."""
+        if packet.clock_ns is None or self._last is None or self._last.clock_ns is None:
+            return False
+        return (packet.clock_ns - self._last.clock_ns) * 1e-9 > self._passed_s(lost, t_ns)
 
     def _towards(self, q: Floats, t_ns: int) -> Floats:
         """Joints q (6,) [rad], or as far as the axes can go to them since the last answer."""

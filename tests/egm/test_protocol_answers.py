@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hrcreplay.egm.codec import RobotPacket
-from hrcreplay.egm.link import JUMPED, REASONS, RESTARTED, PacketStatus
+from hrcreplay.egm.link import JUMPED, OTHER, REASONS, RESTARTED, PacketStatus
 from tests.egm.talks import CYCLE_NS, DQ_MAX, Q_MAX, T0_NS, ZERO, packet, session, talk
 
 
@@ -173,6 +173,11 @@ def test_an_alarm_in_a_queue_is_told_with_the_answer_to_the_robot() -> None:
     heard, newest = talking.classify_all(lot[2:], 3 * CYCLE_NS)
     assert heard.reason == JUMPED
     assert talking.counts["packets"] == 3
+    talking.reply(ZERO, ZERO, 3 * CYCLE_NS)
+    after = [packet(704), packet(705, q=np.zeros(7))]  # in either order
+    heard, newest = talking.classify_all(after, 4 * CYCLE_NS)
+    assert newest is after[0]
+    assert (heard.answer, heard.reason) == (True, OTHER)
 
 
 @pytest.mark.parametrize("lot", [[], [None, None], [replace(packet(0), clock_ns=None)]])

@@ -50,6 +50,11 @@ def next_one_jumps(packet: RobotPacket) -> list[bytes]:
     return [encode_robot(replace(_moved(packet, 0.15), seqno=(packet.seqno or 0) + 1))]
 
 
+def next_one_of_the_future(packet: RobotPacket) -> list[bytes]:
+    """The next packet, whose clock is an hour ahead: those of the robot itself would look overtaken."""
+    return [encode_robot(replace(packet, seqno=(packet.seqno or 0) + 1, clock_ns=(packet.clock_ns or 0) + _HOUR_NS))]
+
+
 def creeping(packet: RobotPacket) -> list[bytes]:
     """Next packets that wander off in steps which the axes could just go."""
     seqno = (packet.seqno or 0) + 1
@@ -101,6 +106,7 @@ KINDS: dict[str, Callable[[RobotPacket], list[bytes]]] = {
         restarted_and_goes_on,
         motors_off_elsewhere,
         next_one_jumps,
+        next_one_of_the_future,
         creeping,
         huge,
         not_a_number,

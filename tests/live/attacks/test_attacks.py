@@ -20,6 +20,7 @@ STOPS = {
     **dict.fromkeys(("restarted_here", "restarted_and_goes_on"), ALARMS),
     "creeping": (*ALARMS, "tracking error"),
     "huge": ALARMS,
+    "next_one_of_the_future": ALARMS,
     "of_another_robot": ALARMS,
 }
 
