@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from hrcreplay.egm.codec import AXES, BadPacket, RobotPacket, decode_robot, encode_correction
-from hrcreplay.egm.link import EgmSession, PacketStatus
+from hrcreplay.egm.link import ALARMS, EgmSession, PacketStatus
 from hrcreplay.live.control.stages import ControlSetup, MotionState, MotionStep, Observer, brake, follow, start_approach
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
@@ -231,10 +231,12 @@ class SessionController:
             self.phase = codec.FOLLOWING
 
     def _refuse(self, t_ns: int, packet_status: PacketStatus) -> None:
-        """Handles datagrams without an answer: a robot that must not be moved at all, or no usable packet."""
+        """Handles datagrams without an answer: a robot that must not be moved at all, or at once no further."""
         if packet_status.reason in REFUSED and not self.stop:
             self._stop(t_ns, packet_status.reason)
             self._motion, self.phase = None, codec.HOLDING
+        elif packet_status.reason in ALARMS and self.phase in (codec.APPROACH, codec.FOLLOWING):
+            self._stop(t_ns, packet_status.reason)
         self._check_silence(t_ns)
 
     def _check_silence(self, t_ns: int) -> None:
