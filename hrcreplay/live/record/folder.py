@@ -202,9 +202,22 @@ def keep_incomplete(partial: Path, crashes: list[str]) -> None:
             shutil.rmtree(path)
         elif path.name != LOG and not path.name.startswith(processes.PREFIX):
             path.unlink()
-    found = _crashed(crashes) | {"command": "live", "complete": False, "notes": [NO_END]}
+    found = _crashed(crashes) | {"command": "live", "complete": False}
+    if _breaks_off(partial / LOG):
+        found["notes"] = [NO_END]
     with suppress(OSError):  # a full disk: the log says by itself that it has no end
         (partial / "run.json").write_text(run_folder.to_json(found))
+
+
+def _breaks_off(log: Path) -> bool:
+    """Whether there is a record, and nothing in it of the session's end."""
+    if not log.exists():
+        return False
+    try:
+        events = [codec.decode_event(m) for m in SessionLogReader(log).messages() if codec.kind(m) == codec.EVENT]
+    except (LogError, OSError):
+        return True
+    return not any(event.get("what") == "end" for event in events)
 
 
 def _crashed(crashes: list[str]) -> dict[str, Any]:
