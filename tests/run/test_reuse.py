@@ -117,6 +117,8 @@ STALE = {
     "report.stationary_m_per_s": "",
     "report.leg_radius_m": "",
     "live.port": "",
+    "live.robot_address": "",
+    "live.listen_address": "",
     "live.cycle_s": "",
     "live.reaction_s": "",
     "live.look_s": "",
@@ -131,6 +133,8 @@ STALE = {
     "live.tracking_rad": "",
     "live.utilization_max": "",
     "live.keep_recorder": "",
+    "live.disk_start_mb": "",
+    "live.disk_low_mb": "",
     "live.real_time": "",
     "live.zenoh": "",
 }
@@ -165,6 +169,8 @@ OTHER: dict[str, Any] = {
     "plan.horizon": "fixed",
     "plan.rows": "hard",
     "plan.room": "square",
+    "live.robot_address": "10.0.0.1",
+    "live.listen_address": "10.0.0.2",
     "live.zenoh": {"mode": "client"},
 }
 

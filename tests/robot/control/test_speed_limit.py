@@ -182,4 +182,4 @@ def test_a_path_without_a_task_has_its_own_greatest_speed(robot: RobotModel) -> 
     assert path.tcp_speed_limit(1.0) == path.tcp_speed_limit(3.3) == pytest.approx(max(speeds), rel=1e-9)
     way = approach(robot, HOME, HOME + 0.2, 0.1)
     speeds = [speed(q, dq) for q, dq in zip(way.q, way.dq, strict=True)]
-    assert way.tcp_speed_limit(0.0) == pytest.approx(max(speeds), rel=1e-9)
+    assert max(speeds) <= way.tcp_speed_limit(0.0) <= 1.1 * max(speeds)  # from a few poses, for a robot waits
