@@ -426,7 +426,7 @@ class Live(Section):
     keep_recorder: bool = True
     """Whether the robot stops when nobody records any more."""
     disk_start_mb: NotNegative = 1000.0
-    """A session does not begin with less space on the disk of its record, which takes some 10 MB a minute [MB]."""
+    """A session does not begin with less space on the disk of its record, which takes some 30 MB a minute [MB]."""
     disk_low_mb: NotNegative = 200.0
     """With less the robot stops, so that the record of its stop finds room [MB]."""
     real_time: bool = True

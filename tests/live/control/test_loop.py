@@ -1,8 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
+from hrcreplay.egm.codec import decode_correction, encode_correction
+from hrcreplay.egm.link import Address
+from hrcreplay.egm.step_gate import UnsafeCommandError
 from hrcreplay.live.control import session_controller
+from hrcreplay.live.control.loop import bring_to_rest
 from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.control.stages import MotionState, MotionStep
 from hrcreplay.live.record import codec
@@ -93,3 +100,33 @@ def test_a_prepared_step_is_not_made_again_in_the_answer(monkeypatch: pytest.Mon
     loop.fly(2.0)
     assert loop.skipped > 100
     assert sum(within) < 10, "but where the phase changes"
+
+
+def test_a_wrong_answer_of_the_controller_never_leaves_and_the_robot_is_braked() -> None:
+    """An answer 0.3 rad off, whoever made it: the gate withholds it, and the fallback goes on from the last one."""
+    loop = counted(flight := Flight()).fly(2.0)
+    said, sent = flight.controller.answer, []
+    leave = loop.link.answer
+
+    def wrong(event: TickEvent) -> Decision:
+        answer = said(event)
+        assert answer.datagram is not None
+        told = decode_correction(answer.datagram)
+        return replace(answer, datagram=encode_correction(replace(told, q=told.q + 0.3)))
+
+    def kept(data: bytes, to: Address) -> None:
+        sent.append(decode_correction(data))
+        leave(data, to)
+
+    assert loop.sent is not None
+    before = decode_correction(loop.sent)
+    assert np.any(before.dq)  # it moves
+    flight.controller.answer = wrong  # type: ignore[method-assign]
+    loop.link.answer = kept  # type: ignore[method-assign]
+    with pytest.raises(UnsafeCommandError, match=r"0\.3\d* rad from the last one"):
+        loop.fly(0.1)
+    assert not sent
+    bring_to_rest(loop, "of the test")
+    way = np.array([before.q, *(told.q for told in sent)])
+    assert np.all(np.abs(np.diff(way, axis=0)) <= flight.robot.dq_max * CYCLE_S * (1 + 1e-6))
+    assert not np.any(sent[-1].dq)
