@@ -155,9 +155,11 @@ def _stage(command: str, text: str) -> None:
 
 def _run(command: str, source: Path, **options: Any) -> Path:
     """Runs the stages up to a command's, and tells the main figures on standard error; the run folder."""
-    from hrcreplay.run import replay, report, stages
+    from hrcreplay.run import replay, stages
 
     folder = replay.run(command, source, **options)
+    from hrcreplay.run import report  # slow, as it can draw: what ends in an error need not wait for it
+
     for line in report.summary(folder):
         stages.print_note(line)
     return folder

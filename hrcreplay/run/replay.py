@@ -24,10 +24,8 @@ from hrcreplay.report import tables
 from hrcreplay.report.story import defect_notes
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import LogLike
-from hrcreplay.run.contact import write_contact
 from hrcreplay.run.job import TABLES, Job, JobOptions, resolve, urdf_digest, versions
 from hrcreplay.run.notes import notes_of
-from hrcreplay.run.report import write_report
 from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
 from hrcreplay.settings.sections import Logs
 from hrcreplay.store import run_folder
@@ -99,6 +97,9 @@ def run(
 
 def _report(job: Job, log: Log, sink: Sink, meta: dict[str, Any], ticks: int) -> None:
     """The contact table and the report of a run whose other tables are written."""
+    from hrcreplay.run.contact import write_contact  # both are slow to load, and the other commands ask for neither
+    from hrcreplay.run.report import write_report
+
     with sink.watch.stage("contact", ticks):
         write_contact(job, log, sink.run, build.robot_base(job, log))
     with sink.watch.stage("report", ticks):
