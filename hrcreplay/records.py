@@ -65,6 +65,12 @@ POINTS = (
     "foot_r",
 )
 
+#: Body id of a frame that shows nobody: all its points are missing.
+NOBODY = -1
+
+#: The border of a watched area among the volumes that a robot keeps clear of: one name for all its sides.
+BORDER = "BORDER"
+
 #: POINTS with left and right exchanged.
 MIRROR = tuple(
     POINTS.index(name[:-1] + {"l": "r", "r": "l"}[name[-1]]) if name[-2:] in ("_l", "_r") else i
@@ -113,7 +119,7 @@ class CameraFrames(Table):
     capture_ns: Ints  #: (n,) when the camera took it
     arrival_ns: Ints  #: (n,) when it reached the logger; no tick before this may use it
     camera: Ints  #: (n,) index into ``cameras``
-    body: Ints  #: (n,) the tracker's body id; may change in mid-recording
+    body: Ints  #: (n,) the tracker's body id, which may change in mid-recording; or NOBODY
     points_m: Floats  #: (n, 20, 3) POINTS in that camera's own frame [m]
     confidence: Floats  #: (n, 20) in [0, 1]
     cameras: tuple[str, ...]
@@ -182,6 +188,8 @@ class HumanStates(Table):
     frame_age_s: Floats  #: (n,) since the newest frame that entered the filter was captured [s]; inf before the first
     points_m: Floats  #: (n, 20, 3) POINTS where cameras show them beside the model, world [m]; NaN: not shown lately
     cameras: tuple[str, ...]
+    nobody_s: Floats | None = None  #: (n,) since the watched area was last without anybody [s]; None: none is watched
+    nobody_else_s: Floats | None = None  #: the same without anybody but the person; inf before the first time [s]
 
 
 @dataclass(frozen=True)

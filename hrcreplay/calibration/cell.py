@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Dis
 
 from hrcreplay.calibration.registration import rigid
 from hrcreplay.errors import SettingsError, shown
+from hrcreplay.geometry.polygon import ConvexPolygon
 from hrcreplay.logs.camera_checks import SOLE_M, SURE
 from hrcreplay.records import POINTS, Bools, Floats, SkeletonTrack
 from hrcreplay.store.run_folder import write_whole
@@ -25,6 +26,17 @@ from hrcreplay.toml_file import read_toml
 _TOLERANCE = 1e-6
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _POSE = "4 rows of 4 numbers, a rotation and a place [m], last row 0 0 0 1"
+_AREA = "3 or more corners [x, y] of a convex area, one after another around it [m]"
+
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _check_area(corners: list[list[float]]) -> list[list[float]]:
+    try:
+        ConvexPolygon.of_corners(np.array(corners, dtype=float).reshape(-1, 2))
+    except ValueError as error:
+        raise ValueError(f"found {error}; would be right: {_AREA}") from error
+    return corners
 
 
 class Residual(BaseModel):
@@ -42,13 +54,34 @@ class Residual(BaseModel):
     """Share of frames in which the two see left and right exchanged."""
 
 
+class Watched(BaseModel):
+    """What the cameras see together: whoever has any part of the body in it is shown by one of them."""
+
+    model_config = _STRICT
+
+    corners_m: Annotated[list[Annotated[list[_Number], Field(min_length=2, max_length=2)]], AfterValidator(_check_area)]
+    """Corners (x, y) of a convex area on the floor, one after another around it; it has any height [m]."""
+    margin_m: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    """How far inside somebody may be who is not shown yet, as by an arm stretched out: 0.85 m in ISO 13855 [m]."""
+    clear_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 2.0
+    """How long all cameras must show nobody there before nobody is believed to be there [s]."""
+    speed_m_per_s: Annotated[float, Field(gt=0.0, le=100.0)] = 1.6
+    """Speed at which people walk in, ISO 13855 [m/s]."""
+
+    @property
+    def polygon(self) -> ConvexPolygon:
+        """The area on the floor."""
+        return ConvexPolygon.of_corners(np.array(self.corners_m))
+
+
 @dataclass(frozen=True)
 class Cell:
-    """Poses and clocks of one cell."""
+    """Poses and clocks of one cell, and what its cameras see."""
 
     T_world_camera: Mapping[str, Floats] = field(default_factory=dict)  #: camera -> (4, 4)
     clock_offset_s: Mapping[str, float] = field(default_factory=dict)  #: camera's clock minus the reference camera's
     T_world_base: Floats | None = None  #: (4, 4) robot base
+    watched: Watched | None = None  #: where nobody can be whom no camera shows
     residuals: tuple[Residual, ...] = ()
     notes: tuple[str, ...] = ()  #: what calibrate was not sure of
 
@@ -62,6 +95,8 @@ class Cell:
         }
         if self.T_world_base is not None:
             cell["T_world_base"] = self.T_world_base.tolist()
+        if self.watched is not None:
+            cell["watched"] = self.watched.model_dump()
         if self.residuals:
             cell["residuals"] = [residual.model_dump() for residual in self.residuals]
         if self.notes:
@@ -86,6 +121,7 @@ class Cell:
             T_world_camera={name: np.array(camera.T_world_camera) for name, camera in file.cameras.items()},
             clock_offset_s={name: camera.clock_offset_s for name, camera in file.cameras.items()},
             T_world_base=None if base is None else np.array(base),
+            watched=file.watched,
             residuals=tuple(file.residuals),
             notes=tuple(file.notes),
         )
@@ -134,6 +170,8 @@ def _toml(cell: Cell) -> str:
         text += ["", f"[cameras.{json.dumps(name, ensure_ascii=False)}]"]
         text += [f"T_world_camera = {_matrix(entry['T_world_camera'])}"]
         text += [f"clock_offset_s = {entry['clock_offset_s']!r}"]
+    if "watched" in table:
+        text += ["", "[watched]", *(f"{key} = {value!r}" for key, value in table["watched"].items())]
     for residual in table.get("residuals", []):
         text += ["", "[[residuals]]"]
         text += [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in residual.items()]
@@ -163,7 +201,6 @@ def _check_pose(rows: list[list[float]]) -> list[list[float]]:
     return rows
 
 
-_Number = Annotated[float, Field(allow_inf_nan=False)]
 _Row = Annotated[list[_Number], Field(min_length=4, max_length=4)]
 _Pose = Annotated[list[_Row], BeforeValidator(_check_rows), AfterValidator(_check_pose)]
 
@@ -192,6 +229,7 @@ class _CellFile(BaseModel):
     model_config = _STRICT
     cameras: dict[str, _Camera] = {}
     T_world_base: _Base | None = None
+    watched: Watched | None = None
     residuals: list[Residual] = []
     notes: list[str] = []
 
@@ -202,6 +240,11 @@ _RIGHT = {
     "T_world_camera": _POSE,
     "T_world_base": _POSE,
     "position_m": "[x, y, z] in the world [m]",
+    "watched": f"a table with {', '.join(Watched.model_fields)}",
+    "corners_m": _AREA,
+    "margin_m": "a distance of 0 or more [m]",
+    "clear_s": "a time of 0 or more [s]",
+    "speed_m_per_s": "a speed above 0 [m/s]",
     "residuals": f"tables with {', '.join(Residual.model_fields)}",
     "notes": "a list of texts",
 }
@@ -220,7 +263,7 @@ def _first_problem(error: ValidationError, table: Mapping[str, Any], where: str)
     at = f"{where}: {'.'.join(keys)}"
     right = "a table" if keys[0] == "cameras" and len(keys) == 2 else _RIGHT.get(keys[-1])
     if kind == "extra_forbidden":
-        models: dict[str, type[BaseModel]] = {"cameras": _Camera, "T_world_base": _Upright}
+        models: dict[str, type[BaseModel]] = {"cameras": _Camera, "T_world_base": _Upright, "watched": Watched}
         model = models[keys[0]] if len(keys) > 1 else _CellFile
         above = ": ".join([where, *filter(None, [".".join(keys[:-1])])])
         return f"{above}: found {shown(keys[-1])}; would be right: {', '.join(model.model_fields)}"

@@ -16,7 +16,7 @@ import numpy as np
 
 from hrcreplay.logs.clocks import CameraClock
 from hrcreplay.logs.messages import RawSkeleton
-from hrcreplay.records import POINTS, Bools, CameraFrames, Floats
+from hrcreplay.records import NOBODY, POINTS, Bools, CameraFrames, Floats
 
 _TORSO = ("pelvis", "chest", "neck", "shoulder_l", "shoulder_r", "hip_l", "hip_r")
 _IN_TORSO = np.isin(POINTS, _TORSO)
@@ -245,8 +245,10 @@ def _keep_longest(found: dict[str, RepeatedSkeleton], camera: str, begin_ns: int
 class Cleaner:
     """Cleans rows in order of arrival and returns them as tables of at most a second."""
 
-    def __init__(self, cameras: tuple[str, ...], gap_s: float, defects: Counter[str]) -> None:
+    def __init__(self, cameras: tuple[str, ...], gap_s: float, defects: Counter[str], *, nobody: bool = False) -> None:
+        """Begin before the first row; with ``nobody`` the tables hold the frames that show nobody, too."""
         self._cameras = cameras
+        self._nobody = nobody
         self._index = {name: i for i, name in enumerate(cameras)}
         self._gap_ns = round(gap_s * 1e9)
         self._defects = defects
@@ -277,6 +279,8 @@ class Cleaner:
     def add(self, row: RawSkeleton, arrival_ns: int) -> CameraFrames | None:
         """Takes a row; returns the table that is complete before it, if there is one."""
         self.note_arrival(row.camera, arrival_ns)
+        if row.body == NOBODY:
+            return self._add_nobody(row, arrival_ns) if self._nobody else None
         self._defects["frames_header_stamp_zero"] += row.stamp_zero
         capture_ns = self._captured(row, arrival_ns)
         newest_ns = self._newest.get((row.camera, row.body))
@@ -299,8 +303,20 @@ class Cleaner:
         self.seen[row.camera] = self.seen.get(row.camera, False) | known
         self.points[row.camera] += int(known.sum())
         self._defects[f"frames_{row.camera}"] += 1
+        return self._deliver(capture_ns, arrival_ns, whole)
+
+    def _add_nobody(self, row: RawSkeleton, arrival_ns: int) -> CameraFrames | None:
+        """Takes a frame that shows nobody; without a stamp it was captured the camera's usual delay ago."""
+        clock, key = self.clocks[row.camera], (row.camera, NOBODY)
+        capture_ns = arrival_ns - clock.usual_ns if row.capture_ns is None else self._captured(row, arrival_ns)
+        if capture_ns <= self._newest.get(key, capture_ns - 1):
+            return None
+        self._newest[key] = capture_ns
+        return self._deliver(capture_ns, arrival_ns, row)
+
+    def _deliver(self, capture_ns: int, arrival_ns: int, row: RawSkeleton) -> CameraFrames | None:
         chunk = self.flush() if self._rows and arrival_ns - self._rows[0][1] >= _CHUNK_NS else None
-        self._rows.append((capture_ns, arrival_ns, whole))
+        self._rows.append((capture_ns, arrival_ns, row))
         return chunk
 
     def _agrees(self, row: RawSkeleton) -> bool:

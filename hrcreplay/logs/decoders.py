@@ -25,10 +25,13 @@ from hrcreplay.logs.messages import (
     Undecodable,
     camera_of,
     missing_body,
+    nobody,
     stamp_ns,
 )
-from hrcreplay.records import POINTS, Floats
+from hrcreplay.records import NOBODY, POINTS, Floats
 from hrcreplay.settings.sections import Decoder
+
+_BODY_BELOW = NOBODY - 1  # a tracker's body with the id of nobody
 
 
 class OwnDecoder:
@@ -55,7 +58,8 @@ def own_row(skeleton: Any, camera: str, topic: str) -> RawSkeleton:
     confidence = np.array(skeleton.confidence, dtype=np.float64)
     if len(confidence) != len(POINTS):
         raise Undecodable(f"{topic}: a skeleton of {len(confidence)} confidences; {len(POINTS)} are right")
-    return RawSkeleton(skeleton.capture_ns, camera, skeleton.body, points_of(skeleton.points, topic), confidence)
+    body = _BODY_BELOW if skeleton.body == NOBODY and confidence.any() else skeleton.body
+    return RawSkeleton(skeleton.capture_ns, camera, body, points_of(skeleton.points, topic), confidence)
 
 
 def points_of(values: Any, topic: str) -> Floats:
@@ -193,13 +197,14 @@ class GenericDecoder:
         return self
 
     def rows(self, message: Message) -> list[RawSkeleton]:
-        """The one row of a message; none where the array is empty."""
+        """The one row of a message; where the array is empty, that of nobody."""
         content = message.read()
         where = f"{self.how.topic} ({message.topic.type})"
         elements = _array(content, self.how.points, where)
         trust = None if self.how.confidence is None else _array(content, self.how.confidence, where)
+        stamp = None if self.how.stamp is None else stamp_ns(_field(content, self.how.stamp, where), where)
         if not len(elements):
-            return []
+            return [nobody(self.how.camera, stamp or None)]
         points, confidence = missing_body()
         scale = METRES[self.how.unit]
         for name, element in self.how.index.items():
@@ -218,7 +223,6 @@ class GenericDecoder:
                     f"{where}: found a confidence of {confidence[i]:g} in {self.how.confidence!r}; would be right: 0 "
                     'to 1, so leave it out (confidence = "none")'
                 )
-        stamp = None if self.how.stamp is None else stamp_ns(_field(content, self.how.stamp, where), where)
         return [RawSkeleton(stamp or None, self.how.camera, 0, points, confidence, stamp_zero=stamp == 0)]
 
 

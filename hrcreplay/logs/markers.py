@@ -25,6 +25,7 @@ from hrcreplay.logs.messages import (
     Undecodable,
     camera_of,
     missing_body,
+    nobody,
     stamp_ns,
 )
 from hrcreplay.logs.plausibility import bone_ratio, looks_like_person
@@ -264,9 +265,12 @@ class MarkerDecoder:
         return self
 
     def rows(self, message: Message) -> list[RawSkeleton]:
-        """A row a body; none for an empty or a clearing array."""
+        """A row a body; that of nobody for an array that shows nothing, where it can only be the one camera's."""
         try:
-            bodies = sorted(_by_body(self._layout, message.read().markers).items())
+            markers = message.read().markers
+            if self.shows_camera_alive and all(marker.action in _GONE for marker in markers):
+                return [nobody(self.cameras[0])]
+            bodies = sorted(_by_body(self._layout, markers).items())
             return [self._row(*body, markers) for body, markers in bodies]
         except LogError as error:
             text = str(error)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from hrcreplay.errors import LogError
-from hrcreplay.records import POINTS, Floats
+from hrcreplay.records import NOBODY, POINTS, Floats
 
 #: How an MCAP file begins and ends.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -207,7 +207,7 @@ METRES: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
 
 
 class RawSkeleton(NamedTuple):
-    """One body in one frame, not yet cleaned."""
+    """One body in one frame, not yet cleaned; NOBODY for a frame without one."""
 
     capture_ns: int | None  #: None: the arrival is the best that is known
     camera: str
@@ -246,6 +246,11 @@ class SkeletonDecoder(Protocol):
 def missing_body() -> tuple[Floats, Floats]:
     """Points and confidence of a body of which nothing is known."""
     return np.full((len(POINTS), 3), np.nan), np.zeros(len(POINTS))
+
+
+def nobody(camera: str, capture_ns: int | None = None) -> RawSkeleton:
+    """A frame that shows nobody."""
+    return RawSkeleton(capture_ns, camera, NOBODY, *missing_body())
 
 
 def stamp_ns(stamp: Any, where: str) -> int:

@@ -25,7 +25,7 @@ from hrcreplay.logs.joints import JointReading, JointTopic, JointTrack
 from hrcreplay.logs.log_files import Header, LogFiles, Truth, open_source
 from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder, MarkerLayout, survey_markers
 from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, topic_list
-from hrcreplay.records import CameraFrames
+from hrcreplay.records import NOBODY, CameraFrames
 from hrcreplay.settings.sections import Logs
 
 _OWN = "hrcreplay.Skeleton"
@@ -223,8 +223,15 @@ class Log:
         """All topics of the log."""
         return self._source.topics()
 
-    def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[CameraFrames]:
+    def frames(
+        self, start_ns: int | None = None, end_ns: int | None = None, *, nobody: bool = False
+    ) -> Iterator[CameraFrames]:
         """Frames with start <= arrival < end in order of arrival, in chunks of at most 1 s of arrival time.
+
+        Args:
+            start_ns: First arrival [ns]; None: the log's.
+            end_ns: Arrival that is too late [ns]; None: the log's end.
+            nobody: Whether to give the frames that show nobody, too.
 
         Raises:
             LogError: The log is broken in a way that cannot be worked around.
@@ -233,7 +240,7 @@ class Log:
         self._remarks = list(dict.fromkeys(note for decoder in self._decoders for note in decoder.notes))
         decoders = {decoder.topic: decoder.fresh_copy() for decoder in self._decoders}
         self._refusals, self.points_seen = [], 0
-        cleaner = Cleaner(self.header.cameras, self._options.gap_s, self._reading)
+        cleaner = Cleaner(self.header.cameras, self._options.gap_s, self._reading, nobody=nobody)
         shapes = {camera: plausibility.BodyShape() for camera in self.header.cameras}
         places, order = plausibility.Alternation(), ArrivalOrder()
         for message in self._source.messages(list(decoders), start_ns, end_ns):
@@ -246,9 +253,10 @@ class Log:
             if decoder.shows_camera_alive:
                 cleaner.note_arrival(decoder.cameras[0], message.arrival_ns)
             for row in rows:
-                shapes[row.camera].add(row.points_m, row.confidence)
-                order.add((message.topic.parse, row.camera, row.body), message.arrival_ns, message.position)
-                places.add(row.camera, row.body, message.arrival_ns, row.points_m)
+                if row.body != NOBODY:
+                    shapes[row.camera].add(row.points_m, row.confidence)
+                    order.add((message.topic.parse, row.camera, row.body), message.arrival_ns, message.position)
+                    places.add(row.camera, row.body, message.arrival_ns, row.points_m)
                 chunk = cleaner.add(row, message.arrival_ns)
                 if chunk is not None:
                     yield chunk

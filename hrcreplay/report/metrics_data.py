@@ -49,7 +49,9 @@ def add_quality(metrics: MetricTable, run: Run, gap_s: float) -> None:
     add_agreement(metrics, run.agreement)
     if run.state is not None:
         _add_coverage(metrics, run.state)
-        _add_known(metrics, run.state, run.meta.get("settings", {}).get("fusion", {}).get("fresh_s"))
+        fresh_s = run.meta.get("settings", {}).get("fusion", {}).get("fresh_s")
+        _add_known(metrics, run.state, fresh_s)
+    _add_watched(metrics, run)
     for name, count in run.counts.items():
         metrics.add(f"count_{name}", int(count), "1", f"data quality counter '{name.replace('_', ' ')}'")
 
@@ -194,6 +196,34 @@ def _add_known(metrics: MetricTable, state: pd.DataFrame, fresh_s: float | None)
             f"the same of the {limb_name}: share of all ticks at most {longest} after one that measured it",
             reason=reason,
         )
+
+
+def _add_watched(metrics: MetricTable, run: Run) -> None:
+    """How often the robot went by the cell's word that nobody can be there whom no camera shows."""
+    watched = (run.meta.get("cell") or {}).get("watched")
+    fresh_s = run.meta.get("settings", {}).get("fusion", {}).get("fresh_s")
+    state, share, refuting = run.state, None, None
+    if watched is not None and state is not None and "nobody_s" in state and len(state):
+        unseen = ~(state["frame_age_s"].to_numpy(dtype=float) <= fresh_s)
+        share = float((unseen & (state["nobody_s"].to_numpy(dtype=float) <= fresh_s)).mean())
+        refuting = int(run.counts["watched_frames_refuting"])
+    reason = "the cell names no watched area"
+    metrics.add(
+        "watched_vacant_share",
+        share,
+        "1",
+        "share of all ticks at which no person was known, and all cameras had just shown the watched area without one",
+        reason=reason,
+    )
+    metrics.add(
+        "watched_frames_refuting",
+        refuting,
+        "1",
+        "frames that show somebody further inside the watched area than anybody could have walked since it was vacant",
+        reason=reason,
+    )
+    speed = None if watched is None else watched["speed_m_per_s"]
+    metrics.add("watched_speed_m_per_s", speed, "m/s", "speed at which people are taken to walk in", reason=reason)
 
 
 def add_occupancy(metrics: MetricTable, occupancy: pd.DataFrame | None) -> None:

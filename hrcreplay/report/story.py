@@ -119,6 +119,11 @@ def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
         "its step and the stop after it were clear of all that the person was predicted to reach until that stop had "
         "ended: as long as that person stays within it, no moving link touches them"
     )
+    if metrics["watched_vacant_share"]["value"] is not None:
+        kept += (
+            ", nor anybody else as long as they come over the border of the watched area and no faster than "
+            f"{text_of(metrics['watched_speed_m_per_s'])}"
+        )
     if others := metrics["others_frames"]["value"]:
         kept += f". Of the other bodies in {others:,} frames nothing was predicted".replace(",", NARROW)
     stops = (
@@ -363,9 +368,14 @@ def _fuse(run: Run, metrics: Metrics) -> str:
     outliers = sum(count for name, count in run.counts.items() if name.startswith("outlier_points_"))
     return (
         f"{text_of(metrics['ticks'])} ticks, person known from fresh frames in {percent(metrics['person_known_share'])}"
-        f"{of_limbs}; "
+        f"{of_limbs}; {_vacant(metrics)}"
         f"frames with the person: {frames}; {outliers:,} outlier points"
     )
+
+
+def _vacant(metrics: Metrics) -> str:
+    share = metrics["watched_vacant_share"]
+    return "" if share["value"] is None else f"nobody in the watched area in another {percent(share)}; "
 
 
 def _predict(run: Run, metrics: Metrics) -> str:

@@ -13,7 +13,7 @@ import pandas as pd
 
 from hrcreplay.human.model import LimitSet
 from hrcreplay.logs import camera_checks
-from hrcreplay.records import BODY, JOINTS
+from hrcreplay.records import BODY, BORDER, JOINTS
 from hrcreplay.report.metrics import ANGLES, Metric
 from hrcreplay.robot.model import RobotModel
 
@@ -80,7 +80,8 @@ FUSION = (
 #: (``control_step.REASONS``).
 REASONS = {
     "no human state": (
-        "it was not known where the person is: their newest frame was older than fusion.fresh_s, or none had come yet"
+        "it was not known where people are: the person's newest frame was older than fusion.fresh_s, or none had come "
+        "yet, and no watched area was known to be without people"
     ),
     "no solution": "no motion satisfied all constraints",
     "separation failed": (
@@ -355,12 +356,18 @@ _PART_NAMES = {
     "FOOT_R": "right foot",
     "FOOT_L": "left foot",
     "LEGS": "legs",
+    BORDER: "border of the watched area",
 }
 
 
 def part_name_text(part: str) -> str:
     """A part of a recorded body as a reader calls it."""
     return LIMB_NAMES.get(part) or _PART_NAMES.get(part, part)
+
+
+def neighbour_text(part: str) -> str:
+    """What a link is near to: a part of the person, or the border behind which others may be."""
+    return f"the {part_name_text(part)}" if part == BORDER else f"the person's {part_name_text(part)}"
 
 
 def limb_names_text(limbs: list[str]) -> str:

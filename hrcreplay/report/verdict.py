@@ -156,7 +156,28 @@ def scope(metrics: Metrics) -> tuple[str, ...]:
             f"The programme is the recorded robot's motion; {gaps_s:.2f} s of it were not recorded, and a straight "
             "line that nobody measured stands for them."
         )
-    return (f"{people}.", *programme, f"Not considered: {', '.join((*NOT_CONSIDERED, *unseen_limbs(metrics)))}.")
+    nothing = f"Not considered: {', '.join((*NOT_CONSIDERED, *unseen_limbs(metrics)))}."
+    return (f"{people}.", *_watched(metrics), *programme, nothing)
+
+
+def _watched(metrics: Metrics) -> list[str]:
+    """What rests on the cell's word that its cameras see everybody in an area."""
+    share, refuting = metrics["watched_vacant_share"]["value"], metrics["watched_frames_refuting"]["value"]
+    if share is None:
+        return []
+    words = (
+        "Whoever else comes in is taken to walk over the border of the watched area at up to "
+        f"{text_of(metrics['watched_speed_m_per_s'])}, as the cell says that its cameras see everybody within; nothing "
+        f"but that word stood for people at {percent(metrics['watched_vacant_share'])} of the ticks, when no camera "
+        "showed anybody there"
+    )
+    if refuting:
+        frames = f"{refuting:,} frame{'' if refuting == 1 else 's'}".replace(",", "\u202f")
+        words += (
+            f". The recording contradicts it: {frames} show somebody further inside than anybody could have walked "
+            "since all cameras showed the area without people"
+        )
+    return [f"{words}."]
 
 
 def unseen_limbs(metrics: Metrics) -> list[str]:

@@ -77,6 +77,7 @@ class RobotModel:
     T_world_base: Floats  #: (4, 4)
     shoulder_m: Floats  #: (3,) origin of the first axis, world [m]
     reach_m: float  #: no pose of the TCP is further from there [m]
+    span_m: float  #: no point of a segment's axis is ever further from the base's origin [m]
     base_frame: str  #: link that stands on ``T_world_base``
     tcp_frame: str  #: link that carries the tool
     locked: tuple[str, ...]  #: joints off the chain, held at zero or the end of their range next to it
@@ -284,6 +285,7 @@ def from_urdf(
         T_world_base=np.array(T_world_base, dtype=float),
         shoulder_m=np.array(model.jointPlacements[1].translation),
         reach_m=_reach_m(model, tcp),
+        span_m=_span_m(model, points, T_world_base),
         base_frame=robot.base,
         tcp_frame=robot.tcp,
         locked=robot.locked,
@@ -386,6 +388,19 @@ def _reach_m(model: Any, tcp: int) -> float:
     """The arm stretched: the offsets from the second joint to the TCP one after another [m]."""
     links = (*model.jointPlacements[2:], model.frames[tcp].placement)
     return sum(norm_n(link.translation) for link in links)
+
+
+def _span_m(model: Any, points: Sequence[int], T_world_base: Floats) -> float:
+    """The arm stretched from the base to the furthest end of a segment: the offsets one after another [m]."""
+    most = 0.0
+    for point in points:
+        frame = model.frames[point]
+        joint, far, offset = frame.parentJoint, 0.0, frame.placement.translation
+        while joint > 0:
+            far, offset = far + norm_n(offset), model.jointPlacements[joint].translation
+            joint = model.parents[joint]
+        most = max(most, far + norm_n(offset - T_world_base[:3, 3]))
+    return most
 
 
 def _axis_reach_m(model: Any, points: Sequence[int]) -> Floats:

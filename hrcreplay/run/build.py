@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Protocol
 
 import numpy as np
@@ -17,18 +17,20 @@ from scipy.spatial.transform import Rotation
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.fusion import inverse_kinematics
+from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
-from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.records import BORDER, NOBODY, CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.path import programmed, recorded, recorded_remarks
 from hrcreplay.robot.task import Reference, Task, parse_task
-from hrcreplay.run.followers import FOLLOWERS, Follower, Planner
+from hrcreplay.run.followers import FOLLOWERS, Follower, Planner, Predict
 from hrcreplay.run.job import Job, UrdfFiles, link_capsules
 from hrcreplay.settings.sections import Fusion, Occupancy, Robot
 
@@ -43,6 +45,7 @@ class FusionStage:
     limits: LimitSet
     person_jump_m: float
     person_memory_s: float
+    watched: WatchedArea | None = None  #: where nobody can be whom no camera shows
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
         """Measurements of the person, by the clock of the reference camera; see ``clean.select_person``.
@@ -56,13 +59,15 @@ class FusionStage:
     def measure_all(
         self, frames: CameraFrames, memory: PersonMemory
     ) -> tuple[PersonMemory, Measurements, CameraFrames, Counter[str]]:
-        """The same, and the frames of all other bodies, their points in the world [m]."""
+        """The same, and the frames of all other bodies, their points in the world [m]; those that show nobody, too."""
         frames = self.on_one_clock(frames)
         late = np.asarray(frames.arrival_ns - frames.capture_ns > self.filter.fresh_s * 1e9)
-        counts = Counter(f"frames_late_{frames.cameras[camera]}" for camera in frames.camera[late])
-        frames = frames.rows(~late)
-        memory, mine, found = select_person(
-            frames, memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
+        bodies = frames.body != NOBODY
+        counts = Counter(f"frames_late_{frames.cameras[camera]}" for camera in frames.camera[late & bodies])
+        frames, bodies = frames.rows(~late), bodies[~late]
+        mine = np.zeros(len(frames), dtype=np.bool_)
+        memory, mine[bodies], found = select_person(
+            frames.rows(bodies), memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
         )
         others = frames.rows(~mine)
         T = self.T_world_camera[others.camera]
@@ -125,23 +130,76 @@ class PredictionStage:
         return swept_volumes.predict(states, self.limits, self.occupancy, horizon_s=horizon_s, memory_s=self.memory_s)
 
 
+@dataclass(frozen=True)
+class WatchedBorder:
+    """The border of a watched area around the robot, and how fast it comes in."""
+
+    area: WatchedArea
+    border: Border
+    latency_s: float  #: from the newest capture to the robot's reaction [s]
+
+    def depth_m(self, since_s: float, horizon_s: float) -> float:
+        """How far in somebody can be within ``horizon_s`` who was outside ``since_s`` [s] ago [m]."""
+        return float(self.area.reached_m(since_s + horizon_s + self.latency_s))
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a robot must keep clear of: the person's volumes, and the border behind which others may be.
+
+    A person whose newest frame is too old is not known. Where nobody can be in the watched area, nobody needs to be.
+    """
+
+    prediction: PredictionStage
+    fresh_s: float  #: a person whose newest frame was captured longer ago is not known [s]
+    watched: WatchedBorder | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What there can be: the limbs that have volumes, then the sides of the border."""
+        sides = 0 if self.watched is None else len(self.watched.border.normals)
+        return (*self.prediction.limbs, *(BORDER,) * sides)
+
+    def obstacles(self, states: HumanStates, tick: int, person: Obstacles) -> Obstacles:
+        """The volumes of a tick and the border, as far as they are known.
+
+        Args:
+            states: The fused person.
+            tick: Row of ``states``.
+            person: Volumes of that tick.
+        """
+        fresh = bool(states.frame_age_s[tick] <= self.fresh_s)
+        if self.watched is None or states.nobody_s is None or states.nobody_else_s is None:
+            return person if fresh else replace(person, known=False)
+        since_s = float((states.nobody_else_s if fresh else states.nobody_s)[tick])
+        depth_m = self.watched.depth_m(since_s, person.horizon_s)
+        return self.watched.border.obstacles(depth_m, person.horizon_s, person if fresh else len(person.radius_m))
+
+
 @dataclass
 class Forecast:
-    """The volumes of a batch of ticks at any horizon."""
+    """What is around the robot in a batch of ticks, at any horizon."""
 
-    stage: PredictionStage
+    around: Surroundings
     states: HumanStates
 
     @cached_property
     def full(self) -> SweptVolumes:
-        """Those of all ticks that hold for the braking time T_s."""
-        return self.stage.volumes(self.states)
+        """The volumes of all ticks that hold for the braking time T_s."""
+        return self.around.prediction.volumes(self.states)
 
     def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
         """Those of one tick that hold for ``horizon_s`` [s]."""
-        if horizon_s == self.stage.horizon_s:
-            return obstacles(self.full, tick, horizon_s)
-        return obstacles(self.stage.volumes(self.states.rows(slice(tick, tick + 1)), horizon_s), 0, horizon_s)
+        stage, states = self.around.prediction, self.states
+        if horizon_s == stage.horizon_s:
+            person = obstacles(self.full, tick, horizon_s)
+        else:
+            person = obstacles(stage.volumes(states.rows(slice(tick, tick + 1)), horizon_s), 0, horizon_s)
+        return self.around.obstacles(states, tick, person)
+
+    def predict(self, tick: int) -> Predict:
+        """The same of one tick as a function of the horizon."""
+        return partial(self.obstacles, tick)
 
 
 class LogLike(Protocol):
@@ -187,7 +245,16 @@ def fusion_stage(job: Job, log: LogLike) -> FusionStage:
         limits=job.tracking,
         person_jump_m=logs.person_jump_m,
         person_memory_s=logs.person_memory_s,
+        watched=watched_area(job),
     )
+
+
+def watched_area(job: Job) -> WatchedArea | None:
+    """What the cameras of a job see together, where its cell says so."""
+    given = None if job.cell is None else job.cell.watched
+    if given is None:
+        return None
+    return WatchedArea(given.polygon, given.margin_m, given.clear_s, job.settings.fusion.fresh_s, given.speed_m_per_s)
 
 
 def prediction_stage(job: Job) -> PredictionStage:
@@ -196,6 +263,15 @@ def prediction_stage(job: Job) -> PredictionStage:
     if job.command == "live":
         occupancy = occupancy.model_copy(update={"latency_s": occupancy.latency_s + job.settings.live.reaction_s})
     return PredictionStage(job.prediction, occupancy, job.settings.fusion.memory_s)
+
+
+def surroundings(job: Job, model: RobotModel) -> Surroundings:
+    """What a job's robot keeps clear of."""
+    stage, area = prediction_stage(job), watched_area(job)
+    border = None
+    if area is not None:
+        border = WatchedBorder(area, Border.around(model, area.polygon), stage.occupancy.latency_s)
+    return Surroundings(stage, job.settings.fusion.fresh_s, border)
 
 
 def known_robot_base(job: Job, log: LogLike) -> Floats | None:
@@ -303,7 +379,7 @@ def planners(job: Job, log: LogLike, start_ns: int) -> dict[str, Planner]:
 
     def planner(name: str) -> Planner:
         follower = make_follower(name, model, path, plan_settings(job, dt_s, name), s_s)
-        return Planner(follower, chosen=name == plan.method, fresh_s=job.settings.fusion.fresh_s)
+        return Planner(follower, chosen=name == plan.method)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
 

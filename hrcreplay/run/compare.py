@@ -369,21 +369,22 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
         progress: Called with the ticks of each batch done; or None.
     """
     began_s, job, slug = time.perf_counter(), task.job, task.variant.slug
-    stage, states, writer = build.prediction_stage(job), task.folder / "state.parquet", _TablesOf(task.folder)
     robot = build.robot(job, task.programme.T_world_base)
+    states, writer = task.folder / "state.parquet", _TablesOf(task.folder)
+    surroundings = build.surroundings(job, robot)
     done, planner = 0, None if task.ready else _planner(task, robot)
     for batch in read_states(states, task.size):
         if planner is not None:
-            forecast = Forecast(stage, batch)
-            around = [partial(forecast.obstacles, tick) for tick in range(len(batch))]
-            made = planner.follow(batch, around, stage.limbs)
+            forecast = Forecast(surroundings, batch)
+            around = [forecast.predict(tick) for tick in range(len(batch))]
+            made = planner.follow(batch.t_ns, around, surroundings.names)
             writer.table(f"motion_{slug}", motion_columns(made))
         done += len(batch)
         if progress is not None:
             progress(len(batch))
     writer.close_tables()
     motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
-    predicted = Predicted(stage, states)
+    predicted = Predicted(surroundings.prediction, states)
     own = own_coverage(job, task.people, predicted, motion)
     full = None if task.variant.method == "none" else task.full
     rows = contact_table(job, robot, task.variant.method, motion, task.people, predicted, own, full)
@@ -398,7 +399,7 @@ def _planner(task: VariantTask, robot: RobotModel) -> Planner:
     settings = build.plan_settings(job, 1.0 / job.settings.fusion.rate_hz, task.variant.method)
     path = replace(programme.path, model=robot)
     follower = build.make_follower(task.variant.method, robot, path, settings, programme.start_s)
-    return Planner(follower, chosen=True, fresh_s=job.settings.fusion.fresh_s)
+    return Planner(follower, chosen=True)
 
 
 class _TablesOf(RunWriter):

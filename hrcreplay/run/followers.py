@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from hrcreplay.geometry.vectors import norm_n
-from hrcreplay.records import Bools, Floats, HumanStates, Motion
+from hrcreplay.records import Floats, Ints, Motion
 from hrcreplay.robot.control import control_step, path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
 from hrcreplay.robot.control.control_step import (
@@ -207,26 +206,24 @@ FOLLOWERS: dict[str, type[Follower]] = {
 
 @dataclass
 class Planner:
-    """One method beside the people of each tick; brakes while what is known of them is too old."""
+    """One method beside the people of each tick."""
 
     follower: Follower
     chosen: bool  #: the run's method, not a baseline
-    fresh_s: float  #: a person whose newest frame was captured longer ago is not known [s]
 
     @property
     def dt_s(self) -> float:
         """The time between two ticks [s]."""
         return self.follower.settings.dt_s
 
-    def follow(self, states: HumanStates, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
-        """The motion of a batch of ticks, beside the volumes that are predicted for each."""
+    def follow(self, t_ns: Ints, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
+        """The motion of a batch of ticks, beside what is predicted for each; ``limbs`` names all that can be there."""
         robot = self.follower.robot
-        known = fresh(states, self.fresh_s)
-        rows = [self.follower.step(around[i] if known[i] else partial(unknown, around[i])) for i in range(len(states))]
+        rows = [self.follower.step(predict) for predict in around]
         found, points, steps = ([getattr(row, name) for row in rows] for name in ("state", "point", "step"))
         poses = [step.pose for step in steps]
         return Motion(
-            t_ns=states.t_ns,
+            t_ns=t_ns,
             q=np.array([state.q for state in found]),
             dq=np.array([state.dq for state in found]),
             u=np.array([step.u for step in steps]),
@@ -248,13 +245,3 @@ class Planner:
             links=tuple(segment.name for segment in robot.segments),
             reasons=control_step.REASONS,
         )
-
-
-def fresh(states: HumanStates, fresh_s: float) -> Bools:
-    """(n,) ticks at which the person is known: their newest frame was captured at most ``fresh_s`` [s] before."""
-    return np.asarray(states.frame_age_s <= fresh_s)
-
-
-def unknown(predict: Predict, horizon_s: float) -> Obstacles:
-    """Volumes that may not be relied on."""
-    return replace(predict(horizon_s), known=False)

@@ -133,10 +133,10 @@ def run_stages(
     flow: Iterable[Any] = states
     if "plan" in todo:
         chosen = build.planners(job, log, int(ticks_ns[0]))
-        path = next(iter(chosen.values())).follower.reference
+        robot, path = (getattr(next(iter(chosen.values())).follower, name) for name in ("robot", "reference"))
         sink.notes["plan"].extend(build.programme_notes(job, log, path))
         every = store_every(job) if "predict" in todo else math.inf
-        flow = stages.planned(states, build.prediction_stage(job), chosen, every, sink)
+        flow = stages.planned(states, build.surroundings(job, robot), chosen, every, sink)
     elif "predict" in todo:
         flow = stages.predicted(states, build.prediction_stage(job), store_every(job), sink)
     if todo:
@@ -254,7 +254,7 @@ def demo_log() -> Path:
 
 
 #: What the fused person depends on, and the volumes; each stage works on what those before it hand on.
-_PERSON = ("versions", "log", "ticks", "cameras", "settings logs", "settings fusion", "limits.tracking")
+_PERSON = ("versions", "log", "ticks", "cameras", "watched", "settings logs", "settings fusion", "limits.tracking")
 _VOLUMES = (*_PERSON, "settings occupancy", "limits.prediction")
 _PROGRAMME = ("base", "programme", "settings robot", "settings plan")
 _JOINT_SETTINGS = tuple(key for key in Logs.model_fields if key.startswith("joint"))
@@ -298,6 +298,7 @@ def dependencies(job: Job, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
         "log": job.log_sha256,
         "ticks": [int(ticks_ns[0]), int(ticks_ns[-1]), len(ticks_ns)],
         "cameras": [log.header.cameras, fusion_stage.T_world_camera.tolist(), fusion_stage.clock_offset_ns.tolist()],
+        "watched": None if job.cell is None or job.cell.watched is None else job.cell.watched.model_dump(),
         "settings logs": _without(settings["logs"], *_JOINT_SETTINGS, "gap_s"),
         "logs.gap_s": settings["logs"]["gap_s"],
         "settings fusion": settings["fusion"],

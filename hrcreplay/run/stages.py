@@ -10,7 +10,6 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from types import TracebackType
 from typing import Self
 
@@ -21,13 +20,13 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from hrcreplay.calibration.clock_check import ClockCheck
 from hrcreplay.errors import LogError
 from hrcreplay.geometry import convex_hull
-from hrcreplay.human.fusion import fuse, inverse_kinematics
+from hrcreplay.human.fusion import fuse, inverse_kinematics, vacancy
 from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Measurements, SkeletonTrack, SweptVolumes
-from hrcreplay.run.build import Forecast, FusionStage, PredictionStage
+from hrcreplay.records import NOBODY, CameraFrames, Floats, HumanStates, Ints, Measurements, SkeletonTrack, SweptVolumes
+from hrcreplay.run.build import Forecast, FusionStage, PredictionStage, Surroundings
 from hrcreplay.run.followers import Planner
 from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.columns import (
@@ -116,19 +115,19 @@ def fused(
     Raises:
         LogError: At the end: what the log shows is certainly no person, or nobody was ever seen.
     """
-    state = fuse.start(log.header.cameras)
-    memory = PersonMemory()
-    frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
+    state, seen_area = fuse.start(log.header.cameras), vacancy.start(len(log.header.cameras))
+    memory, area = PersonMemory(), fusion_stage.watched
+    frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1, nobody=area is not None)
     smoother = StretchSmoother(fusion_stage.filter)
     checks = CameraChecks(log.header.cameras)
     clocks = ClockCheck(log.header.cameras, fusion_stage.T_world_camera, int(ticks_ns[0]), int(ticks_ns[-1]))
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
-        measured = no_frames(log.header.cameras)
+        measured, others = no_frames(log.header.cameras), no_bodies(log.header.cameras)
         if seen is not None:
             with sink.watch.stage("angles", len(ticks)):
-                memory, measured, found = fusion_stage.measure(seen, memory)
-            clocks.add(fusion_stage.on_one_clock(seen))
+                memory, measured, others, found = fusion_stage.measure_all(seen, memory)
+            clocks.add(fusion_stage.on_one_clock(seen.rows(seen.body != NOBODY)))
             sink.counts.update(found)
             sink.run.table("measurements", measurement_columns(measured))
             track = SkeletonTrack(measured.capture_ns, measured.points_m, measured.confidence)
@@ -140,8 +139,11 @@ def fused(
         if smooth:
             for part in smoother.add(states, trace):
                 sink.run.table("smooth", state_columns(part))
+        if area is not None:
+            seen_area, states, refuted = vacancy.watch(seen_area, states, measured, others, area)
+            sink.counts.update(refuted)
         sink.counts.update(events)
-        ever = ever or bool(states.valid.any())
+        ever = ever or bool(states.valid.any()) or max(seen_area.vacant_ns) >= 0
         sink.run.table("state", state_columns(states))
         sink.progress("fuse", len(ticks))
         yield states
@@ -152,14 +154,40 @@ def fused(
         sink.notes["fuse"].extend(clocks.remarks())
     sink.notes["fuse"].extend(_late(log, sink.counts, fusion_stage.clock_offset_ns))
     write_checks(checks, sink)
-    if others := sink.counts["person_frames_beside_others"]:
-        sink.notes["fuse"].append(
-            f"{others} frames show at least one other body than the person: it counts for contact, but nothing is "
-            "predicted of it and the robot does not heed it"
-        )
+    sink.notes["fuse"].extend(_about_area(log, seen_area, sink.counts) if area is not None else ())
+    sink.notes["fuse"].extend(_about_others(sink.counts))
     if smooth:
         for part in smoother.finish():
             sink.run.table("smooth", state_columns(part))
+
+
+def _about_others(counts: Counter[str]) -> Iterator[str]:
+    """A note on bodies that are not the person."""
+    if others := counts["person_frames_beside_others"]:
+        yield (
+            f"{others} frames show at least one other body than the person: it counts for contact, but nothing is "
+            "predicted of it and the robot does not heed it"
+        )
+
+
+def _about_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -> Iterator[str]:
+    """Notes on a watched area: what was never known of it, and what contradicts it."""
+    if refuting := counts["watched_frames_refuting"]:
+        yield (
+            f"watched area: {refuting} frames show somebody further inside than anybody could have walked since all "
+            "cameras showed it without people: they do not see all of it, or people came faster; would be right: a "
+            "smaller area, or a larger watched.margin_m, in the cell file"
+        )
+    if max(seen.vacant_ns) >= 0:
+        return
+    silent = [camera for camera, newest_ns in zip(log.header.cameras, seen.newest_ns, strict=True) if newest_ns < 0]
+    if silent:
+        yield f"watched area: never known to be without people, as no frame came from {', '.join(silent)}"
+    else:
+        yield (
+            "watched area: never known to be without people: not all cameras showed it so for watched.clear_s without "
+            "a gap; trackers whose messages only name people (tf) cannot show that nobody is there"
+        )
 
 
 def write_checks(checks: CameraChecks, sink: Sink) -> None:
@@ -240,6 +268,12 @@ def _late(log: Log, counts: Counter[str], offsets_ns: Ints) -> Iterator[str]:
                 f"camera {camera}: {late} of {log.defects[f'frames_{camera}']} rows came more than fusion.fresh_s "
                 f"after their capture and are not used; {delay_text(log.clocks[camera], offset_ns / 1e9)}"
             )
+
+
+def no_bodies(cameras: tuple[str, ...]) -> CameraFrames:
+    """An empty table of frames."""
+    nothing = np.zeros(0, np.int64)
+    return CameraFrames(nothing, nothing, nothing, nothing, np.zeros((0, 20, 3)), np.zeros((0, 20)), cameras)
 
 
 def no_frames(cameras: tuple[str, ...]) -> Measurements:
@@ -336,7 +370,7 @@ def predicted(
 
 def planned(
     states: Iterable[HumanStates],
-    prediction_stage: PredictionStage,
+    surroundings: Surroundings,
     planners: dict[str, Planner],
     store_every: float,
     sink: Sink,
@@ -347,26 +381,26 @@ def planned(
 
     Args:
         states: Batches of the fused person.
-        prediction_stage: Settings of stage 2.
+        surroundings: What is predicted around the robot.
         planners: Method -> its robot; the chosen one is first.
         store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole; inf: none are.
         sink: Where rows and times go.
     """
-    done, limbs = 0, prediction_stage.limbs
+    done = 0
     for batch in states:
-        forecast = Forecast(prediction_stage, batch)
+        forecast = Forecast(surroundings, batch)
         with sink.watch.stage("predict", len(batch)):
-            around = [partial(forecast.obstacles, tick) for tick in range(len(batch))]
+            around = [forecast.predict(tick) for tick in range(len(batch))]
         for name, planner in planners.items():
             with sink.watch.stage(f"plan {name}", len(batch)):
-                motion = planner.follow(batch, around, limbs)
+                motion = planner.follow(batch.t_ns, around, surroundings.names)
             sink.run.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
             if planner.chosen:
                 stored = stored_ticks(done, len(batch), store_every)
                 with sink.watch.stage("hulls", len(stored)):
                     for tick in stored.tolist():
                         row = slice(tick, tick + 1)
-                        volumes = prediction_stage.volumes(batch.rows(row), float(motion.horizon_s[tick]))
+                        volumes = surroundings.prediction.volumes(batch.rows(row), float(motion.horizon_s[tick]))
                         store_volumes(volumes, np.zeros(1, np.int64), motion.horizon_s[row], sink.run)
         done += len(batch)
         sink.progress("plan", len(batch))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,13 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import LIMBS, STATUSES, Floats, HumanStates, Ints
 from hrcreplay.report.metrics import true_runs
 from hrcreplay.report.metrics_plan import stationary
-from hrcreplay.report.tables import PageTable, part_name_text, reason_text
+from hrcreplay.report.tables import PageTable, neighbour_text, reason_text
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import NO_PLANES
 from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, stands, straight
 from hrcreplay.run import build
 from hrcreplay.run.build import Forecast
-from hrcreplay.run.followers import Follower, Predict, QpFollower, fresh, unknown
+from hrcreplay.run.followers import Follower, Predict, QpFollower
 from hrcreplay.run.holding import Moment, asked, refused
 from hrcreplay.run.job import Job, resolve
 from hrcreplay.store.columns import read_states
@@ -62,17 +62,19 @@ class Record:
         self.job = replace(self.job, settings=self.job.settings.model_copy(update={"plan": plan}))
 
     @cached_property
+    def surroundings(self) -> build.Surroundings:
+        """What the robot keeps clear of."""
+        return build.surroundings(self.job, self.follower.robot)
+
+    @cached_property
     def follower(self) -> Follower:
         """The method's robot, at the start of its programme."""
         (planner,) = build.planners(self.job, self.log, int(self.states.t_ns[0])).values()
         return planner.follower
 
     def predict(self, tick: int) -> Predict:
-        """The volumes of a tick, known where the newest frame of the person was fresh."""
-        stage = build.prediction_stage(self.job)
-        states = self.states.rows(slice(tick, tick + 1))
-        around = partial(Forecast(stage, states).obstacles, 0)
-        return around if fresh(states, self.job.settings.fusion.fresh_s)[0] else partial(unknown, around)
+        """What is around the robot at a tick."""
+        return Forecast(self.surroundings, self.states.rows(slice(tick, tick + 1))).predict(0)
 
     def again(self, tick: int) -> Moment | None:
         """The tick made again; None where no attempt gives the recorded step to the last bit."""
@@ -197,7 +199,8 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
     if moment is None:
         return None
     robot, settings, row = record.follower.robot, record.follower.settings, record.motion.iloc[tick]
-    links, limbs = [segment.name for segment in robot.segments], build.prediction_stage(record.job).limbs
+    links, all_names = [segment.name for segment in robot.segments], record.surroundings.names
+    limbs = all_names[moment.seen.around.first :]  # of the hulls of this tick
     found: dict[str, Any] = {
         "at_s": float(row["t_ns"] - record.motion["t_ns"].iloc[0]) * 1e-9,
         "tick": tick,
@@ -211,9 +214,17 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
     }
     sight = moment.seen.sight
     if sight.limb >= 0:
-        found["nearest"] = {"link": links[sight.link], "limb": limbs[sight.limb]}
+        found["nearest"] = {"link": links[sight.link], "limb": all_names[sight.limb]}
         found["nearest"] |= {"distance_m": sight.distance_m, "overlap_m": sight.overlap_m}
-        found["unseen_s"] = _unseen(record, tick, limbs[sight.limb])
+        found["unseen_s"] = _unseen(record, tick, all_names[sight.limb])
+    if record.states.nobody_s is not None:
+        found["watched"] = {
+            name: float(since[tick]) if since is not None and np.isfinite(since[tick]) else None
+            for name, since in (
+                ("nobody_s", record.states.nobody_s),
+                ("nobody_else_s", record.states.nobody_else_s),
+            )
+        }
     if record.method == "none" or stands(sight, settings):
         return found
     wanted, more = asked(record.follower, moment)
@@ -299,6 +310,8 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         lines.append(f"The {stop} stop proposed, {1e3 * one['stop_s']:.0f} ms long: {_failure(one)}.")
     if found.get("unseen_s") is not None:
         lines.append(f"That limb was last seen {1e3 * found['unseen_s']:.0f} ms before.")
+    if "watched" in found:
+        lines += [_watched_text(found["watched"])]
     for camera, ages in found["cameras"].items():
         used, newest = ages["used_s_ago"], ages["newest_frame_s_ago"]
         words = "not used yet" if used is None else f"last used {1e3 * used:.0f} ms before"
@@ -306,6 +319,15 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
             f"Camera {camera}: {words}" + (f", its newest frame {1e3 * newest:.0f} ms old." if newest else ".")
         )
     return lines
+
+
+def _watched_text(since_s: Mapping[str, float | None]) -> str:
+    """Since when the watched area was without people."""
+    parts = [
+        f"{whom} {'never' if since is None else f'{1e3 * since:.0f} ms before'}"
+        for whom, since in (("anybody", since_s["nobody_s"]), ("anybody but the person", since_s["nobody_else_s"]))
+    ]
+    return f"The watched area was last known to be without {' and without '.join(parts)}."
 
 
 def _state(found: Mapping[str, Any]) -> str:
@@ -339,7 +361,7 @@ def _weighted(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def _pair(of: Mapping[str, Any]) -> str:
-    return f"{of['link']} and the person's {part_name_text(of['limb'])}"
+    return f"{of['link']} and {neighbour_text(of['limb'])}"
 
 
 def _row(row: Mapping[str, Any]) -> str:

@@ -55,6 +55,7 @@ _STATE = (("p", ""), ("v", "_vel"), ("a", "_acc"), ("j", "_jerk"), ("p_std", "_s
 _RESIDUAL = tuple(f"residual_{limb}" for limb in BODY)
 _UNSEEN = tuple(f"unseen_{limb}" for limb in BODY)
 _FRAME_AGE = "frame_age_s"
+_NOBODY = ("nobody_s", "nobody_else_s")
 _SHOWN = tuple(f"point_{point}_{axis}" for point in POINTS for axis in "xyz")
 
 
@@ -67,6 +68,7 @@ def state_columns(states: HumanStates) -> Columns:
     columns |= _spread(states.residual_m, _RESIDUAL) | _spread(states.unseen_s, _UNSEEN)
     columns |= {_FRAME_AGE: states.frame_age_s} | _spread(states.points_m.reshape(len(states), -1), _SHOWN)
     columns |= {_AS_LENGTH: states.p[:, _HEIGHT], f"{_AS_LENGTH}_std": states.p_std[:, _HEIGHT]}
+    columns |= {name: column for name in _NOBODY if (column := getattr(states, name)) is not None}
     return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
 
 
@@ -122,6 +124,8 @@ def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
                 frame_age_s=column[_FRAME_AGE],
                 points_m=_gather(column, _SHOWN).reshape(-1, len(POINTS), 3),
                 cameras=cameras,
+                nobody_s=column.get("nobody_s"),
+                nobody_else_s=column.get("nobody_else_s"),
             )
 
 

@@ -279,8 +279,10 @@ class SessionController:
         if not why and behind_ns > self.setup.bounds.overrun_s * 1e9:
             why = OVERRUN
         if not why:
-            age_s = self.observer.age_s(event.t_ns)
-            why = reason_of_person(self.perception, age_s, self.setup.fresh_s, self.setup.bounds)
+            age_s, fresh_s = self.observer.age_s(event.t_ns), self.setup.fresh_s
+            why = reason_of_person(self.perception, age_s, fresh_s, self.setup.bounds)
+            if why == NO_FRAME and self.observer.vacant_s(self.perception, event.t_ns) <= fresh_s:
+                why = ""  # nobody needs to be known where nobody can be
         if not why and self.setup.sending and self._motion is not None and self.phase != codec.ECHO:
             why = _reason_of_tracking(measured, self._motion.state.q, self.setup.bounds)
         return why
@@ -331,9 +333,7 @@ class SessionController:
         """
         if self.perception is None:
             return _UNSEEN
-        seen = self.observer.age_s(self.perception.t_ns) <= self.setup.fresh_s and not self._late
-        found = self.perception.obstacles if horizon_s else self.observer.present(self.perception.states)
-        return found if seen else replace(found, known=False)
+        return self.observer.around(self.perception, horizon_s, believed=not self._late)
 
 
 def _decoded(data: bytes) -> RobotPacket | None:

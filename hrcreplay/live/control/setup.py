@@ -131,6 +131,7 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         "task": task,
         "sending": sending,
         "limbs": list(predicted.limbs),
+        "neighbours": list(build.surroundings(job, robot).names),
         "method": predicted.method,
         "links": [segment.name for segment in robot.segments],
     }
@@ -147,10 +148,10 @@ def build_controller(start: dict[str, Any]) -> SessionController:
     header = _header(job.log, tuple(start["cameras"]), poses, np.array(start["T_world_base"]), job.task)
     scene = HeaderOnlyLog(header)
     setup = _setup(job, scene, sending=start["sending"])
-    observer = Observer(
-        build.fusion_stage(job, scene), build.prediction_stage(job), header.cameras, job.settings.logs.gap_s
-    )
     robot, live = setup.robot, job.settings.live
+    observer = Observer(
+        build.fusion_stage(job, scene), build.surroundings(job, robot), header.cameras, job.settings.logs.gap_s
+    )
     session = EgmSession(
         robot.q_min,
         robot.q_max,

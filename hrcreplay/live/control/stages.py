@@ -19,13 +19,13 @@ from typing import NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from hrcreplay.human.fusion import fuse
+from hrcreplay.human.fusion import fuse, vacancy
 from hrcreplay.live.record.codec import Perception
 from hrcreplay.logs.clean import Cleaner, PersonMemory
 from hrcreplay.logs.decoders import own_row
 from hrcreplay.logs.messages import Undecodable
 from hrcreplay.logs.skeleton_pb2 import Skeleton
-from hrcreplay.records import CameraFrames, Floats, HumanStates
+from hrcreplay.records import CameraFrames, Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import (
     PlanSettings,
@@ -41,9 +41,9 @@ from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import approach
 from hrcreplay.robot.task import Reference
-from hrcreplay.run.build import FusionStage, PredictionStage
+from hrcreplay.run.build import FusionStage, Surroundings
 from hrcreplay.run.followers import Follower, Predict
-from hrcreplay.run.stages import NS, no_frames
+from hrcreplay.run.stages import NS, no_bodies, no_frames
 from hrcreplay.settings.sections import Live
 
 
@@ -51,16 +51,17 @@ class Observer:
     """Stages 1 and 2, updated with the skeletons that have come since the update before."""
 
     def __init__(
-        self, fusion_stage: FusionStage, prediction_stage: PredictionStage, cameras: tuple[str, ...], gap_s: float
+        self, fusion_stage: FusionStage, surroundings: Surroundings, cameras: tuple[str, ...], gap_s: float
     ) -> None:
         self._fusion_stage = fusion_stage
-        self._prediction_stage = prediction_stage
+        self._surroundings = surroundings
+        self._area = vacancy.start(len(cameras))
         self._cameras = cameras
-        self._nothing = no_frames(cameras)
+        self._nothing, self._no_bodies = no_frames(cameras), no_bodies(cameras)
         self._fusion = fuse.start(cameras)
         self._memory = PersonMemory()
         self.counts: Counter[str] = Counter()
-        self._cleaner = Cleaner(cameras, gap_s, self.counts)
+        self._cleaner = Cleaner(cameras, gap_s, self.counts, nobody=fusion_stage.watched is not None)
         self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
         self._look_ns, self._frame_age_s = 0, float("inf")  # of the last update
 
@@ -73,9 +74,9 @@ class Observer:
             horizon_s: Until when the volumes must hold, the latency aside [s].
         """
         frames = self._frames(t_ns, skeletons)
-        measured = self._nothing
+        measured, others = self._nothing, self._no_bodies
         if frames is not None:
-            self._memory, measured, found = self._fusion_stage.measure(frames, self._memory)
+            self._memory, measured, others, found = self._fusion_stage.measure_all(frames, self._memory)
             self.counts.update(found)
             for camera, capture_ns in zip(measured.camera.tolist(), measured.capture_ns.tolist(), strict=True):
                 self.newest_ns[self._cameras[camera]] = capture_ns
@@ -84,13 +85,34 @@ class Observer:
             self._fusion, ticks, measured, self._fusion_stage.filter, self._fusion_stage.limits
         )
         self.counts.update(events)
+        if self._fusion_stage.watched is not None:
+            self._area, states, refuted = vacancy.watch(
+                self._area, states, measured, others, self._fusion_stage.watched
+            )
+            self.counts.update(refuted)
         self._look_ns, self._frame_age_s = t_ns, float(states.frame_age_s[0])
-        volumes = self._prediction_stage.volumes(states, horizon_s)
+        volumes = self._surroundings.prediction.volumes(states, horizon_s)
         return Perception(t_ns, states, volumes, obstacles(volumes, 0, horizon_s), horizon_s)
 
-    def present(self, states: HumanStates) -> Obstacles:
-        """Where the person may be now, for ``ssm``, which does not look ahead."""
-        return obstacles(self._prediction_stage.volumes(states, 0.0), 0)
+    def around(self, look: Perception, horizon_s: float, *, believed: bool) -> Obstacles:
+        """What the robot keeps clear of, by a look.
+
+        Args:
+            look: The last one.
+            horizon_s: 0 for where people may be now, as ``ssm`` asks; every other horizon is the look's [s].
+            believed: Whether the look is recent enough.
+        """
+        person = look.obstacles
+        if not horizon_s:
+            person = obstacles(self._surroundings.prediction.volumes(look.states, 0.0), 0, 0.0)
+        found = self._surroundings.obstacles(look.states, 0, person)
+        return found if believed else replace(found, known=False)
+
+    def vacant_s(self, look: Perception | None, t_ns: int) -> float:
+        """Since when nobody can be in the watched area, by a look; inf where that is not known [s]."""
+        if look is None or look.states.nobody_s is None:
+            return math.inf
+        return float(look.states.nobody_s[0]) + (t_ns - look.t_ns) / NS
 
     def age_s(self, t_ns: int) -> float:
         """How old the newest frame that entered the filter is; inf before the first [s]."""

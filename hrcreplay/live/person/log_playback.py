@@ -57,7 +57,7 @@ def playback_items(log: Log, *, repeat: bool) -> Iterator[Item]:
     later_ns = 0
     while True:
         captured = dict(newest)
-        for table in log.frames():
+        for table in log.frames(nobody=True):
             frames = [frame for frame in frames_of(table, later_ns) if _rises(frame, newest)]
             for frame in frames:
                 camera = frame.skeleton.camera

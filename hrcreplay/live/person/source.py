@@ -62,7 +62,7 @@ class CameraSubscription:
         self._where = f"live.zenoh.keys.{camera}"
         self._readers: dict[str, tuple[Topic, SkeletonDecoder]] = {}  # of each type
         self._defects: Counter[str] = Counter()
-        self._cleaner = Cleaner((camera,), _GAP_S, self._defects)
+        self._cleaner = Cleaner((camera,), _GAP_S, self._defects, nobody=True)
         self._told: set[str] = set()
         self._unusable: Counter[str] = Counter()
 

@@ -43,6 +43,7 @@ class SessionTables:
     cameras: tuple[str, ...]
     links: tuple[str, ...]
     limbs: tuple[str, ...]  #: that have a swept volume
+    neighbours: tuple[str, ...]  #: what the robot keeps clear of: those, then the sides of a watched area
     method: str  #: of the swept volumes
     counts: Counter[str] = field(default_factory=Counter)
     took_us: list[int] = field(default_factory=list)  #: of every reply
@@ -71,7 +72,7 @@ class SessionTables:
         if self._looks:
             self.run.table("state", state_columns(_states(self._looks, self.cameras, self.run.partial)))
         if self._answers:
-            self.run.table("motion", _motion(self._answers, self.limbs, self.links))
+            self.run.table("motion", _motion(self._answers, self.neighbours, self.links))
         self._looks, self._answers = [], []
 
     def _answered(self, answered: codec.RecordedDecision) -> None:
@@ -106,6 +107,8 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), DOF)
     widths |= dict.fromkeys(("lengths_m", "lengths_std_m"), len(LENGTHS))
     widths |= {"residual_m": len(BODY), "unseen_s": len(BODY), "frame_age_s": 1, "points_m": 3 * len(POINTS)}
+    watched = ("nobody_s", "nobody_else_s") if numbers.shape[1] == sum(widths.values()) + 2 else ()
+    widths |= dict.fromkeys(watched, 1)
     ends = np.cumsum(list(widths.values()))
     if numbers.shape[1] != ends[-1]:
         raise LogError(
@@ -113,7 +116,8 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
             "would be right: the version of hrcreplay that recorded the session"
         )
     parts = dict(zip(widths, np.split(numbers, ends[:-1], axis=1), strict=True))
-    parts["frame_age_s"] = parts["frame_age_s"][:, 0]
+    for name in ("frame_age_s", *watched):
+        parts[name] = parts[name][:, 0]
     parts["points_m"] = parts["points_m"].reshape(len(looks), len(POINTS), 3)
     return HumanStates(
         t_ns=np.array([look.t_ns for look in looks]),
@@ -123,7 +127,7 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
     )
 
 
-def _motion(answers: list[codec.RecordedDecision], limbs: tuple[str, ...], links: tuple[str, ...]) -> Columns:
+def _motion(answers: list[codec.RecordedDecision], neighbours: tuple[str, ...], links: tuple[str, ...]) -> Columns:
     rows = [row for answered in answers if (row := codec.motion_row(answered)) is not None]
     column: dict[str, Floats] = {f.name: np.array([getattr(row, f.name) for row in rows]) for f in fields(MotionRow)}
     reasons = ("", *sorted({answered.reason for answered in answers} - {""}))
@@ -136,7 +140,7 @@ def _motion(answers: list[codec.RecordedDecision], limbs: tuple[str, ...], links
         link=np.array([answered.link for answered in answers]),
         status=np.array([answered.status for answered in answers]),
         reason=np.array([reasons.index(answered.reason) for answered in answers]),
-        limbs=limbs,
+        limbs=neighbours,
         links=links,
         reasons=reasons,
     )
@@ -179,7 +183,8 @@ def finish(partial: Path) -> Path:
     start = log.start()
     job = job_of(start, writer.folder / LOG, run_folder.sha256(partial / LOG))
     cameras, links, limbs = (tuple(start[name]) for name in ("cameras", "links", "limbs"))
-    tables = SessionTables(writer, cameras, links, limbs, start["method"])
+    neighbours = tuple(start.get("neighbours", limbs))  # sessions of earlier versions had no watched area
+    tables = SessionTables(writer, cameras, links, limbs, neighbours, start["method"])
     for message in log.messages():
         tables.add(message)
     tables.flush()

@@ -183,7 +183,7 @@ class StatusPublisher:
             rate_hz=self._rates.get("", 0.0),
             latency_us=None if found is None else Latency(p50=found[0], p99=found[1], p99_9=found[2]),
             distance_m=None if row is None else _known(row.distance_m),
-            limb=None if answer is None or answer.limb < 0 else self._names["limbs"][answer.limb],
+            limb=None if answer is None or answer.limb < 0 else self._names["neighbours"][answer.limb],
             link=None if answer is None or answer.link < 0 else self._names["links"][answer.link],
             tcp_speed=None if row is None else _known(row.tcp_speed),
             status=None if row is None or answer is None or not controller.connected else STATUSES[answer.status],

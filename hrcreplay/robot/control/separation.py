@@ -29,6 +29,7 @@ class Obstacles:
     boxes_m: Floats  #: (l, 2, 3) lowest and highest corner around each limb's vertices [m]
     known: bool  #: False where a limb could not be predicted: whoever plans against it must brake
     horizon_s: float = math.inf  #: until when they hold, from their tick on [s]
+    first: int = 0  #: number of the first of them among all that there can be: the person's limbs, then walls
 
 
 def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> Obstacles:
@@ -43,14 +44,14 @@ def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> 
     offsets = volumes.offsets[tick * limbs : (tick + 1) * limbs + 1]
     vertices, radius = volumes.vertices_m[offsets[0] : offsets[-1]], volumes.radius_m[tick]
     offsets = offsets - offsets[0]
-    boxes, known = _boxes(vertices, offsets, radius)
-    return Obstacles(vertices, offsets, radius, boxes, known, horizon_s)
+    around, known = boxes(vertices, offsets, radius)
+    return Obstacles(vertices, offsets, radius, around, known, horizon_s)
 
 
 @njit(cache=True)
-def _boxes(vertices: Floats, offsets: Ints, radius: Floats) -> tuple[Floats, bool]:
+def boxes(vertices: Floats, offsets: Ints, radius: Floats) -> tuple[Floats, bool]:
     """Boxes around the limbs, and whether every limb has vertices and all numbers are finite."""
-    boxes = np.empty((len(radius), 2, 3))
+    found = np.empty((len(radius), 2, 3))
     known = True
     for i in range(len(radius)):
         known = known and math.isfinite(radius[i]) and offsets[i] < offsets[i + 1]
@@ -59,8 +60,8 @@ def _boxes(vertices: Floats, offsets: Ints, radius: Floats) -> tuple[Floats, boo
             for j in range(offsets[i], offsets[i + 1]):
                 known = known and math.isfinite(vertices[j, k])
                 low, high = min(low, vertices[j, k]), max(high, vertices[j, k])
-            boxes[i, 0, k], boxes[i, 1, k] = low, high
-    return boxes, known
+            found[i, 0, k], found[i, 1, k] = low, high
+    return found, known
 
 
 @dataclass(frozen=True, slots=True)
