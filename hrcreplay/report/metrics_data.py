@@ -206,7 +206,7 @@ def _add_watched(metrics: MetricTable, run: Run) -> None:
     if watched is not None and state is not None and "nobody_s" in state and len(state):
         unseen = ~(state["frame_age_s"].to_numpy(dtype=float) <= fresh_s)
         share = float((unseen & (state["nobody_s"].to_numpy(dtype=float) <= fresh_s)).mean())
-        refuting = int(run.counts["watched_frames_refuting"])
+        refuting = int(run.counts.get("watched_frames_refuting", 0))
     reason = "the cell names no watched area"
     metrics.add(
         "watched_vacant_share",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -91,8 +92,7 @@ def by_search(scene: Scene, at_ns: int, *, but_the_person: bool) -> float:
         until = min(times[-1] for times in captures)
         begin = until - round(AREA.clear_s * 1e9)
         whole = all(
-            times[0] <= begin
-            and all(b - a <= AREA.gap_s * 1e9 for a, b in zip(times, times[1:], strict=False) if b > begin)
+            times[0] <= begin and all(b - a <= AREA.gap_s * 1e9 for a, b in pairwise(times) if b > begin)
             for times in captures
         )
         bad = ("other",) if but_the_person else ("other", "person")
