@@ -64,7 +64,7 @@ class Watched(BaseModel):
     margin_m: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
     """How far inside somebody may be who is not shown yet, as by an arm stretched out: 0.85 m in ISO 13855 [m]."""
     clear_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 2.0
-    """How long all cameras must show nobody there before nobody is believed to be there [s]."""
+    """How long somebody who was lost inside may be there, and all cameras must watch before they know [s]."""
     speed_m_per_s: Annotated[float, Field(gt=0.0, le=100.0)] = 1.6
     """Speed at which people walk in, ISO 13855 [m/s]."""
 

@@ -23,7 +23,7 @@ from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.logs.clean import PersonMemory, select_person
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
-from hrcreplay.records import BORDER, NOBODY, CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.records import BORDER, NOBODY, Bools, CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.separation import Obstacles, obstacles
@@ -53,13 +53,13 @@ class FusionStage:
         A frame that was captured more than ``fresh_s`` before its arrival shows where the person was, not where they
         are: it is left out, and counted as ``frames_late_<camera>``.
         """
-        memory, measured, _, found = self.measure_all(frames, memory)
+        memory, measured, _, _, found = self.measure_all(frames, memory)
         return memory, measured, found
 
     def measure_all(
         self, frames: CameraFrames, memory: PersonMemory
-    ) -> tuple[PersonMemory, Measurements, CameraFrames, Counter[str]]:
-        """The same, and the frames of all other bodies, their points in the world [m]; those that show nobody, too."""
+    ) -> tuple[PersonMemory, Measurements, CameraFrames, Bools, Counter[str]]:
+        """The same, and before the counts all the frames, points in the world [m], and which are the person's."""
         frames = self.on_one_clock(frames)
         late = np.asarray(frames.arrival_ns - frames.capture_ns > self.filter.fresh_s * 1e9)
         bodies = frames.body != NOBODY
@@ -69,11 +69,10 @@ class FusionStage:
         memory, mine[bodies], found = select_person(
             frames.rows(bodies), memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
         )
-        others = frames.rows(~mine)
-        T = self.T_world_camera[others.camera]
-        points_m = np.einsum("nij,npj->npi", T[:, :3, :3], others.points_m) + T[:, None, :3, 3]
         measured = inverse_kinematics.measure(frames.rows(mine), self.T_world_camera, self.filter)
-        return memory, measured, replace(others, points_m=points_m), found + counts
+        T = self.T_world_camera[frames.camera]
+        points_m = np.einsum("nij,npj->npi", T[:, :3, :3], frames.points_m) + T[:, None, :3, 3]
+        return memory, measured, replace(frames, points_m=points_m), mine, found + counts
 
     def on_one_clock(self, frames: CameraFrames) -> CameraFrames:
         """Frames with captures by the clock of the reference camera, none of them after its arrival."""

@@ -182,9 +182,9 @@ def read_people(
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
     for _, due in batches(frames, ticks_ns, _BATCH):
         if due is not None:
-            memory, measured, rest, _ = fusion_stage.measure_all(due, memory)
+            memory, measured, everybody, mine, _ = fusion_stage.measure_all(due, memory)
             seen.append(measured)
-            others.append(rest)
+            others.append(everybody.rows(~mine))
     truth = _truth(log, ticks_ns)
     if truth is not None:
         tracks = _people_off(truth, seen, others, fusion_stage)

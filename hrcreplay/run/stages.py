@@ -25,7 +25,17 @@ from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
-from hrcreplay.records import NOBODY, CameraFrames, Floats, HumanStates, Ints, Measurements, SkeletonTrack, SweptVolumes
+from hrcreplay.records import (
+    NOBODY,
+    Bools,
+    CameraFrames,
+    Floats,
+    HumanStates,
+    Ints,
+    Measurements,
+    SkeletonTrack,
+    SweptVolumes,
+)
 from hrcreplay.run.build import Forecast, FusionStage, PredictionStage, Surroundings
 from hrcreplay.run.followers import Planner
 from hrcreplay.settings.sections import Fusion
@@ -123,10 +133,10 @@ def fused(
     clocks = ClockCheck(log.header.cameras, fusion_stage.T_world_camera, int(ticks_ns[0]), int(ticks_ns[-1]))
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
-        measured, others = no_frames(log.header.cameras), no_bodies(log.header.cameras)
+        measured, (everybody, mine) = no_frames(log.header.cameras), no_bodies(log.header.cameras)
         if seen is not None:
             with sink.watch.stage("angles", len(ticks)):
-                memory, measured, others, found = fusion_stage.measure_all(seen, memory)
+                memory, measured, everybody, mine, found = fusion_stage.measure_all(seen, memory)
             clocks.add(fusion_stage.on_one_clock(seen.rows(seen.body != NOBODY)))
             sink.counts.update(found)
             sink.run.table("measurements", measurement_columns(measured))
@@ -140,7 +150,7 @@ def fused(
             for part in smoother.add(states, trace):
                 sink.run.table("smooth", state_columns(part))
         if area is not None:
-            seen_area, states, refuted = vacancy.watch(seen_area, states, measured, others, area)
+            seen_area, states, refuted = vacancy.watch(seen_area, states, everybody, mine, area)
             sink.counts.update(refuted)
         sink.counts.update(events)
         ever = ever or bool(states.valid.any()) or max(seen_area.vacant_ns) >= 0
@@ -270,10 +280,11 @@ def _late(log: Log, counts: Counter[str], offsets_ns: Ints) -> Iterator[str]:
             )
 
 
-def no_bodies(cameras: tuple[str, ...]) -> CameraFrames:
-    """An empty table of frames."""
+def no_bodies(cameras: tuple[str, ...]) -> tuple[CameraFrames, Bools]:
+    """An empty table of frames, and which of them are the person's."""
     nothing = np.zeros(0, np.int64)
-    return CameraFrames(nothing, nothing, nothing, nothing, np.zeros((0, 20, 3)), np.zeros((0, 20)), cameras)
+    frames = CameraFrames(nothing, nothing, nothing, nothing, np.zeros((0, 20, 3)), np.zeros((0, 20)), cameras)
+    return frames, np.zeros(0, np.bool_)
 
 
 def no_frames(cameras: tuple[str, ...]) -> Measurements:

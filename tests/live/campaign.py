@@ -13,7 +13,6 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 
 from hrcreplay.egm.codec import BadPacket, decode_robot
-from hrcreplay.egm.link import ALARMS
 from hrcreplay.egm.robot_double.faults import KINDS, Fault, random_faults
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.step_gate import StepGate, UnsafeCommandError
@@ -79,7 +78,7 @@ def _motion_after_stops(flight: Flight) -> list[str]:
 def _unanswered(flight: Flight) -> list[str]:
     """Packets that nobody answered although the robot had sent none later; but for those in doubt, after an answer."""
     missed, newest_ns, answered_ns = 0, 0, 0
-    for answer, datagrams in flight.heard:
+    for answer, datagrams, alarmed in flight.heard:
         fresh = False
         for data in datagrams:
             try:
@@ -88,7 +87,7 @@ def _unanswered(flight: Flight) -> list[str]:
                 continue
             if clock_ns > newest_ns:
                 fresh, newest_ns = True, clock_ns
-        doubted = answer.reason in ALARMS and answer.t_ns - answered_ns < PERIOD_NS
+        doubted = alarmed and answer.t_ns - answered_ns < PERIOD_NS
         missed += fresh and answer.datagram is None and not doubted
         answered_ns = answer.t_ns if answer.datagram is not None else answered_ns
     return [f"{missed} packets unanswered"] if missed else []

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.egm.codec import Correction, decode_correction
+from hrcreplay.egm.link import ALARMS
 from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
@@ -20,7 +21,7 @@ from hrcreplay.live.control.setup import build_controller, live_job, start_table
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Decision, MotionRow, Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
-from hrcreplay.records import Floats, HumanStates
+from hrcreplay.records import NOBODY, POINTS, Floats, HumanStates
 from hrcreplay.robot.model import RobotModel
 from tests.egm.rehearsal import rehearse
 
@@ -41,9 +42,9 @@ def far_away(_s: float) -> tuple[float, float]:
 
 
 @cache
-def start(*overrides: str) -> dict[str, Any]:
+def start(*overrides: str, cell: Path | None = None) -> dict[str, Any]:
     """The table of a session in the demo's cell."""
-    job, header = live_job(DEMO, None, overrides, None)
+    job, header = live_job(DEMO, None, overrides, cell)
     return start_table(job, header, sending=True)
 
 
@@ -53,18 +54,23 @@ class Flight:
 
     overrides: tuple[str, ...] = ()
     walk: Walk = far_away
+    cell: Path | None = None  #: cell file; where it says what is watched, frames show that nobody is there
+    silent: Callable[[float], bool] = lambda _s: False  #: whether no camera sends anything
     faults: tuple[Fault, ...] = ()
     seed: int = 0
     twin: TwinSettings = field(default_factory=TwinSettings)
     signals: Callable[[float], Signal] = lambda _s: Signal.NONE
     messages: list[bytes] = field(default_factory=list)  #: what the recorder would get
     answers: list[Decision] = field(default_factory=list)
-    heard: list[tuple[Decision, tuple[bytes, ...]]] = field(default_factory=list)  #: with what they answer
+    heard: list[tuple[Decision, tuple[bytes, ...], bool]] = field(
+        default_factory=list
+    )  #: with what they answer, and whether a packet of it was in doubt
     states: list[HumanStates] = field(default_factory=list)
     frames: list[tuple[int, bytes]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.start = start(*self.overrides)
+        self.start = start(*self.overrides, cell=self.cell)
+        self._watched = "watched" in (self.start["cell"] or {})
         self.controller: SessionController = build_controller(self.start)
         self.core = TwinCore(self.twin, self.faults, self.seed)
         self._framed_ns = BEGIN_NS
@@ -86,9 +92,10 @@ class Flight:
         signals = self.signals((t_ns - BEGIN_NS) * 1e-9)
         if datagrams:
             event = TickEvent(t_ns, tuple(datagrams), signals)
+            alarms = self._alarms()
             answer = self.controller.answer(event)
             self.answers.append(answer)
-            self.heard.append((answer, event.datagrams))
+            self.heard.append((answer, event.datagrams, self._alarms() > alarms))
             self.messages += [codec.encode_robot_packet(t_ns, datagram) for datagram in datagrams]
             self.messages.append(codec.encode_decision(answer, signals, len(datagrams), 0))
             if answer.datagram is not None:
@@ -103,7 +110,11 @@ class Flight:
         seen = []
         while self._framed_ns <= t_ns:
             place = self.walk((self._framed_ns - BEGIN_NS) * 1e-9)
-            if place is not None:
+            if self.silent((self._framed_ns - BEGIN_NS) * 1e-9):
+                pass
+            elif place is None and self._watched:
+                seen += [_nobody(camera, self._framed_ns) for camera in self.start["cameras"]]
+            elif place is not None:
                 seen += [self._skeleton(camera, place, self._framed_ns) for camera in self.start["cameras"]]
             self._framed_ns += FRAME_NS
         perception = self.controller.update_perception(t_ns, seen)
@@ -125,6 +136,11 @@ class Flight:
         data: bytes = message.SerializeToString()
         return data
 
+    def _alarms(self) -> int:
+        """How many packets were in doubt so far, also after the robot was stopped for another reason."""
+        counts = self.controller.counts()
+        return sum(counts[f"robot {alarm}"] for alarm in ALARMS)
+
     def said(self) -> list[Correction]:
         """Every reply."""
         return [decode_correction(answer.datagram) for answer in self.answers if answer.datagram is not None]
@@ -138,6 +154,14 @@ class Flight:
         """(n, 6) positions [rad] and speed references [rad/s] of all replies."""
         said = self.said()
         return np.array([reply.q for reply in said]), np.array([reply.dq for reply in said])
+
+
+def _nobody(camera: str, t_ns: int) -> bytes:
+    """A frame that shows nobody."""
+    points, confidence = [np.nan] * (3 * len(POINTS)), [0.0] * len(POINTS)
+    message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=NOBODY, points=points, confidence=confidence)
+    data: bytes = message.SerializeToString()
+    return data
 
 
 def echoed(one: MotionRow, two: MotionRow) -> bool:

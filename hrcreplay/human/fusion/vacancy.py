@@ -1,8 +1,10 @@
 """Since when nobody can be in an area that the cameras watch.
 
-The area is vacant at an instant when every camera has shown it without a body for long enough, with no gap between its
-frames. From then on nobody can be further inside than they walked since. A body counts wherever a camera shows one of
-its points, whether it is the person that the filter follows or somebody else; a body without any point may be anywhere.
+The area is vacant at an instant to which all cameras have given frames, for long enough and without a gap, when every
+body that one of them showed inside was shown outside afterwards. A body that was lost inside may still be there, but
+not for ever: trackers lose people, and they invent some. From the instant on nobody can be further inside than they
+walked since. A body counts wherever a camera shows one of its points, whether it is the person that the filter follows
+or somebody else; a body without any point may be anywhere.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hrcreplay.geometry.polygon import ConvexPolygon
-from hrcreplay.records import NOBODY, CameraFrames, Floats, HumanStates, Ints, Measurements
+from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, HumanStates
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,7 @@ class WatchedArea:
 
     polygon: ConvexPolygon  #: on the floor; the area has any height
     margin_m: float  #: how far inside the border somebody may be who is not shown yet [m]
-    clear_s: float  #: how long all cameras must show nobody before nobody is believed to be there [s]
+    clear_s: float  #: how long a body that was lost inside is believed to be there [s]
     gap_s: float  #: a camera whose frames are further apart did not watch between them [s]
     speed_m_per_s: float  #: at which people walk in, ISO 13855
 
@@ -32,81 +34,69 @@ class WatchedArea:
         return self.margin_m + self.speed_m_per_s * since_s
 
 
+class Sighting(NamedTuple):
+    """Where a camera last showed a body."""
+
+    capture_ns: int
+    inside: bool
+    other: bool  #: whether it was not the person
+
+
 class VacancyState(NamedTuple):
     """What is remembered between two tables of frames; instants are captures [ns]."""
 
     newest_ns: tuple[int, ...]  #: camera -> its newest frame; -1 before the first
     begin_ns: tuple[int, ...]  #: camera -> since when its frames have come without a gap
-    last_ns: tuple[int, int]  #: the last frame with anybody in the area, and with anybody but the person
-    vacant_ns: tuple[int, int]  #: when the area was last known to be without them; -1 before the first time
+    bodies: tuple[tuple[tuple[int, int], Sighting], ...]  #: camera and body id -> its last sighting, while it matters
+    vacant_ns: tuple[int, int]  #: when the area was last without anybody, and without others; -1 before the first time
 
 
 def start(cameras: int) -> VacancyState:
     """Before the first frame of so many cameras."""
-    return VacancyState((-1,) * cameras, (-1,) * cameras, (-1, -1), (-1, -1))
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """Bodies in order of arrival."""
-
-    arrival_ns: Ints
-    capture_ns: Ints
-    camera: Ints
-    depth_m: Floats  #: (n,) of the body's deepest point; -inf for a frame of nobody, inf for a body without a point
-    other: Ints  #: (n,) 1 for a body that is not the person
-
-
-def _frames(measured: Measurements, others: CameraFrames, area: WatchedArea) -> _Frames:
-    tables = []
-    for table, other in ((measured, 1), (others, 0)):
-        shown = np.isfinite(table.points_m).all(axis=2) & (table.confidence > 0.0)
-        depth = np.where(shown, area.polygon.depth_m(table.points_m), -np.inf).max(axis=1, initial=-np.inf)
-        tables.append((table, np.where(shown.any(axis=1), depth, np.inf), 1 - other))
-    depth_m = np.concatenate([depth for _, depth, _ in tables])
-    depth_m[len(measured) :][others.body == NOBODY] = -np.inf
-    arrival_ns = np.concatenate([table.arrival_ns for table, _, _ in tables])
-    order = np.argsort(arrival_ns, kind="stable")
-    return _Frames(
-        arrival_ns[order],
-        np.concatenate([table.capture_ns for table, _, _ in tables])[order],
-        np.concatenate([table.camera for table, _, _ in tables])[order],
-        depth_m[order],
-        np.concatenate([np.full(len(table), other) for table, _, other in tables])[order],
-    )
+    return VacancyState((-1,) * cameras, (-1,) * cameras, (), (-1, -1))
 
 
 def watch(
-    state: VacancyState, states: HumanStates, measured: Measurements, others: CameraFrames, area: WatchedArea
+    state: VacancyState, states: HumanStates, frames: CameraFrames, mine: Bools, area: WatchedArea
 ) -> tuple[VacancyState, HumanStates, Counter[str]]:
     """Adds to each tick since when nobody, and nobody but the person, can be in the area.
 
     Args:
         state: From the table before; ``start`` at the beginning.
         states: The fused person at the ticks, increasing.
-        measured: Frames of the person that arrived since the tick before the first, up to the last.
-        others: All other bodies, and the frames that show nobody; their points in the world [m].
+        frames: All bodies that arrived since the tick before the first, up to the last, in order of arrival, and the
+            frames that show nobody; points in the world [m].
+        mine: (n,) which of them are the person.
         area: What is watched.
 
     Returns:
         The new state; ``states`` with ``nobody_s`` and ``nobody_else_s``; and the count ``watched_frames_refuting``,
         of frames that show somebody further inside than anybody could have walked since the area was vacant.
     """
-    found = _frames(measured, others, area)
+    depth_m = _depths(frames, area)
     counts: Counter[str] = Counter()
     ages = np.empty((len(states), 2))
-    last = np.searchsorted(found.arrival_ns, states.t_ns, side="right").tolist()
+    last = np.searchsorted(frames.arrival_ns, states.t_ns, side="right").tolist()
     row = 0
     for tick, t_ns in enumerate(states.t_ns.tolist()):
         for k in range(row, last[tick]):
-            body = int(found.capture_ns[k]), float(found.depth_m[k]), bool(found.other[k])
-            if body[1] > 0.0 and _refutes(state.vacant_ns[0], *body[:2], area):
+            who = int(frames.camera[k]), int(frames.body[k])
+            seen = Sighting(int(frames.capture_ns[k]), bool(depth_m[k] > 0.0), not mine[k])
+            if seen.inside and _refutes(state.vacant_ns[0], seen.capture_ns, float(depth_m[k]), area):
                 counts["watched_frames_refuting"] += 1
-            state = _met(state, int(found.camera[k]), *body, round(area.gap_s * 1e9))
+            state = _met(state, who, seen, round(area.gap_s * 1e9))
         row = last[tick]
         state = _judged(state, round(area.clear_s * 1e9))
         ages[tick] = [np.inf if at < 0 else (t_ns - at) / 1e9 for at in state.vacant_ns]
     return state, replace(states, nobody_s=ages[:, 0], nobody_else_s=ages[:, 1]), counts
+
+
+def _depths(frames: CameraFrames, area: WatchedArea) -> Floats:
+    """(n,) of each body's deepest point [m]; -inf for a frame of nobody, inf for a body without a point."""
+    shown = np.isfinite(frames.points_m).all(axis=2) & (frames.confidence > 0.0)
+    depth_m = np.where(shown, area.polygon.depth_m(frames.points_m), -np.inf).max(axis=1, initial=-np.inf)
+    depth_m = np.where(shown.any(axis=1), depth_m, np.inf)
+    return np.asarray(np.where(frames.body == NOBODY, -np.inf, depth_m))
 
 
 def _refutes(vacant_ns: int, capture_ns: int, depth_m: float, area: WatchedArea) -> bool:
@@ -115,26 +105,27 @@ def _refutes(vacant_ns: int, capture_ns: int, depth_m: float, area: WatchedArea)
     return vacant_ns >= 0 and since_s >= 0.0 and np.isfinite(depth_m) and bool(depth_m > area.reached_m(since_s))
 
 
-def _met(state: VacancyState, camera: int, capture_ns: int, depth_m: float, other: bool, gap_ns: int) -> VacancyState:
+def _met(state: VacancyState, who: tuple[int, int], seen: Sighting, gap_ns: int) -> VacancyState:
     """The state after a body, or a frame without one."""
-    newest, begin = list(state.newest_ns), list(state.begin_ns)
-    if newest[camera] < 0 or capture_ns - newest[camera] > gap_ns:
-        begin[camera] = capture_ns
-    newest[camera] = max(newest[camera], capture_ns)
-    anybody, somebody_else = state.last_ns
-    if depth_m > 0.0:
-        anybody = max(anybody, capture_ns)
-        somebody_else = max(somebody_else, capture_ns) if other else somebody_else
-    return VacancyState(tuple(newest), tuple(begin), (anybody, somebody_else), state.vacant_ns)
+    newest, begin, bodies = list(state.newest_ns), list(state.begin_ns), dict(state.bodies)
+    camera, body = who
+    if newest[camera] < 0 or seen.capture_ns - newest[camera] > gap_ns:
+        begin[camera] = seen.capture_ns
+    newest[camera] = max(newest[camera], seen.capture_ns)
+    if body != NOBODY and (who not in bodies or bodies[who].capture_ns <= seen.capture_ns):
+        bodies[who] = seen
+    return state._replace(newest_ns=tuple(newest), begin_ns=tuple(begin), bodies=tuple(bodies.items()))
 
 
 def _judged(state: VacancyState, clear_ns: int) -> VacancyState:
     """The state after all frames of a tick: whether the area is vacant at the newest capture that all cameras have."""
-    watched_ns, begin_ns = min(state.newest_ns), max(state.begin_ns)
+    watched_ns = min(state.newest_ns)
     if watched_ns < 0:
         return state
-    anybody, somebody_else = (
-        max(vacant, watched_ns) if watched_ns - max(begin_ns, last) >= clear_ns else vacant
-        for last, vacant in zip(state.last_ns, state.vacant_ns, strict=True)
-    )
-    return state._replace(vacant_ns=(anybody, somebody_else))
+    bodies = tuple((who, seen) for who, seen in state.bodies if seen.capture_ns > watched_ns - clear_ns)
+    inside = [seen for _, seen in bodies if seen.inside]
+    anybody, others = state.vacant_ns
+    if watched_ns - max(state.begin_ns) >= clear_ns:
+        anybody = anybody if inside else max(anybody, watched_ns)
+        others = others if any(seen.other for seen in inside) else max(others, watched_ns)
+    return state._replace(bodies=bodies, vacant_ns=(anybody, others))

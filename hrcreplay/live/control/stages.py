@@ -74,9 +74,9 @@ class Observer:
             horizon_s: Until when the volumes must hold, the latency aside [s].
         """
         frames = self._frames(t_ns, skeletons)
-        measured, others = self._nothing, self._no_bodies
+        measured, (everybody, mine) = self._nothing, self._no_bodies
         if frames is not None:
-            self._memory, measured, others, found = self._fusion_stage.measure_all(frames, self._memory)
+            self._memory, measured, everybody, mine, found = self._fusion_stage.measure_all(frames, self._memory)
             self.counts.update(found)
             for camera, capture_ns in zip(measured.camera.tolist(), measured.capture_ns.tolist(), strict=True):
                 self.newest_ns[self._cameras[camera]] = capture_ns
@@ -86,9 +86,7 @@ class Observer:
         )
         self.counts.update(events)
         if self._fusion_stage.watched is not None:
-            self._area, states, refuted = vacancy.watch(
-                self._area, states, measured, others, self._fusion_stage.watched
-            )
+            self._area, states, refuted = vacancy.watch(self._area, states, everybody, mine, self._fusion_stage.watched)
             self.counts.update(refuted)
         self._look_ns, self._frame_age_s = t_ns, float(states.frame_age_s[0])
         volumes = self._surroundings.prediction.volumes(states, horizon_s)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
 
 from hrcreplay.geometry.polygon import ConvexPolygon
 from hrcreplay.human.fusion.vacancy import VacancyState, WatchedArea, start, watch
-from hrcreplay.records import NOBODY, CameraFrames, Floats, HumanStates, Measurements
+from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, HumanStates
 from tests.human.people import states as people
 
 AREA = WatchedArea(
@@ -22,6 +22,7 @@ AREA = WatchedArea(
 )
 MS = 1_000_000
 CAMERAS = ("left", "right")
+IDS = {"nobody": NOBODY, "person": 1, "other": 7}
 
 
 class Scene:
@@ -31,33 +32,25 @@ class Scene:
         self.rows: list[tuple[int, int, int, str, Floats]] = []
 
     def add(self, capture_ms: float, camera: int, who: str, x_m: float = np.nan, delay_ms: float = 20.0) -> None:
-        """A frame with ``who``: 'nobody', 'person', 'other'; a body whose place is NaN has no point."""
+        """A frame with ``who``: 'nobody', 'person', 'other'; a body whose place is NaN has no point.
+
+        A camera's frames arrive in the order of their captures; the reader drops others.
+        """
         points = np.full((20, 3), np.nan)
         if who != "nobody":
             points[3] = x_m, 0.0, 1.7
         capture_ns = round(capture_ms * MS)
-        self.rows.append((capture_ns, capture_ns + round(delay_ms * MS), camera, who, points))
+        before_ns = max((row[1] for row in self.rows if row[2] == camera), default=0)
+        self.rows.append((capture_ns, max(before_ns, capture_ns + round(delay_ms * MS)), camera, who, points))
 
-    def tables(self) -> tuple[Measurements, CameraFrames]:
-        """The person's rows and all others, in order of arrival."""
+    def table(self) -> tuple[CameraFrames, Bools]:
+        """All rows in order of arrival, and which are the person's."""
         rows = sorted(self.rows, key=lambda row: row[1])
-        mine = [row for row in rows if row[3] == "person"]
-        others = [row for row in rows if row[3] != "person"]
-
-        def columns(of: list[tuple[int, int, int, str, Floats]]) -> tuple[Floats, ...]:
-            points = np.array([row[4] for row in of]).reshape(-1, 20, 3)
-            return (
-                *(np.array([row[i] for row in of], dtype=np.int64) for i in range(3)),
-                points,
-                np.isfinite(points[..., 0]).astype(float),
-            )
-
-        captured, arrived, camera, points, confidence = columns(mine)
-        z = np.zeros((len(mine), 20))
-        measured = Measurements(captured, arrived, camera, z, z, points, confidence, CAMERAS)
-        captured, arrived, camera, points, confidence = columns(others)
-        body = np.array([NOBODY if row[3] == "nobody" else 7 for row in others], dtype=np.int64)
-        return measured, CameraFrames(captured, arrived, camera, body, points, confidence, CAMERAS)
+        captured, arrived, camera = (np.array([row[i] for row in rows], dtype=np.int64) for i in range(3))
+        points = np.array([row[4] for row in rows])
+        body = np.array([IDS[row[3]] for row in rows], dtype=np.int64)
+        confidence = np.isfinite(points[..., 0]).astype(float)
+        return CameraFrames(captured, arrived, camera, body, points, confidence, CAMERAS), body == IDS["person"]
 
 
 def ticks(count: int, every_ms: float = 4.0) -> HumanStates:
@@ -69,13 +62,13 @@ def ticks(count: int, every_ms: float = 4.0) -> HumanStates:
 def watched(scene: Scene, of: HumanStates, area: WatchedArea = AREA, *, batch: int = 10**9) -> tuple[HumanStates, int]:
     """The states with their vacancies, and the count of refuting frames; ``batch`` ticks at a time."""
     state: VacancyState = start(2)
-    measured, others = scene.tables()
+    frames, mine = scene.table()
     parts, refuting, last_ns = [], 0, -1
     for first in range(0, len(of), batch):
         part = of.rows(slice(first, first + batch))
-        due = [(t.arrival_ns > last_ns) & (t.arrival_ns <= part.t_ns[-1]) for t in (measured, others)]
+        due = (frames.arrival_ns > last_ns) & (frames.arrival_ns <= part.t_ns[-1])
         last_ns = int(part.t_ns[-1])
-        state, found, counts = watch(state, part, measured.rows(due[0]), others.rows(due[1]), area)
+        state, found, counts = watch(state, part, frames.rows(due), mine[due], area)
         parts.append(found)
         refuting += counts["watched_frames_refuting"]
     return HumanStates.join(parts), refuting
@@ -84,7 +77,9 @@ def watched(scene: Scene, of: HumanStates, area: WatchedArea = AREA, *, batch: i
 def by_search(scene: Scene, at_ns: int, *, but_the_person: bool) -> float:
     """The same by the definition, from all frames that have arrived."""
     best = -1
-    for now_ns in sorted({row[1] for row in scene.rows if row[1] <= at_ns}):
+    for now_ns in sorted({-(-row[1] // (4 * MS)) * 4 * MS for row in scene.rows}):  # the ticks with something new
+        if now_ns > at_ns:
+            break
         rows = [row for row in scene.rows if row[1] <= now_ns]
         captures = [sorted(row[0] for row in rows if row[2] == camera) for camera in range(2)]
         if not all(captures):
@@ -95,10 +90,12 @@ def by_search(scene: Scene, at_ns: int, *, but_the_person: bool) -> float:
             times[0] <= begin and all(b - a <= AREA.gap_s * 1e9 for a, b in pairwise(times) if b > begin)
             for times in captures
         )
-        bad = ("other",) if but_the_person else ("other", "person")
-        inside = [
-            row for row in rows if row[3] in bad and row[0] > begin and not abs(row[4][3, 0]) >= 2.0
-        ]  # NaN: anywhere
+        inside = False
+        for camera, who in product(range(2), ("other",) if but_the_person else ("other", "person")):
+            sightings = [row for row in rows if row[2] == camera and row[3] == who]
+            if sightings:
+                last = max(sightings, key=lambda row: (row[0], row[1]))
+                inside = inside or (last[0] > begin and not abs(last[4][3, 0]) >= 2.0)  # NaN: anywhere
         if whole and not inside:
             best = max(best, until)
     return np.inf if best < 0 else (at_ns - best) / 1e9
@@ -148,6 +145,20 @@ def test_somebody_who_is_further_inside_than_anybody_can_have_walked_refutes_the
             scene.add(33.0 * number, camera, "nobody" if number < 30 else "other", x_m)
     _, refuting = watched(scene, ticks(300))  # 33 ms after the last vacant frames: 0.1 m + 1.6 m/s * 33 ms = 0.153 m
     assert refuting == (2 if refutes else 0)
+
+
+@pytest.mark.parametrize(("out_m", "waits"), [(2.2, False), (1.8, True)])
+def test_who_is_seen_to_leave_has_left_and_who_is_lost_inside_may_be_there(out_m: float, waits: bool) -> None:
+    scene = Scene()
+    for number in range(60):
+        x_m = 1.0 if number < 25 else out_m
+        for camera in range(2):
+            scene.add(33.0 * number, camera, "person" if number < 30 else "nobody", x_m)
+    found, _ = watched(scene, ticks(480))
+    assert found.nobody_s is not None
+    just_lost, later = round(30 * 33.0 / 4.0), round((30 * 33.0 + 600.0) / 4.0)
+    assert (found.nobody_s[just_lost] > 0.9) == waits
+    assert found.nobody_s[later] < 0.1
 
 
 def test_one_camera_alone_makes_no_area_vacant() -> None:

@@ -1,0 +1,106 @@
+"""Live sessions in a cell that says what its cameras watch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hrcreplay.live.control import session_controller
+from hrcreplay.live.record import codec, folder
+from hrcreplay.live.record.codec import PHASES
+from hrcreplay.live.verify import verify
+from hrcreplay.records import BORDER
+from tests.live import made
+from tests.live.flights import BEGIN_NS, Flight, steps_keep_the_limits
+from tests.visits import cell_around
+
+FAST = "live.approach_speed=1.0"
+HALF_M = 2.5
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return cell_around(tmp_path_factory.mktemp("cell") / "cell.toml", HALF_M)
+
+
+def speeds(flight: Flight, begin_s: float, end_s: float) -> float:
+    """The greatest commanded axis speed between two instants [rad/s]."""
+    rows = [
+        answer.row.dq
+        for answer in flight.answers
+        if answer.row is not None and begin_s <= (answer.t_ns - BEGIN_NS) * 1e-9 < end_s
+    ]
+    return float(np.abs(rows).max())
+
+
+def test_nobody_is_needed_where_nobody_can_be(cell: Path) -> None:
+    flight = Flight((FAST,), lambda _s: None, cell).fly(8.0)
+    assert flight.phases()[-1] == "following"
+    assert not flight.controller.stops
+    assert speeds(flight, 0.0, 2.0) == 0.0  # watched.clear_s
+    assert speeds(flight, 2.0, 8.0) > 0.3
+    assert all(answer.row.certified for answer in flight.answers if answer.row is not None)
+    assert {flight.start["neighbours"][answer.limb] for answer in flight.answers if answer.limb >= 0} == {BORDER}
+    steps_keep_the_limits(flight)
+
+
+def test_frames_without_people_say_nothing_where_the_cell_does_not() -> None:
+    flight = Flight((FAST,), lambda _s: None).fly(4.0)
+    assert flight.phases()[-1] == "waiting"
+    assert flight.controller.waiting == session_controller.NO_FRAME
+
+
+def test_somebody_who_walks_in_and_out_holds_the_robot_up_and_no_more(cell: Path) -> None:
+    def walk(s: float) -> tuple[float, float] | None:
+        x_m = max(0.6, HALF_M + 0.5 - 1.6 * (s - 4.0)) if s < 7.0 else 0.6 + 1.0 * (s - 7.0)
+        return None if s < 4.0 or x_m > HALF_M + 0.5 else (x_m, 0.0)
+
+    flight = Flight((FAST,), walk, cell).fly(13.0)
+    assert not flight.controller.stops
+    assert speeds(flight, 2.0, 4.0) > 0.3
+    assert speeds(flight, 6.0, 7.0) < 1e-3
+    assert speeds(flight, 11.0, 13.0) > 0.3
+    assert all(answer.row.certified for answer in flight.answers if answer.row is not None)
+    steps_keep_the_limits(flight)
+
+
+def test_cameras_that_fall_silent_stop_the_session(cell: Path) -> None:
+    flight = Flight((FAST,), lambda _s: None, cell, silent=lambda s: s > 4.0).fly(6.0)
+    assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
+    assert speeds(flight, 2.0, 4.0) > 0.3
+    assert speeds(flight, 5.0, 6.0) == 0.0
+    assert PHASES[flight.answers[-1].phase] == "holding"
+
+
+def test_somebody_lost_in_the_middle_stops_the_session(cell: Path) -> None:
+    flight = Flight((FAST,), lambda s: None if s > 4.0 else (1.6, 1.2), cell).fly(7.5)
+    assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
+    assert speeds(flight, 5.0, 7.5) == 0.0
+
+
+def test_with_resume_the_robot_goes_on_once_the_area_is_vacant(cell: Path) -> None:
+    settings = (FAST, "live.resume=true", "live.resume_s=0.5")
+    flight = Flight(settings, lambda s: None if s > 4.0 else (1.6, 1.2), cell).fly(9.0)
+    assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
+    assert speeds(flight, 5.0, 6.0) == 0.0
+    assert speeds(flight, 7.0, 9.0) > 0.1
+
+
+@pytest.mark.parametrize("method", ["qp", "ssm"])
+def test_a_session_in_a_watched_cell_comes_out_the_same_again(cell: Path, tmp_path: Path, method: str) -> None:
+    def walk(s: float) -> tuple[float, float] | None:
+        return None if s < 3.0 else (max(1.2, 3.2 - 1.2 * (s - 3.0)), 0.2)
+
+    flight = Flight((FAST, f"plan.method={method}"), walk, cell).fly(5.0)
+    assert speeds(flight, 2.0, 4.0) > 0.2
+    partial = folder.make_partial(tmp_path / "session")
+    end = {"what": "end", "reason": "Ctrl-C", "counts": {}, "dropped": 0, "looks_skipped": 0, "stops": []}
+    start = codec.encode_event(BEGIN_NS - 1, {"what": "start", **flight.start})
+    messages = [start, *flight.messages, codec.encode_event(BEGIN_NS + 10**10, end)]
+    made.record(partial / "log.mcap", messages, chunk=500)
+    run = folder.finish(partial)
+    assert verify(run).identical
+    page = (run / "report.html").read_text()
+    assert "as the cell says that its cameras see everybody within" in page
