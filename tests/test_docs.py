@@ -116,6 +116,8 @@ def test_toml_is_accepted(page: Path, body: str, tmp_path: Path) -> None:
         assert load_faults(path, seed=0, duration_s=60.0)
     elif "cameras" in table:
         assert Cell.from_dict(table).T_world_base is not None
+    elif "watched" in table:
+        assert Cell.from_dict(table).watched is not None
     elif "waypoints" in table:
         assert parse_task(table, "block").waypoints
     else:

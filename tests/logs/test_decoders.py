@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from hrcreplay.errors import LogError
 from hrcreplay.logs import messages
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import POINTS
+from hrcreplay.records import NOBODY, POINTS, CameraFrames
 from hrcreplay.settings.sections import Decoder, Logs
 from tests.logs import own
 from tests.logs.bags import (
@@ -235,6 +235,22 @@ def test_described_decoder_equals_rosbags_reading() -> None:
     np.testing.assert_array_equal(frames.arrival_ns, [raw[i][0] for i in new])
     elbow = [values[i][4] for i in new]
     np.testing.assert_array_equal(frames.points_m[:, at("elbow_r")], elbow)
+
+
+def test_an_empty_array_of_a_described_decoder_shows_nobody(tmp_path: Path) -> None:
+    path = path_of(tmp_path, "mcap")
+    with bag(path, "mcap") as (write, store):
+        define(store, "lab/msg/Person", "std_msgs/Header header\ngeometry_msgs/Point[] joints")
+        for frame in range(4):
+            joints = [point(store, [1.0, frame, 2.0]), point(store, [1.0, frame, 1.0])] if frame % 2 else []
+            person = make(store, "lab/msg/Person", header=header(store, BEGIN + frame * 10**7), joints=joints)
+            write("/people", "lab/msg/Person", BEGIN + frame * 10**7 + 1000, person)
+    how = Decoder(topic="/people", camera="lidar", points="joints", index={"head": 0, "pelvis": 1})
+    log = open_log(path, Logs(decoders=(how,)))
+    frames = CameraFrames.join(list(log.frames(nobody=True)))
+    assert frames.body.tolist() == [NOBODY, 0, NOBODY, 0]
+    np.testing.assert_array_equal(frames.capture_ns, BEGIN + np.arange(4) * 10**7)
+    assert CameraFrames.join(list(log.frames())).body.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -12,7 +12,7 @@ import pytest
 from hrcreplay.errors import LogError
 from hrcreplay.logs.messages import AZURE_INDEX
 from hrcreplay.logs.reader import Log, open_log
-from hrcreplay.records import POINTS, Floats
+from hrcreplay.records import NOBODY, POINTS, CameraFrames, Floats
 from hrcreplay.settings.sections import Decoder, Logs
 from tests.logs import own
 from tests.logs.bags import OPENNI, bag, define, header, make, point, transform
@@ -93,6 +93,38 @@ def test_ids_of_three_bodies(ids_per_body: int, kind: str, tmp_path: Path) -> No
     bodies = people(3)
     path = written(tmp_path / "a.bag", by_ids(bodies, ids_per_body), kind=kind)
     assert_bodies(open_log(path), dict(enumerate(bodies)))
+
+
+@pytest.mark.parametrize("gone", [None, 2, 3], ids=["an empty array", "DELETE", "DELETEALL"])
+def test_an_array_without_markers_shows_nobody(gone: int | None, tmp_path: Path) -> None:
+    """Delivered to who asks for it, captured the camera's usual delay before it came; and no body to anybody else."""
+    bodies, path = people(1), tmp_path / "a"
+    with bag(path, "mcap") as (write, store):
+        for frame in range(FRAMES):
+            stamp_ns = BEGIN + frame * PERIOD
+            found = [marker(store, stamp_ns, at, **given) for at, given in by_ids(bodies, 100)(frame)]
+            if frame >= 30:
+                found = [] if gone is None else [make(store, "visualization_msgs/msg/Marker", action=gone)]
+            write(TOPIC, TYPE, stamp_ns + 5_000_000, make(store, TYPE, markers=found))
+    assert_bodies(open_log(path), {0: bodies[0][:30]})
+    frames = CameraFrames.join(list(open_log(path).frames(nobody=True)))
+    empty = frames.rows(frames.body == NOBODY)
+    np.testing.assert_array_equal(empty.capture_ns, BEGIN + np.arange(30, FRAMES) * PERIOD)
+    assert np.isnan(empty.points_m).all()
+    assert not empty.confidence.any()
+    assert (frames.body != NOBODY).sum() == 30
+
+
+def test_an_array_of_two_cameras_without_markers_says_nothing(tmp_path: Path) -> None:
+    bodies = people(2)
+
+    def spec(frame: int) -> Iterator[tuple[Any, dict[str, Any]]]:
+        if frame < 30:
+            yield from by_ids(bodies[:1], 100, frame="left")(frame)
+            yield from by_ids(bodies[1:], 100, first=1, frame="right")(frame)
+
+    frames = list(open_log(written(tmp_path / "a", spec)).frames(nobody=True))
+    assert not (CameraFrames.join(frames).body == NOBODY).any()
 
 
 def test_second_body_that_comes_late_decides_the_ids(tmp_path: Path) -> None:

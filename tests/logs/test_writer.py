@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.records import CameraFrames
+from hrcreplay.records import NOBODY, CameraFrames
 from tests.logs import own
+from tests.visits import visit_log
 
 POSE = np.array([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -0.25], [0.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.0, 1.0]])
 TASK = {"name": "pick", "waypoints": [{"joints_deg": [0, 10.5, -3], "speed_m_per_s": 0.25}]}
@@ -156,6 +158,28 @@ def test_generated_messages_are_those_of_the_schema() -> None:
         for name, message in pb.DESCRIPTOR.message_types_by_name.items()
     }
     assert made == told
+
+
+def test_frames_of_nobody_come_back_to_who_asks_for_them(tmp_path: Path) -> None:
+    log = visit_log(tmp_path / "a.mcap", lambda s: {} if s < 0.5 else {3: (2.0, 0.0)}, 1.0)
+    assert {*CameraFrames.join(list(open_log(log).frames())).body.tolist()} == {3}
+    frames = CameraFrames.join(list(open_log(log).frames(nobody=True)))
+    assert {*frames.body.tolist()} == {3, NOBODY}
+    assert (frames.body == NOBODY).sum() == 2 * 16
+    with LogWriter(tmp_path / "again.mcap") as writer:
+        writer.frames(frames)
+    again = CameraFrames.join(list(open_log(tmp_path / "again.mcap").frames(nobody=True)))
+    np.testing.assert_array_equal(again.body, frames.body)
+    np.testing.assert_array_equal(again.capture_ns, frames.capture_ns)
+
+
+def test_a_body_with_the_id_of_nobody_is_a_body(tmp_path: Path) -> None:
+    table = CameraFrames.join(list(open_log(visit_log(tmp_path / "a.mcap", lambda _s: {3: (2.0, 0.0)}, 0.2)).frames()))
+    with LogWriter(tmp_path / "b.mcap") as writer:
+        writer.frames(replace(table, body=np.full(len(table), NOBODY)))
+    found = CameraFrames.join(list(open_log(tmp_path / "b.mcap").frames()))
+    assert len(found) == len(table)
+    assert (found.body != NOBODY).all()
 
 
 def test_an_empty_table_adds_nothing(tmp_path: Path) -> None:

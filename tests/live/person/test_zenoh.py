@@ -20,7 +20,7 @@ from hrcreplay.live.person import source
 from hrcreplay.live.person.source import CameraSubscription
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.messages import AZURE_INDEX, OPENNI_JOINTS
-from hrcreplay.records import POINTS
+from hrcreplay.records import NOBODY, POINTS
 from hrcreplay.settings.sections import ZenohKey
 from tests.live import zenoh_publisher
 from tests.live.human import Human
@@ -45,7 +45,7 @@ def spread(at: float) -> Any:
 
 def markers(stamp_ns: int, bodies: dict[int, Any] | None = None) -> bytes:
     store = store_of("ros2")
-    message = marker_array(store, stamp_ns, bodies or {1: spread(1.0)})
+    message = marker_array(store, stamp_ns, {1: spread(1.0)} if bodies is None else bodies)
     return bytes(store.serialize_cdr(message, "visualization_msgs/msg/MarkerArray"))
 
 
@@ -66,6 +66,21 @@ def test_the_type_comes_from_the_key_of_rmw_zenoh_and_all_bodies_are_read() -> N
         (1, 2.0, "kinect", NOW_NS - 40_000_000),
         (3, 0.25, "kinect", NOW_NS - 40_000_000),
     ]
+
+
+def test_an_array_without_markers_is_a_frame_of_nobody() -> None:
+    stream = CameraSubscription("kinect", ZenohKey(key=MARKER_KEY, payload="cdr"))
+    sent = [
+        list(
+            stream.take(MARKER_KEY, markers(NOW_NS + i * 10**8 - 40_000_000, {1: spread(1.0 + i)}), NOW_NS + i * 10**8)
+        )
+        for i in range(6)
+    ]
+    sent.append(list(stream.take(MARKER_KEY, markers(0, {}), NOW_NS + 6 * 10**8)))
+    *_, last = skeletons([message for messages in sent for message in messages])
+    assert (last.body, last.capture_ns) == (NOBODY, NOW_NS + 6 * 10**8 - 40_000_000)
+    assert not any(last.confidence)
+    assert notes(sent[-1]) == []
 
 
 def test_the_key_of_the_bridge_needs_a_type() -> None:
