@@ -9,12 +9,15 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hrcreplay.cli import CellFile, Config, LimitSet, Set, as_overrides
 from hrcreplay.errors import SettingsError
+
+if TYPE_CHECKING:
+    from hrcreplay.egm.robot_double.servo import Axes
 
 Human = Annotated[
     Path | None,
@@ -96,11 +99,16 @@ def twin(
     ] = 0.0,
     comm_timeout: Annotated[float, typer.Option("--comm-timeout", metavar="S", help="CommTimeout.")] = 1.0,
     start: Annotated[
-        str, typer.Option("--start", metavar="DEG,...", help="Joints at the beginning, six, in degrees.")
+        str, typer.Option("--start", metavar="DEG,...", help="Joints at the beginning, one an axis, in degrees.")
     ] = "0,0,0,0,30,0",
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the record.")] = None,
+    config: Config = None,
+    settings: Set = None,
 ) -> None:
-    """Play the robot of an EGM session: a UDP client with the controller's behaviour, and faults on demand."""
+    """Play the robot of an EGM session: a UDP client with the controller's behaviour, and faults on demand.
+
+    It is the robot of the settings, as of live: --set robot.urdf=FILE, and live.joint_order.
+    """
     from hrcreplay.egm.robot_double.faults import load_faults
     from hrcreplay.egm.robot_double.servo import ServoSettings
     from hrcreplay.egm.robot_double.twin import TwinSettings
@@ -112,13 +120,31 @@ def twin(
         max_speed_deviation_deg_per_s=deviation,
         cond_time_s=cond_time,
         comm_timeout_s=comm_timeout,
+        axes=_axes_of_double(config, as_overrides(settings, None, None)),
     )
-    settings = TwinSettings(servo=servo, start_deg=_degrees(start), version=version, radians=radians)  # type: ignore[arg-type]
+    double = TwinSettings(servo=servo, start_deg=_degrees(start), version=version, radians=radians)  # type: ignore[arg-type]
     script = () if faults is None else load_faults(faults, seed=seed, duration_s=_positive(duration))
     duration_s = None if duration is None else _positive(duration)
     port = 6510 if port is None else port
-    report = run_twin(host, port, settings=settings, faults=script, seed=seed, duration_s=duration_s, out=out)
+    report = run_twin(host, port, settings=double, faults=script, seed=seed, duration_s=duration_s, out=out)
     sys.stdout.write("\n".join(report.lines()) + "\n")
+
+
+def _axes_of_double(config: Path | None, overrides: tuple[str, ...]) -> Axes:
+    """Range and speed of the robot of the settings, in the order of EGM."""
+    import numpy as np
+
+    from hrcreplay.egm.robot_double.servo import IRB140, axes_of
+    from hrcreplay.live.control.setup import joint_order
+    from hrcreplay.run.job import robot_description
+    from hrcreplay.settings.load import load_settings
+
+    found = load_settings(config, overrides)
+    if found.robot.urdf is None:
+        return IRB140
+    robot = robot_description(found.robot)
+    order = joint_order(robot.name, robot.joints, found.live.joint_order)
+    return axes_of(*(np.asarray(bound)[order] for bound in (robot.q_min, robot.q_max, robot.dq_max)))
 
 
 def verify(
@@ -153,7 +179,7 @@ def _degrees(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise SettingsError(f"--start {text}: six numbers with commas between them would be right") from None
+        raise SettingsError(f"--start {text}: numbers with commas between them would be right") from None
 
 
 KINDS = ("azure", "kinect2", "keraal")

@@ -62,8 +62,10 @@ def _turned(turn: tuple[float, ...], vector: tuple[float, float, float]) -> tupl
     return _product(_product(turn, (0.0, *vector)), (w, -x, -y, -z))[1:]
 
 
-#: Axes of the arm.
-AXES: Final = 6
+#: Joints that go as those of the arm; those beyond, a seventh axis or external ones, go as external joints.
+ARM_JOINTS: Final = 6
+#: The most joints that a message may hold in all.
+MOST_JOINTS: Final = 14
 #: Counters of the link, ``seqno`` and ``tm``, go round here.
 WRAP: Final = 2**32
 
@@ -111,8 +113,8 @@ class RobotPacket:
         seqno: The robot's counter, None where it sent none.
         tm_ms: The robot's own stamp [ms], goes round at 2**32.
         clock_ns: Instant of the feedback by the robot's clock; None below RobotWare 6.07, which sends radians.
-        q: (6,) measured joints, and external ones; of another robot as many as it says [rad].
-        q_planned: (6,) where the controller itself wants to be [rad].
+        q: (n,) measured joints, the arm's and then the external ones, as many as it says [rad].
+        q_planned: (n,) where the controller itself wants to be [rad].
         motors: One of ``Motors``.
         mci: One of ``Mci``.
         rapid: One of ``Rapid``.
@@ -134,7 +136,7 @@ class RobotPacket:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """Our reply to the robot: ``q`` (6,) [rad] and the speed reference ``dq`` (6,) [rad/s]."""
+    """Our reply to the robot: ``q`` (n,) [rad] and the speed reference ``dq`` (n,) [rad/s], external joints last."""
 
     seqno: int
     tm_ms: int
@@ -166,15 +168,17 @@ def decode_robot(data: bytes) -> RobotPacket:
         raise BadPacket(f"message type {header.mtype}: a robot sends {messages.TYPE_DATA}")
     clock_ns = _clock(feedback.time) if feedback.HasField("time") else None
     scale = 1.0 if clock_ns is None else _RAD_PER_DEG
-    joints = [*feedback.joints.joints, *feedback.external_joints.joints]
+    joints = _all_joints(feedback)
     if not joints:
         raise BadPacket("feedBack: no joints")
+    if len(joints) > MOST_JOINTS:
+        raise BadPacket(f"feedBack: {len(joints)} joints; at most {MOST_JOINTS} are right")
     return RobotPacket(
         seqno=header.seqno if header.HasField("seqno") else None,
         tm_ms=header.tm if header.HasField("tm") else None,
         clock_ns=clock_ns,
         q=_scaled(joints, scale, "feedBack"),
-        q_planned=_scaled(list(planned.joints.joints), scale, "planned") if planned.HasField("joints") else None,
+        q_planned=_scaled(_all_joints(planned), scale, "planned") if planned.HasField("joints") else None,
         motors=message.motor_state.state,
         mci=message.mci_state.state,
         rapid=message.rapid_state.state,
@@ -187,18 +191,21 @@ def encode_correction(correction: Correction) -> bytes:
     """The datagram that answers the robot: joints [deg] and speed reference [deg/s].
 
     Raises:
-        ValueError: Not six joints, or one that is no finite number: nothing of the kind may leave.
+        ValueError: Not 6 to 14 joints, or one that is no finite number: nothing of the kind may leave.
     """
     q, dq = (correction.q * _DEG_PER_RAD).tolist(), (correction.dq * _DEG_PER_RAD).tolist()
-    if len(q) != AXES or len(dq) != AXES or not all(map(isfinite, q + dq)):
-        raise ValueError(f"correction {correction.q} rad, {correction.dq} rad/s: {AXES} finite joints each are right")
+    if not ARM_JOINTS <= len(q) <= MOST_JOINTS or len(dq) != len(q) or not all(map(isfinite, q + dq)):
+        raise ValueError(
+            f"correction {correction.q} rad, {correction.dq} rad/s: {ARM_JOINTS} to {MOST_JOINTS} finite joints each "
+            "are right"
+        )
     message = messages.SensorMessage()
     header = message.header
     header.seqno = correction.seqno
     header.tm = correction.tm_ms
     header.mtype = messages.TYPE_CORRECTION
-    message.planned.joints.joints.extend(q)
-    message.speed_reference.joints.joints.extend(dq)
+    for place, values in ((message.planned, q), (message.speed_reference, dq)):
+        _fill_joints(place, values)
     return message.SerializeToString()
 
 
@@ -206,17 +213,21 @@ def decode_correction(data: bytes) -> Correction:
     """Read a reply to the robot; without a speed reference the speed is 0.
 
     Raises:
-        BadPacket: Empty, garbage, a robot's own message, not six joints, or a joint that is no finite number.
+        BadPacket: Empty, garbage, a robot's own message, not 6 to 14 joints, other speeds than joints, or one that is
+            no finite number.
     """
     message = _parsed(messages.SensorMessage, data)
     header, speed = message.header, message.speed_reference
     if header.mtype == messages.TYPE_DATA:
         raise BadPacket(f"message type {header.mtype}: a guide sends {messages.TYPE_CORRECTION}")
-    dq = _joints(speed.joints, "speedRef") if speed.HasField("joints") else [0.0] * AXES
+    q = _joints(message.planned, "planned")
+    dq = _joints(speed, "speedRef") if speed.HasField("joints") else [0.0] * len(q)
+    if len(dq) != len(q):
+        raise BadPacket(f"speedRef: {len(dq)} speeds of {len(q)} joints")
     return Correction(
         seqno=header.seqno,
         tm_ms=header.tm,
-        q=_scaled(_joints(message.planned.joints, "planned"), _RAD_PER_DEG, "planned"),
+        q=_scaled(q, _RAD_PER_DEG, "planned"),
         dq=_scaled(dq, _RAD_PER_DEG, "speedRef"),
     )
 
@@ -257,12 +268,27 @@ def encode_robot(
     return message.SerializeToString()
 
 
-def _joints(joints: Any, what: str) -> list[float]:
-    """The arm's joints of one part of a message."""
-    values = list(joints.joints)
-    if len(values) != AXES:
-        raise BadPacket(f"{what}: {len(values)} joints; {AXES} are right")
+def _all_joints(place: Any) -> list[float]:
+    """Joints of the arm, then external ones, of one part of a message."""
+    return [*place.joints.joints, *place.external_joints.joints]
+
+
+def _joints(place: Any, what: str) -> list[float]:
+    """The same of a guide's message: all of the arm, and external ones or none."""
+    values, arm = _all_joints(place), len(place.joints.joints)
+    if arm != ARM_JOINTS or len(values) > MOST_JOINTS:
+        raise BadPacket(
+            f"{what}: {arm} joints and {len(values) - arm} external ones; {ARM_JOINTS} joints are right, and at most "
+            f"{MOST_JOINTS - ARM_JOINTS} external ones"
+        )
     return values
+
+
+def _fill_joints(place: Any, values: list[float]) -> None:
+    """Joints of one part of a message: those beyond the arm's as external ones."""
+    place.joints.joints.extend(values[:ARM_JOINTS])
+    if values[ARM_JOINTS:]:
+        place.external_joints.joints.extend(values[ARM_JOINTS:])
 
 
 def _scaled(values: list[float], scale: float, what: str) -> Floats:
@@ -284,10 +310,7 @@ def _clock(clock: Any) -> int:
 
 def _fill_place(place: Any, q: Floats, scale: float, cartesian: Floats | None) -> None:
     """Joints and pose of the measured or of the planned place."""
-    degrees = (q * scale).tolist()
-    place.joints.joints.extend(degrees[:AXES])
-    if degrees[AXES:]:
-        place.external_joints.joints.extend(degrees[AXES:])
+    _fill_joints(place, (q * scale).tolist())
     if cartesian is not None:
         pos, orient = place.cartesian.pos, place.cartesian.orient
         pos.x, pos.y, pos.z = (cartesian[:3] * _MM_PER_M).tolist()
@@ -304,7 +327,7 @@ def _fill_clock(place: Any, clock_ns: int, *, stamp: bool) -> None:
 
 def _fill_edition(message: Any, packet: RobotPacket, version: str) -> None:
     """What the editions have beyond each other, at rest where this robot has nothing to say."""
-    still = [0.0] * AXES
+    still = [0.0] * ARM_JOINTS
     if version == "A":
         message.measured_force = messages.MeasuredForceA(force=still).SerializeToString()
         return

@@ -107,9 +107,9 @@ class EgmSession:
         """Begin before the first packet.
 
         Args:
-            q_min: (6,) smallest joints that are ever commanded [rad].
-            q_max: (6,) largest ones [rad].
-            dq_max: (6,) largest speed reference, and what the axes can do [rad/s].
+            q_min: (n,) smallest joints that are ever commanded [rad].
+            q_max: (n,) largest ones [rad].
+            dq_max: (n,) largest speed reference, and what the axes can do [rad/s].
             utilization_max: The robot cannot follow above this [%].
             utilization_packets: It must say so this often in a row, because a lost packet lets it flare up.
             silence_s: After a longer pause of the robot the session is a new one [s].
@@ -174,9 +174,9 @@ class EgmSession:
         """Answer the packet just classified. Returns what the robot is told, which may be less than what was asked for.
 
         Args:
-            q: (6,) joints to be at [rad]. Held inside the limits, and a speed that leads out of them with it; where
+            q: (n,) joints to be at [rad]. Held inside the limits, and a speed that leads out of them with it; where
                 the echo itself was outside, the limits reach as far as it.
-            dq: (6,) derivative of q [rad/s]. Held inside dq_max.
+            dq: (n,) derivative of q [rad/s]. Held inside dq_max.
             t_ns: Now.
 
         Raises:
@@ -234,7 +234,7 @@ class EgmSession:
         return (t_ns - self._last_ns) * 1e-9 + cycles * self._cycle_s
 
     def _reaches(self, q: Floats, lost: int, t_ns: int) -> bool:
-        """Whether the axes can have come to q (6,) [rad] since then."""
+        """Whether the axes can have come to q (n,) [rad] since then."""
         assert self._last is not None  # noqa: S101 - for the type checker
         way = _FASTER * self._dq_max * self._passed_s(lost, t_ns) + _NOISE_RAD
         return bool(np.all(np.abs(q - self._last.q) <= way))
@@ -246,7 +246,7 @@ class EgmSession:
         return (packet.clock_ns - self._last.clock_ns) * 1e-9 > self._passed_s(lost, t_ns)
 
     def _towards(self, q: Floats, t_ns: int) -> Floats:
-        """Joints q (6,) [rad], or as far as the axes can go to them since the last answer."""
+        """Joints q (n,) [rad], or as far as the axes can go to them since the last answer."""
         if self._told is None:
             return q
         reach = self._dq_max * max(self._cycle_s, (t_ns - self._told_ns) * 1e-9)

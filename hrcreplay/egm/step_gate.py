@@ -38,7 +38,7 @@ class StepGate:
         """Begin before the first command.
 
         Args:
-            dq_max: (6,) what the axes can do [rad/s].
+            dq_max: (n,) what the axes can do [rad/s].
             cycle_s: The robot's cycle [s].
         """
         self._dq_max, self._cycle_s = dq_max, cycle_s
@@ -50,7 +50,7 @@ class StepGate:
 
         Args:
             datagram: The command.
-            measured: (6,) where the robot says it is [rad]: the first command may lead no further than a cycle from
+            measured: (n,) where the robot says it is [rad]: the first command may lead no further than a cycle from
                 there. None: it does not say.
             t_ns: Now.
 

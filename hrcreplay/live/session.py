@@ -172,7 +172,8 @@ def _run_processes(request: Request, prepared: _Prepared, partial: Path) -> tupl
         _await_person(person, request.human)
         begun, start_ns = True, time.monotonic_ns() + anchor_ns
         parts = prepared.controller, prepared.link, person, recorder
-        gate = StepGate(prepared.controller.setup.robot.dq_max, settings.live.cycle_s)
+        setup = prepared.controller.setup
+        gate = StepGate(setup.robot.dq_max[setup.joint_order], settings.live.cycle_s)
         loop = Loop(*parts, _loop_settings(request, settings), gate, anchor_ns, start_ns, screen)
         recorder.send(codec.encode_event(loop.start_ns, {"what": "start", **prepared.start}))
         crashes = _run_loop(

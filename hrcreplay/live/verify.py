@@ -18,7 +18,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from hrcreplay.egm import motion_link_pb2 as egm
-from hrcreplay.egm.codec import AXES
 from hrcreplay.errors import EXIT_DIFFERS, EXIT_SAME_DECISIONS, LogError, SettingsError
 from hrcreplay.live.control import setup
 from hrcreplay.live.differences import (
@@ -186,11 +185,16 @@ def _context(key: str, recorded: Any, now: Any) -> Iterator[str]:
 
 
 LOG = "log.mcap"
-_ROW = (
-    *(f"{name}{axis}" for name in ("q_measured", "q", "dq", "u") for axis in range(1, AXES + 1)),
+_OTHERS = (
     *("ref_x", "ref_y", "ref_z", "tcp_x", "tcp_y", "tcp_z", "tcp_speed", "ref_speed", "programme_s", "distance_m"),
     *("horizon_s", "tau_s", "certified"),
-)  #: the numbers of a MotionRow, named as in motion.parquet
+)
+
+
+def _row_names(count: int) -> tuple[str, ...]:
+    """So many numbers of a MotionRow, named as in motion.parquet."""
+    axes = range(1, 1 + (count - len(_OTHERS)) // 4)
+    return (*(f"{name}{axis}" for name in ("q_measured", "q", "dq", "u") for axis in axes), *_OTHERS)
 
 
 class DecisionMaker(Protocol):
@@ -403,7 +407,7 @@ class SessionRecomputation:
         names = ("phase", "status", "reason", "look_ns", "limb", "link")
         return [
             *decisions_differing(names, _decision(recorded), _decision(said)),
-            *numbers_differing(_ROW, _numbers(recorded), _numbers(said)),
+            *numbers_differing(_row_names(len(_numbers(recorded))), _numbers(recorded), _numbers(said)),
         ]
 
     def _replied(self, message: bytes) -> list[Difference]:

@@ -23,7 +23,7 @@ from hrcreplay.limits import load_limits
 from hrcreplay.logs.unpack import ZSTD_MAGIC
 from hrcreplay.robot import irb140
 from hrcreplay.robot.model import Segment, from_urdf
-from hrcreplay.robot.urdf import describe
+from hrcreplay.robot.urdf import Description, describe
 from hrcreplay.settings.load import Settings, as_overrides, load_settings
 from hrcreplay.settings.sections import LinkSettings, Robot
 from hrcreplay.store import run_folder
@@ -47,9 +47,18 @@ def robot_axes(robot: Robot) -> tuple[str, ...]:
     Raises:
         SettingsError: The URDF cannot be used.
     """
+    return robot_description(robot).joints
+
+
+def robot_description(robot: Robot) -> Description:
+    """The chain of the robot that the settings name, with the limits of its axes.
+
+    Raises:
+        SettingsError: The URDF cannot be used.
+    """
     files = read_urdf(robot)
     xml, tcp_frame = (irb140.urdf(), "flange") if files is None else (files.text, robot.tcp_frame)
-    return describe(xml, tcp_frame, robot.base_frame).joints
+    return describe(xml, tcp_frame, robot.base_frame)
 
 
 def read_urdf(robot: Robot) -> UrdfFiles | None:

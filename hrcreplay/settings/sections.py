@@ -396,6 +396,9 @@ class Live(Section):
     """The robot's address, the only one that is heard; as it is, that of a robot double on this machine."""
     listen_address: Ipv4OrNone = ""
     """Address of ours to listen on; empty: that from which the robot is reached."""
+    joint_order: tuple[int, ...] = ()
+    """Axis of the robot, 1 next to its base, that each joint of EGM is, external ones last; empty: as they stand.
+    [1, 2, 4, 5, 6, 7, 3] for a YuMi, whose seventh joint is its third axis."""
     cycle_s: Annotated[float, Field(ge=0.001, le=0.1)] = 0.004032
     """The robot's cycle: every answer moves the reference by this much time [s]."""
     reaction_s: NotNegative = 0.05

@@ -23,7 +23,7 @@ from hrcreplay.egm.codec import (
     encode_correction,
     encode_robot,
 )
-from hrcreplay.egm.motion_link_pb2 import MeasuredForceA, MeasuredForceB, RobotMessage
+from hrcreplay.egm.motion_link_pb2 import MeasuredForceA, MeasuredForceB, RobotMessage, SensorMessage
 
 JOINTS_DEG = [0.0, -12.5, 33.25, 179.0, -90.0, 270.5]
 CLOCK_NS = 1_700_000_000_123_456_000
@@ -223,6 +223,32 @@ def test_a_double_can_send_nan() -> None:
 def test_external_joints_follow_the_arm() -> None:
     packet = decode_robot(encode_robot(replace(PACKET, q=np.arange(7.0))))
     assert packet.q.tolist() == pytest.approx(list(range(7)), rel=1e-15)
+
+
+@pytest.mark.parametrize("count", [6, 7, 12, 14])
+def test_a_correction_of_more_joints_comes_back(count: int) -> None:
+    sent = Correction(3, 4, np.arange(count) / 10.0, -np.arange(count) / 100.0)
+    data = encode_correction(sent)
+    message = SensorMessage.FromString(data)
+    for place in (message.planned, message.speed_reference):
+        assert len(place.joints.joints) == 6
+        assert len(place.external_joints.joints) == count - 6
+    back = decode_correction(data)
+    np.testing.assert_allclose(back.q, sent.q, rtol=1e-15)
+    np.testing.assert_allclose(back.dq, sent.dq, rtol=1e-15)
+
+
+@pytest.mark.parametrize("count", [5, 15])
+def test_no_correction_of_other_numbers_of_joints_leaves_or_is_taken(count: int) -> None:
+    with pytest.raises(ValueError, match="6 to 14 finite joints"):
+        encode_correction(Correction(1, 1, np.zeros(count), np.zeros(count)))
+    with pytest.raises(BadPacket, match=r"6 joints are right|at most 14"):
+        decode_correction(part(2, joints(1, [0.0] * min(count, 6)) + joints(3, [0.0] * (count - min(count, 6)))))
+
+
+def test_a_robot_of_more_than_fourteen_joints_is_none() -> None:
+    with pytest.raises(BadPacket, match="15 joints; at most 14"):
+        decode_robot(encode_robot(replace(PACKET, q=np.zeros(15))))
 
 
 def read(decode: Callable[[bytes], RobotPacket | Correction], data: bytes) -> str | None:

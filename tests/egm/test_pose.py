@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hrcreplay.egm.codec import AXES, flange_pose
+from hrcreplay.egm.codec import ARM_JOINTS, flange_pose
 from hrcreplay.robot.model import irb140
 
 #: Axis 2 and 3 [deg], wrist centre x and z [mm].
@@ -36,8 +36,8 @@ def test_the_wrist_centre_meets_the_specification(second: float, third: float, x
 def test_the_flange_is_where_the_planner_has_it() -> None:
     robot = irb140(np.eye(4), stop_s=0.377, tool_m=0.0)
     rng = np.random.default_rng(5)
-    for q in rng.uniform(robot.q_min, robot.q_max, (50, AXES)):
-        pose, expected = flange_pose(q), robot.pose(q, np.zeros(AXES)).T_world_tcp
+    for q in rng.uniform(robot.q_min, robot.q_max, (50, ARM_JOINTS)):
+        pose, expected = flange_pose(q), robot.pose(q, np.zeros(ARM_JOINTS)).T_world_tcp
         assert pose[:3] == pytest.approx(expected[:3, 3], abs=1e-9)
         assert matrix(pose[3:]) == pytest.approx(expected[:3, :3], abs=1e-9)
         assert pose[3] >= 0

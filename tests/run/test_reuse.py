@@ -119,6 +119,7 @@ STALE = {
     "live.port": "",
     "live.robot_address": "",
     "live.listen_address": "",
+    "live.joint_order": "",
     "live.cycle_s": "",
     "live.reaction_s": "",
     "live.look_s": "",
@@ -171,6 +172,7 @@ OTHER: dict[str, Any] = {
     "plan.room": "square",
     "live.robot_address": "10.0.0.1",
     "live.listen_address": "10.0.0.2",
+    "live.joint_order": (1, 2, 4, 5, 6, 7, 3),
     "live.zenoh": {"mode": "client"},
 }
 

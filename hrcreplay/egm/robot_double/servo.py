@@ -46,6 +46,12 @@ IRB140 = Axes(
 )
 
 
+def axes_of(q_min: Floats, q_max: Floats, dq_max: Floats) -> Axes:
+    """The axes of any robot, (n,) each [rad, rad/s]: full speed to rest in 0.15 s."""
+    low, high, speed = (tuple(np.degrees(bound).tolist()) for bound in (q_min, q_max, dq_max))
+    return Axes(low, high, speed, tuple(of / 0.15 for of in speed))
+
+
 @dataclass(frozen=True, slots=True)
 class ServoSettings:
     """The session as RAPID sets it up. As delivered: ``max_speed_deviation_deg_per_s`` 1 and ``cond_time_s`` 1."""

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hrcreplay.egm.codec import (
-    AXES,
+    ARM_JOINTS,
+    MOST_JOINTS,
     WRAP,
     BadPacket,
     Correction,
@@ -26,43 +27,34 @@ from hrcreplay.egm.codec import (
     flange_pose,
 )
 from hrcreplay.egm.robot_double.faults import Datagram, Fault, FaultyChannel, is_active
-from hrcreplay.egm.robot_double.servo import PERIOD_NS, ServoController, ServoSettings
+from hrcreplay.egm.robot_double.servo import IRB140, PERIOD_NS, ServoController, ServoSettings
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats, Ints
 
 _BLOCK = 4096
-_NAN = np.full(AXES, np.nan)
 
-#: A row a cycle: its start; session from 1; seqno sent, -1 none; seqno of the message read, -1 none; messages still
-#: queued; states as sent; joints measured; joints and speed planned; reference and its speed, NaN without; utilization.
-_CYCLE = np.dtype(
-    [
-        ("t_ns", np.int64),
-        ("session", np.int64),
-        ("seqno", np.int64),
-        ("told_seqno", np.int64),
-        ("queued", np.int64),
-        ("motors", np.int64),
-        ("mci", np.int64),
-        ("rapid", np.int64),
-        ("q_rad", np.float64, AXES),
-        ("planned_rad", np.float64, AXES),
-        ("planned_rad_per_s", np.float64, AXES),
-        ("ref_rad", np.float64, AXES),
-        ("ref_rad_per_s", np.float64, AXES),
-        ("utilization", np.float64),
-    ]
-)
-#: A row a message that arrived, before any fault of the way in.
-_ARRIVAL = np.dtype(
-    [
-        ("t_ns", np.int64),
-        ("session", np.int64),
-        ("seqno", np.int64),
-        ("ref_rad", np.float64, AXES),
-        ("ref_rad_per_s", np.float64, AXES),
-    ]
-)
+
+def _cycle_row(axes: int) -> np.dtype[Any]:
+    """A row a cycle.
+
+    Its start; session from 1; seqno sent, -1 none; seqno of the message read, -1 none; messages still queued; states as
+    sent; joints measured; joints and speed planned; reference and its speed, NaN without; utilization.
+    """
+    counts = ("t_ns", "session", "seqno", "told_seqno", "queued", "motors", "mci", "rapid")
+    joints = ("q_rad", "planned_rad", "planned_rad_per_s", "ref_rad", "ref_rad_per_s")
+    return np.dtype(
+        [
+            *((name, np.int64) for name in counts),
+            *((name, np.float64, axes) for name in joints),
+            ("utilization", np.float64),
+        ]
+    )
+
+
+def _arrival_row(axes: int) -> np.dtype[Any]:
+    """A row a message that arrived, before any fault of the way in."""
+    counts, joints = ("t_ns", "session", "seqno"), ("ref_rad", "ref_rad_per_s")
+    return np.dtype([*((name, np.int64) for name in counts), *((name, np.float64, axes) for name in joints)])
 
 
 class TwinRecord:
@@ -73,9 +65,10 @@ class TwinRecord:
         garbage: Datagrams that were no message.
     """
 
-    def __init__(self) -> None:
-        self._cycles = _Rows(_CYCLE)
-        self._arrivals = _Rows(_ARRIVAL)
+    def __init__(self, axes: int) -> None:
+        self._cycles = _Rows(_cycle_row(axes))
+        self._arrivals = _Rows(_arrival_row(axes))
+        self._unknown = np.full(axes, np.nan)
         self.departed_ns: list[int] = []
         self.garbage = 0
 
@@ -84,6 +77,9 @@ class TwinRecord:
         try:
             told = decode_correction(datagram.data)
         except BadPacket:
+            self.garbage += 1
+            return
+        if len(told.q) != len(self._unknown):
             self.garbage += 1
             return
         self._arrivals.append((datagram.t_ns, session, told.seqno, told.q, told.dq))
@@ -109,7 +105,9 @@ class TwinRecord:
         """
         seqno = -1 if packet is None else packet.seqno
         states = (0, 0, 0) if packet is None else (packet.motors, packet.mci, packet.rapid)
-        reference = (_NAN, _NAN) if servo.reference is None else (servo.reference.q, servo.reference.dq)
+        reference = (
+            (self._unknown, self._unknown) if servo.reference is None else (servo.reference.q, servo.reference.dq)
+        )
         motion = (servo.measured, servo.q, servo.dq, *reference, servo.utilization)
         self._cycles.append((t_ns, session, seqno, -1 if told is None else told.seqno, queued, *states, *motion))
 
@@ -181,10 +179,13 @@ class TwinSettings:
 
     def __post_init__(self) -> None:
         axes = self.servo.axes
-        if len(self.start_deg) != AXES or not all(
+        count = len(axes.low_deg)
+        if not ARM_JOINTS <= count <= MOST_JOINTS:
+            raise SettingsError(f"robot double: {count} axes; {ARM_JOINTS} to {MOST_JOINTS} would be right")
+        if len(self.start_deg) != count or not all(
             low <= angle <= high for low, angle, high in zip(axes.low_deg, self.start_deg, axes.high_deg, strict=False)
         ):
-            raise SettingsError(f"robot double: start {self.start_deg} deg; {AXES} joints within range would be right")
+            raise SettingsError(f"robot double: start {self.start_deg} deg; {count} joints within range would be right")
         if self.version not in ("A", "B", "C"):
             raise SettingsError(f"robot double: version is {self.version!r}; A, B or C would be right")
         if not 0 <= self.restart_s < math.inf:
@@ -204,7 +205,7 @@ class TwinCore:
     def __init__(self, settings: TwinSettings, faults: Sequence[Fault] = (), seed: int = 0) -> None:
         self._settings = settings
         self.servo = ServoController(settings.servo, np.radians(settings.start_deg))
-        self.record = TwinRecord()
+        self.record = TwinRecord(len(settings.start_deg))
         self.session = 1
         self.ends = [""]
         link = [fault for fault in faults if fault.of_link]
@@ -307,9 +308,9 @@ class TwinCore:
         servo, since_ns = self.servo, t_ns - (self._first_ns or 0)
         q = servo.measured
         if teleport := active.get("teleport"):
-            q = q + math.radians(teleport.angle_deg) * (np.arange(1, AXES + 1) == teleport.axis)
+            q = q + math.radians(teleport.angle_deg) * (np.arange(1, len(q) + 1) == teleport.axis)
         if missing := active.get("nan"):
-            q = np.where(np.arange(1, AXES + 1) == missing.axis, np.nan, q)
+            q = np.where(np.arange(1, len(q) + 1) == missing.axis, np.nan, q)
         running = Rapid.RUNNING if servo.moves else Rapid.STOPPED
         mci = Mci.RUNNING if servo.moves else Mci.STOPPED
         packet = RobotPacket(
@@ -329,7 +330,7 @@ class TwinCore:
 
     def _send(self, t_ns: int, since_s: float, packet: RobotPacket) -> list[Datagram]:
         """The packet's datagram after the faults of the way out."""
-        pose = flange_pose(self.servo.measured)
+        pose = flange_pose(self.servo.measured) if self._settings.servo.axes == IRB140 else None
         data = encode_robot(packet, version=self._settings.version, radians=self._settings.radians, q_cartesian=pose)
         departing = self._out.transmit(Datagram(t_ns, data), since_s)
         owed_ns = [datagram.t_ns for datagram in departing if datagram.data is data]
@@ -340,6 +341,7 @@ class TwinCore:
     def _read(self) -> Correction | None:
         """The one message of this cycle; what is none is read and ignored."""
         try:
-            return decode_correction(self._queue.popleft()) if self._queue else None
+            told = decode_correction(self._queue.popleft()) if self._queue else None
         except BadPacket:
             return None
+        return told if told is None or len(told.q) == len(self._settings.start_deg) else None

@@ -16,11 +16,13 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
 
 from hrcreplay.egm import motion_link_pb2 as messages
+from hrcreplay.egm.codec import ARM_JOINTS
 from hrcreplay.egm.link import Address, EgmServer, Received
 from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.live.control.session_controller import FAULT, REFUSED, SessionController
@@ -176,7 +178,8 @@ class Loop:
         """
         measured = None
         if received is not None and self.sent is None:
-            told = (_measured(data) for data in (received.data, *reversed(received.older)))
+            axes = self.controller.setup.robot.nv
+            told = (_measured(data, axes) for data in (received.data, *reversed(received.older)))
             measured = next((np.radians(joints) for joints in told if joints is not None), None)
         to = self.sender if received is None else received.sender
         if to is not None:
@@ -265,6 +268,8 @@ _COUNTER = 2**32
 class FallbackBrake:
     """Goes on with the stop that was certified with the last reply, and where that is not known brakes by Eq. (67).
 
+    Joints are in the order of EGM.
+
     Positions of Eq. (67) stay within limits; those of the stop do.
     """
 
@@ -298,8 +303,10 @@ class FallbackBrake:
         message = messages.SensorMessage()
         message.header.seqno, message.header.tm = self.seqno, tm_ms % _COUNTER
         message.header.mtype = messages.TYPE_CORRECTION
-        message.planned.joints.joints.extend(self.q)
-        message.speed_reference.joints.joints.extend(self.dq)
+        for place, values in ((message.planned, self.q), (message.speed_reference, self.dq)):
+            place.joints.joints.extend(values[:ARM_JOINTS])
+            if values[ARM_JOINTS:]:
+                place.external_joints.joints.extend(values[ARM_JOINTS:])
         return bytes(message.SerializeToString())
 
     def _brake_each_axis(self) -> None:
@@ -338,7 +345,7 @@ def bring_to_rest(loop: Loop, why: str) -> None:
             if received is None:
                 silences += 1
                 continue
-        measured = None if received is None else _measured(received.data)
+        measured = None if received is None else _measured(received.data, len(brake.q))
         if received is None or measured is not None:
             if measured is not None:
                 brake.update_position(measured)
@@ -357,23 +364,30 @@ def _brake(loop: Loop) -> FallbackBrake | None:
     if loop.sent is None:
         return None
     told = messages.SensorMessage.FromString(loop.sent)
-    robot, setup = loop.controller.setup.robot, loop.controller.setup
-    ddq_max, q_min, q_max = (np.degrees(bound).tolist() for bound in (robot.ddq_max, robot.q_min, robot.q_max))
-    q, dq = list(told.planned.joints.joints), list(told.speed_reference.joints.joints)
+    setup = loop.controller.setup
+    robot, order = setup.robot, setup.joint_order
+    ddq_max, q_min, q_max = (np.degrees(bound[order]).tolist() for bound in (robot.ddq_max, robot.q_min, robot.q_max))
+    q, dq = _joints(told.planned), _joints(told.speed_reference)
     tracking = math.degrees(setup.bounds.tracking_rad)
     stop: list[tuple[list[float], list[float]]] = []
     if loop.stop is not None:
-        stop = list(zip(np.degrees(loop.stop.q[1:]).tolist(), np.degrees(loop.stop.dq[1:]).tolist(), strict=True))
+        rows = (np.degrees(numbers[1:, order]).tolist() for numbers in (loop.stop.q, loop.stop.dq))
+        stop = list(zip(*rows, strict=True))
     return FallbackBrake(ddq_max, q_min, q_max, setup.plan.dt_s, tracking, q, dq, told.header.seqno, stop)
 
 
-def _measured(data: bytes) -> list[float] | None:
-    """Where the robot is [deg]; None of a datagram that does not say it."""
+def _joints(place: Any) -> list[float]:
+    """Joints of one part of a message, external ones last."""
+    return [*place.joints.joints, *place.external_joints.joints]
+
+
+def _measured(data: bytes, axes: int) -> list[float] | None:
+    """Where a robot of so many axes is [deg]; None of a datagram that does not say it."""
     try:
-        joints = list(messages.RobotMessage.FromString(data).feed_back.joints.joints)
+        joints = _joints(messages.RobotMessage.FromString(data).feed_back)
     except DecodeError:
         return None
-    return joints if len(joints) == 6 and all(map(math.isfinite, joints)) else None
+    return joints if len(joints) == axes and all(map(math.isfinite, joints)) else None
 
 
 def _record(
@@ -391,9 +405,10 @@ def _record(
     datagrams = () if received is None else (*received.older, received.data)
     for datagram in datagrams:
         loop.recorder.send(codec.encode_robot_packet(t_ns, datagram))
-    q, dq = (np.radians(numbers) for numbers in before)
-    u = (np.radians(brake.dq) - dq) / brake.cycle_s
-    where = np.full(len(q), np.nan) if measured is None else np.radians(measured)
+    by_axis = np.argsort(loop.controller.setup.joint_order)
+    q, dq, after = (np.radians(numbers)[by_axis] for numbers in (*before, brake.dq))
+    u = (after - dq) / brake.cycle_s
+    where = np.full(len(q), np.nan) if measured is None else np.radians(measured)[by_axis]
     unknown = np.full(3, np.nan)
     row = MotionRow(where, q, dq, u, unknown, unknown, *[np.nan] * 7)
     phase = codec.HOLDING if brake.at_rest else codec.STOPPING

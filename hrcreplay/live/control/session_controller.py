@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hrcreplay.egm.codec import AXES, BadPacket, RobotPacket, decode_robot, encode_correction
+from hrcreplay.egm.codec import BadPacket, Correction, RobotPacket, decode_robot, encode_correction
 from hrcreplay.egm.link import ALARMS, EgmSession, PacketStatus
 from hrcreplay.live.control.stages import ControlSetup, MotionState, MotionStep, Observer, brake, follow, start_approach
 from hrcreplay.live.record import codec
@@ -98,13 +98,12 @@ def reason_of_person(perception: Perception | None, age_s: float, fresh_s: float
 
 
 def _reason_of_tracking(measured: Floats, commanded: Floats, bounds: Live) -> str:
-    """The reason that the robot is not where it was told to be, or none; both (6,) [rad]."""
+    """The reason that the robot is not where it was told to be, or none; both (n,) [rad]."""
     return "" if np.abs(measured - commanded).max() <= bounds.tracking_rad else TRACKING
 
 
 #: Obstacles before the first perception update: nothing is known, so the robot stands.
 _UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=False)
-_STILL = np.zeros(AXES)
 
 
 class SessionController:
@@ -124,6 +123,7 @@ class SessionController:
         self.setup = setup
         self.observer = observer
         self._session = session
+        self._still = np.zeros(setup.robot.nv)
         self.perception: Perception | None = None
         self.phase = codec.WAITING
         self.stop = ""  #: why the robot was stopped; empty while it may move
@@ -187,7 +187,7 @@ class SessionController:
     def answer(self, event: TickEvent) -> Decision:
         """The reply to what the robot sent, and why it is that one."""
         self._check_silence(event.t_ns)  # also where the packet that ends a silence comes before its time-out is seen
-        packets = [_decoded(data) for data in event.datagrams]
+        packets = [self._decoded(data) for data in event.datagrams]
         cycles = {packet.clock_ns for packet in packets if packet is not None}
         self._behind_ns = (self._behind_ns or event.t_ns) if len(cycles) > 1 else None
         packet_status, packet = self._session.classify_all(packets, event.t_ns)
@@ -195,7 +195,7 @@ class SessionController:
         if packet is None:
             self._refuse(event.t_ns, packet_status)
             return Decision(event.t_ns, look_ns, None, self.phase, control_step.BRAKING, self.stop, -1, -1, None, None)
-        measured = packet.q[:AXES]
+        measured = packet.q
         self._heard_ns = event.t_ns
         if packet_status.fresh or self._motion is None:
             self._begin_session(measured)
@@ -216,8 +216,26 @@ class SessionController:
         step, row = result.step, _row(measured, before, result)
         reason = (self.stop or self.waiting) if result.after.follower is None else control_step.REASONS[step.reason]
         return Decision(
-            event.t_ns, look_ns, encode_correction(reply), phase, step.status, reason, step.limb, step.link, row, stop
+            event.t_ns, look_ns, self._encoded(reply), phase, step.status, reason, step.limb, step.link, row, stop
         )
+
+    def _decoded(self, data: bytes) -> RobotPacket | None:
+        """A packet, its joints in the order of the robot's axes; of another number of axes as it is."""
+        try:
+            packet = decode_robot(data)
+        except BadPacket:
+            return None
+        order = self.setup.joint_order
+        if len(packet.q) != len(order):
+            return packet
+        by_axis = np.empty_like(packet.q)
+        by_axis[order] = packet.q
+        return replace(packet, q=by_axis)
+
+    def _encoded(self, reply: Correction) -> bytes:
+        """A reply, its joints in the order of EGM."""
+        order = self.setup.joint_order
+        return encode_correction(replace(reply, q=reply.q[order], dq=reply.dq[order]))
 
     def _settle(self) -> None:
         """The phase after an answer that left the robot standing, or not."""
@@ -250,7 +268,7 @@ class SessionController:
 
     def _begin_session(self, measured: Floats) -> None:
         """Starts a new session of the robot from its measured joints, whatever was commanded before."""
-        self._motion = MotionState(RobotState(measured, _STILL), self._programme_s, at_rest(measured))
+        self._motion = MotionState(RobotState(measured, self._still), self._programme_s, at_rest(measured))
         self.phase = codec.ECHO
 
     def _apply_watchdog(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> None:
@@ -324,7 +342,7 @@ class SessionController:
 
     def _horizon_s(self) -> float:
         """Until when the volumes of the next look must hold."""
-        return self.setup.plan.horizon_s(self._motion.stop if self._motion is not None else at_rest(_STILL))
+        return self.setup.plan.horizon_s(self._motion.stop if self._motion is not None else at_rest(self._still))
 
     def _obstacles(self, horizon_s: float) -> Obstacles:
         """Swept volumes to keep clear of; unknown where nobody has been seen for too long.
@@ -334,13 +352,6 @@ class SessionController:
         if self.perception is None:
             return _UNSEEN
         return self.observer.around(self.perception, horizon_s, believed=not self._late)
-
-
-def _decoded(data: bytes) -> RobotPacket | None:
-    try:
-        return decode_robot(data)
-    except BadPacket:
-        return None
 
 
 def _row(measured: Floats, before: MotionState, result: MotionStep) -> MotionRow:

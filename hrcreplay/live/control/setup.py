@@ -6,6 +6,7 @@ again. ``compile_kernels`` compiles every kernel and loads every library before 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from pydantic import ValidationError
 
 from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell
-from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, encode_robot
+from hrcreplay.egm.codec import ARM_JOINTS, MOST_JOINTS, Mci, Motors, Rapid, RobotPacket, encode_robot
 from hrcreplay.egm.link import EgmSession
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.fusion.fuse import MEDIAN_LENGTHS_M
@@ -29,7 +30,7 @@ from hrcreplay.logs import skeleton_pb2
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
 from hrcreplay.logs.reader import open_log
-from hrcreplay.records import Floats
+from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.task import Reference
 from hrcreplay.run import build
@@ -116,8 +117,12 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
     known, scene = job.meta(), HeaderOnlyLog(header)
     T_world_base, fusion_stage = build.robot_base(job, scene), build.fusion_stage(job, scene)
     robot = build.robot(job, T_world_base)
-    if robot.nv != AXES:
-        raise SettingsError(f"robot.urdf: {robot.name} has {robot.nv} axes; live drives robots of {AXES} over EGM")
+    if not ARM_JOINTS <= robot.nv <= MOST_JOINTS:
+        raise SettingsError(
+            f"robot.urdf: {robot.name} has {robot.nv} axes; live drives robots of {ARM_JOINTS} to {MOST_JOINTS} over "
+            "EGM"
+        )
+    joint_order(robot.name, robot.joint_names, job.settings.live.joint_order)
     predicted = build.prediction_stage(job)
     return {
         "hrcreplay": __version__,
@@ -135,6 +140,33 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         "method": predicted.method,
         "links": [segment.name for segment in robot.segments],
     }
+
+
+def joint_order(robot: str, names: Sequence[str], given: tuple[int, ...]) -> Ints:
+    """(n,) axis of the robot, 0 next to the base, that each joint of EGM is.
+
+    Args:
+        robot: Its name.
+        names: Of its axes, from the base on.
+        given: ``live.joint_order``; empty: the joints of EGM are the axes as they stand.
+
+    Raises:
+        SettingsError: Not every axis once; or none is given, and the joints' names count otherwise.
+    """
+    axes = list(range(1, len(names) + 1))
+    if given and sorted(given) != axes:
+        raise SettingsError(
+            f"live.joint_order: found {list(given)}; would be right: each of {axes} once, the axes of {robot} "
+            f"from its base on ({', '.join(names)})"
+        )
+    numbers = [int(found[-1]) for name in names if (found := re.findall(r"\d+", name))]
+    if not given and len(numbers) == len(names) and sorted(numbers) == axes and numbers != axes:
+        order = [numbers.index(number) + 1 for number in axes]
+        raise SettingsError(
+            f"live.joint_order: from its base on the joints of {robot} are {', '.join(names)}, and "
+            f"EGM sends them by number; would be right: live.joint_order={order}, or {axes} where EGM sends them so"
+        )
+    return np.array(given or axes) - 1
 
 
 def build_controller(start: dict[str, Any]) -> SessionController:
@@ -209,6 +241,7 @@ def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
         bounds=live,
         fresh_s=job.settings.fusion.fresh_s,
         sending=sending,
+        joint_order=joint_order(robot.name, robot.joint_names, live.joint_order),
     )
 
 
@@ -224,7 +257,7 @@ def compile_kernels(start: dict[str, Any]) -> None:
     camera, T = next(iter(start["cameras"].items()))
     to_camera = np.linalg.inv(np.array(T))
     base = np.array(start["T_world_base"])[:3, 3]
-    q = controller.setup.programme.q0
+    q = controller.setup.programme.q0[controller.setup.joint_order]
     for tick in range(_TICKS):
         t_ns = 10**18 + tick * _TICK_NS
         packet = RobotPacket(tick, tick * 4, t_ns, q, q, Motors.ON, Mci.RUNNING, Rapid.RUNNING, False, 0.0)

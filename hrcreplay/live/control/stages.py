@@ -25,7 +25,7 @@ from hrcreplay.logs.clean import Cleaner, PersonMemory
 from hrcreplay.logs.decoders import own_row
 from hrcreplay.logs.messages import Undecodable
 from hrcreplay.logs.skeleton_pb2 import Skeleton
-from hrcreplay.records import CameraFrames, Floats
+from hrcreplay.records import CameraFrames, Floats, Ints
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import (
     PlanSettings,
@@ -144,6 +144,7 @@ class ControlSetup:
     bounds: Live
     fresh_s: float  #: a person whose newest frame is older is not known, which stops the robot [s]
     sending: bool  #: False in shadow mode: the robot does not follow
+    joint_order: Ints  #: (n,) axis that each joint of EGM is, the external ones last
 
     def stop_from(self, state: RobotState) -> Stop:
         """The stop of a robot whose last one ended elsewhere: it was held at a limit, or only echoed."""

@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hrcreplay.egm.codec import AXES
 from hrcreplay.logs import messages
 from hrcreplay.records import Floats, HumanStates, SweptVolumes
 
@@ -76,10 +75,10 @@ class TickEvent:
 class MotionRow:
     """The commanded motion of one answer. Angles in rad, positions in the world in m; recorded in this order."""
 
-    q_measured: Floats  #: (6,) where it said it was
-    q: Floats  #: (6,) commanded position at the tick
-    dq: Floats  #: (6,) commanded velocity at the tick
-    u: Floats  #: (6,) acceleration applied from the tick on
+    q_measured: Floats  #: (n,) where it said it was
+    q: Floats  #: (n,) commanded position at the tick
+    dq: Floats  #: (n,) commanded velocity at the tick
+    u: Floats  #: (n,) acceleration applied from the tick on
     ref_m: Floats  #: (3,) programmed TCP position
     tcp_m: Floats  #: (3,) TCP position at ``q``
     tcp_speed: float  #: [m/s]
@@ -91,7 +90,7 @@ class MotionRow:
     certified: float  #: 1 where the step, or the stop that it continues, has a certificate that still holds, else 0
 
     def flat(self) -> Floats:
-        """(37,) all numbers one after another."""
+        """(4 n + 13,) all numbers one after another."""
         where = (self.tcp_speed, self.ref_speed, self.programme_s, self.distance_m)
         numbers = (*where, self.horizon_s, self.tau_s, self.certified)
         return np.concatenate((self.q_measured, self.q, self.dq, self.u, self.ref_m, self.tcp_m, numbers))
@@ -99,12 +98,13 @@ class MotionRow:
     @classmethod
     def of(cls, flat: Floats) -> MotionRow:
         """The inverse of ``flat``."""
-        q_measured, q, dq, u, ref_m, tcp_m, numbers = np.split(flat, np.cumsum(_WIDTHS))
+        axes = (len(flat) - _OTHERS) // 4
+        q_measured, q, dq, u, ref_m, tcp_m, numbers = np.split(flat, np.cumsum((*(axes,) * 4, 3, 3)))
         return cls(q_measured, q, dq, u, ref_m, tcp_m, *numbers.tolist())
 
 
-#: Of the vectors of a MotionRow, which its numbers follow.
-_WIDTHS = (AXES, AXES, AXES, AXES, 3, 3)
+#: Numbers of a MotionRow beside the four of each axis.
+_OTHERS = 13
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,7 +307,7 @@ class RecordedDecision:
     limb: int
     link: int
     datagrams: int  #: the ROBOT messages right before it
-    row: Floats | None  #: (37,) of a MotionRow
+    row: Floats | None  #: (4 n + 13,) of a MotionRow
 
 
 def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: int) -> bytes:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from hrcreplay.egm.codec import AXES
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live import processes
 from hrcreplay.live.control.setup import job_of
@@ -144,7 +143,7 @@ def _motion(answers: list[codec.RecordedDecision], neighbours: tuple[str, ...], 
         links=links,
         reasons=reasons,
     )
-    measured = {f"q_measured{i + 1}": np.ascontiguousarray(column["q_measured"][:, i]) for i in range(AXES)}
+    measured = {f"q_measured{i + 1}": np.ascontiguousarray(q) for i, q in enumerate(column["q_measured"].T)}
     phases = pa.array([PHASES[answered.phase] for answered in answers], type=pa.string())
     return {**motion_columns(motion), **measured, "phase": phases}
 

@@ -22,7 +22,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hrcreplay.egm.codec import AXES, Mci, Motors, Rapid, RobotPacket, decode_correction, encode_robot
+from hrcreplay.egm.codec import ARM_JOINTS, Mci, Motors, Rapid, RobotPacket, decode_correction, encode_robot
 from hrcreplay.egm.robot_double.servo import IRB140, PERIOD_NS
 from hrcreplay.records import Floats
 from tests.live.attacks.forged import KINDS
@@ -38,7 +38,7 @@ class Robot:
 
     port: int
     q: Floats = field(default_factory=_HOME.copy)
-    dq: Floats = field(default_factory=lambda: np.zeros(AXES))
+    dq: Floats = field(default_factory=lambda: np.zeros(ARM_JOINTS))
     told: list[tuple[float, Floats]] = field(default_factory=list)
     seqno: int = 0
 
