@@ -223,6 +223,7 @@ def _header(scene: ReplayScene) -> dict[str, Any]:
             for name, track in scene.methods.items()
         },
         "order": list(scene.methods),
+        "watched": scene.watched_m.tolist(),
     }
 
 

@@ -111,6 +111,7 @@ class ReplayScene:
     volumes: VolumeTrack
     robot: RobotGeometry
     methods: dict[str, MethodTrack]  #: the run's own first
+    watched_m: Floats  #: (k, 2) corners of what the cameras watch, on the floor; k is 0 where the cell does not say
 
     @property
     def seconds(self) -> Floats:
@@ -233,6 +234,7 @@ def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, 
         volumes=volume_track(run.occupancy),
         robot=robot_geometry(robot),
         methods={name: _track(run, name, table, robot, t_ns, t0_ns, slow) for name, table in tables.items()},
+        watched_m=np.array(((run.meta.get("cell") or {}).get("watched") or {}).get("corners_m", [])).reshape(-1, 2),
     )
 
 

@@ -30,6 +30,7 @@ from hrcreplay.report.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, 
 _VOLUME_HZ = 5.0
 _CHUNK_BYTES = 1024 * 1024
 _STOP: Rgba = (0.80, 0.20, 0.15, 0.35)
+_WATCHED: Rgba = (0.95, 0.55, 0.10, 1.0)
 _OTHER: Rgba = (0.45, 0.50, 0.55, 0.35)
 _BODY: Rgba = (0.40, 0.63, 0.82, 1.0)
 _CAMERA: Rgba = (0.35, 0.60, 0.30, 0.8)
@@ -57,7 +58,7 @@ def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | Non
         scene: What moves.
         measurements: Rows of measurements.parquet: the skeletons of the cameras; None without them.
     """
-    streams = [_robots(scene), _transforms(scene), _person(scene), _volumes(scene), _distances(scene)]
+    streams = [_robots(scene), _watched(scene), _transforms(scene), _person(scene), _volumes(scene), _distances(scene)]
     streams += [_series(scene, name, track) for name, track in scene.methods.items()]
     streams += _cameras(measurements)
     found = heapq.merge(*streams, key=lambda message: message[1])  # of one instant in the order of the streams
@@ -112,6 +113,16 @@ def _robots(scene: ReplayScene) -> Iterator[Message]:
 
 def _frame(method: str, axis: int, suffix: str) -> str:
     return f"{method}{suffix} axis {axis}" if axis else WORLD
+
+
+def _watched(scene: ReplayScene) -> Iterator[Message]:
+    """The border of what the cameras watch, on the floor."""
+    if len(scene.watched_m):
+        t_ns = int(scene.t_ns[0])
+        corners = np.column_stack((scene.watched_m, np.zeros(len(scene.watched_m))))
+        sides = np.stack((corners, np.roll(corners, -1, axis=0)), axis=1)
+        shown = entity(t_ns, "watched area", lines=[lines(sides, 0.02, _WATCHED)])
+        yield "/watched", t_ns, messages.SceneUpdate(entities=[shown])
 
 
 def _transforms(scene: ReplayScene) -> Iterator[Message]:

@@ -179,7 +179,10 @@ export class ReplayView {
       stopPath: way(32, 0.006, true),
       toBody: way(1, 0.006, true),
       toVolume: way(1, 0.006, true),
+      watched: way(64, 0.012, false),
     };
+    const corners = header.watched.map(([x, y]) => new THREE.Vector3(x, y, 0.01));
+    this.lines.watched.show(corners.length ? [...corners, corners[0]] : [new THREE.Vector3()]);
     this.scene.add(
       this.robot.group, this.shell.group, this.surfaces.group, this.stop.group, this.person.group, this.volumeGroup, this.base, ...Object.values(this.lines).map((one) => one.mesh),
     );
@@ -193,7 +196,7 @@ export class ReplayView {
     const { materials, lines } = this;
     this.scene.background = new THREE.Color(colours.stage);
     for (const [name, material] of Object.entries(materials)) material.color.set(colours[["mesh", "shell"].includes(name) ? "robot" : name]);
-    for (const [name, one] of Object.entries(lines)) one.mesh.material.color.set(colours[name]);
+    for (const [name, one] of Object.entries(lines)) one.mesh.material.color.set(colours[name === "watched" ? "volume" : name]);
     if (this.grid) {
       this.scene.remove(this.grid);
       this.grid.dispose();
