@@ -59,8 +59,8 @@ def visit_log(
                 rows.append((capture_ns, c, NOBODY, np.full((len(POINTS), 3), np.nan), np.zeros(len(POINTS))))
     captures, cameras, bodies, points_m, confidences = (np.array(column) for column in zip(*rows, strict=True))
     with LogWriter(path) as writer:
-        for name, T in header.T_world_camera.items():
-            writer.camera(name, T)
+        for camera, T in header.T_world_camera.items():
+            writer.camera(camera, T)
         writer.task(header.task)
         writer.base(header.T_world_base)
         writer.frames(

@@ -265,11 +265,21 @@ def prediction_stage(job: Job) -> PredictionStage:
 
 
 def surroundings(job: Job, model: RobotModel) -> Surroundings:
-    """What a job's robot keeps clear of."""
+    """What a job's robot keeps clear of.
+
+    Raises:
+        SettingsError: The robot stands outside the area that its cell says is watched.
+    """
     stage, area = prediction_stage(job), watched_area(job)
     border = None
     if area is not None:
         border = WatchedBorder(area, Border.around(model, area.polygon), stage.occupancy.latency_s)
+        if not border.border.room_m.min() > 0.0:
+            base_m = np.round(model.T_world_base[:2, 3], 3).tolist()
+            raise SettingsError(
+                f"cell: watched.corners_m: the robot's base at {base_m} m lies outside; would be right: an area around "
+                "the robot, in the world's coordinates"
+            )
     return Surroundings(stage, job.settings.fusion.fresh_s, border)
 
 

@@ -54,8 +54,6 @@ class Flight:
 
     overrides: tuple[str, ...] = ()
     walk: Walk = far_away
-    cell: Path | None = None  #: cell file; where it says what is watched, frames show that nobody is there
-    silent: Callable[[float], bool] = lambda _s: False  #: whether no camera sends anything
     faults: tuple[Fault, ...] = ()
     seed: int = 0
     twin: TwinSettings = field(default_factory=TwinSettings)
@@ -67,6 +65,8 @@ class Flight:
     )  #: with what they answer, and whether a packet of it was in doubt
     states: list[HumanStates] = field(default_factory=list)
     frames: list[tuple[int, bytes]] = field(default_factory=list)
+    cell: Path | None = None  #: cell file; where it says what is watched, frames show that nobody is there
+    silent: Callable[[float], bool] = lambda _s: False  #: whether no camera sends anything
 
     def __post_init__(self) -> None:
         self.start = start(*self.overrides, cell=self.cell)

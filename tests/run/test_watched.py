@@ -12,7 +12,8 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from hrcreplay.errors import LogError
+from hrcreplay.calibration.cell import Cell, Watched, write_cell
+from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import BORDER
 from hrcreplay.run import replay, report
@@ -172,6 +173,13 @@ def test_somebody_lost_in_the_middle_is_not_gone(tmp_path: Path) -> None:
     meta = json.loads((folder / "run.json").read_text())
     assert meta["counts"]["watched_frames_refuting"] > 0  # whoever says 0.2 s is told that it was wrong
     assert any("a larger watched.margin_m" in note for note in meta["notes"])
+
+
+def test_an_area_without_the_robot_is_refused(tmp_path: Path) -> None:
+    log = visit_log(tmp_path / "visit.mcap", nobody, 1.0)
+    write_cell(Cell(watched=Watched(corners_m=[[5.0, 5.0], [9.0, 5.0], [9.0, 9.0]])), tmp_path / "far.toml")
+    with pytest.raises(SettingsError, match=r"the robot's base at \[0\.2, 0\.0\] m lies outside"):
+        replay.run("plan", log, out=tmp_path / "run", cell_file=tmp_path / "far.toml", overrides=ALONE)
 
 
 def test_why_names_the_border(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def _judged(state: VacancyState, clear_ns: int) -> VacancyState:
     watched_ns = min(state.newest_ns)
     if watched_ns < 0:
         return state
-    bodies = tuple((who, seen) for who, seen in state.bodies if seen.capture_ns > watched_ns - clear_ns)
+    bodies = tuple((who, seen) for who, seen in state.bodies if seen.capture_ns >= watched_ns - clear_ns)
     inside = [seen for _, seen in bodies if seen.inside]
     anybody, others = state.vacant_ns
     if watched_ns - max(state.begin_ns) >= clear_ns:

@@ -95,7 +95,7 @@ def by_search(scene: Scene, at_ns: int, *, but_the_person: bool) -> float:
             sightings = [row for row in rows if row[2] == camera and row[3] == who]
             if sightings:
                 last = max(sightings, key=lambda row: (row[0], row[1]))
-                inside = inside or (last[0] > begin and not abs(last[4][3, 0]) >= 2.0)  # NaN: anywhere
+                inside = inside or (last[0] >= begin and not abs(last[4][3, 0]) >= 2.0)  # NaN: anywhere
         if whole and not inside:
             best = max(best, until)
     return np.inf if best < 0 else (at_ns - best) / 1e9
@@ -159,6 +159,19 @@ def test_who_is_seen_to_leave_has_left_and_who_is_lost_inside_may_be_there(out_m
     just_lost, later = round(30 * 33.0 / 4.0), round((30 * 33.0 + 600.0) / 4.0)
     assert (found.nobody_s[just_lost] > 0.9) == waits
     assert found.nobody_s[later] < 0.1
+
+
+@pytest.mark.parametrize("clear_s", [0.0, 0.02])
+def test_somebody_who_is_shown_inside_is_there_however_short_a_loss_counts(clear_s: float) -> None:
+    scene = Scene()
+    for number in range(40):
+        for camera in range(2):
+            scene.add(33.0 * number + 5.0 * camera, camera, "person" if 10 <= number < 30 else "nobody", 1.0)
+    found, _ = watched(scene, ticks(330), replace(AREA, clear_s=clear_s))
+    assert found.nobody_s is not None
+    inside = (found.t_ns > 380 * MS) & (found.t_ns < 1000 * MS)
+    np.testing.assert_allclose(np.diff(found.nobody_s[inside]), 0.004, atol=1e-9)
+    assert found.nobody_s[found.t_ns > 1100 * MS].max() < 0.1
 
 
 def test_one_camera_alone_makes_no_area_vacant() -> None:

@@ -249,7 +249,7 @@ def test_looks_are_the_replay_tick_by_tick() -> None:
     flight = Flight(walk=lambda s: (2.0 + 0.5 * np.sin(s), 0.3 * s)).fly(4.0)
     controller = build_controller(start())
     observer: Observer = controller.observer
-    fusion_stage, prediction_stage = observer._fusion_stage, observer._prediction_stage
+    fusion_stage, prediction_stage = observer._fusion_stage, observer._surroundings.prediction
     ticks = np.array([int(states.t_ns[0]) for states in flight.states])
     frames = [observer._frames(t_ns, [data]) for t_ns, data in flight.frames]
     _, measured, _ = fusion_stage.measure(

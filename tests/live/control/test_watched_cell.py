@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hrcreplay.human.fusion import vacancy
 from hrcreplay.live.control import session_controller
+from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import PHASES
 from hrcreplay.live.verify import verify
-from hrcreplay.records import BORDER
+from hrcreplay.logs.clean import PersonMemory
+from hrcreplay.records import BORDER, CameraFrames, HumanStates
 from tests.live import made
 from tests.live.flights import BEGIN_NS, Flight, steps_keep_the_limits
 from tests.visits import cell_around
@@ -36,7 +40,7 @@ def speeds(flight: Flight, begin_s: float, end_s: float) -> float:
 
 
 def test_nobody_is_needed_where_nobody_can_be(cell: Path) -> None:
-    flight = Flight((FAST,), lambda _s: None, cell).fly(8.0)
+    flight = Flight((FAST,), lambda _s: None, cell=cell).fly(8.0)
     assert flight.phases()[-1] == "following"
     assert not flight.controller.stops
     assert speeds(flight, 0.0, 2.0) == 0.0  # watched.clear_s
@@ -57,7 +61,7 @@ def test_somebody_who_walks_in_and_out_holds_the_robot_up_and_no_more(cell: Path
         x_m = max(0.6, HALF_M + 0.5 - 1.6 * (s - 4.0)) if s < 7.0 else 0.6 + 1.0 * (s - 7.0)
         return None if s < 4.0 or x_m > HALF_M + 0.5 else (x_m, 0.0)
 
-    flight = Flight((FAST,), walk, cell).fly(13.0)
+    flight = Flight((FAST,), walk, cell=cell).fly(13.0)
     assert not flight.controller.stops
     assert speeds(flight, 2.0, 4.0) > 0.3
     assert speeds(flight, 6.0, 7.0) < 1e-3
@@ -67,7 +71,7 @@ def test_somebody_who_walks_in_and_out_holds_the_robot_up_and_no_more(cell: Path
 
 
 def test_cameras_that_fall_silent_stop_the_session(cell: Path) -> None:
-    flight = Flight((FAST,), lambda _s: None, cell, silent=lambda s: s > 4.0).fly(6.0)
+    flight = Flight((FAST,), lambda _s: None, cell=cell, silent=lambda s: s > 4.0).fly(6.0)
     assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
     assert speeds(flight, 2.0, 4.0) > 0.3
     assert speeds(flight, 5.0, 6.0) == 0.0
@@ -75,17 +79,41 @@ def test_cameras_that_fall_silent_stop_the_session(cell: Path) -> None:
 
 
 def test_somebody_lost_in_the_middle_stops_the_session(cell: Path) -> None:
-    flight = Flight((FAST,), lambda s: None if s > 4.0 else (1.6, 1.2), cell).fly(7.5)
+    flight = Flight((FAST,), lambda s: None if s > 4.0 else (1.6, 1.2), cell=cell).fly(7.5)
     assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
     assert speeds(flight, 5.0, 7.5) == 0.0
 
 
 def test_with_resume_the_robot_goes_on_once_the_area_is_vacant(cell: Path) -> None:
     settings = (FAST, "live.resume=true", "live.resume_s=0.5")
-    flight = Flight(settings, lambda s: None if s > 4.0 else (1.6, 1.2), cell).fly(9.0)
+    flight = Flight(settings, lambda s: None if s > 4.0 else (1.6, 1.2), cell=cell).fly(9.0)
     assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
     assert speeds(flight, 5.0, 6.0) == 0.0
     assert speeds(flight, 7.0, 9.0) > 0.1
+
+
+def test_looks_at_the_area_are_the_replay_tick_by_tick(cell: Path) -> None:
+    def walk(s: float) -> tuple[float, float] | None:
+        return None if s < 3.0 or s > 5.0 else (3.2 - 1.6 * (s - 3.0), 0.2)
+
+    flight = Flight((FAST,), walk, cell=cell).fly(8.0)
+    observer = build_controller(flight.start).observer
+    fusion_stage = observer._fusion_stage
+    assert fusion_stage.watched is not None
+    tables = [observer._frames(t_ns, [data]) for t_ns, data in flight.frames]
+    frames = CameraFrames.join([table for table in tables if table is not None])
+    _, _, everybody, mine, _ = fusion_stage.measure_all(frames, PersonMemory())
+    live = HumanStates.join(flight.states)
+    blank = replace(live, nobody_s=None, nobody_else_s=None)
+    _, again, counts = vacancy.watch(vacancy.start(2), blank, everybody, mine, fusion_stage.watched)
+    assert live.nobody_s is not None
+    assert again.nobody_s is not None
+    assert len(np.unique(np.isfinite(live.nobody_s))) == 2
+    np.testing.assert_array_equal(live.nobody_s, again.nobody_s)
+    assert live.nobody_else_s is not None
+    assert again.nobody_else_s is not None
+    np.testing.assert_array_equal(live.nobody_else_s, again.nobody_else_s)
+    assert counts["watched_frames_refuting"] == flight.controller.counts()["watched_frames_refuting"]
 
 
 @pytest.mark.parametrize("method", ["qp", "ssm"])
@@ -93,7 +121,7 @@ def test_a_session_in_a_watched_cell_comes_out_the_same_again(cell: Path, tmp_pa
     def walk(s: float) -> tuple[float, float] | None:
         return None if s < 3.0 else (max(1.2, 3.2 - 1.2 * (s - 3.0)), 0.2)
 
-    flight = Flight((FAST, f"plan.method={method}"), walk, cell).fly(5.0)
+    flight = Flight((FAST, f"plan.method={method}"), walk, cell=cell).fly(5.0)
     assert speeds(flight, 2.0, 4.0) > 0.2
     partial = folder.make_partial(tmp_path / "session")
     end = {"what": "end", "reason": "Ctrl-C", "counts": {}, "dropped": 0, "looks_skipped": 0, "stops": []}
