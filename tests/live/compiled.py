@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from numba.core.registry import CPUDispatcher
 
@@ -14,6 +16,7 @@ from hrcreplay.egm.robot_double.faults import random_faults
 from hrcreplay.live.control.setup import compile_kernels
 from tests.live import campaign
 from tests.live.flights import Flight, start
+from tests.visits import cell_around
 
 SECONDS = 4.0
 OVERRIDES = ("live.approach_speed=1.0", "live.resume=true", "live.resume_s=0.1")
@@ -37,11 +40,16 @@ def kernels() -> set[tuple[str, str]]:
 
 
 def late(sessions: int) -> Iterator[str]:
-    """Kernels that sessions with faults compile while the robot waits."""
-    compile_kernels(start(*OVERRIDES))
-    before = kernels()
-    for seed in range(sessions):
-        Flight(OVERRIDES, walk, random_faults(seed, duration_s=SECONDS - 0.5, count=6), seed).fly(SECONDS)
+    """Kernels that sessions with faults compile while the robot waits, and one in a watched cell."""
+    with TemporaryDirectory() as folder:
+        cell = cell_around(Path(folder) / "cell.toml", 2.5, clear_s=0.5)
+        compile_kernels(start(*OVERRIDES, cell=cell))
+        before = kernels()
+        for seed in range(sessions):
+            Flight(OVERRIDES, walk, random_faults(seed, duration_s=SECONDS - 0.5, count=6), seed).fly(SECONDS)
+        watched = Flight(OVERRIDES, lambda s: None if s < 2.0 else (4.0 - s, 0.2), cell=cell).fly(SECONDS)
+    if "following" not in watched.phases() or watched.phases()[-1] == "waiting":
+        yield "the robot in a watched cell did not move\n"
     for name, signature in sorted(kernels() - before):
         yield f"{name}: {signature}\n"
 

@@ -73,7 +73,7 @@ class Border:
 
 
 def _obstacles(vertices: Floats, offsets: Ints, radius: Floats, horizon_s: float, first: int) -> Obstacles:
-    for array in (vertices, offsets, radius):  # as those of a person alone, or numba would compile all kernels again
+    for array in (vertices, radius):  # as those of a person alone, or numba would compile all kernels again
         array.setflags(write=False)
     around, known = boxes(vertices, offsets, radius)
     return Obstacles(vertices, offsets, radius, around, known, horizon_s, first)
