@@ -9,6 +9,9 @@ import argparse
 import sys
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +20,9 @@ from hrcreplay.egm.robot_double.faults import KINDS, Fault, random_faults
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.step_gate import StepGate, UnsafeCommandError
 from hrcreplay.live.record.codec import PHASES
+from tests.live.attacks import checker
 from tests.live.flights import CYCLE_S, Flight, is_a_stop, steps_keep_the_limits
+from tests.live.made import record
 
 SECONDS = 6.0
 
@@ -93,30 +98,57 @@ def _unanswered(flight: Flight) -> list[str]:
     return [f"{missed} packets unanswered"] if missed else []
 
 
-def _judge(seed: int) -> tuple[int, list[str], Counter[str], Counter[str]]:
+class Judged(NamedTuple):
+    """What became of a session."""
+
+    wrong: list[str]
+    faults: Counter[str]
+    stops: Counter[str]
+    greatest: checker.Step | None  #: by a checker that reads the session's log alone; None where nothing was sent
+
+
+def judge(seed: int) -> Judged:
+    """Runs a session, and looks at its answers and at its log."""
     flight = session(seed)
+    wrong, greatest = violations(flight), None
+    with TemporaryDirectory() as folder:
+        log = record(Path(folder) / "log.mcap", flight.messages, chunk=500)
+        steps = list(checker.steps(log))
+    if steps:
+        greatest = max(steps, key=lambda step: step.share)
+        if greatest.share > 1.0 + 1e-6:
+            wrong.append(f"a step of {greatest.step_deg:.4f} deg, {greatest.share:.3f} of what the axis can go")
     faults = Counter(fault.kind for fault in flight.faults)
-    return seed, violations(flight), faults, Counter(reason for _, reason in flight.controller.stops)
+    return Judged(wrong, faults, Counter(reason for _, reason in flight.controller.stops), greatest)
 
 
 def main() -> int:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m tests.live.campaign", description=__doc__)
     parser.add_argument("--sessions", type=int, default=200)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first session")
     parser.add_argument("--processes", type=int, default=1)
     given = parser.parse_args()
     faults: Counter[str] = Counter()
     stops: Counter[str] = Counter()
-    bad = 0
+    bad, worst = 0, checker.Step(0, 0, 0.0, 0.0)
+    seeds = range(given.first, given.first + given.sessions)
     with ProcessPoolExecutor(given.processes) as pool:
-        for seed, wrong, kinds, reasons in pool.map(_judge, range(given.sessions)):
-            faults, stops, bad = faults + kinds, stops + reasons, bad + bool(wrong)
-            for line in wrong:
+        for seed, found in zip(seeds, pool.map(judge, seeds), strict=True):
+            faults, stops, bad = faults + found.faults, stops + found.stops, bad + bool(found.wrong)
+            worst = max(worst, found.greatest or worst, key=lambda step: step.share)
+            for line in found.wrong:
                 sys.stdout.write(f"session {seed}: {line}\n")
+            if (seed + 1) % 100 == 0:
+                sys.stderr.write(f"{seed + 1 - given.first} sessions done\n")
     missing = sorted(set(KINDS) - set(faults))
     sys.stdout.write(f"{given.sessions} sessions, {sum(faults.values())} faults: {dict(sorted(faults.items()))}\n")
     sys.stdout.write(f"kinds that did not come up: {', '.join(missing) or 'none'}\n")
-    sys.stdout.write(f"stops: {dict(sorted(stops.items()))}\n{bad} sessions with a violation\n")
+    sys.stdout.write(f"stops: {dict(sorted(stops.items()))}\n")
+    sys.stdout.write(
+        f"greatest step, from the logs alone: {worst.step_deg:.4f} deg of joint {worst.axis + 1}, {worst.share:.3f} of "
+        f"what it can go\n{bad} sessions with a violation\n"
+    )
     return int(bad > 0)
 
 
