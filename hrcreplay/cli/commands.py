@@ -132,16 +132,17 @@ def twin(
 
 def _axes_of_double(config: Path | None, overrides: tuple[str, ...]) -> Axes:
     """Range and speed of the robot of the settings, in the order of EGM."""
-    import numpy as np
-
     from hrcreplay.egm.robot_double.servo import IRB140, axes_of
-    from hrcreplay.live.control.setup import joint_order
-    from hrcreplay.run.job import robot_description
     from hrcreplay.settings.load import load_settings
 
     found = load_settings(config, overrides)
-    if found.robot.urdf is None:
+    if found.robot.urdf is None:  # and the double is there at once
         return IRB140
+    import numpy as np
+
+    from hrcreplay.live.control.setup import joint_order
+    from hrcreplay.run.job import robot_description
+
     robot = robot_description(found.robot)
     order = joint_order(robot.name, robot.joints, found.live.joint_order)
     return axes_of(*(np.asarray(bound)[order] for bound in (robot.q_min, robot.q_max, robot.dq_max)))

@@ -113,10 +113,10 @@ def test_other_settings_of_a_urdf_are_refused_for_the_built_in_robot() -> None:
             robot_of(job_without_log("plan", DEMO, settings, None), np.eye(4))
 
 
-def test_live_drives_six_axes_and_says_so(tmp_path: Path) -> None:
+def test_live_drives_six_to_fourteen_axes_and_says_so(tmp_path: Path) -> None:
     path = urdf(tmp_path / "arm.urdf", "", "<sphere radius='0.1'/>")
     opened, header = live_job(DEMO, None, (f"robot.urdf={path}",), None)
-    with pytest.raises(SettingsError, match=r"robot.urdf: other has 1 axes; live drives robots of 6 over EGM"):
+    with pytest.raises(SettingsError, match=r"robot.urdf: other has 1 axes; live drives robots of 6 to 14 over EGM"):
         start_table(opened, header, sending=True)
 
 
