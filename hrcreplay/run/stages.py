@@ -195,8 +195,9 @@ def _about_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -> I
         yield f"watched area: never known to be without people, as no frame came from {', '.join(silent)}"
     else:
         yield (
-            "watched area: never known to be without people: not all cameras showed it so for watched.clear_s without "
-            "a gap; trackers whose messages only name people (tf) cannot show that nobody is there"
+            "watched area: never known to be without people beside the person: another body was in it all along, or "
+            "not all cameras showed it for watched.clear_s without a gap; trackers whose messages only name people (tf) "
+            "cannot show that nobody is there"
         )
 
 

@@ -175,6 +175,15 @@ def test_somebody_lost_in_the_middle_is_not_gone(tmp_path: Path) -> None:
     assert any("a larger watched.margin_m" in note for note in meta["notes"])
 
 
+def test_an_area_that_is_never_without_others_is_told_and_the_robot_stands(tmp_path: Path) -> None:
+    folder = run(tmp_path, lambda _s: {1: (-1.8, -0.4), 2: (1.8, 1.2)}, 3.5)
+    motion, state = tables(folder)
+    assert np.isinf(state["nobody_else_s"]).all()
+    assert (motion["tcp_speed"] == 0.0).all()
+    notes = json.loads((folder / "run.json").read_text())["notes"]
+    assert any("another body was in it all along" in note for note in notes)
+
+
 def test_an_area_without_the_robot_is_refused(tmp_path: Path) -> None:
     log = visit_log(tmp_path / "visit.mcap", nobody, 1.0)
     write_cell(Cell(watched=Watched(corners_m=[[5.0, 5.0], [9.0, 5.0], [9.0, 9.0]])), tmp_path / "far.toml")
