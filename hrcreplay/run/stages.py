@@ -196,8 +196,8 @@ def _about_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -> I
     else:
         yield (
             "watched area: never known to be without people beside the person: another body was in it all along, or "
-            "not all cameras showed it for watched.clear_s without a gap; trackers whose messages only name people (tf) "
-            "cannot show that nobody is there"
+            "not all cameras showed it for watched.clear_s without a gap; trackers whose messages only name people, as "
+            "on tf, cannot show that nobody is there"
         )
 
 
