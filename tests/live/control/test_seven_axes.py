@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hrcreplay.egm import motion_link_pb2 as egm
+from hrcreplay.egm.codec import decode_correction
 from hrcreplay.egm.robot_double.servo import ServoSettings, axes_of
 from hrcreplay.egm.robot_double.twin import TwinSettings
 from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.errors import SettingsError
+from hrcreplay.live.control.loop import _brake
 from hrcreplay.live.control.session_controller import TRACKING
 from hrcreplay.live.control.setup import joint_order
 from hrcreplay.live.record import codec, folder
@@ -61,6 +65,26 @@ def test_an_arm_of_seven_axes_follows_its_programme(tmp_path: Path, order: list[
     assert_allclose(measured[1:, by_egm], after[: len(rows) - 1], atol=1e-9)
     lag = np.abs(measured - np.array([row.q for row in rows])).max()
     assert lag < 0.15
+
+
+def test_after_a_crash_the_fallback_goes_on_with_the_stop_in_the_order_of_egm(tmp_path: Path) -> None:
+    flight = flight_of(tmp_path, SEVEN, seconds=3.0)
+    last = flight.answers[-1]
+    assert last.stop is not None
+    assert last.stop.ticks > 3
+    loop: Any = SimpleNamespace(sent=last.datagram, stop=last.stop, controller=flight.controller)
+    fallback = _brake(loop)
+    assert fallback is not None
+    by_egm = np.array(SEVEN) - 1
+    for row in range(1, last.stop.ticks + 1):
+        told = decode_correction(fallback.step(0))
+        assert_allclose(told.q, last.stop.q[row, by_egm], atol=1e-12)
+        assert_allclose(told.dq, last.stop.dq[row, by_egm], atol=1e-12)
+    assert fallback.at_rest
+    fallback.dq, fallback.stop = [10.0] * 7, []
+    fallback.step(0)  # and by itself, each axis by its own limit
+    slower = 10.0 - np.degrees(flight.robot.ddq_max[by_egm]) * fallback.cycle_s
+    assert_allclose(fallback.dq, np.maximum(slower, 0.0), atol=1e-9)
 
 
 def test_another_order_than_the_robot_s_is_met_by_a_stop(tmp_path: Path) -> None:
