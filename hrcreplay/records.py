@@ -18,6 +18,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+#: Height of the floor in the world, whose z axis is up [m].
+FLOOR_Z_M = 0.0
+
 #: Joints of the human model in the order of Eq. (37), right arm before left; then the pelvis's height above the floor,
 #: which the paper counts among the lengths: people squat, sit down and get up.
 JOINTS = ("x", "y", "theta", "rho", "ar1", "ar2", "ar3", "ar4", "al1", "al2", "al3", "al4", "z")

@@ -71,6 +71,25 @@ def _flat(points_m: Floats, axes: Floats) -> tuple[Floats, Ints]:
     return points_m[corners], np.concatenate([_fan(loop), _fan(np.roll(loop, -1))[:, ::-1]])
 
 
+def above(points_m: Floats, triangles: Ints, height_m: float) -> tuple[Floats, Ints]:
+    """The part of a convex polytope above a height, as ``hull`` gives it; no corners where all of it is below.
+
+    Args:
+        points_m: (n, 3) points, its corners among them [m].
+        triangles: (f, 3) of its surface, in any order.
+        height_m: Only what is not below is kept [m].
+    """
+    a, b = points_m[np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)), axis=0).T]
+    low, high = a[:, 2:] - height_m, b[:, 2:] - height_m
+    passes = (low * high < 0.0)[:, 0]
+    low, high = low[passes], high[passes]
+    there = (high * a[passes] - low * b[passes]) / (high - low)
+    there[:, 2] = height_m
+    corners = points_m[np.unique(triangles)]
+    kept = np.concatenate([corners[corners[:, 2] >= height_m], there])
+    return hull(kept) if len(kept) else (kept, np.empty((0, 3), np.int64))
+
+
 @njit(cache=True)
 def _turn_outward(vertices: Floats, faces: Ints, neighbors: Ints) -> None:
     """Makes all triangles counterclockwise from outside, in place; a sliver's own normal could not tell.

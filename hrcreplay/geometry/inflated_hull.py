@@ -1,4 +1,4 @@
-"""A convex hull with a ball around every point: distances from it, and volumes of unions."""
+"""A convex hull with a ball around every point: distances from it, its volume above a height, volumes of unions."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ _COARSE = 16.0 * float(np.finfo(np.float64).eps)
 _G = 1.2207440846057594759
 _STEPS = np.array([1.0 / _G, 1.0 / _G**2, 1.0 / _G**3])
 _PARTS = 4
+#: Points in the box of what lies below a height: they err by 0.2 % of that box.
+_BELOW = 2048
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,20 @@ class InflatedHull:
     def volume_m3(self) -> float:
         """Its volume [m^3]."""
         return sphere_swept_volume_m3(self.vertices_m, self.radius_m, self.faces)
+
+    def volume_above_m3(self, height_m: float) -> float:
+        """Volume of its part above a height: all of it, less what is below by evenly spread points [m^3].
+
+        Args:
+            height_m: Such as that of the floor [m].
+        """
+        low, high = self.vertices_m.min(axis=0) - self.radius_m, self.vertices_m.max(axis=0) + self.radius_m
+        if low[2] >= height_m:
+            return self.volume_m3()
+        high[2] = min(high[2], height_m)
+        return max(
+            self.volume_m3() - float(np.prod(high - low)) * float(_inside([self], low, high, _BELOW).mean()), 0.0
+        )
 
     def distances_m(self, points_m: Floats) -> Floats:
         """(k,) distance of points (k, 3) from the hull, before the ball; 0 inside, NaN for a NaN point [m].
@@ -63,13 +79,18 @@ def union_volume_m3(solids: Sequence[InflatedHull], points: int, first: int = 0)
     """
     low = np.min([s.vertices_m.min(axis=0) - s.radius_m for s in solids], axis=0)
     high = np.max([s.vertices_m.max(axis=0) + s.radius_m for s in solids], axis=0)
+    shares = _inside(solids, low, high, points, first).reshape(_PARTS, -1).mean(axis=1)
+    box = float(np.prod(high - low))
+    return box * float(shares.mean()), box * float(shares.std(ddof=1)) / _PARTS**0.5
+
+
+def _inside(solids: Sequence[InflatedHull], low: Floats, high: Floats, points: int, first: int = 0) -> Bools:
+    """Which of the points that fill a box evenly, from ``low`` (3,) to ``high`` (3,) [m], are in any of the solids."""
     samples = (0.5 + np.arange(first, first + points)[:, None] * _STEPS) % 1.0 * (high - low) + low
     inside = np.zeros(points, dtype=np.bool_)
     for solid in solids:
         _mark(samples, solid.vertices_m, solid.faces, solid.radius_m, inside)
-    shares = inside.reshape(_PARTS, -1).mean(axis=1)
-    box = float(np.prod(high - low))
-    return box * float(shares.mean()), box * float(shares.std(ddof=1)) / _PARTS**0.5
+    return inside
 
 
 @njit(cache=True)

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
@@ -20,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats
 from hrcreplay.report import drawing
-from hrcreplay.report.figures_scene import ABOVE, RenderedHull, View, bones, bounds_of, draw_solids, outline, view_from
+from hrcreplay.report.figures_scene import ABOVE, View, bones, bounds_of, draw_solids, view_from, volume_solids
 from hrcreplay.report.metrics import columns, times
 from hrcreplay.report.metrics_plan import numeric_column
 
@@ -196,9 +195,9 @@ def volumes_at(occupancy: pd.DataFrame, state: pd.DataFrame, moment_ns: int, t0_
     points, heading = skeleton_at(state, t_ns)
     figure = drawing.column_figure(2.5)
     (ahead, above), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.56, gap_in=(0.0, 0.5))
-    solids = _solids(limbs)
+    solids = volume_solids(limbs)
     for ax, view in ((ahead, view_from(heading - 0.7, 0.15)), (above, ABOVE)):
-        low, high = bounds_of([outline(vertices, radius, view) for vertices, radius in limbs.values()], 0.03)
+        low, high = bounds_of([solid.outline(view) for solid in solids], 0.03)
         drawing.set_window(ax, low.tolist(), high.tolist())
         draw_solids(ax, solids, view, opacity=0.8, line=0.45)
         _draw_bones(ax, points, view, np.zeros(2))
@@ -224,9 +223,9 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
     centres = [view.flat(points[[POINTS.index("pelvis")]])[0] for points, _ in people]
     outlines = {
         method: [
-            outline(vertices, radius, view) - centre
+            solid.outline(view) - centre
             for (_, found), centre in zip(instants, centres, strict=True)
-            for vertices, radius in found[method].values()
+            for solid in volume_solids(found[method])
         ]
         for method in methods
     }
@@ -271,13 +270,8 @@ def skeleton_at(state: pd.DataFrame, t_ns: int) -> tuple[Floats, float]:
 def _draw_person(ax: Axes, limbs: Limbs, points: Floats, view: View, centre: Floats) -> None:
     """Volumes, half transparent, with the skeleton in them; ``centre`` is where the axes' origin is in the view."""
     moved = centre @ np.stack([view.right, view.up])
-    draw_solids(ax, _solids({limb: (v - moved, r) for limb, (v, r) in limbs.items()}), view, opacity=0.8, line=0.45)
+    draw_solids(ax, volume_solids(limbs, moved), view, opacity=0.8, line=0.45)
     _draw_bones(ax, points, view, centre)
-
-
-def _solids(limbs: Limbs) -> list[RenderedHull]:
-    colours = {limb: to_rgb(drawing.LIMBS.get(limb, drawing.FAINT)) for limb in limbs}
-    return [RenderedHull(vertices, radius, colours[limb]) for limb, (vertices, radius) in limbs.items()]
 
 
 def _draw_bones(ax: Axes, points: Floats, view: View, centre: Floats) -> None:

@@ -16,9 +16,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.spatial import ConvexHull, QhullError
 
-from hrcreplay.geometry.convex_hull import visible_front
+from hrcreplay.geometry.convex_hull import above, hull, visible_front
 from hrcreplay.geometry.small_matrices import apply, multiply
-from hrcreplay.records import POINTS, Floats
+from hrcreplay.records import FLOOR_Z_M, POINTS, Floats, Ints
 from hrcreplay.report import drawing
 from hrcreplay.report.drawing import figure_in
 from hrcreplay.report.metrics import thin_path
@@ -31,12 +31,33 @@ class RenderedHull:
     vertices_m: Floats  #: (m, 3) world [m]
     radius_m: float
     colour: tuple[float, float, float]
+    floor_m: float = -math.inf  #: what is below this height is not there [m]
 
     @cached_property
-    def hull(self) -> ConvexHull | None:
-        """The hull with balls of few corners; None where there is none."""
-        balls = _sphere(64 if len(self.vertices_m) <= _FEW else 32)  # a polytope hides most of each ball
-        return _hull((np.asarray(self.vertices_m)[:, None, :] + self.radius_m * balls).reshape(-1, 3))
+    def surface(self) -> tuple[Floats, Ints]:
+        """The hull with balls of few corners, as ``hull`` gives it; empty where it is not known."""
+        return self._grown(_sphere(64 if len(self.vertices_m) <= _FEW else 32))  # a polytope hides most of each ball
+
+    def outline(self, view: View) -> Floats:
+        """(k, 2) its outline in a view, exact but for the circle's 36 corners [m]; empty without a hull."""
+        if not np.isfinite(self.vertices_m).all():
+            return np.zeros((0, 2))
+        angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+        circle = np.column_stack([np.cos(angle), np.sin(angle)])
+        cloud = (view.flat(self.vertices_m)[:, None, :] + self.radius_m * circle).reshape(-1, 2)
+        if self.vertices_m[:, 2].min() - self.radius_m < self.floor_m:  # its edge on the floor may be outermost
+            cloud = view.flat(self._grown(np.concatenate([circle @ [view.right, view.up], _sphere(64)]))[0])
+        try:
+            return np.asarray(cloud[ConvexHull(cloud).vertices])
+        except (QhullError, ValueError):  # flat, or nothing
+            return np.zeros((0, 2))
+
+    def _grown(self, ball: Floats) -> tuple[Floats, Ints]:
+        """The hull of the vertices with points of the unit ball (k, 3) around each, above the floor."""
+        if not np.isfinite(self.vertices_m).all():
+            return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+        corners, faces = hull((self.vertices_m[:, None, :] + self.radius_m * ball).reshape(-1, 3))
+        return above(corners, faces, self.floor_m) if corners[:, 2].min() < self.floor_m else (corners, faces)
 
 
 @dataclass(frozen=True)
@@ -76,18 +97,6 @@ def _sphere(count: int) -> Floats:
     return np.column_stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)])
 
 
-def outline(vertices_m: Floats, radius_m: float, view: View) -> Floats:
-    """(k, 2) the outline of hull + ball in a view, exact but for the circle's 36 corners [m]; empty without a hull."""
-    if not np.isfinite(vertices_m).all():
-        return np.zeros((0, 2))
-    angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
-    circle = radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
-    flat = view.flat(vertices_m)
-    cloud = (flat[:, None, :] + circle).reshape(-1, 2)
-    hull = _hull(cloud)
-    return np.zeros((0, 2)) if hull is None else np.asarray(cloud[hull.vertices])
-
-
 def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: Floats, pixel_m: float) -> Floats:
     """What a viewer sees of solids that may intersect: each pixel shows the frontmost surface, lit from above.
 
@@ -108,18 +117,16 @@ def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: 
     sun = view.toward + 0.9 * view.up - 0.6 * view.right
     axes = np.column_stack([view.right, view.up, view.toward])
     for solid in solids:
-        hull = solid.hull
-        if hull is None:
+        corners, faces = solid.surface
+        if not len(faces):
             continue
-        triangles = multiply(hull.points, axes)[hull.simplices]
-        normals = np.ascontiguousarray(hull.equations[:, :3])
+        triangles = multiply(corners, axes)[faces]
         across = np.cross(*(triangles[:, k] - triangles[:, 0] for k in (1, 2)))
-        inward = (across * multiply(normals, axes)).sum(axis=1)
-        triangles[inward < 0.0] = triangles[inward < 0.0][:, ::-1]  # qhull's corners are in no order
+        normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         low_uv, high_uv = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         rows = slice(*np.searchsorted(v, [low_uv[1], high_uv[1]]))
         columns = slice(*np.searchsorted(u, [low_uv[0], high_uv[0]]))
-        depth, light = visible_front(triangles, apply(normals, sun), u[columns], v[rows])
+        depth, light = visible_front(triangles, apply(normals, multiply(sun[None], axes)[0]), u[columns], v[rows])
         ahead = depth > nearest[rows, columns]
         shade = (0.62 + 0.38 * np.clip(light / np.linalg.norm(sun), 0.0, 1.0))[..., None] * np.asarray(solid.colour)
         nearest[rows, columns][ahead] = depth[ahead]
@@ -140,7 +147,7 @@ def draw_solids(
         opacity: Of what is seen, in [0, 1].
         line: Opacity of the lines, which also show what is hidden.
     """
-    edges = [outline(solid.vertices_m, solid.radius_m, view) for solid in solids]
+    edges = [solid.outline(view) for solid in solids]
     if not any(len(edge) for edge in edges):
         return
     low, high = bounds_of(edges, 0.01)
@@ -157,13 +164,27 @@ def draw_solids(
     ax.add_collection(polygons, autolim=False)
 
 
+def volume_solids(limbs: Mapping[str, tuple[Floats, float]], moved_m: Floats | None = None) -> list[RenderedHull]:
+    """Swept volumes in the colours of their limbs, above the floor: limb -> (m, 3) vertices, world, and radius [m].
+
+    Args:
+        limbs: What to draw.
+        moved_m: (3,) place of the drawing's origin in the world; None where that is the same [m].
+    """
+    origin = np.zeros(3) if moved_m is None else moved_m
+    return [
+        RenderedHull(v - origin, r, to_rgb(drawing.LIMBS.get(limb, drawing.FAINT)), FLOOR_Z_M - float(origin[2]))
+        for limb, (v, r) in limbs.items()
+    ]
+
+
 def draw_outlines(ax: Axes, limbs: Mapping[str, tuple[Floats, float]], view: View) -> None:
     """Swept volumes in pale colour behind all else: limb -> (m, 3) vertices, world, and radius [m]."""
-    edges = {limb: outline(vertices, radius, view) for limb, (vertices, radius) in limbs.items()}
-    known = {limb: edge for limb, edge in edges.items() if len(edge)}
-    colours = [drawing.LIMBS.get(limb, drawing.FAINT) for limb in known]
+    edges = [(solid.colour, solid.outline(view)) for solid in volume_solids(limbs)]
+    colours = [colour for colour, edge in edges if len(edge)]
     for look in ({"facecolors": colours, "alpha": 0.15, "linewidths": 0.0}, {"edgecolors": colours, "alpha": 0.8}):
-        polygons = PolyCollection(list(known.values()), facecolors="none", linewidths=0.5, zorder=0)
+        known = [edge for _, edge in edges if len(edge)]
+        polygons = PolyCollection(known, facecolors="none", linewidths=0.5, zorder=0)
         polygons.set(**look)
         ax.add_collection(polygons, autolim=False)
 
@@ -175,13 +196,6 @@ def bounds_of(edges: Sequence[Floats], margin_m: float) -> tuple[Floats, Floats]
     if not len(corners):
         return np.full(2, -margin_m), np.full(2, margin_m)
     return corners.min(axis=0) - margin_m, corners.max(axis=0) + margin_m
-
-
-def _hull(points: Floats) -> ConvexHull | None:
-    try:
-        return ConvexHull(points)
-    except (QhullError, ValueError):  # NaN, or flat
-        return None
 
 
 def bones(points_m: Floats, view: View) -> list[Floats]:
@@ -246,8 +260,8 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
     """
     person = np.mean([v.mean(axis=0) for scene in story.scenes for v, _ in scene.volumes.values()], axis=0)
     view = view_from(_beside(person, story.base_m), 0.2)
-    arms = [outline(p, r, view) for s in story.scenes for e in s.ends_m for p, r in zip(e, story.radius_m, strict=True)]
-    bodies = [outline(v, r, view) for scene in story.scenes for v, r in scene.volumes.values()]
+    arms = [solid.outline(view) for s in story.scenes for ends in s.ends_m for solid in _robot(ends, story)]
+    bodies = [solid.outline(view) for scene in story.scenes for solid in volume_solids(scene.volumes)]
     low, high = bounds_of([*arms, *bodies], 0.02)
     robot_low = bounds_of(arms, 0.02)[0]
     low[1] = max(low[1], min(robot_low[1], float(view.flat(story.base_m[None])[0, 1]) - 0.05))  # legs say nothing here
@@ -283,13 +297,17 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
     return figure
 
 
+def _robot(ends_m: Floats, story: Storyboard) -> list[RenderedHull]:
+    """The robot's links, by the ends (s, 2, 3) of their axes [m]."""
+    return [RenderedHull(e, float(r), to_rgb(drawing.SKY)) for e, r in zip(ends_m, story.radius_m, strict=True)]
+
+
 def _draw_scene(ax: Axes, scene: StoryScene, side: int, story: Storyboard, view: View) -> None:
     if side:
         draw_outlines(ax, scene.volumes, view)
         for pair in bones(scene.points_m, view):
             ax.plot(*pair.T, color=drawing.INK, lw=1.0, zorder=1)
-    links = zip(scene.ends_m[side], story.radius_m, strict=True)
-    draw_solids(ax, [RenderedHull(e, float(r), to_rgb(drawing.SKY)) for e, r in links], view, line=0.4)
+    draw_solids(ax, _robot(scene.ends_m[side], story), view, line=0.4)
     ax.plot(*view.flat(thin_path(story.reference_m, 0.004)).T, color=drawing.NOMINAL, lw=0.9, zorder=4)
     driven = scene.tcp_m[side]
     ax.plot(*view.flat(thin_path(driven, 0.004)).T, color=drawing.ACTUAL, lw=1.1, zorder=5)
@@ -325,7 +343,7 @@ def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
     if pose.volumes:
         azimuth = _beside(np.mean([vertices.mean(axis=0) for vertices, _ in pose.volumes.values()], axis=0), base_m)
     for ax, view in ((side, view_from(azimuth, 0.12)), (above, ABOVE)):
-        edges = [outline(solid.vertices_m, solid.radius_m, view) for solid in solids]
+        edges = [solid.outline(view) for solid in solids]
         low, high = bounds_of([*edges, view.flat(base_m[None])], _MARGIN_M)
         drawing.set_window(ax, low.tolist(), high.tolist())
         draw_outlines(ax, pose.volumes, view)

@@ -240,7 +240,7 @@ def add_occupancy(metrics: MetricTable, occupancy: pd.DataFrame | None) -> None:
                 f"occupancy_{method}_{limb}_m3",
                 float(volume.mean()) if len(volume) else None,
                 "m^3",
-                f"mean swept volume of {limb} over the stored ticks, method '{method}', limb radius included",
+                f"mean swept volume of {limb} above the floor, limb radius included, over the stored ticks, '{method}'",
             )
         total = (
             rows[rows["limb"].isin(LIMBS)].groupby("t_ns", sort=True)["volume_m3"].sum(min_count=len(LIMBS)).dropna()

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from hrcreplay.records import Floats, Ints
 from hrcreplay.report import drawing
 from hrcreplay.report.drawing import BONES
-from hrcreplay.report.figures_scene import RenderedHull, View, outline, render_hulls, view_from
+from hrcreplay.report.figures_scene import RenderedHull, render_hulls, view_from, volume_solids
 from hrcreplay.report.metrics import seconds_from
 from hrcreplay.report.replay_scene import (
     RATE_HZ,
@@ -297,14 +297,14 @@ def snapshot(scene: ReplayScene, row: int) -> Figure:
         for pair, r in zip(body, scene.body_radius_m, strict=True)
         if np.isfinite(pair).all()
     ]
-    volumes = _stored(scene, row)
     figure = drawing.new_figure(6.2)
     axes = drawing.panels(figure, 1, 1, left_in=0.62, top_in=0.62, bottom_in=0.75)[0][0]
-    edges = [outline(solid.vertices_m, solid.radius_m, view) for solid in (*robot, *person)]
-    corners = np.vstack([*edges, *(edge for edge in _volumes_outlines(volumes, view) if len(edge))])
+    edges = [solid.outline(view) for solid in (*robot, *person)]
+    reach = [solid.outline(view) for solid in volume_solids(_stored(scene, row))]
+    corners = np.vstack([*edges, *(edge for edge in reach if len(edge))])
     low, high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
     drawing.set_window(axes, low.tolist(), high.tolist())
-    for edge in _volumes_outlines(volumes, view):
+    for edge in reach:
         axes.add_patch(Polygon(edge, facecolor=drawing.ORANGE, edgecolor=drawing.ORANGE, alpha=0.16, lw=0.7, zorder=1))
     image = render_hulls([*robot, *person], view, low, high, float(high[1] - low[1]) / 700.0)
     limits = axes.get_xlim(), axes.get_ylim()
@@ -341,21 +341,19 @@ def _words(track: MethodTrack, row: int) -> str:
     return ", ".join(words) + reason
 
 
-def _stored(scene: ReplayScene, row: int) -> list[tuple[Floats, float]]:
-    """The volumes stored last before an instant, not more than a fifth of a second."""
+def _stored(scene: ReplayScene, row: int) -> dict[str, tuple[Floats, float]]:
+    """The volumes stored last before an instant, not more than a fifth of a second: limb -> vertices and radius [m]."""
     stored, now_ns = scene.volumes, int(scene.t_ns[row])
     before = stored.t_ns[(stored.t_ns <= now_ns) & (stored.t_ns >= now_ns - 200_000_000)]
     if not len(before):
-        return []
-    return [
-        (stored.vertices_m[stored.offsets[k] : stored.offsets[k + 1]], float(stored.radius_m[k]))
+        return {}
+    return {
+        stored.limbs[stored.limb[k]]: (
+            stored.vertices_m[stored.offsets[k] : stored.offsets[k + 1]],
+            float(stored.radius_m[k]),
+        )
         for k in np.flatnonzero(stored.t_ns == before.max()).tolist()
-    ]
-
-
-def _volumes_outlines(volumes: list[tuple[Floats, float]], view: View) -> list[Floats]:
-    """(k, 2) the outline of each volume in a view [m]."""
-    return [outline(vertices, radius, view) for vertices, radius in volumes]
+    }
 
 
 def _beside(scene: ReplayScene, row: int) -> float:

@@ -9,7 +9,8 @@ import numpy as np
 from foxglove import messages
 from scipy.spatial import ConvexHull
 
-from hrcreplay.records import POINTS, Floats, Ints
+from hrcreplay.geometry.convex_hull import above
+from hrcreplay.records import FLOOR_Z_M, POINTS, Floats, Ints
 from hrcreplay.report.drawing import BONES
 
 Rgba = tuple[float, float, float, float]
@@ -96,19 +97,24 @@ def capsule(ends_m: Floats, radius_m: float, rgba: Rgba) -> dict[str, Any]:
 
 
 def surface(vertices_m: Floats, radius_m: float, rgba: Rgba = VOLUME) -> Any:
-    """The surface of hull + ball, (m, 3) vertices [m]; empty where there is no volume.
+    """The surface of hull + ball above the floor, (m, 3) vertices [m]; empty where there is no volume."""
+    corners, triangles = surface_mesh(vertices_m, radius_m)
+    return messages.TriangleListPrimitive(
+        points=points(np.round(corners, 3)), indices=triangles.ravel().tolist(), color=colour(rgba)
+    )
+
+
+def surface_mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, Ints]:
+    """Corners (k, 3) [m] and triangles (f, 3) of the surface of hull + ball, (m, 3) vertices [m], above the floor.
 
     For each direction the vertex that is furthest along it, and from there the ball's radius: the corners lie on the
     surface, so that between them the picture may be smaller than the volume, by millimetres.
     """
+    if not len(vertices_m) or not np.isfinite(vertices_m).all():
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     directions, triangles = _around_a_ball()
-    known = len(vertices_m) > 0 and bool(np.isfinite(vertices_m).all())
-    if not known:
-        return messages.TriangleListPrimitive(points=[], indices=[], color=colour(rgba))
     corners = vertices_m[np.argmax(directions @ vertices_m.T, axis=1)] + radius_m * directions
-    return messages.TriangleListPrimitive(
-        points=points(np.round(corners, 3)), indices=triangles.ravel().tolist(), color=colour(rgba)
-    )
+    return above(corners, triangles, FLOOR_Z_M) if corners[:, 2].min() < FLOOR_Z_M else (corners, triangles)
 
 
 @cache

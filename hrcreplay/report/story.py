@@ -385,7 +385,7 @@ def _predict(run: Run, metrics: Metrics) -> str:
     words = f"{settings['method']}, {limits}: the six limbs {text_of(metrics.get(f'{name}_sum_m3'))}"
     if f"{name}_LEGS_m3" in metrics:
         words += f", lower body {text_of(metrics[f'{name}_LEGS_m3'])}"
-    return words + " (means of the stored ticks; overlaps of limbs count twice)"
+    return words + " (means of the stored ticks, above the floor; overlaps of limbs count twice)"
 
 
 def _plan(metrics: Metrics, prefix: str) -> str:

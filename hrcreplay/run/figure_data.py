@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hrcreplay.geometry.convex_hull import sphere_swept_volume_m3
+from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.sweep import TRIANGLE_RAD
-from hrcreplay.records import JOINTS, LIMBS, POINTS, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import FLOOR_Z_M, JOINTS, LIMBS, POINTS, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.report import figures_prediction, figures_robot
 from hrcreplay.report.figures_prediction import Growth, Instant, Sweep, Walk
 from hrcreplay.report.figures_scene import LinkPose, Storyboard, StoryScene
@@ -138,7 +138,7 @@ def _sum_m3(volumes: SweptVolumes) -> float:
     hulls = _hulls(volumes, 0)
     if not all(np.isfinite(hulls[limb][0]).all() for limb in LIMBS):
         return float("nan")
-    return sum(sphere_swept_volume_m3(*hulls[limb]) for limb in LIMBS)
+    return sum(InflatedHull.around(*hulls[limb]).volume_above_m3(FLOOR_Z_M) for limb in LIMBS)
 
 
 def story(job: Job, run: Run, _people: HumanStates) -> Storyboard | None:

@@ -19,13 +19,14 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 from hrcreplay.calibration.clock_check import ClockCheck
 from hrcreplay.errors import LogError
-from hrcreplay.geometry import convex_hull
+from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.human.fusion import fuse, inverse_kinematics, vacancy
 from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import (
+    FLOOR_Z_M,
     NOBODY,
     Bools,
     CameraFrames,
@@ -326,7 +327,7 @@ def stored_ticks(first: int, count: int, store_every: float) -> Ints:
 
 
 def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, run: RunWriter) -> None:
-    """Writes hull vertices and size of some ticks' volumes; a tick without a person has none.
+    """Writes hull vertices and size above the floor of some ticks' volumes; a tick without a person has none.
 
     Args:
         volumes: Of any ticks.
@@ -345,13 +346,12 @@ def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, run: Ru
             vertices = volumes.vertices(tick, i)
             if np.isnan(vertices).any():
                 continue
-            corners, faces = convex_hull.hull(vertices)
-            radius = float(volumes.radius_m[tick, i])
+            solid = InflatedHull.around(vertices, float(volumes.radius_m[tick, i]))
             t_ns.append(int(volumes.t_ns[tick]))
             limbs.append(limb)
-            radii.append(radius)
-            sizes.append(convex_hull.sphere_swept_volume_m3(corners, radius, faces))
-            hulls.append(corners)
+            radii.append(solid.radius_m)
+            sizes.append(solid.volume_above_m3(FLOOR_Z_M))
+            hulls.append(solid.vertices_m)
             horizons.append(float(horizon_s[tick]))
     if t_ns:
         run.table("occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls, horizons))

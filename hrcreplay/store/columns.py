@@ -145,7 +145,7 @@ def occupancy_columns(
         limbs: Limb of each row.
         method: Method of the swept volumes.
         radius_m: Radius of the ball around each hull [m].
-        volume_m3: Volume of each hull with its ball [m^3].
+        volume_m3: Volume of each hull with its ball, above the floor [m^3].
         hulls: (m, 3) hull vertices of each row, before the radius, world [m].
         horizon_s: How long after the tick they hold, of each row [s].
     """

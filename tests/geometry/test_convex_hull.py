@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.geometry.convex_hull import hull, sphere_swept_volume_m3
+from hrcreplay.geometry.convex_hull import above, hull, sphere_swept_volume_m3
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, Ints
 from tests.human.people import random_states
@@ -182,3 +182,25 @@ def test_the_surface_is_closed_even_with_slivers() -> None:
         edges = [(int(face[k]), int(face[(k + 1) % 3])) for face in faces for k in range(3)]
         assert len(set(edges)) == len(edges)
         assert {(j, i) for i, j in edges} == set(edges)
+
+
+def test_a_hull_above_a_height_holds_the_points_that_do_both() -> None:
+    """Against qhull's own planes: a random point is in the part if it is in the hull and not below."""
+    rng = np.random.default_rng(11)
+    for height in (-0.4, 0.0, 0.3):
+        points = rng.normal(size=(40, 3))
+        whole, (corners, faces) = ConvexHull(points), above(points, hull(points)[1][:0], height)
+        assert len(corners) == len(faces) == 0  # no surface, nothing above
+        vertices, triangles = hull(points)
+        corners, faces = above(vertices, triangles, height)
+        assert corners[:, 2].min() == height
+        asked = rng.uniform(-2.0, 2.0, size=(4000, 3))
+        wanted = (asked @ whole.equations[:, :3].T + whole.equations[:, 3] <= 0.0).all(axis=1) & (asked[:, 2] >= height)
+        part = ConvexHull(corners)
+        found = (asked @ part.equations[:, :3].T + part.equations[:, 3] <= 1e-12).all(axis=1)
+        np.testing.assert_array_equal(found, wanted)
+        assert wanted.any()
+        outward = np.cross(corners[faces[:, 1]] - corners[faces[:, 0]], corners[faces[:, 2]] - corners[faces[:, 0]])
+        assert ((corners[faces[:, 0]] - corners.mean(axis=0)) * outward).sum(axis=1).min() > 0.0
+    corners, faces = above(vertices, triangles, 9.0)
+    assert corners.shape == faces.shape == (0, 3)

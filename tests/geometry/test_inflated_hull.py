@@ -82,3 +82,28 @@ def test_the_union_of_two_balls_that_meet() -> None:
         assert error < 0.05 * exact
     assert abs(np.mean(errors)) < 0.004 * exact  # calls that go on in the sequence do not share their error
     assert union_volume_m3(balls[:1] * 3, 4096)[0] == union_volume_m3(balls[:1], 4096)[0]
+
+
+def test_a_ball_and_a_capsule_above_a_height() -> None:
+    """A cap of a ball in closed form; a capsule that stands in the floor keeps all but half a ball."""
+    ball = InflatedHull.around(np.array([[0.4, -2.0, 0.1]]), 0.3)
+    cap = np.pi * 0.2**2 * (3.0 * 0.3 - 0.2) / 3.0
+    whole = 4.0 / 3.0 * np.pi * 0.3**3
+    assert ball.volume_above_m3(0.0) == pytest.approx(whole - cap, rel=0.005)
+    assert ball.volume_above_m3(0.2) == pytest.approx(cap, rel=0.02)
+    assert ball.volume_above_m3(-0.2) == ball.volume_m3()
+    assert ball.volume_above_m3(0.5) == pytest.approx(0.0, abs=0.01 * whole)
+    assert ball.volume_above_m3(5.0) == pytest.approx(0.0, abs=0.01 * whole)
+    legs = InflatedHull.around(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.9]]), 0.4)
+    half = 2.0 / 3.0 * np.pi * 0.4**3
+    assert legs.volume_above_m3(0.0) == pytest.approx(legs.volume_m3() - half, rel=0.003)
+
+
+def test_a_hull_above_a_height_is_the_share_of_random_points() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(DOF):
+        solid = InflatedHull.around(rng.normal(size=(12, 3)) * 0.3 + [0.0, 0.0, 0.2], 0.15)
+        low, high = solid.vertices_m.min(axis=0) - 0.15, solid.vertices_m.max(axis=0) + 0.15
+        points = rng.uniform(low, high, size=(40_000, 3))
+        share = ((points[:, 2] >= 0.0) & (solid.distances_m(points) <= 0.15)).mean()
+        assert solid.volume_above_m3(0.0) == pytest.approx(share * np.prod(high - low), rel=0.03)

@@ -10,7 +10,7 @@ from PIL import Image
 from hrcreplay.report import figures, figures_prediction, figures_robot
 from hrcreplay.report.figures import FIGURES, FigureData
 from hrcreplay.report.figures_prediction import Growth, Sweep, Walk
-from hrcreplay.report.figures_scene import RenderedHull, outline, render_hulls, view_from
+from hrcreplay.report.figures_scene import ABOVE, RenderedHull, render_hulls, view_from
 from hrcreplay.report.metrics import instants
 from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
@@ -188,16 +188,37 @@ def test_instants_are_a_second_apart_and_hold_the_nearest() -> None:
     assert ticks[0] <= nearest <= ticks[-1]
 
 
+BLACK = (0.0, 0.0, 0.0)
+
+
 def test_outline_of_a_ball_is_its_circle_from_anywhere() -> None:
     centre = np.array([[0.3, -0.2, 1.0]])
     for azimuth, elevation in ((0.0, 0.0), (1.0, 0.4), (-2.0, 1.2)):
         view = view_from(azimuth, elevation)
-        edge = outline(centre, 0.25, view) - view.flat(centre)
+        edge = RenderedHull(centre, 0.25, BLACK).outline(view) - view.flat(centre)
         assert np.linalg.norm(edge, axis=1) == pytest.approx(0.25)
 
 
 def test_outline_of_missing_vertices_is_empty() -> None:
-    assert len(outline(np.full((1, 3), np.nan), 0.1, view_from(0.0, 0.0))) == 0
+    assert len(RenderedHull(np.full((1, 3), np.nan), 0.1, BLACK).outline(view_from(0.0, 0.0))) == 0
+
+
+def test_the_floor_cuts_the_outline_of_a_ball() -> None:
+    """A ball with its centre in the floor: a half circle from the side, half an ellipse from obliquely above."""
+    ball = RenderedHull(np.array([[0.3, -0.2, 0.0]]), 0.25, BLACK, floor_m=0.0)
+    for elevation in (0.0, 0.5, 1.2):
+        view = view_from(0.7, elevation)
+        edge = ball.outline(view) - view.flat(ball.vertices_m)
+        low = np.sin(elevation) * 0.25
+        assert edge[:, 1].max() == pytest.approx(0.25, abs=0.002)
+        assert edge[:, 1].min() == pytest.approx(-low, abs=0.01)
+        assert edge[:, 0].max() == pytest.approx(0.25, abs=0.002)
+        below = edge[edge[:, 1] < -0.02]
+        if len(below):
+            assert np.hypot(below[:, 0] / 0.25, below[:, 1] / low) == pytest.approx(1.0, abs=0.05)
+    assert len(RenderedHull(np.array([[0.0, 0.0, -1.0]]), 0.25, BLACK, floor_m=0.0).outline(ABOVE)) == 0
+    buried = RenderedHull(np.array([[0.0, 0.0, -1.0]]), 0.25, BLACK, floor_m=0.0)
+    assert not render_hulls([buried], ABOVE, -np.ones(2), np.ones(2), 0.05).any()
 
 
 def test_picture_shows_the_nearer_solid_and_the_area_of_a_ball() -> None:

@@ -113,6 +113,9 @@ def test_a_volume_is_drawn_on_its_own_surface(tab: Tab, scene: ReplayScene) -> N
         hull = rows.vertices_m[rows.offsets[i] : rows.offsets[i + 1]]
         furthest = (hull @ normals.T).max(axis=0) + rows.radius_m[i]
         np.testing.assert_allclose((corners * normals).sum(axis=1), furthest, atol=1.5e-3)
+    floor = tab.evaluate("replay.view.materials.volume.clippingPlanes.map(p => [...p.normal.toArray(), p.constant])")
+    assert floor == [[0, 0, 1, 0]]  # and what is below the floor is not shown
+    assert tab.evaluate("replay.view.renderer.localClippingEnabled")
 
 
 def test_playing_moves_the_scene_and_pausing_holds_it(tab: Tab) -> None:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import hrcreplay
 from hrcreplay.report.replay_scene import ReplayScene, posed
 from hrcreplay.report.scene_mcap import write_scene
-from hrcreplay.report.scene_messages import surface
+from hrcreplay.report.scene_messages import surface, surface_mesh
 from tests.report.moving import moving_run, moving_scene, robot
 
 LAYOUT = Path(hrcreplay.__file__).parents[1] / "docs" / "foxglove-layout.json"
@@ -138,6 +138,23 @@ def test_a_volume_is_drawn_on_hull_and_ball(topics: dict[str, list[tuple[int, An
         faces = corners[np.reshape(entity.triangles[0].indices, (-1, 3))]
         closed = np.einsum("ij,ij->i", faces[:, 0], np.cross(faces[:, 1], faces[:, 2])).sum() / 6.0
         assert closed == pytest.approx(ConvexHull(corners).volume, rel=0.05)  # closed, and its faces look outward
+
+
+def test_a_volume_is_drawn_down_to_the_floor() -> None:
+    """Legs reach their radius beyond the line from floor to pelvis; below the floor nothing is drawn."""
+    legs, radius_m = np.array([[0.2, 0.1, 0.0], [0.4, 0.1, 0.9]]), 0.4
+    corners, triangles = surface_mesh(legs, radius_m)
+    assert corners[:, 2].min() == 0.0
+    assert corners[:, 2].max() == pytest.approx(1.3, abs=0.01)
+    on_floor = corners[corners[:, 2] == 0.0]
+    assert on_floor[:, 0].min() == pytest.approx(0.2 - radius_m, abs=0.02)
+    faces = corners[triangles]
+    closed = np.einsum("ij,ij->i", faces[:, 0], np.cross(faces[:, 1], faces[:, 2])).sum() / 6.0
+    asked = np.random.default_rng(4).uniform([-0.3, -0.4, 0.0], [0.9, 0.6, 1.4], size=(200_000, 3))
+    along = np.clip((asked - legs[0]) @ (legs[1] - legs[0]) / np.dot(legs[1] - legs[0], legs[1] - legs[0]), 0.0, 1.0)
+    inside = np.linalg.norm(asked - legs[0] - along[:, None] * (legs[1] - legs[0]), axis=1) <= radius_m
+    assert closed == pytest.approx(inside.mean() * 1.2 * 1.0 * 1.4, rel=0.05)
+    assert len(surface_mesh(legs - [0.0, 0.0, 5.0], radius_m)[0]) == 0
 
 
 def ball() -> np.ndarray:

@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.spatial import ConvexHull
 
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.geometry.convex_hull import hull
+from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, Floats, SweptVolumes
@@ -305,6 +307,28 @@ def test_what_the_volumes_hold_is_the_person(demo: Run) -> None:
         shown = row[[f"point_wrist_r_{axis}" for axis in "xyz"]].to_numpy(dtype=float)
         assert (directions @ shown <= far + 1e-9).all()
         assert (directions @ wrist <= far + radius * np.linalg.norm(directions, axis=1)).all()
+
+
+def test_the_size_of_a_volume_is_what_of_it_is_above_the_floor(demo: Run) -> None:
+    """Against random points around the stored hull; the other limbs are above the floor and lose nothing."""
+    assert demo.occupancy is not None
+    rng = np.random.default_rng(9)
+    for _, row in demo.occupancy[demo.occupancy["limb"] == "LEGS"].iloc[::200].iterrows():
+        solid = InflatedHull.around(np.asarray(row["vertices"]).reshape(-1, 3), row["radius_m"])
+        low, high = solid.vertices_m.min(axis=0) - solid.radius_m, solid.vertices_m.max(axis=0) + solid.radius_m
+        assert low[2] < -0.1
+        low[2] = 0.0
+        share = (solid.distances_m(rng.uniform(low, high, size=(20_000, 3))) <= solid.radius_m).mean()
+        assert row["volume_m3"] == pytest.approx(share * np.prod(high - low), rel=0.03)
+        assert row["volume_m3"] < 0.95 * solid.volume_m3()
+    row = demo.occupancy[demo.occupancy["limb"] == "HD"].iloc[0]
+    head = ConvexHull(_grown(np.asarray(row["vertices"]).reshape(-1, 3), row["radius_m"]))
+    assert row["volume_m3"] == pytest.approx(head.volume, rel=0.05)
+
+
+def _grown(vertices: Floats, radius: float) -> Floats:
+    unit = np.random.default_rng(2).normal(size=(400, 3))
+    return (vertices[:, None] + radius * unit / np.linalg.norm(unit, axis=1, keepdims=True)).reshape(-1, 3)
 
 
 def test_nothing_of_a_span_outside_the_log_is_replayed(tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ from typing import Any
 import foxglove
 import numpy as np
 from foxglove import channels, messages
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.geometry.convex_hull import above, hull
 from hrcreplay.live.view.status import Scene, SceneNames, Status, unpack
-from hrcreplay.records import Floats
+from hrcreplay.records import FLOOR_Z_M, Floats, Ints
 from hrcreplay.report.scene_messages import ROBOT, VOLUME, bones, capsule, colour, entity, points
 
 _BALL = 24  # directions in which a hull is grown by its radius
@@ -88,26 +89,15 @@ class FoxgloveStream:
         return [entity(now.t_ns, f"robot {link}", **capsule(ends, radius_m, ROBOT)) for link, radius_m, ends in links]
 
 
-def mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, np.ndarray[Any, Any]]:
-    """Surface of hull + ball: (k, 3) corners [m] and (f, 3) triangles, both empty where there is no volume.
+def mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, Ints]:
+    """Surface of hull + ball above the floor, as ``hull`` gives it; empty where there is no volume.
 
     The ball is a polyhedron around it, so the picture is never smaller than the volume.
     """
-    none = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     if not len(vertices_m) or not np.isfinite(vertices_m).all():
-        return none
-    cloud = (vertices_m[:, None, :] + radius_m * _around_a_ball()).reshape(-1, 3)
-    try:
-        hull = ConvexHull(cloud)
-    except QhullError:  # no radius and flat
-        return none
-    used, faces = np.unique(hull.simplices, return_inverse=True)
-    corners = cloud[used]
-    triangles = faces.reshape(hull.simplices.shape).copy()
-    a, b, c = (corners[triangles[:, k]] for k in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
-    triangles[inward] = triangles[inward][:, ::-1]
-    return corners, triangles
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    corners, faces = hull((vertices_m[:, None, :] + radius_m * _around_a_ball()).reshape(-1, 3))
+    return above(corners, faces, FLOOR_Z_M) if corners[:, 2].min() < FLOOR_Z_M else (corners, faces)
 
 
 @cache

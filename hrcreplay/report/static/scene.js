@@ -153,6 +153,8 @@ export class ReplayView {
     const solid = () => new THREE.MeshLambertMaterial();
     const glass = (opacity) => new THREE.MeshLambertMaterial({ transparent: true, opacity, depthWrite: false, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
     this.materials = { robot: solid(), shell: glass(0.18), mesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid() };
+    this.renderer.localClippingEnabled = true;
+    this.materials.volume.clippingPlanes = [new THREE.Plane(UP, 0)]; // above the floor
     this.robot = new Capsules(header.robot.radius_m, this.materials.robot);
     this.shell = new Capsules(header.robot.radius_m, this.materials.shell);
     this.surfaces = new Surfaces(header.robot, data.motion, this.materials.mesh);

@@ -61,7 +61,7 @@ def test_a_scene_comes_out_as_it_went_in() -> None:
 
 def test_a_mesh_holds_the_grown_hull_and_looks_outward() -> None:
     rng = np.random.default_rng(7)
-    vertices = rng.normal(size=(30, 3))
+    vertices = rng.normal(size=(30, 3)) + np.array([0.0, 0.0, 5.0])
     corners, faces = mesh(vertices, 0.1)
     a, b, c = (corners[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
@@ -72,6 +72,15 @@ def test_a_mesh_holds_the_grown_hull_and_looks_outward() -> None:
     room = np.einsum("ij,ij->i", unit, a) - (vertices @ unit.T).max(axis=0)  # of each face beyond the vertices
     assert (room > 0.1 - 1e-12).all()
     assert (room < 0.1 * 1.4).all()
+
+
+def test_a_mesh_ends_at_the_floor() -> None:
+    corners, faces = mesh(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.9]]), 0.4)
+    a, b, c = (corners[faces[:, k]] for k in range(3))
+    assert corners[:, 2].min() == 0.0
+    exact = np.pi * 0.4**2 * 0.9 + 2.0 / 3.0 * np.pi * 0.4**3
+    assert exact < np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0 < 1.4 * exact
+    assert len(mesh(np.array([[0.0, 0.0, -2.0]]), 0.4)[0]) == 0
 
 
 @pytest.mark.parametrize("vertices", [np.full((1, 3), np.nan), np.zeros((0, 3))])
