@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -30,7 +31,12 @@ def body(x_m: float, y_m: float, at_s: float) -> Floats:
 
 
 def visit_log(
-    path: Path, visitors: Visitors, seconds: float, *, silent: Callable[[str, float], bool] | None = None
+    path: Path,
+    visitors: Visitors,
+    seconds: float,
+    *,
+    silent: Callable[[str, float], bool] | None = None,
+    frozen: Mapping[int, float] = MappingProxyType({}),
 ) -> Path:
     """A log of the demo's cell and task.
 
@@ -39,6 +45,7 @@ def visit_log(
         visitors: Who is there.
         seconds: How long it lasts [s].
         silent: Camera and time -> whether that camera gives no frame at all then.
+        frozen: Body -> from then on its track shows it as it was [s].
     """
     header = open_log(replay.demo_log()).header
     assert header.T_world_base is not None and header.task is not None  # noqa: PT018 - for the type checker
@@ -53,7 +60,8 @@ def visit_log(
             capture_ns = BEGIN_NS + number * FRAME_NS + c * 5_000_000
             there = visitors(at_s)
             for name, (x_m, y_m) in sorted(there.items()):
-                points = body(base[0] + x_m, base[1] + y_m, at_s) @ to_camera[:3, :3].T + to_camera[:3, 3]
+                breath_s = min(at_s, frozen.get(name, at_s))
+                points = body(base[0] + x_m, base[1] + y_m, breath_s) @ to_camera[:3, :3].T + to_camera[:3, 3]
                 rows.append((capture_ns, c, name, points, np.isfinite(points[:, 0]).astype(float)))
             if not there:
                 rows.append((capture_ns, c, NOBODY, np.full((len(POINTS), 3), np.nan), np.zeros(len(POINTS))))

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hrcreplay.logs.clocks import CameraClock
-from hrcreplay.logs.messages import RawSkeleton
+from hrcreplay.logs.messages import RawSkeleton, missing_body
 from hrcreplay.records import NOBODY, POINTS, Bools, CameraFrames, Floats
 
 _TORSO = ("pelvis", "chest", "neck", "shoulder_l", "shoulder_r", "hip_l", "hip_r")
@@ -246,7 +246,15 @@ class Cleaner:
     """Cleans rows in order of arrival and returns them as tables of at most a second."""
 
     def __init__(self, cameras: tuple[str, ...], gap_s: float, defects: Counter[str], *, nobody: bool = False) -> None:
-        """Begin before the first row; with ``nobody`` the tables hold the frames that show nobody, too."""
+        """Begin before the first row.
+
+        Args:
+            cameras: Their names.
+            gap_s: A longer silence of a camera is a gap [s].
+            defects: Where defects are counted.
+            nobody: Whether the tables also tell what only matters for a watched area: frames that show nobody, and, by
+                rows without a point, bodies that are said to be there but not shown anew.
+        """
         self._cameras = cameras
         self._nobody = nobody
         self._index = {name: i for i, name in enumerate(cameras)}
@@ -292,13 +300,14 @@ class Cleaner:
                 self._defects["frames_duplicate"] += 1
             else:
                 self._flaw(row.camera, "frames_contradicting", 1)
+                return self._add_unshown(row, capture_ns, arrival_ns)
             return None
         self._newest[(row.camera, row.body)] = capture_ns
         whole, flaws = clean_skeleton(row)
         for name, count in flaws:
             self._flaw(row.camera, name, count)
         if self._repeats(whole, arrival_ns) or self._trembles(whole, arrival_ns):
-            return None
+            return self._add_unshown(row, capture_ns, arrival_ns)
         known = whole.confidence > 0
         self.seen[row.camera] = self.seen.get(row.camera, False) | known
         self.points[row.camera] += int(known.sum())
@@ -313,6 +322,13 @@ class Cleaner:
             return None
         self._newest[key] = capture_ns
         return self._deliver(capture_ns, arrival_ns, row)
+
+    def _add_unshown(self, row: RawSkeleton, capture_ns: int, arrival_ns: int) -> CameraFrames | None:
+        """Takes a body of which a frame says that it is there, but not where."""
+        if not self._nobody:
+            return None
+        points_m, confidence = missing_body()
+        return self._deliver(capture_ns, arrival_ns, row._replace(points_m=points_m, confidence=confidence))
 
     def _deliver(self, capture_ns: int, arrival_ns: int, row: RawSkeleton) -> CameraFrames | None:
         chunk = self.flush() if self._rows and arrival_ns - self._rows[0][1] >= _CHUNK_NS else None

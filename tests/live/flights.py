@@ -67,6 +67,7 @@ class Flight:
     frames: list[tuple[int, bytes]] = field(default_factory=list)
     cell: Path | None = None  #: cell file; where it says what is watched, frames show that nobody is there
     silent: Callable[[float], bool] = lambda _s: False  #: whether no camera sends anything
+    named: Callable[[float], bool] = lambda _s: False  #: whether they name another body, and show no point of it
 
     def __post_init__(self) -> None:
         self.start = start(*self.overrides, cell=self.cell)
@@ -113,9 +114,11 @@ class Flight:
             if self.silent((self._framed_ns - BEGIN_NS) * 1e-9):
                 pass
             elif place is None and self._watched:
-                seen += [_nobody(camera, self._framed_ns) for camera in self.start["cameras"]]
+                seen += [_without_points(camera, NOBODY, self._framed_ns) for camera in self.start["cameras"]]
             elif place is not None:
                 seen += [self._skeleton(camera, place, self._framed_ns) for camera in self.start["cameras"]]
+            if self.named((self._framed_ns - BEGIN_NS) * 1e-9):
+                seen += [_without_points(camera, 2, self._framed_ns) for camera in self.start["cameras"]]
             self._framed_ns += FRAME_NS
         perception = self.controller.update_perception(t_ns, seen)
         self.frames += [(t_ns, data) for data in seen]
@@ -156,10 +159,10 @@ class Flight:
         return np.array([reply.q for reply in said]), np.array([reply.dq for reply in said])
 
 
-def _nobody(camera: str, t_ns: int) -> bytes:
-    """A frame that shows nobody."""
+def _without_points(camera: str, body: int, t_ns: int) -> bytes:
+    """A frame that names a body and does not show it; of NOBODY: that shows nobody."""
     points, confidence = [np.nan] * (3 * len(POINTS)), [0.0] * len(POINTS)
-    message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=NOBODY, points=points, confidence=confidence)
+    message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=body, points=points, confidence=confidence)
     data: bytes = message.SerializeToString()
     return data
 

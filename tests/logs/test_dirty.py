@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from hrcreplay.logs.clean import DEFECTS
 from hrcreplay.logs.reader import Log, open_log
@@ -116,6 +117,30 @@ def test_a_camera_that_freezes_is_silent(tmp_path: Path) -> None:
     (said,) = (note for note in log.notes if "froze" in note)
     assert said.startswith("camera one froze: for 1.30 s from 0.10 s on it gave one and the same skeleton")
     assert said.endswith("its 39 rows that repeat count as silence")
+
+
+@pytest.mark.parametrize("kind", ["frozen", "trembling", "contradicting"])
+def test_a_body_that_is_not_shown_anew_is_said_to_be_there(tmp_path: Path, kind: str) -> None:
+    """Where frames of nobody are asked for, too: its rows have no point, and the counts are the same."""
+    rng = np.random.default_rng(3)
+    table = own.frames(10, cameras=("one",), which=[0, 1, 2, *([3] * 40), 4, 5])
+    captures, points = BEGIN + np.arange(45) * PERIOD, table.points_m.copy()
+    if kind == "trembling":
+        points[4:43] += rng.uniform(-1e-4, 1e-4, size=(39, *points.shape[1:]))
+    if kind == "contradicting":
+        captures[4:43:2] = captures[3:42:2]
+        points[3:43] += rng.uniform(-0.1, 0.1, size=(40, *points.shape[1:]))
+    log = opened(tmp_path, changed(table, capture_ns=captures, arrival_ns=captures + 5_000_000, points_m=points))
+    plain, counts = own.read(log), dict(log.defects)
+    everything = CameraFrames.join(list(log.frames(nobody=True)))
+    assert dict(log.defects) == counts
+    unshown = np.isnan(everything.points_m).all(axis=(1, 2))
+    assert unshown.sum() == counts[{"frozen": "frames_repeated"}.get(kind, f"frames_{kind}")]
+    assert unshown.sum() > 15
+    assert not everything.confidence[unshown].any()
+    assert (everything.body == table.body[0]).all()
+    assert len(everything) == len(table)
+    np.testing.assert_array_equal(everything.points_m[~unshown], plain.points_m)
 
 
 def test_a_repeated_frame_now_and_then_is_counted_only(tmp_path: Path) -> None:

@@ -27,9 +27,9 @@ HALF_M = 2.5
 
 
 def run(folder: Path, visitors: Visitors, seconds: float, *more: str, command: str = "plan", **how: Any) -> Path:
-    """A run on a made log; ``watched``: None for a cell that says nothing; ``silent`` as of ``visit_log``."""
-    watched, silent = how.pop("watched", {}), how.pop("silent", None)
-    log = visit_log(folder / "visit.mcap", visitors, seconds, silent=silent)
+    """A run on a made log; ``watched``: None for a cell that says nothing; some more is as of ``visit_log``."""
+    watched, spoilt = how.pop("watched", {}), {name: how.pop(name) for name in ("silent", "frozen") if name in how}
+    log = visit_log(folder / "visit.mcap", visitors, seconds, **spoilt)
     cell = None if watched is None else cell_around(folder / "cell.toml", HALF_M, **watched)
     return replay.run(command, log, out=folder / "run", cell_file=cell, overrides=(*ALONE, *more))
 
@@ -173,6 +173,23 @@ def test_somebody_lost_in_the_middle_is_not_gone(tmp_path: Path) -> None:
     meta = json.loads((folder / "run.json").read_text())
     assert meta["counts"]["watched_frames_refuting"] > 0  # whoever says 0.2 s is told that it was wrong
     assert any("a larger watched.margin_m" in note for note in meta["notes"])
+
+
+def test_a_body_whose_track_is_frozen_is_not_gone(tmp_path: Path) -> None:
+    """The trackers go on with somebody outside, and with a person at the robot as they were a while ago."""
+
+    def visitors(s: float) -> dict[int, tuple[float, float]]:
+        return {1: (0.9, 0.3), 2: (HALF_M + 0.3 + 0.1 * np.sin(3.0 * s), 0.0)}
+
+    def gone(s: float) -> dict[int, tuple[float, float]]:
+        return visitors(s) if s < 3.0 else {2: visitors(s)[2]}
+
+    motion, state = tables(run(tmp_path, visitors, 9.0, frozen={1: 3.0}))
+    assert (motion["tcp_speed"][motion["s"] > 3.4] == 0.0).all()
+    assert np.isinf(state["nobody_s"]).all()
+    (tmp_path / "gone").mkdir()
+    motion, _ = tables(run(tmp_path / "gone", gone, 9.0))
+    assert motion["tcp_speed"][motion["s"] > 6.0].max() > 0.2
 
 
 def test_an_area_that_is_never_without_others_is_told_and_the_robot_stands(tmp_path: Path) -> None:

@@ -127,6 +127,8 @@ class Observer:
             if row.camera not in self._cameras:
                 self.counts["skeletons_of_unknown_cameras"] += 1
                 continue
+            if self._fusion_stage.watched is None and not row.confidence.any():
+                continue  # a body without a point only matters for a watched area
             self._cleaner.add(row, t_ns)
         return self._cleaner.flush()
 

@@ -84,6 +84,21 @@ def test_somebody_lost_in_the_middle_stops_the_session(cell: Path) -> None:
     assert speeds(flight, 5.0, 7.5) == 0.0
 
 
+def test_a_body_that_is_named_and_not_shown_keeps_the_area_from_being_vacant(cell: Path) -> None:
+    flight = Flight((FAST,), lambda _s: None, cell=cell, named=lambda s: s > 4.0).fly(7.5)
+    assert flight.phases()[-1] == "holding"
+    assert speeds(flight, 2.0, 4.0) > 0.3
+    assert speeds(flight, 5.5, 7.5) == 0.0
+
+
+def test_without_a_word_of_the_cell_a_body_without_a_point_is_as_if_it_was_not_sent() -> None:
+    plain, named = (
+        Flight((FAST,), lambda _s: (1.6, 1.2), named=when).fly(3.0) for when in (lambda _s: False, lambda _s: True)
+    )
+    assert [answer.datagram for answer in plain.answers] == [answer.datagram for answer in named.answers]
+    assert plain.controller.counts() == named.controller.counts()
+
+
 def test_with_resume_the_robot_goes_on_once_the_area_is_vacant(cell: Path) -> None:
     settings = (FAST, "live.resume=true", "live.resume_s=0.5")
     flight = Flight(settings, lambda s: None if s > 4.0 else (1.6, 1.2), cell=cell).fly(9.0)

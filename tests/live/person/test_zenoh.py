@@ -128,6 +128,18 @@ def test_frames_that_come_twice_or_late_are_dropped() -> None:
     assert "frames_out_of_order" in notes(taken[2])[0]
 
 
+def test_a_body_whose_track_is_frozen_is_sent_without_a_point() -> None:
+    """Control needs to know that the camera says it is there, where the cell says what is watched."""
+    stream = CameraSubscription("ours", ZenohKey(key="hrc/x"))
+    where = [1.0 + k / 64.0 for k in range(60)]
+    (shown,) = skeletons(list(stream.take("hrc/x", own(NOW_NS, points=where), NOW_NS + 100)))
+    (named,) = skeletons(list(stream.take("hrc/x", own(NOW_NS + 1000, points=where), NOW_NS + 1100)))
+    assert np.isfinite(shown.points).any()
+    assert (named.body, named.capture_ns) == (shown.body, NOW_NS + 1000)
+    assert np.isnan(named.points).all()
+    assert not np.any(named.confidence)
+
+
 def test_a_capture_in_the_future_does_not_shut_out_those_that_follow() -> None:
     stream = CameraSubscription("ours", ZenohKey(key="hrc/x"))
     ahead = list(stream.take("hrc/x", own(NOW_NS + 3_600 * 10**9), NOW_NS))
