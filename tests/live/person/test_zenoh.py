@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trustme
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.live.person import source
@@ -338,3 +339,59 @@ def test_a_configuration_of_zenoh_s_own_is_used(tmp_path: Path) -> None:
                     break
         subscriber.undeclare()
     assert heard.is_set()
+
+
+def test_with_certificates_of_its_own_authority_no_stranger_is_heard(tmp_path: Path) -> None:
+    """Mutual TLS as in docs/live.md: a camera with a certificate, a stranger of another authority, one with none."""
+    pytest.importorskip("zenoh")
+    endpoint = free_endpoint().replace("tcp/", "tls/").replace("127.0.0.1", "localhost")
+    authorities = {name: certificates(tmp_path, name) for name in ("pc", "camera", "stranger")}
+    certificates(tmp_path, "camera", authorities["pc"])
+    heard: list[bytes] = []
+    everything = Event()
+
+    def take(sample: Any) -> None:
+        heard.append(sample.payload.to_bytes())
+        everything.set()
+
+    with source.open_session({"config": str(configuration(tmp_path, "pc", listen=endpoint))}) as ours:
+        subscriber = ours.declare_subscriber("a", take)
+        for name in ("stranger", "nobody"):
+            with source.open_session({"config": str(configuration(tmp_path, name, connect=endpoint))}) as theirs:
+                for _ in range(20):
+                    theirs.put("a", name.encode())
+                    everything.wait(0.05)
+        with source.open_session({"connect": [endpoint.replace("tls/", "tcp/")]}) as theirs:
+            for _ in range(20):
+                theirs.put("a", b"in the clear")
+                everything.wait(0.05)
+        assert not heard
+        with source.open_session({"config": str(configuration(tmp_path, "camera", connect=endpoint))}) as theirs:
+            for _ in range(600):
+                theirs.put("a", b"camera")
+                if everything.wait(0.1):
+                    break
+        subscriber.undeclare()
+    assert set(heard) == {b"camera"}
+
+
+def certificates(folder: Path, name: str, authority: trustme.CA | None = None) -> trustme.CA:
+    """Writes key and certificate of a computer by an authority, its own where none is given; returns the authority."""
+    authority = authority or trustme.CA()
+    issued = authority.issue_cert("localhost")
+    authority.cert_pem.write_to_path(folder / f"{name}_ca.pem")
+    issued.private_key_pem.write_to_path(folder / f"{name}.key")
+    (folder / f"{name}.pem").write_bytes(b"".join(part.bytes() for part in issued.cert_chain_pems))
+    return authority
+
+
+def configuration(folder: Path, name: str, **ends: str) -> Path:
+    """Zenoh's configuration of a computer; it trusts the PC's authority, and shows its certificate if it has one."""
+    tls: dict[str, Any] = {"root_ca_certificate": str(folder / "pc_ca.pem"), "enable_mtls": name != "nobody"}
+    for end in ("listen", "connect") if name != "nobody" else ():
+        tls |= {f"{end}_certificate": str(folder / f"{name}.pem"), f"{end}_private_key": str(folder / f"{name}.key")}
+    config: dict[str, Any] = {end: {"endpoints": [where]} for end, where in ends.items()}
+    config |= {"mode": "peer", "scouting": {"multicast": {"enabled": False}}, "transport": {"link": {"tls": tls}}}
+    path = folder / f"{name}.json5"
+    path.write_text(json.dumps(config))
+    return path
