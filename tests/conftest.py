@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import hrcreplay  # names the folder of compiled kernels
+from hrcreplay import kernels
 
 if TYPE_CHECKING:
     from hrcreplay.store.run_folder import Run
@@ -44,23 +44,18 @@ def pytest_configure(config: pytest.Config) -> None:
     """Gives every process but the first compiled kernels of its own, as numba does not lock its files."""
     worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
     if worker != "gw0":
-        os.environ["NUMBA_CACHE_DIR"] = str(_kernels_of(worker))
+        os.environ["NUMBA_CACHE_DIR"] = str(kernels.folder() / worker)
+        kernels.folder.cache_clear()
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
     """Gives every process what any of them has compiled before, as they do not run the same tests each time."""
-    first, *others = (_kernels_of(spec.id) for spec in specs)
+    first, others = kernels.folder(), [kernels.folder() / spec.id for spec in specs[1:]]
     for folder in others:
-        hrcreplay.share_kernels(folder, first)
+        kernels.share(folder, first)
     for folder in others:
-        hrcreplay.share_kernels(first, folder)
-
-
-def _kernels_of(worker: str) -> Path:
-    """Folder of the compiled kernels of a process: that which hrcreplay names on its import, or one within it."""
-    first = Path(os.environ["NUMBA_CACHE_DIR"])
-    return first if worker == "gw0" else first / worker
+        kernels.share(first, folder)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.spatial.transform import Rotation
 
+from hrcreplay.kernels import njit
 from hrcreplay.logs.camera_checks import find_mirrored, interpolate
 from hrcreplay.records import MIRROR, POINTS, Floats, Ints, SkeletonTrack
 

@@ -18,11 +18,11 @@ import math
 from itertools import combinations
 
 import numpy as np
-from numba import njit
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.geometry.small_matrices import apply, multiply, singular_values
 from hrcreplay.geometry.vectors import cross, dot, edge, norm, norm_n
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 
 #: A set thinner than this in a direction has no extent in it [m].

@@ -12,9 +12,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.vectors import dot3
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 
 #: A distance is proven when its bounds are this close [m].

@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hrcreplay.geometry.vectors import Vector, cross, dot, edge, norm
+from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
 
 Int32s = NDArray[np.int32]

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.convex_hull import hull, sphere_swept_volume_m3
+from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
 
 #: A triangle counts as seen by a point that is not clearly behind it: in the plane of a flat set nothing is in front.

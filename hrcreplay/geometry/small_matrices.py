@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.vectors import dot_n, norm_n
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 
 _EPS = float(np.finfo(np.float64).eps)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 
 Vector = tuple[float, float, float]

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, POINTS, Floats
 from hrcreplay.settings.sections import Occupancy
 

@@ -9,10 +9,10 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numba import njit
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 
 Vector = tuple[float, float, float]

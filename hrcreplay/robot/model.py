@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numba import njit
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.small_matrices import apply, multiply
 from hrcreplay.geometry.vectors import dot_n, norm_n
+from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot import irb140 as irb140_data
 from hrcreplay.robot.link_capsules import Extent, Segment, Vector, capsules, distance_m

@@ -44,13 +44,13 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from hrcreplay.errors import SettingsError, shown
 from hrcreplay.geometry import small_matrices
 from hrcreplay.geometry.small_matrices import apply, multiply
 from hrcreplay.geometry.vectors import dot_n, norm_n, turn_between
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import Plan

@@ -22,7 +22,7 @@ from typing import Any, Unpack, get_args
 import pandas as pd
 import pyarrow.parquet as pq
 
-import hrcreplay
+from hrcreplay import kernels
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import Floats, Ints
@@ -349,15 +349,17 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
 
 def _second_process() -> ProcessPoolExecutor:
     """A process with compiled kernels of its own, since numba does not lock its files; it begins with all there are."""
-    first = os.environ["NUMBA_CACHE_DIR"]
-    second = Path(first) / "second"
-    hrcreplay.share_kernels(Path(first), second)
+    second = kernels.folder() / "second"
+    kernels.share(kernels.folder(), second)
     pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-    os.environ["NUMBA_CACHE_DIR"] = str(second)  # read when the process begins
+    mine = os.environ.get("NUMBA_CACHE_DIR")
+    os.environ["NUMBA_CACHE_DIR"] = str(second)  # read by the process as it begins
     try:
         pool.submit(os.getpid).result()
     finally:
-        os.environ["NUMBA_CACHE_DIR"] = first
+        os.environ.pop("NUMBA_CACHE_DIR")
+        if mine is not None:
+            os.environ["NUMBA_CACHE_DIR"] = mine
     return pool
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import coal
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.distances import EXACT_M
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotPose

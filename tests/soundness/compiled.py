@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numba
 import numpy as np
 
+from hrcreplay import kernels
 from hrcreplay.records import Floats
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -22,7 +23,7 @@ _DIGEST = hashlib.sha256(b"".join(path.read_bytes() for path in _SOURCES)).hexdi
 def kernel(function: F) -> F:
     """Compiles a function when it is first called."""
     others = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(Path(others or _HERE / "__pycache__") / f"soundness-{_DIGEST}")
+    numba.config.CACHE_DIR = str(kernels.folder() / f"soundness-{_DIGEST}")
     try:
         compiled: F = numba.njit(cache=True)(function)
     finally:

@@ -9,11 +9,11 @@ where it was shown last, or ahead, and turns with the body: no more than a foot'
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.human.fusion.gating import distance
 from hrcreplay.human.fusion.kalman import Filter, Rules
 from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, skeleton_row, torso_rotation
+from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats
 
 #: No point of a leg is further from the pelvis: toes of a tall man's straight leg. What is further is no leg [m].

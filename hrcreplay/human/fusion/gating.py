@@ -9,11 +9,11 @@ cameras show that, the residual holds it all the same (``model_residual``).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, ROWS
 from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Rules, Track, ago, delay
 from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
+from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, LENGTHS, POINTS, Bools, Floats
 
 #: An angle known no better than this is not observed: a circle cannot tell [rad].

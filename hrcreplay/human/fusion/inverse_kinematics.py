@@ -8,7 +8,6 @@ seen from the side, each arm from its own two bones in the torso's frame. Length
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.vectors import Vector, cross, dot, edge, norm
 from hrcreplay.human.model import (
@@ -23,6 +22,7 @@ from hrcreplay.human.model import (
     torso_rotation,
     wrap,
 )
+from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, LENGTHS, POINTS, CameraFrames, Floats, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 

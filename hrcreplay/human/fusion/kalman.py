@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
 
 #: Before every tick: what has not happened yet [ns].

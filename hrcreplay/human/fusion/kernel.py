@@ -6,7 +6,6 @@ The filter of Eq. (42)-(57) is 13 filters of four states, one a joint, and 7 of 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.human.fusion.body_points import place
 from hrcreplay.human.fusion.gating import judge
@@ -15,6 +14,7 @@ from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, correct,
 from hrcreplay.human.fusion.model_residual import observe, told, unseen
 from hrcreplay.human.fusion.reported_deviations import add_innovation, autocorrelation, reset, variance_factor
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row, nearest_arm, wrap
+from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, Floats, Ints
 
 #: A name of an arm is kept until the other is better by this [rad].

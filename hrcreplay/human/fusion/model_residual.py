@@ -16,12 +16,12 @@ its kind has not been seen before.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.human.fusion.body_points import REACH_M, learn, shift
 from hrcreplay.human.fusion.gating import distance
 from hrcreplay.human.fusion.kalman import Filter, Rules, ago, delay
 from hrcreplay.human.model import ARM_POINTS, BENDS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
+from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
 
 _BIN_M = 0.001

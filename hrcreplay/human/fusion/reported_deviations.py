@@ -16,9 +16,9 @@ So the variances also grow exponentially with the autocorrelation at lag 1. By h
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.human.fusion.kalman import Filter, Rules
+from hrcreplay.kernels import njit
 
 #: Highest square before the first innovation: the reported variances are then about the filter's own.
 FIRST_SPREAD = 4.0

@@ -8,9 +8,9 @@ there and goes to v_max at a_max (from above: at a_min), and no displacement abo
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.human.model import alpha_2_bounds, alpha_3_bounds
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 
 #: Largest and smallest value of a joint's stops over a reachable box: (least, inner least, inner most, most).

@@ -24,10 +24,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.human.model import SHOWN_BY
 from hrcreplay.human.prediction.joint_reach import Stops, fastest, interval, rise, saturation_s, stops
+from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, Floats, HumanStates
 from hrcreplay.settings.sections import Occupancy
 

@@ -30,7 +30,6 @@ knees are further out.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
@@ -65,6 +64,7 @@ from hrcreplay.human.prediction.velocity_tube import (
     tubes,
     velocities,
 )
+from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, LIMBS, POINTS, Floats, HumanStates, Ints
 from hrcreplay.settings.sections import Occupancy
 

@@ -12,10 +12,10 @@ steps are proven on the surface around the set, so nothing is dropped that is no
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.hull_reduction import NX, NY, POINT, A, B, C, Surface, is_inside
 from hrcreplay.human.model import HEIGHT
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 
 _X, _Y, _Z = 0, 1, 2

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
@@ -17,6 +16,7 @@ from hrcreplay.human.model import HEIGHT, SHOWN_BY, LimitSet, alpha_2_bounds, al
 from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, likely
 from hrcreplay.human.prediction.sound_volumes import sweep_sound
 from hrcreplay.human.prediction.sweep import MOST_COPIES, append, box, kinematic_chain, sweep_rot, sweep_walk
+from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
 from hrcreplay.settings.sections import Occupancy
 

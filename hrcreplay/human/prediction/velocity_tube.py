@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.human.model import ARM_POINTS, BENDS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, LimitSet, skeleton_row
+from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, Bools, Floats, HumanStates
 
 #: Time step of the difference that gives the velocities of the points [s].

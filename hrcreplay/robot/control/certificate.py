@@ -21,10 +21,10 @@ from collections.abc import Sequence
 
 import coal
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.small_matrices import apply
 from hrcreplay.geometry.vectors import dot3, dot_n, norm_n
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.control_step import (
     BRAKING,

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.separation import Obstacles, Separation, separation
 from hrcreplay.robot.model import RobotModel, RobotPose

@@ -11,10 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.small_matrices import cholesky, solve_lower, solve_transposed
 from hrcreplay.geometry.vectors import dot_n, norm_n
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.separation import Approach, worst_rows
 

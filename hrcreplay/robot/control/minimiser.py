@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import proxsuite
 
 from hrcreplay.geometry.small_matrices import apply, nonnegative_least_squares
 from hrcreplay.geometry.vectors import dot_n
+from hrcreplay.kernels import forgo
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.metric_rows import (
     CLEAR,
@@ -86,7 +87,21 @@ TRIES = ((100, 1e-6, 6), (-1, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-
 #: Newton steps between them.
 INNER = 20
 
-_dense = proxsuite.proxqp.dense
+
+def _load_proxqp() -> Any:
+    """Proxsuite's ProxQP, by its AVX2 library where the processor would do AVX-512, too.
+
+    It comes in three, takes the widest and rounds otherwise in each: a robot would move otherwise by the last bits on
+    every other computer. Without the name of one of them it takes the next.
+    """
+    forgo("proxsuite.proxsuite_pywrap_avx512")
+    import proxsuite
+
+    return proxsuite.proxqp
+
+
+_proxqp = _load_proxqp()
+_dense = _proxqp.dense
 
 
 def minimise(task: Problem) -> Solution | Unsolved:
@@ -185,7 +200,7 @@ def _by_proxqp(problem: Metric, y: Floats, z: Floats, penalty: float, rounds: in
     # the last bits of what its other backend returns depend on where its memory happens to lie
     qp = _dense.QP(n, 0, m, False, _dense.HessianType.Dense, _dense.DenseBackend.PrimalLDLT)
     settings = qp.settings
-    settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START
+    settings.initial_guess = _proxqp.InitialGuess.WARM_START
     settings.eps_abs, settings.eps_rel = 0.1 * PROVEN, 0.0
     settings.eps_primal_inf = settings.eps_dual_inf = 0.0  # with its own tests it denies problems that have solutions
     settings.max_iter, settings.max_iter_in = rounds, INNER

@@ -13,9 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.small_matrices import apply
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Sight, Stop, along_path

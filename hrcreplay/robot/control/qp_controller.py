@@ -16,10 +16,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.small_matrices import apply
 from hrcreplay.geometry.vectors import dot_n, norm_n, turn_between
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import RETREAT_SPEED

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hrcreplay.geometry.distances import distances
 from hrcreplay.geometry.vectors import dot3
+from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints, SweptVolumes
 from hrcreplay.robot.model import RobotPose
 

@@ -12,8 +12,8 @@ import argparse
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from hrcreplay.kernels import njit
 from hrcreplay.records import LIMBS, Floats, SweptVolumes
 from hrcreplay.robot.control.certificate import NO_PLANES, clear
 from hrcreplay.robot.control.control_step import Stop, at_rest, axis_by_axis, straight

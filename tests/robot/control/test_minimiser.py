@@ -287,10 +287,10 @@ def test_two_processes_find_the_same_bits() -> None:
 
 _WIDEST = """
 import sys, types
-import hrcreplay
 every = types.ModuleType("proxsuite.instructionset")  # of a processor that does it all
 every.has_AVX2 = every.has_AVX512F = lambda: True
 sys.modules["proxsuite.instructionset"] = every
+from hrcreplay.robot.control import minimiser
 import proxsuite
 print(proxsuite._submodule.__name__)
 """
