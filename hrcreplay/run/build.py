@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,6 +35,15 @@ from hrcreplay.run.job import Job, UrdfFiles, link_capsules
 from hrcreplay.settings.sections import Fusion, Occupancy, Robot
 
 
+class Sightings(NamedTuple):
+    """What some frames show."""
+
+    measured: Measurements  #: of the person
+    everybody: CameraFrames  #: all bodies, and frames that show nobody; points in the world [m]
+    mine: Bools  #: which of ``everybody`` are the person
+    counts: Counter[str]  #: of ``select_person``, and ``frames_late_<camera>``
+
+
 @dataclass(frozen=True)
 class FusionStage:
     """Stage 1: camera poses and clocks, point noise, and the settings of filter and person selection."""
@@ -47,19 +56,12 @@ class FusionStage:
     person_memory_s: float
     watched: WatchedArea | None = None  #: where nobody can be whom no camera shows
 
-    def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Measurements, Counter[str]]:
-        """Measurements of the person, by the clock of the reference camera; see ``clean.select_person``.
+    def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Sightings]:
+        """What frames show, by the clock of the reference camera; see ``clean.select_person``.
 
         A frame that was captured more than ``fresh_s`` before its arrival shows where the person was, not where they
         are: it is left out, and counted as ``frames_late_<camera>``.
         """
-        memory, measured, _, _, found = self.measure_all(frames, memory)
-        return memory, measured, found
-
-    def measure_all(
-        self, frames: CameraFrames, memory: PersonMemory
-    ) -> tuple[PersonMemory, Measurements, CameraFrames, Bools, Counter[str]]:
-        """The same, and before the counts all the frames, points in the world [m], and which are the person's."""
         frames = self.on_one_clock(frames)
         late = np.asarray(frames.arrival_ns - frames.capture_ns > self.filter.fresh_s * 1e9)
         bodies = frames.body != NOBODY
@@ -72,7 +74,7 @@ class FusionStage:
         measured = inverse_kinematics.measure(frames.rows(mine), self.T_world_camera, self.filter)
         T = self.T_world_camera[frames.camera]
         points_m = np.einsum("nij,npj->npi", T[:, :3, :3], frames.points_m) + T[:, None, :3, 3]
-        return memory, measured, replace(frames, points_m=points_m), mine, found + counts
+        return memory, Sightings(measured, replace(frames, points_m=points_m), mine, found + counts)
 
     def on_one_clock(self, frames: CameraFrames) -> CameraFrames:
         """Frames with captures by the clock of the reference camera, none of them after its arrival."""

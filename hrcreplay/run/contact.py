@@ -10,7 +10,7 @@ prediction.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -19,9 +19,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 
 from hrcreplay.geometry.distances import nearest_pair, protrusion_m
-from hrcreplay.human.fusion import fuse
 from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
-from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints
 from hrcreplay.report.metrics_contact import deciding_rows
@@ -30,6 +28,7 @@ from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.containment import Outcome, coverage
+from hrcreplay.run.fusion import PersonFuser
 from hrcreplay.run.job import Job
 from hrcreplay.run.recording import BodyTrack, RecordedPeople, read_people
 from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states, state_columns
@@ -76,15 +75,11 @@ def recorded_people(job: Job, log: Log, writer: RunWriter) -> RecordedPeople:
 def _smooth(job: Job, log: Log, ticks_ns: Ints) -> Iterator[HumanStates]:
     """The person fused and smoothed, where the stage was not run or was taken over."""
     fusion_stage, cameras = build.fusion_stage(job, log), log.header.cameras
-    state, memory, smoother = fuse.start(cameras), PersonMemory(), stages.StretchSmoother(fusion_stage.filter)
+    fuser = PersonFuser(replace(fusion_stage, watched=None), cameras, traced=True)
+    smoother = stages.StretchSmoother(fusion_stage.filter)
     for ticks, seen in stages.batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
-        measured = stages.no_frames(cameras)
-        if seen is not None:
-            memory, measured, _ = fusion_stage.measure(seen, memory)
-        state, states, _, trace = fuse.fuse(
-            state, ticks, measured, fusion_stage.filter, fusion_stage.limits, traced=True
-        )
-        yield from smoother.add(states, trace)
+        fused, _ = fuser.update(ticks, seen)
+        yield from smoother.add(fused.states, fused.trace)
     yield from smoother.finish()
 
 

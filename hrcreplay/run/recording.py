@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import LENGTHS, POINTS, Bools, CameraFrames, Floats, HumanStates, Ints, Measurements
 from hrcreplay.run.build import FusionStage
+from hrcreplay.run.fusion import PersonFuser
 from hrcreplay.run.stages import StretchSmoother, batches
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
@@ -182,9 +183,9 @@ def read_people(
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
     for _, due in batches(frames, ticks_ns, _BATCH):
         if due is not None:
-            memory, measured, everybody, mine, _ = fusion_stage.measure_all(due, memory)
-            seen.append(measured)
-            others.append(everybody.rows(~mine))
+            memory, found = fusion_stage.measure(due, memory)
+            seen.append(found.measured)
+            others.append(found.everybody.rows(~found.mine))
     truth = _truth(log, ticks_ns)
     if truth is not None:
         tracks = _people_off(truth, seen, others, fusion_stage)
@@ -335,24 +336,17 @@ def fused_stretches(
     Raises:
         LogError: No camera saw anybody.
     """
-    state, memory = fuse.start(log.header.cameras), PersonMemory()
-    measured: Measurements | None = None
+    fuser, ever = PersonFuser(replace(fusion_stage, watched=None), log.header.cameras, traced=True), False
     for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
         progress(len(ticks))
-        if due is not None:
-            memory, measured, found = fusion_stage.measure(due, memory)
-            counts.update(found)
-        elif measured is not None:
-            measured = measured.rows(slice(0, 0))
-        else:
-            continue
-        state, states, events, trace = fuse.fuse(
-            state, ticks, measured, fusion_stage.filter, fusion_stage.limits, traced=True
-        )
-        counts.update(events)
-        yield measured, states, trace
+        ever = ever or due is not None
+        if ever:
+            fused, seen = fuser.update(ticks, due)
+            counts.update(seen.counts)
+            counts.update(fused.counts)
+            yield seen.measured, fused.states, fused.trace
     log.check()
-    if measured is None:
+    if not ever:
         raise LogError(f"{log.header.path}: no camera saw anybody; an audit needs a person")
 
 

@@ -22,23 +22,21 @@ from hrcreplay.errors import LogError
 from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.human.fusion import fuse, inverse_kinematics, vacancy
 from hrcreplay.logs.camera_checks import CameraChecks
-from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import (
     FLOOR_Z_M,
     NOBODY,
-    Bools,
     CameraFrames,
     Floats,
     HumanStates,
     Ints,
-    Measurements,
     SkeletonTrack,
     SweptVolumes,
 )
 from hrcreplay.run.build import Forecast, FusionStage, PredictionStage, Surroundings
 from hrcreplay.run.followers import Planner
+from hrcreplay.run.fusion import PersonFuser
 from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.columns import (
     measurement_columns,
@@ -126,35 +124,31 @@ def fused(
     Raises:
         LogError: At the end: what the log shows is certainly no person, or nobody was ever seen.
     """
-    state, seen_area = fuse.start(log.header.cameras), vacancy.start(len(log.header.cameras))
-    memory, area = PersonMemory(), fusion_stage.watched
-    frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1, nobody=area is not None)
+    fuser = PersonFuser(fusion_stage, log.header.cameras, traced=smooth)
+    watched = fusion_stage.watched is not None
+    frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1, nobody=watched)
     smoother = StretchSmoother(fusion_stage.filter)
     checks = CameraChecks(log.header.cameras)
     clocks = ClockCheck(log.header.cameras, fusion_stage.T_world_camera, int(ticks_ns[0]), int(ticks_ns[-1]))
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
-        measured, (everybody, mine) = no_frames(log.header.cameras), no_bodies(log.header.cameras)
+        sightings = fuser.nothing
         if seen is not None:
             with sink.watch.stage("angles", len(ticks)):
-                memory, measured, everybody, mine, found = fusion_stage.measure_all(seen, memory)
+                sightings = fuser.measure(seen)
             clocks.add(fusion_stage.on_one_clock(seen.rows(seen.body != NOBODY)))
-            sink.counts.update(found)
+            measured = sightings.measured
             sink.run.table("measurements", measurement_columns(measured))
             track = SkeletonTrack(measured.capture_ns, measured.points_m, measured.confidence)
             checks.add(measured.camera, track)
         with sink.watch.stage("fuse", len(ticks)):
-            state, states, events, trace = fuse.fuse(
-                state, ticks, measured, fusion_stage.filter, fusion_stage.limits, traced=smooth
-            )
+            states, events, trace = fuser.advance(ticks, sightings)
         if smooth:
             for part in smoother.add(states, trace):
                 sink.run.table("smooth", state_columns(part))
-        if area is not None:
-            seen_area, states, refuted = vacancy.watch(seen_area, states, everybody, mine, area)
-            sink.counts.update(refuted)
+        sink.counts.update(sightings.counts)
         sink.counts.update(events)
-        ever = ever or bool(states.valid.any()) or max(seen_area.vacant_ns) >= 0
+        ever = ever or bool(states.valid.any()) or max(fuser.area.vacant_ns) >= 0
         sink.run.table("state", state_columns(states))
         sink.progress("fuse", len(ticks))
         yield states
@@ -165,7 +159,7 @@ def fused(
         sink.notes["fuse"].extend(clocks.remarks())
     sink.notes["fuse"].extend(_late(log, sink.counts, fusion_stage.clock_offset_ns))
     write_checks(checks, sink)
-    sink.notes["fuse"].extend(_about_area(log, seen_area, sink.counts) if area is not None else ())
+    sink.notes["fuse"].extend(_about_area(log, fuser.area, sink.counts) if watched else ())
     sink.notes["fuse"].extend(_about_others(sink.counts))
     if smooth:
         for part in smoother.finish():
@@ -280,27 +274,6 @@ def _late(log: Log, counts: Counter[str], offsets_ns: Ints) -> Iterator[str]:
                 f"camera {camera}: {late} of {log.defects[f'frames_{camera}']} rows came more than fusion.fresh_s "
                 f"after their capture and are not used; {delay_text(log.clocks[camera], offset_ns / 1e9)}"
             )
-
-
-def no_bodies(cameras: tuple[str, ...]) -> tuple[CameraFrames, Bools]:
-    """An empty table of frames, and which of them are the person's."""
-    nothing = np.zeros(0, np.int64)
-    frames = CameraFrames(nothing, nothing, nothing, nothing, np.zeros((0, 20, 3)), np.zeros((0, 20)), cameras)
-    return frames, np.zeros(0, np.bool_)
-
-
-def no_frames(cameras: tuple[str, ...]) -> Measurements:
-    """An empty table of measurements."""
-    return Measurements(
-        capture_ns=np.zeros(0, np.int64),
-        arrival_ns=np.zeros(0, np.int64),
-        camera=np.zeros(0, np.int64),
-        z=np.zeros((0, inverse_kinematics.ROWS)),
-        z_std=np.zeros((0, inverse_kinematics.ROWS)),
-        points_m=np.zeros((0, 20, 3)),
-        confidence=np.zeros((0, 20)),
-        cameras=cameras,
-    )
 
 
 def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:

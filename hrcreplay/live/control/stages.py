@@ -19,9 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from hrcreplay.human.fusion import fuse, vacancy
 from hrcreplay.live.record.codec import Perception
-from hrcreplay.logs.clean import Cleaner, PersonMemory
+from hrcreplay.logs.clean import Cleaner
 from hrcreplay.logs.decoders import own_row
 from hrcreplay.logs.messages import Undecodable
 from hrcreplay.logs.skeleton_pb2 import Skeleton
@@ -43,7 +42,8 @@ from hrcreplay.robot.path import approach
 from hrcreplay.robot.task import Reference
 from hrcreplay.run.build import FusionStage, Surroundings
 from hrcreplay.run.followers import Follower, Predict
-from hrcreplay.run.stages import NS, no_bodies, no_frames
+from hrcreplay.run.fusion import PersonFuser
+from hrcreplay.run.stages import NS
 from hrcreplay.settings.sections import Live
 
 
@@ -53,13 +53,9 @@ class Observer:
     def __init__(
         self, fusion_stage: FusionStage, surroundings: Surroundings, cameras: tuple[str, ...], gap_s: float
     ) -> None:
-        self._fusion_stage = fusion_stage
+        self._fuser = PersonFuser(fusion_stage, cameras)
         self._surroundings = surroundings
-        self._area = vacancy.start(len(cameras))
         self._cameras = cameras
-        self._nothing, self._no_bodies = no_frames(cameras), no_bodies(cameras)
-        self._fusion = fuse.start(cameras)
-        self._memory = PersonMemory()
         self.counts: Counter[str] = Counter()
         self._cleaner = Cleaner(cameras, gap_s, self.counts, nobody=fusion_stage.watched is not None)
         self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
@@ -73,21 +69,11 @@ class Observer:
             skeletons: Serialised Skeleton messages. What cannot be read is counted and left out.
             horizon_s: Until when the volumes must hold, the latency aside [s].
         """
-        frames = self._frames(t_ns, skeletons)
-        measured, (everybody, mine) = self._nothing, self._no_bodies
-        if frames is not None:
-            self._memory, measured, everybody, mine, found = self._fusion_stage.measure_all(frames, self._memory)
-            self.counts.update(found)
-            for camera, capture_ns in zip(measured.camera.tolist(), measured.capture_ns.tolist(), strict=True):
-                self.newest_ns[self._cameras[camera]] = capture_ns
-        ticks = np.array([t_ns])
-        self._fusion, states, events, _ = fuse.fuse(
-            self._fusion, ticks, measured, self._fusion_stage.filter, self._fusion_stage.limits
-        )
+        (states, events, _), seen = self._fuser.update(np.array([t_ns]), self._frames(t_ns, skeletons))
+        self.counts.update(seen.counts)
         self.counts.update(events)
-        if self._fusion_stage.watched is not None:
-            self._area, states, refuted = vacancy.watch(self._area, states, everybody, mine, self._fusion_stage.watched)
-            self.counts.update(refuted)
+        for camera, capture_ns in zip(seen.measured.camera.tolist(), seen.measured.capture_ns.tolist(), strict=True):
+            self.newest_ns[self._cameras[camera]] = capture_ns
         self._look_ns, self._frame_age_s = t_ns, float(states.frame_age_s[0])
         volumes = self._surroundings.prediction.volumes(states, horizon_s)
         return Perception(t_ns, states, volumes, obstacles(volumes, 0, horizon_s), horizon_s)
@@ -127,7 +113,7 @@ class Observer:
             if row.camera not in self._cameras:
                 self.counts["skeletons_of_unknown_cameras"] += 1
                 continue
-            if self._fusion_stage.watched is None and not row.confidence.any():
+            if self._fuser.stage.watched is None and not row.confidence.any():
                 continue  # a body without a point only matters for a watched area
             self._cleaner.add(row, t_ns)
         return self._cleaner.flush()

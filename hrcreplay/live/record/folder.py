@@ -234,8 +234,8 @@ def _measure(job: Job, writer: RunWriter) -> None:
     log = open_log(writer.partial / LOG, job.settings.logs, skeletons=False)
     fusion_stage, memory = build.fusion_stage(job, log), PersonMemory()
     for frames in log.frames():
-        memory, measured, _ = fusion_stage.measure(frames, memory)
-        writer.table("measurements", measurement_columns(measured))
+        memory, seen = fusion_stage.measure(frames, memory)
+        writer.table("measurements", measurement_columns(seen.measured))
 
 
 def _compare(job: Job, writer: RunWriter, start: dict[str, Any]) -> None:

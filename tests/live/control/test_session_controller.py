@@ -249,14 +249,12 @@ def test_looks_are_the_replay_tick_by_tick() -> None:
     flight = Flight(walk=lambda s: (2.0 + 0.5 * np.sin(s), 0.3 * s)).fly(4.0)
     controller = build_controller(start())
     observer: Observer = controller.observer
-    fusion_stage, prediction_stage = observer._fusion_stage, observer._surroundings.prediction
+    fusion_stage, prediction_stage = observer._fuser.stage, observer._surroundings.prediction
     ticks = np.array([int(states.t_ns[0]) for states in flight.states])
     frames = [observer._frames(t_ns, [data]) for t_ns, data in flight.frames]
-    _, measured, _ = fusion_stage.measure(
-        CameraFrames.join([frame for frame in frames if frame is not None]), PersonMemory()
-    )
+    _, seen = fusion_stage.measure(CameraFrames.join([frame for frame in frames if frame is not None]), PersonMemory())
     before = fuse.start(observer._cameras)
-    states = fuse.fuse(before, ticks, measured, fusion_stage.filter, fusion_stage.limits)[1]
+    states = fuse.fuse(before, ticks, seen.measured, fusion_stage.filter, fusion_stage.limits)[1]
     live = HumanStates.join(flight.states)
     for name in ("p", "v", "a", "j", "p_std", "v_std", "lengths_m", "residual_m", "unseen_s", "valid"):
         assert_array_equal(getattr(live, name), getattr(states, name), err_msg=name)

@@ -113,14 +113,14 @@ def test_looks_at_the_area_are_the_replay_tick_by_tick(cell: Path) -> None:
 
     flight = Flight((FAST,), walk, cell=cell).fly(8.0)
     observer = build_controller(flight.start).observer
-    fusion_stage = observer._fusion_stage
+    fusion_stage = observer._fuser.stage
     assert fusion_stage.watched is not None
     tables = [observer._frames(t_ns, [data]) for t_ns, data in flight.frames]
     frames = CameraFrames.join([table for table in tables if table is not None])
-    _, _, everybody, mine, _ = fusion_stage.measure_all(frames, PersonMemory())
+    _, seen = fusion_stage.measure(frames, PersonMemory())
     live = HumanStates.join(flight.states)
     blank = replace(live, nobody_s=None, nobody_else_s=None)
-    _, again, counts = vacancy.watch(vacancy.start(2), blank, everybody, mine, fusion_stage.watched)
+    _, again, counts = vacancy.watch(vacancy.start(2), blank, seen.everybody, seen.mine, fusion_stage.watched)
     assert live.nobody_s is not None
     assert again.nobody_s is not None
     assert len(np.unique(np.isfinite(live.nobody_s))) == 2
