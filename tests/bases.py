@@ -22,7 +22,7 @@ import numpy as np
 from hrcreplay.cli import commands
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import POINTS, Floats, HumanStates
-from hrcreplay.report.metrics_contact import retreats
+from hrcreplay.reporting.metrics_contact import retreats
 from hrcreplay.run import replay
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states

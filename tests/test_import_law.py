@@ -14,13 +14,14 @@ PACKAGE = Path(hrcreplay.__file__).parent
 
 FOUNDATION = {"errors", "records", "toml_file"}
 #: Sections of settings may be passed to these rooms as they are; none of them loads a setting.
-TAKERS = ("human", "robot", "logs", "egm", "calibration", "report")
+TAKERS = ("human", "robot", "logs", "egm", "calibration", "reporting")
 #: Room -> the rooms that it may import.
 MAY_IMPORT = {
     "errors": set(),
     "records": set(),
     "toml_file": {"errors"},
     "kernels": set(),
+    "version": set(),
     "geometry": {"records", "kernels"},
     "human": FOUNDATION | {"kernels", "geometry", "settings"},
     "robot": FOUNDATION | {"kernels", "geometry", "settings"},
@@ -30,16 +31,29 @@ MAY_IMPORT = {
     "store": FOUNDATION,
     "limits": FOUNDATION | {"human", "store"},
     "calibration": FOUNDATION | {"kernels", "geometry", "logs", "settings", "store"},
-    "report": FOUNDATION | {"geometry", "human", "robot", "logs", "settings", "store"},
+    "reporting": FOUNDATION | {"geometry", "human", "robot", "logs", "settings", "store"},
     "run": FOUNDATION
-    | {"kernels", "geometry", "human", "robot", "logs", "settings", "store", "limits", "calibration", "report"}
-    | {"__version__"},
-    "audit": FOUNDATION | {"kernels", "geometry", "human", "logs", "store", "limits", "report", "run", "__version__"},
+    | {"kernels", "geometry", "human", "robot", "logs", "settings", "store", "limits", "calibration", "reporting"}
+    | {"version"},
+    "audit": FOUNDATION | {"kernels", "geometry", "human", "logs", "store", "limits", "reporting", "run", "version"},
     "live": FOUNDATION
-    | {"geometry", "human", "robot", "logs", "egm", "settings", "store", "calibration", "report", "run", "__version__"},
-    "cli": FOUNDATION | {"logs", "egm", "settings", "calibration", "run", "audit", "live", "__version__"},
+    | {
+        "geometry",
+        "human",
+        "robot",
+        "logs",
+        "egm",
+        "settings",
+        "store",
+        "calibration",
+        "reporting",
+        "run",
+        "version",
+    },
+    "api": FOUNDATION | {"geometry", "robot", "logs", "settings", "store", "calibration", "run"},
+    "cli": FOUNDATION | {"logs", "egm", "settings", "calibration", "run", "audit", "live", "version"},
     "__main__": {"cli"},
-    "__init__": set(),
+    "__init__": {"api", "version"},
 }
 #: Libraries that one module alone may import.
 ALONE = {
@@ -51,7 +65,7 @@ ALONE = {
 PURE = ("geometry", "human", "robot")
 IMPURE_MODULES = {"io", "logging", "os", "pathlib", "random", "socket", "sys", "tempfile", "time", "datetime"}
 IMPURE_CALLS = {"open", "print", "input"}
-MOST_ROOMS = 19
+MOST_ROOMS = 22
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

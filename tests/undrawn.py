@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from unittest import mock
 
-from hrcreplay.report import figures
+from hrcreplay.reporting import figures
 
 
 @contextmanager

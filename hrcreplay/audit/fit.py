@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 
-from hrcreplay import __version__
 from hrcreplay.audit import COVER, COVERAGE, HELD_BACK, fit_limits
 from hrcreplay.audit.departure_fit import EACH, counted
 from hrcreplay.audit.departure_fit import fit as fit_departures
@@ -31,6 +30,7 @@ from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.recording import SMOOTHED, TRUTH, Recording, read_recording
 from hrcreplay.run.stages import NS, ProgressBar, tick_times
+from hrcreplay.version import __version__
 
 
 def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) -> list[str]:

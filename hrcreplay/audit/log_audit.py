@@ -17,7 +17,7 @@ from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import Reach, limb_radii
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import DOF, JOINTS, Floats, HumanStates, Ints, SweptVolumes
-from hrcreplay.report.metrics import ANGLES, difference
+from hrcreplay.reporting.metrics import ANGLES, difference
 from hrcreplay.run import build
 from hrcreplay.run.build import PredictionStage
 from hrcreplay.run.containment import (

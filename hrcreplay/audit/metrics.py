@@ -12,8 +12,8 @@ import numpy as np
 
 from hrcreplay.audit.measures import Estimate, Resampling
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
-from hrcreplay.report.metrics import Metric, MetricTable, true_runs
-from hrcreplay.report.tables import PageTable
+from hrcreplay.reporting.metrics import Metric, MetricTable, true_runs
+from hrcreplay.reporting.tables import PageTable
 from hrcreplay.run.containment import Outcome
 
 

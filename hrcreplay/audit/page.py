@@ -21,10 +21,10 @@ from hrcreplay.audit.metrics import (
     volume_at,
 )
 from hrcreplay.records import JOINTS, LIMBS
-from hrcreplay.report.metrics import ANGLES, Metric
-from hrcreplay.report.page import PageFigure, PageSection
-from hrcreplay.report.story import Answer, Card
-from hrcreplay.report.tables import PageTable, text_of
+from hrcreplay.reporting.metrics import ANGLES, Metric
+from hrcreplay.reporting.page import PageFigure, PageSection
+from hrcreplay.reporting.story import Answer, Card
+from hrcreplay.reporting.tables import PageTable, text_of
 
 CAPTIONS = {
     "audit_coverage": (
@@ -59,7 +59,9 @@ def render(found: Mapping[str, Any], metrics: Mapping[str, Metric], meta: Mappin
         figures_dir: Where ``figures.draw_all`` drew.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(resources.files("hrcreplay.report").joinpath("page.html.j2").read_text("utf-8"))
+    template = environment.from_string(
+        resources.files("hrcreplay.reporting").joinpath("page.html.j2").read_text("utf-8")
+    )
     names = [log["log"] for log in found["logs"]]
     total = found["total"]
     return template.render(

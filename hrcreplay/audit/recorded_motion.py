@@ -6,7 +6,7 @@ import numpy as np
 
 from hrcreplay.human.model import SHOWN_BY
 from hrcreplay.records import POINTS, Floats, Ints
-from hrcreplay.report.metrics import difference
+from hrcreplay.reporting.metrics import difference
 from hrcreplay.run.recording import LIMB_POINTS, Recording
 
 #: A limb has moved once one of its ends is so far from where it was first, the middle of so many sightings [m].

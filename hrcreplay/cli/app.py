@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 import typer
 
-from hrcreplay import __version__
 from hrcreplay.audit import COVER, COVERAGE, HELD_BACK
 from hrcreplay.cli import (
     CellFile,
@@ -31,6 +30,7 @@ from hrcreplay.cli import (
     span,
 )
 from hrcreplay.errors import CoverageMissed, HrcReplayError, SettingsError
+from hrcreplay.version import __version__
 
 app = typer.Typer(
     name="hrcreplay",

@@ -26,9 +26,9 @@ from hrcreplay import kernels
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import Floats, Ints
-from hrcreplay.report import comparison
-from hrcreplay.report.comparison import Variant
-from hrcreplay.report.story import defect_notes
+from hrcreplay.reporting import comparison
+from hrcreplay.reporting.comparison import Variant
+from hrcreplay.reporting.story import defect_notes
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference
 from hrcreplay.run import build, replay
@@ -39,7 +39,7 @@ from hrcreplay.run.followers import Planner
 from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.notes import notes_of
 from hrcreplay.run.recording import RecordedPeople
-from hrcreplay.run.stages import ProgressBar, Sink, print_note
+from hrcreplay.run.stages import ProgressBar, Sink, print_note, told_of_plan
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Occupancy, Plan
 from hrcreplay.store.columns import motion_columns, read_states
@@ -192,7 +192,9 @@ def _compare_log(
     reused = replay.take_over(fusing, replay.dependencies(fusing, log, ticks_ns), part, smooth=False)
     with ProgressBar(name, len(ticks_ns) * len(variants)) as bar:
         sink = Sink(part, watch, _silent)
-        replay.run_stages(fusing, log, ticks_ns, size, sink, reused, smooth=not log.header.has_truth)
+        told = replay.run_stages(
+            fusing, log, ticks_ns, size, sink, reused, folder=part.partial, smooth=not log.header.has_truth
+        )
         part.close_tables()
         people = recorded_people(job, log, part)
         part.close_tables()
@@ -208,7 +210,8 @@ def _compare_log(
             for variant in variants
         ]
         took = _plan_all(tasks, processes, partial(bar.advance, name))
-    told = _notes(job, part.partial, variants, programme, replay.findings(job, log, sink, reused))
+    told |= {"plan": told_of_plan(log, sink)}
+    notes = _notes(job, part.partial, variants, programme, replay.findings(job, told, reused))
     writer.timing[f"plan {name}"] = {variant.label: {"seconds": took[variant]} for variant in variants}
     part.partial.rename(part.folder)
     rows = {
@@ -217,7 +220,7 @@ def _compare_log(
         for motion, contact in [tables(part.folder, variant)]
     }
     return comparison.LogResult(
-        name, job.log_sha256, people.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, told, rows
+        name, job.log_sha256, people.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, notes, rows
     )
 
 

@@ -22,7 +22,7 @@ from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints
-from hrcreplay.report.metrics_contact import deciding_rows
+from hrcreplay.reporting.metrics_contact import deciding_rows
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.run import build, stages

@@ -15,11 +15,11 @@ from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.sweep import TRIANGLE_RAD
 from hrcreplay.records import FLOOR_Z_M, JOINTS, LIMBS, POINTS, Floats, HumanStates, Ints, SweptVolumes
-from hrcreplay.report import figures_prediction, figures_robot
-from hrcreplay.report.figures_prediction import Growth, Instant, Sweep, Walk
-from hrcreplay.report.figures_scene import LinkPose, Storyboard, StoryScene
-from hrcreplay.report.metrics import instants, known_ticks_ns, moment_ns, nearest_tick, times
-from hrcreplay.report.metrics_plan import numeric_column, position_columns
+from hrcreplay.reporting import figures_prediction, figures_robot
+from hrcreplay.reporting.figures_prediction import Growth, Instant, Sweep, Walk
+from hrcreplay.reporting.figures_scene import LinkPose, Storyboard, StoryScene
+from hrcreplay.reporting.metrics import instants, known_ticks_ns, moment_ns, nearest_tick, times
+from hrcreplay.reporting.metrics_plan import numeric_column, position_columns
 from hrcreplay.run import build
 from hrcreplay.run.job import Job
 from hrcreplay.store.columns import read_states

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
@@ -15,7 +16,6 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell, load_cell
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.model import LimitSet
@@ -29,6 +29,7 @@ from hrcreplay.settings.sections import LinkSettings, Robot
 from hrcreplay.store import run_folder
 from hrcreplay.store.machine import describe_machine
 from hrcreplay.toml_file import read_toml
+from hrcreplay.version import __version__
 
 
 @dataclass(frozen=True)
@@ -257,6 +258,7 @@ def resolve(
     cell_file: Path | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
+    given: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Job:
     """The job that a command line asks for.
 
@@ -270,6 +272,7 @@ def resolve(
         cell_file: Poses of cameras and robot; None: those of the earlier run, else of the log.
         start_s: Start of the span, from the log's first message [s]; None: as the earlier run, else its beginning.
         end_s: End of the span, from the log's first message [s]; None: as the earlier run, else its end.
+        given: Settings, section -> key -> value, over those of the file.
 
     Raises:
         SettingsError: A setting, the cell, a limit set or the run folder cannot be used.
@@ -281,7 +284,7 @@ def resolve(
     if earlier is not None and (missing := [key for key in _NEEDED if key not in earlier]):
         raise LogError(f"{source}: its run.json lacks {missing[0]}, so another version made it; give the log itself")
     base = earlier["settings"] if earlier is not None else {}
-    settings = load_settings(config, overrides, base)
+    settings = load_settings(config, overrides, base, given)
     cell = load_cell(cell_file) if cell_file is not None else None
     if earlier is not None:
         cell = cell or (Cell.from_dict(earlier["cell"]) if earlier["cell"] else None)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
-from hrcreplay.report import metrics_data, tables, verdict
+from hrcreplay.reporting import metrics_data, tables, verdict
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.store.run_folder import Run
 

@@ -17,16 +17,18 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Unpack
 
+import pyarrow.parquet as pq
+
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import HumanStates, Ints
-from hrcreplay.report import tables
-from hrcreplay.report.story import defect_notes
+from hrcreplay.reporting import tables
+from hrcreplay.reporting.story import defect_notes
 from hrcreplay.run import build, stages
 from hrcreplay.run.build import LogLike
 from hrcreplay.run.job import TABLES, Job, JobOptions, resolve, urdf_digest, versions
 from hrcreplay.run.notes import notes_of
-from hrcreplay.run.stages import NS, ProgressBar, Sink, print_note
+from hrcreplay.run.stages import NS, ProgressBar, Sink, Told, print_note, told_of_fusion, told_of_plan
 from hrcreplay.settings.sections import Logs
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import missing_columns, read_states
@@ -73,42 +75,76 @@ def run(
         with ProgressBar(last[0] if last else "", len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
             compared = command == "report" and not log.header.has_truth  # then with the smoothed person
-            found = run_stages(job, log, ticks_ns, chunk_ticks, sink, reused, smooth=smooth or compared)
-        base = build.known_robot_base(job, log)
-        writer.close_tables()
-        found |= _about_results(job, log, writer.partial, known, found["notes"])
-        for line in defect_notes(found["counts"], found["notes"]):
-            print_note(line)
-        meta = {
-            **known,
-            **found,
-            "arguments": job.arguments(smooth=smooth),
-            "depends_on": parts,
-            "stages": stage_digests(job, parts),
-            "T_world_base": None if base is None else base.tolist(),
-            "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
-        }
-        if command == "report":
-            _report(job, log, sink, meta, len(ticks_ns))
-        writer.timing.update(sink.watch.summary(1.0 / job.settings.fusion.rate_hz))
-        writer.finish(meta)
+            told = run_stages(
+                job, log, ticks_ns, chunk_ticks, sink, reused, folder=writer.partial, smooth=smooth or compared
+            )
+        found = findings(job, told, reused)
+        complete(job, log, writer, sink.watch, {**known, **found, **about_run(job, began, parts, smooth=smooth)})
         return writer.folder
 
 
-def _report(job: Job, log: Log, sink: Sink, meta: dict[str, Any], ticks: int) -> None:
+def about_run(job: Job, began: datetime, parts: Mapping[str, str], *, smooth: bool) -> dict[str, Any]:
+    """What run.json says of how a run came to be.
+
+    Args:
+        job: What was asked for.
+        began: When.
+        parts: What ``dependencies`` found.
+        smooth: Whether the smoothed person was asked for.
+    """
+    return {
+        "arguments": job.arguments(smooth=smooth),
+        "depends_on": parts,
+        "stages": stage_digests(job, parts),
+        "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
+    }
+
+
+def complete(job: Job, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any]) -> None:
+    """Completes a run whose stages have written their tables; with the report where that was asked for.
+
+    Args:
+        job: What was asked for.
+        log: Log of the job.
+        writer: Run folder.
+        watch: Times of the stages; takes those of the report.
+        meta: What run.json says so far.
+    """
+    base = build.known_robot_base(job, log)
+    writer.close_tables()
+    meta |= _about_results(job, log, writer.partial, meta, meta["notes"])
+    for line in defect_notes(meta["counts"], meta["notes"]):
+        print_note(line)
+    meta["T_world_base"] = None if base is None else base.tolist()
+    if job.command == "report":
+        _report(job, log, writer, watch, meta)
+    writer.timing.update(watch.summary(1.0 / job.settings.fusion.rate_hz))
+    writer.finish(meta)
+
+
+def _report(job: Job, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any]) -> None:
     """The contact table and the report of a run whose other tables are written."""
     from hrcreplay.run.contact import write_contact  # both are slow to load, and the other commands ask for neither
     from hrcreplay.run.report import write_report
 
-    with sink.watch.stage("contact", ticks):
-        write_contact(job, log, sink.run, build.robot_base(job, log))
-    with sink.watch.stage("report", ticks):
-        write_report(job, sink.run, meta, log)
+    ticks = pq.read_metadata(writer.partial / "state.parquet").num_rows
+    with watch.stage("contact", ticks):
+        write_contact(job, log, writer, build.robot_base(job, log))
+    with watch.stage("report", ticks):
+        write_report(job, writer, meta, log)
 
 
 def run_stages(
-    job: Job, log: Log, ticks_ns: Ints, size: int, sink: Sink, reused: tuple[str, ...], *, smooth: bool
-) -> dict[str, Any]:
+    job: Job,
+    log: Log,
+    ticks_ns: Ints,
+    size: int,
+    sink: Sink,
+    reused: tuple[str, ...],
+    *,
+    folder: Path,
+    smooth: bool,
+) -> dict[str, Told]:
     """All stages of the job in one pass, without those whose tables were taken over.
 
     Args:
@@ -118,10 +154,11 @@ def run_stages(
         size: Ticks of a batch.
         sink: Where rows, counts and times go.
         reused: Stages whose tables were taken over from an earlier run.
+        folder: Where those are.
         smooth: Whether to write the smoothed person too.
 
     Returns:
-        ``counts`` and ``notes`` about the data, for run.json, and ``found_by``: those of each stage that reads the log.
+        What the stages that read the log found in it.
     """
     todo = [stage for stage in job.stages if stage not in reused]
     states: Iterable[HumanStates]
@@ -129,7 +166,7 @@ def run_stages(
         stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
         states = stages.fused(log, ticks_ns, size, build.fusion_stage(job, log), sink, smooth=smooth)
     else:
-        states = read_states(sink.run.partial / "state.parquet", size)
+        states = read_states(folder / "state.parquet", size)
     flow: Iterable[Any] = states
     if "plan" in todo:
         chosen = build.planners(job, log, int(ticks_ns[0]))
@@ -142,7 +179,7 @@ def run_stages(
     if todo:
         for _ in flow:
             pass
-    return findings(job, log, sink, reused)
+    return {"fuse": told_of_fusion(log, sink), "plan": told_of_plan(log, sink)}
 
 
 def _about_results(job: Job, log: Log, folder: Path, meta: dict[str, Any], told: list[str]) -> dict[str, Any]:
@@ -165,33 +202,30 @@ def _about_results(job: Job, log: Log, folder: Path, meta: dict[str, Any], told:
     return {"notes": notes} | ({} if robot is None else {"robot": tables.summary(robot)})
 
 
-def findings(job: Job, log: Log, sink: Sink, reused: tuple[str, ...]) -> dict[str, Any]:
+def findings(job: Job, told: Mapping[str, Told], reused: tuple[str, ...] = ()) -> dict[str, Any]:
     """What the stages found in the log; of a stage taken over, what the earlier run found.
 
     Damage to the files that only this run met is told all the same.
 
     Args:
         job: What was asked for.
-        log: Log of the job, read.
-        sink: What the stages counted and noted.
+        told: What ``run_stages`` returned.
         reused: Stages whose tables were taken over from an earlier run.
+
+    Returns:
+        ``counts`` and ``notes`` about the data, for run.json, and ``found_by``: those of each stage that reads the log.
     """
-    joints = log.joint_defects
-    found: dict[str, tuple[Counter[str], list[str]]] = {
-        "fuse": (log.defects - joints + sink.counts, [*log.notes, *sink.notes["fuse"]]),
-        "plan": (joints, sink.notes["plan"]),
-    }
     by_stage: dict[str, Any] = {}
-    for stage, (counts, notes) in found.items():
+    for stage, (counts, notes) in told.items():
         if stage in reused and job.earlier is not None:
             theirs = run_folder.read_meta(job.earlier)["found_by"][stage]
             counts = Counter[str](theirs["counts"]) | counts
-            notes = [*theirs["notes"], *notes]
+            notes = (*theirs["notes"], *notes)
         if stage in job.stages:
             by_stage[stage] = {"counts": _plain(counts), "notes": list(dict.fromkeys(notes))}
     total = sum((Counter(part["counts"]) for part in by_stage.values()), Counter[str]())
-    told = [note for part in by_stage.values() for note in part["notes"]]
-    return {"counts": _plain(total), "notes": told, "found_by": by_stage}
+    notes_of_all = [note for part in by_stage.values() for note in part["notes"]]
+    return {"counts": _plain(total), "notes": notes_of_all, "found_by": by_stage}
 
 
 def take_over(job: Job, parts: Mapping[str, str], writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:

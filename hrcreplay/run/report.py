@@ -11,17 +11,17 @@ from typing import Any
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import PARTS, part_radii
 from hrcreplay.logs.reader import Log
-from hrcreplay.report import drawing, figures, page, tables
-from hrcreplay.report.figures import FigureData, FigureKind
-from hrcreplay.report.metrics import Metric, MetricTable, start_ns
-from hrcreplay.report.metrics_contact import add_contact
-from hrcreplay.report.metrics_data import add_fusion, add_limbs, add_occupancy, add_quality
-from hrcreplay.report.metrics_plan import add_plan
-from hrcreplay.report.replay_page import snapshot
-from hrcreplay.report.replay_scene import ReplayScene, replay_scene
-from hrcreplay.report.scene_mcap import write_scene
-from hrcreplay.report.story import lines
-from hrcreplay.report.tables import PageTable
+from hrcreplay.reporting import drawing, figures, page, tables
+from hrcreplay.reporting.figures import FigureData, FigureKind
+from hrcreplay.reporting.metrics import Metric, MetricTable, start_ns
+from hrcreplay.reporting.metrics_contact import add_contact
+from hrcreplay.reporting.metrics_data import add_fusion, add_limbs, add_occupancy, add_quality
+from hrcreplay.reporting.metrics_plan import add_plan
+from hrcreplay.reporting.replay_page import snapshot
+from hrcreplay.reporting.replay_scene import ReplayScene, replay_scene
+from hrcreplay.reporting.scene_mcap import write_scene
+from hrcreplay.reporting.story import lines
+from hrcreplay.reporting.tables import PageTable
 from hrcreplay.run import build
 from hrcreplay.run.figure_data import computed
 from hrcreplay.run.job import Job, job_of_run

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 from rich.console import Console
@@ -46,7 +46,7 @@ from hrcreplay.store.columns import (
     state_columns,
     truth_columns,
 )
-from hrcreplay.store.run_folder import RunWriter, Stopwatch
+from hrcreplay.store.run_folder import Stopwatch
 
 NS = 1_000_000_000
 #: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
@@ -63,15 +63,39 @@ _LOST = (
 LONGEST_S = 24 * 3600
 
 
+class Tables(Protocol):
+    """Where the rows of tables go: to a run folder, or into memory."""
+
+    def table(self, name: str, columns: Mapping[str, Any], /) -> None:
+        """Appends rows to a table."""
+
+
+class Told(NamedTuple):
+    """What a stage counted and noted."""
+
+    counts: Counter[str]
+    notes: tuple[str, ...]
+
+
 @dataclass
 class Sink:
-    """Output of the stages: the run folder, times, progress, counters and notes."""
+    """Output of the stages: tables, times, progress, counters and notes."""
 
-    run: RunWriter
+    tables: Tables
     watch: Stopwatch
     progress: Callable[[str, int], None]  #: stage, ticks done
     counts: Counter[str] = field(default_factory=Counter)
     notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> what is odd
+
+
+def told_of_fusion(log: Log, sink: Sink) -> Told:
+    """What the latest pass over a log's frames and stage 1 found, in files, frames and person."""
+    return Told(log.defects - log.joint_defects + sink.counts, (*log.notes, *sink.notes["fuse"]))
+
+
+def told_of_plan(log: Log, sink: Sink) -> Told:
+    """What the latest reading of a log's joints and stage 3 found."""
+    return Told(log.joint_defects, tuple(sink.notes["plan"]))
 
 
 def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
@@ -138,18 +162,18 @@ def fused(
                 sightings = fuser.measure(seen)
             clocks.add(fusion_stage.on_one_clock(seen.rows(seen.body != NOBODY)))
             measured = sightings.measured
-            sink.run.table("measurements", measurement_columns(measured))
+            sink.tables.table("measurements", measurement_columns(measured))
             track = SkeletonTrack(measured.capture_ns, measured.points_m, measured.confidence)
             checks.add(measured.camera, track)
         with sink.watch.stage("fuse", len(ticks)):
             states, events, trace = fuser.advance(ticks, sightings)
         if smooth:
             for part in smoother.add(states, trace):
-                sink.run.table("smooth", state_columns(part))
+                sink.tables.table("smooth", state_columns(part))
         sink.counts.update(sightings.counts)
         sink.counts.update(events)
         ever = ever or bool(states.valid.any()) or max(fuser.area.vacant_ns) >= 0
-        sink.run.table("state", state_columns(states))
+        sink.tables.table("state", state_columns(states))
         sink.progress("fuse", len(ticks))
         yield states
     log.check()
@@ -163,7 +187,7 @@ def fused(
     sink.notes["fuse"].extend(_about_others(sink.counts))
     if smooth:
         for part in smoother.finish():
-            sink.run.table("smooth", state_columns(part))
+            sink.tables.table("smooth", state_columns(part))
 
 
 def _about_others(counts: Counter[str]) -> Iterator[str]:
@@ -201,7 +225,7 @@ def write_checks(checks: CameraChecks, sink: Sink) -> None:
     sink.notes["fuse"].extend(checks.remarks())
     for name, rows in zip(("bodies", "agreement"), checks.figures(), strict=True):
         if rows:
-            sink.run.table(name, record_columns(rows))
+            sink.tables.table(name, record_columns(rows))
 
 
 class StretchSmoother:
@@ -288,7 +312,7 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
     for truth in log.truth():
         within = truth.rows((truth.t_ns >= start_ns) & (truth.t_ns <= end_ns))
         if len(within):
-            sink.run.table("truth", truth_columns(within.t_ns, *inverse_kinematics.inverse(within.points_m)))
+            sink.tables.table("truth", truth_columns(within.t_ns, *inverse_kinematics.inverse(within.points_m)))
 
 
 def stored_ticks(first: int, count: int, store_every: float) -> Ints:
@@ -299,14 +323,14 @@ def stored_ticks(first: int, count: int, store_every: float) -> Ints:
     return np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
 
 
-def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, run: RunWriter) -> None:
+def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, tables: Tables) -> None:
     """Writes hull vertices and size above the floor of some ticks' volumes; a tick without a person has none.
 
     Args:
         volumes: Of any ticks.
         ticks: Rows of ``volumes`` to write.
         horizon_s: (n,) how long after its tick each row holds [s].
-        run: Where they go.
+        tables: Where they go.
     """
     t_ns: list[int] = []
     limbs: list[str] = []
@@ -327,7 +351,9 @@ def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, run: Ru
             hulls.append(solid.vertices_m)
             horizons.append(float(horizon_s[tick]))
     if t_ns:
-        run.table("occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls, horizons))
+        tables.table(
+            "occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls, horizons)
+        )
 
 
 def predicted(
@@ -347,7 +373,7 @@ def predicted(
         with sink.watch.stage("predict", len(batch)):
             volumes = prediction_stage.volumes(batch)
         with sink.watch.stage("hulls", len(stored)):
-            store_volumes(volumes, stored, np.full(len(batch), prediction_stage.horizon_s), sink.run)
+            store_volumes(volumes, stored, np.full(len(batch), prediction_stage.horizon_s), sink.tables)
         done += len(batch)
         sink.progress("predict", len(batch))
         yield batch
@@ -379,14 +405,14 @@ def planned(
         for name, planner in planners.items():
             with sink.watch.stage(f"plan {name}", len(batch)):
                 motion = planner.follow(batch.t_ns, around, surroundings.names)
-            sink.run.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
+            sink.tables.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
             if planner.chosen:
                 stored = stored_ticks(done, len(batch), store_every)
                 with sink.watch.stage("hulls", len(stored)):
                     for tick in stored.tolist():
                         row = slice(tick, tick + 1)
                         volumes = surroundings.prediction.volumes(batch.rows(row), float(motion.horizon_s[tick]))
-                        store_volumes(volumes, np.zeros(1, np.int64), motion.horizon_s[row], sink.run)
+                        store_volumes(volumes, np.zeros(1, np.int64), motion.horizon_s[row], sink.tables)
         done += len(batch)
         sink.progress("plan", len(batch))
         yield

@@ -19,9 +19,9 @@ import pyarrow.parquet as pq
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import LIMBS, STATUSES, Floats, HumanStates, Ints
-from hrcreplay.report.metrics import true_runs
-from hrcreplay.report.metrics_plan import stationary
-from hrcreplay.report.tables import PageTable, neighbour_text, reason_text
+from hrcreplay.reporting.metrics import true_runs
+from hrcreplay.reporting.metrics_plan import stationary
+from hrcreplay.reporting.tables import PageTable, neighbour_text, reason_text
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import NO_PLANES
 from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, stands, straight

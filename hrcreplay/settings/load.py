@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -39,7 +40,10 @@ _PATHS = (
 
 
 def load_settings(
-    path: Path | None = None, overrides: tuple[str, ...] = (), base: dict[str, Any] | None = None
+    path: Path | None = None,
+    overrides: tuple[str, ...] = (),
+    base: dict[str, Any] | None = None,
+    given: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Settings:
     """Settings from a TOML file and ``section.key=value`` overrides, over those of an earlier run (``base``).
 
@@ -47,6 +51,7 @@ def load_settings(
         path: A file, or the name of one of SHIPPED where no such file exists.
         overrides: ``section.key=value``.
         base: The settings of an earlier run.
+        given: Section -> key -> value; over the file and under the overrides.
 
     Raises:
         SettingsError: The file cannot be read, or a key or value is not known.
@@ -59,6 +64,8 @@ def load_settings(
         given = read_toml(file, f"name a TOML file, or {', '.join(SHIPPED)}")
         for name, section in _beside(given, file.parent).items():
             table[name] = table.get(name, {}) | section if isinstance(section, dict) else section
+    for name, section in (given or {}).items():
+        table[name] = {**table.get(name, {}), **section}
     for override in overrides:
         _override(table, override)
     try:

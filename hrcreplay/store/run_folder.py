@@ -60,7 +60,7 @@ class TableWriter:
 
     def write(self, columns: Mapping[str, Any]) -> None:
         """Appends rows given as columns: numpy arrays or arrow arrays."""
-        self._waiting.append(pa.table({name: _one_nan(column) for name, column in columns.items()}))
+        self._waiting.append(arrow_table(columns))
         while sum(len(table) for table in self._waiting) >= self.ROWS:
             table = pa.concat_tables(self._waiting).combine_chunks()
             self._flush(table.slice(0, self.ROWS))
@@ -78,6 +78,11 @@ class TableWriter:
             self._flush(pa.concat_tables(rest or self._waiting[:1]))
         if self._writer is not None:
             self._writer.close()
+
+
+def arrow_table(columns: Mapping[str, Any]) -> pa.Table:
+    """Columns as arrow has them: numpy arrays or arrow arrays."""
+    return pa.table({name: _one_nan(column) for name, column in columns.items()})
 
 
 def _one_nan(column: Any) -> Any:

@@ -19,7 +19,7 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import POINTS, CameraFrames, Floats
-from hrcreplay.report.metrics import columns
+from hrcreplay.reporting.metrics import columns
 from hrcreplay.run import replay, report
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states

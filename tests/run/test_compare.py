@@ -18,8 +18,8 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, HumanStates, Ints
-from hrcreplay.report import comparison, figures_robot
-from hrcreplay.report.comparison import FIELDS, Variant
+from hrcreplay.reporting import comparison, figures_robot
+from hrcreplay.reporting.comparison import FIELDS, Variant
 from hrcreplay.run import build, compare, replay
 from hrcreplay.run.contact import recorded_people
 from hrcreplay.run.job import resolve

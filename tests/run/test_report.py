@@ -17,15 +17,15 @@ from PIL import Image
 from hrcreplay.errors import SettingsError
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS
-from hrcreplay.report import drawing
-from hrcreplay.report.figures import FIGURES, FigureData
-from hrcreplay.report.replay_page import snapshot
-from hrcreplay.report.replay_scene import posed, robot_geometry
+from hrcreplay.reporting import drawing
+from hrcreplay.reporting.figures import FIGURES, FigureData
+from hrcreplay.reporting.replay_page import snapshot
+from hrcreplay.reporting.replay_scene import posed, robot_geometry
 from hrcreplay.run import build, figure_data, replay, report
 from hrcreplay.run.job import job_of_run
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
-from tests.report.moving import moving_run, moving_scene
+from tests.reporting.moving import moving_run, moving_scene
 
 
 @pytest.fixture(scope="module")

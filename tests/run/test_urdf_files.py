@@ -10,7 +10,7 @@ import pytest
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.live.control.setup import live_job, start_table
-from hrcreplay.report.tables import remarks, robot_table, summary
+from hrcreplay.reporting.tables import remarks, robot_table, summary
 from hrcreplay.robot.model import from_urdf
 from hrcreplay.run.build import robot as robot_of
 from hrcreplay.run.job import Job, job_without_log, read_urdf, urdf_digest

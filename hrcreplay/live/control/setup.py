@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from hrcreplay import __version__
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.egm.codec import ARM_JOINTS, MOST_JOINTS, Mci, Motors, Rapid, RobotPacket, encode_robot
 from hrcreplay.egm.link import EgmSession
@@ -37,6 +36,7 @@ from hrcreplay.run import build
 from hrcreplay.run.followers import Follower
 from hrcreplay.run.job import Job, job_without_log, recorded_limits, resolve
 from hrcreplay.settings.load import Settings, load_settings
+from hrcreplay.version import __version__
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.convex_hull import above, hull
 from hrcreplay.live.view.status import Scene, SceneNames, Status, unpack
 from hrcreplay.records import FLOOR_Z_M, Floats, Ints
-from hrcreplay.report.scene_messages import ROBOT, VOLUME, bones, capsule, colour, entity, points
+from hrcreplay.reporting.scene_messages import ROBOT, VOLUME, bones, capsule, colour, entity, points
 
 _BALL = 24  # directions in which a hull is grown by its radius
 

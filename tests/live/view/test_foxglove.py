@@ -21,7 +21,7 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.view.foxglove import FoxgloveStream, mesh
 from hrcreplay.live.view.status import Scene, SceneNames, pack, unpack
 from hrcreplay.records import POINTS, SweptVolumes
-from hrcreplay.report.scene_messages import upright_to
+from hrcreplay.reporting.scene_messages import upright_to
 from tests.live.statuses import status
 
 # --- scene ---

@@ -1,0 +1,512 @@
+"""The library: what the commands do, step by step. ``import hrcreplay as hr`` offers all that stands in ``__all__``.
+
+Every result holds plain numpy records and gives a DataFrame by ``to_pandas()``, with the columns of the tables in a run
+folder (``store/columns.py``). Settings are those of a settings file, as a nested mapping:
+``settings={"fusion": {"rate_hz": 250.0}}``.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from hrcreplay.calibration.cell import Cell
+from hrcreplay.errors import SettingsError
+from hrcreplay.geometry.inflated_hull import InflatedHull
+from hrcreplay.logs.clean import Cleaner
+from hrcreplay.logs.messages import RawSkeleton
+from hrcreplay.logs.reader import Log
+from hrcreplay.logs.reader import open_log as read_log
+from hrcreplay.logs.writer import LogWriter
+from hrcreplay.records import POINTS, CameraFrames, Floats, HumanStates, Ints, Motion, SweptVolumes
+from hrcreplay.robot.task import parse_task
+from hrcreplay.run import build, replay, stages
+from hrcreplay.run.build import Forecast
+from hrcreplay.run.followers import Planner
+from hrcreplay.run.fusion import PersonFuser
+from hrcreplay.run.job import Job, resolve
+from hrcreplay.run.replay import demo_log
+from hrcreplay.run.stages import Sink, Told, told_of_fusion, told_of_plan
+from hrcreplay.settings.load import load_settings
+from hrcreplay.settings.sections import Robot as RobotSettings
+from hrcreplay.store.columns import motion_columns, occupancy_columns, state_columns
+from hrcreplay.store.run_folder import RunWriter, Stopwatch, arrow_table
+from hrcreplay.toml_file import read_toml
+
+__all__ = [
+    "Controller",
+    "Fusion",
+    "People",
+    "Plan",
+    "Recording",
+    "Robot",
+    "Volumes",
+    "demo_log",
+    "frames",
+    "fuse",
+    "load_task",
+    "open_log",
+    "plan",
+    "predict",
+    "report",
+]
+
+_BATCH = 250  # ticks; changes no result
+Settings = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A log, with the cell and the settings that it is used with."""
+
+    log: Log
+    job: Job
+    _kept: Any = None  #: what must live as long as the log
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return self.log.header.cameras
+
+    @property
+    def T_world_base(self) -> Floats | None:
+        """(4, 4) pose of the robot's base in the world: of the cell file, else of the log; None: known to neither."""
+        return build.known_robot_base(self.job, self.log)
+
+    @property
+    def task(self) -> dict[str, Any] | None:
+        """The programmed task in the log, of the structure of a task file."""
+        return self.job.task or self.log.header.task
+
+    def camera_frames(self) -> Iterator[CameraFrames]:
+        """The cleaned frames in order of arrival, in chunks of at most 1 s."""
+        return self.log.frames()
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The cleaned frames as ``frames`` takes them, a row a body a frame."""
+        return _frames_table(list(self.log.frames()), self.cameras)
+
+
+def open_log(
+    path: str | Path,
+    *,
+    cell: str | Path | None = None,
+    config: str | Path | None = None,
+    settings: Settings | None = None,
+) -> Recording:
+    """Opens an MCAP file, a ROS 1 bag or a ROS 2 bag.
+
+    Args:
+        path: The log.
+        cell: Cell file: poses of cameras and robot; None: those in the log.
+        config: Settings file (TOML), or the name of one that ships: ``paper``.
+        settings: Section -> key -> value; over those of the file.
+
+    Raises:
+        LogError: There is no log that can be read.
+        SettingsError: A setting or the cell cannot be used.
+    """
+    job = resolve(
+        "plan",
+        Path(path),
+        config=None if config is None else Path(config),
+        cell_file=None if cell is None else Path(cell),
+        given=settings,
+    )
+    return Recording(read_log(job.log, job.settings.logs), job)
+
+
+def frames(
+    table: pd.DataFrame,
+    cameras: Mapping[str, Floats],
+    *,
+    T_world_base: Floats | None = None,
+    task: Mapping[str, Any] | None = None,
+    path: str | Path | None = None,
+    **how: Any,
+) -> Recording:
+    """A recording from a DataFrame, a row a body a frame.
+
+    Args:
+        table: ``arrival_ns``, ``camera``, and of body points (``records.POINTS``) ``<point>_x``, ``_y``, ``_z`` in the
+            camera's frame [m]; NaN where a point was not seen. Also, where there is more than one, ``body``;
+            ``capture_ns`` where frames took time to arrive; ``<point>_confidence`` in [0, 1].
+        cameras: Camera -> its pose (4, 4) in the world, z up, floor at z = 0 [m].
+        T_world_base: (4, 4) robot base in the world [m].
+        task: The programmed task, of the structure of a task file.
+        path: MCAP file to keep the recording in; None: it goes with the recording.
+        **how: ``cell``, ``config`` and ``settings``, as for ``open_log``.
+
+    Raises:
+        SettingsError: A column is missing, or names a camera without a pose.
+    """
+    found, folder = _camera_frames(table, tuple(cameras)), None
+    if path is None:
+        folder = tempfile.TemporaryDirectory(prefix="hrcreplay-")
+        path = Path(folder.name) / "frames.mcap"
+    file = Path(path)
+    with LogWriter(file) as writer:
+        for name, pose in cameras.items():
+            writer.camera(name, pose)
+        if task is not None:
+            writer.task(dict(task))
+        if T_world_base is not None:
+            writer.base(T_world_base)
+        writer.frames(found)
+    return replace(open_log(file, **how), _kept=folder)
+
+
+@dataclass(frozen=True)
+class People:
+    """The fused person, a row a tick."""
+
+    recording: Recording  #: with the span that was fused
+    states: HumanStates
+    tables: dict[str, pa.Table] = field(default_factory=dict)  #: of a run folder: what stage 1 found
+    told: Told = field(default_factory=lambda: Told(Counter(), ()))  #: what it counted and noted
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def rows(self, which: slice | Ints) -> People:
+        """Some ticks only."""
+        return People(self.recording, self.states.rows(which))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The columns of state.parquet: angles, velocities, accelerations, jerks, lengths, and how sure they are."""
+        return arrow_table(state_columns(self.states)).to_pandas()
+
+
+def fuse(
+    recording: Recording, *, start_s: float | None = None, end_s: float | None = None, smooth: bool | None = None
+) -> People:
+    """Stage 1: skeletons of all cameras to joint angles, merged by a Kalman filter.
+
+    Args:
+        recording: A log.
+        start_s: Start of the span, from the log's first message [s]; None: its beginning.
+        end_s: End of the span [s]; None: its end.
+        smooth: Whether to smooth the person too; None: where a report needs it, of a log without ground truth.
+
+    Raises:
+        LogError: The log shows nobody, or a camera's pose is not known.
+    """
+    log = recording.log
+    job = replace(recording.job, start_s=start_s, end_s=end_s)
+    ticks_ns = replay.span_ticks(job, log)
+    found = _MemoryTables()
+    sink = found.sink()
+    stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
+    smooth = not log.header.has_truth if smooth is None else smooth
+    batches = stages.fused(log, ticks_ns, _BATCH, build.fusion_stage(job, log), sink, smooth=smooth)
+    states = HumanStates.join(list(batches))
+    return People(replace(recording, job=job), states, found.tables, told_of_fusion(log, sink))
+
+
+@dataclass(frozen=True)
+class Volumes:
+    """What the person can reach within the horizon: ``volumes[tick][limb]`` is a convex hull grown by a radius."""
+
+    volumes: SweptVolumes
+    horizon_s: float
+
+    def __len__(self) -> int:
+        return len(self.volumes)
+
+    def __getitem__(self, tick: int) -> dict[str, InflatedHull]:
+        """Limb -> its volume at a tick. One that cannot be predicted has one vertex, of NaN: it may be anywhere."""
+        found = {}
+        for i, limb in enumerate(self.volumes.limbs):
+            vertices, radius_m = self.volumes.vertices(tick, i), float(self.volumes.radius_m[tick, i])
+            known = bool(np.isfinite(vertices).all())
+            nothing = InflatedHull(vertices, np.zeros((0, 3), np.int64), radius_m)
+            found[limb] = InflatedHull.around(vertices, radius_m) if known else nothing
+        return found
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The columns of occupancy.parquet, a row a tick and limb that is known."""
+        found = _MemoryTables()
+        found.table("occupancy", occupancy_columns(np.zeros(0, np.int64), [], self.volumes.method, [], [], [], []))
+        stages.store_volumes(self.volumes, np.arange(len(self)), np.full(len(self), self.horizon_s), found)
+        return found.tables["occupancy"].to_pandas()
+
+
+def predict(people: People, horizon_s: float | None = None, *, method: str | None = None) -> Volumes:
+    """Stage 2: what the person can reach, as convex swept volumes per limb.
+
+    Args:
+        people: The fused person; a tick takes some 20 kB, so give ``people.rows(...)`` of a long one.
+        horizon_s: Until when after each tick they hold; None: the robot's braking time T_s [s].
+        method: ``sound``, ``paper`` or ``positions``; None: that of the settings.
+    """
+    stage = build.prediction_stage(people.recording.job)
+    until_s = stage.horizon_s if horizon_s is None else horizon_s
+    return Volumes(stage.volumes(people.states, until_s, method=method), until_s)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A manipulator at its place."""
+
+    settings: RobotSettings = field(default_factory=RobotSettings)
+    T_world_base: Floats | None = None  #: (4, 4); None: where cell file or log have it
+
+    @classmethod
+    def from_urdf(cls, path: str | Path, T_world_base: Floats | None = None, **how: Any) -> Self:
+        """The robot of a URDF.
+
+        Args:
+            path: URDF; link capsules come from its collision shapes.
+            T_world_base: (4, 4) its base in the world [m].
+            **how: Keys of the settings' section ``robot``, such as ``tcp_frame`` and ``tool_m``.
+
+        Raises:
+            SettingsError: Such a key or its value is not known.
+        """
+        return cls(load_settings(given={"robot": {"urdf": str(path), **how}}).robot, T_world_base)
+
+    @classmethod
+    def irb140(cls, T_world_base: Floats | None = None, **how: Any) -> Self:
+        """The ABB IRB 140, as ``from_urdf`` of others."""
+        return cls(load_settings(given={"robot": how}).robot, T_world_base)
+
+
+def load_task(path: str | Path) -> dict[str, Any]:
+    """The programmed task of a task file (TOML).
+
+    Raises:
+        SettingsError: It cannot be read, or is no task.
+    """
+    table = read_toml(Path(path), "name a task file")
+    parse_task(table, str(path))
+    return table
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the robot would have done beside the person, by a method and its baselines."""
+
+    job: Job
+    tables: dict[str, pa.Table]  #: of a run folder: motion, motion_<baseline>, occupancy
+    told: Told
+
+    def to_pandas(self, baseline: str | None = None) -> pd.DataFrame:
+        """The columns of motion.parquet, of the method or of a baseline: positions, velocities, status, distances."""
+        return self.tables["motion" if baseline is None else f"motion_{baseline}"].to_pandas()
+
+
+def plan(
+    people: People,
+    robot: Robot | None = None,
+    task: Mapping[str, Any] | None = None,
+    *,
+    method: str | None = None,
+    baselines: Sequence[str] | None = None,
+) -> Plan:
+    """Stage 3: the robot's motion along its task, tick by tick, clear of all that the person can reach.
+
+    Args:
+        people: The fused person.
+        robot: None: that of the settings.
+        task: From ``load_task``; None: that of the log, else its recorded joints.
+        method: ``qp``, ``scaling``, ``shield``, ``ssm`` or ``none``; None: that of the settings.
+        baselines: Methods beside it; None: those of the settings.
+
+    Raises:
+        SettingsError: The robot, its place or the task is not known, or cannot be used.
+    """
+    job, log = _planned(people.recording.job, robot, task, method, baselines), people.recording.log
+    found = _MemoryTables()
+    sink = found.sink()
+    chosen = build.planners(job, log, int(people.states.t_ns[0]))
+    follower = next(iter(chosen.values())).follower
+    sink.notes["plan"].extend(build.programme_notes(job, log, follower.reference))
+    batches = (people.states.rows(slice(i, i + _BATCH)) for i in range(0, len(people), _BATCH))
+    around = build.surroundings(job, follower.robot)
+    for _ in stages.planned(batches, around, chosen, replay.store_every(job), sink):
+        pass
+    return Plan(job, found.tables, told_of_plan(log, sink))
+
+
+def report(recording: Recording, people: People, motion: Plan, out: str | Path) -> Path:
+    """Writes a run folder: all tables, metrics.json, figures and report.html, as ``hrcreplay report`` does.
+
+    Args:
+        recording: The log.
+        people: From ``fuse``, whole.
+        motion: From ``plan``.
+        out: Folder to make.
+
+    Raises:
+        SettingsError: The folder exists, or cannot be made.
+    """
+    began = datetime.now(UTC)
+    job, log = replace(motion.job, command="report"), recording.log
+    with RunWriter(Path(out)) as writer:
+        for name, table in (people.tables | motion.tables).items():
+            writer.table(name, {column: table[column] for column in table.column_names})
+        parts = replay.dependencies(job, log, people.states.t_ns)
+        found = replay.findings(job, {"fuse": people.told, "plan": motion.told})
+        meta = {**job.meta(), **found, **replay.about_run(job, began, parts, smooth=False)}
+        replay.complete(job, log, writer, Stopwatch(time.perf_counter_ns), meta)
+        return writer.folder
+
+
+class Fusion:
+    """Stage 1 tick by tick, for frames as they come. The states are those of ``fuse``, bit for bit."""
+
+    def __init__(self, recording: Recording) -> None:
+        """Begin before the first frame, with the cameras, cell and settings of a recording."""
+        self._cameras, job = recording.cameras, recording.job
+        stage = build.fusion_stage(job, recording.log)
+        self._fuser = PersonFuser(stage, self._cameras)
+        self.counts = Counter[str]()  #: defects and events so far
+        self._cleaner = Cleaner(self._cameras, job.settings.logs.gap_s, self.counts, nobody=stage.watched is not None)
+
+    def update(self, found: CameraFrames | pd.DataFrame | None, t_ns: int) -> HumanStates:
+        """The fused person at a tick, a table of one row.
+
+        Args:
+            found: All frames that arrived after the tick before and up to this one, in order; as ``frames`` takes them.
+            t_ns: The tick, after that of the last call [ns].
+        """
+        table = _camera_frames(found, self._cameras) if isinstance(found, pd.DataFrame) else found
+        parts = [] if table is None else [part for part in self._clean(table) if part is not None]
+        fused, seen = self._fuser.update(np.array([t_ns]), CameraFrames.join(parts) if parts else None)
+        self.counts.update(seen.counts)
+        self.counts.update(fused.counts)
+        return fused.states
+
+    def _clean(self, table: CameraFrames) -> Iterator[CameraFrames | None]:
+        for i in range(len(table)):
+            camera, capture_ns = self._cameras[table.camera[i]], int(table.capture_ns[i])
+            row = RawSkeleton(capture_ns, camera, int(table.body[i]), table.points_m[i], table.confidence[i])
+            yield self._cleaner.add(row, int(table.arrival_ns[i]))
+        yield self._cleaner.flush()
+
+
+class Controller:
+    """Stages 2 and 3 tick by tick: the next step of the robot beside a person. The steps are those of ``plan``."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        robot: Robot | None = None,
+        task: Mapping[str, Any] | None = None,
+        *,
+        method: str | None = None,
+    ) -> None:
+        """Begin at the start of the programme; the arguments are those of ``plan``."""
+        self._job = _planned(recording.job, robot, task, method, ())
+        self._log = recording.log
+        self._started: tuple[Planner, build.Surroundings] | None = None
+
+    def step(self, person: HumanStates) -> Motion:
+        """The robot's motion at a tick, a table of one row; ``person`` is the row of ``Fusion.update``."""
+        if self._started is None:
+            (planner,) = build.planners(self._job, self._log, int(person.t_ns[0])).values()
+            self._started = planner, build.surroundings(self._job, planner.follower.robot)
+        planner, around = self._started
+        return planner.follow(person.t_ns, [Forecast(around, person).predict(0)], around.names)
+
+    @staticmethod
+    def to_pandas(steps: Sequence[Motion]) -> pd.DataFrame:
+        """The columns of motion.parquet of some steps."""
+        return arrow_table(motion_columns(Motion.join(list(steps)))).to_pandas()
+
+
+class _MemoryTables:
+    """Tables as a run folder takes them, kept."""
+
+    def __init__(self) -> None:
+        self.tables: dict[str, pa.Table] = {}
+
+    def table(self, name: str, columns: Mapping[str, Any]) -> None:
+        """Appends rows."""
+        rows = arrow_table(columns)
+        self.tables[name] = pa.concat_tables([self.tables[name], rows]) if name in self.tables else rows
+
+    def sink(self) -> Sink:
+        """All output of a stage; no progress is shown."""
+        return Sink(self, Stopwatch(time.perf_counter_ns), lambda _stage, _ticks: None)
+
+
+def _planned(
+    job: Job,
+    robot: Robot | None,
+    task: Mapping[str, Any] | None,
+    method: str | None,
+    baselines: Sequence[str] | None,
+) -> Job:
+    """The job with another robot, task or method."""
+    chosen = {"method": method, "baselines": None if baselines is None else list(baselines)}
+    given = {"plan": {name: value for name, value in chosen.items() if value is not None}}
+    settings, cell = load_settings(base=job.settings.model_dump(mode="json"), given=given), job.cell
+    if robot is not None:
+        settings = settings.model_copy(update={"robot": robot.settings})
+        if robot.T_world_base is not None:
+            cell = replace(cell or Cell(), T_world_base=np.asarray(robot.T_world_base, dtype=float))
+    return replace(job, settings=settings, cell=cell, task=job.task if task is None else dict(task))
+
+
+def _camera_frames(table: pd.DataFrame, cameras: tuple[str, ...]) -> CameraFrames:
+    """The rows of a DataFrame as ``frames`` describes it, in order of arrival."""
+    for name in ("arrival_ns", "camera"):
+        if name not in table:
+            raise SettingsError(f"frames: column {name} is missing; would be right: {', '.join(_COLUMNS)}, ...")
+    points = {point for point in POINTS if f"{point}_x" in table}
+    for name in (f"{point}_{axis}" for point in sorted(points) for axis in "yz"):
+        if name not in table:
+            raise SettingsError(f"frames: column {name} is missing; would be right: x, y and z of a point")
+    if not points:
+        raise SettingsError(f"frames: no body point; would be right: columns such as pelvis_x, of {', '.join(POINTS)}")
+    unknown = sorted(set(table["camera"].astype(str)) - set(cameras))
+    if unknown:
+        raise SettingsError(f"frames: camera {unknown[0]} has no pose; cameras are {', '.join(cameras)}")
+    table = table.sort_values("arrival_ns", kind="stable")
+    places, confidence = np.full((len(table), len(POINTS), 3), np.nan), np.zeros((len(table), len(POINTS)))
+    for i, point in enumerate(POINTS):
+        if point in points:
+            places[:, i] = table[[f"{point}_{axis}" for axis in "xyz"]].to_numpy(dtype=float)
+            seen = np.isfinite(places[:, i]).all(axis=1).astype(float)
+            told = f"{point}_confidence"
+            confidence[:, i] = table[told].to_numpy(dtype=float) if told in table else seen
+    arrival_ns = table["arrival_ns"].to_numpy(dtype=np.int64)
+    return CameraFrames(
+        capture_ns=table["capture_ns"].to_numpy(dtype=np.int64) if "capture_ns" in table else arrival_ns,
+        arrival_ns=arrival_ns,
+        camera=np.array([cameras.index(name) for name in table["camera"].astype(str)], dtype=np.int64),
+        body=table["body"].to_numpy(dtype=np.int64) if "body" in table else np.zeros(len(table), np.int64),
+        points_m=places,
+        confidence=confidence,
+        cameras=cameras,
+    )
+
+
+_COLUMNS = ("arrival_ns", "camera", "pelvis_x", "pelvis_y", "pelvis_z")
+
+
+def _frames_table(parts: list[CameraFrames], cameras: tuple[str, ...]) -> pd.DataFrame:
+    if not parts:
+        return pd.DataFrame(columns=list(_COLUMNS))
+    whole = CameraFrames.join(parts)
+    columns: dict[str, Any] = {
+        "arrival_ns": whole.arrival_ns,
+        "capture_ns": whole.capture_ns,
+        "camera": np.array(cameras, dtype=object)[whole.camera],
+        "body": whole.body,
+    }
+    for i, point in enumerate(POINTS):
+        columns |= {f"{point}_{axis}": whole.points_m[:, i, k] for k, axis in enumerate("xyz")}
+        columns[f"{point}_confidence"] = whole.confidence[:, i]
+    return pd.DataFrame(columns)

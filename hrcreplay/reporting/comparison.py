@@ -1,0 +1,474 @@
+"""Methods side by side: figures of each, the sum over several logs, tables, and one picture of safety and pace.
+
+Terminal, CSV, Markdown and JSON show the same numbers. Those of a motion alone are the metrics of a report.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from hrcreplay.records import Floats
+from hrcreplay.reporting import drawing, figures_robot
+from hrcreplay.reporting.metrics import Metric, MetricTable, times, true_runs
+from hrcreplay.reporting.metrics_contact import PERSONS, add_contact
+from hrcreplay.reporting.metrics_plan import PAPER, add_plan, is_moving
+from hrcreplay.reporting.tables import PageTable
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import Run, RunWriter
+
+#: A smaller pace is shown as 0.0 %: the robot made no way.
+NO_WAY = 0.0005
+
+#: Name of the row over several logs.
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A method, and how and how far ahead the person is predicted for it."""
+
+    method: str
+    occupancy: str
+    horizon: str
+
+    @property
+    def label(self) -> str:
+        """As ``--methods`` takes it; the programme run blind has no volumes."""
+        return self.method if self.method == "none" else f"{self.method}:{self.occupancy}:{self.horizon}"
+
+    @property
+    def slug(self) -> str:
+        """Part of file names."""
+        return self.label.replace(":", "_")
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the figures ask of the settings."""
+
+    near_m: float
+    stationary_m_per_s: float
+    leash_m: float
+
+
+@dataclass(frozen=True)
+class LogResult:
+    """What is known of one log."""
+
+    name: str
+    sha256: str
+    person: str  #: where the recorded person is from, as contact.parquet has it
+    seconds: float
+    notes: tuple[str, ...]
+    figures: Mapping[Variant, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Field:
+    """A figure: how those of several logs make one, its unit and its meaning."""
+
+    name: str
+    how: str  #: sum, min, max; or "a / b" of two others; or "mean", "rms" by ticks
+    unit: str
+    meaning: str
+
+
+FIELDS = (
+    Field("ticks", "sum", "1", "ticks"),
+    Field("known_ticks", "sum", "1", "ticks at which the person is known"),
+    Field("touch_ticks", "sum", "1", "ticks with a moving link in contact with anybody recorded"),
+    Field("touch_person_ticks", "sum", "1", "of these, with the person"),
+    Field("touch_other_ticks", "sum", "1", "of these, with another body, which the robot did not heed"),
+    Field("touch_s", "sum", "s", "the time of these"),
+    Field("touch_inside_ticks", "sum", "1", "with the person inside the volumes: the robot is at fault"),
+    Field("touch_retreating_ticks", "sum", "1", "with the robot moving out of the volumes: the person came"),
+    Field(
+        "touch_outside_ticks",
+        "sum",
+        "1",
+        "with the person outside the volumes: the prediction is at fault",
+    ),
+    Field("touch_unpredicted_ticks", "sum", "1", "with the person, where the motion rested on no volume of that limb"),
+    Field("touch_rest_ticks", "sum", "1", "ticks with a link at rest in contact with anybody recorded"),
+    Field("touch_speed_m_per_s", "max", "m/s", "largest speed of the touching surface while moving"),
+    Field("nearest_moving_m", "min", "m", "smallest distance, surface to surface, while moving; negative in overlap"),
+    Field("nearest_rest_m", "min", "m", "the same at rest"),
+    Field("moving_ticks", "sum", "1", "ticks with the robot moving"),
+    Field("uncertified_ticks", "sum", "1", "of these, ticks without a certificate"),
+    Field(
+        "still_logs",
+        "sum",
+        "1",
+        "logs on which the robot never moved, or made no way: without contact there is no success",
+    ),
+    Field("tcp_speed_max_m_per_s", "max", "m/s", "greatest speed of the TCP"),
+    Field("tcp_speed_near_body_m_per_s", "max", "m/s", "the same within report.near_m of the recorded body"),
+    Field("programme_speed_max_m_per_s", "max", "m/s", "greatest programmed speed of the TCP, where the reference was"),
+    Field("retreating_ticks", "sum", "1", "ticks in retreat: they begin inside a volume"),
+    Field("retreating_share", "retreating_ticks / ticks", "1", "retreating ticks / ticks"),
+    Field("retreating_overlap_m", "max", "m", "how deep, at most, a link was inside a volume then"),
+    Field("near_ticks", "sum", "1", "ticks with at most report.near_m between robot and volumes"),
+    Field("standing_ticks", "sum", "1", "of these, the robot stands though its programme moves or waits for it"),
+    Field("standing_share", "standing_ticks / near_ticks", "1", "standing ticks / near ticks"),
+    Field("null_speed_ticks", "sum", "1", "near ticks with a TCP that stands, programmed dwells included"),
+    Field("null_speed_share", "null_speed_ticks / near_ticks", "1", "null velocity when near, as the paper defines it"),
+    Field("made_s", "sum", "s", "programmed time of the way that the robot made"),
+    Field("given_s", "sum", "s", "time that it had"),
+    Field("pace", "made_s / given_s", "1", "pace kept, of the programmed"),
+    Field("cycles", "sum", "1", "times the reference came back to its first point"),
+    Field("deviation_mean_m", "mean", "m", "distance of the TCP from the programmed path, mean"),
+    Field("deviation_max_m", "max", "m", "the same, largest"),
+    Field("braking_events", "sum", "1", "times that a moving robot began to brake"),
+    Field("jerk_rms_rad_per_s3", "rms", "rad/s^3", "joint jerk, root mean square over ticks and axes"),
+    Field("jerk_max_rad_per_s3", "max", "rad/s^3", "joint jerk, largest"),
+    Field(
+        "checked_ticks",
+        "sum",
+        "1",
+        "ticks, 25 a second, at which a limb was seen near the end of the tick's horizon",
+    ),
+    Field("held_ticks", "sum", "1", "of these, every limb that was seen stayed whole inside its volume"),
+    Field("coverage", "held_ticks / checked_ticks", "1", "held ticks / checked ticks"),
+    Field("left_max_m", "max", "m", "how far a limb left its volume at most"),
+    Field("full_checked_ticks", "sum", "1", "the same until the braking time T_s, as audit asks: ticks"),
+    Field("full_held_ticks", "sum", "1", "of these, every limb that was seen stayed whole inside its volume"),
+    Field("full_coverage", "full_held_ticks / full_checked_ticks", "1", "as audit counts it until T_s"),
+)
+#: Where a figure is a metric of the report: its name there, after ``plan_`` but for those of the volumes.
+_METRICS = {
+    "ticks": "plan_ticks",
+    "known_ticks": "plan_body_known_ticks",
+    "touch_ticks": "plan_touch_moving_ticks",
+    "touch_person_ticks": "plan_touch_person_ticks",
+    "touch_other_ticks": "plan_touch_other_ticks",
+    "touch_s": "plan_touch_moving_s",
+    "touch_inside_ticks": "plan_touch_inside_ticks",
+    "touch_retreating_ticks": "plan_touch_retreating_ticks",
+    "touch_outside_ticks": "plan_touch_outside_ticks",
+    "touch_unpredicted_ticks": "plan_touch_unpredicted_ticks",
+    "touch_rest_ticks": "plan_touch_rest_ticks",
+    "touch_speed_m_per_s": "plan_touch_contact_speed_max_m_per_s",
+    "nearest_moving_m": "plan_body_distance_min_moving_m",
+    "nearest_rest_m": "plan_body_distance_min_rest_m",
+    "moving_ticks": "plan_moving_ticks",
+    "uncertified_ticks": "plan_uncertified_moving_ticks",
+    "tcp_speed_max_m_per_s": "plan_tcp_speed_max_m_per_s",
+    "tcp_speed_near_body_m_per_s": "plan_tcp_speed_near_body_max_m_per_s",
+    "programme_speed_max_m_per_s": "plan_ref_speed_max_m_per_s",
+    "retreating_overlap_m": "plan_retreating_overlap_max_m",
+    "near_ticks": "plan_near_ticks",
+    "standing_ticks": "plan_stationary_ticks",
+    "null_speed_ticks": "plan_null_speed_ticks",
+    "cycles": "plan_cycles",
+    "deviation_mean_m": "plan_deviation_mean_m",
+    "deviation_max_m": "plan_deviation_max_m",
+    "checked_ticks": "volumes_checked_ticks",
+    "left_max_m": "volumes_left_max_m",
+    "full_checked_ticks": "volumes_full_checked_ticks",
+}
+
+
+def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Any]:
+    """The figures of a variant on one log: FIELDS, and ``braking_events_by_cause``; None where one does not apply.
+
+    Args:
+        variant: Which.
+        motion: Its table of motion.
+        contact: Its rows of contact.
+        bounds: What the settings say.
+    """
+    metrics = _metrics(variant, motion, contact, bounds)
+    found = {name: metrics[key]["value"] for name, key in _METRICS.items()}
+    given_s, lost_s = float(times(motion)[-1] - times(motion)[0]) * 1e-9, metrics["plan_time_lost_s"]["value"]
+    found["given_s"], found["made_s"] = (None, None) if lost_s is None else (given_s, given_s - lost_s)
+    found["retreating_ticks"] = int((motion["status"].astype(str) == "retreating").sum())
+    pace = None if found["made_s"] is None or not given_s else found["made_s"] / given_s
+    found["still_logs"] = int(not found["moving_ticks"] or (pace is not None and pace < NO_WAY))
+    causes = braking_events(motion, bounds.stationary_m_per_s)
+    found["braking_events"] = sum(causes.values())
+    jerk = _jerk(motion)
+    found["jerk_rms_rad_per_s3"] = float(np.sqrt(np.mean(jerk**2))) if jerk.size else None
+    found["jerk_max_rad_per_s3"] = float(np.abs(jerk).max()) if jerk.size else None
+    for prefix, until in (("", "volumes"), ("full_", "volumes_full")):
+        left, checked = metrics[f"{until}_left_ticks"]["value"], found[f"{prefix}checked_ticks"]
+        found[f"{prefix}held_ticks"] = None if checked is None else checked - left
+    return _with_ratios(found) | {"braking_events_by_cause": causes}
+
+
+def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Metric]:
+    """What a report says of this motion, with nothing beside it."""
+    table = MetricTable()
+    settings = {"plan": {"method": variant.method}}
+    add_plan(
+        table,
+        motion,
+        {},
+        method=variant.method,
+        near_m=bounds.near_m,
+        stationary_m_per_s=bounds.stationary_m_per_s,
+        leash_m=bounds.leash_m,
+        contact=contact,
+    )
+    run = Run(Path(), {"settings": settings}, motion=motion, contact=contact)
+    add_contact(table, run, bounds.stationary_m_per_s)
+    return table.sorted()
+
+
+def braking_events(motion: pd.DataFrame, slow_m_per_s: float) -> dict[str, int]:
+    """How often a moving robot began to brake, by the reason that its record gives at that tick."""
+    runs = true_runs((motion["status"].astype(str) == "braking").to_numpy())
+    moving, reasons = is_moving(motion, slow_m_per_s), motion["reason"].fillna("").astype(str).to_numpy()
+    found: dict[str, int] = {}
+    for first in runs[:, 0].tolist():
+        if moving[first]:
+            found[reasons[first]] = found.get(reasons[first], 0) + 1
+    return dict(sorted(found.items()))
+
+
+def _jerk(motion: pd.DataFrame) -> Floats:
+    """(n - 1, nv) change of the joint accelerations from tick to tick [rad/s^3]."""
+    axes = [name for name in motion.columns if name[0] == "u" and name[1:].isdigit()]
+    u = motion[axes].to_numpy(dtype=float)
+    return np.asarray(np.diff(u, axis=0) / (np.diff(times(motion)) * 1e-9)[:, None])
+
+
+def _with_ratios(found: dict[str, Any]) -> dict[str, Any]:
+    """The figures in the order of FIELDS, with those that are one over another."""
+    for field in FIELDS:
+        if "/" in field.how:
+            above, below = (found[part.strip()] for part in field.how.split("/"))
+            found[field.name] = None if above is None or not below else above / below
+    return {field.name: found[field.name] for field in FIELDS}
+
+
+def total(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The figures of a variant over several logs: counts and times add up, extremes are those of the worst log."""
+    found: dict[str, Any] = {}
+    for field in FIELDS:
+        known = [row for row in each if row[field.name] is not None]
+        values = [row[field.name] for row in known]
+        ticks = sum(row["ticks"] for row in known)
+        if "/" in field.how or not values:
+            found[field.name] = None
+        elif field.how in ("mean", "rms"):
+            power = 1 if field.how == "mean" else 2
+            found[field.name] = (sum(row["ticks"] * row[field.name] ** power for row in known) / ticks) ** (1 / power)
+        else:
+            found[field.name] = (
+                sum(values) if field.how == "sum" else min(values) if field.how == "min" else max(values)
+            )
+    causes: dict[str, int] = {}
+    for row in each:
+        for cause, count in row["braking_events_by_cause"].items():
+            causes[cause] = causes.get(cause, 0) + count
+    return _with_ratios(found) | {"braking_events_by_cause": dict(sorted(causes.items()))}
+
+
+def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str, Any]:
+    """The content of compare.json."""
+    return {
+        "methods": {
+            variant.label: {"method": variant.method}
+            | ({} if variant.method == "none" else {"occupancy": variant.occupancy, "horizon": variant.horizon})
+            for variant in variants
+        },
+        "fields": {field.name: {"unit": field.unit, "meaning": field.meaning} for field in FIELDS},
+        "logs": [
+            {
+                "log": log.name,
+                "sha256": log.sha256,
+                "person": log.person,
+                "seconds": log.seconds,
+                "notes": list(log.notes),
+                "methods": {variant.label: _told(log.figures[variant], 1) for variant in variants},
+            }
+            for log in logs
+        ],
+        "total": {
+            variant.label: _told(total([log.figures[variant] for log in logs]), len(logs)) for variant in variants
+        },
+        "paper": {
+            name: {"value": PAPER[f"paper_stationary_share_{name}"][0], "unit": "1", "meaning": _PAPER}
+            for name in ("qp", "scaling")
+        },
+    }
+
+
+def _told(row: Mapping[str, Any], logs: int) -> dict[str, Any]:
+    """The figures of a variant with what they say of its motion, in words; None where it made its way."""
+    return {**row, "stillness": stillness(row, logs) or None}
+
+
+_PAPER = (
+    "share of the ticks at most 0.50 m from the volumes at which the paper's robot stood, in experiments whose logs "
+    "were never published: to be compared in kind only"
+)
+
+#: Heading with its unit, figure, factor and decimals.
+_COLUMNS = (
+    ("ticks in\ncontact", "touch_ticks", 1, 0),
+    ("fastest\nm/s", "touch_speed_m_per_s", 1, 2),
+    ("TCP up to\nm/s", "tcp_speed_max_m_per_s", 1, 2),
+    ("near body\nm/s", "tcp_speed_near_body_m_per_s", 1, 2),
+    ("nearest\nmoving m", "nearest_moving_m", 1, 3),
+    ("nearest\nat rest m", "nearest_rest_m", 1, 3),
+    ("pace\n%", "pace", 100, 1),
+    ("\ncycles", "cycles", 1, 0),
+    ("stands\nnear %", "standing_share", 100, 1),
+    ("no speed\nnear %", "null_speed_share", 100, 1),
+    ("off path\nm", "deviation_max_m", 1, 3),
+    ("\nbrakings", "braking_events", 1, 0),
+    ("jerk\nrad/s\u00b3", "jerk_rms_rad_per_s3", 1, 0),
+    ("held in\nvolumes %", "coverage", 100, 1),
+)
+
+
+def _cell(value: float | None, factor: int, decimals: int) -> str:
+    """A figure as a reader wants it."""
+    return "\u2013" if value is None else f"{factor * value:,.{decimals}f}".replace("-", "\u2212")
+
+
+def stillness(row: Mapping[str, Any], logs: int) -> str:
+    """That a method never moved, or made no way, on one log or on how many of several; empty where it did.
+
+    Args:
+        row: Its figures.
+        logs: How many logs they are of.
+    """
+    if not row["still_logs"]:
+        return ""
+    if row["still_logs"] < logs:
+        return f"no way on {row['still_logs']} of {logs} logs"
+    return "made no way" if row["moving_ticks"] else "never moved"
+
+
+def notes(found: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The notes of all logs, each with the log's name."""
+    return [(log["log"], note) for log in found["logs"] for note in log["notes"]]
+
+
+def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
+    """What terminal and Markdown show: the methods side by side, and why they braked."""
+    logs = [(log["log"], log["methods"]) for log in found["logs"]]
+    if len(logs) > 1:
+        logs.append((ALL, found["total"]))
+    lead = ("log", "method") if len(logs) > 1 else ("method",)
+    rows, brakings = [], []
+    causes = sorted({cause for row in found["total"].values() for cause in row["braking_events_by_cause"]})
+    for log, methods in logs:
+        for label, row in methods.items():
+            head = (log, label) if len(logs) > 1 else (label,)
+            cells = [_cell(row[name], *how) for _, name, *how in _COLUMNS]
+            if row["stillness"]:  # lest it be taken for a success
+                cells[0] += f"\n({row['stillness']})"
+            rows.append((*head, *cells))
+            by_cause = row["braking_events_by_cause"]
+            brakings.append((*head, *(f"{by_cause.get(cause, 0):,}" for cause in causes)))
+    tables = [PageTable("Methods", (*lead, *(column[0] for column in _COLUMNS)), tuple(rows), _note(found))]
+    if causes:
+        named = tuple(cause or "unnamed" for cause in causes)
+        note = "Times that a moving robot began to brake, by the reason at that tick."
+        tables.append(PageTable("Brakings by cause", (*lead, *named), tuple(brakings), note))
+    return tuple(tables)
+
+
+def _note(found: Mapping[str, Any]) -> str:
+    """What the numbers are of, and the paper's own beside them."""
+    persons = sorted({PERSONS.get(log["person"], log["person"]) for log in found["logs"]})
+    known, ticks = (
+        sum(next(iter(log["methods"].values()))[name] for log in found["logs"]) for name in ("known_ticks", "ticks")
+    )
+    qp, scaling = (f"{100 * found['paper'][name]['value']:.2f} %" for name in ("qp", "scaling"))
+    outside, other = (
+        sum(row[f"touch_{of}_ticks"] or 0 for row in found["total"].values()) for of in ("outside", "other")
+    )
+    fault = (
+        f" At {outside:,} of the ticks in contact the person was outside the volumes that the motion was certified by."
+        if outside
+        else ""
+    )
+    if other:
+        fault += f" At {other:,} of them it was another body than the person, which the robot did not heed."
+    still = [label for label, row in found["total"].items() if row["still_logs"]]
+    fault += f" No contact of a robot that makes no way is a success: {', '.join(still)}." if still else ""
+    programmed = [row["programme_speed_max_m_per_s"] or 0.0 for row in found["total"].values()]
+    return (
+        f"The person is {' or '.join(persons)}, known at {known:,} of {ticks:,} ticks. Contact: while the robot "
+        f"moves.{fault} The programme's TCP makes up to {max(programmed):.2f} m/s; near body: within report.near_m "
+        "of the recorded person. Near: at most report.near_m from the volumes. Stands near: though its programme "
+        "moves; no speed near, as the paper counts: programmed dwells, too. The paper's robot stood in "
+        f"{scaling} (scaling) and {qp} (QP) of the ticks near people, on its own data: compare in kind only."
+    )
+
+
+def print_tables(found: Mapping[str, Any]) -> None:
+    """The tables on standard error, where they do not mix with the result."""
+    console = Console(stderr=True, markup=False, emoji=False, highlight=False)
+    if not console.is_terminal:
+        console.width = 190
+    for table in page_tables(found):
+        shown = Table(title=table.title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
+        for column in table.columns:
+            shown.add_column(column, justify="left" if column in ("log", "method") else "right", no_wrap=True)
+        for row in table.rows:
+            shown.add_row(*row)
+        console.print(shown)
+        console.print(table.note)
+
+
+def write(found: Mapping[str, Any], writer: RunWriter) -> None:
+    """compare.json, compare.csv, compare.md and the figure."""
+    writer.text("compare.json", run_folder.to_json(found))
+    writer.text("compare.csv", as_csv(found))
+    writer.text("compare.md", as_markdown(found))
+    folder = writer.partial / "figures"
+    folder.mkdir(exist_ok=True)
+    with drawing.style():
+        drawing.save(figures_robot.methods(found), folder, "compare")
+
+
+def as_csv(found: Mapping[str, Any]) -> str:
+    """A row a log and method, and the sums over all logs; an empty cell where a figure does not apply."""
+    causes = sorted({cause for row in found["total"].values() for cause in row["braking_events_by_cause"]})
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    named = [f"braking_events_{cause.replace(' ', '_') or 'unnamed'}" for cause in causes]
+    lead = ["log", "variant", "method", "occupancy", "horizon", "stillness"]
+    table.writerow([*lead, *(field.name for field in FIELDS), *named])
+    for log, methods in (*((log["log"], log["methods"]) for log in found["logs"]), (ALL, found["total"])):
+        for label, row in methods.items():
+            of = found["methods"][label]
+            values = ["" if row[field.name] is None else row[field.name] for field in FIELDS]
+            by_cause = [row["braking_events_by_cause"].get(cause, 0) for cause in causes]
+            who = [of["method"], of.get("occupancy", ""), of.get("horizon", ""), row["stillness"] or ""]
+            table.writerow([log, label, *who, *values, *by_cause])
+    return text.getvalue()
+
+
+def as_markdown(found: Mapping[str, Any]) -> str:
+    """The tables and the notes of the terminal."""
+    parts = []
+    for table in page_tables(found):
+        head = [
+            f"## {table.title}",
+            "",
+            f"| {' | '.join(' '.join(column.split()) for column in table.columns)} |",
+            f"|{'---|' * len(table.columns)}",
+        ]
+        parts.append("\n".join([*head, *(f"| {' | '.join(row)} |".replace("\n", " ") for row in table.rows)]))
+        parts[-1] += f"\n\n{table.note}\n"
+    several = len(found["logs"]) > 1
+    told = [f"- {log}: {note}" if several else f"- {note}" for log, note in notes(found)]
+    parts += ["\n".join(["## Notes", "", *told, ""])] if told else []
+    return "\n".join(parts)

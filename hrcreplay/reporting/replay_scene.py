@@ -1,0 +1,388 @@
+"""What the 3-D replay of a run shows, at a steady rate: robot, person, volumes, and each method's motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
+
+from hrcreplay.human.model import skeleton
+from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
+from hrcreplay.reporting.drawing import BONES
+from hrcreplay.reporting.metrics import seconds_from, times
+from hrcreplay.reporting.metrics_contact import StopEvent, method_prefixes, stop_events
+from hrcreplay.reporting.metrics_plan import numeric_column
+from hrcreplay.robot.control.control_step import axis_by_axis
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.settings.sections import setting
+from hrcreplay.store.run_folder import Run
+
+#: Instants of the replay a second.
+RATE_HZ = 25.0
+#: Volumes of the replay a second at most.
+VOLUME_HZ = 12.5
+#: A row of a table that is older than this says nothing of an instant [s].
+_STALE_S = 0.2
+#: Body points of the fused person that are shown.
+SHOWN_POINTS = tuple(dict.fromkeys(name for bone in BONES for name in bone))
+
+
+@dataclass(frozen=True)
+class LinkMesh:
+    """The surface of a link in the world, with all axes at zero."""
+
+    link: int  #: which of the robot's links
+    vertices_m: Floats  #: (k, 3)
+    triangles: Ints  #: (t, 3) which vertices
+
+
+@dataclass(frozen=True)
+class RobotGeometry:
+    """A serial robot for drawing: with all axes at zero in the world, and the screws that move it from there."""
+
+    links: tuple[str, ...]  #: (s,) names
+    radius_m: Floats  #: (s,) of the links' capsules
+    ends_m: Floats  #: (s, 2, 3) ends of their axes
+    moved_by: Ints  #: (s,) so many axes, counted from the base, move the link
+    screws: Floats  #: (nv, 6) of a unit turn: velocity of the point at the world's origin, angular velocity
+    tcp_m: Floats  #: (3,)
+    base_m: Floats  #: (3,)
+    meshes: tuple[LinkMesh, ...]  #: of the links that have one
+
+
+@dataclass(frozen=True)
+class MethodTrack:
+    """What one method did, a row an instant; NaN and -1 where its table says nothing."""
+
+    q: Floats  #: (n, nv) [rad]
+    stop_q: Floats  #: (n, nv) where the stop ends that it would go on with [rad]
+    ref_m: Floats  #: (n, 3) programmed TCP, world
+    tcp_m: Floats  #: (n, 3) driven TCP, world
+    ref_speed: Floats  #: (n,) [m/s]
+    tcp_speed: Floats  #: (n,) [m/s]
+    distance_m: Floats  #: (n,) to all that the person can reach until the horizon
+    body_m: Floats  #: (n,) to the recorded body
+    horizon_s: Floats  #: (n,)
+    certified: Ints  #: (n,) 1, 0, or -1 where the table does not say
+    names: dict[str, tuple[tuple[str, ...], Ints]]  #: status, reason, limb, link: all names, and (n,) indices or -1
+    events: tuple[StopEvent, ...]
+
+
+@dataclass(frozen=True)
+class VolumeTrack:
+    """The swept volumes as stored: rows of (instant, limb)."""
+
+    t_ns: Ints  #: (k,)
+    limb: Ints  #: (k,) index into ``limbs``
+    radius_m: Floats  #: (k,) of the ball around the hull
+    offsets: Ints  #: (k + 1,) hull ``i`` is ``vertices_m[offsets[i] : offsets[i + 1]]``
+    vertices_m: Floats  #: (m, 3) world
+    horizon_s: Floats  #: (k,) how long after the instant it holds; NaN where the table does not say
+    limbs: tuple[str, ...]
+
+    def rows(self, which: Ints) -> VolumeTrack:
+        """Only some rows."""
+        counts = np.diff(self.offsets)[which]
+        parts = [self.vertices_m[self.offsets[i] : self.offsets[i + 1]] for i in which.tolist()]
+        return VolumeTrack(
+            t_ns=self.t_ns[which],
+            limb=self.limb[which],
+            radius_m=self.radius_m[which],
+            offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+            vertices_m=np.concatenate(parts) if parts else np.zeros((0, 3)),
+            horizon_s=self.horizon_s[which],
+            limbs=self.limbs,
+        )
+
+
+@dataclass(frozen=True)
+class ReplayScene:
+    """Everything that moves in the 3-D replay, at ``RATE_HZ``."""
+
+    t0_ns: int  #: instant of time zero of the report
+    t_ns: Ints  #: (n,)
+    points_m: Floats  #: (n, len(SHOWN_POINTS), 3) the fused person
+    body_m: Floats  #: (n, p, 2, 3) ends of the recorded body's capsules; p is 0 without a comparison
+    body_parts: tuple[str, ...]  #: (p,)
+    body_radius_m: Floats  #: (p,)
+    volumes: VolumeTrack
+    robot: RobotGeometry
+    methods: dict[str, MethodTrack]  #: the run's own first
+    watched_m: Floats  #: (k, 2) corners of what the cameras watch, on the floor; k is 0 where the cell does not say
+
+    @property
+    def seconds(self) -> Floats:
+        """(n,) the instants by the report's clock [s]."""
+        return seconds_from(self.t_ns, self.t0_ns)
+
+
+def robot_geometry(robot: RobotModel) -> RobotGeometry:
+    """A robot with all axes at zero. A link's twist at a unit velocity of one axis is that axis' screw, or zero."""
+    zero = np.zeros((robot.nv, robot.nv))
+    motion = robot.link_motion(zero, np.eye(robot.nv))
+    moves = np.abs(motion.twist[:, :, 3:]).sum(axis=2) > 0.0  # (nv, s)
+    screws = motion.twist[np.arange(robot.nv), np.argmax(moves, axis=1)]
+    return RobotGeometry(
+        links=tuple(segment.name for segment in robot.segments),
+        radius_m=np.array([segment.radius_m for segment in robot.segments]),
+        ends_m=motion.ends_m[0],
+        moved_by=np.where(moves.any(axis=0), robot.nv - np.argmax(moves[::-1], axis=0), 0),
+        screws=screws,
+        tcp_m=robot.pose(zero[0], zero[0]).T_world_tcp[:3, 3],
+        base_m=robot.T_world_base[:3, 3],
+        meshes=tuple(_meshes(robot, motion.ends_m[0, :, 0], zero[0])),
+    )
+
+
+#: A mesh of more triangles is drawn coarser.
+_TRIANGLES = 8000
+
+
+def _meshes(robot: RobotModel, start_m: Floats, q: Floats) -> Iterator[LinkMesh]:
+    """The links' meshes in the world at joint positions (nv,) [rad], where the links begin at (s, 3) [m]."""
+    for link, (segment, turn) in enumerate(zip(robot.segments, robot.R_bodies(q), strict=True)):
+        if segment.surface is not None and len(segment.surface.triangles):
+            vertices_m, triangles = coarser(segment.surface.vertices_m, segment.surface.triangles, _TRIANGLES)
+            yield LinkMesh(link, (vertices_m - segment.start_m) @ turn.T + start_m[link], triangles)
+
+
+def coarser(vertices_m: Floats, triangles: Ints, most: int) -> tuple[Floats, Ints]:
+    """A mesh of so many triangles at most: what lies in one cell of a grid becomes one vertex, their mean.
+
+    Args:
+        vertices_m: (k, 3) [m].
+        triangles: (t, 3) which vertices.
+        most: As few triangles are left.
+
+    Returns:
+        (k, 3) vertices [m] and (t, 3) triangles.
+    """
+    cell_m = 1e-4
+    while True:
+        cells, owner = np.unique(np.round(vertices_m / cell_m), axis=0, return_inverse=True)
+        owner = owner.ravel()
+        corners = owner[triangles]
+        corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+        if len(corners) <= most:
+            count = np.bincount(owner, minlength=len(cells))
+            mean = [np.bincount(owner, axis, minlength=len(cells)) / count for axis in vertices_m.T]
+            return np.column_stack(mean), corners
+        cell_m *= 1.5
+
+
+def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floats]]:
+    """Where each axis brings what it moves, from the pose with all axes at zero: products of exponentials.
+
+    Args:
+        robot: Its screws.
+        q: (n, nv) [rad].
+
+    Yields:
+        For each axis, from the base on: n rotations and (n, 3) positions [m].
+    """
+    turned, at_m = Rotation.identity(len(q)), np.zeros((len(q), 3))
+    for angle, screw in zip(q.T, robot.screws, strict=True):
+        foot = np.cross(screw[3:], screw[:3])  # the axis' point nearest to the world's origin
+        turn = Rotation.from_rotvec(angle[:, None] * screw[3:])
+        at_m = at_m + turned.apply(foot - turn.apply(foot))
+        turned = turned * turn
+        yield turned, at_m
+
+
+def posed(robot: RobotGeometry, q: Floats) -> Floats:
+    """(n, s, 2, 3) ends of the links' axes in the world at joint positions (n, nv) [rad]; NaN where these are [m]."""
+    known = np.asarray(np.isfinite(q).all(axis=1))
+    ends = np.repeat(robot.ends_m[None], len(q), axis=0)
+    for axis, (turned, at_m) in enumerate(placements(robot, np.where(known[:, None], q, 0.0)), start=1):
+        for i in np.flatnonzero(robot.moved_by == axis).tolist():
+            for end in (0, 1):
+                ends[:, i, end] = turned.apply(robot.ends_m[i, end]) + at_m
+    ends[~known] = np.nan
+    return ends
+
+
+def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, float]) -> ReplayScene | None:
+    """The replay of a run that moved a robot; None of any other.
+
+    Args:
+        run: The run's tables.
+        robot: The robot of the run at its place.
+        t0_ns: Instant of time zero of the report [ns].
+        radii_m: Part of the recorded body -> radius of its capsule [m].
+    """
+    if run.motion is None or len(run.motion) < 2 or "q1" not in run.motion:
+        return None
+    first, last = (int(t) for t in times(run.motion)[[0, -1]])
+    step_ns = round(1e9 / RATE_HZ)
+    t_ns = first + step_ns * np.arange((last - first) // step_ns + 1)
+    parts = tuple(part for part in radii_m if run.body is not None and f"{part}_0_x" in run.body)
+    tables = {
+        method: run.motion if prefix == "plan" else run.baselines[method]
+        for method, prefix in method_prefixes(run).items()
+    }
+    slow = float(setting(run.meta.get("settings", {}), "report", "stationary_m_per_s"))
+    return ReplayScene(
+        t0_ns=t0_ns,
+        t_ns=t_ns,
+        points_m=_fused(run.state, t_ns),
+        body_m=_body(run.body, parts, t_ns),
+        body_parts=parts,
+        body_radius_m=np.array([radii_m[part] for part in parts]),
+        volumes=volume_track(run.occupancy),
+        robot=robot_geometry(robot),
+        methods={name: _track(run, name, table, robot, t_ns, t0_ns, slow) for name, table in tables.items()},
+        watched_m=np.array(((run.meta.get("cell") or {}).get("watched") or {}).get("corners_m", [])).reshape(-1, 2),
+    )
+
+
+def _rows(table: pd.DataFrame, at_ns: Ints) -> tuple[Ints, Bools]:
+    """The last row of a table at each instant, and whether it says anything of it."""
+    t_ns = times(table)
+    row = np.searchsorted(t_ns, at_ns, side="right") - 1
+    known = (row >= 0) & (at_ns - t_ns[np.maximum(row, 0)] <= _STALE_S * 1e9)
+    return np.maximum(row, 0), known
+
+
+def _pick(table: pd.DataFrame, names: list[str], at_ns: Ints) -> Floats:
+    """(n, len(names)) numbers of a table at some instants; NaN where it says nothing."""
+    if not len(table) or not set(names) <= set(table.columns):
+        return np.full((len(at_ns), len(names)), np.nan)
+    row, known = _rows(table, at_ns)
+    found = table[names].to_numpy(dtype=float)[row]
+    found[~known] = np.nan
+    return found
+
+
+def _fused(state: pd.DataFrame | None, at_ns: Ints) -> Floats:
+    if state is None:
+        return np.full((len(at_ns), len(SHOWN_POINTS), 3), np.nan)
+    points = skeleton(_pick(state, list(JOINTS), at_ns), _pick(state, list(LENGTHS), at_ns))
+    return np.asarray(points[:, [POINTS.index(name) for name in SHOWN_POINTS]])
+
+
+def _body(body: pd.DataFrame | None, parts: tuple[str, ...], at_ns: Ints) -> Floats:
+    if body is None:
+        return np.zeros((len(at_ns), 0, 2, 3))
+    names = [f"{part}_{end}_{axis}" for part in parts for end in (0, 1) for axis in "xyz"]
+    return _pick(body, names, at_ns).reshape(len(at_ns), len(parts), 2, 3)
+
+
+def at_rate(t_ns: Ints, rate_hz: float) -> Ints:
+    """Rows of the first stored instant in each period."""
+    if not len(t_ns):
+        return np.zeros(0, np.int64)
+    instants = np.unique(t_ns)
+    period = np.floor((instants - instants[0]) * 1e-9 * rate_hz + 1e-6)
+    _, first = np.unique(period, return_index=True)
+    return np.flatnonzero(np.isin(t_ns, instants[first]))
+
+
+def volume_track(occupancy: pd.DataFrame | None) -> VolumeTrack:
+    """The stored volumes, in order of time, at most ``VOLUME_HZ`` of them a second."""
+    if occupancy is None or not len(occupancy):
+        nothing, none = np.zeros(0), np.zeros(0, np.int64)
+        return VolumeTrack(none, none, nothing, np.zeros(1, np.int64), np.zeros((0, 3)), nothing, ())
+    limbs = tuple(dict.fromkeys(occupancy["limb"].astype(str)))
+    occupancy = occupancy.iloc[at_rate(times(occupancy), VOLUME_HZ)]
+    counts = np.array([len(flat) // 3 for flat in occupancy["vertices"]], dtype=np.int64)
+    return VolumeTrack(
+        t_ns=times(occupancy),
+        limb=np.array([limbs.index(limb) for limb in occupancy["limb"]], dtype=np.int64),
+        radius_m=numeric_column(occupancy, "radius_m"),
+        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        vertices_m=np.concatenate(list(occupancy["vertices"])).reshape(-1, 3),
+        horizon_s=numeric_column(occupancy, "horizon_s")
+        if "horizon_s" in occupancy
+        else np.full(len(occupancy), np.nan),
+        limbs=limbs,
+    )
+
+
+def _track(
+    run: Run, method: str, motion: pd.DataFrame, robot: RobotModel, t_ns: Ints, t0_ns: int, slow: float
+) -> MethodTrack:
+    """What one method did.
+
+    Args:
+        run: The run's tables.
+        method: Name of the method.
+        motion: Its table.
+        robot: The robot of the run.
+        t_ns: (n,) instants of the replay [ns].
+        t0_ns: Instant of time zero [ns].
+        slow: A TCP slower than this stands [m/s].
+    """
+    contact = None if run.contact is None else run.contact[run.contact["method"] == method]
+    axes = range(1, robot.nv + 1)
+    q, dq = (_pick(motion, [f"{kind}{i}" for i in axes], t_ns) for kind in ("q", "dq"))
+    numbers = _pick(motion, ["tcp_speed", "ref_speed", "distance_m", "horizon_s", "tau_s", "certified"], t_ns)
+    body = np.full(len(t_ns), np.nan) if contact is None else _pick(contact, ["distance_m"], t_ns)[:, 0]
+    certified = np.where(np.isfinite(numbers[:, 5]), numbers[:, 5], -1).astype(np.int64)
+    return MethodTrack(
+        q=q,
+        stop_q=_stops(run, method, motion, robot, t_ns, q, dq, numbers[:, 4]),
+        ref_m=_pick(motion, ["ref_x", "ref_y", "ref_z"], t_ns),
+        tcp_m=_pick(motion, ["tcp_x", "tcp_y", "tcp_z"], t_ns),
+        ref_speed=numbers[:, 1],
+        tcp_speed=numbers[:, 0],
+        distance_m=numbers[:, 2],
+        body_m=body,
+        horizon_s=numbers[:, 3],
+        certified=certified,
+        names={name: _names(motion, name, t_ns) for name in ("status", "reason", "limb", "link")},
+        events=stop_events(motion, contact, t0_ns, slow),
+    )
+
+
+#: The method whose stops leave the path; those of all others end where the path is at rest again.
+_LEAVES_PATH = "qp"
+
+
+def _stops(
+    run: Run, method: str, motion: pd.DataFrame, robot: RobotModel, t_ns: Ints, q: Floats, dq: Floats, tau_s: Floats
+) -> Floats:
+    """(n, nv) where the stop ends that the method would go on with; NaN where the table does not say [rad].
+
+    A straight stop loses its velocity evenly, so it goes on for half its time at the velocity of the instant. One
+    along the path does so in programmed time, and a path's joint positions are those that were driven there.
+
+    Args:
+        run: The run's tables.
+        method: Name of the method.
+        motion: Its table.
+        robot: The robot of the run.
+        t_ns: (n,) instants [ns].
+        q: (n, nv) there [rad].
+        dq: (n, nv) there [rad/s].
+        tau_s: (n,) how long the stop takes [s].
+    """
+    straight = q + dq * (0.5 * tau_s)[:, None]
+    if method == _LEAVES_PATH:
+        if setting(run.meta.get("settings", {}), "plan", "certify"):
+            return straight
+        dt_s = float(np.median(np.diff(times(motion)))) * 1e-9
+        ends = [axis_by_axis(*row, robot.ddq_max, dt_s).q[-1] for row in zip(q, dq, strict=True)]  # Eq. (67)
+        return np.where(np.isfinite(tau_s)[:, None], np.array(ends), np.nan)
+    if "programme_s" not in motion:
+        return straight
+    driven = pd.concat([motion, *(table for name, table in run.baselines.items() if name == "none")])
+    s_s, first = np.unique(numeric_column(driven, "programme_s"), return_index=True)
+    path = driven[[f"q{i}" for i in range(1, robot.nv + 1)]].to_numpy(dtype=float)[first]
+    rate = np.gradient(numeric_column(motion, "programme_s"), times(motion) * 1e-9)
+    row, _ = _rows(motion, t_ns)
+    at_s = numeric_column(motion, "programme_s")[row] + 0.5 * rate[row] * tau_s
+    return np.column_stack([np.interp(at_s, s_s, axis) for axis in path.T])
+
+
+def _names(motion: pd.DataFrame, column: str, at_ns: Ints) -> tuple[tuple[str, ...], Ints]:
+    """The texts of a column, in order of appearance, and which of them holds at each instant; -1: none."""
+    if column not in motion:
+        return (), np.full(len(at_ns), -1)
+    texts = motion[column].fillna("").astype(str)
+    known = tuple(text for text in dict.fromkeys(texts) if text)
+    index = texts.map({text: i for i, text in enumerate(known)}).fillna(-1).to_numpy(dtype=np.int64)
+    row, valid = _rows(motion, at_ns)
+    return known, np.where(valid, index[row], -1)

@@ -1,0 +1,239 @@
+"""scene.mcap: a run's 3-D scene with Foxglove's well-known messages, for Foxglove and Rerun.
+
+The links hang on the frames of the axes that move them, so that each method's robot is drawn once and moved by /tf.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from foxglove import messages
+from mcap.writer import CompressionType, Writer
+
+from hrcreplay.geometry.distances import nearest_pair
+from hrcreplay.human.model import skeleton
+from hrcreplay.records import JOINTS, LENGTHS, Floats
+from hrcreplay.reporting import scene_messages as parts
+from hrcreplay.reporting.drawing import BONES
+from hrcreplay.reporting.metrics import times
+from hrcreplay.reporting.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, at_rate, placements, posed
+from hrcreplay.reporting.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
+
+#: Volumes a second at most.
+_VOLUME_HZ = 5.0
+_CHUNK_BYTES = 1024 * 1024
+_STOP: Rgba = (0.80, 0.20, 0.15, 0.35)
+_WATCHED: Rgba = (0.95, 0.55, 0.10, 1.0)
+_OTHER: Rgba = (0.45, 0.50, 0.55, 0.35)
+_BODY: Rgba = (0.40, 0.63, 0.82, 1.0)
+_CAMERA: Rgba = (0.35, 0.60, 0.30, 0.8)
+_DISTANCE: Rgba = (0.48, 0.12, 0.64, 1.0)
+_BONE_M = 0.02
+#: A message: topic, instant [ns], and what to write.
+Message = tuple[str, int, Any]
+#: Numbers of a method over time, for plots.
+_SERIES = ("tcp_speed", "ref_speed", "distance_m", "body_m", "horizon_s")
+_SERIES_SCHEMA = {
+    "type": "object",
+    "properties": {
+        **{name: {"type": ["number", "null"]} for name in _SERIES},
+        **{name: {"type": "string"} for name in ("status", "reason", "limb", "link")},
+        "certified": {"type": ["boolean", "null"]},
+    },
+}
+
+
+def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | None) -> None:
+    """Writes the scene of a run.
+
+    Args:
+        path: File to make.
+        scene: What moves.
+        measurements: Rows of measurements.parquet: the skeletons of the cameras; None without them.
+    """
+    streams = [_robots(scene), _watched(scene), _transforms(scene), _person(scene), _volumes(scene), _distances(scene)]
+    streams += [_series(scene, name, track) for name, track in scene.methods.items()]
+    streams += _cameras(measurements)
+    found = heapq.merge(*streams, key=lambda message: message[1])  # of one instant in the order of the streams
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer.start(profile="", library="hrcreplay")  # the library's version would change the bytes
+        channels: dict[str, int] = {}
+        for topic, t_ns, message in found:
+            if topic not in channels:
+                channels[topic] = _channel(writer, topic, message)
+            data = message.encode() if not isinstance(message, bytes) else message
+            writer.add_message(channels[topic], log_time=t_ns, publish_time=t_ns, data=data)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _channel(writer: Writer, topic: str, message: Any) -> int:
+    if isinstance(message, bytes):
+        text = json.dumps(_SERIES_SCHEMA, sort_keys=True).encode()
+        schema = writer.register_schema(name="hrcreplay.Series", encoding="jsonschema", data=text)
+        return int(writer.register_channel(topic=topic, message_encoding="json", schema_id=schema))
+    known = type(message).get_schema()
+    schema = writer.register_schema(name=known.name, encoding=known.encoding, data=known.data)
+    return int(writer.register_channel(topic=topic, message_encoding="protobuf", schema_id=schema))
+
+
+def _base(scene: ReplayScene, name: str) -> str:
+    """Topic of a method: the run's own is the plan."""
+    return "/plan" if name == next(iter(scene.methods)) else f"/baseline/{name}"
+
+
+def _robots(scene: ReplayScene) -> Iterator[Message]:
+    """The links of each method's robot, and where the plan's would stop, each in the frame of its last axis."""
+    t_ns = int(scene.t_ns[0])
+    for name in scene.methods:
+        topic = _base(scene, name)
+        shown = [(f"{topic}/robot", "", ROBOT if topic == "/plan" else _OTHER)]
+        if topic == "/plan":
+            shown.append((f"{topic}/stop", " stop", _STOP))
+        for where, suffix, rgba in shown:
+            robot = scene.robot
+            entities = [
+                entity(
+                    t_ns,
+                    f"{where[1:]} {link}",
+                    frame=_frame(name, int(robot.moved_by[i]), suffix),
+                    **capsule(robot.ends_m[i], float(robot.radius_m[i]), rgba),
+                )
+                for i, link in enumerate(robot.links)
+            ]
+            yield where, t_ns, messages.SceneUpdate(entities=entities)
+
+
+def _frame(method: str, axis: int, suffix: str) -> str:
+    return f"{method}{suffix} axis {axis}" if axis else WORLD
+
+
+def _watched(scene: ReplayScene) -> Iterator[Message]:
+    """The border of what the cameras watch, on the floor."""
+    if len(scene.watched_m):
+        t_ns = int(scene.t_ns[0])
+        corners = np.column_stack((scene.watched_m, np.zeros(len(scene.watched_m))))
+        sides = np.stack((corners, np.roll(corners, -1, axis=0)), axis=1)
+        shown = entity(t_ns, "watched area", lines=[lines(sides, 0.02, _WATCHED)])
+        yield "/watched", t_ns, messages.SceneUpdate(entities=[shown])
+
+
+def _transforms(scene: ReplayScene) -> Iterator[Message]:
+    """The frames of all axes of all methods, an update an instant."""
+    frames: list[str] = []
+    numbers: list[Floats] = []
+    plan = next(iter(scene.methods))
+    for name, track in scene.methods.items():
+        for suffix, q in (("", track.q), (" stop", track.stop_q)) if name == plan else (("", track.q),):
+            known = np.asarray(np.isfinite(q).all(axis=1))
+            for axis, (turned, at_m) in enumerate(placements(scene.robot, np.where(known[:, None], q, 0.0)), start=1):
+                frames.append(_frame(name, axis, suffix))
+                rows = np.column_stack([np.round(at_m, 5), np.round(turned.as_quat(canonical=True), 6)])
+                rows[~known] = np.nan
+                numbers.append(rows)
+    table = np.stack(numbers, axis=1)
+    for t_ns, rows in zip(scene.t_ns.tolist(), table, strict=True):
+        stamp = timestamp(t_ns)
+        yield (
+            "/tf",
+            t_ns,
+            messages.FrameTransforms(
+                transforms=[
+                    messages.FrameTransform(
+                        timestamp=stamp,
+                        parent_frame_id=WORLD,
+                        child_frame_id=frame,
+                        translation=messages.Vector3(x=x, y=y, z=z),
+                        rotation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw),
+                    )
+                    for frame, (x, y, z, qx, qy, qz, qw) in zip(frames, rows.tolist(), strict=True)
+                    if x == x  # NaN: the method has no such instant
+                ]
+            ),
+        )
+
+
+def _person(scene: ReplayScene) -> Iterator[Message]:
+    """The fused skeleton, its points, and the recorded body as lines as thick as its parts."""
+    fields = [
+        messages.PackedElementField(name=axis, offset=4 * i, type=messages.PackedElementFieldNumericType.Float32)
+        for i, axis in enumerate("xyz")
+    ]
+    pairs = [[SHOWN_POINTS.index(a), SHOWN_POINTS.index(b)] for a, b in BONES]
+    shown, body = np.round(scene.points_m, 3), np.round(scene.body_m, 3)
+    origin = parts.pose(np.zeros(3))
+    for i, t_ns in enumerate(scene.t_ns.tolist()):
+        skeleton_lines = [lines(shown[i, pairs], _BONE_M, parts.PERSON)]
+        yield "/person/fused", t_ns, messages.SceneUpdate(entities=[entity(t_ns, "fused", lines=skeleton_lines)])
+        known = shown[i][np.isfinite(shown[i]).all(axis=1)].astype("<f4")
+        cloud = messages.PointCloud(
+            timestamp=timestamp(t_ns), frame_id=WORLD, pose=origin, point_stride=12, fields=fields, data=known.tobytes()
+        )
+        yield "/person/points", t_ns, cloud
+        thick = [
+            lines(body[i, [k]], 2.0 * float(radius), _BODY) for k, radius in enumerate(scene.body_radius_m.tolist())
+        ]
+        yield "/person/recorded", t_ns, messages.SceneUpdate(entities=[entity(t_ns, "recorded", lines=thick)])
+
+
+def _volumes(scene: ReplayScene) -> Iterator[Message]:
+    """The stored volumes, and none of a limb that is not predicted."""
+    stored = scene.volumes.rows(at_rate(scene.volumes.t_ns, _VOLUME_HZ))
+    for t_ns in np.unique(stored.t_ns).tolist():
+        entities = []
+        for k in np.flatnonzero(stored.t_ns == t_ns).tolist():
+            hull = stored.vertices_m[stored.offsets[k] : stored.offsets[k + 1]]
+            shape = surface(hull, float(stored.radius_m[k]))
+            entities.append(entity(t_ns, f"volume {stored.limbs[stored.limb[k]]}", triangles=[shape]))
+        yield "/volumes", t_ns, messages.SceneUpdate(entities=entities)
+
+
+def _distances(scene: ReplayScene) -> Iterator[Message]:
+    """From the surface of the plan's robot to the nearest part of the recorded body."""
+    if not len(scene.body_parts):
+        return
+    robot, track = scene.robot, next(iter(scene.methods.values()))
+    pair = nearest_pair(posed(robot, track.q), robot.radius_m, scene.body_m, scene.body_radius_m)
+    apart = pair.at_second_m - pair.at_first_m
+    with np.errstate(invalid="ignore"):
+        towards = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-12)
+    start = pair.at_first_m + robot.radius_m[pair.first][:, None] * towards
+    end = pair.at_second_m - scene.body_radius_m[pair.second][:, None] * towards
+    for i, t_ns in enumerate(scene.t_ns.tolist()):
+        line = lines(np.round(np.stack([start[i], end[i]])[None], 4), 0.01, _DISTANCE)
+        yield "/plan/distance", t_ns, messages.SceneUpdate(entities=[entity(t_ns, "distance", lines=[line])])
+
+
+def _series(scene: ReplayScene, name: str, track: MethodTrack) -> Iterator[Message]:
+    """The numbers of a method as JSON, null where not known."""
+    topic = f"{_base(scene, name)}/series"
+    table = {key: np.round(getattr(track, key), 4).tolist() for key in _SERIES}
+    texts = {kind: [known[i] if i >= 0 else "" for i in index.tolist()] for kind, (known, index) in track.names.items()}
+    certified = track.certified.tolist()
+    for i, t_ns in enumerate(scene.t_ns.tolist()):
+        row: dict[str, Any] = {key: values[i] if math.isfinite(values[i]) else None for key, values in table.items()}
+        row |= {kind: words[i] for kind, words in texts.items()}
+        row["certified"] = None if certified[i] < 0 else bool(certified[i])
+        yield topic, t_ns, json.dumps(row, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _cameras(measurements: pd.DataFrame | None) -> list[Iterator[Message]]:
+    """The skeletons that each camera's frames gave, by arrival, a stream a camera."""
+    if measurements is None or not set(LENGTHS) <= set(measurements.columns):
+        return []
+    return [_camera(str(camera), rows) for camera, rows in measurements.groupby("camera", sort=True)]
+
+
+def _camera(camera: str, rows: pd.DataFrame) -> Iterator[Message]:
+    rows = rows.sort_values("arrival_ns", kind="stable")
+    at = np.round(skeleton(rows[list(JOINTS)].to_numpy(dtype=float), rows[list(LENGTHS)].to_numpy(dtype=float)), 3)
+    for t_ns, found in zip(times(rows, "arrival_ns").tolist(), at, strict=True):
+        shown = entity(t_ns, f"camera {camera}", lines=[bones(found, _CAMERA)])
+        yield f"/camera/{camera}", t_ns, messages.SceneUpdate(entities=[shown])

@@ -1,0 +1,143 @@
+"""Parts of Foxglove's well-known messages, for the recorded scene and the live one alike."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from foxglove import messages
+from scipy.spatial import ConvexHull
+
+from hrcreplay.geometry.convex_hull import above
+from hrcreplay.records import FLOOR_Z_M, POINTS, Floats, Ints
+from hrcreplay.reporting.drawing import BONES
+
+Rgba = tuple[float, float, float, float]
+
+#: Frame that everything is in.
+WORLD = "world"
+PERSON: Rgba = (0.10, 0.35, 0.85, 1.0)
+VOLUME: Rgba = (0.95, 0.55, 0.10, 0.30)
+ROBOT: Rgba = (0.95, 0.45, 0.05, 1.0)
+_NS = 10**9
+_BALL = 162  # directions in which a volume's surface is looked for
+
+
+def colour(rgba: Rgba) -> Any:
+    """A colour."""
+    r, g, b, a = rgba
+    return messages.Color(r=r, g=g, b=b, a=a)
+
+
+def points(points_m: Floats) -> list[Any]:
+    """(n, 3) points."""
+    return [messages.Point3(x=x, y=y, z=z) for x, y, z in points_m.tolist()]
+
+
+def pose(position_m: Floats, quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)) -> Any:
+    """A pose from position (3,) and quaternion (x, y, z, w)."""
+    x, y, z = position_m.tolist()
+    qx, qy, qz, qw = quaternion
+    return messages.Pose(
+        position=messages.Vector3(x=x, y=y, z=z), orientation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw)
+    )
+
+
+def timestamp(t_ns: int) -> Any:
+    """An instant."""
+    return messages.Timestamp(t_ns // _NS, t_ns % _NS)
+
+
+def entity(t_ns: int, name: str, *, frame: str = WORLD, **shapes: Any) -> Any:
+    """An entity of a scene that holds until its next update.
+
+    Args:
+        t_ns: Instant [ns].
+        name: Of the entity.
+        frame: That its shapes are given in, and that it moves with.
+        **shapes: Lists of primitives.
+    """
+    return messages.SceneEntity(
+        timestamp=timestamp(t_ns), frame_id=frame, id=name, frame_locked=frame != WORLD, **shapes
+    )
+
+
+def lines(ends_m: Floats, thickness_m: float, rgba: Rgba) -> Any:
+    """(n, 2, 3) separate lines; those with an unknown end are left out."""
+    known = ends_m[np.isfinite(ends_m).all(axis=(1, 2))]
+    return messages.LinePrimitive(
+        type=messages.LinePrimitiveLineType.LineList,
+        thickness=thickness_m,
+        points=points(known.reshape(-1, 3)),
+        color=colour(rgba),
+    )
+
+
+def bones(points_m: Floats, rgba: Rgba = PERSON) -> Any:
+    """The skeleton of (20, 3) POINTS."""
+    pairs = [[POINTS.index(a), POINTS.index(b)] for a, b in BONES]
+    return lines(points_m[pairs], 0.02, rgba)
+
+
+def capsule(ends_m: Floats, radius_m: float, rgba: Rgba) -> dict[str, Any]:
+    """The primitives of a capsule between two points, (2, 3) [m]."""
+    a, b = ends_m
+    size = 2.0 * radius_m
+    ball = messages.Vector3(x=size, y=size, z=size)
+    rod = messages.CylinderPrimitive(
+        pose=pose((a + b) / 2.0, upright_to(b - a)),
+        size=messages.Vector3(x=size, y=size, z=float(np.linalg.norm(b - a))),
+        bottom_scale=1.0,
+        top_scale=1.0,
+        color=colour(rgba),
+    )
+    balls = [messages.SpherePrimitive(pose=pose(end), size=ball, color=colour(rgba)) for end in (a, b)]
+    return {"spheres": balls, "cylinders": [rod]}
+
+
+def surface(vertices_m: Floats, radius_m: float, rgba: Rgba = VOLUME) -> Any:
+    """The surface of hull + ball above the floor, (m, 3) vertices [m]; empty where there is no volume."""
+    corners, triangles = surface_mesh(vertices_m, radius_m)
+    return messages.TriangleListPrimitive(
+        points=points(np.round(corners, 3)), indices=triangles.ravel().tolist(), color=colour(rgba)
+    )
+
+
+def surface_mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, Ints]:
+    """Corners (k, 3) [m] and triangles (f, 3) of the surface of hull + ball, (m, 3) vertices [m], above the floor.
+
+    For each direction the vertex that is furthest along it, and from there the ball's radius: the corners lie on the
+    surface, so that between them the picture may be smaller than the volume, by millimetres.
+    """
+    if not len(vertices_m) or not np.isfinite(vertices_m).all():
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    directions, triangles = _around_a_ball()
+    corners = vertices_m[np.argmax(directions @ vertices_m.T, axis=1)] + radius_m * directions
+    return above(corners, triangles, FLOOR_Z_M) if corners[:, 2].min() < FLOOR_Z_M else (corners, triangles)
+
+
+@cache
+def _around_a_ball() -> tuple[Floats, Ints]:
+    """(162, 3) unit directions, spread evenly by the golden angle, and (f, 3) triangles between them, outward."""
+    k = np.arange(_BALL) + 0.5
+    polar, around = np.arccos(1.0 - 2.0 * k / _BALL), np.pi * (1.0 + np.sqrt(5.0)) * k
+    unit = np.column_stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)])
+    hull = ConvexHull(unit)
+    triangles = hull.simplices.astype(np.int64)
+    a, b, c = (unit[triangles[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return unit, triangles
+
+
+def upright_to(direction: Floats) -> tuple[float, float, float, float]:
+    """The quaternion (x, y, z, w) that turns the z axis into a direction; none at all where that is zero."""
+    length = float(np.linalg.norm(direction))
+    if length == 0.0:
+        return 0.0, 0.0, 0.0, 1.0
+    x, y, z = (direction / length).tolist()
+    if z < -1.0 + 1e-12:
+        return 1.0, 0.0, 0.0, 0.0
+    w = np.sqrt(0.5 * (1.0 + z))
+    return -y / (2.0 * w), x / (2.0 * w), 0.0, float(w)

@@ -1,0 +1,436 @@
+"""What stands first on the page: would the robot have touched the recorded person, and at what cost; a row a method.
+
+Beside it what a reader must know of limbs that were not measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from hrcreplay.records import LIMBS
+from hrcreplay.reporting.metrics import Metric, MetricTable
+from hrcreplay.reporting.metrics_contact import PERSONS, SHOWN_PARTS, method_prefixes
+from hrcreplay.reporting.metrics_data import add_limbs
+from hrcreplay.reporting.tables import PageTable, limb_names_text, part_name_text, percent, text_of
+from hrcreplay.settings.sections import setting
+from hrcreplay.store.run_folder import Run
+
+Metrics = Mapping[str, Metric]
+#: How contact.parquet calls a person from the log's ground truth.
+TRUTH = "ground truth"
+#: A limb that is known for so long counts as seen throughout.
+_WHOLE = 0.995
+_HAD = "Had this controller been running, "
+_COLUMNS = (
+    "",
+    "touched while moving",
+    "fastest touch",
+    "nearest while moving",
+    "link / TCP speed there",
+    "nearest at rest",
+    "pace kept",
+    "standing, of near ticks",
+    "full stops",
+)
+
+
+@dataclass(frozen=True)
+class ContactSummary:
+    """The chosen method in a few sentences, and all methods beside each other."""
+
+    sentences: tuple[str, ...]  #: contact, then cost
+    speeds: str  #: greatest speeds, and what standing means
+    scope: tuple[str, ...]  #: what was considered, and what was not
+    held: str  #: how far the prediction they rest on can be trusted; empty: not known
+    details: tuple[str, ...]  #: the same with places, instants and causes
+    table: PageTable
+
+
+def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
+    """What the comparison with everybody recorded says; None where there is none."""
+    if run.motion is None or metrics["contact_person"]["value"] is None:
+        return None
+    return ContactSummary(
+        (_contact_in_short(metrics), _cost_in_short(run, metrics)),
+        _speeds(run, metrics),
+        scope(metrics),
+        _held(metrics),
+        (_touched(metrics), _cost(run, metrics)),
+        _table(run, metrics),
+    )
+
+
+def _contact_in_short(metrics: Metrics) -> str:
+    """Whether the robot would have touched anybody, at the ticks at which somebody is known."""
+    touch, near = metrics["plan_touch_moving_ticks"]["value"], metrics["plan_body_distance_min_moving_m"]["value"]
+    if touch is None:
+        return "Whether the robot would have touched anybody is not known: the recording shows nobody."
+    if touch:
+        speed = text_of(metrics["plan_touch_contact_speed_max_m_per_s"])
+        seconds = text_of(metrics["plan_touch_moving_s"])
+        words = f"With this controller the moving robot would have touched {_whom(metrics)}: {seconds}, up to {speed}"
+    elif near is None:
+        words = "With this controller the robot would not have moved while anybody was known to be there"
+    else:
+        words = (
+            f"With this controller{_as_far_as(metrics)} the moving robot would not have touched anybody "
+            f"{_at_known_ticks(metrics)}: it kept {_centimetres(near)} away or more"
+        )
+    return f"{words}.{_at_rest(metrics)}"
+
+
+def _as_far_as(metrics: Metrics) -> str:
+    """What must stand before 'touched nobody' where a limb was not seen."""
+    return ", as far as the person was seen," if unseen_limbs(metrics) else ""
+
+
+def _whom(metrics: Metrics, prefix: str = "plan") -> str:
+    """Who was touched by the moving robot."""
+    person, other = (metrics[f"{prefix}_touch_{who}_ticks"]["value"] for who in ("person", "other"))
+    if person and other:
+        return f"the person ({_count(person)}) and another body ({_count(other)})"
+    return f"another body than the person it heeds ({_count(other)})" if other else f"the person ({_count(person)})"
+
+
+def _count(ticks: int) -> str:
+    return f"{ticks:,} tick{'' if ticks == 1 else 's'}".replace(",", "\u202f")
+
+
+def _at_known_ticks(metrics: Metrics) -> str:
+    """At which ticks, and judged by what."""
+    known, ticks = metrics["plan_body_known_ticks"], metrics["plan_ticks"]
+    which = f"at the {text_of(known)} of {text_of(ticks)} ticks" if known["value"] != ticks["value"] else "at any tick"
+    where = " at which the person is known" if known["value"] != ticks["value"] else ""
+    return f"{which}{where}, judged by the {metrics['contact_person']['value']}"
+
+
+def _at_rest(metrics: Metrics) -> str:
+    """Contacts of a robot at rest."""
+    rest, deep = metrics["plan_touch_rest_ticks"]["value"], metrics["plan_body_distance_min_rest_m"]["value"]
+    if not rest:
+        return ""
+    return f" The robot at rest was in contact at {_count(rest)}, up to {-100 * deep:.0f} cm deep."
+
+
+def _speeds(run: Run, metrics: Metrics) -> str:
+    """The greatest speeds beside the programme's, and how often the robot stood, by two counts."""
+    fastest, near, programmed = (
+        metrics[f"plan_{name}_max_m_per_s"] for name in ("tcp_speed", "tcp_speed_near_body", "ref_speed")
+    )
+    words = f"The TCP moved at up to {text_of(fastest)} (its programme at up to {text_of(programmed)})"
+    if near["value"] is not None:
+        near_m = setting(run.meta.get("settings", {}), "report", "near_m")
+        words += f", and with anybody within {near_m:g} m at up to {text_of(near)}"
+    stood, null = metrics["plan_stationary_share"], metrics["plan_null_speed_share"]
+    if stood["value"] is not None:
+        words += (
+            f". Near the volumes it stood at {percent(stood)} of the ticks while its programme moved or waited for it, "
+            f"and at {percent(null)} with the programme's own dwells"
+        )
+    return f"{words}."
+
+
+#: What no run looks at.
+NOT_CONSIDERED = (
+    "objects, table and fixtures",
+    "the robot's own links",
+    "people whom no camera tracked",
+    "what people would do differently beside another motion",
+)
+
+
+def scope(metrics: Metrics) -> tuple[str, ...]:
+    """What the verdict considers, and what it does not."""
+    others = metrics["others_frames"]["value"]
+    people = "One person is planned for"
+    if others:
+        frames = f"{others:,} frame{'' if others == 1 else 's'}".replace(",", "\u202f")
+        people += (
+            f"; {frames} show at least one other body, which counts for contact, but the robot did not heed it and "
+            "nothing was predicted of it"
+        )
+    gaps_s, programme = metrics["programme_gaps_s"]["value"], []
+    if gaps_s:
+        programme.append(
+            f"The programme is the recorded robot's motion; {gaps_s:.2f} s of it were not recorded, and a straight "
+            "line that nobody measured stands for them."
+        )
+    nothing = f"Not considered: {', '.join((*NOT_CONSIDERED, *unseen_limbs(metrics)))}."
+    return (f"{people}.", *_watched(metrics), *programme, nothing)
+
+
+def _watched(metrics: Metrics) -> list[str]:
+    """What rests on the cell's word that its cameras see everybody in an area."""
+    share, refuting = metrics["watched_vacant_share"]["value"], metrics["watched_frames_refuting"]["value"]
+    if share is None:
+        return []
+    words = (
+        "Whoever else comes in is taken to walk over the border of the watched area at up to "
+        f"{text_of(metrics['watched_speed_m_per_s'])}, as the cell says that its cameras see everybody within; nothing "
+        f"but that word stood for people at {percent(metrics['watched_vacant_share'])} of the ticks, when no camera "
+        "showed anybody there"
+    )
+    if refuting:
+        frames = f"{refuting:,} frame{'' if refuting == 1 else 's'}".replace(",", "\u202f")
+        words += (
+            f". The recording contradicts it: {frames} show somebody further inside than anybody could have walked "
+            "since all cameras showed the area without people"
+        )
+    return [f"{words}."]
+
+
+def unseen_limbs(metrics: Metrics) -> list[str]:
+    """Limbs of the recorded person that were not seen, or only part of the time, each in words."""
+    shares = {f"the {limb}": metrics[f"contact_{limb}_known_share"]["value"] for limb in SHOWN_PARTS}
+    found = {limb: share for limb, share in shares.items() if share is not None and share < _WHOLE}
+    if metrics["contact_person"]["value"] != TRUTH:
+        never, mostly = unmeasured(metrics)
+        found |= {f"the {part_name_text(limb)}": 0.0 for limb in never}
+        found |= {f"the {part_name_text(limb)}": 1.0 - share for limb, share in mostly.items()}
+    return [
+        f"{limb} (never seen)" if share == 0.0 else f"{limb} (not seen {100 * (1 - share):.0f} % of the time)"
+        for limb, share in found.items()
+    ]
+
+
+def _cost_in_short(run: Run, metrics: Metrics) -> str:
+    """What would it have cost, and what without a controller?"""
+    pace = metrics["plan_progress_share"]["value"]
+    cost = "What it would have cost the task is not known"
+    if pace is not None:
+        cost = f"The task would have run at {100 * pace:.0f} % of its pace"
+        if 0.05 < pace < 0.95:
+            cost = f"The task would have taken {1 / pace:.1f} times as long ({100 * pace:.0f} % of its pace)"
+    if "none" not in run.baselines or metrics["baseline_none_touch_moving_ticks"]["value"] is None:
+        return f"{cost}."
+    if not metrics["baseline_none_touch_moving_ticks"]["value"]:
+        return f"{cost}; without a controller the robot would not have touched anybody at these ticks either."
+    speed = text_of(metrics["baseline_none_touch_contact_speed_max_m_per_s"])
+    return f"{cost}; without a controller the robot would have hit {_whom(metrics, 'baseline_none')} at up to {speed}."
+
+
+def _held(metrics: Metrics) -> str:
+    """How often the prediction held the recorded person, as ``audit`` counts it."""
+    parts = []
+    for prefix, until in (("volumes", "their horizon"), ("volumes_full", "the braking time")):
+        checked, left = metrics[f"{prefix}_checked_ticks"]["value"], metrics[f"{prefix}_left_ticks"]["value"]
+        if checked and left is not None:
+            share = f"all {checked}" if left == 0 else f"{_floor_percent(1 - left / checked)} of {checked}"
+            parts.append(f"until {until} at {share} checked ticks")
+    if not parts:
+        return ""
+    judge = metrics["contact_person"]["value"]
+    return f"The predicted volumes held every limb that was seen ({judge}) {', and '.join(parts)}."
+
+
+def _floor_percent(share: float) -> str:
+    """Rounded down, so that nothing but all is 100 %."""
+    return f"{int(1000 * share) / 10:.1f} %"
+
+
+def _centimetres(metres: float) -> str:
+    """Rounded down: a distance is never made larger than it was."""
+    return f"{int(100 * metres)} cm"
+
+
+def _touched(metrics: Metrics) -> str:
+    """The first sentence: whether the moving robot would have touched anybody."""
+    touch = metrics["plan_touch_moving_ticks"]["value"]
+    if touch is None:
+        return f"{_HAD}it is not known whether the robot would have touched anybody: nobody is known."
+    if touch:
+        words = (
+            f"the moving robot would have touched {_whom(metrics)} for {text_of(metrics['plan_touch_moving_s'])} in "
+            f"all, at up to {text_of(metrics['plan_touch_contact_speed_max_m_per_s'])}; the deepest contact was of its "
+            f"{_pair(metrics)} {_when(metrics)}"
+        )
+        return f"{_HAD}{words}{_fault(metrics)}."
+    if metrics["plan_body_distance_min_moving_m"]["value"] is None:
+        return f"{_HAD}the robot would not have moved while anybody was known to be there."
+    seen = "as far as the person was seen, " if unseen_limbs(metrics) else ""
+    nearest = text_of(metrics["plan_body_distance_min_moving_m"])
+    speed = text_of(metrics["plan_body_distance_min_moving_contact_speed_m_per_s"])
+    return (
+        f"{_HAD}{seen}no moving part of the robot would have touched anybody {_at_known_ticks(metrics)}: the smallest "
+        f"distance was {nearest}, between its {_pair(metrics)}, {_when(metrics)}; that link then moved at {speed}."
+    )
+
+
+def _pair(metrics: Metrics) -> str:
+    link, limb, source = (
+        metrics[f"plan_body_distance_min_moving_{part}"]["value"] for part in ("link", "limb", "source")
+    )
+    if ", body " in source:
+        return f"{link} and the {part_name_text(limb)} of another body ({source})"
+    return f"{link} and the person's {part_name_text(limb)}"
+
+
+def _when(metrics: Metrics) -> str:
+    return f"{metrics['plan_body_distance_min_moving_at_s']['value']:.1f} s after the start"
+
+
+def _fault(metrics: Metrics) -> str:
+    """Whose fault the contacts were."""
+    inside, retreating, outside, unknown = (
+        metrics[f"plan_touch_{name}_ticks"]["value"] for name in ("inside", "retreating", "outside", "unpredicted")
+    )
+    if inside is None:
+        return "; it heeds nobody"
+    parts = []
+    if other := metrics["plan_touch_other_ticks"]["value"]:
+        parts.append(f"at {other} it touched a body that it did not heed")
+    if inside:
+        parts.append(f"at {inside} of these ticks the person was where the prediction said, so the robot is at fault")
+    if retreating:
+        parts.append(f"at {retreating} the robot was moving away, and the person came after it")
+    if outside:
+        parts.append(f"at {outside} the person was not where the prediction said, so the prediction is at fault")
+    if unknown:
+        parts.append(f"at {unknown} nothing was predicted")
+    return "".join(f"; {part}" for part in parts)
+
+
+def _cost(run: Run, metrics: Metrics) -> str:
+    """The second sentence: what it would have cost, and what the programme run blind would have done."""
+    words = []
+    if metrics["plan_progress_share"]["value"] is not None:
+        words.append(f"kept {percent(metrics['plan_progress_share'])} of the programmed pace")
+    if metrics["plan_stationary_share"]["value"] is not None:
+        words.append(f"stood still in {percent(metrics['plan_stationary_share'])} of the time near the person")
+    cost = f"It would have {' and '.join(words)}" if words else "What it would have cost the task is not known"
+    if "none" not in run.baselines or metrics["baseline_none_touch_moving_ticks"]["value"] is None:
+        return f"{cost}."
+    touch, speed = (metrics[f"baseline_none_touch_{name}"] for name in ("moving_s", "contact_speed_max_m_per_s"))
+    if touch["value"]:
+        return (
+            f"{cost}; without any controller the robot would have touched {_whom(metrics, 'baseline_none')} for "
+            f"{text_of(touch)} in all, at up to {text_of(speed)}."
+        )
+    return f"{cost}; without any controller the robot would not have touched anybody at these ticks either."
+
+
+def _table(run: Run, metrics: Metrics) -> PageTable:
+    """A row a method."""
+    rows = []
+    for method, prefix in method_prefixes(run).items():
+        near = f"{prefix}_body_distance_min_moving"
+        speeds = [text_of(metrics[f"{near}_{of}_speed_m_per_s"]) for of in ("contact", "tcp")]
+        rows.append(
+            (
+                method + (" (this plan)" if prefix == "plan" else "") + (" (run blind)" if method == "none" else ""),
+                _ticks(metrics[f"{prefix}_touch_moving_ticks"]),
+                text_of(metrics[f"{prefix}_touch_contact_speed_max_m_per_s"]),
+                _signed(metrics[f"{near}_m"]),
+                " / ".join(speed.removesuffix(" m/s") for speed in speeds) + (" m/s" if "m/s" in speeds[0] else ""),
+                _signed(metrics[f"{prefix}_body_distance_min_rest_m"]),
+                percent(metrics[f"{prefix}_progress_share"]),
+                percent(metrics[f"{prefix}_stationary_share"]),
+                percent(metrics[f"{prefix}_full_stop_share"]),
+            )
+        )
+    return PageTable("Robot against everybody recorded", _COLUMNS, tuple(rows), _note(run, metrics))
+
+
+def _signed(metric: Metric) -> str:
+    """A number with the minus that is as wide as a digit."""
+    return text_of(metric).replace("-", "\u2212")
+
+
+def _ticks(metric: Metric) -> str:
+    return f"{text_of(metric)} tick{'' if metric['value'] == 1 else 's'}" if metric["value"] is not None else "\u2013"
+
+
+def _note(run: Run, metrics: Metrics) -> str:
+    """Which person and which body it was."""
+    settings = run.meta.get("settings", {})
+    hand_m, leg_m = settings.get("occupancy", {}).get("hand_m"), settings.get("report", {}).get("leg_radius_m")
+    person = str(metrics["contact_person"]["value"])
+    hand = "" if hand_m is None else f", the forearms prolonged by a hand of {hand_m:g} m"
+    leg = "" if leg_m is None else f" with a radius of {leg_m:g} m"
+    words = (
+        f"The person is {PERSONS.get(person, person)}: head, trunk and arms with the radii of Table 2{hand}, and "
+        f"thighs, shanks and feet{leg} where they were seen"
+    )
+    if gaps := unseen_limbs(metrics):
+        words += f"; not known: {', '.join(gaps)}"
+    if metrics["others_frames"]["value"]:
+        words += "; every other body of every camera counts, too"
+    words += (
+        ". Distances are between surfaces, at the ticks; negative in overlap. The person is known at "
+        f"{text_of(metrics['plan_body_known_ticks'])} of {text_of(metrics['plan_ticks'])} ticks."
+    )
+    return words + _left(metrics)
+
+
+def _left(metrics: Metrics) -> str:
+    """How often the person left the volumes."""
+    checked, left = metrics["volumes_checked_ticks"]["value"], metrics["volumes_left_ticks"]["value"]
+    if checked is None or left is None:
+        return ""
+    words = f" A limb left the predicted volumes before their horizon at {left} of {checked} checked ticks"
+    if left:
+        parts = [found.split(" ") for found in str(metrics["volumes_left_limbs"]["value"]).split(", ")]
+        names = ", ".join(f"{part_name_text(part)} {count}" for part, count in parts)
+        words += f", by up to {text_of(metrics['volumes_left_max_m'])} ({names})"
+    return words + "."
+
+
+def line(run: Run, metrics: Metrics) -> str:
+    """The same in a line for the terminal; empty where there is no comparison."""
+    if run.motion is None or metrics["contact_person"]["value"] is None:
+        return ""
+    parts = []
+    for method, prefix in method_prefixes(run).items():
+        touch, near = metrics[f"{prefix}_touch_moving_ticks"], metrics[f"{prefix}_body_distance_min_moving_m"]
+        if touch["value"]:
+            speed = text_of(metrics[f"{prefix}_touch_contact_speed_max_m_per_s"])
+            parts.append(f"{method} touched {_whom(metrics, prefix)}, at up to {speed}")
+        elif near["value"] is not None:
+            parts.append(f"{method} touched nobody (nearest {text_of(near)})")
+        else:
+            parts.append(f"{method} did not move beside a known person")
+    known = f"{text_of(metrics['plan_body_known_ticks'])} of {text_of(metrics['plan_ticks'])} ticks"
+    judged = f"moving robot against everybody recorded ({metrics['contact_person']['value']}, person known at {known})"
+    return f"{judged}: {'; '.join(parts)}. {' '.join(scope(metrics))}"
+
+
+#: A limb unmeasured at more than this share of the time has to be spoken of.
+_MOST = 0.5
+
+
+def unmeasured(metrics: Metrics) -> tuple[list[str], dict[str, float]]:
+    """Limbs that were never measured, and those unmeasured most of the time with that share."""
+    shares = {limb: metrics[f"limb_{limb}_unmeasured_share"]["value"] for limb in LIMBS}
+    never = [limb for limb, share in shares.items() if share == 1.0]
+    return never, {limb: share for limb, share in shares.items() if share is not None and _MOST < share < 1.0}
+
+
+def limb_remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
+    """What a user has to know of limbs that were not measured, or not whole; a line each.
+
+    Args:
+        run: Its tables of the first stage.
+        told: Notes on the log, which may already say of a limb that no camera gave its points.
+    """
+    table = MetricTable()
+    add_limbs(table, run)
+    metrics = table.sorted()
+    never, mostly = unmeasured(metrics)
+    lines = []
+    for limb in never:
+        begin = f"limb {limb} was never measured"
+        if not any(note.startswith(begin) for note in told):
+            lines.append(
+                f"{begin}: its points never agreed, or not with the confidence that fusion.confidence_min asks for; "
+                "its volume holds all that its joints allow"
+            )
+    lines += [
+        f"the {limb_names_text([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"
+        for limb, share in mostly.items()
+    ]
+    for limb in LIMBS:
+        joints = metrics[f"limb_{limb}_joints_unmeasured"]["value"]
+        if joints is not None and limb not in never and limb != "HD":  # the head hangs on the trunk's joints
+            lines.append(f"the {limb_names_text([limb])} was measured only in part: never its {joints}")
+    return lines

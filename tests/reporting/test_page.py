@@ -1,0 +1,276 @@
+from __future__ import annotations
+
+import dataclasses
+import re
+import shlex
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hrcreplay.human.model import LimitSet
+from hrcreplay.records import DOF
+from hrcreplay.reporting import figures, page, story, tables
+from hrcreplay.reporting import tables as wording
+from hrcreplay.reporting.figures import FigureData
+from hrcreplay.robot.control import control_step
+from hrcreplay.run.report import compute
+from hrcreplay.store.run_folder import Run
+from tests.reporting.synthetic import make_run
+
+PI = np.pi
+PAPER = LimitSet(
+    name="paper",
+    p_min=np.array([-np.inf, -np.inf, -np.inf, -PI / 6, *([-PI / 20, -PI, -PI, PI / 9] * 2), 0.0]),
+    p_max=np.array([np.inf, np.inf, np.inf, PI / 2, *([8 * PI / 9, PI, PI, PI] * 2), 1.3]),
+    v_min=np.array([0.0, -0.8, -PI / 4, -PI / 10, *([-PI / 2, -PI / 2, -PI / 2, -3 * PI / 10] * 2), 0.0]),
+    v_max=np.array([0.8, 0.8, PI / 4, PI / 10, *([PI / 2, PI / 2, PI / 2, 3 * PI / 10] * 2), 0.0]),
+    a_min=-np.array([0.1, 0.1, PI / 8, PI / 20, *([PI / 4, PI / 4, PI / 4, 3 * PI / 20] * 2), 0.1]),
+    a_max=np.array([0.1, 0.1, PI / 8, PI / 20, *([PI / 4, PI / 4, PI / 4, 3 * PI / 20] * 2), 0.1]),
+    coupled=True,
+)
+RADII = {"head": 0.12, "thorax": 0.15, "upper arm": 0.07, "lower arm": 0.07}
+
+
+class Reader(HTMLParser):
+    """What a browser would take from the page."""
+
+    VOID = frozenset({"meta", "link", "img", "br", "hr", "input"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.tags: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(str(value))
+            if name in ("href", "src"):
+                self.links.append(str(value))
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] not in ("style", "script"):
+            self.text.append(data)
+
+
+def rendered(run: Run, folder: Path) -> str:
+    """The page with the figures that the folder holds."""
+    metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
+    used = [tables.limit_table(PAPER, use="prediction"), tables.radius_table(RADII)]
+    return page.render(run, metrics, folder, used)
+
+
+def read(html: str) -> Reader:
+    reader = Reader()
+    reader.feed(html)
+    assert not reader.open
+    return reader
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder, run = tmp_path_factory.mktemp("figures"), make_run(8.0)
+    metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
+    assert figures.draw_all(FigureData(run, metrics, near_m=0.5, stationary_m_per_s=0.001), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def html(drawn: Path) -> str:
+    return rendered(make_run(8.0), drawn)
+
+
+def test_page_is_self_contained_and_well_formed(html: str) -> None:
+    reader = read(html)
+    assert len(html) < 6_000_000
+    assert reader.tags & {"script", "iframe", "img"} == {"script"}  # for the theme; links says that it names no source
+    assert all(link.startswith(("#", "data:")) for link in reader.links)
+    assert len(reader.ids) == len(set(reader.ids))
+    assert {link[1:] for link in reader.links if link.startswith("#")} <= set(reader.ids)
+    assert not re.search(r"url\((?!#)", html)
+
+
+def test_page_shows_every_figure_drawn_under_its_caption(html: str, drawn: Path) -> None:
+    kinds = [kind for kind in figures.FIGURES if (drawn / f"{kind.name}.svg").exists()]
+    assert len(kinds) > 8
+    assert html.count("<figure>") == len(kinds)
+    text = " ".join(read(html).text)
+    for kind in kinds:
+        assert kind.caption in text
+
+
+def test_page_answers_with_the_metrics_values(html: str) -> None:
+    metrics = compute(make_run(8.0), near_m=0.5, stationary_m_per_s=0.001)
+    text = " ".join(read(html).text)
+    for name in ("plan_braking_moving_ticks", "plan_near_ticks", "plan_separation_min_m", "plan_deviation_max_m"):
+        assert tables.text_of(metrics[name]) in text, name
+    for name in ("plan_stationary_share", "baseline_scaling_stationary_share"):
+        assert tables.percent(metrics[name], 2) in text, name
+    assert tables.percent(metrics["plan_progress_share"]) in text
+    assert "30.06 %" in text
+    assert "86.44 %" in text
+    assert "Not at every tick" in text
+
+
+def test_page_says_nothing_missing_as_nan_and_no_paths_or_times(html: str) -> None:
+    text = " ".join(read(html).text)
+    assert not re.search(r"\b(nan|NaN|None|inf)\b", text)
+    assert "/somewhere" not in html
+    assert "demo.mcap" in text
+    assert "ab" * 32 in text
+
+
+def test_page_has_every_section_and_what_it_does_not_claim(html: str) -> None:
+    keys = ("safety", "cost", "prediction", "fusion", "data", "settings", "provenance", "claims")
+    assert [i for i in read(html).ids if i in keys] == list(keys)
+    assert "not certified" in html
+
+
+def test_the_same_run_renders_the_same_page_wherever_its_figures_are(html: str, drawn: Path, tmp_path: Path) -> None:
+    for path in drawn.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    assert rendered(make_run(8.0), tmp_path) == html
+
+
+def test_a_robot_that_kept_the_constraint_throughout(tmp_path: Path) -> None:
+    run = make_run(4.0)
+    assert run.motion is not None
+    kept = dataclasses.replace(run, motion=run.motion.assign(status="tracking", reason=""))
+    text = " ".join(read(rendered(kept, tmp_path)).text)
+    assert "By the paper's criterion at every moving tick" in text
+    assert "Not at every tick" not in text
+
+
+def test_every_reason_to_brake_has_its_words() -> None:
+    assert set(control_step.REASONS[1:]) <= set(wording.REASONS)
+    assert len({wording.reason_text(reason) for reason in control_step.REASONS[1:]}) == len(control_step.REASONS) - 1
+    assert wording.reason_text("no oil") == "the record says 'no oil'"
+
+
+def test_the_verdict_says_by_reason_what_happened(tmp_path: Path) -> None:
+    """Where the distance failed somebody knew where the person was."""
+    run = make_run(4.0)
+    assert run.motion is not None
+    n = len(run.motion)
+    reason = np.where(np.arange(n) < 30, "separation failed", np.where(np.arange(n) == 30, "no oil", ""))
+    status = np.where(reason == "", "tracking", "braking")
+    braked = dataclasses.replace(run, motion=run.motion.assign(status=status, reason=reason, tcp_speed=0.2))
+    text = " ".join(read(rendered(braked, tmp_path)).text)
+    said = wording.REASONS["separation failed"]
+    assert f"at 30 ticks {said}; at 1 tick the record says 'no oil'." in text
+    assert "nobody could say" not in text
+    assert wording.REASONS["no human state"] not in text
+
+
+def test_the_smallest_distance_says_which_it_is() -> None:
+    run = make_run(4.0)
+    assert run.motion is not None
+    touching = dataclasses.replace(run, motion=run.motion.assign(distance_m=0.0, status="limited", reason=""))
+    metrics = compute(touching, near_m=0.5, stationary_m_per_s=0.001)
+    safe, _ = story.answers(touching, metrics)
+    assert (
+        "The smallest distance while it moved was 0.000 m: from the surface of a link to the surface of all that the "
+        "person could reach within T_s = 0.377 s, not to the body."
+    ) in safe.words
+    assert "At 0 the constraint lets a link move along that space or away from it, but not into it." in safe.words
+    card = story.cards(touching, metrics)[1]
+    assert card.value == "0.000 m"
+    assert "from a link's surface to that of what the person could reach within T_s" in card.label
+    assert card.detail.startswith("not to the body")
+
+
+def test_times_below_a_second_are_not_rounded_to_nothing() -> None:
+    def metric(value: float) -> dict[str, object]:
+        return {"value": value, "unit": "s", "meaning": ""}
+
+    assert tables.text_of(metric(0.0337)) == "34 ms"
+    assert tables.text_of(metric(0.0001)) == "below 1 ms"
+    assert tables.text_of(metric(0.0)) == "0.0 s"
+    assert tables.text_of(metric(1.25)) == "1.2 s"
+
+
+def test_a_tables_cells_wrap_rather_than_be_cut_off(html: str) -> None:
+    style = html[html.index("<style>") : html.index("</style>")]
+    assert "nowrap" not in style
+    assert re.search(r"\.scroll \{[^}]*overflow-x: auto", style)
+
+
+def test_the_page_gives_the_command_that_makes_it_again(tmp_path: Path) -> None:
+    run = make_run(2.0)
+    arguments = ["report", "demo.mcap", "--start", "8", "--cell", "CELL.toml", "--set", 'logs.topics=["/a b"]']
+    again = dataclasses.replace(run, meta={**run.meta, "arguments": arguments})
+    text = " ".join(read(rendered(again, tmp_path)).text)
+    assert shlex.join(["hrcreplay", *arguments]) in text
+    assert "what it held stands in run.json under cell" in text
+    assert "hrcreplay report" in " ".join(read(rendered(run, tmp_path)).text)  # a run of an earlier version
+
+
+def test_a_fused_run_explains_what_is_missing(tmp_path: Path) -> None:
+    text = " ".join(read(rendered(make_run(4.0, human=False, robot=False), tmp_path)).text)
+    assert "Not asked in this run." in text
+    assert "No swept volumes in this run." in text
+    assert "no ground truth" in text
+
+
+def test_table_1_reads_as_the_paper_prints_it() -> None:
+    rows = {row[0]: row[1:] for row in tables.limit_table(PAPER, use="prediction").rows}
+    assert rows["x"] == ("\u2212\u221e", "\u221e", "0.00", "0.80", "\u22120.10", "0.10")
+    assert rows["\u03c1"] == (
+        "\u2212\u03c0/6",
+        "\u03c0/2",
+        "\u2212\u03c0/10",
+        "\u03c0/10",
+        "\u2212\u03c0/20",
+        "\u03c0/20",
+    )
+    assert rows["\u03b1 r,1"][:2] == ("\u2212\u03c0/20", "8\u03c0/9")
+    assert rows["\u03b1 l,2"][:2] == ("(34b)", "(34b)")
+    assert rows["\u03b1 r,3"][:2] == ("(34c)", "(34c)")
+    assert rows["\u03b1 l,4"] == (
+        "\u03c0/9",
+        "\u03c0",
+        *["\u22123\u03c0/10", "3\u03c0/10", "\u22123\u03c0/20", "3\u03c0/20"],
+    )
+
+
+def test_bounds_that_are_no_fraction_of_pi_stay_numbers() -> None:
+    odd = dataclasses.replace(PAPER, v_max=np.full(DOF, 12.6), coupled=False)
+    rows = {row[0]: row[1:] for row in tables.limit_table(odd, use="tracking").rows}
+    assert rows["\u03b1 r,2"][3] == "12.60"
+    assert rows["\u03b1 r,2"][:2] == ("\u2212\u03c0", "\u03c0")
+
+
+def test_table_2() -> None:
+    assert tables.radius_table(RADII).rows[1] == ("thorax", "0.15")
+
+
+def test_a_robot_that_was_never_let_go_is_said_to_have_stood() -> None:
+    run = make_run(4.0)
+    assert run.motion is not None
+    still = dataclasses.replace(run, motion=run.motion.assign(tcp_speed=0.0))
+    safe, _ = story.answers(still, compute(still, near_m=0.5, stationary_m_per_s=0.001))
+    assert safe.short == "The robot never moved."
+    assert safe.words.startswith("It stood at all 400 ticks.")
+
+
+def test_an_interval_does_not_break_at_its_dash(tmp_path: Path) -> None:
+    run = make_run(2.0)
+    shown = tables.PageTable("shares", ("", "here"), (("limb", "99.5 (97.1\u2013100.0)"),))
+    html = page.render(run, compute(run, near_m=0.5, stationary_m_per_s=0.001), tmp_path, [shown])
+    assert "<td>99.5 (97.1\u2013\u2060100.0)</td>" in html

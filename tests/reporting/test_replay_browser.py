@@ -1,0 +1,235 @@
+"""The page's replay as a browser has it. Nothing here depends on how fast the browser is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hrcreplay.geometry.distances import distances
+from hrcreplay.reporting import page
+from hrcreplay.reporting.replay_scene import ReplayScene
+from hrcreplay.run.report import compute
+from tests.reporting.browser import Tab, chromium, opened
+from tests.reporting.moving import moving_run, moving_scene, robot
+from tests.reporting.test_page import read
+
+PROGRAM = chromium()
+pytestmark = pytest.mark.skipif(PROGRAM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+
+
+@pytest.fixture(scope="module")
+def scene() -> ReplayScene:
+    return moving_scene(moving_run(8.0))
+
+
+@pytest.fixture(scope="module")
+def file(scene: ReplayScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run, folder = moving_run(8.0), tmp_path_factory.mktemp("page")
+    metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
+    (folder / "report.html").write_text(page.render(run, metrics, folder, scene=scene), encoding="utf-8")
+    return folder / "report.html"
+
+
+@pytest.fixture(scope="module")
+def loaded(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    """Opened once: without a graphics card it takes seconds to compile the shaders."""
+    assert PROGRAM is not None
+    with opened(PROGRAM, tmp_path_factory.mktemp("profile")) as tab:
+        tab.open(file, 1280, 900)
+        yield tab
+
+
+@pytest.fixture
+def tab(loaded: Tab) -> Tab:
+    loaded.evaluate("replay.play(false), replay.choose('qp'), replay.seek(0)")
+    loaded.evaluate("document.getElementById('replay').scrollIntoView()")
+    return loaded
+
+
+def settled(tab: Tab) -> None:
+    """Waits until the browser has laid out and drawn twice."""
+    tab.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def picture(tab: Tab) -> str:
+    """The canvas as it is drawn now."""
+    return str(tab.evaluate("replay.view.render(), document.querySelector('#replay canvas').toDataURL()"))
+
+
+def instant(tab: Tab) -> float:
+    return float(tab.evaluate("replay.state.t_s"))
+
+
+def test_the_page_runs_without_network_and_without_trouble(tab: Tab, file: Path) -> None:
+    assert tab.evaluate("document.querySelector('.replay-trouble').textContent") == ""
+    assert all(url.startswith(("file:", "blob:", "data:")) for url in tab.requests)
+    assert sum(url.startswith("file:") for url in tab.requests) == 1
+    html = file.read_text("utf-8")
+    assert all(link.startswith("#") for link in read(html).links)
+    assert "MIT License" in html
+    assert tab.trouble == []
+
+
+def test_links_and_distances_are_where_python_has_them(tab: Tab, scene: ReplayScene) -> None:
+    model, row = robot(moving_run(2.0)), 93
+    tab.evaluate(f"replay.seek({scene.seconds[row]})")
+    ends = tab.evaluate("replay.view.ends.map(pair => pair.map(end => end.toArray()))")
+    np.testing.assert_allclose(np.array(ends), model.ends_m(scene.methods["qp"].q[row]), atol=1e-3)
+    near: dict[str, Any] = tab.evaluate(f"replay.view.show('qp', {row}, {scene.seconds[row]})")
+    links, body = np.array(ends), scene.body_m[row]
+    share = np.linspace(0.0, 1.0, 201)[:, None]
+    apart = min(
+        float(np.linalg.norm((a + share * (b - a))[:, None] - (c + share * (d - c))[None], axis=2).min()) - r - s
+        for (a, b), r in zip(links, scene.robot.radius_m, strict=True)
+        for (c, d), s in zip(body, scene.body_radius_m, strict=True)
+    )
+    assert near["body"]["distance"] == pytest.approx(apart, abs=2e-3)
+    shown = scene.t0_ns + round(1e9 * tab.evaluate("replay.view.stored.at_s"))
+    assert 0 <= scene.t_ns[row] - shown <= 80_000_000
+    rows = scene.volumes.rows(np.flatnonzero(scene.volumes.t_ns == shown))
+    assert len(rows.t_ns) == 6
+    far, _, _ = distances(np.ascontiguousarray(links), rows.vertices_m, rows.offsets)
+    assert near["volume"]["distance"] == pytest.approx(
+        (far - scene.robot.radius_m[:, None] - rows.radius_m[None]).min(), abs=2e-3
+    )
+
+
+def test_a_volume_is_drawn_on_its_own_surface(tab: Tab, scene: ReplayScene) -> None:
+    """Each corner of the drawn surface lies on hull + ball: no vertex reaches further along its direction."""
+    tab.evaluate(f"replay.seek({scene.seconds[100]})")
+    shown = scene.t0_ns + round(1e9 * tab.evaluate("replay.view.stored.at_s"))
+    rows = scene.volumes.rows(np.flatnonzero(scene.volumes.t_ns == shown))
+    for i in range(len(rows.t_ns)):
+        mesh = f"replay.view.volumes[{rows.limb[i]}].mesh"
+        assert tab.evaluate(f"{mesh}.visible")
+        corners, normals = (
+            np.array(tab.evaluate(f"Array.from({mesh}.geometry.getAttribute('{name}').array)")).reshape(-1, 3)
+            for name in ("position", "normal")
+        )
+        hull = rows.vertices_m[rows.offsets[i] : rows.offsets[i + 1]]
+        furthest = (hull @ normals.T).max(axis=0) + rows.radius_m[i]
+        np.testing.assert_allclose((corners * normals).sum(axis=1), furthest, atol=1.5e-3)
+    floor = tab.evaluate("replay.view.materials.volume.clippingPlanes.map(p => [...p.normal.toArray(), p.constant])")
+    assert floor == [[0, 0, 1, 0]]  # and what is below the floor is not shown
+    assert tab.evaluate("replay.view.renderer.localClippingEnabled")
+
+
+def test_playing_moves_the_scene_and_pausing_holds_it(tab: Tab) -> None:
+    tab.evaluate("replay.seek(1)")
+    before = picture(tab)
+    tab.press(" ")
+    tab.evaluate(
+        "new Promise(done => { const look = () => replay.state.t_s > 1.5 ? done(1) : setTimeout(look, 20); look(); })"
+    )
+    assert tab.evaluate("replay.state.playing")
+    assert tab.evaluate("document.querySelector('.play').textContent") == "Pause"
+    tab.press(" ")
+    assert not tab.evaluate("replay.state.playing")
+    at_s, after = instant(tab), picture(tab)
+    assert after != before
+    settled(tab)
+    assert (instant(tab), picture(tab)) == (at_s, after)
+    assert tab.trouble == []
+
+
+def test_it_stops_by_itself_at_the_end(tab: Tab, scene: ReplayScene) -> None:
+    tab.evaluate(
+        "{ const list = document.querySelector('.speed'); list.value = '10'; list.dispatchEvent(new Event('change')); }"
+    )
+    tab.evaluate(f"replay.seek({scene.seconds[-1] - 0.2}), replay.play(true)")
+    tab.evaluate(
+        "new Promise(done => { const look = () => replay.state.playing ? setTimeout(look, 20) : done(1); look(); })"
+    )
+    assert instant(tab) == pytest.approx(scene.seconds[-1])
+    tab.press(" ")  # and begins again from there
+    assert tab.evaluate("replay.state.playing")
+    assert instant(tab) < scene.seconds[-1]
+    for _ in range(3):
+        tab.press("ArrowDown")
+    assert tab.evaluate("replay.state.speed") == 1
+
+
+def test_scrubbing_changes_the_instant(tab: Tab) -> None:
+    tab.evaluate("replay.seek(0)")
+    before = picture(tab)
+    tab.evaluate(
+        "{ const bar = document.querySelector('.scrub'); bar.value = 3.2; bar.dispatchEvent(new Event('input')); }"
+    )
+    assert instant(tab) == pytest.approx(3.2)
+    assert tab.evaluate("document.querySelector('.clock').textContent") == "3.20 s"
+    assert picture(tab) != before
+    tab.evaluate("scrollBy(0, 400)")
+    box = tab.evaluate(
+        "(b => [b.left, b.top, b.width, b.height])(document.querySelector('.plot .u-over').getBoundingClientRect())"
+    )
+    x, y = box[0] + 0.25 * box[2], box[1] + 0.5 * box[3]
+    for kind in ("mousePressed", "mouseReleased"):
+        tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+    assert instant(tab) == pytest.approx(0.25 * 7.96, abs=0.02)
+    line = tab.evaluate("document.querySelector('.plot-now').getBoundingClientRect().left")
+    assert line == pytest.approx(x, abs=2.0)
+
+
+def test_keys(tab: Tab, scene: ReplayScene) -> None:
+    tab.evaluate("replay.seek(2)")
+    for key, want in (("ArrowRight", 2.04), ("ArrowRight", 2.08), ("ArrowLeft", 2.04), ("Home", 0.0), ("End", 7.96)):
+        tab.press(key)
+        assert instant(tab) == pytest.approx(want), key
+    tab.press("m")
+    assert tab.evaluate("replay.state.method") == "scaling"
+    assert not tab.evaluate("document.querySelector('.volumes-note').hidden")
+    events = [event.at_s for event in scene.methods["scaling"].events]
+    assert len(events) > 2
+    tab.press("Home")
+    for at_s in (at_s for at_s in events if at_s > 1e-3):
+        tab.press("n")
+        assert instant(tab) == pytest.approx(at_s, abs=1e-3)
+    tab.press("p")
+    assert instant(tab) == pytest.approx(events[-2], abs=1e-3)
+    tab.press("ArrowUp")
+    assert tab.evaluate("replay.state.speed") == 2
+    tab.press("ArrowDown")
+    assert tab.evaluate("replay.state.speed") == 1
+    assert tab.trouble == []
+
+
+def test_a_press_on_a_stop_goes_there(tab: Tab, scene: ReplayScene) -> None:
+    for k, event in enumerate(scene.methods["qp"].events):
+        tab.evaluate(f"document.querySelectorAll('.stops button')[{k}].click()")
+        assert instant(tab) == pytest.approx(event.at_s, abs=1e-3)
+        assert tab.evaluate(f"document.querySelectorAll('.stops li')[{k}].classList.contains('now')")
+    tab.evaluate("replay.choose('scaling')")
+    assert "1 contact" in tab.evaluate("document.querySelector('.stops h3').textContent")
+
+
+def test_the_theme_follows_the_system_and_the_switch(tab: Tab) -> None:
+    colour = "getComputedStyle(document.body).backgroundColor"
+    light, drawn = tab.evaluate(colour), picture(tab)
+    tab.evaluate("document.getElementById('theme').click()")
+    dark = tab.evaluate(colour)
+    assert dark != light
+    assert picture(tab) != drawn
+    tab.evaluate("document.getElementById('theme').click(), localStorage.clear()")
+    assert tab.evaluate(colour) == light
+    tab.evaluate("delete document.documentElement.dataset.theme")
+    tab.look(1280, 900, theme="dark")
+    settled(tab)
+    assert tab.evaluate(colour) == dark
+    assert tab.evaluate("document.getElementById('theme').textContent") == "Light theme"
+    assert picture(tab) != drawn
+    tab.look(1280, 900)
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_is_wider_than_the_screen(tab: Tab, width: int) -> None:
+    tab.look(width, 844)
+    settled(tab)
+    assert tab.evaluate("document.documentElement.scrollWidth") == width
+    box = tab.evaluate("(b => [b.left, b.right])(document.querySelector('.stage').getBoundingClientRect())")
+    assert box[0] >= 0
+    assert box[1] <= width
+    assert tab.evaluate("document.querySelector('.plot canvas').getBoundingClientRect().right") <= width

@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import zlib
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from hrcreplay.human.model import skeleton
+from hrcreplay.records import LIMBS, POINTS, Floats
+from hrcreplay.reporting.metrics_contact import stop_events
+from hrcreplay.reporting.replay_page import MISSING, NumberBlock, replay_data
+from hrcreplay.reporting.replay_scene import SHOWN_POINTS, ReplayScene
+from hrcreplay.robot.control.control_step import axis_by_axis, straight
+from tests.reporting.moving import joints, moving_run, moving_scene, robot
+from tests.reporting.synthetic import LENGTHS_M, T0_NS, pose
+
+
+@pytest.fixture(scope="module")
+def scene() -> ReplayScene:
+    return moving_scene(moving_run(8.0))
+
+
+def test_the_screws_move_the_links_as_pinocchio_does(scene: ReplayScene) -> None:
+    model, shape = robot(moving_run(2.0)), scene.robot
+    q = np.array([0.4, -0.7, 0.3, 1.1, -0.5, 2.0])
+    T = [np.eye(4)]
+    for turned, screw in zip(q, shape.screws, strict=True):
+        v, (x, y, z) = screw[:3], screw[3:]
+        twist = np.array([[0, -z, y, v[0]], [z, 0, -x, v[1]], [-y, x, 0, v[2]], [0, 0, 0, 0]])
+        T.append(T[-1] @ expm(twist * turned))
+    for i, ends in enumerate(model.ends_m(q)):
+        moved = T[shape.moved_by[i]]
+        np.testing.assert_allclose(shape.ends_m[i] @ moved[:3, :3].T + moved[:3, 3], ends, atol=1e-12)
+    tcp = model.pose(q, np.zeros(6)).T_world_tcp[:3, 3]
+    np.testing.assert_allclose(T[-1][:3, :3] @ shape.tcp_m + T[-1][:3, 3], tcp, atol=1e-12)
+
+
+def test_a_scene_has_25_instants_a_second_of_every_table(scene: ReplayScene) -> None:
+    assert np.diff(scene.t_ns).tolist() == [40_000_000] * (len(scene.t_ns) - 1)
+    assert len(scene.t_ns) == 200
+    assert list(scene.methods) == ["qp", "scaling"]
+    np.testing.assert_allclose(scene.methods["qp"].q, joints(scene.seconds)[0], atol=1e-9)
+    want = skeleton(pose(scene.seconds), np.tile(LENGTHS_M, (200, 1)))[:, [POINTS.index(name) for name in SHOWN_POINTS]]
+    known = scene.seconds >= 0.5
+    assert np.isnan(scene.points_m[~known]).all()
+    assert np.abs(scene.points_m[known] - want[known]).max() < 0.05  # the fused person is a little off
+    np.testing.assert_allclose(scene.body_m[:, 3, 0], skeleton(pose(scene.seconds), np.tile(LENGTHS_M, (200, 1)))[:, 9])
+
+
+def test_a_certified_stop_ends_where_it_would(scene: ReplayScene) -> None:
+    """On the way of the velocity, half of its time on: as the controller's own stop of that many ticks."""
+    q, dq = joints(scene.seconds)
+    ticks = 50
+    limit = np.abs(dq[77]).max() / (ticks * 0.004) * (1 + 1e-9)
+    stop = straight(q[77], dq[77], np.full(6, limit), 0.004)
+    assert stop.ticks == ticks  # 0.2 s, as the made-up table has it
+    np.testing.assert_allclose(scene.methods["qp"].stop_q[77], stop.q[-1], atol=1e-9)
+
+
+def test_a_stop_without_certificates_is_that_of_each_axis() -> None:
+    run = moving_run(2.0)
+    plain = dataclasses.replace(run, meta={**run.meta, "settings": {"plan": {"method": "qp", "certify": False}}})
+    found = moving_scene(plain).methods["qp"]
+    q, dq = joints(np.array([0.4]))
+    np.testing.assert_allclose(found.stop_q[10], axis_by_axis(q[0], dq[0], robot(run).ddq_max, 0.01).q[-1], atol=1e-9)
+
+
+def test_a_stop_on_the_path_stays_on_it(scene: ReplayScene) -> None:
+    """The made-up baseline's joints follow the clock, so each programmed time has its joints."""
+    run = moving_run(8.0)
+    table = run.baselines["scaling"]
+    s_s = table["programme_s"].to_numpy()
+    rate = np.gradient(s_s, 0.01)
+    row = 4 * 20
+    s_end = s_s[row] + rate[row] * 0.1
+    clock_s = np.interp(s_end, s_s, np.arange(len(s_s)) * 0.01)
+    np.testing.assert_allclose(scene.methods["scaling"].stop_q[20], joints(np.array([clock_s]))[0][0], atol=2e-3)
+
+
+def test_the_list_of_stops_has_each_once() -> None:
+    run = moving_run(8.0)
+    assert run.motion is not None
+    assert run.contact is not None
+    t_s = (run.motion["t_ns"].to_numpy() - T0_NS) * 1e-9
+    braking = ((t_s >= 2.0) & (t_s < 2.3)) | ((t_s >= 2.35) & (t_s < 2.5)) | ((t_s >= 6.0) & (t_s < 6.1))
+    still = (t_s >= 2.5) & (t_s < 3.1)
+    dq = {f"dq{i}": np.where(still, 0.0, run.motion[f"dq{i}"]) for i in range(1, 7)}
+    motion = run.motion.assign(
+        **dq,
+        status=np.where(braking | still, "braking", "tracking"),
+        reason=np.where(braking, "not certified", ""),
+        tcp_speed=np.where(still, 0.0, 0.4),
+        distance_m=0.3,
+    )
+    first, second = stop_events(motion, run.contact[run.contact["method"] == "qp"], T0_NS, 0.001)
+    assert (first.kind, first.reason, first.link, first.limb) == ("stop", "not certified", "tool", "LRA")
+    assert (first.at_s, first.moving_s, first.rest_s) == pytest.approx((2.0, 0.45, 0.6))
+    assert (first.speed_m_per_s, first.distance_m) == pytest.approx((0.4, 0.3))
+    assert (second.at_s, second.moving_s, second.rest_s) == pytest.approx((6.0, 0.1, 0.0))
+    (touch,) = stop_events(
+        motion.assign(status="tracking"), run.contact[run.contact["method"] == "scaling"], T0_NS, 0.001
+    )
+    assert touch.kind == "touch"
+    assert (touch.at_s, touch.moving_s) == pytest.approx((3.0, 0.5))
+    assert (touch.speed_m_per_s, touch.distance_m) == pytest.approx((0.3, -0.02 - 0.01 * 0.49))
+
+
+def unpacked(header: dict[str, Any], entry: dict[str, Any], stream: bytes) -> Floats:
+    """An array of the block again, by other means than the page's."""
+    size, at = entry["rows"] * entry["columns"], entry["at"]
+    low, high = (np.frombuffer(stream, np.uint8, size, at + k * size).astype(np.uint16) for k in (0, 1))
+    steps = (low + 256 * high).astype(np.int16).reshape(entry["columns"], entry["rows"])
+    counts = np.cumsum(steps, axis=1, dtype=np.int64).astype(np.int16).T
+    return np.where(counts == MISSING, np.nan, counts * entry["unit"])
+
+
+def test_the_numbers_come_back_to_the_millimetre(scene: ReplayScene) -> None:
+    text, numbers = replay_data(scene)
+    header = json.loads(text)
+    block = base64.b64decode(numbers)
+    motion, hulls = zlib.decompress(block[: header["bytes"][0]]), zlib.decompress(block[header["bytes"][0] :])
+    points = unpacked(header, header["entries"]["points"], motion)
+    np.testing.assert_allclose(points, scene.points_m.reshape(200, -1), atol=0.5001e-3)
+    np.testing.assert_allclose(
+        unpacked(header, header["entries"]["scaling/q"], motion), scene.methods["scaling"].q, atol=0.51e-4
+    )
+    entries = header["volumes"]["entries"]
+    assert header["volumes"]["limbs"] == list(LIMBS)
+    assert header["volumes"]["rate_hz"] == 12.5
+    count = unpacked(header, entries["count"], hulls)[:, 0].astype(int)
+    vertices = np.split(unpacked(header, entries["vertices"], hulls), np.cumsum(count)[:-1])
+    stored = {(int(t), limb): i for i, (t, limb) in enumerate(zip(scene.volumes.t_ns, scene.volumes.limb, strict=True))}
+    for at_s, limb, found in zip(
+        header["volumes"]["at_s"], unpacked(header, entries["limb"], hulls)[:, 0], vertices, strict=True
+    ):
+        i = stored[scene.t0_ns + round(at_s * 1e9), int(limb)]
+        want = scene.volumes.vertices_m[scene.volumes.offsets[i] : scene.volumes.offsets[i + 1]]
+        assert np.abs(found.mean(axis=0) - want.mean(axis=0)).max() < 0.5001e-3  # the order of vertices is another
+        np.testing.assert_allclose(np.sort(found[:, 2]), np.sort(want[:, 2]), atol=0.5001e-3)
+
+
+def test_numbers_too_large_for_16_bits_come_with_larger_steps() -> None:
+    block = NumberBlock()
+    values = np.array([[-400.0], [np.nan], [123.4], [400.0]])
+    block.add("far", values, 1e-3)
+    stream = zlib.decompress(block.deflated())
+    np.testing.assert_allclose(unpacked({}, block.entries["far"], stream), values, atol=0.51 * 400 / 32767)
+
+
+def test_a_small_budget_costs_the_volumes_their_rate_and_nothing_else(scene: ReplayScene) -> None:
+    whole, numbers = replay_data(scene)
+    header = json.loads(whole)
+    motion_bytes = header["bytes"][0]
+    text, small = replay_data(scene, budget_bytes=len(numbers) // 2)
+    assert json.loads(text)["volumes"]["rate_hz"] < header["volumes"]["rate_hz"]
+    assert len(small) <= len(numbers) // 2
+    assert base64.b64decode(small)[:motion_bytes] == base64.b64decode(numbers)[:motion_bytes]
+    none = json.loads(replay_data(scene, budget_bytes=motion_bytes)[0])
+    assert none["volumes"]["rate_hz"] is None
+    assert none["volumes"]["at_s"] == []
+
+
+def test_the_same_run_gives_the_same_block() -> None:
+    first, second = (replay_data(moving_scene(moving_run(3.0))) for _ in range(2))
+    assert first == second

@@ -1,0 +1,184 @@
+"""scene.mcap as a reader that knows only Foxglove's schemas finds it."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.reader import make_reader
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+import hrcreplay
+from hrcreplay.reporting.replay_scene import ReplayScene, posed
+from hrcreplay.reporting.scene_mcap import write_scene
+from hrcreplay.reporting.scene_messages import surface, surface_mesh
+from tests.reporting.moving import moving_run, moving_scene, robot
+
+LAYOUT = Path(hrcreplay.__file__).parents[1] / "docs" / "foxglove-layout.json"
+
+
+@pytest.fixture(scope="module")
+def scene() -> ReplayScene:
+    return moving_scene(moving_run(4.0))
+
+
+@pytest.fixture(scope="module")
+def file(scene: ReplayScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "scene.mcap"
+    write_scene(path, scene, moving_run(4.0).measurements)
+    return path
+
+
+@pytest.fixture(scope="module")
+def topics(file: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Topic -> instants and messages."""
+    found = defaultdict(list)
+    kinds: dict[int, Any] = {}
+    with file.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            if schema.encoding == "jsonschema":
+                found[channel.topic].append((message.log_time, json.loads(message.data)))
+                continue
+            if schema.id not in kinds:
+                pool = descriptor_pool.DescriptorPool()
+                for part in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+                    pool.Add(part)
+                kinds[schema.id] = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+            found[channel.topic].append((message.log_time, kinds[schema.id].FromString(message.data)))
+    return dict(found)
+
+
+def test_every_topic_has_its_instants(topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene) -> None:
+    each = scene.t_ns.tolist()
+    for topic in ("/tf", "/person/fused", "/person/points", "/person/recorded", "/plan/distance", "/plan/series"):
+        assert [t_ns for t_ns, _ in topics[topic]] == each, topic
+    assert {"/baseline/scaling/robot", "/baseline/scaling/series", "/camera/kinect", "/camera/xtion"} <= topics.keys()
+    stored = [t_ns for t_ns, _ in topics["/volumes"]]
+    assert np.diff(stored).min() >= 160_000_000
+    assert len(stored) == pytest.approx(3.5 * 5, abs=1)
+
+
+def test_the_links_hang_on_frames_that_bring_them_where_they_are(
+    topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene
+) -> None:
+    row = 57
+    frames = {
+        one.child_frame_id: (
+            Rotation.from_quat([one.rotation.x, one.rotation.y, one.rotation.z, one.rotation.w]),
+            np.array([one.translation.x, one.translation.y, one.translation.z]),
+        )
+        for one in topics["/tf"][row][1].transforms
+    }
+    for topic, q in (
+        ("/plan/robot", scene.methods["qp"].q),
+        ("/plan/stop", scene.methods["qp"].stop_q),
+        ("/baseline/scaling/robot", scene.methods["scaling"].q),
+    ):
+        want = robot(moving_run(2.0)).ends_m(q[row])
+        for i, shown in enumerate(topics[topic][0][1].entities):
+            turned, at_m = frames[shown.frame_id]
+            assert shown.frame_locked
+            for ball, end in zip(shown.spheres, want[i], strict=True):
+                centre = np.array([ball.pose.position.x, ball.pose.position.y, ball.pose.position.z])
+                np.testing.assert_allclose(turned.apply(centre) + at_m, end, atol=2e-5)
+                assert ball.size.x == 2 * scene.robot.radius_m[i]
+
+
+def test_many_poses_at_once_are_those_of_the_robot(scene: ReplayScene) -> None:
+    q = scene.methods["qp"].q
+    model = robot(moving_run(2.0))
+    np.testing.assert_allclose(posed(scene.robot, q[::17]), [model.ends_m(row) for row in q[::17]], atol=1e-12)
+
+
+def test_the_distance_is_drawn_as_long_as_it_is(topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene) -> None:
+    row = 33
+    (line,) = topics["/plan/distance"][row][1].entities[0].lines
+    start, end = (np.array([point.x, point.y, point.z]) for point in line.points)
+    links, share = robot(moving_run(2.0)).ends_m(scene.methods["qp"].q[row]), np.linspace(0.0, 1.0, 201)[:, None]
+    apart = min(
+        float(np.linalg.norm((a + share * (b - a))[:, None] - (c + share * (d - c))[None], axis=2).min()) - r - s
+        for (a, b), r in zip(links, scene.robot.radius_m, strict=True)
+        for (c, d), s in zip(scene.body_m[row], scene.body_radius_m, strict=True)
+    )
+    assert np.linalg.norm(end - start) == pytest.approx(abs(apart), abs=2e-3)
+
+
+def test_numbers_over_time_are_those_of_the_record(
+    topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene
+) -> None:
+    track = scene.methods["scaling"]
+    rows = [row for _, row in topics["/baseline/scaling/series"]]
+    assert rows[5]["distance_m"] is None  # nobody is known yet
+    np.testing.assert_allclose([row["tcp_speed"] for row in rows], track.tcp_speed, atol=0.51e-4)
+    known, index = track.names["status"]
+    assert [row["status"] for row in rows] == [known[i] for i in index.tolist()]
+    assert all(row["certified"] is True for row in rows)
+
+
+def test_a_volume_is_drawn_on_hull_and_ball(topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene) -> None:
+    t_ns, update = topics["/volumes"][3]
+    stored = np.flatnonzero(scene.volumes.t_ns == t_ns)
+    assert len(update.entities) == len(stored) == 6
+    for k, entity in zip(stored.tolist(), update.entities, strict=True):
+        vertices = scene.volumes.vertices_m[scene.volumes.offsets[k] : scene.volumes.offsets[k + 1]]
+        corners = np.array([[point.x, point.y, point.z] for point in entity.triangles[0].points])
+        radius_m = scene.volumes.radius_m[k]
+        whole = ConvexHull((vertices[:, None] + radius_m * ball()).reshape(-1, 3))
+        assert (
+            corners @ whole.equations[:, :3].T + whole.equations[:, 3]
+        ).max() < 0.02 * radius_m + 1e-3  # not outside
+        assert ConvexHull(corners).volume > 0.93 * whole.volume
+        faces = corners[np.reshape(entity.triangles[0].indices, (-1, 3))]
+        closed = np.einsum("ij,ij->i", faces[:, 0], np.cross(faces[:, 1], faces[:, 2])).sum() / 6.0
+        assert closed == pytest.approx(ConvexHull(corners).volume, rel=0.05)  # closed, and its faces look outward
+
+
+def test_a_volume_is_drawn_down_to_the_floor() -> None:
+    """Legs reach their radius beyond the line from floor to pelvis; below the floor nothing is drawn."""
+    legs, radius_m = np.array([[0.2, 0.1, 0.0], [0.4, 0.1, 0.9]]), 0.4
+    corners, triangles = surface_mesh(legs, radius_m)
+    assert corners[:, 2].min() == 0.0
+    assert corners[:, 2].max() == pytest.approx(1.3, abs=0.01)
+    on_floor = corners[corners[:, 2] == 0.0]
+    assert on_floor[:, 0].min() == pytest.approx(0.2 - radius_m, abs=0.02)
+    faces = corners[triangles]
+    closed = np.einsum("ij,ij->i", faces[:, 0], np.cross(faces[:, 1], faces[:, 2])).sum() / 6.0
+    asked = np.random.default_rng(4).uniform([-0.3, -0.4, 0.0], [0.9, 0.6, 1.4], size=(200_000, 3))
+    along = np.clip((asked - legs[0]) @ (legs[1] - legs[0]) / np.dot(legs[1] - legs[0], legs[1] - legs[0]), 0.0, 1.0)
+    inside = np.linalg.norm(asked - legs[0] - along[:, None] * (legs[1] - legs[0]), axis=1) <= radius_m
+    assert closed == pytest.approx(inside.mean() * 1.2 * 1.0 * 1.4, rel=0.05)
+    assert len(surface_mesh(legs - [0.0, 0.0, 5.0], radius_m)[0]) == 0
+
+
+def ball() -> np.ndarray:
+    """Directions all around, not those of the picture."""
+    unit = np.random.default_rng(3).normal(size=(1000, 3))
+    return np.asarray(unit / np.linalg.norm(unit, axis=1, keepdims=True))
+
+
+def test_a_limb_that_is_not_known_has_no_surface() -> None:
+    assert surface(np.full((1, 3), np.nan), 0.2).encode() == surface(np.zeros((0, 3)), 0.2).encode()
+    assert len(surface(np.full((1, 3), np.nan), 0.2).encode()) < 64
+
+
+def test_the_same_scene_gives_the_same_bytes(file: Path, scene: ReplayScene, tmp_path: Path) -> None:
+    write_scene(tmp_path / "again.mcap", scene, moving_run(4.0).measurements)
+    assert (tmp_path / "again.mcap").read_bytes() == file.read_bytes()
+
+
+def test_the_layout_shows_topics_that_there_are(topics: dict[str, list[tuple[int, Any]]]) -> None:
+    layout = json.loads(LAYOUT.read_text())
+    shown = layout["configById"]["3D!scene"]["topics"]
+    assert set(shown) <= topics.keys()
+    paths = [path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())]
+    assert len(paths) > 4
+    row = topics["/plan/series"][0][1]
+    assert {path.partition(".")[0] for path in paths} == {"/plan/series"}
+    assert {path.partition(".")[2] for path in paths} <= row.keys()

@@ -1,0 +1,83 @@
+"""The lines after a command, against figures counted out here from the tables themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hrcreplay.records import LIMBS
+from hrcreplay.reporting.story import lines
+from hrcreplay.run.report import compute
+from hrcreplay.store.run_folder import Run
+from tests.reporting.synthetic import make_run
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    made = make_run()
+    meta = {**made.meta, "limits": {"prediction": {"name": "people"}}}
+    return dataclasses.replace(made, meta=meta, counts={"outlier_points_kinect": 1200, "outlier_points_xtion": 34})
+
+
+def _lines(run: Run) -> dict[str, str]:
+    found = lines(run, compute(run, near_m=0.5, stationary_m_per_s=0.001))
+    return dict(line.split(": ", 1) for line in found)
+
+
+def test_fuse(run: Run) -> None:
+    assert run.state is not None
+    assert run.measurements is not None
+    n = len(run.state)
+    age_s = np.where(np.arange(n) < n // 4, 0.5, 0.02)  # of the first quarter too old
+    unseen_s = np.where(np.arange(n) < n // 2, 0.5, 0.02)
+    run = dataclasses.replace(run, state=run.state.assign(frame_age_s=age_s, unseen_LEGS=unseen_s, unseen_HD=age_s))
+    run.meta["settings"]["fusion"]["fresh_s"] = 0.3
+    assert run.measurements is not None
+    frames = run.measurements.groupby("camera").size()
+    assert _lines(run)["fuse"] == (
+        "1,200 ticks, person known from fresh frames in 75.0 % (LEGS 50.0 %); frames with the person: "
+        f"kinect {frames['kinect']}, xtion {frames['xtion']}; 1,234 outlier points"
+    )
+
+
+def test_predict(run: Run) -> None:
+    assert run.occupancy is not None
+    total = run.occupancy[run.occupancy["limb"].isin(LIMBS)]["volume_m3"].sum() / run.occupancy["t_ns"].nunique()
+    assert _lines(run)["predict"].startswith(f"paper, people: the six limbs {total:.3f} m³ (")
+    legs = run.occupancy[run.occupancy["limb"] == "HD"].assign(limb="LEGS", volume_m3=1.25)
+    walking = dataclasses.replace(run, occupancy=pd.concat([run.occupancy, legs]))
+    assert f"the six limbs {total:.3f} m³, lower body 1.250 m³ (" in _lines(walking)["predict"]
+
+
+def test_plan(run: Run) -> None:
+    motion = run.motion
+    assert motion is not None
+    near = motion["distance_m"] <= 0.5
+    stands = near & (motion["tcp_speed"] < 0.001)
+    late = ((motion["status"] == "braking") & (motion["tcp_speed"] >= 0.001)).sum()
+    mine, other = _lines(run)["plan"].split("; ")
+    assert mine.startswith("qp: ")
+    assert f"standing in {100.0 * stands.sum() / near.sum():.1f} % of the near ticks" in mine
+    assert mine.endswith(f", {late} ticks ({100.0 * late / len(motion):.1f} %) in full stops")
+    assert other.startswith("scaling: ")
+    pace = compute(run, near_m=0.5, stationary_m_per_s=0.001)["plan_progress_share"]["value"]
+    assert mine.startswith(f"qp: {100.0 * pace:.1f} % of the programmed pace, ")
+
+
+def test_a_programme_that_never_waits_has_a_pace_too(run: Run) -> None:
+    settings = {**run.meta["settings"], "plan": {"method": "qp", "reference": "time"}}
+    timed = dataclasses.replace(run, meta={**run.meta, "settings": settings})
+    assert _lines(timed)["plan"] == _lines(run)["plan"]
+    assert "of the programmed pace" in _lines(timed)["plan"]
+
+
+def test_only_what_the_run_holds(run: Run) -> None:
+    fused = dataclasses.replace(
+        run, meta={**run.meta, "command": "fuse"}, occupancy=None, motion=None, baselines={}, truth=None
+    )
+    assert list(_lines(fused)) == ["fuse"]
+    assert list(_lines(run)) == ["fuse", "predict", "plan", "report"]
+    assert _lines(run)["report"].startswith("Not at every tick: ")
