@@ -29,10 +29,10 @@ from hrcreplay.logs.reader import Log
 from hrcreplay.logs.reader import open_log as read_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import POINTS, CameraFrames, Floats, HumanStates, Ints, Motion, SweptVolumes
+from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.task import parse_task
 from hrcreplay.run import build, replay, stages
 from hrcreplay.run.build import Forecast
-from hrcreplay.run.followers import Planner
 from hrcreplay.run.fusion import PersonFuser
 from hrcreplay.run.job import Job, resolve
 from hrcreplay.run.replay import demo_log
@@ -329,10 +329,10 @@ def plan(
     found = _MemoryTables()
     sink = found.sink()
     chosen = build.planners(job, log, int(people.states.t_ns[0]))
-    follower = next(iter(chosen.values())).follower
-    sink.notes["plan"].extend(build.programme_notes(job, log, follower.reference))
+    controller = next(iter(chosen.values())).controller
+    sink.notes["plan"].extend(build.programme_notes(job, log, controller.reference))
     batches = (people.states.rows(slice(i, i + _BATCH)) for i in range(0, len(people), _BATCH))
-    around = build.surroundings(job, follower.robot)
+    around = build.surroundings(job, controller.robot)
     for _ in stages.planned(batches, around, chosen, replay.store_every(job), sink):
         pass
     return Plan(job, found.tables, told_of_plan(log, sink))
@@ -415,7 +415,7 @@ class Controller:
         """The robot's motion at a tick, a table of one row; ``person`` is the row of ``Fusion.update``."""
         if self._started is None:
             (planner,) = build.planners(self._job, self._log, int(person.t_ns[0])).values()
-            self._started = planner, build.surroundings(self._job, planner.follower.robot)
+            self._started = planner, build.surroundings(self._job, planner.controller.robot)
         planner, around = self._started
         return planner.follow(person.t_ns, [Forecast(around, person).predict(0)], around.names)
 

@@ -1,1 +1,1 @@
-"""Offline runs: job, stages, followers of a programme, report."""
+"""Offline runs: job, stages, controllers, report."""

@@ -26,11 +26,11 @@ from hrcreplay.logs.log_files import Header
 from hrcreplay.records import BORDER, NOBODY, Bools, CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import PlanSettings
+from hrcreplay.robot.control.controllers import CONTROLLERS, Controller, Planner, Predict
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.path import programmed, recorded, recorded_remarks
 from hrcreplay.robot.task import Reference, Task, parse_task
-from hrcreplay.run.followers import FOLLOWERS, Follower, Planner, Predict
 from hrcreplay.run.job import Job, UrdfFiles, link_capsules
 from hrcreplay.settings.sections import Fusion, Occupancy, Robot
 
@@ -389,8 +389,8 @@ def planners(job: Job, log: LogLike, start_ns: int) -> dict[str, Planner]:
     s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
 
     def planner(name: str) -> Planner:
-        follower = make_follower(name, model, path, plan_settings(job, dt_s, name), s_s)
-        return Planner(follower, chosen=name == plan.method)
+        controller = make_controller(name, model, path, plan_settings(job, dt_s, name), s_s)
+        return Planner(controller, chosen=name == plan.method)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
 
@@ -423,7 +423,7 @@ def plan_settings(job: Job, dt_s: float, method: str) -> PlanSettings:
     )
 
 
-def make_follower(method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float) -> Follower:
+def make_controller(method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float) -> Controller:
     """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on.
 
     Args:
@@ -433,4 +433,4 @@ def make_follower(method: str, model: RobotModel, path: Reference, settings: Pla
         settings: Section 5 for the length of a tick.
         s_s: Programmed time at the start [s].
     """
-    return FOLLOWERS[method](model, path, settings, s_s)
+    return CONTROLLERS[method](model, path, settings, s_s)

@@ -29,13 +29,13 @@ from hrcreplay.records import Floats, Ints
 from hrcreplay.reporting import comparison
 from hrcreplay.reporting.comparison import Variant
 from hrcreplay.reporting.story import defect_notes
+from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference
 from hrcreplay.run import build, replay
 from hrcreplay.run.build import Forecast
 from hrcreplay.run.contact import Predicted, contact_table, full_coverage, own_coverage, recorded_people
 from hrcreplay.run.containment import Outcome
-from hrcreplay.run.followers import Planner
 from hrcreplay.run.job import Job, JobOptions, resolve
 from hrcreplay.run.notes import notes_of
 from hrcreplay.run.recording import RecordedPeople
@@ -403,8 +403,8 @@ def _planner(task: VariantTask, robot: RobotModel) -> Planner:
     job, programme = task.job, task.programme
     settings = build.plan_settings(job, 1.0 / job.settings.fusion.rate_hz, task.variant.method)
     path = replace(programme.path, model=robot)
-    follower = build.make_follower(task.variant.method, robot, path, settings, programme.start_s)
-    return Planner(follower, chosen=True)
+    controller = build.make_controller(task.variant.method, robot, path, settings, programme.start_s)
+    return Planner(controller, chosen=True)
 
 
 class _TablesOf(RunWriter):

@@ -170,7 +170,7 @@ def run_stages(
     flow: Iterable[Any] = states
     if "plan" in todo:
         chosen = build.planners(job, log, int(ticks_ns[0]))
-        robot, path = (getattr(next(iter(chosen.values())).follower, name) for name in ("robot", "reference"))
+        robot, path = (getattr(next(iter(chosen.values())).controller, name) for name in ("robot", "reference"))
         sink.notes["plan"].extend(build.programme_notes(job, log, path))
         every = store_every(job) if "predict" in todo else math.inf
         flow = stages.planned(states, build.surroundings(job, robot), chosen, every, sink)

@@ -34,8 +34,8 @@ from hrcreplay.records import (
     SkeletonTrack,
     SweptVolumes,
 )
+from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.run.build import Forecast, FusionStage, PredictionStage, Surroundings
-from hrcreplay.run.followers import Planner
 from hrcreplay.run.fusion import PersonFuser
 from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.columns import (

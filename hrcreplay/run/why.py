@@ -23,12 +23,12 @@ from hrcreplay.reporting.metrics import true_runs
 from hrcreplay.reporting.metrics_plan import stationary
 from hrcreplay.reporting.tables import PageTable, neighbour_text, reason_text
 from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.active_constraints import TickContext, explain_refusal, propose_explained
 from hrcreplay.robot.control.certificate import NO_PLANES
-from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, stands, straight
+from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, standstill_reason, straight
+from hrcreplay.robot.control.controllers import Controller, Predict, QpController
 from hrcreplay.run import build
 from hrcreplay.run.build import Forecast
-from hrcreplay.run.followers import Follower, Predict, QpFollower
-from hrcreplay.run.holding import Moment, asked, refused
 from hrcreplay.run.job import Job, resolve
 from hrcreplay.store.columns import read_states
 
@@ -64,42 +64,42 @@ class Record:
     @cached_property
     def surroundings(self) -> build.Surroundings:
         """What the robot keeps clear of."""
-        return build.surroundings(self.job, self.follower.robot)
+        return build.surroundings(self.job, self.controller.robot)
 
     @cached_property
-    def follower(self) -> Follower:
+    def controller(self) -> Controller:
         """The method's robot, at the start of its programme."""
         (planner,) = build.planners(self.job, self.log, int(self.states.t_ns[0])).values()
-        return planner.follower
+        return planner.controller
 
     def predict(self, tick: int) -> Predict:
         """What is around the robot at a tick."""
         return Forecast(self.surroundings, self.states.rows(slice(tick, tick + 1))).predict(0)
 
-    def again(self, tick: int) -> Moment | None:
+    def again(self, tick: int) -> TickContext | None:
         """The tick made again; None where no attempt gives the recorded step to the last bit."""
-        for first, going in self._starts(tick):
-            follower = self.follower
-            follower.stop, follower.s_s = going, float(self.motion["programme_s"].iloc[first])
-            follower.point = follower.reference.sample(follower.s_s)
-            follower.u = self._u[first - 1].copy() if first else np.zeros(follower.robot.nv)
-            follower.planes = NO_PLANES
-            moment = None
+        for first, current_stop in self._starts(tick):
+            controller = self.controller
+            controller.stop, controller.s_s = current_stop, float(self.motion["programme_s"].iloc[first])
+            controller.point = controller.reference.sample(controller.s_s)
+            controller.u = self._u[first - 1].copy() if first else np.zeros(controller.robot.nv)
+            controller.planes = NO_PLANES
+            context = None
             for now in range(first, tick + 1):
-                moment = self._moment(now)
+                context = self._context(now)
                 with np.errstate(all="ignore"):
-                    step = follower.step(moment.seen.predict).step
+                    step = controller.step(context.seen.predict).step
                 if not self._as_recorded(now, step):
-                    moment = None
+                    context = None
                     break
-            if moment is not None:
-                return moment
+            if context is not None:
+                return context
         return None
 
-    def _moment(self, tick: int) -> Moment:
-        follower = self.follower
+    def _context(self, tick: int) -> TickContext:
+        controller = self.controller
         with np.errstate(all="ignore"):
-            return Moment(follower.stop, follower.u, follower.s_s, follower.observe(self.predict(tick)))
+            return TickContext(controller.stop, controller.u, controller.s_s, controller.observe(self.predict(tick)))
 
     def _as_recorded(self, tick: int, step: control_step.Step) -> bool:
         """Whether a step is that of the record, bit for bit."""
@@ -114,7 +114,7 @@ class Record:
 
     def _starts(self, tick: int) -> Iterator[tuple[int, Stop]]:
         """Ticks from which the run can be made again, nearest first, with the stop that was under way there."""
-        if isinstance(self.follower, QpFollower):
+        if isinstance(self.controller, QpController):
             for before in _BEFORE:
                 first = max(0, tick - before)
                 for stop in self._stops(first):
@@ -135,7 +135,7 @@ class Record:
         first = tick
         while first and self._status[first - 1] == "braking":
             first -= 1
-        robot, dt_s = self.follower.robot, self.follower.settings.dt_s
+        robot, dt_s = self.controller.robot, self.controller.settings.dt_s
         for form in (straight, axis_by_axis):
             stop = form(self._q[first], self._dq[first], robot.ddq_max, dt_s)
             gone = tick - first
@@ -195,12 +195,12 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
         record: Of the run.
         tick: Row of its motion.
     """
-    moment = record.again(tick)
-    if moment is None:
+    context = record.again(tick)
+    if context is None:
         return None
-    robot, settings, row = record.follower.robot, record.follower.settings, record.motion.iloc[tick]
+    robot, settings, row = record.controller.robot, record.controller.settings, record.motion.iloc[tick]
     links, all_names = [segment.name for segment in robot.segments], record.surroundings.names
-    limbs = all_names[moment.seen.around.first :]  # of the hulls of this tick
+    limbs = all_names[context.seen.obstacles.first :]  # of the hulls of this tick
     found: dict[str, Any] = {
         "at_s": float(row["t_ns"] - record.motion["t_ns"].iloc[0]) * 1e-9,
         "tick": tick,
@@ -208,11 +208,11 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
         "status": str(row["status"]),
         "reason": str(row["reason"] or ""),
         "tcp_speed_m_per_s": float(row["tcp_speed"]),
-        "horizon_s": moment.seen.horizon_s,
+        "horizon_s": context.seen.horizon_s,
         "tau_s": float(row["tau_s"]),
         "cameras": _cameras(record, tick),
     }
-    sight = moment.seen.sight
+    sight = context.seen.sight
     if sight.limb >= 0:
         found["nearest"] = {"link": links[sight.link], "limb": all_names[sight.limb]}
         found["nearest"] |= {"distance_m": sight.distance_m, "overlap_m": sight.overlap_m}
@@ -225,15 +225,15 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
                 ("nobody_else_s", record.states.nobody_else_s),
             )
         }
-    if record.method == "none" or stands(sight, settings):
+    if record.method == "none" or standstill_reason(sight, settings):
         return found
-    wanted, more = asked(record.follower, moment)
+    proposals, more = propose_explained(record.controller, context)
     found |= _named(more, links, limbs)
-    if isinstance(wanted, list) and settings.certified and record.motion["reason"].iloc[tick] == "not certified":
-        around, horizon_s = moment.seen.around, moment.seen.horizon_s
+    if isinstance(proposals, list) and settings.certified and record.motion["reason"].iloc[tick] == "not certified":
+        obstacles, horizon_s = context.seen.obstacles, context.seen.horizon_s
         found["refused"] = [
-            _named(refused(robot, moment.going, proposal, around, horizon_s, settings), links, limbs)
-            for proposal in wanted
+            _named(explain_refusal(robot, context.current_stop, proposal, obstacles, horizon_s, settings), links, limbs)
+            for proposal in proposals
         ]
     return found
 
@@ -401,7 +401,7 @@ def stop_table(record: Record, slow_m_per_s: float) -> tuple[PageTable, list[dic
     rows, every, t_ns = [], [], record.motion["t_ns"].to_numpy()
     for first, past in longest_stops(record.motion, slow_m_per_s).tolist():
         found = facts(record, first)
-        lasted_s = float(t_ns[past - 1] - t_ns[first]) * 1e-9 + record.follower.settings.dt_s
+        lasted_s = float(t_ns[past - 1] - t_ns[first]) * 1e-9 + record.controller.settings.dt_s
         at_s = float(t_ns[first] - t_ns[0]) * 1e-9
         words = reason_text(str(record.motion["reason"].iloc[first] or "")) if found is None else cause(found)
         rows.append((f"{at_s:.2f} s", f"{lasted_s:.2f} s", str(record.motion["status"].iloc[first]), words))

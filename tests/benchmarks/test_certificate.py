@@ -12,11 +12,11 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from hrcreplay.robot.control import certificate
 from hrcreplay.robot.control.certificate import clear
 from hrcreplay.robot.control.control_step import PlanSettings
+from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import irb140
 from hrcreplay.robot.path import programmed
 from hrcreplay.robot.task import parse_task
-from hrcreplay.run.followers import QpFollower
 from hrcreplay.settings.sections import Plan
 from tests.robot.distances import by_coal
 from tests.robot.people import person
@@ -44,9 +44,11 @@ def test_the_certificate(benchmark: BenchmarkFixture, monkeypatch: pytest.Monkey
         return clear(*given)
 
     monkeypatch.setattr(certificate, "clear", listening)
-    follower = QpFollower(robot, programmed(parse_task(TASK), robot), PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S))
+    controller = QpController(
+        robot, programmed(parse_task(TASK), robot), PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)
+    )
     for tick in range(TICKS):
-        follower.step(lambda _, tick=tick: obstacles(people, tick))  # type: ignore[misc]
+        controller.step(lambda _, tick=tick: obstacles(people, tick))  # type: ignore[misc]
     took_us: list[float] = []
 
     def certify() -> None:

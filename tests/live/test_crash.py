@@ -27,8 +27,8 @@ from hrcreplay.live.verify import SessionRecomputation
 from hrcreplay.live.view import status
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import straight
+from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.run.followers import QpFollower
 from tests.live.counted import Cable, CountedLoop, counted
 from tests.live.crashing import BUG, failing
 from tests.live.flights import BEGIN_NS, CYCLE_S, DEMO, Flight
@@ -37,7 +37,7 @@ from tests.live.sessions import children
 #: Where a bug may be; those of the stages the controller catches itself.
 PLACES: dict[str, tuple[Any, str]] = {
     "fusion": (Observer, "update_perception"),
-    "controller": (QpFollower, "step"),
+    "controller": (QpController, "step"),
     "every pose": (RobotModel, "pose"),
     "packets": (session_controller, "decode_robot"),
     "conversation": (EgmSession, "classify_all"),

@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.records import Floats, SweptVolumes
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
-from hrcreplay.robot.control.control_step import PlanSettings, RobotState, Step, axis_by_axis, made, observe, stands
+from hrcreplay.robot.control.control_step import (
+    PlanSettings,
+    RobotState,
+    Step,
+    axis_by_axis,
+    make_step,
+    observe,
+    standstill_reason,
+)
 from hrcreplay.robot.control.minimiser import SLACK, Problem
 from hrcreplay.robot.control.qp_controller import Target, problem, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles
@@ -56,11 +64,11 @@ def step(
     horizon_s = settings.horizon_s(going)
     with np.errstate(all="ignore"):
         sight = observe(robot, state, seen, settings.plan.clearance_m)
-        wanted = stands(sight, settings) or propose(
+        wanted = standstill_reason(sight, settings) or propose(
             robot, state, np.zeros(6), Target(T, twist, HOME), sight, seen, horizon_s, settings
         )
         taken, _ = decide(robot, going, wanted, seen, horizon_s, NO_PLANES, settings)
-    return made(sight, going, taken, horizon_s, DT_S)
+    return make_step(sight, going, taken, horizon_s, DT_S)
 
 
 def run(

@@ -19,9 +19,10 @@ from typer.testing import CliRunner
 from hrcreplay.cli.app import app
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
+from hrcreplay.robot.control import active_constraints
+from hrcreplay.robot.control.active_constraints import LinearRows
 from hrcreplay.robot.control.minimiser import SLACK, Problem
-from hrcreplay.run import build, holding, why
-from hrcreplay.run.holding import LinearRows
+from hrcreplay.run import build, why
 from hrcreplay.run.why import Record
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
@@ -48,7 +49,7 @@ def gaps(record: Record, q: Floats, around: Any) -> Floats:
 
 
 def names(record: Record) -> tuple[list[str], tuple[str, ...]]:
-    return [s.name for s in record.follower.robot.segments], build.prediction_stage(record.job).limbs
+    return [s.name for s in record.controller.robot.segments], build.prediction_stage(record.job).limbs
 
 
 def every_row(task: Problem) -> tuple[Floats, Floats, list[tuple[int, int, int, int]]]:
@@ -85,7 +86,7 @@ def by_daqp(task: Problem) -> tuple[Floats, Floats, list[tuple[int, int, int, in
     assert flag == 1
     every = np.vstack([np.eye(len(g)), -np.eye(len(g)), J, -J, A])
     left = np.concatenate([high - x, x - low, limits.J_high - J @ x, J @ x - limits.J_low, b - A @ x])
-    active = np.flatnonzero(left <= holding.ACTIVE)
+    active = np.flatnonzero(left <= active_constraints.ACTIVE)
     pull = -(H @ x + g)
     near, top = 1e-7 * np.abs(pull).max(), np.full(len(active), 1e30)
     held = np.ascontiguousarray(every[active].T)
@@ -99,15 +100,15 @@ def by_daqp(task: Problem) -> tuple[Floats, Floats, list[tuple[int, int, int, in
 
 
 def spied(monkeypatch: pytest.MonkeyPatch, name: str) -> list[Any]:
-    """What is given to a function of ``holding``."""
+    """What is given to a function of ``active_constraints``."""
     seen: list[Any] = []
-    own = getattr(holding, name)
+    own = getattr(active_constraints, name)
 
     def spy(first: Any, *rest: Any) -> Any:
         seen.append(first)
         return own(first, *rest)
 
-    monkeypatch.setattr(holding, name, spy)
+    monkeypatch.setattr(active_constraints, name, spy)
     return seen
 
 
@@ -138,10 +139,10 @@ def assert_binding(found: dict[str, Any], task: Problem, record: Record) -> None
 
 def assert_nearest(found: dict[str, Any], record: Record, tick: int) -> None:
     """The nearest pair is that by coal."""
-    moment = record.again(tick)
-    assert moment is not None
+    context = record.again(tick)
+    assert context is not None
     at_links, at_limbs = names(record)
-    gap = gaps(record, moment.going.q[0], moment.seen.around)
+    gap = gaps(record, context.current_stop.q[0], context.seen.obstacles)
     link, limb = np.unravel_index(int(np.argmin(gap)), gap.shape)
     assert found["nearest"]["link"] == at_links[link]
     assert found["nearest"]["limb"] == at_limbs[limb]
@@ -201,17 +202,17 @@ def test_a_refused_stop_is_told_where_it_comes_too_near(record: Record) -> None:
     at_links, at_limbs = names(record)
     for tick in np.random.default_rng(5).choice(ticks, 6, replace=False).tolist():
         found = why.facts(record, tick)
-        moment = record.again(tick)
+        context = record.again(tick)
         assert found is not None
-        assert moment is not None
-        wanted, _ = holding.asked(record.follower, moment)
+        assert context is not None
+        wanted, _ = active_constraints.propose_explained(record.controller, context)
         assert isinstance(wanted, list)
         assert len(found["refused"]) == len(wanted) == 2
         for one, (stop, _) in zip(found["refused"], wanted, strict=True):
             failed = round(one["failed_s"] / 0.004)
-            q = (moment.going.q[0], *stop.q)
+            q = (context.current_stop.q[0], *stop.q)
             for i in range(failed + 1):
-                gap = gaps(record, q[i], moment.seen.around)
+                gap = gaps(record, q[i], context.seen.obstacles)
                 assert (gap.min() <= 0.0) == (i == failed and one["why"] == "not clear")
             at = at_links.index(one["link"]), at_limbs.index(one["limb"])
             assert one["gap_m"] == pytest.approx(gap[at], abs=1e-7)
@@ -253,7 +254,7 @@ def test_rows_that_contradict_each_other_are_as_few_as_can_be() -> None:
         A, b = rng.normal(size=(m, 6)) * (rng.random((m, 6)) < 0.4), rng.normal(size=m) * 0.5 + 0.5
         A[np.arange(m), rng.integers(0, 6, m)] += 1.0
         rows = LinearRows(A, b, tuple({"kind": "row", "number": i} for i in range(m)))
-        found = holding.conflict(rows)
+        found = active_constraints.conflict(rows)
         assert bool(found) != feasible(A, b)
         if found:
             assert_minimal(rows, found)
@@ -264,7 +265,7 @@ def test_rows_that_contradict_each_other_are_as_few_as_can_be() -> None:
 
 def test_a_row_that_nothing_can_keep_is_a_conflict_alone() -> None:
     rows = LinearRows(np.array([[1.0, 0.0], [0.0, 0.0]]), np.array([1.0, -1.0]), ({"n": 0}, {"n": 1}))
-    assert holding.conflict(rows) == [{"n": 1}]
+    assert active_constraints.conflict(rows) == [{"n": 1}]
 
 
 def test_where_the_printed_method_has_no_solution_the_rows_are_named(

@@ -214,7 +214,7 @@ class SessionController:
         self._programme_s = result.after.programme_s
         self._settle()
         step, row = result.step, _row(measured, before, result)
-        reason = (self.stop or self.waiting) if result.after.follower is None else control_step.REASONS[step.reason]
+        reason = (self.stop or self.waiting) if result.after.controller is None else control_step.REASONS[step.reason]
         return Decision(
             event.t_ns, look_ns, self._encoded(reply), phase, step.status, reason, step.limb, step.link, row, stop
         )
@@ -309,7 +309,7 @@ class SessionController:
         self.stop, self.phase, self._clear_ns = why, codec.STOPPING, None
         self.stops.append((t_ns, why))
         if self._motion is not None:
-            self._motion = replace(self._motion, follower=None)
+            self._motion = replace(self._motion, controller=None)
 
     def _next_step(self, motion: MotionState) -> MotionStep:
         """The step of this tick: the precomputed one where it is still valid, else a new one."""
@@ -331,7 +331,7 @@ class SessionController:
         return brake(self.setup, motion, lambda _: _UNSEEN)
 
     def _step(self, motion: MotionState) -> MotionStep:
-        return (brake if motion.follower is None else follow)(self.setup, motion, self._obstacles)
+        return (brake if motion.controller is None else follow)(self.setup, motion, self._obstacles)
 
     def _look_late(self, t_ns: int) -> None:
         """Whether the volumes are older than the reaction time allows for: then only the certified stop is."""

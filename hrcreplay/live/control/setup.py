@@ -30,10 +30,10 @@ from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.control.controllers import Controller
 from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.task import Reference
 from hrcreplay.run import build
-from hrcreplay.run.followers import Follower
 from hrcreplay.run.job import Job, job_without_log, recorded_limits, resolve
 from hrcreplay.settings.load import Settings, load_settings
 from hrcreplay.version import __version__
@@ -228,8 +228,8 @@ def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
     programme, _ = build.reference(job, scene, robot)
     settings = build.plan_settings(job, live.cycle_s, plan.method)
 
-    def follow(path: Reference, s_s: float) -> Follower:
-        return build.make_follower(plan.method, robot, path, settings, s_s)
+    def follow(path: Reference, s_s: float) -> Controller:
+        return build.make_controller(plan.method, robot, path, settings, s_s)
 
     return ControlSetup(
         robot=robot,

@@ -33,15 +33,15 @@ from hrcreplay.robot.control.control_step import (
     Stop,
     Taken,
     axis_by_axis,
-    made,
+    make_step,
     straight,
 )
+from hrcreplay.robot.control.controllers import Controller, Predict
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import approach
 from hrcreplay.robot.task import Reference
 from hrcreplay.run.build import FusionStage, Surroundings
-from hrcreplay.run.followers import Follower, Predict
 from hrcreplay.run.fusion import PersonFuser
 from hrcreplay.run.stages import NS
 from hrcreplay.settings.sections import Live
@@ -126,7 +126,7 @@ class ControlSetup:
     robot: RobotModel
     programme: Reference
     plan: PlanSettings
-    follow: Callable[[Reference, float], Follower]  #: a robot at a programmed time of a path
+    follow: Callable[[Reference, float], Controller]  #: a robot at a programmed time of a path
     waypoint_m: float  #: the approach is over when the TCP is this close to its end [m]
     approach_speed: float  #: share of the axes' top speeds on the way to the programme
     bounds: Live
@@ -148,7 +148,7 @@ class MotionState:
     state: RobotState
     programme_s: float  #: of the programme
     stop: Stop  #: what goes on where no better step is certified; its row 0 is ``state``
-    follower: Follower | None = None  #: None: it stands, or brakes
+    controller: Controller | None = None  #: None: it stands, or brakes
     arrived: bool = False  #: whether it follows the programme, not the way to it
 
 
@@ -164,9 +164,9 @@ class MotionStep(NamedTuple):
 def start_approach(setup: ControlSetup, motion: MotionState) -> MotionState:
     """Starts the approach from where the robot stands to the point that its programme has reached."""
     goal = setup.programme.sample(motion.programme_s).q
-    follower = setup.follow(approach(setup.robot, motion.state.q, goal, setup.approach_speed), 0.0)
-    follower.take_over(motion.stop)
-    return replace(motion, follower=follower, arrived=False)
+    controller = setup.follow(approach(setup.robot, motion.state.q, goal, setup.approach_speed), 0.0)
+    controller.take_over(motion.stop)
+    return replace(motion, controller=controller, arrived=False)
 
 
 def follow(setup: ControlSetup, motion: MotionState, predict: Predict) -> MotionStep:
@@ -175,26 +175,26 @@ def follow(setup: ControlSetup, motion: MotionState, predict: Predict) -> Motion
     Raises:
         ValueError: No approach was started.
     """
-    if motion.follower is None:
+    if motion.controller is None:
         raise ValueError("follow: the robot has not set out")
-    follower = copy(motion.follower)
-    tick = follower.step(predict)
-    after = replace(motion, state=tick.step.next, stop=tick.step.stop, follower=follower)
+    controller = copy(motion.controller)
+    tick = controller.step(predict)
+    after = replace(motion, state=tick.step.next, stop=tick.step.stop, controller=controller)
     if motion.arrived:
         after = replace(after, programme_s=tick.programme_s)
-    elif _at_the_end(setup, follower):
-        follower = setup.follow(setup.programme, motion.programme_s)
-        follower.take_over(tick.step.stop)
-        after = replace(after, follower=follower, arrived=True)
+    elif _at_the_end(setup, controller):
+        controller = setup.follow(setup.programme, motion.programme_s)
+        controller.take_over(tick.step.stop)
+        after = replace(after, controller=controller, arrived=True)
     return MotionStep(tick.point.T_world_tcp[:3, 3], tick.point.tcp_speed, tick.step, after)
 
 
-def _at_the_end(setup: ControlSetup, follower: Follower) -> bool:
+def _at_the_end(setup: ControlSetup, controller: Controller) -> bool:
     """Whether the approach has come to its end."""
-    if follower.s_s < follower.reference.duration_s:
+    if controller.s_s < controller.reference.duration_s:
         return False
-    goal = follower.reference.sample(follower.s_s).T_world_tcp[:3, 3]
-    pose = setup.robot.pose(follower.state.q, follower.state.dq)
+    goal = controller.reference.sample(controller.s_s).T_world_tcp[:3, 3]
+    pose = setup.robot.pose(controller.state.q, controller.state.dq)
     return math.dist(pose.T_world_tcp[:3, 3], goal) <= setup.waypoint_m
 
 
@@ -204,8 +204,8 @@ def brake(setup: ControlSetup, motion: MotionState, predict: Predict) -> MotionS
     horizon_s = plan.horizon_s(motion.stop)
     with np.errstate(all="ignore"):
         seen = control_step.observe(robot, state, predict(horizon_s), plan.plan.clearance_m)
-    going = Taken(motion.stop.rest(), control_step.BRAKING, 0, plan.certified or not motion.stop.ticks)
-    step = made(seen, motion.stop, going, horizon_s, plan.dt_s)
+    taken = Taken(motion.stop.rest(), control_step.BRAKING, 0, plan.certified or not motion.stop.ticks)
+    step = make_step(seen, motion.stop, taken, horizon_s, plan.dt_s)
     point = setup.programme.sample(motion.programme_s)
     after = MotionState(step.next, motion.programme_s, step.stop)
     return MotionStep(point.T_world_tcp[:3, 3], 0.0, step, after)

@@ -81,7 +81,7 @@ RETREAT_SPEED = 0.25
 
 def clear(
     robot: RobotModel,
-    going: Stop,
+    current_stop: Stop,
     stop: Stop,
     obstacles: Obstacles,
     clearance_m: float,
@@ -96,7 +96,7 @@ def clear(
 
     Args:
         robot: The manipulator.
-        going: Its row 0 is where the step begins.
+        current_stop: Its row 0 is where the step begins.
         stop: From the end of the step on.
         obstacles: The swept volumes, valid until the stop has ended.
         clearance_m: Beyond limb radius + link radius [m].
@@ -108,7 +108,7 @@ def clear(
         The verdict, REFUSED as well where a number is not finite, the stop would leave the range of an axis, an axis
         would have to leap, or coal finds no distance; and the planes for the next tick.
     """
-    q, dq = np.vstack((going.q[:1], stop.q)), np.vstack((going.dq[:1], stop.dq))
+    q, dq = np.vstack((current_stop.q[:1], stop.q)), np.vstack((current_stop.dq[:1], stop.dq))
     last = stop.q[-1]
     within = np.all((robot.q_min <= last) & (last <= robot.q_max))
     if not (obstacles.known and within and _can_be_done(q, dq, robot.ddq_max * dt_s, dt_s)):
@@ -362,9 +362,9 @@ def _gjk(segment: coal.Convex, hull: coal.Convex) -> tuple[float, Floats]:
 
 def decide(
     robot: RobotModel,
-    going: Stop,
-    wanted: Sequence[Proposal] | int,
-    around: Obstacles,
+    current_stop: Stop,
+    proposals: Sequence[Proposal] | int,
+    obstacles: Obstacles,
     horizon_s: float,
     planes: Floats,
     settings: PlanSettings,
@@ -373,9 +373,9 @@ def decide(
 
     Args:
         robot: The manipulator.
-        going: The stop that goes on where nothing else is taken; its row 0 is where the robot is.
-        wanted: The proposals of the method, the one it would like best first; or the reason why there is none.
-        around: The swept volumes of the tick.
+        current_stop: The stop that goes on where nothing else is taken; its row 0 is where the robot is.
+        proposals: The proposals of the method, the one it would like best first; or the reason why there is none.
+        obstacles: The swept volumes of the tick.
         horizon_s: Until when they hold [s].
         planes: (s, l, 3) planes between links and limbs, of the tick before.
         settings: Of the method.
@@ -383,21 +383,19 @@ def decide(
     Returns:
         What is executed, and the planes for the next tick.
     """
-    certify, inside = settings.certified, False
-    if not isinstance(wanted, int):
-        for stop, status in wanted:
-            if not certify:
-                return Taken(stop, status, 0, not stop.ticks and not going.ticks), planes
-            if (stop.ticks + 1) * settings.dt_s > horizon_s + 1e-9:
-                continue
-            verdict, planes = clear(
-                robot, going, stop, around, settings.plan.clearance_m, settings.dt_s, planes, settings.retreat_m
-            )
-            if verdict == CLEAR:
-                return Taken(stop, status, 0, certified=True), planes
-            if verdict == OPENING and (stop.ticks or going.ticks):
-                return Taken(stop, RETREATING, 0, certified=True), planes
-            inside = inside or verdict == OPENING
-        wanted = INSIDE if inside else NOT_CERTIFIED
-    held = not going.ticks and wanted not in (NO_HUMAN, NOT_FINITE)
-    return Taken(going.rest(), LIMITED if held else BRAKING, wanted, certify or not going.ticks), planes
+    certify, reason = settings.certified, proposals if isinstance(proposals, int) else NOT_CERTIFIED
+    for stop, status in () if isinstance(proposals, int) else proposals:
+        if not certify:
+            return Taken(stop, status, 0, not stop.ticks and not current_stop.ticks), planes
+        if (stop.ticks + 1) * settings.dt_s > horizon_s + 1e-9:
+            continue
+        clearance_m, dt_s = settings.plan.clearance_m, settings.dt_s
+        verdict, planes = clear(robot, current_stop, stop, obstacles, clearance_m, dt_s, planes, settings.retreat_m)
+        if verdict == CLEAR:
+            return Taken(stop, status, 0, certified=True), planes
+        if verdict == OPENING and (stop.ticks or current_stop.ticks):
+            return Taken(stop, RETREATING, 0, certified=True), planes
+        reason = INSIDE if verdict == OPENING else reason
+    held = not current_stop.ticks and reason not in (NO_HUMAN, NOT_FINITE)
+    status = LIMITED if held else BRAKING
+    return Taken(current_stop.rest(), status, reason, certify or not current_stop.ticks), planes

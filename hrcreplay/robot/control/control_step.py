@@ -312,8 +312,8 @@ class Taken(NamedTuple):
     certified: bool  #: whether step and stop were found clear of volumes that still hold
 
 
-def stands(sight: Sight, settings: PlanSettings) -> int:
-    """Why nothing is proposed at all: people are not known, or the robot is inside a volume; 0 where neither is so.
+def standstill_reason(sight: Sight, settings: PlanSettings) -> int:
+    """Reason to propose no step: people are not known, or the robot is inside a volume; 0 where neither holds.
 
     Args:
         sight: The robot's distances from people.
@@ -324,12 +324,12 @@ def stands(sight: Sight, settings: PlanSettings) -> int:
     return INSIDE if settings.certified and sight.overlap_m >= settings.retreat_m and sight.distance_m <= 0.0 else 0
 
 
-def made(sight: Sight, going: Stop, taken: Taken, horizon_s: float, dt_s: float) -> Step:
+def make_step(sight: Sight, current_stop: Stop, taken: Taken, horizon_s: float, dt_s: float) -> Step:
     """The record of a tick.
 
     Args:
         sight: What was seen at the tick.
-        going: Its row 0 is where the robot is.
+        current_stop: Its row 0 is where the robot is.
         taken: What is executed.
         horizon_s: Until when the volumes of the tick hold [s].
         dt_s: Length of a tick [s].
@@ -337,7 +337,7 @@ def made(sight: Sight, going: Stop, taken: Taken, horizon_s: float, dt_s: float)
     after = RobotState(taken.stop.q[0], taken.stop.dq[0])
     return Step(
         pose=sight.pose,
-        u=np.asarray((after.dq - going.dq[0]) / dt_s),
+        u=np.asarray((after.dq - current_stop.dq[0]) / dt_s),
         next=after,
         distance_m=sight.distance_m,
         overlap_m=math.nan if math.isnan(sight.distance_m) else sight.overlap_m,
@@ -346,7 +346,7 @@ def made(sight: Sight, going: Stop, taken: Taken, horizon_s: float, dt_s: float)
         status=taken.status,
         reason=taken.reason,
         horizon_s=horizon_s,
-        tau_s=going.ticks * dt_s,
+        tau_s=current_stop.ticks * dt_s,
         certified=taken.certified,
         stop=taken.stop,
     )

@@ -45,7 +45,7 @@ class PathState:
 def propose(
     robot: RobotModel,
     reference: Reference,
-    going: Stop,
+    current_stop: Stop,
     sight: Sight,
     obstacles: Obstacles | None,
     horizon_s: float,
@@ -61,7 +61,7 @@ def propose(
     Args:
         robot: The manipulator.
         reference: The programmed path.
-        going: The stop that goes on where nothing else is taken; its row 0 is where the robot is.
+        current_stop: The stop that goes on where nothing else is taken; its row 0 is where the robot is.
         sight: The robot's pose, and its distances from people.
         obstacles: The swept volumes of the tick, whose rows bound the rate; None: nothing but the robot does.
         horizon_s: Until when they hold [s].
@@ -70,7 +70,7 @@ def propose(
     Returns:
         The step and the stop after it, along the path; a reason where there is none.
     """
-    state, slowest = PathState(*going.along[0].tolist()), going.rest().along[0, 1]
+    state, slowest = PathState(*current_stop.along[0].tolist()), current_stop.rest().along[0, 1]
     fastest, slowed = _fastest(robot, reference, state, sight, obstacles, horizon_s, settings)
     if fastest is None or fastest.rate < slowest - SAME:
         return control_step.NO_SOLUTION

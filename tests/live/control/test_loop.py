@@ -16,7 +16,7 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, TickEvent
 from hrcreplay.live.session import outcome
 from hrcreplay.live.verify import SessionRecomputation
-from hrcreplay.run.followers import QpFollower
+from hrcreplay.robot.control.controllers import QpController
 from tests.live.counted import CountedLoop, counted
 from tests.live.flights import CYCLE_S, Flight
 
@@ -65,7 +65,7 @@ def test_a_step_that_cannot_be_prepared_fails_in_the_answer(monkeypatch: pytest.
     def broken(*_args: object) -> None:
         raise ZeroDivisionError("of the test")
 
-    monkeypatch.setattr(QpFollower, "step", broken)
+    monkeypatch.setattr(QpController, "step", broken)
     flight.controller._ready = None
     flight.controller.prepare()
     assert flight.controller.fault is None

@@ -19,8 +19,8 @@ from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.logs.clean import PersonMemory
 from hrcreplay.logs.skeleton_pb2 import Skeleton
 from hrcreplay.records import STATUSES, CameraFrames, Floats, HumanStates
+from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.model import RobotModel, RobotPose
-from hrcreplay.run.followers import QpFollower
 from tests.live.campaign import violations
 from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, far_away, is_a_stop, start, steps_keep_the_limits
 
@@ -163,7 +163,7 @@ def test_a_robot_waits_for_few_poses_when_it_sets_out(monkeypatch: pytest.Monkey
         return pose(self, *state)
 
     monkeypatch.setattr(RobotModel, "pose", counted)
-    way = start_approach(setup, motion).follower
+    way = start_approach(setup, motion).controller
     assert len(poses) <= 12
     monkeypatch.undo()
     assert way is not None
@@ -273,7 +273,7 @@ def test_a_bug_in_the_stages_brakes_the_robot_and_is_told(monkeypatch: pytest.Mo
     def broken(*_args: object) -> None:
         raise ZeroDivisionError("of the test")
 
-    monkeypatch.setattr(QpFollower, "step", broken)
+    monkeypatch.setattr(QpController, "step", broken)
     before = len(flight.said())
     flight.fly(1.0)
     assert isinstance(flight.controller.fault, ZeroDivisionError)

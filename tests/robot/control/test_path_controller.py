@@ -10,12 +10,12 @@ import pytest
 from hrcreplay.records import Floats, SweptVolumes
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, Step, along_path
+from hrcreplay.robot.control.controllers import ScalingController
 from hrcreplay.robot.control.path_controller import PathState, rates
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.path import programmed
 from hrcreplay.robot.task import Reference, parse_task
-from hrcreplay.run.followers import ScalingFollower
 from hrcreplay.settings.sections import Plan
 from tests.robot.checker import violation
 from tests.robot.distances import by_coal
@@ -49,12 +49,12 @@ def step(
     robot: RobotModel, reference: Reference, state: PathState, seen: Obstacles, settings: PlanSettings
 ) -> tuple[Step, PathState]:
     """One tick from a given state of the path."""
-    follower = ScalingFollower(robot, reference, settings)
+    controller = ScalingController(robot, reference, settings)
     going = along_path(reference.grid, state.s_s, state.rate, robot.ddq_max, settings.dt_s)
     assert going is not None
-    follower.stop = going
-    made = follower.step(lambda _: seen).step
-    return made, PathState(*follower.stop.along[0].tolist())
+    controller.stop = going
+    made = controller.step(lambda _: seen).step
+    return made, PathState(*controller.stop.along[0].tolist())
 
 
 def run(robot: RobotModel, reference: Reference, people: SweptVolumes) -> Iterator[tuple[PathState, Step]]:

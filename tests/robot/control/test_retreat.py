@@ -11,10 +11,10 @@ from hrcreplay.records import STATUSES, Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, OPENING, REFUSED, clear
 from hrcreplay.robot.control.control_step import PlanSettings, Step, at_rest, straight
+from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.path import programmed
 from hrcreplay.robot.task import parse_task
-from hrcreplay.run.followers import QpFollower
 from hrcreplay.settings.sections import Plan
 from tests.robot.control.random_stops import (
     DT_S,
@@ -75,26 +75,26 @@ def test_what_is_called_opening_brings_no_point_of_the_link_nearer_to_any_of_the
     assert refused > 100
 
 
-def follower(robot: RobotModel, retreat_m: float) -> QpFollower:
+def controller(robot: RobotModel, retreat_m: float) -> QpController:
     waypoints = [{"joints_deg": [0, 30, -20, 0, 60, 0]}, {"joints_deg": [5, 30, -20, 0, 60, 0]}]
     path = programmed(parse_task({"name": "small", "repeat": True, "waypoints": waypoints}), robot)
     settings = PlanSettings(Plan(retreat_m=retreat_m), dt_s=DT_S, stop_s=0.377, retreat_m=retreat_m)
-    return QpFollower(robot, path, settings)
+    return QpController(robot, path, settings)
 
 
-def beside(robot: RobotModel, runner: QpFollower, depth_m: float) -> Box:
+def beside(robot: RobotModel, runner: QpController, depth_m: float) -> Box:
     """A slab that the tool is inside of, from the front."""
     tip = link_points(runner.state.q[None])[0, 4]
     return Box(tip[-1] + [0.05 + 0.1 + RADII_M[4] - depth_m, 0.0, 0.0], np.eye(3), np.array([0.1, 0.3, 0.3]), 0.05)
 
 
-def go(runner: QpFollower, box: Box, ticks: int) -> list[Step]:
+def go(runner: QpController, box: Box, ticks: int) -> list[Step]:
     seen = replace(as_obstacles([box]), horizon_s=np.inf)
     return [runner.step(lambda _: seen).step for _ in range(ticks)]
 
 
 def test_a_robot_that_is_a_little_inside_moves_out_slowly_and_goes_on(robot: RobotModel) -> None:
-    runner = follower(robot, 0.05)
+    runner = controller(robot, 0.05)
     box = beside(robot, runner, 0.03)
     began = box.distance_m(link_points(runner.state.q[None])[0, 4]).min()
     steps = go(runner, box, 500)
@@ -114,7 +114,7 @@ def test_a_robot_that_is_a_little_inside_moves_out_slowly_and_goes_on(robot: Rob
 def test_deeper_inside_or_without_retreat_the_robot_stands_and_says_why(
     robot: RobotModel, retreat_m: float, depth_m: float
 ) -> None:
-    runner = follower(robot, retreat_m)
+    runner = controller(robot, retreat_m)
     steps = go(runner, beside(robot, runner, depth_m), 100)
     assert not any(step.next.dq.any() for step in steps)
     assert {step.reason for step in steps} == {control_step.INSIDE}

@@ -24,16 +24,16 @@ from hrcreplay.robot.control.control_step import (
     Step,
     Stop,
     at_rest,
-    made,
+    make_step,
     observe,
-    stands,
+    standstill_reason,
 )
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference, ReferencePoint, advance, tcp_speed_cap
 
 
-class FollowerTick(NamedTuple):
+class ControllerTick(NamedTuple):
     """State, reference and decision of a method at one tick."""
 
     state: RobotState
@@ -50,13 +50,13 @@ class Observation(NamedTuple):
     """What a robot sees of people at a tick."""
 
     sight: Sight  #: its pose, and its distances from people
-    around: Obstacles  #: the swept volumes
+    obstacles: Obstacles  #: the swept volumes
     horizon_s: float  #: until when they hold [s]
     predict: Predict  #: the volumes for any horizon
 
 
 @dataclass
-class Follower(ABC):
+class Controller(ABC):
     """A robot that follows a reference by a method: it takes a step that is certified, or its last stop goes on."""
 
     robot: RobotModel
@@ -74,31 +74,33 @@ class Follower(ABC):
         return RobotState(self.stop.q[0], self.stop.dq[0])
 
     def take_over(self, stop: Stop) -> None:
-        """Goes on from where another follower has brought the robot: with the stop that was certified."""
+        """Goes on from where another controller has brought the robot: with the stop that was certified."""
         self.stop = stop if stop.ticks else at_rest(stop.q[0], np.array([self.s_s, 0.0]))
         self.u = np.zeros(self.robot.nv)
         self.planes = NO_PLANES
 
-    def step(self, predict: Predict) -> FollowerTick:
+    def step(self, predict: Predict) -> ControllerTick:
         """One tick."""
-        settings, going = self.settings, self.stop
+        settings, current_stop = self.settings, self.stop
         state, point, now_s = self.state, self.point, self.s_s
         with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
             seen = self.observe(predict)
-            wanted = self.propose(seen)
-            taken, self.planes = decide(self.robot, going, wanted, seen.around, seen.horizon_s, self.planes, settings)
-        step = made(seen.sight, going, taken, seen.horizon_s, settings.dt_s)
+            proposals = self.propose(seen)
+            taken, self.planes = decide(
+                self.robot, current_stop, proposals, seen.obstacles, seen.horizon_s, self.planes, settings
+            )
+        step = make_step(seen.sight, current_stop, taken, seen.horizon_s, settings.dt_s)
         self.stop, self.u = step.stop, step.u
         self._move_on()
-        return FollowerTick(state, point, now_s, step)
+        return ControllerTick(state, point, now_s, step)
 
     def observe(self, predict: Predict) -> Observation:
         """The people of the tick, with the volumes that hold until the stop after its step would have ended."""
         horizon_s = self.settings.horizon_s(self.stop)
-        around = predict(horizon_s)
-        horizon_s = min(horizon_s, around.horizon_s)  # in a live session those of an earlier look may have to do
+        obstacles = predict(horizon_s)
+        horizon_s = min(horizon_s, obstacles.horizon_s)  # in a live session those of an earlier look may have to do
         return Observation(
-            observe(self.robot, self.state, around, self.settings.plan.clearance_m), around, horizon_s, predict
+            observe(self.robot, self.state, obstacles, self.settings.plan.clearance_m), obstacles, horizon_s, predict
         )
 
     @abstractmethod
@@ -114,13 +116,13 @@ class Follower(ABC):
 Programme = tuple[RobotModel, RobotState, Floats, qp_controller.Target, Sight, Obstacles, float]
 
 
-class QpFollower(Follower):
+class QpController(Controller):
     """The trajectory generator of Section 5 along a reference that waits for it or not."""
 
     def propose(self, seen: Observation) -> list[Proposal] | int:
         """The step that Eq. (66) finds best, and the stop after it."""
         programme = self.programme(seen)
-        return stands(seen.sight, self.settings) or qp_controller.propose(*programme, self.settings)
+        return standstill_reason(seen.sight, self.settings) or qp_controller.propose(*programme, self.settings)
 
     def programme(self, seen: Observation) -> Programme:
         """What Eq. (66) is made of. Its target is the reference one tick later, to which the reference moves on."""
@@ -129,13 +131,13 @@ class QpFollower(Follower):
         self.point = self.reference.sample(self.s_s)
         cap = tcp_speed_cap(self.reference, self.s_s, self.settings.plan)
         target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q, cap)
-        return self.robot, self.state, self.u, target, seen.sight, seen.around, seen.horizon_s
+        return self.robot, self.state, self.u, target, seen.sight, seen.obstacles, seen.horizon_s
 
     def _move_on(self) -> None:
         """The reference has moved already: the program is solved for where it will be."""
 
 
-class PathFollower(Follower):
+class PathController(Controller):
     """A robot that stays on the programmed path: the baselines of ``path_controller``."""
 
     #: Whether the method looks at people at all, and whether the rows of Eq. (66i) bound its rate.
@@ -144,12 +146,12 @@ class PathFollower(Follower):
     def propose(self, seen: Observation) -> list[Proposal] | int:
         """The largest rate along the path that is allowed, and the stop after it."""
         sight = seen.sight
-        reason = stands(sight, self.settings) if self.careful else 0
+        reason = standstill_reason(sight, self.settings) if self.careful else 0
         if reason or sight.reason == NOT_FINITE:
             return reason or sight.reason
         if np.isnan(self.stop.along[0, 0]):
             return NO_SOLUTION  # the stop of another method goes on
-        rows = seen.around if self.by_rows else None
+        rows = seen.obstacles if self.by_rows else None
         return path_controller.propose(
             self.robot, self.reference, self.stop, sight, rows, seen.horizon_s, self.settings
         )
@@ -162,45 +164,45 @@ class PathFollower(Follower):
         self.point = self.reference.sample(self.s_s)
 
 
-class ScalingFollower(PathFollower):
+class ScalingController(PathController):
     """The baseline [24]: the largest share of the programmed speed that meets the constraints."""
 
     by_rows = True
 
 
-class BlindFollower(PathFollower):
+class BlindController(PathController):
     """The programme, whoever is there."""
 
     careful = False
 
 
-class SsmFollower(PathFollower):
+class SsmController(PathController):
     """Speed and separation monitoring, ISO/TS 15066: goes while the protective separation distance is kept."""
 
     def propose(self, seen: Observation) -> list[Proposal] | int:
         """The same, while the protective separation distance is kept."""
-        wanted = super().propose(seen)
-        if isinstance(wanted, int):
-            return wanted
-        present, needed_m = self.protective(seen, wanted[0])
-        return wanted if present.distance_m >= needed_m else TOO_NEAR
+        proposals = super().propose(seen)
+        if isinstance(proposals, int):
+            return proposals
+        present, needed_m = self.protective(seen, proposals[0])
+        return proposals if present.distance_m >= needed_m else TOO_NEAR
 
-    def protective(self, seen: Observation, wanted: Proposal) -> tuple[Sight, float]:
+    def protective(self, seen: Observation, proposal: Proposal) -> tuple[Sight, float]:
         """The people where they are now, and the protective separation distance of a step [m]."""
         pose, settings = seen.sight.pose, self.settings
         present = observe(self.robot, self.state, seen.predict(0.0), settings.plan.clearance_m, pose)
         return present, path_controller.protective_distance_m(
-            pose, wanted.stop, settings.plan.human_speed, settings.latency_s, settings.dt_s
+            pose, proposal.stop, settings.plan.human_speed, settings.latency_s, settings.dt_s
         )
 
 
 #: Method -> how it follows.
-FOLLOWERS: dict[str, type[Follower]] = {
-    "qp": QpFollower,
-    "scaling": ScalingFollower,
-    "shield": PathFollower,
-    "ssm": SsmFollower,
-    "none": BlindFollower,
+CONTROLLERS: dict[str, type[Controller]] = {
+    "qp": QpController,
+    "scaling": ScalingController,
+    "shield": PathController,
+    "ssm": SsmController,
+    "none": BlindController,
 }
 
 
@@ -208,18 +210,18 @@ FOLLOWERS: dict[str, type[Follower]] = {
 class Planner:
     """One method beside the people of each tick."""
 
-    follower: Follower
+    controller: Controller
     chosen: bool  #: the run's method, not a baseline
 
     @property
     def dt_s(self) -> float:
         """The time between two ticks [s]."""
-        return self.follower.settings.dt_s
+        return self.controller.settings.dt_s
 
     def follow(self, t_ns: Ints, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
         """The motion of a batch of ticks, beside what is predicted for each; ``limbs`` names all that can be there."""
-        robot = self.follower.robot
-        rows = [self.follower.step(predict) for predict in around]
+        robot = self.controller.robot
+        rows = [self.controller.step(predict) for predict in around]
         found, points, steps = ([getattr(row, name) for row in rows] for name in ("state", "point", "step"))
         poses = [step.pose for step in steps]
         return Motion(

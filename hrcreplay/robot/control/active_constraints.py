@@ -17,10 +17,17 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.control import qp_controller
 from hrcreplay.robot.control.certificate import MARGIN_M
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Stop
+from hrcreplay.robot.control.controllers import (
+    Controller,
+    Observation,
+    PathController,
+    QpController,
+    ScalingController,
+    SsmController,
+)
 from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, minimise
 from hrcreplay.robot.control.separation import Approach, Obstacles, tick_rows
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.run.followers import Follower, Observation, PathFollower, QpFollower, ScalingFollower, SsmFollower
 
 #: A row whose link could approach faster by no more than this is one that the solution lies on [m/s].
 ACTIVE = 1e-6
@@ -34,10 +41,10 @@ RIDGE = 1e-6
 NEXT = 3
 
 
-class Moment(NamedTuple):
-    """What a follower has before a tick, and what it sees at the tick."""
+class TickContext(NamedTuple):
+    """What a controller has before a tick, and what it sees at the tick."""
 
-    going: Stop
+    current_stop: Stop
     u_before: Floats
     s_s: float
     seen: Observation
@@ -51,63 +58,63 @@ class LinearRows(NamedTuple):
     names: tuple[dict[str, Any], ...]
 
 
-def asked(follower: Follower, moment: Moment) -> tuple[list[Proposal] | int, dict[str, Any]]:
+def propose_explained(controller: Controller, context: TickContext) -> tuple[list[Proposal] | int, dict[str, Any]]:
     """What a method proposes at a tick, and what bounds it.
 
     Args:
-        follower: Its robot, which is brought back to the tick.
-        moment: The tick.
+        controller: Its robot, which is brought back to the tick.
+        context: The tick.
     """
-    follower.stop, follower.u, follower.s_s = moment.going, moment.u_before, moment.s_s
-    follower.point = follower.reference.sample(moment.s_s)
-    if isinstance(follower, QpFollower):
-        return _by_program(follower, moment.seen)
-    wanted = follower.propose(moment.seen)
-    if isinstance(follower, SsmFollower):
-        return wanted, _protective(follower, moment.seen)
-    if isinstance(follower, ScalingFollower):
-        dq = moment.going.rest().dq[0] if isinstance(wanted, int) else wanted[0].stop.dq[0]
-        margins = margins_of(_rows(follower, moment.seen, 0.0), dq, 0.0)
+    controller.stop, controller.u, controller.s_s = context.current_stop, context.u_before, context.s_s
+    controller.point = controller.reference.sample(context.s_s)
+    if isinstance(controller, QpController):
+        return _by_program(controller, context.seen)
+    proposals = controller.propose(context.seen)
+    if isinstance(controller, SsmController):
+        return proposals, _protective(controller, context.seen)
+    if isinstance(controller, ScalingController):
+        dq = context.current_stop.rest().dq[0] if isinstance(proposals, int) else proposals[0].stop.dq[0]
+        margins = margins_of(_rows(controller, context.seen, 0.0), dq, 0.0)
         broken = [row for row in margins if row["margin_m_per_s"] < -ACTIVE]
-        if isinstance(wanted, int):  # even the hardest braking along the path breaks a row
+        if isinstance(proposals, int):  # even the hardest braking along the path breaks a row
             stop = {"kind": "path", "what": "the hardest braking along the path"}
-            return wanted, {"conflict": [*broken[:1], stop], "next": margins[len(broken) :][:NEXT]}
+            return proposals, {"conflict": [*broken[:1], stop], "next": margins[len(broken) :][:NEXT]}
         active = [row for row in margins if row["margin_m_per_s"] <= 1e-4]
-        return wanted, {"binding": active, "next": margins[len(active) :][:NEXT]}
-    return wanted, {}
+        return proposals, {"binding": active, "next": margins[len(active) :][:NEXT]}
+    return proposals, {}
 
 
-def _by_program(follower: QpFollower, seen: Observation) -> tuple[list[Proposal] | int, dict[str, Any]]:
+def _by_program(controller: QpController, seen: Observation) -> tuple[list[Proposal] | int, dict[str, Any]]:
     """The proposals of Eq. (66), the rows that its solution lies on, or those that leave none."""
-    settings = follower.settings
+    settings = controller.settings
     with np.errstate(all="ignore"):
-        programme = follower.programme(seen)
-        wanted = qp_controller.propose(*programme, settings)
+        programme = controller.programme(seen)
+        proposals = qp_controller.propose(*programme, settings)
         task = qp_controller.problem(*programme, settings)
         solved = minimise(task)
         if not isinstance(solved, Solution) and settings.plan.jerk_s > 0.0:
             task = qp_controller.problem(*programme, settings.without_jerk())
             solved = minimise(task)
     if isinstance(solved, Solution):
-        return wanted, held_by(task, solved)
-    return wanted, {"unsolved": solved.status, "conflict": conflict(all_rows(task))}
+        return proposals, held_by(task, solved)
+    return proposals, {"unsolved": solved.status, "conflict": conflict(all_rows(task))}
 
 
-def _rows(follower: Follower, seen: Observation, give_way_m: float) -> Approach:
+def _rows(controller: Controller, seen: Observation, give_way_m: float) -> Approach:
     """The approach rows of a tick."""
-    pairs, plan = seen.sight.pairs, follower.settings.plan
+    pairs, plan = seen.sight.pairs, controller.settings.plan
     if pairs is None:
         raise ValueError("why: the distances from people are not known")
     room = pairs.room_m2(plan.room, give_way_m)
-    return tick_rows(seen.sight.pose, seen.around, room, pairs.distance_m, seen.horizon_s + plan.lead_s)
+    return tick_rows(seen.sight.pose, seen.obstacles, room, pairs.distance_m, seen.horizon_s + plan.lead_s)
 
 
-def _protective(follower: SsmFollower, seen: Observation) -> dict[str, Any]:
+def _protective(controller: SsmController, seen: Observation) -> dict[str, Any]:
     """What speed and separation monitoring compares: the distance now, and the protective one."""
-    wanted = PathFollower.propose(follower, seen)
-    if isinstance(wanted, int):
+    proposals = PathController.propose(controller, seen)
+    if isinstance(proposals, int):
         return {}
-    now, needed_m = follower.protective(seen, wanted[0])
+    now, needed_m = controller.protective(seen, proposals[0])
     pair = {"link": now.link, "limb": now.limb, "distance_m": now.distance_m}
     return {"protective": {**pair, "needed_m": needed_m}}
 
@@ -265,16 +272,21 @@ def _least_broken(A: Floats, b: Floats, chosen: Sequence[int]) -> tuple[float, F
     return float(found.fun), weights
 
 
-def refused(
-    robot: RobotModel, going: Stop, proposal: Proposal, around: Obstacles, horizon_s: float, settings: PlanSettings
+def explain_refusal(
+    robot: RobotModel,
+    current_stop: Stop,
+    proposal: Proposal,
+    obstacles: Obstacles,
+    horizon_s: float,
+    settings: PlanSettings,
 ) -> dict[str, Any]:
     """Where the step and the stop after it are not clear: the first instant, and link and limb there.
 
     Args:
         robot: The manipulator.
-        going: Its row 0 is where the robot is.
+        current_stop: Its row 0 is where the robot is.
         proposal: That was not certified.
-        around: The swept volumes of the tick.
+        obstacles: The swept volumes of the tick.
         horizon_s: Until when they hold [s].
         settings: Of the method.
     """
@@ -287,13 +299,13 @@ def refused(
     if len(beyond):
         return {**found, "why": "out of range", "axis": int(beyond[0]) + 1}
     radius = np.array([segment.radius_m for segment in robot.segments])
-    keep_m = radius[:, None] + around.radius_m + settings.plan.clearance_m + MARGIN_M
-    q, dq = np.vstack((going.q[:1], stop.q)), np.abs(np.vstack((going.dq[:1], stop.dq)))
+    keep_m = radius[:, None] + obstacles.radius_m + settings.plan.clearance_m + MARGIN_M
+    q, dq = np.vstack((current_stop.q[:1], stop.q)), np.abs(np.vstack((current_stop.dq[:1], stop.dq)))
     turned = np.maximum(np.abs(np.diff(q, axis=0)), settings.dt_s * np.maximum(dq[:-1], dq[1:]))
     travel_m = np.vstack((turned @ robot.axis_reach_m, np.zeros((1, len(radius)))))
     worst = np.inf, 0, 0, 0, 0, 0.0
     for i in range(len(q)):  # a link moves by its travel at most until the next tick
-        low, _, near = distances(robot.ends_m(q[i]), around.vertices_m, around.offsets)
+        low, _, near = distances(robot.ends_m(q[i]), obstacles.vertices_m, obstacles.offsets)
         left = low - keep_m - travel_m[i][:, None]
         link, limb = divmod(int(np.argmin(left)), left.shape[1])
         if left[link, limb] < worst[0]:
@@ -305,4 +317,4 @@ def refused(
     why = "not clear" if gap_m <= 0.0 else "not proven until the next tick" if left_m <= 0.0 else "hardly clear"
     found |= {"why": why, "failed_s": i * settings.dt_s, "link": link, "limb": limb, "gap_m": gap_m}
     found["travel_m"] = float(travel_m[i, link])
-    return found | {"vertex_m": around.vertices_m[vertex].tolist()}
+    return found | {"vertex_m": obstacles.vertices_m[vertex].tolist()}
