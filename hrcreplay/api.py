@@ -215,7 +215,7 @@ def fuse(
 
 @dataclass(frozen=True)
 class Volumes:
-    """What the person can reach within the horizon: ``volumes[tick][limb]`` is a convex hull grown by a radius."""
+    """The space that the person can reach within the horizon: ``volumes[tick][limb]`` is a hull plus a radius."""
 
     volumes: SweptVolumes
     horizon_s: float
@@ -294,7 +294,7 @@ def load_task(path: str | Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the robot would have done beside the person, by a method and its baselines."""
+    """The robot's motion beside the person, by a method and its baselines."""
 
     job: Job
     tables: dict[str, pa.Table]  #: of a run folder: motion, motion_<baseline>, occupancy

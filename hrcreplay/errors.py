@@ -1,4 +1,4 @@
-"""What a user can get wrong, each with its exit code.
+"""User errors, each with its exit code.
 
 A message says *where: what was found; what would be right*. A bug keeps its traceback.
 """

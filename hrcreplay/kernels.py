@@ -37,7 +37,7 @@ def njit(**options: Any) -> Callable[[Any], Any]:
 
 @cache
 def folder() -> Path:
-    """Where this process keeps compiled kernels: NUMBA_CACHE_DIR where that is set, else by the digest of the sources.
+    """Folder of this process's compiled kernels: NUMBA_CACHE_DIR where that is set, else by the digest of the sources.
 
     Beside the package, or in the user's cache where that cannot be written.
     """

@@ -140,7 +140,7 @@ class SkeletonTrack(Table):
 
 @dataclass(frozen=True)
 class Measurements(Table):
-    """What the closed-form inverse kinematics makes of the frames, a row a frame, in order of arrival."""
+    """Joint angles and limb lengths of camera frames, a row a frame, in order of arrival."""
 
     capture_ns: Ints  #: (n,)
     arrival_ns: Ints  #: (n,)
@@ -197,7 +197,7 @@ class HumanStates(Table):
 
 @dataclass(frozen=True)
 class SweptVolumes:
-    """What the person can reach within the horizon: per tick and limb the convex hull of ``vertices`` + a ball.
+    """Reachable space within the horizon: per tick and limb the convex hull of ``vertices`` + a ball.
 
     ``vertices_m[offsets[i * len(limbs) + l] : offsets[i * len(limbs) + l + 1]]`` belong to tick i, limb l.
     A limb that cannot be predicted (no state yet) has one NaN vertex: whoever plans against it must brake.
@@ -228,7 +228,7 @@ STATUSES = ("tracking", "limited", "braking", "retreating")
 
 @dataclass(frozen=True)
 class Motion(Table):
-    """What the robot was told, a row a tick."""
+    """Commanded motion of the robot, a row a tick."""
 
     t_ns: Ints  #: (n,)
     q: Floats  #: (n, nv) at the tick [rad]
@@ -245,7 +245,7 @@ class Motion(Table):
     link: Ints  #: (n,) index into ``links`` of the nearest pair; -1 without one
     status: Ints  #: (n,) index into STATUSES
     reason: Ints  #: (n,) index into ``reasons``: why it braked or stood, 0 where it did neither
-    horizon_s: Floats  #: (n,) until when the volumes hold that the tick was decided with, from the tick on [s]
+    horizon_s: Floats  #: (n,) horizon of the volumes used at the tick, from the tick on [s]
     tau_s: Floats  #: (n,) how long the stop from the tick's velocity takes [s]
     certified: Bools  #: (n,) whether this tick's step, or the stop it continues, has a certificate that holds
     limbs: tuple[str, ...]

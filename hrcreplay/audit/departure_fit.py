@@ -67,7 +67,7 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
 
 
 def counted(samples: Sequence[LimbDepartures]) -> list[bool]:
-    """Which logs count where ticks of all are counted together: those without the truth; without any such log, all."""
+    """Mark the logs that count where ticks of all are counted together: those without the truth, else all."""
     all_true = all(sample.true for sample in samples)
     return [all_true or not sample.true for sample in samples]
 

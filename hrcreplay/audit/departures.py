@@ -1,4 +1,4 @@
-"""How far whole limbs depart from constant velocity on recordings: what ``departure_fit`` fits bounds to.
+"""Departure of whole limbs from constant velocity on recordings, for the bounds that ``departure_fit`` fits.
 
 At a tick the pelvis departs until a horizon by how far it rises above, and sinks below, its heights at the tick and
 where its velocity takes it, and a limb by how far its recorded points get from its tube (``velocity_tube``) without the
@@ -21,7 +21,7 @@ from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, tubes
 from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.run.build import PredictionStage
-from hrcreplay.run.containment import RecordedFuture, check_containment, flesh_m, recorded_future
+from hrcreplay.run.containment import RecordedFuture, body_radii_m, check_containment, recorded_future
 from hrcreplay.run.recording import TRUTH, Recording
 
 #: Robots beside people stop within some 10 to 100 ms; nothing is known before the first horizon that is measured [s].
@@ -95,7 +95,7 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
     @cache
     def beyond_m(k: int, rise_m: float, sink_m: float) -> Floats:
         volumes = tube_stage(stage, _bare(horizon_s, rise_m, sink_m), residual=False).volumes(states, horizon_s[k])
-        found = check_containment(volumes, futures[k], flesh_m(stage), nothing).beyond_m
+        found = check_containment(volumes, futures[k], body_radii_m(stage), nothing).beyond_m
         found = np.where(asked[k], found, np.nan)
         found[~at[k].legs_shown, LEGS] = np.nan
         return found

@@ -203,7 +203,7 @@ def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
 
 
 def _margins(prediction_stage: PredictionStage) -> tuple[Any, ...]:
-    """What ``sound`` adds to the model."""
+    """Margins that ``sound`` adds to the model."""
     occupancy = prediction_stage.occupancy
     names = ("sigmas", "latency_s", "hand_m", "legs_radius_m", "legs", "residual", "residual_unknown_m")
     return (*(getattr(occupancy, name) for name in names), prediction_stage.memory_s)

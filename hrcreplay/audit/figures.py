@@ -75,7 +75,7 @@ def trade_off(found: Mapping[str, Any]) -> Figure:
 
 
 def _drawn(figures: Mapping[str, Any]) -> bool:
-    """Whether a method has a place in the figure: a volume of 0 has none on an axis of powers."""
+    """Return whether a method has a place in the figure: a volume of 0 has none on an axis of powers."""
     return bool(figures["union_m3"]["value"]) and figures["covered_share"]["value"] is not None
 
 

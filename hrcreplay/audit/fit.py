@@ -34,7 +34,7 @@ from hrcreplay.version import __version__
 
 
 def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) -> list[str]:
-    """What the user should know of a fit.
+    """Lines on a fit for the user.
 
     Args:
         found: The fit.
@@ -94,7 +94,7 @@ def _by_horizon(found: dict[str, Any], shares: Sequence[dict[str, Any]]) -> str:
 
 
 class FitReport(NamedTuple):
-    """What a fit tells."""
+    """Report of a fit."""
 
     lines: list[str]  #: what the user should know
     missed: str  #: where whole limbs are inside less often than asked for in recordings not fitted to; empty: nowhere
@@ -305,7 +305,7 @@ def _sizes(stage: PredictionStage, one: LimbDepartures, fold: Departure, coverag
 
 
 def _missed(facts: dict[str, Any], coverage: float) -> str:
-    """Where whole limbs that were not fitted to are inside less often than asked for."""
+    """Whole limbs that were not fitted to and are inside less often than required."""
     wanted = [(facts["pooled_are"], facts["unknown"], coverage)]
     wanted += [(log["name"], log["shares"], 1.0 - EACH * (1.0 - coverage)) for log in facts["logs"]]
     return "; ".join(

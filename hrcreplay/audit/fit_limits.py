@@ -37,7 +37,7 @@ ARMS = slice(4, 12)
 
 @dataclass(frozen=True)
 class Futures(Table):
-    """What each joint did within the horizon of a tick, seen from the fused state. (n, 13) each.
+    """Motion of each joint within the horizon of a tick, relative to the fused state. (n, 13) each.
 
     x and y are those of the body frame at the tick: forward, to the left. NaN where not recorded to the end.
     """
@@ -276,7 +276,7 @@ def rounded_up(values: Floats) -> Floats:
 
 
 def count_excursions(t_ns: Ints, moving: Bools, horizon_s: float) -> int:
-    """How many of the moving ticks fit behind each other without a common future."""
+    """Number of moving ticks that fit behind each other without a common future."""
     count, free_ns = 0, -1
     for t in t_ns[moving].tolist():
         if t >= free_ns:

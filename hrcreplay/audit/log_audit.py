@@ -25,8 +25,8 @@ from hrcreplay.run.containment import (
     Outcome,
     RecordedFuture,
     asked_rows,
+    body_radii_m,
     check_containment,
-    flesh_m,
     recorded_future,
 )
 from hrcreplay.run.job import Job
@@ -36,7 +36,7 @@ from hrcreplay.store.run_folder import Stopwatch
 
 
 def standstill_s(prediction_stage: PredictionStage) -> float:
-    """How long the person must stay in what was predicted: until the robot has reacted and braked [s]."""
+    """Time for which the person must stay in the prediction: until the robot has reacted and braked [s]."""
     return prediction_stage.horizon_s + prediction_stage.occupancy.latency_s
 
 
@@ -221,8 +221,8 @@ def _hold(
     for first in range(0, n, _BATCH):
         some = future.rows(slice(first, first + _BATCH))
         counted = np.arange(first, first + len(some.states)) % union_every == 0
-        swept, flesh = volumes(prediction_stage, some, method), flesh_m(prediction_stage)
-        parts.append(check_containment(swept, some, flesh, counted, first))
+        swept, limb_radius = volumes(prediction_stage, some, method), body_radii_m(prediction_stage)
+        parts.append(check_containment(swept, some, limb_radius, counted, first))
         progress(len(some.states))
     return Outcome.join(parts)
 
@@ -259,7 +259,7 @@ def _shorter(
 
 
 def _remarks(recording: Recording, audited_s: float, horizon_s: float) -> tuple[str, ...]:
-    """What the reader of one log's figures must know."""
+    """Remarks on one log's figures."""
     notes = [f"the recorded future is the {recording.source}"]
     if others := recording.counts.get("person_frames_beside_others"):
         notes.append(f"{others} frames show at least one other body: nothing was predicted of it, and nothing audited")

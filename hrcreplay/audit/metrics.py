@@ -53,7 +53,7 @@ def ticks_of(part: Mapping[str, Any], method: str, limb: str) -> int:
 
 
 def unchecked_notes(part: Mapping[str, Any], method: str) -> list[str]:
-    """What the reader of a log's figures must know of what was not checked."""
+    """Remarks on what a log's figures did not check."""
     told = []
     if gaps := never_checked(part, method):
         told.append(f"not checked at all, so nothing is said of it: {', '.join(gaps)}")
@@ -87,7 +87,7 @@ def checked_table(total: Mapping[str, Any], method: str) -> PageTable:
 
 
 def checked_cameras(log: Mapping[str, Any]) -> PageTable:
-    """How many of each camera's points were rejected."""
+    """Number of rejected points of each camera."""
     rows = tuple(
         (camera, *("\u2013" if count is None else str(count) for count in counts.values()))
         for camera, counts in log["cameras"].items()
@@ -105,8 +105,8 @@ def checked_cameras(log: Mapping[str, Any]) -> PageTable:
 
 #: Several limbs together -> what their share is of.
 WHAT = {
-    "all": "every limb that was checked, flesh and all, in its own volume",
-    "upper": "every limb that was checked, flesh and all, the lower body left out, in its own volume",
+    "all": "every limb that was checked, limb radius included, in its own volume",
+    "upper": "every limb that was checked, limb radius included, the lower body left out, in its own volume",
 }
 UNCHECKED = "not checked: not seen to the end of a horizon"
 #: Ticks of one escape may have so many ticks without one between them.

@@ -95,10 +95,10 @@ def _answer(found: Mapping[str, Any]) -> Answer:
     limits = sorted({log["limits"] for log in found["logs"]})
     words = (
         f"Method {METHODS.get(method, method)}, limits {', '.join(limits)}: at so many of {share['samples']} ticks, "
-        f"every limb that was checked ({checked_scope(found['total'], method)}) stayed, flesh and all, around its "
-        f"recorded points ({', '.join(sources)}) in its own volume for all of the next {found['horizon_s']:g} s. "
-        f"95 % interval {100 * share['low']:.1f} to {100 * share['high']:.1f} %. Asked of the points alone, which "
-        f"grants the flesh as tolerance, it is {100 * whole['points_share']['value']:.1f} %."
+        f"every limb that was checked ({checked_scope(found['total'], method)}) stayed with its whole thickness around "
+        f"its recorded points ({', '.join(sources)}) in its own volume for all of the next {found['horizon_s']:g} s. "
+        f"95 % interval {100 * share['low']:.1f} to {100 * share['high']:.1f} %. For skeleton points only, "
+        f"limb thickness ignored, it is {100 * whole['points_share']['value']:.1f} %."
     )
     deepest = whole["escape_max_m"]
     if deepest is not None:
@@ -204,7 +204,7 @@ def _counted(error: float) -> str:
 
 
 def _lower(found: Mapping[str, Any]) -> str:
-    """Which methods have a lower body that can leave its volume."""
+    """Methods with a lower body that can leave its volume."""
     methods = found["total"]["methods"]
     have = [METHODS.get(m, m) for m in in_order(methods) if "LEGS" in methods[m]]
     if not have:
@@ -213,7 +213,7 @@ def _lower(found: Mapping[str, Any]) -> str:
 
 
 def _equal(found: Mapping[str, Any]) -> str:
-    """How much room our methods take where their curves reach a baseline's coverage less half a percent."""
+    """Volumes of our methods where their curves reach a baseline's coverage less half a percent."""
     peer = found["total"]["methods"].get("v2_a50")
     if peer is None or peer["upper"]["covered_share"]["value"] is None or not peer["upper"]["union_m3"]["value"]:
         return ""

@@ -1,4 +1,4 @@
-"""What an audit asks of the recorded motion alone: when limbs first moved, and how far the filter's state was off."""
+"""Audit of the recorded motion alone: when limbs first moved, and how far the filter's state was off."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ACROSS_NS, _GAP_NS, _SEEN_S = 40_000_000, 100_000_000, 0.25
 
 
 def errors_in_deviations(recording: Recording, ticks: Ints) -> Floats:
-    """How far the fused positions and velocities were from the recorded ones, in their standard deviations.
+    """Errors of the fused positions and velocities, in their standard deviations.
 
     Args:
         recording: The log.

@@ -124,7 +124,7 @@ def _checks(cell: Cell, tracks: list[SkeletonTrack]) -> CameraChecks:
 
 
 def person_positions(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tuple[str, ...]:
-    """Where the person stood in the cell's world and which way its axes point: what a robot's base is placed by."""
+    """Position and axes of the person in the cell's world, for placing a robot's base."""
     looks_along = abs(cell.T_world_camera[root][2, 2]) <= LEVEL_VIEW
     x = f"x points where {root} looks, along the floor" if looks_along else f"x points along {root}'s own x"
     there = [transform(T, track.points_m) for T, track in zip(cell.T_world_camera.values(), tracks, strict=True)]
@@ -223,7 +223,7 @@ def _tree(tracks: list[SkeletonTrack], root: int) -> list[Pair]:
 
 
 def _tie(tracks: list[SkeletonTrack], pair: Pair, known: Registration, search_s: float, log: Log) -> Registration:
-    """How camera b stands to the root, by way of camera a."""
+    """Pose of camera b relative to the root, by way of camera a."""
     a, b = (tracks[i] for i in pair)
     search_s += round(abs(b.delay_s - a.delay_s), 1)
     names = " and ".join(log.header.cameras[i] for i in pair)

@@ -40,7 +40,7 @@ def _check_area(corners: list[list[float]]) -> list[list[float]]:
 
 
 class Residual(BaseModel):
-    """How far two cameras are apart about the same person once calibrated, outliers included."""
+    """Distance between two calibrated cameras about the same person, outliers included."""
 
     model_config = _STRICT
 
@@ -55,7 +55,7 @@ class Residual(BaseModel):
 
 
 class Watched(BaseModel):
-    """What the cameras see together: whoever has any part of the body in it is shown by one of them."""
+    """Area that the cameras see together: one of them shows everybody who has any part of the body in it."""
 
     model_config = _STRICT
 

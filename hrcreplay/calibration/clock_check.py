@@ -51,7 +51,7 @@ class ClockCheck:
                 yield _remark((first, a.delay_s), (name, b.delay_s), offset)
 
     def _tracks(self) -> dict[str, SkeletonTrack]:
-        """What each camera saw, in the world."""
+        """The world track of each camera."""
         table = CameraFrames.join(self._kept) if self._kept else None
         if table is None:
             return {}

@@ -39,7 +39,7 @@ class Registration:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """What remains between two registered tracks, over every point that both saw, outliers included."""
+    """Residual between two registered tracks, over every point that both saw, outliers included."""
 
     median_m: float
     p95_m: float
@@ -188,7 +188,7 @@ def find_clock_offset(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float) ->
 
 
 def disagreement(a: SkeletonTrack, b: SkeletonTrack, found: Registration) -> Disagreement | None:
-    """What remains between the raw points of two registered tracks, b interpolated linearly to a's instants.
+    """Residual between the raw points of two registered tracks, b interpolated linearly to a's instants.
 
     Returns:
         Median and 95th percentile over all point pairs of positive confidence [m]; None where there is no pair.

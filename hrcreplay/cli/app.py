@@ -69,7 +69,7 @@ def info(
     topic: Topic = None,
     cell: CellFile = None,
 ) -> None:
-    """What a log holds, and what is missing for the next step."""
+    """Show the content of a log, and what is missing for the next step."""
     sys.stdout.write("\n".join(commands.describe(log, config, as_overrides(settings, topic), cell)) + "\n")
 
 
@@ -226,7 +226,7 @@ def report(
 def _part_of_report(
     source: Path | None, figure: str | None, snapshot: float | None, out: Path | None, *, listed: bool
 ) -> None:
-    """What ``report`` makes of a run folder without making another."""
+    """Parts that ``report`` makes of a run folder without making another."""
     from hrcreplay.run.report import draw_figures, list_figures, take_still
 
     if listed:
@@ -266,7 +266,7 @@ def compare(
         int, typer.Option("--processes", min=1, max=2, help="How many plan at once; changes no result.")
     ] = 2,
 ) -> None:
-    """What if another controller had been running: methods side by side on the same recording."""
+    """Compare methods side by side on the same recording: what if another controller had been running?"""
     from hrcreplay.run import compare as comparing
 
     folder = comparing.run(
@@ -292,7 +292,7 @@ def why(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all facts as JSON.")] = False,
 ) -> None:
-    """What held the robot at an instant of a run: limb, link, vertex and row, or where its stop was refused."""
+    """Explain the robot's step at an instant of a run: limb, link, vertex and row that held it, or its refused stop."""
     import json
 
     from hrcreplay.run import why as explaining
@@ -316,7 +316,7 @@ def audit(
     start: Start = None,
     end: End = None,
 ) -> None:
-    """How often people left the volumes that were predicted for them, by method and limb."""
+    """Count how often people left the volumes that were predicted for them, by method and limb."""
     from hrcreplay.audit import driver
 
     overrides = as_overrides(settings, topic, limits)
@@ -356,6 +356,25 @@ def fit_limits(
     sys.stdout.write(f"{out}\n")
     if found.missed:
         raise CoverageMissed(f"{out}: {found.missed}")
+
+
+@app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the three files.")] = Path(),
+) -> None:
+    """Write commented files to begin with: cell.toml, task.toml and settings.toml."""
+    for path in commands.write_templates(folder):
+        sys.stdout.write(f"{path}\n")
+
+
+@app.command(name="settings")
+def settings_(
+    section: Annotated[str | None, typer.Argument(metavar="SECTION", help="Only this one, such as fusion.")] = None,
+) -> None:
+    """Print all settings with their defaults, units and meanings, as a settings file."""
+    from hrcreplay.settings.listing import as_toml
+
+    sys.stdout.write(as_toml(section))
 
 
 @app.command()

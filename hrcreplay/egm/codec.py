@@ -326,7 +326,7 @@ def _fill_clock(place: Any, clock_ns: int, *, stamp: bool) -> None:
 
 
 def _fill_edition(message: Any, packet: RobotPacket, version: str) -> None:
-    """What the editions have beyond each other, at rest where this robot has nothing to say."""
+    """Fills the fields that only some editions have; at rest where this robot has nothing to say."""
     still = [0.0] * ARM_JOINTS
     if version == "A":
         message.measured_force = messages.MeasuredForceA(force=still).SerializeToString()

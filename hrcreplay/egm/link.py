@@ -67,7 +67,7 @@ _ALONE = 1.5
 
 @dataclass(frozen=True, slots=True)
 class PacketStatus:
-    """How a packet is to be treated.
+    """Classification of a received packet.
 
     Attributes:
         answer: It is to be answered, at once.
@@ -202,7 +202,7 @@ class EgmSession:
         return Correction(seqno=self._seqno, tm_ms=t_ns // 1_000_000 % WRAP, q=q, dq=dq)
 
     def _place(self, packet: RobotPacket, t_ns: int) -> tuple[str, int]:
-        """What the packet is to the conversation, and how many are missing before it.
+        """Relation of the packet to the conversation, and how many packets are missing before it.
 
         Returns:
             "new" after a pause, "next", "again" where it makes its predecessor a new session, a refusal or an alarm.
@@ -221,11 +221,11 @@ class EgmSession:
         return kind, lost
 
     def _live(self, t_ns: int) -> bool:
-        """Whether a robot is being answered."""
+        """Return whether a robot is being answered."""
         return self._answered and t_ns - self._heard_ns <= self._silence_ns
 
     def _follows_rival(self, packet: RobotPacket) -> bool:
-        """Whether the packet goes on with what may be a new session."""
+        """Return whether the packet continues a possible new session."""
         return self._rival is not None and _follows(packet, self._rival)[0] == "next"
 
     def _passed_s(self, lost: int, t_ns: int) -> float:
@@ -234,13 +234,13 @@ class EgmSession:
         return (t_ns - self._last_ns) * 1e-9 + cycles * self._cycle_s
 
     def _reaches(self, q: Floats, lost: int, t_ns: int) -> bool:
-        """Whether the axes can have come to q (n,) [rad] since then."""
+        """Return whether the axes can have come to q (n,) [rad] since then."""
         assert self._last is not None  # noqa: S101 - for the type checker
         way = _FASTER * self._dq_max * self._passed_s(lost, t_ns) + _NOISE_RAD
         return bool(np.all(np.abs(q - self._last.q) <= way))
 
     def _hurries(self, packet: RobotPacket, lost: int, t_ns: int) -> bool:
-        """Whether its clock runs ahead: believed, it would make those of the robot itself look stale."""
+        """Return whether its clock runs ahead: believed, it would make those of the robot itself look stale."""
         if packet.clock_ns is None or self._last is None or self._last.clock_ns is None:
             return False
         return (packet.clock_ns - self._last.clock_ns) * 1e-9 > self._passed_s(lost, t_ns)
@@ -279,7 +279,7 @@ class EgmSession:
         return PacketStatus(answer=False, fresh=False, allowed=self._allowed, reason=reason, ended=False, lost=0)
 
     def _judge(self, packet: RobotPacket, lost: int) -> PacketStatus:
-        """Whether the robot may be moved."""
+        """Return whether the robot may be moved."""
         allowed = packet.motors == Motors.ON and packet.mci == Mci.RUNNING and packet.rapid != Rapid.STOPPED
         self._fresh = self._fresh or (allowed and not self._allowed)
         self._allowed = allowed
@@ -293,7 +293,7 @@ class EgmSession:
         return PacketStatus(answer=True, fresh=self._fresh, allowed=allowed, reason=reason, ended=ended, lost=lost)
 
     def _standing(self, packet: RobotPacket) -> str:
-        """Why the robot may not move. EGM does not run before the first answer: that is no stop."""
+        """Reason why the robot may not move. EGM does not run before the first answer: that is no stop."""
         if packet.motors != Motors.ON:
             return "motors off"
         if packet.mci == Mci.ERROR:
@@ -306,7 +306,7 @@ class EgmSession:
 
 
 def _follows(packet: RobotPacket, last: RobotPacket) -> tuple[str, int]:
-    """What a packet is to one before it, "next", a refusal or a restart, and how many are missing between them."""
+    """Relation of a packet to one before it: "next", a refusal or a restart, and how many are missing between them."""
     if packet.seqno is None or last.seqno is None:
         return "next", 0
     if (packet.clock_ns or 0) < (last.clock_ns or 0) and packet.seqno != 0:

@@ -115,7 +115,7 @@ def _turn_outward(vertices: Floats, faces: Ints, neighbors: Ints) -> None:
 
 @njit(cache=True)
 def _runs_same_way(a: Ints, b: Ints) -> bool:
-    """Whether two triangles have an edge in common, in the same direction."""
+    """Return whether two triangles have an edge in common, in the same direction."""
     for i in range(3):
         for k in range(3):
             if a[i] == b[k] and a[(i + 1) % 3] == b[(k + 1) % 3]:

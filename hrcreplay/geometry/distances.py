@@ -196,7 +196,7 @@ def _edge(on: Carriers, i: int) -> bool:
 
 
 def protrusion_m(axes: Floats, radius_m: float, vertices: Floats, ball_m: float) -> Floats:
-    """How far capsules stand out of the convex hull of points with a ball around each; negative: deep inside the ball.
+    """Distance by which capsules stand out of a hull with a ball around each point; negative: inside the ball.
 
     The distance from a convex set is convex, so no point of an axis is further away than one of its ends.
 

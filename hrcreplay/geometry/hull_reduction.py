@@ -52,7 +52,7 @@ def surface() -> Surface:
 
 @njit(cache=True)
 def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:  # noqa: D417
-    """Whether a point is proven to be inside of all triangles.
+    """Return whether a point is proven to be inside of all triangles.
 
     Args:
         x, y, z: The point [m].
@@ -149,7 +149,7 @@ def _outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:  # n
 
 @njit(cache=True)
 def is_loop(edges: int, faces: Int32s) -> bool:
-    """Whether the edges are one simple loop: a closed surface stays closed when that is cut out of it and filled.
+    """Return whether the edges are one simple loop, so that the surface stays closed when it is cut out and filled.
 
     They enter each slot as often as they leave it, so who follows them stays on them. Who is back at the start after as
     many steps as there are edges, and not before, has been along each of them.
@@ -263,7 +263,7 @@ def keep_corners(points: Floats, count: int, work: Surface) -> tuple[int, int]:
 
 @njit(cache=True)
 def _among(mark: float, marks: Floats, kept: int) -> bool:
-    """Whether a mark is among the first."""
+    """Return whether a mark is among the first."""
     alike = 0
     for k in range(kept):
         alike += marks[k] == mark
@@ -272,7 +272,7 @@ def _among(mark: float, marks: Floats, kept: int) -> bool:
 
 @njit(cache=True)
 def _same(points: Floats, kept: int, i: int) -> int:
-    """Where a point stands already among the kept, or where it would go."""
+    """Index at which a point is already kept, or would be inserted."""
     for k in range(kept):
         if points[k, 0] == points[i, 0] and points[k, 1] == points[i, 1] and points[k, 2] == points[i, 2]:
             return k

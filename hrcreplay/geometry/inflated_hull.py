@@ -85,7 +85,7 @@ def union_volume_m3(solids: Sequence[InflatedHull], points: int, first: int = 0)
 
 
 def _inside(solids: Sequence[InflatedHull], low: Floats, high: Floats, points: int, first: int = 0) -> Bools:
-    """Which of the points that fill a box evenly, from ``low`` (3,) to ``high`` (3,) [m], are in any of the solids."""
+    """Mark the points, evenly spread in a box from ``low`` (3,) to ``high`` (3,) [m], that are in any of the solids."""
     samples = (0.5 + np.arange(first, first + points)[:, None] * _STEPS) % 1.0 * (high - low) + low
     inside = np.zeros(points, dtype=np.bool_)
     for solid in solids:
@@ -105,7 +105,7 @@ def _distances(points: Floats, vertices: Floats, faces: Ints) -> Floats:
 
 @njit(cache=True)
 def _behind(vertices: Floats) -> float:
-    """How far behind a triangle a point must be to be clearly behind it [m]."""
+    """Distance behind a triangle at which a point counts as clearly behind it [m]."""
     size = 0.0
     for vertex in vertices:
         for k in range(3):
@@ -183,7 +183,7 @@ def _triangle(p: Floats, a: Floats, b: Floats, c: Floats, normal: Floats, height
 
 @njit(cache=True)
 def _left(p: Floats, a: Floats, b: Floats, normal: Floats) -> bool:
-    """Whether p is on the inner side of the edge from a to b of a triangle with that normal."""
+    """Return whether p is on the inner side of the edge from a to b of a triangle with that normal."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     wx, wy, wz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
     x, y, z = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx

@@ -44,7 +44,7 @@ _DEGREE = np.pi / 180.0
 
 @dataclass(frozen=True)
 class Departure:
-    """How far whole limbs get from where the fused velocity takes them, measured on recordings.
+    """Measured bounds on how far whole limbs depart from constant velocity.
 
     The body may be ``rise_m`` higher and ``sink_m`` lower than its velocity says. Until a horizon no point of a limb is
     further from the hull of the limb at the tick and at all these places later (``human.prediction.velocity_tube``)

@@ -37,7 +37,7 @@ class Difference:
 
     @property
     def tolerable(self) -> bool:
-        """Whether another processor may be all there is to it."""
+        """Return whether another processor alone can explain the difference."""
         return self.size <= TOLERANCE
 
     def at(self, where: str) -> Difference:
@@ -71,7 +71,7 @@ def _counts_differing(names: Sequence[str], recorded: int, again: int) -> Differ
 
 
 def _bits_differ(recorded: Floats, again: Floats) -> Bools:
-    """Where two arrays differ by a bit; any NaN is like any other."""
+    """Mark the elements of two arrays that differ by a bit; any NaN equals any other."""
     mine, yours = (np.ascontiguousarray(values, dtype=np.float64) for values in (recorded, again))
     return np.asarray((mine.view(np.int64) != yours.view(np.int64)) & ~(np.isnan(mine) & np.isnan(yours)))
 

@@ -52,7 +52,7 @@ def describe_exception(error: BaseException) -> str:
 
 
 def describe_exit(code: int) -> str:
-    """How a process ended that left nothing else: killed, or by an exit code."""
+    """Describe the end of a process that left no other trace: killed, or by an exit code."""
     if code >= 0:
         return f"ended with exit code {code}"
     with suppress(ValueError):
@@ -81,7 +81,7 @@ def write_crash(folder: Path, part: str, error: BaseException | str) -> str:
 
 
 def read_crashes(folder: Path) -> list[str]:
-    """What there is to say of the crashes that a session's folder holds, a line each."""
+    """Describe the crashes that a session's folder holds, a line each."""
     lines = []
     for path in sorted(folder.glob(f"{PREFIX}*.txt")):
         text = path.read_text(errors="replace").splitlines()
@@ -90,7 +90,7 @@ def read_crashes(folder: Path) -> list[str]:
 
 
 def has_crash_file(folder: Path, part: str) -> bool:
-    """Whether a part has left a file."""
+    """Return whether a part has left a crash file."""
     return _file(folder, part).exists()
 
 
@@ -154,7 +154,7 @@ class ControlChannel:
 
 
 class Inbox:
-    """What came from control and is not written yet. A thread empties the socket, so that no disk makes it fill up."""
+    """Messages from control that are not written yet. A thread empties the socket, so that no disk makes it fill up."""
 
     def __init__(self, control: socket.socket) -> None:
         self._control = control
@@ -250,7 +250,7 @@ class HelperProcess:
                 yield message
 
     def crashed(self) -> bool:
-        """Whether it has ended with an unexpected exit code; False while it runs or is about to end."""
+        """Return whether it has ended with an unexpected exit code; False while it runs or is about to end."""
         return not self.alive and self.process.poll() not in (None, *self._told)
 
     def close(self, patience_s: float) -> int | None:

@@ -108,7 +108,7 @@ def _finish(partial: Path, crashes: list[str]) -> Path:
 
 
 def _broken_off(partial: Path, crashes: list[str]) -> LiveStopped:
-    """What to say of a session that no run folder can be made of; what there is of it says the same."""
+    """Describe a session that no run folder can be made of; what there is of it says the same."""
     folder.keep_incomplete(partial, crashes)
     return LiveStopped(f"{crashes[0]}; not complete: what there is of the record, and the traceback, is in {partial}")
 
@@ -222,7 +222,7 @@ def _run_loop(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bo
 
 
 def outcome(loop: Loop) -> dict[str, Any]:
-    """What there is to say of a session at its end, as JSON."""
+    """Result of a session at its end, as JSON."""
     return {
         "stops": [{"t_ns": t_ns, "reason": reason} for t_ns, reason in loop.controller.stops],
         "reason": _reason(loop),
@@ -272,7 +272,7 @@ _LEFT_ALONE = {
 
 @contextmanager
 def _signals(loop: Loop) -> Iterator[None]:
-    """What would end or suspend the process becomes a signal of the loop: the robot brakes before anything ends."""
+    """Turn signals of the process into signals of the loop: the robot brakes before anything ends."""
 
     def catch(number: int, _frame: FrameType | None) -> None:
         loop.caught |= _MEANING.get(number, Signal.OTHER)
@@ -337,6 +337,6 @@ def _screen_arguments(request: Request) -> list[str]:
 
 
 def default_out(human: Path | None) -> Path:
-    """Where a session is left when nobody says where."""
+    """Default folder of a session."""
     name = "zenoh" if human is None else human.stem
     return Path("reports") / name / f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-live"

@@ -46,7 +46,7 @@ _CONTEXT = ("versions", "limits", "task", "cell")  #: of run.json: what else may
 
 
 class Agreement(IntEnum):
-    """How a run came out when it was computed again; the value is the exit code."""
+    """Outcome of computing a run again; the value is the exit code."""
 
     IDENTICAL = 0
     DIFFERS = EXIT_DIFFERS
@@ -55,14 +55,14 @@ class Agreement(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How a run came out again, and what there is to say of it."""
+    """Outcome of computing a run again, with its explanation."""
 
     agreement: Agreement
     lines: tuple[str, ...]
 
     @property
     def identical(self) -> bool:
-        """Whether every bit was the same."""
+        """Return whether every bit was the same."""
         return self.agreement is Agreement.IDENTICAL
 
 
@@ -78,7 +78,7 @@ _PARTS = {
 
 
 def find_other_parts(recorded: dict[str, Any]) -> str:
-    """What of the machine is not that of the record, in words; empty where all of it is, or the record names none.
+    """Parts of the machine that differ from the record's, in words; empty where none does, or the record names none.
 
     Other versions come with it, but do not alone explain a difference.
     """
@@ -91,7 +91,7 @@ def find_other_parts(recorded: dict[str, Any]) -> str:
 
 
 def _origin(recorded: dict[str, Any]) -> tuple[str, ...]:
-    """Where a run was recorded and where it was computed again."""
+    """Machines on which a run was recorded and computed again."""
     here = describe_machine()
     machine = recorded.get("machine")
     if machine == here:
@@ -161,7 +161,7 @@ def _compared(run: Path, meta: dict[str, Any], made: Path) -> Verdict:
 def _output_differing(
     name: str, run: Path, made: Path, recorded: dict[str, str], again: dict[str, str]
 ) -> list[Difference]:
-    """What differs in an output whose bytes do; nothing for one that is drawn, of which the bytes are all there is."""
+    """Differences within an output whose bytes differ; none for a drawn one, of which the bytes are all there is."""
     if name not in again:
         return [Difference("recorded, but not made again", np.inf)]
     if name not in recorded:
@@ -198,13 +198,13 @@ def _row_names(count: int) -> tuple[str, ...]:
 
 
 class DecisionMaker(Protocol):
-    """What makes a session's decisions: ``SessionController``, or a substitute in tests."""
+    """Source of a session's decisions: ``SessionController``, or a substitute in tests."""
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
-        """What is known of the person."""
+        """Perception of the person."""
 
     def answer(self, event: TickEvent) -> Decision:
-        """What the robot is told."""
+        """Decision for the robot."""
 
     def silence(self, t_ns: int, signals: Signal) -> None:
         """The robot said nothing."""
@@ -307,7 +307,7 @@ class SessionRecomputation:
         }
 
     def differences_at(self, message: bytes) -> list[Difference]:
-        """What of a message, or due before it, is not the same again; in the order of the record."""
+        """Differences in a message, or in what was due before it; in the order of the record."""
         kind, t_ns = codec.kind(message), codec.clock_ns(message)
         if self._start_ns is None:
             self._start_ns = t_ns
@@ -325,7 +325,7 @@ class SessionRecomputation:
         return due + self._at(t_ns, self._take[kind](message))
 
     def pending_differences(self) -> list[Difference]:
-        """What differs that the message after the last one would have shown."""
+        """Differences that the message after the last one would have shown."""
         return self._at(self._last_ns, self._unproven())
 
     def _unproven(self) -> list[Difference]:

@@ -58,7 +58,7 @@ _WAIT_NS = 60 * 10**9  # frames arrive out of order of capture by less
 
 @dataclass(frozen=True)
 class LimbAgreement:
-    """How far two cameras show a limb from one another at the same instant."""
+    """Distance between two cameras' views of a limb at the same instant."""
 
     a: str
     b: str
@@ -71,7 +71,7 @@ class LimbAgreement:
 
 @dataclass(frozen=True)
 class BodyInWorld:
-    """How a camera's person stands on the floor z = 0; NaN where that was not seen."""
+    """Height of a camera's person above the floor z = 0; NaN where that was not seen."""
 
     camera: str
     frames: int
@@ -117,7 +117,7 @@ def find_mirrored(points_a: Floats, points_b: Floats, weight: Floats, scale_m: f
 
 @dataclass
 class _CameraPair:
-    """What two cameras showed at the same instants so far."""
+    """Views of two cameras at the same instants so far."""
 
     apart_m: list[NDArray[np.float32]] = field(default_factory=list)  #: (n, 20), NaN where one lacks a point
     mirrored: list[Bools] = field(default_factory=list)
@@ -229,7 +229,7 @@ class CameraChecks:
 
 
 def height_remarks(body: BodyInWorld) -> Iterator[str]:
-    """What is wrong with the floor under a camera's person, and with the head above it."""
+    """Remarks on a wrong floor under a camera's person, or a wrong height of the head."""
     found, bound_m = ("ankle", _ANKLE_ERROR_M) if body.by_ankles else ("foot", FLOOR_M)
     if abs(body.floor_m) > bound_m:
         side = "above" if body.floor_m > 0 else "below"
@@ -264,7 +264,7 @@ def pair_remarks(agreements: Sequence[LimbAgreement]) -> Iterator[str]:
 
 
 def _is_far(found: LimbAgreement) -> bool:
-    """Whether a limb is told; of few points a percentile says nothing, so the median has to be that far."""
+    """Return whether a limb is reported; a percentile of few points says nothing, so the median has to be that far."""
     return (found.p95_m if found.pairs >= _FEW_PAIRS else found.median_m) > APART_M
 
 

@@ -26,7 +26,7 @@ Place = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class LastPosition:
-    """Where and when the person was last seen."""
+    """Last position of the person, and its time."""
 
     position_m: Place
     arrival_ns: int
@@ -99,7 +99,7 @@ def select_person(
 
 
 def _nearest(rows: list[int], places_m: list[Place], here_m: Place) -> tuple[float, int]:
-    """How far the nearest body is from a place [m], inf where none's is known, and its row."""
+    """Distance of the nearest body from a place [m], inf where none's is known, and its row."""
     return min((inf if isnan(apart_m := dist(places_m[row], here_m)) else apart_m, row) for row in rows)
 
 
@@ -224,7 +224,7 @@ def _together(points: Floats) -> Bools:
 
 
 def _moved(before_m: Floats, now_m: Floats) -> bool:
-    """Whether any point (20, 3) has moved by more than STILL_M; without points to compare, it counts as moved."""
+    """Return whether any point (20, 3) has moved by more than STILL_M; no common point counts as moved."""
     by_m = np.linalg.norm(now_m - before_m, axis=1)
     return not np.isfinite(by_m).any() or bool(np.nanmax(by_m) > STILL_M)
 
@@ -336,12 +336,12 @@ class Cleaner:
         return chunk
 
     def _agrees(self, row: RawSkeleton) -> bool:
-        """Whether a row has the points of the last one of its body."""
+        """Return whether a row has the points of the last one of its body."""
         before, _ = self._last[(row.camera, row.body)]
         return np.array_equal(before.points_m, clean_skeleton(row).row.points_m, equal_nan=True)
 
     def _captured(self, row: RawSkeleton, arrival_ns: int) -> int:
-        """When the row was captured; by its arrival where its stamp cannot be right."""
+        """Capture time of a row; its arrival where its stamp cannot be right."""
         if row.capture_ns is None:
             return arrival_ns
         clock = self.clocks[row.camera]
@@ -352,7 +352,7 @@ class Cleaner:
         return capture_ns
 
     def _repeats(self, row: RawSkeleton, arrival_ns: int) -> bool:
-        """Whether the row shows the very skeleton of the one before it, which no sensor measures twice."""
+        """Return whether the row shows the very skeleton of the one before it, which no sensor measures twice."""
         key = (row.camera, row.body)
         before = self._last.get(key)
         if (
@@ -368,7 +368,7 @@ class Cleaner:
         return True
 
     def _trembles(self, row: RawSkeleton, arrival_ns: int) -> bool:
-        """Whether the row shows a body of which no point has moved for so long that its image must be an old one."""
+        """Return whether no point of the body has moved for so long that its image must be an old one."""
         key = (row.camera, row.body)
         before = self._still.get(key)
         if before is None or _moved(before[0], row.points_m):

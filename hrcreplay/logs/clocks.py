@@ -54,7 +54,7 @@ class CameraClock:
         return int(np.median(self._believed)) if len(self._believed) >= _LEAST else 0
 
     def capture_ns(self, stamp_ns: int, arrival_ns: int) -> int:
-        """When a row was captured."""
+        """Capture time of a row."""
         last_ns, first_ns, capture_ns = self._last
         if stamp_ns == last_ns and arrival_ns - first_ns <= _SAME_NS:
             return capture_ns  # another body of the same frame
@@ -69,7 +69,7 @@ class CameraClock:
         return capture_ns
 
     def _doubt(self, stamp_ns: int, arrival_ns: int) -> str:
-        """Why a stamp is not believed; empty where it is."""
+        """Reason not to believe a stamp; empty where it is believed."""
         delay_ns = arrival_ns - stamp_ns
         if abs(delay_ns) > _FAR_NS:
             low, high = self.far_ns or (stamp_ns, stamp_ns)
@@ -93,7 +93,7 @@ class CameraClock:
         return ""
 
     def _clock_changed(self) -> bool:
-        """Whether the frames that are not newer come as a clock's that was set back, or stands still, do.
+        """Return whether the frames that are not newer look like a clock that was set back or stands still.
 
         Frames that were held up on their way come all at once, or between others.
         """
@@ -132,7 +132,7 @@ class CameraClock:
 
 
 class ArrivalOrder:
-    """Whether messages of one body come in the file as they arrived: a recorder's clock that is set back mixes times.
+    """Check of the order of a body's messages in the file: a recorder's clock that is set back mixes times.
 
     Bodies, topics and files may have been written one after the other; each has an order of its own.
     """
@@ -154,7 +154,7 @@ class ArrivalOrder:
         waiting.append((arrival_ns, position))
 
     def remarks(self, start_ns: int) -> Iterator[str]:
-        """What was found, and where; ``start_ns`` is where the log begins [ns]."""
+        """Remarks on wrong orders, and where; ``start_ns`` is where the log begins [ns]."""
         if self._count < _FEW:
             return
         begin_s = (self._mixed[0] - _MIXED_NS - start_ns) / 1e9
@@ -215,7 +215,7 @@ def late_remark(camera: str, clock: CameraClock, offset_s: float) -> str | None:
 
 
 def delay_text(clock: CameraClock, offset_s: float) -> str:
-    """How long after their capture a camera's frames come, what may be the cause, and what to do."""
+    """Describe the delay from capture to arrival of a camera's frames, its likely cause, and the remedy."""
     median_s, p95_s, least_s, most_s = (s + offset_s for s in clock.delay_s(50.0, 95.0, 0.0, 100.0))
     return (
         f"its frames come {median_s:.2f} s after their capture by their stamps (median; 95 % within {p95_s:.2f} s, "
@@ -225,7 +225,7 @@ def delay_text(clock: CameraClock, offset_s: float) -> str:
 
 
 def _epoch(low_ns: int, high_ns: int) -> str:
-    """Which clock stamps may be of."""
+    """Clock that stamps are likely to be of."""
     if 0 <= high_ns < _YOUNG_NS:
         return f"{low_ns / 1e9:.2f} to {high_ns / 1e9:.2f} s: the time of a simulation, or since a computer started"
     try:

@@ -32,7 +32,7 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class CameraSummary:
-    """What one camera delivered, after duplicates and late frames are dropped."""
+    """Frames of one camera, after duplicates and late ones are dropped."""
 
     name: str
     frames: int  #: instants; several bodies in one frame count once
@@ -50,13 +50,13 @@ class CameraSummary:
 
     @property
     def posed(self) -> bool:
-        """Whether its extrinsics are known."""
+        """Return whether its extrinsics are known."""
         return self.pose_from != "none"
 
 
 @dataclass(frozen=True)
 class JointSummary:
-    """What one topic tells of the robot's joints."""
+    """Joint positions of one topic."""
 
     topic: str
     names: tuple[str, ...]

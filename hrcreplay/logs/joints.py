@@ -74,7 +74,7 @@ class JointTopic:
 
 @dataclass(frozen=True)
 class Clock:
-    """How the stamps of a topic stand to the log's clock, and what its instants are."""
+    """Relation of a topic's stamps to the log's clock, and the basis of its instants."""
 
     topic: str
     delay_s: tuple[float, float, float]  #: arrival - stamp: median, 5th and 95th percentile; NaN without stamps [s]
@@ -405,7 +405,7 @@ def _match_clocks(arrival_ns: Ints, stamp_ns: Ints, delays_ns: Ints, wrong: Bool
 
 
 def _judge(match: _Match, stamps: str, offset_s: float | None) -> tuple[str, str]:
-    """What the instants are taken from (see ``Clock.basis``), and the remark."""
+    """Basis of the instants (see ``Clock.basis``), and the remark."""
     median_s, low_s, high_s = match.delay_s
     least_s, most_s = min(match.least_s), max(match.least_s)
     told = (
@@ -516,7 +516,7 @@ def _gaps(series: Sequence[tuple[Ints, Floats]], track: JointTrack) -> Ints:
 
 
 def _covered_ns(gaps_ns: Ints) -> int:
-    """How long at least one axis is not told [ns], of gaps (g, 2) in order."""
+    """Total time in which at least one axis is missing [ns], of gaps (g, 2) in order."""
     covered, until = 0, 0
     for begin, end in gaps_ns.tolist():
         covered += max(0, end - max(begin, until))

@@ -57,7 +57,7 @@ class LogFiles:
     folder: Any = None  #: temporary files that live as long as the source
 
     def damage(self) -> Damage:
-        """What is known to be wrong with the files so far; reading may find more."""
+        """Known damage of the files so far; reading may find more."""
         found = Damage(Counter(self.defects), list(self.notes))
         several = len(self.streams) > 1
         for number, stream in enumerate(self.streams, start=1):
@@ -154,7 +154,7 @@ def _unpacked(source: LogFiles, file: Path) -> Path:
 
 
 def _is_text(path: Path) -> bool:
-    """Whether a file may be a tracker's table: it is called so, and begins with lines of text, plain or gzipped."""
+    """Return whether a file may be a tracker's table: by its name, and by text at its start, plain or gzipped."""
     if path.name.lower().removesuffix(".gz").rpartition(".")[2] not in _TABLES:
         return False
     try:
@@ -220,7 +220,7 @@ def _open_files(source: LogFiles, files: list[Path]) -> None:
 
 @dataclass(frozen=True)
 class _Metadata:
-    """What the metadata of a ROS 2 bag says of its files."""
+    """Files of a ROS 2 bag, by its metadata."""
 
     files: tuple[str, ...]
     messages: int
@@ -244,7 +244,7 @@ def _metadata(path: Path) -> _Metadata:
 
 @dataclass(frozen=True)
 class Header:
-    """What is known of a log before its first frame."""
+    """Knowledge of a log before its first frame."""
 
     path: Path
     kind: str  #: "hrcreplay", "mcap", "ros1" or "ros2"

@@ -55,7 +55,7 @@ _PEEK = 300  # messages that are decoded in any case: ten seconds of a sensor
 
 @dataclass(frozen=True)
 class MarkerLayout:
-    """How the markers of a topic are numbered: id = body * ids_per_body + joint."""
+    """Numbering of a topic's markers: id = body * ids_per_body + joint."""
 
     frames: tuple[str, ...] = ()  #: frames in the headers, in order of appearance; () where none was looked for
     ids_per_body: int = 100
@@ -67,7 +67,7 @@ class MarkerLayout:
 
 @dataclass(frozen=True)
 class NoBodies:
-    """Why the markers of a topic are no bodies."""
+    """Reason why the markers of a topic are no bodies."""
 
     found: str
     certain: bool  #: False where there were no markers, or too few to say so
@@ -76,7 +76,7 @@ class NoBodies:
 
 @dataclass
 class _Survey:
-    """What is known of a topic while it is gone through."""
+    """Knowledge of a topic while it is gone through."""
 
     frames: dict[str, None] = field(default_factory=dict)
     types: set[int] = field(default_factory=set)
@@ -87,7 +87,7 @@ class _Survey:
 
 
 def survey_markers(messages: Iterable[Message], ids_per_body: int | None) -> MarkerLayout | NoBodies:
-    """How the markers of a topic are numbered, from all its messages.
+    """Find the numbering of a topic's markers, from all its messages.
 
     Args:
         messages: All of the topic.
@@ -144,7 +144,7 @@ def _take(survey: _Survey, message: Message) -> None:
 
 
 def _frames_known(data: bytes, frames: Iterable[str]) -> bool:
-    """Whether a message names as many known frames as it has markers, so that none is new."""
+    """Return whether a message names as many known frames as it has markers, so that none is new."""
     found = sum(data.count(b"%c\0\0\0%b\0" % (len(frame) + 1, frame.encode())) for frame in frames)
     return found > 0 and data[:1] == b"\0" and found == int.from_bytes(data[4:8], "little")  # of ROS 2; else decode
 
@@ -245,7 +245,7 @@ class MarkerDecoder:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """How the topic is read."""
+        """Remarks on the reading of the topic."""
         return tuple(self._told())
 
     def _told(self) -> Iterator[str]:

@@ -171,7 +171,7 @@ def _profile(file: IO[bytes], path: Path) -> str:
 
 
 def _summary(file: IO[bytes]) -> _Index | None:
-    """What the file says of itself at its end; None where that is missing or too little."""
+    """Summary at the end of the file; None where it is missing or too short."""
     try:
         records = _summary_records(file)
     except (*_BROKEN, OSError, StopIteration):

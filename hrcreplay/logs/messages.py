@@ -234,7 +234,7 @@ class SkeletonDecoder(Protocol):
 
     @property
     def shows_camera_alive(self) -> bool:
-        """Whether a message without a body still shows that the camera (the only one) delivers frames."""
+        """Return whether a message without a body still shows that the camera (the only one) delivers frames."""
 
     def fresh_copy(self) -> SkeletonDecoder:
         """The decoder at the start of a pass, with nothing remembered."""

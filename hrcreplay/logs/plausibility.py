@@ -93,7 +93,7 @@ class BodyShape:
 
     @property
     def ratio(self) -> float:
-        """How many times as tall the body is by one bone as by another, by medians; 1 where few were seen."""
+        """Ratio of the body's heights by two bones, by medians; 1 where few were seen."""
         self._flush()
         return _ratio(np.concatenate(self._bones)) if self._bones else 1.0
 
@@ -105,7 +105,7 @@ class BodyShape:
 
     @property
     def certain(self) -> bool:
-        """Whether enough rows show bones for a refusal."""
+        """Return whether enough rows show bones for a refusal."""
         self._flush()
         return sum(int(np.isfinite(part).sum()) for part in self._statures) >= _FEW
 
@@ -164,7 +164,7 @@ _FEW_BONES = 4
 
 
 def bone_ratio(points: Floats) -> float:
-    """How many times as tall bodies (n, 20, 3) are by one bone as by another, by medians; 1 where few are seen."""
+    """Ratio of the heights of bodies (n, 20, 3) by two bones, by medians; 1 where few are seen."""
     return _ratio(_heights(points))
 
 
@@ -180,7 +180,7 @@ def _ratio(heights: Floats) -> float:
 
 
 def looks_like_person(points: Floats) -> bool:
-    """Whether bodies (n, 20, 3), in any unit, have the proportions of a person."""
+    """Return whether bodies (n, 20, 3), in any unit, have the proportions of a person."""
     return bone_ratio(points) <= PROPORTION
 
 
@@ -261,7 +261,7 @@ def proportion_remark(camera: str, ratio: float) -> str | None:
 
 
 def impossible_size(stature_m: float) -> bool:
-    """Whether nobody can be of that size."""
+    """Return whether nobody can be of that size."""
     return stature_m > _CERTAIN * PERSON_M[1] or stature_m < PERSON_M[0] / _CERTAIN
 
 
@@ -284,7 +284,7 @@ def mirror_remarks(camera: str, sides: Floats, cue: str) -> Iterator[str]:
 
 
 def bone_range_m(bone: tuple[str, str]) -> tuple[float, float]:
-    """How long a bone of an adult is as trackers see it: its share of ADULT_M, and a margin [m]."""
+    """Range of an adult's bone as trackers see it: its share of ADULT_M, and a margin [m]."""
     share = _SHARES[bone]
     longest = share + _HALF_HAND if bone[0].startswith("elbow") else share
     return share * ADULT_M[0] * (1.0 - _BONE_MARGIN), longest * ADULT_M[1] * (1.0 + _BONE_MARGIN)
@@ -343,7 +343,7 @@ _ALTERNATING = 0.1  # of the rows
 
 
 class Alternation:
-    """Whether a body's rows alternate between two places, as where two cameras publish under one name."""
+    """Detector of rows of a body that alternate between two places, as of two cameras under one name."""
 
     def __init__(self) -> None:
         self._before: dict[tuple[str, int], tuple[tuple[int, Floats], ...]] = {}  # a body's last two rows

@@ -100,7 +100,7 @@ def no_skeletons_error(source: LogFiles, remarks: list[str]) -> LogError:
 
 
 def skeletons_remedy(topics: Sequence[Topic], remarks: Sequence[str]) -> str:
-    """What the user of a log without skeletons can do.
+    """Remedy for a log without skeletons.
 
     Args:
         topics: All topics of the log.
@@ -141,7 +141,7 @@ def _markers(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) 
 
 
 def _descriptions(source: LogFiles) -> Iterator[str]:
-    """What the topics of a log without skeletons hold, as far as they may be bodies."""
+    """Describe the topics of a log without skeletons, as far as they may be bodies."""
     for topic in source.topics():
         if not topic.count or topic.type in _NO_BODIES:
             continue
@@ -198,7 +198,7 @@ class Log:
 
     @property
     def defects(self) -> Counter[str]:
-        """What was found wrong so far: in the files, in the latest pass over the frames and over the joints."""
+        """Defects found so far: in the files, in the latest pass over the frames and over the joints."""
         found = self._source.damage().defects + self._track
         found.update(self._reading)  # unlike +, keeps a count of zero
         return Counter(dict(sorted(found.items())))
@@ -215,7 +215,7 @@ class Log:
 
     @property
     def skeletons_remedy(self) -> str:
-        """What makes skeletons of a log that has none."""
+        """Remedy for a log without skeletons."""
         return skeletons_remedy(self.topics, self._topic_remarks)
 
     @property
@@ -301,7 +301,7 @@ class Log:
         self._refusals.extend(found)
 
     def _unit_of(self, camera: str) -> str:
-        """Where the unit of a camera's points is set."""
+        """Setting that holds the unit of a camera's points."""
         for decoder in self._decoders:
             if camera in decoder.cameras and isinstance(decoder, GenericDecoder):
                 other = "m" if decoder.how.unit == "mm" else "mm"
@@ -371,7 +371,7 @@ def _contradictions(cleaner: Cleaner) -> Iterator[str]:
 
 
 def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
-    """What was wrong with a camera's points and stamps."""
+    """Remarks on a camera's points and stamps."""
     for name in _TOLD:
         count = cleaner.flaws[(camera, name)]
         if count:

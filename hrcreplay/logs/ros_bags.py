@@ -506,7 +506,7 @@ def _readable_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int, int
 
 
 def _is_short(path: Path) -> bool:
-    """Whether a database has fewer bytes than its header says."""
+    """Return whether a database has fewer bytes than its header says."""
     with path.open("rb") as file:
         head = file.read(32)
     (page,), (pages,) = struct.unpack_from(">H", head, 16), struct.unpack_from(">L", head, 28)

@@ -55,7 +55,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the figures ask of the settings."""
+    """Settings that the figures need."""
 
     near_m: float
     stationary_m_per_s: float
@@ -64,7 +64,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class LogResult:
-    """What is known of one log."""
+    """Results of one log."""
 
     name: str
     sha256: str
@@ -207,7 +207,7 @@ def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bound
 
 
 def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Metric]:
-    """What a report says of this motion, with nothing beside it."""
+    """Metrics of this motion as a report has them, with nothing beside it."""
     table = MetricTable()
     settings = {"plan": {"method": variant.method}}
     add_plan(
@@ -226,7 +226,7 @@ def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, boun
 
 
 def braking_events(motion: pd.DataFrame, slow_m_per_s: float) -> dict[str, int]:
-    """How often a moving robot began to brake, by the reason that its record gives at that tick."""
+    """Number of times a moving robot began to brake, by the reason that its record gives at that tick."""
     runs = true_runs((motion["status"].astype(str) == "braking").to_numpy())
     moving, reasons = is_moving(motion, slow_m_per_s), motion["reason"].fillna("").astype(str).to_numpy()
     found: dict[str, int] = {}
@@ -359,7 +359,7 @@ def notes(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
-    """What terminal and Markdown show: the methods side by side, and why they braked."""
+    """Tables of terminal and Markdown: the methods side by side, and why they braked."""
     logs = [(log["log"], log["methods"]) for log in found["logs"]]
     if len(logs) > 1:
         logs.append((ALL, found["total"]))
@@ -384,7 +384,7 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
 
 
 def _note(found: Mapping[str, Any]) -> str:
-    """What the numbers are of, and the paper's own beside them."""
+    """Note on the numbers, and the paper's own beside them."""
     persons = sorted({PERSONS.get(log["person"], log["person"]) for log in found["logs"]})
     known, ticks = (
         sum(next(iter(log["methods"].values()))[name] for log in found["logs"]) for name in ("known_ticks", "ticks")

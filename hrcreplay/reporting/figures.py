@@ -26,7 +26,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class FigureData:
-    """What figures are drawn from: the run's tables and metrics, and what the prediction says at some instants."""
+    """Input of figures: the run's tables and metrics, and the prediction at some instants."""
 
     run: Run
     metrics: Mapping[str, Metric]
@@ -316,7 +316,7 @@ FIGURES = (
 
 
 def label(kind: FigureKind) -> str:
-    """What a user types for it: its number, or where the paper has none its name."""
+    """Name that a user types for it: its number, or where the paper has none its name."""
     return ", ".join(kind.numbers) or kind.name
 
 
@@ -328,7 +328,7 @@ def find(key: str) -> tuple[FigureKind, ...]:
 
 
 def missing(kind: FigureKind, run: Run, metrics: Mapping[str, Metric]) -> str:
-    """Why a run has not what a figure needs; empty where it has."""
+    """Reason why a run lacks data for a figure; empty where it has them."""
     return next((why for there, why in map(NEEDS.__getitem__, kind.needs) if not there(run, metrics)), "")
 
 

@@ -34,7 +34,7 @@ COLOURS = {"paper": drawing.ORANGE, "positions": drawing.GREEN, "sound": drawing
 
 @dataclass(frozen=True)
 class Walk:
-    """What of the floor the person can reach from one instant on."""
+    """Floor area that the person can reach from one instant on."""
 
     t_ns: int
     horizon_s: float  #: braking time T_s

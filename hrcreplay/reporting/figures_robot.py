@@ -29,7 +29,7 @@ SHORTEST_M = 0.5e-3
 
 @dataclass(frozen=True)
 class Deviation:
-    """Where the TCP was furthest from the programmed path."""
+    """Largest deviation of the TCP from the programmed path."""
 
     row: int  #: of motion.parquet
     at_m: Floats  #: (3,) the TCP, world
@@ -37,7 +37,7 @@ class Deviation:
 
     @property
     def length_m(self) -> float:
-        """How far it was."""
+        """Its length."""
         return float(np.linalg.norm(self.at_m - self.foot_m))
 
 
@@ -199,7 +199,7 @@ def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
 
 
 def horizon(motion: pd.DataFrame, t0_ns: int, stop_s: float) -> Figure:
-    """Until when the volumes hold by which each tick was decided, and how long the stop from its velocity takes.
+    """Horizon of the volumes used at each tick, and duration of the stop from its velocity.
 
     Args:
         motion: Rows of motion.parquet.
@@ -258,7 +258,7 @@ def status(
     near_m: float,
     slow_m_per_s: float,
 ) -> Figure:
-    """What the plan and each baseline did over time, and when each stood near the person though it should move.
+    """Status of the plan and each baseline over time, and when each stood near the person though it should move.
 
     Args:
         motion: Rows of motion.parquet.

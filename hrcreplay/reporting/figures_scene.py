@@ -98,7 +98,7 @@ def _sphere(count: int) -> Floats:
 
 
 def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: Floats, pixel_m: float) -> Floats:
-    """What a viewer sees of solids that may intersect: each pixel shows the frontmost surface, lit from above.
+    """Render solids that may intersect: each pixel shows the frontmost surface, lit from above.
 
     Args:
         solids: Hulls with their balls and colours.

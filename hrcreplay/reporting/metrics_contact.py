@@ -75,7 +75,7 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
 
 
 def _add_people(metrics: MetricTable, run: Run) -> None:
-    """Who was there, which limbs of the person were shown, and how much of a recorded robot was not."""
+    """Number of people, limbs of the person that were shown, and missing part of a recorded robot."""
     frames = run.counts.get("person_frames_beside_others", 0)
     metrics.add(
         "others_frames",
@@ -155,7 +155,7 @@ def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: st
 
 
 def _add_touch(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str) -> None:
-    """How often, how long and how fast the robot touched anybody."""
+    """Number, duration and speed of the robot's contacts."""
     distance, moving = numeric_column(rows, "distance_m"), rows["moving"].to_numpy(dtype=bool)
     person, other = (numeric_column(rows, f"{who}_m") for who in ("person", "other"))
     known = np.isfinite(distance)
@@ -247,7 +247,7 @@ def deciding_rows(motion: pd.DataFrame) -> Ints:
 
 
 def retreats(motion: pd.DataFrame, t_ns: Ints) -> Bools:
-    """Whether the motion at some of its ticks (n,) was a retreat, or the stop of one."""
+    """Mark the ticks (n,) at which the motion was a retreat, or the stop of one."""
     decided = deciding_rows(motion)[np.searchsorted(times(motion), t_ns)]
     return np.asarray((decided >= 0) & (motion["status"].astype(str).to_numpy()[decided] == "retreating"))
 
@@ -283,7 +283,7 @@ def _add_faults(
 
 
 def _add_left(metrics: MetricTable, contact: pd.DataFrame) -> None:
-    """How often the person left the volumes before their horizon, and before the braking time."""
+    """Number of times the person left the volumes before their horizon, and before the braking time."""
     until = {"volumes": ("left", "the tick's horizon"), "volumes_full": ("left_full", "the braking time T_s")}
     for prefix, (column, end) in until.items():
         left = contact[np.isfinite(numeric_column(contact, f"{column}_m"))]

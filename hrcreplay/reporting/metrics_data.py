@@ -121,7 +121,7 @@ def _add_heights(metrics: MetricTable, bodies: pd.DataFrame | None, camera: str)
 
 
 def add_agreement(metrics: MetricTable, agreement: pd.DataFrame | None) -> None:
-    """How far any two cameras show each limb of BODY apart at the same instants."""
+    """Distance between the views of any two cameras of each limb of BODY at the same instants."""
     for limb in BODY:
         rows = None if agreement is None else agreement[agreement["limb"] == limb]
         for name, text in (("median_m", "median"), ("p95_m", "95th percentile")):
@@ -199,7 +199,7 @@ def _add_known(metrics: MetricTable, state: pd.DataFrame, fresh_s: float | None)
 
 
 def _add_watched(metrics: MetricTable, run: Run) -> None:
-    """How often the robot went by the cell's word that nobody can be there whom no camera shows."""
+    """Share of ticks at which the robot relied on the cell's word that nobody can be there whom no camera shows."""
     watched = (run.meta.get("cell") or {}).get("watched")
     fresh_s = run.meta.get("settings", {}).get("fusion", {}).get("fresh_s")
     state, share, refuting = run.state, None, None

@@ -47,7 +47,7 @@ def programme(ref_m: Floats, programme_s: Floats) -> Programme:
 
 
 def foot(path: Programme, tcp_m: Floats, ahead_m: float) -> tuple[int, float]:
-    """How far along the path a TCP came in the end.
+    """Final position of a TCP along the path.
 
     Args:
         path: The programmed path.
@@ -134,7 +134,7 @@ def numeric_column(motion: pd.DataFrame, name: str) -> Floats:
 
 
 def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -> tuple[Bools, Bools]:
-    """Which ticks are near (separation at most ``near_m``), and at which of all the robot stands though it should move.
+    """Mark the near ticks (separation at most ``near_m``), and all at which the robot stands though it should move.
 
     It stands when the TCP is slower than ``stationary_m_per_s``. It should move when the reference is not, and when the
     reference waits for the robot: at a waypoint it stands itself.
@@ -168,7 +168,7 @@ def waited_s(motion: pd.DataFrame) -> Floats:
 
 
 def cycles(motion: pd.DataFrame, *, at_m: float = 0.002, away_m: float = 0.05) -> int:
-    """How often the reference came back to its first point (within ``at_m``) after being ``away_m`` from it."""
+    """Number of returns of the reference to its first point (within ``at_m``) after being ``away_m`` from it."""
     reference = position_columns(motion, "ref")
     gap = np.linalg.norm(reference - reference[0], axis=1)
     marks = np.where(gap >= away_m, 1, np.where(gap <= at_m, -1, 0))

@@ -77,7 +77,7 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class ReplayPart:
-    """What the page's template puts in."""
+    """Parts that the page's template inserts."""
 
     html: Markup
     style: Markup
@@ -330,7 +330,7 @@ def _legend() -> list[Patch | Line2D]:
 
 
 def _words(track: MethodTrack, row: int) -> str:
-    """What the record says of an instant."""
+    """Describe the record at an instant."""
     found = {kind: known[index[row]] if index[row] >= 0 else "" for kind, (known, index) in track.names.items()}
     words = [found["status"] or "no record", f"{track.tcp_speed[row]:.2f} m/s"]
     if np.isfinite(track.body_m[row]):

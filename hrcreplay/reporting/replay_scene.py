@@ -1,4 +1,4 @@
-"""What the 3-D replay of a run shows, at a steady rate: robot, person, volumes, and each method's motion."""
+"""Content of the 3-D replay of a run, at a steady rate: robot, person, volumes, and each method's motion."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class RobotGeometry:
 
 @dataclass(frozen=True)
 class MethodTrack:
-    """What one method did, a row an instant; NaN and -1 where its table says nothing."""
+    """Motion of one method, a row an instant; NaN and -1 where its table says nothing."""
 
     q: Floats  #: (n, nv) [rad]
     stop_q: Floats  #: (n, nv) where the stop ends that it would go on with [rad]
@@ -174,7 +174,7 @@ def coarser(vertices_m: Floats, triangles: Ints, most: int) -> tuple[Floats, Int
 
 
 def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floats]]:
-    """Where each axis brings what it moves, from the pose with all axes at zero: products of exponentials.
+    """Pose of each link relative to the pose with all axes at zero: products of exponentials.
 
     Args:
         robot: Its screws.
@@ -304,7 +304,7 @@ def volume_track(occupancy: pd.DataFrame | None) -> VolumeTrack:
 def _track(
     run: Run, method: str, motion: pd.DataFrame, robot: RobotModel, t_ns: Ints, t0_ns: int, slow: float
 ) -> MethodTrack:
-    """What one method did.
+    """Motion of one method.
 
     Args:
         run: The run's tables.

@@ -36,7 +36,7 @@ def defect_notes(counts: Mapping[str, int], notes: Sequence[str]) -> tuple[str, 
 
 
 def _text(name: str) -> str:
-    """What ``DEFECTS`` says of a counter; empty where it counts no defect. A note tells of the instant."""
+    """Text of ``DEFECTS`` for a counter; empty where it counts no defect. A note tells of the instant."""
     for known, text in DEFECTS.items():
         stem = known.removesuffix(_CAMERA)
         of_camera = stem != known and name.startswith(f"{stem}_")
@@ -104,7 +104,7 @@ def _safety(run: Run, metrics: Mapping[str, Metric]) -> Answer:
 
 
 def _certifies(run: Run) -> bool:
-    """Whether the plan took certified steps only."""
+    """Return whether the plan took certified steps only."""
     plan = run.meta.get("settings", {}).get("plan", {})
     return bool(plan.get("certify")) and plan.get("method") != "none"
 
@@ -200,7 +200,7 @@ def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
 
 
 def _horizon(run: Run, metrics: Mapping[str, Metric]) -> str:
-    """How far ahead the person was predicted."""
+    """Horizon of the prediction, in words."""
     settings = run.meta.get("settings", {})
     median, most = metrics["plan_horizon_median_s"], metrics["plan_horizon_max_s"]
     if settings.get("plan", {}).get("horizon") == "adaptive" and median["value"] is not None:
@@ -210,7 +210,7 @@ def _horizon(run: Run, metrics: Mapping[str, Metric]) -> str:
 
 
 def _braked(metrics: Mapping[str, Metric]) -> str:
-    """What happened at the ticks at which it braked, and at which it stood held; the most frequent reason first."""
+    """Reasons for which it braked, and for which it stood held; the most frequent first."""
     mark, stood = "plan_braking_ticks_", "plan_standing_share_"
     held = [(m["value"], name.removeprefix(stood)) for name, m in metrics.items() if name.startswith(stood)]
     why = [

@@ -101,7 +101,7 @@ REASONS = {
 
 
 def reason_text(reason: str) -> str:
-    """What happened at a tick with a reason to brake or stand; of a reason without words, the record's own."""
+    """Text of a reason to brake or stand; of a reason without words, the record's own."""
     return REASONS.get(reason, f"the record says '{reason}'")
 
 
@@ -117,8 +117,8 @@ NOT_CLAIMED = (
         "shoulders and move faster than Table 1: the method 'paper' does not enclose all that a person can do."
     ),
     (
-        "The limb's radius is all the room there is for clothes, tools and the cameras' own errors, unless the "
-        "settings add clearance."
+        "No margin for clothing, tools and camera errors is added to the limbs' radii, unless the settings add "
+        "clearance."
     ),
     "The robot is assumed to follow its commands exactly, those of a stop among them.",
     "The paper's numbers come from experiments whose logs were never published. They are printed for orientation.",
@@ -241,7 +241,7 @@ def compare(
 
 
 def agreement_table(agreement: pd.DataFrame | None) -> tuple[PageTable, ...]:
-    """How far two cameras show each limb apart; nothing where there are no two."""
+    """Distance between two cameras' views of each limb; nothing where there are no two."""
     if agreement is None:
         return ()
     pairs = list(dict.fromkeys(zip(agreement["a"], agreement["b"], strict=True)))
@@ -292,7 +292,7 @@ def summary(robot: RobotModel) -> dict[str, Any]:
 
 
 def remarks(robot: RobotModel) -> tuple[str, ...]:
-    """What a user should know of a robot from a URDF: its chain, its capsules, what is locked, what is not guarded."""
+    """Remarks on a robot from a URDF: its chain, its capsules, what is locked, what is not guarded."""
     found = []
     derived = [segment for segment in robot.segments if segment.shape_m3 > 0]
     if derived:
@@ -366,7 +366,7 @@ def part_name_text(part: str) -> str:
 
 
 def neighbour_text(part: str) -> str:
-    """What a link is near to: a part of the person, or the border behind which others may be."""
+    """Neighbour of a link in words: a part of the person, or the border behind which others may be."""
     return f"the {part_name_text(part)}" if part == BORDER else f"the person's {part_name_text(part)}"
 
 

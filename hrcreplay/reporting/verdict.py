@@ -1,4 +1,4 @@
-"""What stands first on the page: would the robot have touched the recorded person, and at what cost; a row a method.
+"""Verdict at the top of the page: would the robot have touched the recorded person, and at what cost; a row a method.
 
 Beside it what a reader must know of limbs that were not measured.
 """
@@ -48,7 +48,7 @@ class ContactSummary:
 
 
 def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
-    """What the comparison with everybody recorded says; None where there is none."""
+    """Result of the comparison with everybody recorded; None where there is none."""
     if run.motion is None or metrics["contact_person"]["value"] is None:
         return None
     return ContactSummary(
@@ -62,7 +62,7 @@ def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
 
 
 def _contact_in_short(metrics: Metrics) -> str:
-    """Whether the robot would have touched anybody, at the ticks at which somebody is known."""
+    """State whether the robot would have touched anybody, at the ticks at which somebody is known."""
     touch, near = metrics["plan_touch_moving_ticks"]["value"], metrics["plan_body_distance_min_moving_m"]["value"]
     if touch is None:
         return "Whether the robot would have touched anybody is not known: the recording shows nobody."
@@ -81,12 +81,12 @@ def _contact_in_short(metrics: Metrics) -> str:
 
 
 def _as_far_as(metrics: Metrics) -> str:
-    """What must stand before 'touched nobody' where a limb was not seen."""
+    """Qualification before 'touched nobody' where a limb was not seen."""
     return ", as far as the person was seen," if unseen_limbs(metrics) else ""
 
 
 def _whom(metrics: Metrics, prefix: str = "plan") -> str:
-    """Who was touched by the moving robot."""
+    """People touched by the moving robot."""
     person, other = (metrics[f"{prefix}_touch_{who}_ticks"]["value"] for who in ("person", "other"))
     if person and other:
         return f"the person ({_count(person)}) and another body ({_count(other)})"
@@ -141,7 +141,7 @@ NOT_CONSIDERED = (
 
 
 def scope(metrics: Metrics) -> tuple[str, ...]:
-    """What the verdict considers, and what it does not."""
+    """Scope of the verdict: what it considers, and what it does not."""
     others = metrics["others_frames"]["value"]
     people = "One person is planned for"
     if others:
@@ -161,7 +161,7 @@ def scope(metrics: Metrics) -> tuple[str, ...]:
 
 
 def _watched(metrics: Metrics) -> list[str]:
-    """What rests on the cell's word that its cameras see everybody in an area."""
+    """Claims that rest on the cell's word that its cameras see everybody in an area."""
     share, refuting = metrics["watched_vacant_share"]["value"], metrics["watched_frames_refuting"]["value"]
     if share is None:
         return []
@@ -195,7 +195,7 @@ def unseen_limbs(metrics: Metrics) -> list[str]:
 
 
 def _cost_in_short(run: Run, metrics: Metrics) -> str:
-    """What would it have cost, and what without a controller?"""
+    """Cost to the task, and contacts without a controller."""
     pace = metrics["plan_progress_share"]["value"]
     cost = "What it would have cost the task is not known"
     if pace is not None:
@@ -211,7 +211,7 @@ def _cost_in_short(run: Run, metrics: Metrics) -> str:
 
 
 def _held(metrics: Metrics) -> str:
-    """How often the prediction held the recorded person, as ``audit`` counts it."""
+    """Share of the recorded person that the prediction held, as ``audit`` counts it."""
     parts = []
     for prefix, until in (("volumes", "their horizon"), ("volumes_full", "the braking time")):
         checked, left = metrics[f"{prefix}_checked_ticks"]["value"], metrics[f"{prefix}_left_ticks"]["value"]
@@ -342,7 +342,7 @@ def _ticks(metric: Metric) -> str:
 
 
 def _note(run: Run, metrics: Metrics) -> str:
-    """Which person and which body it was."""
+    """Person and body that were judged."""
     settings = run.meta.get("settings", {})
     hand_m, leg_m = settings.get("occupancy", {}).get("hand_m"), settings.get("report", {}).get("leg_radius_m")
     person = str(metrics["contact_person"]["value"])
@@ -364,7 +364,7 @@ def _note(run: Run, metrics: Metrics) -> str:
 
 
 def _left(metrics: Metrics) -> str:
-    """How often the person left the volumes."""
+    """Number of times the person left the volumes."""
     checked, left = metrics["volumes_checked_ticks"]["value"], metrics["volumes_left_ticks"]["value"]
     if checked is None or left is None:
         return ""
@@ -407,7 +407,7 @@ def unmeasured(metrics: Metrics) -> tuple[list[str], dict[str, float]]:
 
 
 def limb_remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
-    """What a user has to know of limbs that were not measured, or not whole; a line each.
+    """Remarks on limbs that were not measured, or not whole; a line each.
 
     Args:
         run: Its tables of the first stage.

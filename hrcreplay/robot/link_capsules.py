@@ -175,7 +175,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Extent:
-    """What a collision shape takes up in the link's frame.
+    """Extent of a collision shape in the link's frame.
 
     Box, mesh: the convex hull of the points. Capsule, cylinder, sphere: what is round about the axis between two.
     """

@@ -93,7 +93,7 @@ class RobotModel:
 
     @property
     def unguarded_tool(self) -> str | None:
-        """What is told where the TCP is outside of every capsule, with the setting that guards it; else None."""
+        """Remark where the TCP is outside of every capsule, with the setting that guards it; else None."""
         if not self.tcp_outside_m > _OUTSIDE_M:
             return None
         end = ", ".join(f"{at:.4g}" for at in (self.tcp_in_frame_m + 0.0).tolist())
@@ -124,7 +124,7 @@ class RobotModel:
         return self._kinematics.R_bodies(q)
 
     def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
-        """Where the segments are and how they move, at many instants.
+        """Positions and velocities of the segments at many instants.
 
         Args:
             q: (n, nv) [rad].
@@ -322,7 +322,7 @@ def _whole(robot: Description) -> Any:
 
 
 def _extents(whole: Any, robot: Description, meshes: Mapping[str, str]) -> dict[str, Extent]:
-    """What each collision shape takes up in its link's frame, by the shape's name."""
+    """Extent of each collision shape in its link's frame, by the shape's name."""
     text, names = with_shapes(robot, meshes)
     if not names:
         return {}
@@ -428,7 +428,7 @@ def _shift(offset_m: Vector) -> Any:
 
 
 def _outside(model: Any, segments: Sequence[Segment], points: Sequence[int], tcp: int) -> float:
-    """How far the TCP is from the nearest capsule that moves with it; NaN where none does [m]."""
+    """Distance of the TCP from the nearest capsule that moves with it; NaN where none does [m]."""
     tool = model.frames[tcp]
     away = [math.nan]
     for i, segment in enumerate(segments):
@@ -440,6 +440,6 @@ def _outside(model: Any, segments: Sequence[Segment], points: Sequence[int], tcp
 
 
 def _support(model: Any, frame: int) -> list[bool]:
-    """Which axes move a frame."""
+    """Axes that move a frame."""
     moving = set(model.supports[model.frames[frame].parentJoint])
     return [joint in moving for joint in range(1, model.njoints)]

@@ -33,7 +33,7 @@ _SLOWEST = 20.0
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a move may be."""
+    """Speed limits of a move."""
 
     dq_max: Floats  #: (nv,) [rad/s]
     ddq_max: Floats  #: (nv,) [rad/s^2]
@@ -339,7 +339,7 @@ def _by_itself(
 
 
 def recorded_remarks(path: Reference) -> list[str]:
-    """What a recorded path asks of the robot that it cannot do, and what looks like another unit.
+    """Remarks on a recorded path that the robot cannot follow, or that looks like another unit.
 
     Args:
         path: What ``recorded`` made.

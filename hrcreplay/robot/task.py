@@ -2,32 +2,8 @@
 
 It is what the robot would do if nobody were there.
 
-The structure of the waypoints is a task file (TOML) and the task that travels inside a log. In full::
-
-    name = "pick and place"
-    repeat = true                     # for the whole log; or: cycles = 3 (default 1)
-    speed = 0.6                       # share of every axis' top speed, in (0, 1]
-    acceleration = 0.5                # share of every axis' acceleration limit, in (0, 1]
-    tcp_speed_m_per_s = 1.0           # no move carries the TCP faster [m/s]
-    tcp_acceleration_m_per_s2 = 4.0   # of linear moves [m/s^2]
-
-    [[waypoints]]                     # the first is where the robot starts
-    name = "home"
-    joints_deg = [0, 0, 0, 0, 90, 0]  # or joints_rad
-
-    [[waypoints]]
-    name = "above the rack"
-    position_m = [0.45, 0.30, 0.25]   # TCP in the robot's base frame [m]
-    rpy_deg = [180, 0, 0]             # R = Rz(yaw) Ry(pitch) Rx(roll); or quaternion_wxyz = [0, 1, 0, 0]
-    move = "joint"                    # how to get here: "joint" (default) or "linear"
-
-    [[waypoints]]
-    name = "rack"
-    position_m = [0.45, 0.30, 0.10]
-    rpy_deg = [180, 0, 0]
-    move = "linear"
-    tcp_speed_m_per_s = 0.25          # this move only; at most the task's
-    dwell_s = 0.5                     # the robot stands this long before it goes on [s]
+The structure of the waypoints is a task file (TOML) and the task that travels inside a log; ``hrcreplay init`` writes
+one that explains every key (``cli/templates/task.toml``).
 
 The robot stops at every waypoint, and stands at the first for its dwell before it starts. ``cycles`` times from the
 first to the last; between two cycles it goes back to the first by the first's own ``move``. On a straight line the TCP
@@ -140,7 +116,7 @@ class Task(_Strict):
         return self
 
     def label(self, index: int) -> str:
-        """How messages call a waypoint, counted from 1."""
+        """Name of a waypoint in messages, counted from 1."""
         name = self.waypoints[index].name
         return f"waypoint {index + 1}" + (f" ({name})" if name else "")
 

@@ -1,4 +1,4 @@
-"""What hrcreplay needs from a URDF before pinocchio reads it: the chain from base to tool, its limits, its meshes.
+"""Parts of a URDF that are read before pinocchio: the chain from base to tool, its limits, its meshes.
 
 pinocchio's parser has one sentence for every wrong file, refuses a limit without an effort, forgets which joint mimics
 another, sorts the joints by name, and must have the paths of the meshes. So the tree and the limits are read here, and
@@ -119,7 +119,7 @@ def with_shapes(robot: Description, paths: Mapping[str, str]) -> tuple[str, dict
 
 
 def own_extent(shape: Shape, geometry: Any) -> Extent:
-    """What a shape takes up in its own frame.
+    """Extent of a shape in its own frame.
 
     Args:
         shape: As the URDF has it.
@@ -142,7 +142,7 @@ def own_extent(shape: Shape, geometry: Any) -> Extent:
 
 
 def unreadable(shape: Shape) -> SettingsError:
-    """What is wrong with a shape that pinocchio's parser left out."""
+    """Problem of a shape that pinocchio's parser left out."""
     if shape.mesh is None and shape.collision.find("origin") is None:
         return no_size(shape)
     return SettingsError(

@@ -36,7 +36,7 @@ from hrcreplay.settings.sections import Fusion, Occupancy, Robot
 
 
 class Sightings(NamedTuple):
-    """What some frames show."""
+    """Content of some frames."""
 
     measured: Measurements  #: of the person
     everybody: CameraFrames  #: all bodies, and frames that show nobody; points in the world [m]
@@ -57,7 +57,7 @@ class FusionStage:
     watched: WatchedArea | None = None  #: where nobody can be whom no camera shows
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Sightings]:
-        """What frames show, by the clock of the reference camera; see ``clean.select_person``.
+        """Measure frames by the clock of the reference camera; see ``clean.select_person``.
 
         A frame that was captured more than ``fresh_s`` before its arrival shows where the person was, not where they
         are: it is left out, and counted as ``frames_late_<camera>``.
@@ -97,7 +97,7 @@ class PredictionStage:
 
     @property
     def method(self) -> str:
-        """How the volumes are predicted."""
+        """Method of the prediction."""
         return self.occupancy.method
 
     @property
@@ -140,13 +140,13 @@ class WatchedBorder:
     latency_s: float  #: from the newest capture to the robot's reaction [s]
 
     def depth_m(self, since_s: float, horizon_s: float) -> float:
-        """How far in somebody can be within ``horizon_s`` who was outside ``since_s`` [s] ago [m]."""
+        """Depth that somebody outside ``since_s`` [s] ago can reach within ``horizon_s`` [m]."""
         return float(self.area.reached_m(since_s + horizon_s + self.latency_s))
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a robot must keep clear of: the person's volumes, and the border behind which others may be.
+    """Obstacles of a robot: the person's volumes, and the border behind which others may be.
 
     A person whose newest frame is too old is not known. Where nobody can be in the watched area, nobody needs to be.
     """
@@ -157,7 +157,7 @@ class Surroundings:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What there can be: the limbs that have volumes, then the sides of the border."""
+        """Names of the obstacles: the limbs that have volumes, then the sides of the border."""
         sides = 0 if self.watched is None else len(self.watched.border.normals)
         return (*self.prediction.limbs, *(BORDER,) * sides)
 
@@ -179,7 +179,7 @@ class Surroundings:
 
 @dataclass
 class Forecast:
-    """What is around the robot in a batch of ticks, at any horizon."""
+    """Obstacles of a batch of ticks, at any horizon."""
 
     around: Surroundings
     states: HumanStates
@@ -204,7 +204,7 @@ class Forecast:
 
 
 class LogLike(Protocol):
-    """What the stages need of a log; in a live session a header without one."""
+    """Part of a log that the stages need; in a live session a header without one."""
 
     @property
     def header(self) -> Header:
@@ -251,7 +251,7 @@ def fusion_stage(job: Job, log: LogLike) -> FusionStage:
 
 
 def watched_area(job: Job) -> WatchedArea | None:
-    """What the cameras of a job see together, where its cell says so."""
+    """Area that the cameras of a job see together, where its cell names one."""
     given = None if job.cell is None else job.cell.watched
     if given is None:
         return None
@@ -267,7 +267,7 @@ def prediction_stage(job: Job) -> PredictionStage:
 
 
 def surroundings(job: Job, model: RobotModel) -> Surroundings:
-    """What a job's robot keeps clear of.
+    """Obstacles of a job's robot.
 
     Raises:
         SettingsError: The robot stands outside the area that its cell says is watched.

@@ -55,7 +55,7 @@ _COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3}
 
 @dataclass(frozen=True)
 class PlacedProgramme:
-    """What the robot is to do, and where; found once for all variants."""
+    """Programme and place of the robot; found once for all variants."""
 
     T_world_base: Floats  #: (4, 4)
     path: Reference
@@ -227,7 +227,7 @@ def _compare_log(
 def _full_coverages(
     job: Job, variants: Sequence[Variant], people: RecordedPeople, folder: Path
 ) -> dict[str, Outcome | None]:
-    """How the volumes of each occupancy hold the person until the braking time."""
+    """Coverage of the person by the volumes of each occupancy until the braking time."""
     found: dict[str, Outcome | None] = {}
     for variant in sorted(variants, key=lambda variant: variant.method == "none"):
         if variant.occupancy not in found:
@@ -245,7 +245,7 @@ def _notes(
     programme: PlacedProgramme,
     found: Mapping[str, Any],
 ) -> tuple[str, ...]:
-    """What a report on the log says of it and of its robot, and where a method's robot stands inside the person.
+    """Remarks on a log and its robot, as in a report, and on methods whose robot stands inside the person.
 
     Args:
         job: What was asked for.
@@ -267,7 +267,7 @@ def _programme(job: Job, log: Log, start_ns: int) -> PlacedProgramme:
 
 
 def _silent(_stage: str, _ticks: int) -> None:
-    """The person is fused in no time."""
+    """Ignores fusion progress."""
 
 
 def tables(folder: Path, variant: Variant) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -118,7 +118,7 @@ def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats
 
 
 def own_coverage(job: Job, people: RecordedPeople, predicted: Predicted, motion: pd.DataFrame) -> Outcome | None:
-    """How the volumes of every asked tick hold until the horizon that the motion's tick was decided with.
+    """Coverage of every checked tick until the horizon that the motion's tick was decided with.
 
     Args:
         job: What was asked for.
@@ -134,7 +134,7 @@ def own_coverage(job: Job, people: RecordedPeople, predicted: Predicted, motion:
 
 
 def full_coverage(job: Job, people: RecordedPeople, predicted: Predicted) -> Outcome | None:
-    """How the volumes of every asked tick hold until the braking time T_s, as ``audit`` asks."""
+    """Coverage of every checked tick until the braking time T_s, as ``audit`` counts it."""
     if job.settings.plan.method == "none":
         return None
     states = predicted.all_states
@@ -191,7 +191,7 @@ def contact_table(
 
 @dataclass(frozen=True)
 class Nearest:
-    """What is nearest between the robot and some bodies, a row a tick."""
+    """Nearest pair of the robot and some bodies, a row a tick."""
 
     distance_m: Floats  #: (n,) surface to surface, negative in overlap; NaN where no body is known [m]
     link: Ints  #: (n,) index into the robot's segments; -1 where no body is known

@@ -1,4 +1,4 @@
-"""Whether the predicted volumes held the recorded person: one meaning of 'held' for report, compare and audit.
+"""Coverage of the recorded person by the predicted volumes: one meaning of 'held' for report, compare and audit.
 
 A limb is held at a tick where all its recorded points, those of every camera and with the limb's radius about each,
 stay inside its volume until the horizon has passed.
@@ -45,16 +45,16 @@ class Outcome(Table):
     upper_m3: Floats  #: (n,) of the six LIMBS together, for which every method has volumes
     upper_std_m3: Floats  #: (n,)
     limbs: tuple[str, ...]  #: LIMBS first
-    flesh_m: tuple[float, ...]  #: radius of each limb itself, Table 2 and a thigh's [m]
+    limb_radius_m: tuple[float, ...]  #: radius of each limb itself, Table 2 and a thigh's [m]
 
     def escape_m(self, *, points_alone: bool = False) -> Floats:
         """(n, l) how far the limb left its volume within the horizon; 0 inside, NaN where not audited [m].
 
-        The whole limb: the ball of its flesh around each of its recorded points. Volumes are convex, so what is between
-        two points is no further out than the worse of them. Or its points alone, which grants the flesh as tolerance.
+        The whole limb: a ball of the limb radius around each of its recorded points. Volumes are convex, so what is
+        between two points is no further out than the worse of them. With ``points_alone`` limb thickness is ignored.
         """
-        flesh = np.zeros(len(self.limbs)) if points_alone else np.array(self.flesh_m)
-        depth = self.beyond_m + flesh - self.radius_m
+        radius = np.zeros(len(self.limbs)) if points_alone else np.array(self.limb_radius_m)
+        depth = self.beyond_m + radius - self.radius_m
         return np.where(np.isnan(depth), np.nan, np.where(depth > _ROUNDING_M, depth, 0.0))
 
     def worst_m(self, limbs: int | None = None, *, points_alone: bool = False) -> Floats:
@@ -122,7 +122,7 @@ def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
     return np.asarray(count[last] > count[first])
 
 
-def flesh_m(prediction_stage: PredictionStage) -> dict[str, float]:
+def body_radii_m(prediction_stage: PredictionStage) -> dict[str, float]:
     """Limb -> its radius, Table 2; of the legs that of a thigh [m]."""
     return dict(zip(BODY, (*limb_radii(prediction_stage.occupancy).tolist(), THIGH_M), strict=True))
 
@@ -130,7 +130,7 @@ def flesh_m(prediction_stage: PredictionStage) -> dict[str, float]:
 def check_containment(
     volumes: SweptVolumes,
     future: RecordedFuture,
-    flesh: Mapping[str, float],
+    limb_radius: Mapping[str, float],
     counted: Bools,
     first_sample: int = 0,
     *,
@@ -141,7 +141,7 @@ def check_containment(
     Args:
         volumes: Of the n ticks.
         future: Of the same ticks.
-        flesh: Limb -> its radius, as ``flesh_m`` gives it [m].
+        limb_radius: Limb -> its radius, as ``body_radii_m`` gives it [m].
         counted: (n,) the ticks whose union volume is estimated.
         first_sample: Number of ticks counted before, see ``union_volume_m3``.
         sizes: Whether the volume of each limb is measured.
@@ -168,12 +168,12 @@ def check_containment(
             if len(limbs) > len(LIMBS):
                 union[i], union_std[i] = union_volume_m3(solids, _COUNT, _COUNT * (first_sample + i))
     radius = np.array(volumes.radius_m)
-    thick = tuple(flesh[limb] for limb in limbs)
+    thick = tuple(limb_radius[limb] for limb in limbs)
     return Outcome(volumes.t_ns, beyond, radius, size, union, union_std, upper, upper_std, limbs, thick)
 
 
 def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str) -> float:
-    """How far the recorded points of a limb, some of them seen, get from a hull [m]."""
+    """Largest distance of the recorded points of a limb, some of them seen, from a hull [m]."""
     points = future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
     return float(np.nanmax(solid.distances_m(points)))
 
@@ -200,7 +200,7 @@ def asked_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: flo
 def coverage(
     stage: PredictionStage, people: RecordedPeople, states: HumanStates, fusion: Fusion, horizon_s: Floats
 ) -> Outcome | None:
-    """How the volumes of a run held the recorded person, at the ticks that are asked; None where none is.
+    """Coverage of the recorded person by a run's volumes, at the checked ticks; None where none is.
 
     Args:
         stage: That predicts.
@@ -214,7 +214,7 @@ def coverage(
     rows = asked_rows(states, last_ns, fusion.rate_hz, np.where(np.isfinite(until_s), until_s, np.inf), fusion.fresh_s)
     asked = states.rows(rows)
     future = recorded_future(people.t_ns, people.points_m, asked, until_s[rows])
-    radii_m, nothing = flesh_m(stage), np.zeros(1, dtype=np.bool_)
+    radii_m, nothing = body_radii_m(stage), np.zeros(1, dtype=np.bool_)
     outcomes = []
     for i, row in enumerate(rows.tolist()):
         volumes = stage.volumes(asked.rows(slice(i, i + 1)), float(horizon_s[row]))

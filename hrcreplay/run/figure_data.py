@@ -1,4 +1,4 @@
-"""What the figures of a run show of its prediction and its robot, from the run folder alone.
+"""Data of a run's figures on its prediction and its robot, from the run folder alone.
 
 Corrected equations: docs/paper.md.
 """
@@ -58,7 +58,7 @@ def volumes_by_method(job: Job, run: Run, people: HumanStates) -> list[Instant]:
 
 
 def fastest_walk(job: Job, run: Run, people: HumanStates) -> Walk | None:
-    """Where the person could walk from the tick of the fastest walking, Eq. (18)-(30), corrected, and by ``sound``."""
+    """Reachable places from the tick of the fastest walking, Eq. (18)-(30), corrected, and by ``sound``."""
     t_ns = _fastest_ns(run, job.settings.occupancy.stop_s)
     if run.state is None or t_ns is None:
         return None
@@ -84,7 +84,7 @@ def fastest_walk(job: Job, run: Run, people: HumanStates) -> Walk | None:
 
 
 def forearm_sweep(job: Job, run: Run, people: HumanStates) -> Sweep | None:
-    """How elbow and walking sweep the forearm that the robot was nearest to, or the right one, Alg. 2 and Fig. 7, 8."""
+    """Sweep by elbow and walking of the forearm nearest to the robot, or the right one, Alg. 2 and Fig. 7, 8."""
     moment = moment_ns(run)
     if moment is None:
         return None

@@ -16,7 +16,7 @@ from hrcreplay.run.build import FusionStage, Sightings
 
 
 class FusedTicks(NamedTuple):
-    """What stage 1 makes of some ticks."""
+    """Result of stage 1 for some ticks."""
 
     states: HumanStates
     counts: Counter[str]  #: of ``fuse`` and ``watch``
@@ -69,7 +69,7 @@ class PersonFuser:
 
 
 def no_sightings(cameras: tuple[str, ...]) -> Sightings:
-    """What no frame at all shows."""
+    """Sightings of no frame at all."""
     none, points, confidence = np.zeros(0, np.int64), np.zeros((0, 20, 3)), np.zeros((0, 20))
     rows = np.zeros((0, inverse_kinematics.ROWS))
     measured = Measurements(none, none, none, rows, rows, points, confidence, cameras)

@@ -144,7 +144,7 @@ def _find(name: str, link: str, urdf: Path, packages: tuple[Path, ...]) -> Path:
 
 
 def _ros_path() -> list[Path]:
-    """Where ROS looks for packages."""
+    """Directories in which ROS looks for packages."""
     ros1 = os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)
     ros2 = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     return [Path(root) for root in ros1 if root] + [Path(root) / "share" for root in ros2 if root]
@@ -415,7 +415,7 @@ def link_capsules(robot: Robot, files: UrdfFiles) -> tuple[Segment, ...]:
 
 
 def _urdf_record(job: Job) -> dict[str, Any] | None:
-    """What makes the robot again without its files."""
+    """Record that makes the robot again without its files."""
     files = job.urdf
     if files is None:
         return None

@@ -1,4 +1,4 @@
-"""What a user is told beside the results of a run: the same for ``report``, which has one motion, and ``compare``."""
+"""Remarks beside the results of a run: the same for ``report``, which has one motion, and ``compare``."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _overlaps(folder: Path, motions: Mapping[str, Path], rate_hz: float) -> list
 
 
 def initial_overlap(state: Path, motion: Path, rate_hz: float) -> str | None:
-    """What to tell where robot and person overlap at every tick of the first second with a person in view, else None.
+    """Remark where robot and person overlap at every tick of the first second with a person in view, else None.
 
     Args:
         state: Table of the fused person.

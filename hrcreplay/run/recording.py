@@ -94,7 +94,7 @@ class BodyTrack:
         return np.where(known, axes, axes[:, :, ::-1])
 
     def is_near(self, first_ns: int, last_ns: int) -> bool:
-        """Whether the track has a sample so near to a span of time that it may count in it."""
+        """Return whether the track has a sample so near to a span of time that it may count in it."""
         margin_ns = round(GAP_S * 1e9)
         return bool(len(self.t_ns)) and self.t_ns[0] - margin_ns <= last_ns and first_ns <= self.t_ns[-1] + margin_ns
 

@@ -84,7 +84,7 @@ def run(
 
 
 def about_run(job: Job, began: datetime, parts: Mapping[str, str], *, smooth: bool) -> dict[str, Any]:
-    """What run.json says of how a run came to be.
+    """Entries of run.json on how a run came to be.
 
     Args:
         job: What was asked for.
@@ -183,7 +183,7 @@ def run_stages(
 
 
 def _about_results(job: Job, log: Log, folder: Path, meta: dict[str, Any], told: list[str]) -> dict[str, Any]:
-    """What run.json says beside what the stages found: more remarks, and the robot where there is a plan.
+    """Entries of run.json beside the findings of the stages: more remarks, and the robot where there is a plan.
 
     Args:
         job: What was asked for.
@@ -203,7 +203,7 @@ def _about_results(job: Job, log: Log, folder: Path, meta: dict[str, Any], told:
 
 
 def findings(job: Job, told: Mapping[str, Told], reused: tuple[str, ...] = ()) -> dict[str, Any]:
-    """What the stages found in the log; of a stage taken over, what the earlier run found.
+    """Findings of the stages in the log; of a stage taken over, those of the earlier run.
 
     Damage to the files that only this run met is told all the same.
 
@@ -387,7 +387,7 @@ def _difference(parts: tuple[str, ...], found: Mapping[str, str], meta: Mapping[
 
 
 def _damage(folder: Path, stage: str, outputs: Mapping[str, str]) -> str | None:
-    """What keeps an earlier run's tables of a stage from being taken for ours."""
+    """Reason not to take an earlier run's tables of a stage for ours."""
     for name in sorted(name for name in outputs if any(fnmatch(name, pattern) for pattern in TABLES[stage])):
         path = folder / name
         if not path.exists() or run_folder.sha256(path) != outputs[name]:

@@ -65,7 +65,7 @@ def write_report(job: Job, writer: RunWriter, meta: dict[str, Any], log: Log | N
 
 
 def scene_of(job: Job, run: Run) -> ReplayScene | None:
-    """What the 3-D replay of a run shows; None where it moved no robot."""
+    """Scene of a run's 3-D replay; None where it moved no robot."""
     if run.motion is None or run.T_world_base is None:
         return None
     radii_m = part_radii(job.settings.occupancy, job.settings.report.leg_radius_m)
@@ -106,7 +106,7 @@ def summary(folder: Path) -> list[str]:
 
 
 def _bounds(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """What the metrics ask of the settings."""
+    """Settings that the metrics need."""
     return {
         "near_m": settings["report"]["near_m"],
         "stationary_m_per_s": settings["report"]["stationary_m_per_s"],

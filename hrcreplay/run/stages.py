@@ -64,14 +64,14 @@ LONGEST_S = 24 * 3600
 
 
 class Tables(Protocol):
-    """Where the rows of tables go: to a run folder, or into memory."""
+    """Destination of the rows of tables: a run folder, or memory."""
 
     def table(self, name: str, columns: Mapping[str, Any], /) -> None:
         """Appends rows to a table."""
 
 
 class Told(NamedTuple):
-    """What a stage counted and noted."""
+    """Counts and notes of a stage."""
 
     counts: Counter[str]
     notes: tuple[str, ...]
@@ -89,12 +89,12 @@ class Sink:
 
 
 def told_of_fusion(log: Log, sink: Sink) -> Told:
-    """What the latest pass over a log's frames and stage 1 found, in files, frames and person."""
+    """Findings of the latest pass over a log's frames and of stage 1, in files, frames and person."""
     return Told(log.defects - log.joint_defects + sink.counts, (*log.notes, *sink.notes["fuse"]))
 
 
 def told_of_plan(log: Log, sink: Sink) -> Told:
-    """What the latest reading of a log's joints and stage 3 found."""
+    """Findings of the latest reading of a log's joints and of stage 3."""
     return Told(log.joint_defects, tuple(sink.notes["plan"]))
 
 
@@ -270,7 +270,7 @@ class StretchSmoother:
 
 
 def _nobody(log: Log, found: Counter[str]) -> LogError:
-    """What to tell of a log in which nobody was ever seen: what there was, and what would be right."""
+    """Error for a log in which nobody was ever seen: what there was, and what would be right."""
     rows = sum(log.defects[f"frames_{camera}"] for camera in log.header.cameras)
     text = (
         f"{log.header.path}: nobody was ever seen: {rows} bodies in the frames of {', '.join(log.header.cameras)} hold "
@@ -316,7 +316,7 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
 
 
 def stored_ticks(first: int, count: int, store_every: float) -> Ints:
-    """Which of ``count`` ticks from the ``first`` of a run on have their volumes stored: one in ``store_every``."""
+    """Select those of ``count`` ticks from the ``first`` on whose volumes are stored: one in ``store_every``."""
     if math.isinf(store_every):
         return np.zeros(0, np.int64)
     number = np.arange(first, first + count)

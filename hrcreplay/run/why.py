@@ -63,7 +63,7 @@ class Record:
 
     @cached_property
     def surroundings(self) -> build.Surroundings:
-        """What the robot keeps clear of."""
+        """Obstacles of the robot."""
         return build.surroundings(self.job, self.controller.robot)
 
     @cached_property
@@ -73,7 +73,7 @@ class Record:
         return planner.controller
 
     def predict(self, tick: int) -> Predict:
-        """What is around the robot at a tick."""
+        """Obstacles at a tick."""
         return Forecast(self.surroundings, self.states.rows(slice(tick, tick + 1))).predict(0)
 
     def again(self, tick: int) -> TickContext | None:
@@ -102,7 +102,7 @@ class Record:
             return TickContext(controller.stop, controller.u, controller.s_s, controller.observe(self.predict(tick)))
 
     def _as_recorded(self, tick: int, step: control_step.Step) -> bool:
-        """Whether a step is that of the record, bit for bit."""
+        """Return whether a step is that of the record, bit for bit."""
         row = self.motion.iloc[tick]
         same = STATUSES[step.status] == row["status"] and REASONS[step.reason] == (row["reason"] or "")
         same = same and np.array_equal(step.u, self._u[tick]) and step.certified == row["certified"]
@@ -164,7 +164,7 @@ def open_record(folder: Path, method: str | None = None) -> Record:
 
 
 def explain(folder: Path, at_s: float, method: str | None = None) -> dict[str, Any]:
-    """Why the robot did what it did at an instant of a run.
+    """Explain the robot's step at an instant of a run.
 
     Args:
         folder: Run folder with a plan.
@@ -256,7 +256,7 @@ def _cameras(record: Record, tick: int) -> dict[str, dict[str, float | None]]:
 
 
 def _unseen(record: Record, tick: int, limb: str) -> float | None:
-    """Since a camera last saw the joints of a limb [s]; None for the lower body, and before the first time."""
+    """Time since a camera last saw the joints of a limb [s]; None for the lower body, and before the first time."""
     since = record.states.unseen_s[tick, LIMBS.index(limb)] if limb in LIMBS else np.inf
     return float(since) if np.isfinite(since) else None
 
@@ -322,7 +322,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
 
 
 def _watched_text(since_s: Mapping[str, float | None]) -> str:
-    """Since when the watched area was without people."""
+    """Time since the watched area was without people, in words."""
     parts = [
         f"{whom} {'never' if since is None else f'{1e3 * since:.0f} ms before'}"
         for whom, since in (("anybody", since_s["nobody_s"]), ("anybody but the person", since_s["nobody_else_s"]))
@@ -337,7 +337,7 @@ def _state(found: Mapping[str, Any]) -> str:
 
 
 def cause(found: Mapping[str, Any]) -> str:
-    """What held the robot, in a sentence without its full stop."""
+    """Cause that held the robot, in a sentence without its full stop."""
     if found.get("conflict"):
         return f"no velocity keeps all of these: {'; '.join(_row(row) for row in found['conflict'])}"
     if found.get("refused"):
@@ -381,7 +381,7 @@ def _row(row: Mapping[str, Any]) -> str:
 
 
 def _failure(one: Mapping[str, Any]) -> str:
-    """Where a stop is not clear, in words."""
+    """Place at which a stop is not clear, in words."""
     if "link" not in one:
         return one["why"] + (f", axis {one['axis']}" if "axis" in one else "")
     when = f"{1e3 * one['failed_s']:.0f} ms after the tick"

@@ -47,7 +47,7 @@ class Section(BaseModel):
 
 
 class Decoder(Section):
-    """How to read skeletons from a message type the package does not know."""
+    """Decoder of skeletons from a message type the package does not know."""
 
     topic: str
     """Topic of the messages."""
@@ -125,11 +125,11 @@ class Fusion(Section):
     outlier_m: Positive = 0.20
     """A point further than this from the predicted skeleton is an outlier [m]."""
     relearn_s: Positive = 0.1
-    """Unless a camera has shown it in one place for so long, and none has shown it where the filter has it [s]."""
+    """Accept an outlier seen in one place this long, while no camera sees it where the filter has it [s]."""
     bone_m: Positive = 0.10
-    """An outlier is also a point at the end of a bone that is longer or shorter than the person's by more [m]."""
+    """A point is an outlier too where its bone is longer or shorter than the person's by more than this [m]."""
     bone_memory_s: Positive = 5.0
-    """Unless no camera has seen that bone right for so long [s]."""
+    """Accept such an outlier once no camera has seen that bone's right length for this long [s]."""
     point_std_m: Positive = 0.02
     """Standard deviation of a skeleton point at full confidence [m]."""
     point_std_per_m: NotNegative = 0.0
@@ -137,7 +137,7 @@ class Fusion(Section):
     sigma_position: Sigmas = (300.0, 100.0, 5.0, 1.0)
     """Sigmas of Eq. (44) for x and y: p, v, a, j [m/s^2, m/s^2.5, m/s^3, m/s^3.5]."""
     sigma_height: Sigmas = (300.0, 200.0, 5.0, 1.0)
-    """The same for z: who gets up is faster than who walks about."""
+    """The same for z: people get up faster than they walk about."""
     sigma_angle: Sigmas = (1500.0, 600.0, 10.0, 1.0)
     """The same for the angles [rad]."""
     coast_s: Positive = 0.12
@@ -145,13 +145,13 @@ class Fusion(Section):
     delay_max_s: Positive = 0.25
     """An older frame counts as this old [s]."""
     residual_quantile: Share = 0.9
-    """Of how far each limb's measured points were from the model's: the quantile that is tracked."""
+    """Tracked quantile of the distance of each limb's measured points from the model's."""
     residual_memory_s: Positive = 20.0
-    """A distance seen this long ago counts 1/e of a new one [s]."""
+    """Time constant with which a measured distance loses weight [s]."""
     residual_hold_s: NotNegative = 0.15
-    """A distance above the quantile counts for so long, or until a larger one [s]."""
+    """Time for which a distance above the quantile counts, unless a larger one follows [s]."""
     offset_memory_s: Positive = 0.5
-    """Where shoulders, head and arms are beside the model is a mean in which a frame this old counts 1/e [s]."""
+    """Time constant of the mean offset of shoulders, head and arms from the model [s]."""
     spread_memory_s: Positive = 1.0
     """The reported variances are scaled by the highest normalised innovation squared; it decays to 1/e in this time
     [s]."""
@@ -324,7 +324,7 @@ class Plan(Section):
 
 
 class Report(Section):
-    """What is computed and drawn."""
+    """Computation of metrics and figures."""
 
     near_m: Positive = 0.50
     """The stationary share counts ticks with a separation of at most this [m]."""
@@ -402,10 +402,10 @@ class Live(Section):
     cycle_s: Annotated[float, Field(ge=0.001, le=0.1)] = 0.004032
     """The robot's cycle: every answer moves the reference by this much time [s]."""
     reaction_s: NotNegative = 0.05
-    """From a look at the person to the robot's obedience: up to two cycles until it is used, an answer's delay, a cycle
+    """Latency from perception to robot response: up to two cycles until a look is used, the delay of an answer, a cycle
     and the robot's own lag. The swept volumes of method sound reach this much further than T_s [s]."""
     look_s: Positive = 0.016
-    """plan.certify: a look at the person older than this is not used for a step; the certified stop goes on [s]."""
+    """plan.certify: largest age of a perception update that a step may use; after it the certified stop goes on [s]."""
     approach_speed: Annotated[float, Field(gt=0, le=1)] = 0.1
     """Share of the axes' top speeds on the way from where the robot stands to its programme."""
     resume: bool = False

@@ -1,4 +1,4 @@
-"""What the last bits of a number depend on beside versions: processor, code chosen for it, and mathematical libraries.
+"""Description of what last bits depend on beside versions: processor, code chosen for it, mathematical libraries.
 
 BLAS, numpy's loops, the C library and numba each choose code by the processor at run time. So each run says where it
 was made, and who computes it again can tell another processor from another motion.
@@ -59,7 +59,7 @@ def name_machine(machine: dict[str, Any] | None) -> str:
 
 
 def _cpu_information() -> dict[str, str]:
-    """What Linux tells of its first processor; nothing elsewhere."""
+    """Description of the first processor by Linux; nothing elsewhere."""
     try:
         text = Path("/proc/cpuinfo").read_text().partition("\n\n")[0]
     except OSError:
@@ -68,7 +68,7 @@ def _cpu_information() -> dict[str, str]:
 
 
 def _blas_core() -> str:
-    """Which processor numpy's OpenBLAS has its kernels for; empty for another library, and where it cannot be asked."""
+    """Processor of numpy's OpenBLAS kernels; empty for another library, and where it cannot be asked."""
     try:
         lines = Path("/proc/self/maps").read_text().splitlines()
     except OSError:

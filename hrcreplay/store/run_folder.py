@@ -106,7 +106,7 @@ class RunWriter:
 
     @property
     def partial(self) -> Path:
-        """Where the run is written until it is complete."""
+        """Folder in which the run is written until it is complete."""
         return self.folder.with_name(self.folder.name + ".partial")
 
     def __enter__(self) -> Self:
@@ -197,7 +197,7 @@ class Run:
 
 
 def is_run(path: Path) -> bool:
-    """Whether a folder was left by an earlier command."""
+    """Return whether a folder was left by an earlier command."""
     return (path / "run.json").is_file()
 
 

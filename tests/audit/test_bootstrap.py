@@ -27,7 +27,7 @@ def _outcome(beyond: Floats, radius: float = 0.1, flesh: float = 0.0) -> Outcome
         upper_m3=np.where(np.arange(n) % 2 == 0, 1.5, np.nan),
         upper_std_m3=np.where(np.arange(n) % 2 == 0, 0.015, np.nan),
         limbs=BODY[:limbs],
-        flesh_m=(flesh,) * limbs,
+        limb_radius_m=(flesh,) * limbs,
     )
 
 

@@ -91,7 +91,7 @@ class FaultyChannel:
 
 
 def is_active(fault: Fault, since_s: float) -> bool:
-    """Whether a fault is on; one without duration is on for less than a cycle."""
+    """Return whether a fault is on; one without duration is on for less than a cycle."""
     return fault.at_s <= since_s < fault.at_s + max(fault.duration_s, 0.004032)
 
 
@@ -159,7 +159,7 @@ class Fault:
 
     @property
     def of_link(self) -> bool:
-        """Whether it touches datagrams, not the robot."""
+        """Return whether it touches datagrams, not the robot."""
         return self.kind in LINK_FAULTS
 
 
@@ -316,7 +316,7 @@ class FaultOutcome:
 
 
 def fault_outcome(fault: Fault, cycles: NDArray[Any]) -> FaultOutcome:
-    """How long it took from the onset of a fault until everything stood still."""
+    """Time from the onset of a fault until everything stood still."""
     since_s = (cycles["t_ns"] - cycles["t_ns"][:1]) * 1e-9
     told = _told_still(cycles)
     robot_s = _rest_s(fault, since_s, np.all(np.abs(cycles["planned_rad_per_s"]) < _REST_RAD_PER_S, axis=1))

@@ -143,7 +143,7 @@ class ServoController:
 
     @property
     def moves(self) -> bool:
-        """Whether references are followed: the session lasts, motors are on and the program runs."""
+        """Return whether references are followed: the session lasts, motors are on and the program runs."""
         return self.ended_ns is None and self.motors_on and self.program_running
 
     def step(self, t_ns: int, told: Correction | None) -> None:

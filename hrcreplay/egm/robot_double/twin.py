@@ -299,12 +299,12 @@ class TwinCore:
                 self._queue.append(data)
 
     def _silent(self, t_ns: int, active: dict[str, Fault]) -> bool:
-        """Whether nothing is sent: by a fault, or because the session is over and its last states have been told."""
+        """Return whether nothing is sent: by a fault, or since the session is over and its last states are told."""
         ended_ns = self.servo.ended_ns
         return "silence" in active or (ended_ns is not None and t_ns - ended_ns > self._settings.servo.ramp_s * 1e9)
 
     def _packet(self, t_ns: int, active: dict[str, Fault]) -> RobotPacket:
-        """What the robot says in this cycle."""
+        """State of the robot in this cycle."""
         servo, since_ns = self.servo, t_ns - (self._first_ns or 0)
         q = servo.measured
         if teleport := active.get("teleport"):

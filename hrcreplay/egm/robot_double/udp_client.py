@@ -299,7 +299,7 @@ def _wait(until_ns: int, late: list[tuple[int, int, bytes]], client: socket.sock
 
 
 def _arrived(client: socket.socket) -> list[Datagram]:
-    """What has come in, with the instants at which the kernel had it, which no sleep of ours delays."""
+    """Received packets, with the instants at which the kernel had them, which no sleep of ours delays."""
     datagrams: list[Datagram] = []
     to_monotonic_ns = time.monotonic_ns() - time.time_ns()
     while True:

@@ -1,4 +1,4 @@
-"""Where the body's points are beside the model, in the torso's frame, and where hands and legs hang (docs/paper.md).
+"""Offsets of the body's points from the model, in the torso's frame, and attachment of hands and legs (docs/paper.md).
 
 People bend sideways, twist and lift their shoulders; thirteen joints do not. Where shoulders, head, elbows and wrists
 are beside the model is a running mean. Hands and legs have no joints: they are where a camera last showed them, carried
@@ -101,7 +101,7 @@ def _learn_legs(filter_: Filter, c: int, pelvis: Floats, heading: float, rules: 
 
 @njit(cache=True)
 def _near(filter_: Filter, c: int, k: int, place: Floats, most: float, rules: Rules) -> bool:
-    """Whether a camera shows a point with enough confidence within ``most`` [m] of a place."""
+    """Return whether a camera shows a point with enough confidence within ``most`` [m] of a place."""
     shown = filter_.confidence[c, k] >= rules.confidence_min
     return bool(shown and distance(filter_.points[c, k], place) <= most)
 

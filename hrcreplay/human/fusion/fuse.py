@@ -37,7 +37,7 @@ FusionState = Filter
 
 @dataclass(frozen=True)
 class Trace:
-    """What a smoother needs beside the states: P of every tick, and how it was reached. No rows where not traced."""
+    """Input of the smoother beside the states: P of every tick, and how it was reached. No rows where not traced."""
 
     cov: Floats  #: (n, 13, 4, 4) covariance of p, v, a, j
     damping: Floats  #: (n, 13) of the derivatives on the way to the tick; 1 unless the joint was unseen

@@ -1,6 +1,6 @@
-"""What of a camera's frame the filter may use, 4.1.2: by confidence, and by the predicted skeleton.
+"""Gating of camera frames, 4.1.2: by confidence, and by the predicted skeleton.
 
-A gate that only refuses keeps a filter that went wrong from ever seeing it. So a point that a camera goes on showing in
+Pure rejection prevents recovery of a filter that went wrong. So a point that a camera goes on showing in
 one place, while no camera shows it where the filter has it, is evidence: after ``relearn_s`` it is believed, and its
 rows start anew. Left and right exchanged are none, nor is a marker that jumps and leaves its bone behind; where two
 cameras show that, the residual holds it all the same (``model_residual``).
@@ -54,7 +54,7 @@ _UNKNOWN_M = 0.1
 
 @njit(cache=True)
 def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
-    """Which rows of a new frame are valid, 4.1.2 and Eq. (58), and which limbs it shows whole.
+    """Select the valid rows of a new frame, 4.1.2 and Eq. (58), and the limbs that it shows whole.
 
     Args:
         filter_: Holds the frame. ``valid`` and ``shows`` of the camera are written, and the ticks at which points and
@@ -90,7 +90,7 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
 
 @njit(cache=True)
 def _judge_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> None:
-    """Which rows are valid, Eq. (58), given the points (20,) to be trusted."""
+    """Select the valid rows, Eq. (58), given the points (20,) to be trusted."""
     confidence, points = filter_.confidence[c], filter_.points[c]
     for row in range(ROWS):
         product = 1.0
@@ -138,7 +138,7 @@ def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> 
 
 @njit(cache=True)
 def _gates(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Floats, Floats]:
-    """Where a camera's frame should show the points, (20, 3) [m], and how far off they may be, (20,) [m].
+    """Expected points in a camera's frame, (20, 3) [m], and their allowed errors, (20,) [m].
 
     That is ``outlier_m`` widened by three standard deviations of the prediction towards the point, each joint's carried
     through the forward kinematics. Those across say nothing: left and right exchanged would pass.

@@ -77,7 +77,7 @@ def inverse(points_m: Floats) -> tuple[Floats, Floats]:
 
 
 def measure(frames: CameraFrames, T_world_camera: Floats, settings: Fusion) -> Measurements:
-    """What the closed-form inverse kinematics makes of camera frames.
+    """Joint angles and limb lengths of camera frames, by closed-form inverse kinematics.
 
     Args:
         frames: Skeletons in their camera's frame, one body each.

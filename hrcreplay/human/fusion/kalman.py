@@ -105,7 +105,7 @@ class Rules(NamedTuple):
 
 
 class Track(NamedTuple):
-    """What the ticks leave behind; rows before the start stay as they are."""
+    """Output of the ticks; rows before the start stay as they are."""
 
     motion: Floats  #: (6, n, 13) p, v, a, j, and the reported deviations of p and v
     lengths: Floats  #: (2, n, 7) and their deviations
@@ -223,7 +223,7 @@ def process_variance(a: int, dt: float, damping: float, sigma: Floats, rest_std:
 
 @njit(cache=True)
 def ago(mean: Floats, d: float) -> Floats:
-    """Where the joints (13,) were d seconds before, by the Taylor polynomial of Eq. (43)."""
+    """Joint positions (13,) d seconds before, by the Taylor polynomial of Eq. (43)."""
     return mean[:, 0] - d * mean[:, 1] + d**2 / 2.0 * mean[:, 2] - d**3 / 6.0 * mean[:, 3]
 
 

@@ -1,4 +1,4 @@
-"""How far the body's points are from where the model and ``body_points`` have them, and how long no camera saw them.
+"""Distance of the body's points from the model and ``body_points``, and time since a camera saw them.
 
 A sample of a limb's residual is the largest distance of its measured points from those, of the predicted model at the
 frame's capture time, where the delay is compensated. It is taken before the frame is used, so it also holds how far the
@@ -147,7 +147,7 @@ def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rule
 
 @njit(cache=True)
 def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
-    """Whether no joint that carries the limb is lost or has started anew lately: the filter must find it first."""
+    """Return whether no joint that carries the limb is lost or has restarted lately: the filter must find it first."""
     root = 2 if limb == _LEGS else 4
     newest, last = filter_.acquired_ns[:root].max(), filter_.row_ns[:root].min()
     newest, last = max(newest, filter_.acquired_ns[HEIGHT]), min(last, filter_.row_ns[HEIGHT])

@@ -1,4 +1,4 @@
-"""Since when nobody can be in an area that the cameras watch.
+"""Time since nobody can have been in an area that the cameras watch.
 
 The area is vacant at an instant to which all cameras have given frames, for long enough and without a gap, when every
 body that one of them showed inside was shown outside afterwards. A body that was lost inside may still be there, but
@@ -21,7 +21,7 @@ from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, HumanStates
 
 @dataclass(frozen=True)
 class WatchedArea:
-    """What the cameras see together: whoever has any point of the body in it is shown by one of them."""
+    """Area that the cameras see together: one of them shows everybody who has any point of the body in it."""
 
     polygon: ConvexPolygon  #: on the floor; the area has any height
     margin_m: float  #: how far inside the border somebody may be who is not shown yet [m]
@@ -30,12 +30,12 @@ class WatchedArea:
     speed_m_per_s: float  #: at which people walk in, ISO 13855
 
     def reached_m(self, since_s: float | Floats) -> float | Floats:
-        """How far inside the border somebody can be who was outside ``since_s`` [s] ago; inf for inf [m]."""
+        """Depth inside the border that somebody outside ``since_s`` [s] ago can have reached; inf for inf [m]."""
         return self.margin_m + self.speed_m_per_s * since_s
 
 
 class Sighting(NamedTuple):
-    """Where a camera last showed a body."""
+    """Last place at which a camera showed a body."""
 
     capture_ns: int
     inside: bool
@@ -43,7 +43,7 @@ class Sighting(NamedTuple):
 
 
 class VacancyState(NamedTuple):
-    """What is remembered between two tables of frames; instants are captures [ns]."""
+    """State between two tables of frames; instants are captures [ns]."""
 
     newest_ns: tuple[int, ...]  #: camera -> its newest frame; -1 before the first
     begin_ns: tuple[int, ...]  #: camera -> since when its frames have come without a gap
@@ -100,7 +100,7 @@ def _depths(frames: CameraFrames, area: WatchedArea) -> Floats:
 
 
 def _refutes(vacant_ns: int, capture_ns: int, depth_m: float, area: WatchedArea) -> bool:
-    """Whether a body is where nobody can have come since the area was vacant."""
+    """Return whether a body is where nobody can have come since the area was vacant."""
     since_s = (capture_ns - vacant_ns) / 1e9
     return vacant_ns >= 0 and since_s >= 0.0 and np.isfinite(depth_m) and bool(depth_m > area.reached_m(since_s))
 

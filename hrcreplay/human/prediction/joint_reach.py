@@ -1,4 +1,4 @@
-"""How far one joint gets: bang-bang motions between bounds, with what stops do to them.
+"""Reach of one joint: bang-bang motions between bounds, with what stops do to them.
 
 A joint obeys v_min <= v <= v_max and a_min <= a <= a_max. A state beyond a velocity bound comes back as fast as the
 acceleration bounds allow. So with v_hi the largest initial velocity, no velocity is ever above the profile that starts
@@ -19,7 +19,7 @@ Stops = tuple[float, float, float, float]
 
 @njit(cache=True)
 def saturation_s(v: float, top: float, gain: float, brake: float) -> float:
-    """When the fastest velocity profile reaches its bound [s]; inf where it never does.
+    """Time at which the fastest velocity profile reaches its bound [s]; inf where it never does.
 
     Args:
         v: Largest initial velocity [m/s or rad/s].
@@ -73,13 +73,13 @@ def rise(v: float, top: float, gain: float, brake: float, horizon: float) -> flo
 
 @njit(cache=True)
 def braking(v: float, brake: float, horizon: float) -> float:
-    """How far a joint still gets that brakes as hard as it can."""
+    """Distance that a joint travels while it brakes as hard as it can."""
     return rise(v, 0.0, 0.0, brake, horizon) if v > 0.0 else 0.0
 
 
 @njit(cache=True)
 def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> Stops:
-    """Where the stops of joint j can be while the joints that they depend on are in [low, high].
+    """Range of the stops of joint j while the joints that they depend on are in [low, high].
 
     A stop outside of all of them holds always; one inside of all may be where the joint is stopped. The coupled ones,
     Eq. (34b), (34c), are monotonic or bilinear: their extremes are at the corners.
@@ -111,7 +111,7 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
 def interval(
     p: tuple[float, float], v: tuple[float, float], speed: Floats, limit: Stops, horizon: float
 ) -> tuple[float, float]:
-    """What a joint between stops can reach at any time in [0, horizon]; stands for Alg. 1 under ``sound``.
+    """Reachable interval of a joint between stops at any time in [0, horizon]; replaces Alg. 1 under ``sound``.
 
     A stop takes the velocity into it away at once: from there the joint starts again from rest. A state that may be
     beyond a stop brakes outward and then stays; a stop takes nothing away from what the state itself encloses.

@@ -35,7 +35,7 @@ Range = tuple[float, float]
 
 
 class Likely(NamedTuple):
-    """Where people may be at the tick, a row each: a box around the estimate, and what nobody has seen for long."""
+    """Possible states of people at the tick, a row each: a box around the estimate, and what is long unseen."""
 
     p: Floats  #: (n, 13)
     v: Floats  #: (n, 13)
@@ -45,7 +45,7 @@ class Likely(NamedTuple):
 
 
 class SoundMotionLimits(NamedTuple):
-    """What bounds the motions that ``sound`` encloses."""
+    """Bounds on the motions that ``sound`` encloses."""
 
     bounds: Floats  #: (6, 13) of ``human.model.bounds_of``
     coupled: bool  #: whether Eq. (34b), (34c) hold
@@ -214,7 +214,7 @@ def walked(heading: Range, velocity: tuple[Range, Range, Range], bounds: Floats,
 
 @njit(cache=True)
 def _turn(omega: Range, bounds: Floats, t: float) -> Range:
-    """How far the heading can turn to the right and to the left at any time until t [rad]."""
+    """Largest turn of the heading to the right and to the left at any time until t [rad]."""
     least, most, brake, gain = bounds[2, 2], bounds[3, 2], bounds[4, 2], bounds[5, 2]
     return rise(-omega[0], -least, -brake, -gain, t), rise(omega[1], most, gain, brake, t)
 
@@ -291,7 +291,7 @@ KNEE_M = 0.55
 
 @njit(cache=True)
 def knees_out(pelvis_m: float) -> float:
-    """How far the knees are from the line below a pelvis of that height, whose foot is under it [m]."""
+    """Distance of the knees from the line below a pelvis of that height, whose foot is under it [m]."""
     return np.sqrt(max(0.0, BONE_M**2 - (0.5 * pelvis_m) ** 2))  # thigh and shank of one length
 
 

@@ -173,11 +173,11 @@ def _sweep_rows(
     within: SoundMotionLimits,
     hand: float,
     legs: float,
-    flesh: Floats,
+    limb_radius: Floats,
     radii: Floats,
     work: Surface,
 ) -> tuple[Floats, Ints]:
-    """Vertices and offsets; writes the radii of limbs that have tubes into ``radii``, their flesh (7,) in them."""
+    """Vertices and offsets; writes the radii of limbs that have tubes into ``radii``, their own (7,) in them."""
     limbs = radii.shape[1]
     offsets = np.zeros(len(at.p) * limbs + 1, np.int64)
     vertices = np.empty((len(at.p) * limbs * 80 + 80, 3))
@@ -194,10 +194,10 @@ def _sweep_rows(
                 reach = tubed.reach_s[i, limb]
                 count = tube(limb, tubed.points[i], velocity, within.horizon, reach, hand, tubed, short)
                 usable = np.isfinite(short[:count].sum())
-                thick = flesh[limb]
+                thick = limb_radius[limb]
                 if limb == LEGS and not tubed.legs_shown[i]:
                     hidden = max(legs, knees_out(at.p[i, HEIGHT]) + THIGH_M) + ROUNDING_M
-                    thick = np.fmax(hidden, tubed.legs_m[i] + flesh[limb])
+                    thick = np.fmax(hidden, tubed.legs_m[i] + limb_radius[limb])
                 radii[i, limb] = thick + departs_m(limb, reach, tubed.residual[i, limb], tubed)
                 if not usable:
                     short[0], count = np.nan, 1

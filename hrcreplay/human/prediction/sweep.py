@@ -220,7 +220,7 @@ def _directions(floor: Floats) -> Floats:
 
 @njit(cache=True)
 def _is_between(away: Cone, k: int, sides: Floats) -> bool:
-    """Whether a copy is no corner at a place, given the directions to it from its set and from its turned copies."""
+    """Return whether a copy is no corner at a place, by the directions to it from its set and its turned copies."""
     if away[0] == ALL_ROUND:
         return True
     for j in (0, 2):

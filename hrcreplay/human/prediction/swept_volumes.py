@@ -1,4 +1,4 @@
-"""What every joint can reach within the horizon, and the volumes that the limbs sweep: Eq. (18)-(30), Alg. 1, Alg. 2.
+"""Reachable intervals of the joints within the horizon, and swept volumes of the limbs: Eq. (18)-(30), Alg. 1, Alg. 2.
 
 Corrections: docs/paper.md. Under ``sound`` both enclose every motion of Eq. (25), see ``sound_volumes``.
 """
@@ -36,7 +36,7 @@ class Reach(Table):
 
 
 class MotionLimits(NamedTuple):
-    """What bounds the motions that a printed method predicts from."""
+    """Bounds on the motions that a printed method predicts from."""
 
     bounds: Floats  #: (6, 13) of ``bounds_of``
     coupled: bool  #: whether Eq. (34b), (34c) hold
@@ -151,7 +151,7 @@ def _joint(p: float, v: float, bounds: Floats, horizon: float) -> tuple[float, f
 
 @njit(cache=True)
 def _farthest(p: float, v: float, v_bound: float, a_bound: float, horizon: float) -> float:
-    """Where a joint gets that accelerates at its bound until it reaches its velocity bound at T* of Alg. 1."""
+    """Position of a joint that accelerates at its bound until it reaches its velocity bound at T* of Alg. 1."""
     t_star = max(0.0, min((v_bound - v) / a_bound, horizon))  # an estimate over the bound has T* < 0
     if t_star == horizon:
         return p + v * horizon + 0.5 * a_bound * horizon**2

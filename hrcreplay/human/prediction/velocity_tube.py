@@ -22,7 +22,7 @@ _STEP_S = 1e-4
 _FRESH_S = 0.1
 #: A larger residual is no noise of one place but another place, which the filter does not believe yet [m].
 NOISE_M = 0.2
-#: A velocity of now says nothing of where trunk and legs, and where arms, are later than this: people change it [s].
+#: Longest extrapolation at constant velocity, of trunk and legs, and of arms [s].
 _CARRIES_S, _CARRIES_ARMS_S = 0.25, 0.15
 #: A swinging leg is so many times as fast as the body: it stands for about half of the time.
 _STRIDE = 2.0
@@ -37,7 +37,7 @@ _ARMS = np.array(ARM_POINTS)
 
 
 class Tubes(NamedTuple):
-    """What the tubes are made of, a row a tick."""
+    """Data of the tubes, a row a tick."""
 
     points: Floats  #: (n, 20, 3) of ``HumanStates.points_m``
     residual: Floats  #: (n, 7) what is added for each limb of BODY times ``residuals`` [m]
@@ -88,7 +88,7 @@ def tubes(
 
 @njit(cache=True)
 def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
-    """How far a limb departs at most until ``reach_s`` [m].
+    """Largest departure of a limb until ``reach_s`` [m].
 
     Never less than the residual: the limb may be there already.
 

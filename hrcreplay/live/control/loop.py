@@ -285,7 +285,7 @@ class FallbackBrake:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the robot has been told to stand."""
+        """Return whether the robot has been told to stand."""
         return not any(self.dq)
 
     def update_position(self, measured: Sequence[float]) -> None:
@@ -382,7 +382,7 @@ def _joints(place: Any) -> list[float]:
 
 
 def _measured(data: bytes, axes: int) -> list[float] | None:
-    """Where a robot of so many axes is [deg]; None of a datagram that does not say it."""
+    """Joint positions of a robot of so many axes [deg]; None of a datagram without them."""
     try:
         joints = _joints(messages.RobotMessage.FromString(data).feed_back)
     except DecodeError:

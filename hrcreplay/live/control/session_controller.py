@@ -141,12 +141,12 @@ class SessionController:
 
     @property
     def connected(self) -> bool:
-        """Whether a robot is being answered."""
+        """Return whether a robot is being answered."""
         return self._motion is not None
 
     @property
     def outlook(self) -> str:
-        """What a robot that stands waits for; empty where it moves, or where the session ends."""
+        """Reason for which a standing robot waits; empty where it moves, or where the session ends."""
         if self.phase == codec.WAITING and self.waiting:
             return "it moves as soon as that is over"
         if self.phase != codec.HOLDING or self.stop in (*_ENDINGS, *_FINAL):
@@ -258,7 +258,7 @@ class SessionController:
         self._check_silence(t_ns)
 
     def _check_silence(self, t_ns: int) -> None:
-        """Whether the robot has been gone for too long: it has stopped listening, so it begins anew where it stands."""
+        """Check whether the robot was silent for too long: it no longer listens, so it begins anew where it stands."""
         if self._heard_ns is None or t_ns - self._heard_ns <= self.setup.bounds.silent_s * 1e9:
             return
         if self.phase in (codec.APPROACH, codec.FOLLOWING, codec.STOPPING):
@@ -334,14 +334,14 @@ class SessionController:
         return (brake if motion.controller is None else follow)(self.setup, motion, self._obstacles)
 
     def _look_late(self, t_ns: int) -> None:
-        """Whether the volumes are older than the reaction time allows for: then only the certified stop is."""
+        """Return whether the volumes are older than the reaction time allows: then only the certified stop is."""
         age_s = math.inf if self.perception is None else (t_ns - self.perception.t_ns) * 1e-9
         self._late = self.setup.plan.certified and age_s > self.setup.bounds.look_s
         if self._late:
             self._ready = None
 
     def _horizon_s(self) -> float:
-        """Until when the volumes of the next look must hold."""
+        """Time until which the volumes of the next look must hold."""
         return self.setup.plan.horizon_s(self._motion.stop if self._motion is not None else at_rest(self._still))
 
     def _obstacles(self, horizon_s: float) -> Obstacles:

@@ -79,7 +79,7 @@ class Observer:
         return Perception(t_ns, states, volumes, obstacles(volumes, 0, horizon_s), horizon_s)
 
     def around(self, look: Perception, horizon_s: float, *, believed: bool) -> Obstacles:
-        """What the robot keeps clear of, by a look.
+        """Obstacles that the robot keeps clear of, by a look.
 
         Args:
             look: The last one.
@@ -93,13 +93,13 @@ class Observer:
         return found if believed else replace(found, known=False)
 
     def vacant_s(self, look: Perception | None, t_ns: int) -> float:
-        """Since when nobody can be in the watched area, by a look; inf where that is not known [s]."""
+        """Time since nobody can have been in the watched area, by a look; inf where that is not known [s]."""
         if look is None or look.states.nobody_s is None:
             return math.inf
         return float(look.states.nobody_s[0]) + (t_ns - look.t_ns) / NS
 
     def age_s(self, t_ns: int) -> float:
-        """How old the newest frame that entered the filter is; inf before the first [s]."""
+        """Age of the newest frame that entered the filter; inf before the first [s]."""
         return self._frame_age_s + (t_ns - self._look_ns) / NS
 
     def _frames(self, t_ns: int, skeletons: Sequence[bytes]) -> CameraFrames | None:
@@ -190,7 +190,7 @@ def follow(setup: ControlSetup, motion: MotionState, predict: Predict) -> Motion
 
 
 def _at_the_end(setup: ControlSetup, controller: Controller) -> bool:
-    """Whether the approach has come to its end."""
+    """Return whether the approach has come to its end."""
     if controller.s_s < controller.reference.duration_s:
         return False
     goal = controller.reference.sample(controller.s_s).T_world_tcp[:3, 3]

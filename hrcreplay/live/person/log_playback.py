@@ -50,7 +50,7 @@ Item = Opened | Note | list[Frame] | Exception | None  #: None: nothing will fol
 
 
 def playback_items(log: Log, *, repeat: bool) -> Iterator[Item]:
-    """What is read from a recording: its span, its frames chunk by chunk (again and again with ``repeat``), notes."""
+    """Read a recording: its span, its frames chunk by chunk (again and again with ``repeat``), notes."""
     header = log.header
     yield Opened(header.cameras, header.start_ns, header.end_ns)
     newest: dict[str, int] = {}  # last capture of each camera in the passes before
@@ -74,7 +74,7 @@ def playback_items(log: Log, *, repeat: bool) -> Iterator[Item]:
 
 
 def _rises(frame: Frame, newest: dict[str, int]) -> bool:
-    """Whether a frame is captured after the pass before; delays of the first frames may differ from the last."""
+    """Return whether a frame is captured after the pass before; delays of the first frames may differ from the last."""
     before = newest.get(frame.skeleton.camera)
     return before is None or frame.skeleton.capture_ns > before
 
@@ -94,7 +94,7 @@ def frames_of(table: CameraFrames, later_ns: int = 0) -> Iterator[Frame]:
 
 
 def same_frame(one: Frame, two: Frame) -> bool:
-    """Whether two bodies stood in one frame. The shift to session time comes when the first of them is sent."""
+    """Return whether two bodies are of one frame. The shift to session time comes when the first of them is sent."""
     return (one.skeleton.camera, one.skeleton.capture_ns) == (two.skeleton.camera, two.skeleton.capture_ns)
 
 
@@ -158,7 +158,7 @@ class Playback:
             yield b"Z", b""
 
     def next_ns(self, now_ns: int) -> int | None:
-        """When the next message is due, in session time; None where nothing is to come or nothing is known yet."""
+        """Session time at which the next message is due; None where nothing is to come or nothing is known yet."""
         if self._shift_ns is None or self._ended:
             return None
         if self._waiting:
@@ -177,7 +177,7 @@ class Playback:
             yield ready_note(opened.cameras)
 
     def _fill(self) -> bool:
-        """Whether a message waits, taking what has been read where none does."""
+        """Return whether a message waits, taking what has been read where none does."""
         while not self._waiting and not self._exhausted:
             try:
                 item = self._take()

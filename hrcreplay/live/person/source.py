@@ -311,7 +311,7 @@ class SkeletonSource(Protocol):
         """The messages to send now. Raises LogError, SettingsError."""
 
     def next_ns(self, now_ns: int) -> int | None:
-        """When the next message is due; None: not known, or woken otherwise."""
+        """Time at which the next message is due; None: not known, or woken otherwise."""
 
 
 class SendSchedule:
@@ -327,14 +327,14 @@ class SendSchedule:
             self._source.go(int.from_bytes(message[1:], "little"))
 
     def send(self, now_ns: int) -> Iterator[Outgoing]:
-        """What is due. Raises LogError, SettingsError."""
+        """Send all that is due. Raises LogError, SettingsError."""
         if now_ns >= self._beat_ns:
             self._beat_ns += BEAT_NS * ((now_ns - self._beat_ns) // BEAT_NS + 1)  # missed beats are not made up for
             yield b"H", b""
         yield from self._source.due(now_ns)
 
     def next_ns(self, now_ns: int) -> int:
-        """When something is due again."""
+        """Time at which something is due again."""
         due_ns = self._source.next_ns(now_ns)
         return self._beat_ns if due_ns is None else min(self._beat_ns, due_ns)
 

@@ -109,7 +109,7 @@ _OTHERS = 13
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the controller decided on an event."""
+    """Decision of the controller on an event."""
 
     t_ns: int  #: of the event
     look_ns: int  #: of the perception update whose volumes it kept clear of
@@ -125,7 +125,7 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class Perception:
-    """What is known of the person after a perception update."""
+    """Knowledge of the person after a perception update."""
 
     t_ns: int
     states: HumanStates  #: one row
@@ -180,7 +180,7 @@ def encode_reply(t_ns: int, datagram: bytes, *, sent: bool) -> bytes:
 
 
 def decode_reply(message: bytes) -> tuple[bool, bytes]:
-    """Whether a recorded reply was sent, and its datagram."""
+    """Decode a recorded reply: whether it was sent, and its datagram."""
     return bool(_REPLY.unpack_from(message)[2]), message[_REPLY.size :]
 
 
@@ -270,7 +270,7 @@ def _hash(points: Floats, radius: Floats) -> bytes:
 
 
 def same_on_a_grid(recorded: bytes, again: bytes) -> bool:
-    """Whether two of ``volume_digests`` tell of the same volume, but for GRID_M."""
+    """Return whether two results of ``volume_digests`` describe the same volume, up to GRID_M."""
     grids = [slice(_DIGEST * i, _DIGEST * (i + 1)) for i in range(1, _DIGESTS)]
     return len(recorded) == len(again) and any(recorded[grid] == again[grid] for grid in grids)
 

@@ -214,7 +214,7 @@ def keep_incomplete(partial: Path, crashes: list[str]) -> None:
 
 
 def _breaks_off(log: Path) -> bool:
-    """Whether there is a record, and nothing in it of the session's end."""
+    """Return whether there is a record without the session's end."""
     if not log.exists():
         return False
     try:
@@ -225,7 +225,7 @@ def _breaks_off(log: Path) -> bool:
 
 
 def _crashed(crashes: list[str]) -> dict[str, Any]:
-    """What run.json has of crashes."""
+    """Entries of run.json about crashes."""
     return {"crashes": crashes, "reason": crashes[0]} if crashes else {}
 
 

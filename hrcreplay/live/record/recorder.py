@@ -64,7 +64,7 @@ class Flaw:
     before_s: float | None  #: of the first message behind it; None where there is none
 
     def __str__(self) -> str:
-        """Where and what."""
+        """Path and reason."""
         end = "the end" if self.before_s is None else f"{self.before_s:.3f} s"
         return f"byte {self.at_byte}, between {self.after_s:.3f} s and {end}: {self.what}"
 
@@ -75,7 +75,7 @@ class _CutError(ValueError):
 
 @dataclass
 class _McapChunk:
-    """What a chunk holds."""
+    """Content of a chunk."""
 
     end: int  #: offset of what follows
     messages: list[tuple[int, int, int, bytes]]  #: channel, number, log time, content

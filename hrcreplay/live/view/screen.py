@@ -32,7 +32,7 @@ _WIDTH = 84
 
 
 def panel(status: Status) -> RenderableType:
-    """What a terminal shows."""
+    """Panel for a terminal."""
     rows = Table.grid(padding=(0, 2))
     rows.add_column(style="dim", min_width=10)
     rows.add_column()
@@ -60,7 +60,7 @@ def panel(status: Status) -> RenderableType:
 
 
 def line(status: Status) -> str:
-    """What a pipe gets."""
+    """Line for a pipe."""
     parts = [clock(status["t_s"]), status["phase"], *_some(status["status"])]
     if status["reason"]:
         parts[-1] += f" ({status['reason']})"

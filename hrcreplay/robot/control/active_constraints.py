@@ -1,4 +1,4 @@
-"""What holds a step of the robot: rows that Eq. (66) ends on, rows that leave it nothing, and stops that come too near.
+"""Constraints that hold a step: rows active in Eq. (66), rows that contradict each other, and refused stops.
 
 Nothing is taken from the solver but its solution: multipliers come from the rows by non-negative least squares, and
 rows that contradict each other from linear programs.
@@ -42,7 +42,7 @@ NEXT = 3
 
 
 class TickContext(NamedTuple):
-    """What a controller has before a tick, and what it sees at the tick."""
+    """State of a controller before a tick, and its observation at the tick."""
 
     current_stop: Stop
     u_before: Floats
@@ -59,7 +59,7 @@ class LinearRows(NamedTuple):
 
 
 def propose_explained(controller: Controller, context: TickContext) -> tuple[list[Proposal] | int, dict[str, Any]]:
-    """What a method proposes at a tick, and what bounds it.
+    """Proposals of a method at a tick, and the constraints that bound them.
 
     Args:
         controller: Its robot, which is brought back to the tick.
@@ -110,7 +110,7 @@ def _rows(controller: Controller, seen: Observation, give_way_m: float) -> Appro
 
 
 def _protective(controller: SsmController, seen: Observation) -> dict[str, Any]:
-    """What speed and separation monitoring compares: the distance now, and the protective one."""
+    """Distances that speed and separation monitoring compares: the present one, and the protective one."""
     proposals = PathController.propose(controller, seen)
     if isinstance(proposals, int):
         return {}
@@ -280,7 +280,7 @@ def explain_refusal(
     horizon_s: float,
     settings: PlanSettings,
 ) -> dict[str, Any]:
-    """Where the step and the stop after it are not clear: the first instant, and link and limb there.
+    """First instant at which the step and the stop after it are not clear, with link and limb.
 
     Args:
         robot: The manipulator.

@@ -1,4 +1,4 @@
-"""Whether a motion keeps clear of the swept volumes from its first instant to its last, and the decision by that.
+"""Certificate that a motion keeps clear of the swept volumes at every instant, and the decision by it.
 
 By conservative advancement (Mirtich, 1996): between two positions of the axes no point of a link moves by more than the
 sum over the axes of its largest distance from the axis times the angle the axis turns. Where the link is further than
@@ -89,7 +89,7 @@ def clear(
     planes: Floats,
     retreat_m: float = 0.0,
 ) -> tuple[int, Floats]:
-    """Whether a step and the stop after it keep every link clear of every volume at all times.
+    """Check that a step and the stop after it keep every link clear of every volume at all times.
 
     A link that begins inside a volume may move if no point of it comes nearer to any point of the volume, wherever the
     person is inside it.
@@ -141,7 +141,7 @@ def clear(
 
 @njit(cache=True)
 def _moves_away(ends: Floats, twist: Floats, vertices: Floats) -> bool:
-    """Whether no point of a link's axis comes nearer to a point of a hull at any tick of a motion, and none is fast.
+    """Check that no point of a link's axis comes nearer to a point of a hull at any tick of a motion, and none is fast.
 
     (r - p) @ v <= 0 for a point p of the axis with velocity v and every vertex r; it is linear along the axis, Eq.
     (11), and in r, so the ends and the vertices speak for all. Between two ticks the link moves by 1 mm at most.
@@ -223,7 +223,7 @@ def _proven(travel: Floats, row: int, gap: float) -> int:
 
 @njit(cache=True)
 def _can_be_done(q: Floats, dq: Floats, gain: Floats, dt_s: float) -> bool:
-    """Whether no axis leaps from a row of a motion to the next; false where a number is not finite.
+    """Check that no axis leaps from a row of a motion to the next; false where a number is not finite.
 
     Args:
         q: (n, nv) [rad].

@@ -38,7 +38,7 @@ class Stop:
         return len(self.q) - 1
 
     def rest(self) -> Stop:
-        """What is left one tick later; at rest, the same."""
+        """Remainder of the stop one tick later; at rest, the same."""
         return Stop(self.q[1:], self.dq[1:], self.along[1:]) if self.ticks else self
 
 
@@ -195,7 +195,7 @@ TRACKING, LIMITED, BRAKING, RETREATING = range(4)
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """Where the axes are and how fast they turn."""
+    """Positions and velocities of the axes."""
 
     q: Floats  #: (nv,) [rad]
     dq: Floats  #: (nv,) [rad/s]
@@ -214,7 +214,7 @@ class PlanSettings:
     retreat_m: float = 0.0  #: a robot that is inside a volume by no more than this may move out of it [m]
 
     def horizon_s(self, stop: Stop) -> float:
-        """Until when the volumes of a tick must hold: the end of the stop that would follow the step [s].
+        """Required horizon of a tick's volumes: the end of the stop that would follow the step [s].
 
         Beside the stop from the present velocity that is the step itself, and the tick more that a stop takes from
         the velocity it may have gained.
@@ -228,7 +228,7 @@ class PlanSettings:
         return max(self.stop_s, needed) if self.certified else self.stop_s
 
     def retreats(self, overlap_m: float) -> bool:
-        """Whether a robot with a link so deep inside a volume may move out of it, slowly [m]."""
+        """Return whether a robot with a link so deep inside a volume may move out of it, slowly [m]."""
         return 0.0 < overlap_m < self.retreat_m
 
     def without_jerk(self) -> PlanSettings:
@@ -245,7 +245,7 @@ class Proposal(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What the controller decided in one tick."""
+    """Decision of the controller in one tick."""
 
     pose: RobotPose  #: at the tick
     u: Floats  #: (nv,) applied from the tick on [rad/s^2]
@@ -304,7 +304,7 @@ def observe(
 
 
 class Taken(NamedTuple):
-    """What is executed in a tick."""
+    """Motion executed in a tick."""
 
     stop: Stop  #: from the end of the step on; its row 0 is where the step leads
     status: int  #: index into ``records.STATUSES``

@@ -47,7 +47,7 @@ Predict = Callable[[float], Obstacles]
 
 
 class Observation(NamedTuple):
-    """What a robot sees of people at a tick."""
+    """Observation of people at a tick."""
 
     sight: Sight  #: its pose, and its distances from people
     obstacles: Obstacles  #: the swept volumes
@@ -70,7 +70,7 @@ class Controller(ABC):
 
     @property
     def state(self) -> RobotState:
-        """Where the robot is."""
+        """State of the robot."""
         return RobotState(self.stop.q[0], self.stop.dq[0])
 
     def take_over(self, stop: Stop) -> None:
@@ -105,7 +105,7 @@ class Controller(ABC):
 
     @abstractmethod
     def propose(self, seen: Observation) -> list[Proposal] | int:
-        """What the method would do, or the reason why it does nothing."""
+        """Proposals of the method, or the reason why there are none."""
 
     @abstractmethod
     def _move_on(self) -> None:
@@ -125,7 +125,7 @@ class QpController(Controller):
         return standstill_reason(seen.sight, self.settings) or qp_controller.propose(*programme, self.settings)
 
     def programme(self, seen: Observation) -> Programme:
-        """What Eq. (66) is made of. Its target is the reference one tick later, to which the reference moves on."""
+        """Input of Eq. (66). Its target is the reference one tick later, to which the reference moves on."""
         error_m = norm_n(seen.sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3])
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)

@@ -18,7 +18,7 @@ from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.separation import Approach, worst_rows
 
-#: Stands for a bound that there is none.
+#: Marks a missing bound.
 NONE = 1e20
 #: Rows broken by no more than this hold, in the metric; and where a row does not depend on the velocity [m/s].
 HELD = 1e-9
@@ -52,7 +52,7 @@ class Metric(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a candidate breaks."""
+    """Constraint that a candidate breaks."""
 
     outcome: int  #: CLEAR, KNOWN, NEW or HOPELESS
     w: Floats  #: (nv,) the candidate, within the axes' bounds [rad/s]
@@ -64,7 +64,7 @@ class Found(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def known_numbers(H: Floats, g: Floats, limits: Limits, rows: Approach) -> bool:
-    """Whether nothing is NaN, and nothing infinite but for bounds that do not exist.
+    """Return whether nothing is NaN, and nothing infinite but for bounds that do not exist.
 
     Args:
         H: (nv, nv).
@@ -168,7 +168,7 @@ def residual(problem: Metric, y: Floats, z: Floats) -> float:
 
 @njit(cache=True)
 def denied(problem: Metric, z: Floats, limits: Limits) -> bool:
-    """Whether multipliers prove that no velocity keeps all rows (Farkas).
+    """Return whether multipliers prove that no velocity keeps all rows (Farkas).
 
     The rows of TCP and people are added up with them as weights; no velocity within the axes' bounds keeps the sum.
     Beside a slack that is never so: it loosens all rows of people.

@@ -82,7 +82,7 @@ PROVEN = 2e-10
 KEPT = 1e-8
 #: Tries of proxqp, one after the other: sweeps of coordinate descent before it begins, its inverse penalty, and how
 #: many times it may change the multipliers. Which, and in which order, was tried on replays. The second one (-1) begins
-#: at what non-negative least squares find: deep inside people rows nearly repeat each other, and proxqp is at a loss.
+#: at what non-negative least squares find: deep inside people rows are nearly dependent, and ProxQP fails.
 TRIES = ((100, 1e-6, 6), (-1, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-3, 40), (0, 1e-7, 40))
 #: Newton steps between them.
 INNER = 20
@@ -142,7 +142,7 @@ def compile_second_tries() -> None:
 
 
 def _keeps(limits: Limits, w: Floats) -> bool:
-    """Whether a velocity, rounded into the axes' bounds, also keeps those of the TCP."""
+    """Return whether a velocity, rounded into the axes' bounds, also keeps those of the TCP."""
     twist = apply(limits.J, w)
     return bool(np.all((limits.J_low - KEPT <= twist) & (twist <= limits.J_high + KEPT)))
 
@@ -195,7 +195,7 @@ def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
 
 
 def _by_proxqp(problem: Metric, y: Floats, z: Floats, penalty: float, rounds: int) -> tuple[Floats, Floats, str]:
-    """What proxqp finds, and what it says of it."""
+    """Solution of ProxQP, and its status."""
     n, m = len(y), len(z)
     # the last bits of what its other backend returns depend on where its memory happens to lie
     qp = _dense.QP(n, 0, m, False, _dense.HessianType.Dense, _dense.DenseBackend.PrimalLDLT)

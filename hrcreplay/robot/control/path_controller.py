@@ -36,7 +36,7 @@ ROUNDS = 40
 
 @dataclass(frozen=True, slots=True)
 class PathState:
-    """How far along its programmed path the robot is, and the share of the programmed speed it moves with."""
+    """Progress of the robot along its programmed path, and its share of the programmed speed."""
 
     s_s: float  #: programmed time [s]
     rate: float  #: in [0, 1]

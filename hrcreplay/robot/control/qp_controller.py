@@ -121,7 +121,7 @@ DAMPING = 1e-6
 
 
 class Target(NamedTuple):
-    """Where the robot is to be one tick later."""
+    """Target of the robot one tick later."""
 
     T_world_tcp: Floats  #: (4, 4)
     twist: Floats  #: (6,) velocity in the world, linear first [m/s, rad/s]

@@ -107,7 +107,7 @@ def separation(pose: RobotPose, obstacles: Obstacles, clearance_m: Floats) -> Se
 
 
 class Approach(NamedTuple):
-    """What the approach rows of a tick are made of."""
+    """Data of a tick's approach rows."""
 
     ends_m: Floats  #: (s, 2, 3) ends of the links' axes [m]
     J_ends: Floats  #: (s, 2, 3, nv) their position Jacobians [m/rad]
@@ -198,7 +198,7 @@ def _row(ends: Floats, J_ends: Floats, vertex: Floats, end: int) -> Floats:
 
 @njit(cache=True)
 def _box_top(box: Floats, v: Floats) -> float:
-    """How far along v a point of the box can lie."""
+    """Largest extent of the box along v."""
     top = 0.0
     for i in range(3):
         top += max(box[0, i] * v[i], box[1, i] * v[i])
