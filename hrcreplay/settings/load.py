@@ -61,8 +61,8 @@ def load_settings(
     if path is not None:
         where = str(path)
         file = SHIPPED.get(where, path) if not path.exists() else path
-        given = read_toml(file, f"name a TOML file, or {', '.join(SHIPPED)}")
-        for name, section in _beside(given, file.parent).items():
+        read = read_toml(file, f"name a TOML file, or {', '.join(SHIPPED)}")
+        for name, section in _beside(read, file.parent).items():
             table[name] = table.get(name, {}) | section if isinstance(section, dict) else section
     for name, section in (given or {}).items():
         table[name] = {**table.get(name, {}), **section}
