@@ -363,7 +363,9 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the three files.")] = Path(),
 ) -> None:
     """Write commented files to begin with: cell.toml, task.toml and settings.toml."""
-    for path in commands.write_templates(folder):
+    from hrcreplay.run.templates import write_templates
+
+    for path in write_templates(folder):
         sys.stdout.write(f"{path}\n")
 
 

@@ -10,11 +10,11 @@ import pytest
 from pydantic import BaseModel
 
 from hrcreplay.calibration.cell import load_cell
-from hrcreplay.cli import commands
 from hrcreplay.errors import SettingsError
 from hrcreplay.robot.model import irb140
 from hrcreplay.robot.path import programmed
 from hrcreplay.robot.task import parse_task
+from hrcreplay.run.templates import write_templates
 from hrcreplay.settings.listing import as_toml
 from hrcreplay.settings.load import Settings, load_settings
 from hrcreplay.settings.sections import setting
@@ -44,7 +44,7 @@ def test_one_section_is_that_section() -> None:
 
 
 def test_the_files_to_begin_with_are_read(tmp_path: Path) -> None:
-    paths = commands.write_templates(tmp_path / "new")
+    paths = write_templates(tmp_path / "new")
     assert [path.name for path in paths] == ["cell.toml", "task.toml", "settings.toml"]
     cell, task, settings = paths
     np.testing.assert_array_equal(load_cell(cell).T_world_base, np.eye(4))
@@ -52,13 +52,13 @@ def test_the_files_to_begin_with_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(path.sample(0.0).q, np.radians([0, 0, 0, 0, 90, 0]), atol=1e-9)
     assert load_settings(settings) == Settings()
     with pytest.raises(SettingsError, match="exists already"):
-        commands.write_templates(tmp_path / "new")
+        write_templates(tmp_path / "new")
 
 
 @pytest.mark.parametrize("name", ["cell.toml", "task.toml", "settings.toml"])
 def test_what_stands_in_comments_is_right_too(tmp_path: Path, name: str) -> None:
     """Every line of TOML in a comment, taken out of it, is read."""
-    path = {path.name: path for path in commands.write_templates(tmp_path / "new")}[name]
+    path = {path.name: path for path in write_templates(tmp_path / "new")}[name]
     lines = path.read_text().splitlines()
     bare = [line.removeprefix("# ") if _is_toml(line.removeprefix("# ")) else line for line in lines]
     path.write_text("\n".join(bare) + "\n")
