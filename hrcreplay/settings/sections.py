@@ -173,7 +173,7 @@ class LimitNames(Section):
     tracking: str = "human"
     """Bounds the filter's state, Eq. (62)-(65)."""
     prediction: str = "people"
-    """Bounds the reachable sets, Alg. 1. people: fitted on recordings; the README says why it is the default."""
+    """Bounds the reachable sets, Alg. 1. people: fitted on recordings; see docs/validation.md."""
 
 
 class Occupancy(Section):

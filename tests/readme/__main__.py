@@ -1,4 +1,4 @@
-"""Measures every figure of the README, keeps them in docs/figures.json and writes them into the README.
+"""Measures every figure of README and docs/validation.md, keeps them in docs/figures.json and writes them there.
 
 python -m tests.readme [NAME...]
 
@@ -21,11 +21,13 @@ import time
 from pathlib import Path
 from typing import Any
 
+from hrcreplay.settings.listing import as_toml
 from tests.readme.blocks import fill
 from tests.readme.measurements import ROOT, Measurement, load, measurements
 
 FACTS = ROOT / "docs" / "figures.json"
-README = ROOT / "README.md"
+PAGES = (ROOT / "README.md", ROOT / "docs" / "validation.md")
+GUIDE = ROOT / "docs" / "guide.md"
 PICTURE = ROOT / "reports" / "demo.png"
 CACHE = ROOT / ".readme"
 
@@ -53,11 +55,20 @@ def main(arguments: list[str] | None = None) -> int:
         facts[name] = {"command": " && ".join(measurement.commands), "figures": _figures(measurement, data or "")}
         FACTS.write_text(json.dumps(facts, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
     FACTS.write_text(json.dumps(facts, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
-    README.write_text(fill(README.read_text(), facts))
+    for page in PAGES:
+        page.write_text(fill(page.read_text(), facts))
+    GUIDE.write_text(with_settings(GUIDE.read_text()))
     missing = [name for name in known if name not in facts]
     if missing:
-        print(f"never measured, so the README keeps what it had: {', '.join(missing)}")
+        print(f"never measured, so the pages keep what they had: {', '.join(missing)}")
     return int(bool(missing))
+
+
+def with_settings(guide: str) -> str:
+    """The guide with all settings as they are now."""
+    begin, end = "<!-- settings -->\n", "<!-- end of settings -->"
+    before, after = guide.index(begin) + len(begin), guide.index(end)
+    return f"{guide[:before]}```toml\n{as_toml()}```\n{guide[after:]}"
 
 
 def _figures(measurement: Measurement, data: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The parts of the README that hold figures, written from docs/figures.json."""
+"""The parts of README and docs/validation.md that hold figures, written from docs/figures.json."""
 
 from __future__ import annotations
 
@@ -75,6 +75,23 @@ def demo(facts: Facts) -> str:
         f"angular velocities {run['fusion_velocity_rmse_ratio']:.2f} of that of its differenced angles."
     )
     return f"{_table(['', *(title for title, *_ in columns)], rows)}\n\n{_wrapped(words)}"
+
+
+def headline(facts: Facts) -> str:
+    """The demo log by method, in a few rows."""
+    run = _of(facts, "demo")
+    columns = [("`qp` (default)", "plan"), *((f"`{name}`", f"baseline_{name}") for name in BASELINES)]
+
+    def row(title: str, name: str, text: Callable[[Any], str]) -> list[str]:
+        return [title, *(text(run[f"{prefix}_{name}"]) for _, prefix in columns)]
+
+    rows = [
+        row("ticks moving in contact with the worker", "touch_moving_ticks", lambda n: f"{n:,}"),
+        row("nearest to the worker while moving", "body_distance_min_moving_m", _cm),
+        row("pace, of the programmed", "progress_share", _share),
+        row("standing still, of the ticks with at most 0.5 m of separation", "stationary_share", _share),
+    ]
+    return _table(["", *(title for title, _ in columns)], rows)
 
 
 _ENCLOSES = {
@@ -169,6 +186,7 @@ def compare(facts: Facts) -> str:
 
 
 BLOCKS: dict[str, Callable[[Facts], str]] = {
+    "headline": headline,
     "demo": demo,
     "compare": compare,
     "soundness": soundness,

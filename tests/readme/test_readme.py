@@ -33,15 +33,25 @@ from tests.readme.measurements import (
 from tests.soundness import __main__ as soundness
 
 FACTS = load(readme.FACTS)
-README = readme.README.read_text()
+TEXTS = [page.read_text() for page in readme.PAGES]
 CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 #: What is measured and not given: a share, a volume, a depth, how many times.
 MEASURED = re.compile(r"\d(?:[\d.,]*) (?:%|mm\b|m\u00b3|times\b|million\b)|\d\.\d+ of\b")
 
 
 def test_the_readme_holds_the_figures_that_were_measured() -> None:
-    assert {name for _, name, _, _ in BLOCK.findall(README)} == set(BLOCKS)
-    assert fill(README, FACTS) == README, "make readme"
+    assert sorted(name for text in TEXTS for _, name, _, _ in BLOCK.findall(text)) == sorted(BLOCKS)
+    for text in TEXTS:
+        assert fill(text, FACTS) == text, "make readme"
+
+
+def test_the_guide_lists_the_settings_as_they_are() -> None:
+    text = readme.GUIDE.read_text()
+    assert readme.with_settings(text) == text, "make readme"
+
+
+def test_the_readme_is_short() -> None:
+    assert len(TEXTS[0].splitlines()) <= 110
 
 
 def test_every_figure_was_measured() -> None:
@@ -52,8 +62,9 @@ def test_every_figure_was_measured() -> None:
 
 
 def test_no_figure_stands_outside_of_what_is_measured() -> None:
-    assert not MEASURED.findall(BLOCK.sub("", CODE.sub("", README)))
-    assert len(MEASURED.findall(README)) > 30
+    for text in TEXTS:
+        assert not MEASURED.findall(BLOCK.sub("", CODE.sub("", text)))
+    assert len(MEASURED.findall("".join(TEXTS))) > 30
 
 
 def _same(name: str, found: dict[str, Any]) -> None:
@@ -185,8 +196,10 @@ def test_only_the_figures_asked_for_are_measured_and_nothing_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """And without the recordings of others their figures stay."""
-    for name, path in (("FACTS", "figures.json"), ("README", "README.md"), ("CACHE", ".readme")):
+    for name, path in (("FACTS", "figures.json"), ("GUIDE", "guide.md"), ("CACHE", ".readme")):
         monkeypatch.setattr(readme, name, tmp_path / path)
+    monkeypatch.setattr(readme, "PAGES", (tmp_path / "README.md",))
+    (tmp_path / "guide.md").write_text("<!-- settings -->\n<!-- end of settings -->\n")
     monkeypatch.delenv("HRCREPLAY_DATA", raising=False)
     (tmp_path / "README.md").write_text("<!-- figures: recordings -->\n<!-- end -->\n")
     old = _made_up()
