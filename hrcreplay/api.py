@@ -348,8 +348,10 @@ def report(recording: Recording, people: People, motion: Plan, out: str | Path) 
         out: Folder to make.
 
     Raises:
-        SettingsError: The folder exists, or cannot be made.
+        SettingsError: The folder exists or cannot be made, or person or motion are not whole.
     """
+    if "state" not in people.tables or len(motion.tables["motion"]) != len(people):
+        raise SettingsError("report: some ticks only; would be right: all that fuse returned, and the plan beside it")
     began = datetime.now(UTC)
     job, log = replace(motion.job, command="report"), recording.log
     with RunWriter(Path(out)) as writer:

@@ -133,6 +133,14 @@ def test_another_robot_moves_as_by_the_command(people: hr.People, log: hr.Record
     pd.testing.assert_frame_equal(found.to_pandas(), pq.read_table(folder / "motion.parquet").to_pandas())
 
 
+def test_no_report_is_made_of_a_part(log: hr.Recording, people: hr.People, plan: hr.Plan, tmp_path: Path) -> None:
+    some = people.rows(slice(0, 20))
+    for person, motion in ((some, plan), (people, hr.plan(some, baselines=()))):
+        with pytest.raises(SettingsError, match="some ticks only"):
+            hr.report(log, person, motion, tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_cannot_be_used_is_told(log: hr.Recording) -> None:
     table = log.to_pandas().head(5)
     with pytest.raises(SettingsError, match="column arrival_ns is missing"):
