@@ -95,7 +95,7 @@ def _answer(found: Mapping[str, Any]) -> Answer:
     limits = sorted({log["limits"] for log in found["logs"]})
     words = (
         f"Method {METHODS.get(method, method)}, limits {', '.join(limits)}: at so many of {share['samples']} ticks, "
-        f"every limb that was checked ({checked_scope(found['total'], method)}) stayed with its whole thickness around "
+        f"every limb that was checked ({checked_scope(found['total'], method)}) stayed, limb radius included, around "
         f"its recorded points ({', '.join(sources)}) in its own volume for all of the next {found['horizon_s']:g} s. "
         f"95 % interval {100 * share['low']:.1f} to {100 * share['high']:.1f} %. For skeleton points only, "
         f"limb thickness ignored, it is {100 * whole['points_share']['value']:.1f} %."
