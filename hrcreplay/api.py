@@ -24,11 +24,12 @@ from hrcreplay.calibration.cell import Cell
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.logs.clean import Cleaner
+from hrcreplay.logs.frame_table import frames_of_table, table_of_frames
 from hrcreplay.logs.messages import RawSkeleton
 from hrcreplay.logs.reader import Log
 from hrcreplay.logs.reader import open_log as read_log
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.records import POINTS, CameraFrames, Floats, HumanStates, Ints, Motion, SweptVolumes
+from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Motion, SweptVolumes
 from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.task import parse_task
 from hrcreplay.run import build, replay, stages
@@ -94,7 +95,7 @@ class Recording:
 
     def to_pandas(self) -> pd.DataFrame:
         """The cleaned frames as ``frames`` takes them, a row a body a frame."""
-        return _frames_table(list(self.log.frames()), self.cameras)
+        return table_of_frames(list(self.log.frames()), self.cameras)
 
 
 def open_log(
@@ -150,7 +151,7 @@ def frames(
     Raises:
         SettingsError: A column is missing, or names a camera without a pose.
     """
-    found, folder = _camera_frames(table, tuple(cameras)), None
+    found, folder = frames_of_table(table, tuple(cameras)), None
     if path is None:
         folder = tempfile.TemporaryDirectory(prefix="hrcreplay-")
         path = Path(folder.name) / "frames.mcap"
@@ -382,7 +383,7 @@ class Fusion:
             found: All frames that arrived after the tick before and up to this one, in order; as ``frames`` takes them.
             t_ns: The tick, after that of the last call [ns].
         """
-        table = _camera_frames(found, self._cameras) if isinstance(found, pd.DataFrame) else found
+        table = frames_of_table(found, self._cameras) if isinstance(found, pd.DataFrame) else found
         parts = [] if table is None else [part for part in self._clean(table) if part is not None]
         fused, seen = self._fuser.update(np.array([t_ns]), CameraFrames.join(parts) if parts else None)
         self.counts.update(seen.counts)
@@ -459,56 +460,3 @@ def _planned(
         if robot.T_world_base is not None:
             cell = replace(cell or Cell(), T_world_base=np.asarray(robot.T_world_base, dtype=float))
     return replace(job, settings=settings, cell=cell, task=job.task if task is None else dict(task))
-
-
-def _camera_frames(table: pd.DataFrame, cameras: tuple[str, ...]) -> CameraFrames:
-    """The rows of a DataFrame as ``frames`` describes it, in order of arrival."""
-    for name in ("arrival_ns", "camera"):
-        if name not in table:
-            raise SettingsError(f"frames: column {name} is missing; would be right: {', '.join(_COLUMNS)}, ...")
-    points = {point for point in POINTS if f"{point}_x" in table}
-    for name in (f"{point}_{axis}" for point in sorted(points) for axis in "yz"):
-        if name not in table:
-            raise SettingsError(f"frames: column {name} is missing; would be right: x, y and z of a point")
-    if not points:
-        raise SettingsError(f"frames: no body point; would be right: columns such as pelvis_x, of {', '.join(POINTS)}")
-    unknown = sorted(set(table["camera"].astype(str)) - set(cameras))
-    if unknown:
-        raise SettingsError(f"frames: camera {unknown[0]} has no pose; cameras are {', '.join(cameras)}")
-    table = table.sort_values("arrival_ns", kind="stable")
-    places, confidence = np.full((len(table), len(POINTS), 3), np.nan), np.zeros((len(table), len(POINTS)))
-    for i, point in enumerate(POINTS):
-        if point in points:
-            places[:, i] = table[[f"{point}_{axis}" for axis in "xyz"]].to_numpy(dtype=float)
-            seen = np.isfinite(places[:, i]).all(axis=1).astype(float)
-            told = f"{point}_confidence"
-            confidence[:, i] = table[told].to_numpy(dtype=float) if told in table else seen
-    arrival_ns = table["arrival_ns"].to_numpy(dtype=np.int64)
-    return CameraFrames(
-        capture_ns=table["capture_ns"].to_numpy(dtype=np.int64) if "capture_ns" in table else arrival_ns,
-        arrival_ns=arrival_ns,
-        camera=np.array([cameras.index(name) for name in table["camera"].astype(str)], dtype=np.int64),
-        body=table["body"].to_numpy(dtype=np.int64) if "body" in table else np.zeros(len(table), np.int64),
-        points_m=places,
-        confidence=confidence,
-        cameras=cameras,
-    )
-
-
-_COLUMNS = ("arrival_ns", "camera", "pelvis_x", "pelvis_y", "pelvis_z")
-
-
-def _frames_table(parts: list[CameraFrames], cameras: tuple[str, ...]) -> pd.DataFrame:
-    if not parts:
-        return pd.DataFrame(columns=list(_COLUMNS))
-    whole = CameraFrames.join(parts)
-    columns: dict[str, Any] = {
-        "arrival_ns": whole.arrival_ns,
-        "capture_ns": whole.capture_ns,
-        "camera": np.array(cameras, dtype=object)[whole.camera],
-        "body": whole.body,
-    }
-    for i, point in enumerate(POINTS):
-        columns |= {f"{point}_{axis}": whole.points_m[:, i, k] for k, axis in enumerate("xyz")}
-        columns[f"{point}_confidence"] = whole.confidence[:, i]
-    return pd.DataFrame(columns)
