@@ -1,7 +1,7 @@
 from __future__ import annotations
 
-import textwrap
 import tomllib
+from importlib import resources
 from typing import Any
 
 import pytest
@@ -12,9 +12,12 @@ from hrcreplay.robot.task import parse_task
 
 
 def example() -> dict[str, Any]:
-    """The example of the module's docstring, which is the format's documentation."""
-    text = str(task_module.__doc__).split("In full::\n\n")[1].split("\n\nThe robot stops")[0]
-    return tomllib.loads(textwrap.dedent(text))
+    """The commented task file of ``hrcreplay init``, which is the format's documentation."""
+    return tomllib.loads(template())
+
+
+def template() -> str:
+    return (resources.files("hrcreplay.run") / "task_template.toml").read_text("utf-8")
 
 
 def pair(**second: Any) -> dict[str, Any]:
@@ -37,7 +40,7 @@ def test_the_example_gives_every_key_but_the_alternatives() -> None:
     known = set(task_module.Task.model_fields) | set(task_module.Waypoint.model_fields)
     assert known - given == {"cycles", "joints_rad", "quaternion_wxyz"}
     for key in known - given:
-        assert key in str(task_module.__doc__)
+        assert key in template()
 
 
 @pytest.mark.parametrize(
