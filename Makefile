@@ -25,30 +25,30 @@ SAMPLES ?= 1000000
 METHOD ?= sound
 LIMITS ?= people
 soundness: $(VENV)/made
-	$(BIN)/python -m tests.soundness --samples $(SAMPLES) --method $(METHOD) --limits $(LIMITS) --processes $(shell nproc)
+	$(BIN)/python -m tests.tools.soundness --samples $(SAMPLES) --method $(METHOD) --limits $(LIMITS) --processes $(shell nproc)
 
-# Measures every figure of the README anew where sources changed, and writes them into it; see tests/readme. It goes on
+# Measures every figure of the README anew where sources changed, and writes them into it; see tests/tools/readme. It goes on
 # where it was broken off. ONLY='"demo,"' measures what begins so; recordings by others are those in $HRCREPLAY_DATA.
 ONLY ?=
 readme: $(VENV)/made
-	$(BIN)/python -m tests.readme $(ONLY)
+	$(BIN)/python -m tests.tools.readme $(ONLY)
 
 # Fits hrcreplay/limits/people.toml again, byte for byte, to the recordings by others in $HRCREPLAY_DATA and to simulated
 # people who get up and sit down; tells what each recording that was left out gave.
 people: $(VENV)/made
-	$(BIN)/python -m tests.people
+	$(BIN)/python -m tests.tools.people
 
 # Compares the deviations in state.parquet with errors against the truth and against smoothed recordings (docs/deviations.md), and
 # fits their constants anew; exit code 5 where these are not those in the code.
 deviations: $(VENV)/made
-	$(BIN)/python -m tests.deviations
+	$(BIN)/python -m tests.tools.deviations
 
 # Spoils logs at random and puts them through the commands: no traceback, no other exit code, nothing half-written.
 LOGS ?= 500
 LIVE ?= 100
 SEED ?= 1
 fuzz: $(VENV)/made
-	$(BIN)/python -m tests.fuzz --logs $(LOGS) --live $(LIVE) --seed $(SEED)
+	$(BIN)/python -m tests.tools.fuzz --logs $(LOGS) --live $(LIVE) --seed $(SEED)
 
 # Everything from the lock, by hash and without a compiler; then the project itself, its kernels compiled once.
 $(VENV)/made: requirements.lock pyproject.toml

@@ -21,23 +21,24 @@ import pandas as pd
 import pyarrow as pa
 
 from hrcreplay.calibration.cell import Cell
+from hrcreplay.commands import replay
+from hrcreplay.commands.replay import demo_log
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.inflated_hull import InflatedHull
-from hrcreplay.logs.clean import Cleaner
+from hrcreplay.logs.cleaning import Cleaner
 from hrcreplay.logs.frame_table import frames_of_table, table_of_frames
 from hrcreplay.logs.messages import RawSkeleton
 from hrcreplay.logs.reader import Log
 from hrcreplay.logs.reader import open_log as read_log
 from hrcreplay.logs.writer import LogWriter
+from hrcreplay.pipeline import assembly, reuse, stages
+from hrcreplay.pipeline.assembly import Forecast
+from hrcreplay.pipeline.person_fuser import PersonFuser
+from hrcreplay.pipeline.run_config import RunConfig, resolve
+from hrcreplay.pipeline.stages import Sink, Told, told_of_fusion, told_of_plan
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Motion, SweptVolumes
 from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.task import parse_task
-from hrcreplay.run import build, replay, stages
-from hrcreplay.run.build import Forecast
-from hrcreplay.run.fusion import PersonFuser
-from hrcreplay.run.job import Job, resolve
-from hrcreplay.run.replay import demo_log
-from hrcreplay.run.stages import Sink, Told, told_of_fusion, told_of_plan
 from hrcreplay.settings.load import load_settings
 from hrcreplay.settings.sections import Robot as RobotSettings
 from hrcreplay.store.columns import motion_columns, occupancy_columns, state_columns
@@ -71,7 +72,7 @@ class Recording:
     """A log, with the cell and the settings that it is used with."""
 
     log: Log
-    job: Job
+    run_config: RunConfig
     _kept: Any = None  #: what must live as long as the log
 
     @property
@@ -82,12 +83,12 @@ class Recording:
     @property
     def T_world_base(self) -> Floats | None:
         """(4, 4) pose of the robot's base in the world: of the cell file, else of the log; None: known to neither."""
-        return build.known_robot_base(self.job, self.log)
+        return assembly.known_robot_base(self.run_config, self.log)
 
     @property
     def task(self) -> dict[str, Any] | None:
         """The programmed task in the log, of the structure of a task file."""
-        return self.job.task or self.log.header.task
+        return self.run_config.task or self.log.header.task
 
     def camera_frames(self) -> Iterator[CameraFrames]:
         """The cleaned frames in order of arrival, in chunks of at most 1 s."""
@@ -117,14 +118,14 @@ def open_log(
         LogError: There is no log that can be read.
         SettingsError: A setting or the cell cannot be used.
     """
-    job = resolve(
+    run_config = resolve(
         "plan",
         Path(path),
         config=None if config is None else Path(config),
         cell_file=None if cell is None else Path(cell),
         given=settings,
     )
-    return Recording(read_log(job.log, job.settings.logs), job)
+    return Recording(read_log(run_config.log, run_config.settings.logs), run_config)
 
 
 def frames(
@@ -203,15 +204,15 @@ def fuse(
         LogError: The log shows nobody, or a camera's pose is not known.
     """
     log = recording.log
-    job = replace(recording.job, start_s=start_s, end_s=end_s)
-    ticks_ns = replay.span_ticks(job, log)
+    run_config = replace(recording.run_config, start_s=start_s, end_s=end_s)
+    ticks_ns = stages.span_ticks(run_config, log)
     found = _MemoryTables()
     sink = found.sink()
     stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
     smooth = not log.header.has_truth if smooth is None else smooth
-    batches = stages.fused(log, ticks_ns, _BATCH, build.fusion_stage(job, log), sink, smooth=smooth)
+    batches = stages.fused(log, ticks_ns, _BATCH, assembly.fusion_stage(run_config, log), sink, smooth=smooth)
     states = HumanStates.join(list(batches))
-    return People(replace(recording, job=job), states, found.tables, told_of_fusion(log, sink))
+    return People(replace(recording, run_config=run_config), states, found.tables, told_of_fusion(log, sink))
 
 
 @dataclass(frozen=True)
@@ -250,7 +251,7 @@ def predict(people: People, horizon_s: float | None = None, *, method: str | Non
         horizon_s: Until when after each tick they hold; None: the robot's braking time T_s [s].
         method: ``sound``, ``paper`` or ``positions``; None: that of the settings.
     """
-    stage = build.prediction_stage(people.recording.job)
+    stage = assembly.prediction_stage(people.recording.run_config)
     until_s = stage.horizon_s if horizon_s is None else horizon_s
     return Volumes(stage.volumes(people.states, until_s, method=method), until_s)
 
@@ -297,7 +298,7 @@ def load_task(path: str | Path) -> dict[str, Any]:
 class Plan:
     """The robot's motion beside the person, by a method and its baselines."""
 
-    job: Job
+    run_config: RunConfig
     tables: dict[str, pa.Table]  #: of a run folder: motion, motion_<baseline>, occupancy
     told: Told
 
@@ -326,17 +327,17 @@ def plan(
     Raises:
         SettingsError: The robot, its place or the task is not known, or cannot be used.
     """
-    job, log = _planned(people.recording.job, robot, task, method, baselines), people.recording.log
+    run_config, log = _planned(people.recording.run_config, robot, task, method, baselines), people.recording.log
     found = _MemoryTables()
     sink = found.sink()
-    chosen = build.planners(job, log, int(people.states.t_ns[0]))
+    chosen = assembly.planners(run_config, log, int(people.states.t_ns[0]))
     controller = next(iter(chosen.values())).controller
-    sink.notes["plan"].extend(build.programme_notes(job, log, controller.reference))
+    sink.notes["plan"].extend(assembly.programme_notes(run_config, log, controller.reference))
     batches = (people.states.rows(slice(i, i + _BATCH)) for i in range(0, len(people), _BATCH))
-    around = build.surroundings(job, controller.robot)
-    for _ in stages.planned(batches, around, chosen, replay.store_every(job), sink):
+    around = assembly.surroundings(run_config, controller.robot)
+    for _ in stages.planned(batches, around, chosen, stages.store_every(run_config), sink):
         pass
-    return Plan(job, found.tables, told_of_plan(log, sink))
+    return Plan(run_config, found.tables, told_of_plan(log, sink))
 
 
 def report(recording: Recording, people: People, motion: Plan, out: str | Path) -> Path:
@@ -354,14 +355,14 @@ def report(recording: Recording, people: People, motion: Plan, out: str | Path) 
     if "state" not in people.tables or len(motion.tables["motion"]) != len(people):
         raise SettingsError("report: some ticks only; would be right: all that fuse returned, and the plan beside it")
     began = datetime.now(UTC)
-    job, log = replace(motion.job, command="report"), recording.log
+    run_config, log = replace(motion.run_config, command="report"), recording.log
     with RunWriter(Path(out)) as writer:
         for name, table in (people.tables | motion.tables).items():
             writer.table(name, {column: table[column] for column in table.column_names})
-        parts = replay.dependencies(job, log, people.states.t_ns)
-        found = replay.findings(job, {"fuse": people.told, "plan": motion.told})
-        meta = {**job.meta(), **found, **replay.about_run(job, began, parts, smooth=False)}
-        replay.complete(job, log, writer, Stopwatch(time.perf_counter_ns), meta)
+        parts = reuse.dependencies(run_config, log, people.states.t_ns)
+        found = replay.findings(run_config, {"fuse": people.told, "plan": motion.told})
+        meta = {**run_config.meta(), **found, **replay.about_run(run_config, began, parts, smooth=False)}
+        replay.complete(run_config, log, writer, Stopwatch(time.perf_counter_ns), meta)
         return writer.folder
 
 
@@ -370,11 +371,13 @@ class Fusion:
 
     def __init__(self, recording: Recording) -> None:
         """Begin before the first frame, with the cameras, cell and settings of a recording."""
-        self._cameras, job = recording.cameras, recording.job
-        stage = build.fusion_stage(job, recording.log)
+        self._cameras, run_config = recording.cameras, recording.run_config
+        stage = assembly.fusion_stage(run_config, recording.log)
         self._fuser = PersonFuser(stage, self._cameras)
         self.counts = Counter[str]()  #: defects and events so far
-        self._cleaner = Cleaner(self._cameras, job.settings.logs.gap_s, self.counts, nobody=stage.watched is not None)
+        self._cleaner = Cleaner(
+            self._cameras, run_config.settings.logs.gap_s, self.counts, nobody=stage.watched is not None
+        )
 
     def update(self, found: CameraFrames | pd.DataFrame | None, t_ns: int) -> HumanStates:
         """The fused person at a tick, a table of one row.
@@ -410,15 +413,15 @@ class Controller:
         method: str | None = None,
     ) -> None:
         """Begin at the start of the programme; the arguments are those of ``plan``."""
-        self._job = _planned(recording.job, robot, task, method, ())
+        self._run_config = _planned(recording.run_config, robot, task, method, ())
         self._log = recording.log
-        self._started: tuple[Planner, build.Surroundings] | None = None
+        self._started: tuple[Planner, assembly.Surroundings] | None = None
 
     def step(self, person: HumanStates) -> Motion:
         """The robot's motion at a tick, a table of one row; ``person`` is the row of ``Fusion.update``."""
         if self._started is None:
-            (planner,) = build.planners(self._job, self._log, int(person.t_ns[0])).values()
-            self._started = planner, build.surroundings(self._job, planner.controller.robot)
+            (planner,) = assembly.planners(self._run_config, self._log, int(person.t_ns[0])).values()
+            self._started = planner, assembly.surroundings(self._run_config, planner.controller.robot)
         planner, around = self._started
         return planner.follow(person.t_ns, [Forecast(around, person).predict(0)], around.names)
 
@@ -445,18 +448,18 @@ class _MemoryTables:
 
 
 def _planned(
-    job: Job,
+    run_config: RunConfig,
     robot: Robot | None,
     task: Mapping[str, Any] | None,
     method: str | None,
     baselines: Sequence[str] | None,
-) -> Job:
-    """The job with another robot, task or method."""
+) -> RunConfig:
+    """The run with another robot, task or method."""
     chosen = {"method": method, "baselines": None if baselines is None else list(baselines)}
     given = {"plan": {name: value for name, value in chosen.items() if value is not None}}
-    settings, cell = load_settings(base=job.settings.model_dump(mode="json"), given=given), job.cell
+    settings, cell = load_settings(base=run_config.settings.model_dump(mode="json"), given=given), run_config.cell
     if robot is not None:
         settings = settings.model_copy(update={"robot": robot.settings})
         if robot.T_world_base is not None:
             cell = replace(cell or Cell(), T_world_base=np.asarray(robot.T_world_base, dtype=float))
-    return replace(job, settings=settings, cell=cell, task=job.task if task is None else dict(task))
+    return replace(run_config, settings=settings, cell=cell, task=run_config.task if task is None else dict(task))

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 GROUPS = {
     "sessions": ("tests/live/test_killed.py", "tests/live/test_session.py", "tests/live/test_zenoh_session.py"),
     "demo": (
-        "tests/run/test_replay.py",
-        "tests/readme/test_readme.py",
-        "tests/run/test_why.py",
-        "tests/run/test_speed_limit.py",
+        "tests/commands/test_replay.py",
+        "tests/tools/readme/test_readme.py",
+        "tests/commands/test_explain.py",
+        "tests/pipeline/test_speed_limit.py",
     ),
-    "soundness": ("tests/soundness/test_motion.py", "tests/soundness/test_soundness.py"),
+    "soundness": ("tests/tools/soundness/test_motion.py", "tests/tools/soundness/test_soundness.py"),
     "recordings": ("tests/test_recordings.py",),
 }
 WHOLE_RUNS = {"demo_folder", "printed"}
@@ -92,7 +92,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 @pytest.fixture(scope="session")
 def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report on the shipped log, as ``hrcreplay report`` makes it by default."""
-    from hrcreplay.run import replay
+    from hrcreplay.commands import replay
 
     out = tmp_path_factory.mktemp("demo") / "run"
     return replay.run("report", replay.demo_log(), out=out)
@@ -101,7 +101,7 @@ def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def printed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The plan on the shipped log by the paper's own prediction, with which the robot meets the person at speed."""
-    from hrcreplay.run import replay
+    from hrcreplay.commands import replay
     from hrcreplay.store import run_folder
 
     out = tmp_path_factory.mktemp("printed") / "run"

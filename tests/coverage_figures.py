@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from hrcreplay.audit import driver
-from hrcreplay.run import compare
+from hrcreplay.commands import audit, compare
 
 VARIANT = "qp:sound:adaptive"
 
@@ -22,7 +21,7 @@ def assert_one_coverage(run: Path, scratch: Path) -> int:
     said = [metrics[f"volumes_full_{name}"]["value"] for name in ("checked_ticks", "held_share", "left_max_m")]
     folder = compare.run([run], methods=f"{VARIANT},none", out=scratch / "compare", processes=1)
     compared = json.loads((folder / "compare.json").read_text())["logs"][0]["methods"][VARIANT]
-    audited = json.loads((driver.run([run], out=scratch / "audit") / "audit.json").read_text())
+    audited = json.loads((audit.run([run], out=scratch / "audit") / "audit.json").read_text())
     found = audited["logs"][0]["methods"]["sound"]["all"]
     assert said == [found["covered_share"]["samples"], found["covered_share"]["value"], found["escape_max_m"]]
     assert said[:2] == [compared["full_checked_ticks"], compared["full_coverage"]]

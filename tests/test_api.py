@@ -14,11 +14,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import hrcreplay as hr
+from hrcreplay.commands import replay
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import HumanStates
-from hrcreplay.run import replay
 from hrcreplay.store.run_folder import NOT_DETERMINISTIC
-from tests.run.arms import ARMS
+from tests.commands.arms import ARMS
 
 BEGIN_S, END_S = 8.0, 9.2
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"

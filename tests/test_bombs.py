@@ -19,11 +19,11 @@ from hrcreplay.egm.robot_double.faults import load_faults
 from hrcreplay.errors import SettingsError
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.reader import open_log
+from hrcreplay.pipeline.run_config import read_urdf
 from hrcreplay.robot.model import from_urdf, irb140
 from hrcreplay.robot.path import MOVE_S, programmed
 from hrcreplay.robot.task import CYCLE_S, parse_task
 from hrcreplay.robot.urdf import MOST_LINKS
-from hrcreplay.run.job import read_urdf
 from hrcreplay.settings.load import load_settings
 from hrcreplay.settings.sections import Robot
 from hrcreplay.toml_file import parse_toml, read_toml

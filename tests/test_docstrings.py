@@ -17,9 +17,7 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py") if not path.name.endswit
 #: A function with at least so many parameters needs an Args section.
 MANY = 4
 #: The command line: here the help of each option documents it, and a docstring is the text of --help.
-COMMANDS = ("cli/app.py", "cli/commands.py")
-#: Modules of one name in several rooms are counterparts: the same task, each for its room.
-COUNTERPARTS = {"__init__", "codec", "figures", "inverse_kinematics", "metrics", "model", "page", "stages"}
+COMMANDS = ("cli/app.py", "cli/live.py")
 
 _SECTIONS = re.compile(r"^(Returns|Raises|Yields|Attributes):$", re.MULTILINE)
 
@@ -96,10 +94,3 @@ def test_no_two_classes_share_a_name() -> None:
                 places[node.name].append(path.relative_to(PACKAGE).as_posix())
     shared = {name: paths for name, paths in places.items() if len(paths) > 1}
     assert shared == {}
-
-
-def test_modules_of_one_name_are_counterparts() -> None:
-    places = defaultdict(list)
-    for path in MODULES:
-        places[path.stem].append(path.relative_to(PACKAGE).as_posix())
-    assert {name: paths for name, paths in places.items() if len(paths) > 1 and name not in COUNTERPARTS} == {}

@@ -13,6 +13,8 @@ import hrcreplay
 PACKAGE = Path(hrcreplay.__file__).parent
 
 FOUNDATION = {"errors", "records", "toml_file"}
+#: Rooms that compute the stages, and what they are set by.
+STAGES = {"kernels", "geometry", "human", "robot", "logs", "settings", "limits", "calibration"}
 #: Sections of settings may be passed to these rooms as they are; none of them loads a setting.
 TAKERS = ("human", "robot", "logs", "egm", "calibration", "reporting")
 #: Room -> the rooms that it may import.
@@ -31,27 +33,14 @@ MAY_IMPORT = {
     "store": FOUNDATION,
     "limits": FOUNDATION | {"human", "store"},
     "calibration": FOUNDATION | {"kernels", "geometry", "logs", "settings", "store"},
-    "reporting": FOUNDATION | {"geometry", "human", "robot", "logs", "settings", "store"},
-    "run": FOUNDATION
-    | {"kernels", "geometry", "human", "robot", "logs", "settings", "store", "limits", "calibration", "reporting"}
-    | {"version"},
-    "audit": FOUNDATION | {"kernels", "geometry", "human", "logs", "store", "limits", "reporting", "run", "version"},
-    "live": FOUNDATION
-    | {
-        "geometry",
-        "human",
-        "robot",
-        "logs",
-        "egm",
-        "settings",
-        "store",
-        "calibration",
-        "reporting",
-        "run",
-        "version",
-    },
-    "api": FOUNDATION | {"geometry", "robot", "logs", "settings", "store", "calibration", "run"},
-    "cli": FOUNDATION | {"logs", "egm", "settings", "calibration", "run", "audit", "live", "version"},
+    "pipeline": FOUNDATION | STAGES | {"store", "version"},
+    "evaluation": FOUNDATION | STAGES | {"store", "pipeline"},
+    "reporting": FOUNDATION | STAGES | {"store", "pipeline", "evaluation"},
+    "audit": FOUNDATION | STAGES | {"store", "version", "pipeline", "evaluation", "reporting"},
+    "commands": FOUNDATION | STAGES | {"store", "version", "pipeline", "evaluation", "reporting", "audit"},
+    "live": FOUNDATION | STAGES | {"egm", "store", "version", "pipeline", "evaluation", "reporting", "commands"},
+    "api": FOUNDATION | {"geometry", "robot", "logs", "settings", "store", "calibration", "pipeline", "commands"},
+    "cli": FOUNDATION | {"egm", "settings", "pipeline", "commands", "audit", "live", "version"},
     "__main__": {"cli"},
     "__init__": {"api", "version"},
 }

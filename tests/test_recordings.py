@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from hrcreplay.cli import commands
-from hrcreplay.run import replay
+from hrcreplay.commands import replay
 from hrcreplay.store import run_folder
 from tests.coverage_figures import assert_one_coverage
 from tests.realdata import data_path

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from unittest import mock
 
-from hrcreplay.reporting import figures
+from hrcreplay.reporting.figures import catalogue
 
 
 @contextmanager
 def undrawn() -> Iterator[None]:
     """Makes the folder of the figures, and leaves it empty."""
-    with mock.patch.object(figures, "wanted", return_value=()):
+    with mock.patch.object(catalogue, "wanted", return_value=()):
         yield

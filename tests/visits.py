@@ -9,11 +9,11 @@ from types import MappingProxyType
 import numpy as np
 
 from hrcreplay.calibration.cell import Cell, Watched, write_cell
+from hrcreplay.commands import replay
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import NOBODY, POINTS, CameraFrames, Floats
-from hrcreplay.run import replay
 
 BEGIN_NS = 1_700_000_000_000_000_000
 FRAME_NS = 33_000_000

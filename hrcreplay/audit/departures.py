@@ -15,14 +15,14 @@ import numpy as np
 
 from hrcreplay.audit import baselines
 from hrcreplay.audit.log_audit import SHORTER_S
+from hrcreplay.evaluation.containment import RecordedFuture, body_radii_m, check_containment, recorded_future
+from hrcreplay.evaluation.recorded_person import TRUTH, Recording
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, tubes
+from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolumes
-from hrcreplay.run.build import PredictionStage
-from hrcreplay.run.containment import RecordedFuture, body_radii_m, check_containment, recorded_future
-from hrcreplay.run.recording import TRUTH, Recording
 
 #: Robots beside people stop within some 10 to 100 ms; nothing is known before the first horizon that is measured [s].
 _FIRST_S = 0.02

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from hrcreplay.records import JOINTS, LIMBS, Floats
-from hrcreplay.reporting import drawing
-from hrcreplay.reporting.figures_human import LABELS
+from hrcreplay.reporting.figures import drawing
+from hrcreplay.reporting.figures.fusion import LABELS
 
 #: Method -> how the page calls it.
 METHODS = {

@@ -21,15 +21,15 @@ from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, 
 from hrcreplay.audit.fit_limits import Fit, Futures
 from hrcreplay.audit.measures import Estimate, block_ticks, resample
 from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.evaluation.recorded_person import SMOOTHED, TRUTH, Recording, read_recording
 from hrcreplay.human.model import Departure, LimitSet
 from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.assembly import PredictionStage
+from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
+from hrcreplay.pipeline.stages import NS, ProgressBar, tick_times
 from hrcreplay.records import JOINTS, LIMBS, Floats
-from hrcreplay.run import build
-from hrcreplay.run.build import PredictionStage
-from hrcreplay.run.job import Job, JobOptions, resolve
-from hrcreplay.run.recording import SMOOTHED, TRUTH, Recording, read_recording
-from hrcreplay.run.stages import NS, ProgressBar, tick_times
 from hrcreplay.version import __version__
 
 
@@ -112,7 +112,7 @@ COVERS = ("joints", "limbs")
 class FitSample:
     """One log's ticks: the first part to fit on, the last part to test the fit on."""
 
-    job: Job
+    run_config: RunConfig
     name: str
     source: str
     training: Futures
@@ -135,7 +135,7 @@ def run(
     coverage: float = COVERAGE,
     held_back: float = HELD_BACK,
     cover: str = COVER,
-    **options: Unpack[JobOptions],
+    **options: Unpack[RunOptions],
 ) -> FitReport:
     """Fits velocity and acceleration bounds to logs and writes them as a limit set.
 
@@ -149,7 +149,7 @@ def run(
         held_back: Share of every log's time, its end.
         cover: ``joints``: bounds on the joints, whose intervals of Alg. 1 hold that share. ``limbs``: also how far
             whole limbs, the lower body too, depart from constant velocity in that share of the ticks.
-        **options: Settings, cell and span, as ``job.resolve`` takes them.
+        **options: Settings, cell and span, as ``run_config.resolve`` takes them.
 
     Returns:
         What the user should know, and whether the share was missed.
@@ -159,9 +159,9 @@ def run(
         LogError: A log cannot be read, is too short, or shows no arm motion.
     """
     _refuse(logs, out, coverage, held_back, cover)
-    jobs = [resolve("fit-limits", log, **options) for log in logs]
-    horizon_s = _horizon_s(jobs)
-    samples = [_sample(job, horizon_s, held_back, cover == "limbs") for job in jobs]
+    run_configs = [resolve("fit-limits", log, **options) for log in logs]
+    horizon_s = _horizon_s(run_configs)
+    samples = [_sample(run_config, horizon_s, held_back, cover == "limbs") for run_config in run_configs]
     found = _fit(samples, coverage, horizon_s)
     limits = _limits(found, samples, out.stem)
     facts = _facts(samples, found, limits, coverage, horizon_s, held_back) | {"covers": cover}
@@ -191,29 +191,35 @@ def _refuse(logs: Sequence[Path], out: Path, coverage: float, held_back: float, 
         raise SettingsError(f"{out}: exists already; name another file, or remove it")
 
 
-def _horizon_s(jobs: Sequence[Job]) -> float:
-    horizons = {build.prediction_stage(job).horizon_s for job in jobs}
+def _horizon_s(run_configs: Sequence[RunConfig]) -> float:
+    horizons = {assembly.prediction_stage(run_config).horizon_s for run_config in run_configs}
     if len(horizons) > 1:
         raise SettingsError(f"occupancy.stop_s: found {sorted(horizons)} s; all logs need one horizon, set it")
     return horizons.pop()
 
 
-def _sample(job: Job, horizon_s: float, held_back: float, limbs: bool) -> FitSample:
-    log = open_log(job.log, job.settings.logs)
+def _sample(run_config: RunConfig, horizon_s: float, held_back: float, limbs: bool) -> FitSample:
+    log = open_log(run_config.log, run_config.settings.logs)
     first_ns = log.header.start_ns
-    begin_ns = first_ns + round((job.start_s or 0.0) * NS)
-    end_ns = log.header.end_ns if job.end_s is None else min(log.header.end_ns, first_ns + round(job.end_s * NS))
+    begin_ns = first_ns + round((run_config.start_s or 0.0) * NS)
+    end_ns = (
+        log.header.end_ns
+        if run_config.end_s is None
+        else min(log.header.end_ns, first_ns + round(run_config.end_s * NS))
+    )
     cut_ns = end_ns - round(held_back * (end_ns - begin_ns))
     if min(cut_ns - begin_ns, end_ns - cut_ns) / NS <= horizon_s:
         raise LogError(
-            f"{job.log}: found {max(0.0, (end_ns - begin_ns) / NS):.2f} s; the part to fit on and the part held back "
-            f"both need more than the horizon of {horizon_s:g} s"
+            f"{run_config.log}: found {max(0.0, (end_ns - begin_ns) / NS):.2f} s; the part to fit on and the part held "
+            f"back both need more than the horizon of {horizon_s:g} s"
         )
-    rate_hz = job.settings.fusion.rate_hz
+    rate_hz = run_config.settings.fusion.rate_hz
     ticks_ns = tick_times(begin_ns, end_ns, rate_hz)
-    stage = f"reading {job.log.name}"
+    stage = f"reading {run_config.log.name}"
     with ProgressBar(stage, len(ticks_ns)) as bar:
-        recording = read_recording(log, ticks_ns, build.fusion_stage(job, log), lambda n: bar.advance(stage, n))
+        recording = read_recording(
+            log, ticks_ns, assembly.fusion_stage(run_config, log), lambda n: bar.advance(stage, n)
+        )
     states, joints = recording.states, recording.joints
     if recording.source != TRUTH:
         joints = fit_limits.recently_seen(joints, states.unseen_s, SEEN_S)
@@ -223,23 +229,23 @@ def _sample(job: Job, horizon_s: float, held_back: float, limbs: bool) -> FitSam
     some = fit_limits.futures(states, ticks, recording.joints_t_ns, joints, horizon_s=horizon_s, memory_s=SEEN_S)
     training = states.rows(states.t_ns <= cut_ns)
     return FitSample(
-        job,
-        job.log.name,
+        run_config,
+        run_config.log.name,
         TRUTH if recording.source == TRUTH else SMOOTHED,
         some.rows(some.t_ns + round(horizon_s * NS) <= cut_ns),
         some.rows(some.t_ns > cut_ns),
         bool(fit_limits.outside_positions(training.p, load_limits(STANDARD)).any()),
-        build.prediction_stage(job),
-        _limbs(job, recording, limbs),
+        assembly.prediction_stage(run_config),
+        _limbs(run_config, recording, limbs),
         cut_ns,
     )
 
 
-def _limbs(job: Job, recording: Recording, wanted: bool) -> LimbDepartures:
+def _limbs(run_config: RunConfig, recording: Recording, wanted: bool) -> LimbDepartures:
     """The departures in a recording; of no tick where they are not wanted."""
-    stage, states = build.prediction_stage(job), recording.states
+    stage, states = assembly.prediction_stage(run_config), recording.states
     horizon_ns = round(stage.horizon_s * NS)
-    ticks = np.arange(0, len(states), max(1, round(job.settings.fusion.rate_hz / DEPARTURES_HZ)))
+    ticks = np.arange(0, len(states), max(1, round(run_config.settings.fusion.rate_hz / DEPARTURES_HZ)))
     ticks = ticks[np.isfinite(states.residual_m[ticks, : len(LIMBS)]).all(axis=1)]  # the filter has found the person
     ticks = ticks[states.t_ns[ticks] + horizon_ns <= recording.t_ns[-1]] if wanted else ticks[:0]
     return departures(stage, recording, ticks)
@@ -358,8 +364,16 @@ def _facts(
 
     logs = []
     for i, sample in enumerate(samples):
-        facts: dict[str, Any] = {"name": sample.name, "sha256": sample.job.log_sha256, "recorded_future": sample.source}
-        facts |= {key: s for key, s in (("start_s", sample.job.start_s), ("end_s", sample.job.end_s)) if s is not None}
+        facts: dict[str, Any] = {
+            "name": sample.name,
+            "sha256": sample.run_config.log_sha256,
+            "recorded_future": sample.source,
+        }
+        facts |= {
+            key: s
+            for key, s in (("start_s", sample.run_config.start_s), ("end_s", sample.run_config.end_s))
+            if s is not None
+        }
         facts |= shares(trained[i : i + 1], held[i : i + 1])
         others = [*samples[:i], *samples[i + 1 :]]
         if any(fit_limits.arms_move(other.training).any() for other in others):

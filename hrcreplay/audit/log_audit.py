@@ -12,15 +12,7 @@ from hrcreplay.audit import baselines
 from hrcreplay.audit.fit_limits import ARMS
 from hrcreplay.audit.recorded_motion import errors_in_deviations
 from hrcreplay.errors import LogError
-from hrcreplay.human.model import LimitSet
-from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.human.prediction.swept_volumes import Reach, limb_radii
-from hrcreplay.logs.reader import open_log
-from hrcreplay.records import DOF, JOINTS, Floats, HumanStates, Ints, SweptVolumes
-from hrcreplay.reporting.metrics import ANGLES, difference
-from hrcreplay.run import build
-from hrcreplay.run.build import PredictionStage
-from hrcreplay.run.containment import (
+from hrcreplay.evaluation.containment import (
     AUDIT_HZ,
     Outcome,
     RecordedFuture,
@@ -29,9 +21,17 @@ from hrcreplay.run.containment import (
     check_containment,
     recorded_future,
 )
-from hrcreplay.run.job import Job
-from hrcreplay.run.recording import Recording, read_recording
-from hrcreplay.run.stages import NS, ProgressBar, tick_times
+from hrcreplay.evaluation.recorded_person import Recording, read_recording
+from hrcreplay.human.model import LimitSet
+from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.human.prediction.swept_volumes import Reach, limb_radii
+from hrcreplay.logs.reader import open_log
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.assembly import PredictionStage
+from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.pipeline.stages import NS, ProgressBar, tick_times
+from hrcreplay.records import DOF, JOINTS, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.reporting.metrics.series import ANGLES, difference
 from hrcreplay.store.run_folder import Stopwatch
 
 
@@ -97,7 +97,7 @@ _PEERS = ("v2_a50", "iso_13855")
 class LogAudit:
     """Results of the audit of one log."""
 
-    job: Job
+    run_config: RunConfig
     name: str
     recording: Recording
     outcomes: dict[str, Outcome]  #: by method, our own first
@@ -152,33 +152,33 @@ def shorter(prediction_stage: PredictionStage) -> tuple[float, ...]:
     return tuple(h for h in SHORTER_S if h < standstill_s(prediction_stage))
 
 
-def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
+def audit_log(run_config: RunConfig, name: str, watch: Stopwatch) -> LogAudit:
     """Audits one log by all methods.
 
     Raises:
         SettingsError: The cell does not fit the log.
         LogError: The log cannot be read, is shorter than the horizon, or shows nobody.
     """
-    log = open_log(job.log, job.settings.logs)
-    prediction_stage = build.prediction_stage(job)
+    log = open_log(run_config.log, run_config.settings.logs)
+    prediction_stage = assembly.prediction_stage(run_config)
     horizon_s = standstill_s(prediction_stage)
     first_ns, last_ns = log.header.start_ns, log.header.end_ns
-    begin_ns = first_ns + round((job.start_s or 0.0) * NS)
-    end_ns = last_ns if job.end_s is None else min(last_ns, first_ns + round(job.end_s * NS))
+    begin_ns = first_ns + round((run_config.start_s or 0.0) * NS)
+    end_ns = last_ns if run_config.end_s is None else min(last_ns, first_ns + round(run_config.end_s * NS))
     if (end_ns - begin_ns) / NS <= horizon_s:
         raise LogError(
-            f"{job.log}: found {max(0.0, (end_ns - begin_ns) / NS):.2f} s; an audit needs more than the horizon of "
-            f"{horizon_s:g} s"
+            f"{run_config.log}: found {max(0.0, (end_ns - begin_ns) / NS):.2f} s; an audit needs more than the horizon "
+            f"of {horizon_s:g} s"
         )
-    ticks_ns = tick_times(begin_ns, end_ns, job.settings.fusion.rate_hz)
+    ticks_ns = tick_times(begin_ns, end_ns, run_config.settings.fusion.rate_hz)
     with ProgressBar(f"reading {name}", len(ticks_ns)) as bar, watch.stage("record", len(ticks_ns)):
         recording = read_recording(
-            log, ticks_ns, build.fusion_stage(job, log), lambda n: bar.advance(f"reading {name}", n)
+            log, ticks_ns, assembly.fusion_stage(run_config, log), lambda n: bar.advance(f"reading {name}", n)
         )
-    fusion = job.settings.fusion
+    fusion = run_config.settings.fusion
     rows = asked_rows(recording.states, int(recording.t_ns[-1]), fusion.rate_hz, horizon_s, fusion.fresh_s)
     if not len(rows):
-        raise LogError(f"{job.log}: nobody was seen for longer than the horizon of {horizon_s:g} s")
+        raise LogError(f"{run_config.log}: nobody was seen for longer than the horizon of {horizon_s:g} s")
     future = recorded_future(recording.t_ns, recording.points_m, recording.states.rows(rows), horizon_s)
     outcomes, curve = {}, {}
     stage = f"auditing {name}"
@@ -192,7 +192,7 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
                 outcomes[method] = _hold(prediction_stage, future, method, EVERY, progress)
         if not np.isfinite(outcomes[prediction_stage.method].beyond_m).any():
             raise LogError(
-                f"{job.log}: nothing to check: no limb was both predicted and seen to the end of the horizon of "
+                f"{run_config.log}: nothing to check: no limb was both predicted and seen to the end of the horizon of "
                 f"{horizon_s:g} s"
             )
         for method in swept_volumes.METHODS:
@@ -206,7 +206,7 @@ def audit_log(job: Job, name: str, watch: Stopwatch) -> LogAudit:
         joints[method] = joints_inside(recording, future.states, interval, horizon_s)
     notes = (*log.notes, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))
     errors = errors_in_deviations(recording, rows)
-    return LogAudit(job, name, recording, outcomes, joints, curve, horizons, errors, future.points(), notes)
+    return LogAudit(run_config, name, recording, outcomes, joints, curve, horizons, errors, future.points(), notes)
 
 
 def _hold(

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.audit.measures import Estimate, Resampling
+from hrcreplay.evaluation.containment import Outcome
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats
-from hrcreplay.reporting.metrics import Metric, MetricTable, true_runs
+from hrcreplay.reporting.metrics.series import Metric, MetricTable, true_runs
 from hrcreplay.reporting.tables import PageTable
-from hrcreplay.run.containment import Outcome
 
 
 def never_checked(part: Mapping[str, Any], method: str) -> list[str]:

@@ -21,9 +21,9 @@ from hrcreplay.audit.metrics import (
     volume_at,
 )
 from hrcreplay.records import JOINTS, LIMBS
-from hrcreplay.reporting.metrics import ANGLES, Metric
-from hrcreplay.reporting.page import PageFigure, PageSection
-from hrcreplay.reporting.story import Answer, Card
+from hrcreplay.reporting.metrics.series import ANGLES, Metric
+from hrcreplay.reporting.page.report_page import PageFigure, PageSection
+from hrcreplay.reporting.summary_text import Answer, Card
 from hrcreplay.reporting.tables import PageTable, text_of
 
 CAPTIONS = {
@@ -60,7 +60,7 @@ def render(found: Mapping[str, Any], metrics: Mapping[str, Metric], meta: Mappin
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(
-        resources.files("hrcreplay.reporting").joinpath("page.html.j2").read_text("utf-8")
+        resources.files("hrcreplay.reporting.page").joinpath("page.html.j2").read_text("utf-8")
     )
     names = [log["log"] for log in found["logs"]]
     total = found["total"]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from hrcreplay.evaluation.recorded_person import LIMB_POINTS, Recording
 from hrcreplay.human.model import SHOWN_BY
 from hrcreplay.records import POINTS, Floats, Ints
-from hrcreplay.reporting.metrics import difference
-from hrcreplay.run.recording import LIMB_POINTS, Recording
+from hrcreplay.reporting.metrics.series import difference
 
 #: A limb has moved once one of its ends is so far from where it was first, the middle of so many sightings [m].
 _MOVED_M, _FIRST = 0.1, 10

@@ -12,7 +12,7 @@ from hrcreplay.calibration.cell import LEVEL_VIEW, Cell, Floor, Residual, find_f
 from hrcreplay.calibration.registration import Registration, disagreement, register, transform
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.camera_checks import CameraChecks, agreement_lines, body_line
-from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.cleaning import PersonMemory, select_person
 from hrcreplay.logs.reader import Log
 from hrcreplay.records import POINTS, Bools, CameraFrames, Floats, SkeletonTrack
 from hrcreplay.settings.sections import Logs

@@ -26,7 +26,7 @@ from hrcreplay.cli import (
     Start,
     Topic,
     as_overrides,
-    commands,
+    live,
     span,
 )
 from hrcreplay.errors import CoverageMissed, HrcReplayError, SettingsError
@@ -70,7 +70,9 @@ def info(
     cell: CellFile = None,
 ) -> None:
     """Show the content of a log, and what is missing for the next step."""
-    sys.stdout.write("\n".join(commands.describe(log, config, as_overrides(settings, topic), cell)) + "\n")
+    from hrcreplay.commands import inputs
+
+    sys.stdout.write("\n".join(inputs.describe(log, config, as_overrides(settings, topic), cell)) + "\n")
 
 
 @app.command(name="import")
@@ -84,7 +86,9 @@ def import_(
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="keraal: rate of the Kinect, in Hz.")] = 30.0,
 ) -> None:
     """Make our log from Azure Kinect CSV, Kinect v2 CSV or KERAAL text files."""
-    for note in commands.import_files(kind, files, out, rate):
+    from hrcreplay.commands import inputs
+
+    for note in inputs.import_files(kind, files, out, rate):
         sys.stderr.write(f"hrcreplay: {note}\n")
     sys.stdout.write(f"{out}\n")
 
@@ -115,7 +119,9 @@ def calibrate(
     ] = None,
 ) -> None:
     """Find the poses and clock offsets of the cameras from the skeletons themselves."""
-    for line in commands.calibrate(
+    from hrcreplay.commands import inputs
+
+    for line in inputs.calibrate(
         log, out, config, as_overrides(settings, topic), reference=camera, up=up, height_m=height, base=base
     ):
         sys.stderr.write(f"hrcreplay: {line}\n")
@@ -155,10 +161,11 @@ def _stage(command: str, text: str) -> None:
 
 def _run(command: str, source: Path, **options: Any) -> Path:
     """Runs the stages up to a command's, and tells the main figures on standard error; the run folder."""
-    from hrcreplay.run import replay, stages
+    from hrcreplay.commands import replay
+    from hrcreplay.pipeline import stages
 
     folder = replay.run(command, source, **options)
-    from hrcreplay.run import report  # slow, as it can draw: what ends in an error need not wait for it
+    from hrcreplay.commands import report  # slow, as it can draw: what ends in an error need not wait for it
 
     for line in report.summary(folder):
         stages.print_note(line)
@@ -227,7 +234,7 @@ def _part_of_report(
     source: Path | None, figure: str | None, snapshot: float | None, out: Path | None, *, listed: bool
 ) -> None:
     """Parts that ``report`` makes of a run folder without making another."""
-    from hrcreplay.run.report import draw_figures, list_figures, take_still
+    from hrcreplay.commands.report import draw_figures, list_figures, take_still
 
     if listed:
         found: list[object] = [*list_figures(source)]
@@ -267,7 +274,7 @@ def compare(
     ] = 2,
 ) -> None:
     """Compare methods side by side on the same recording: what if another controller had been running?"""
-    from hrcreplay.run import compare as comparing
+    from hrcreplay.commands import compare as comparing
 
     folder = comparing.run(
         sources,
@@ -295,7 +302,7 @@ def why(
     """Explain the robot's step at an instant of a run: limb, link, vertex and row that held it, or its refused stop."""
     import json
 
-    from hrcreplay.run import why as explaining
+    from hrcreplay.commands import explain as explaining
 
     found = explaining.explain(folder, at, method)
     lines = [json.dumps(found, indent=2)] if as_json else explaining.sentences(found)
@@ -317,10 +324,10 @@ def audit(
     end: End = None,
 ) -> None:
     """Count how often people left the volumes that were predicted for them, by method and limb."""
-    from hrcreplay.audit import driver
+    from hrcreplay.commands import audit as auditing
 
     overrides = as_overrides(settings, topic, limits)
-    folder = driver.run(sources, out=out, config=config, overrides=overrides, cell_file=cell, **span(start, end))
+    folder = auditing.run(sources, out=out, config=config, overrides=overrides, cell_file=cell, **span(start, end))
     sys.stdout.write(f"{folder}\n")
 
 
@@ -363,7 +370,7 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the three files.")] = Path(),
 ) -> None:
     """Write commented files to begin with: cell.toml, task.toml and settings.toml."""
-    from hrcreplay.run.templates import write_templates
+    from hrcreplay.commands.templates import write_templates
 
     for path in write_templates(folder):
         sys.stdout.write(f"{path}\n")
@@ -387,14 +394,14 @@ def demo(
     chunk_ticks: Chunk = 250,
 ) -> None:
     """Report on the log that ships with hrcreplay: a worker beside a pick-and-place robot, two cameras, 60 s."""
-    from hrcreplay.run import replay
+    from hrcreplay.commands import replay
 
     overrides = as_overrides(settings)
     folder = _run("report", replay.demo_log(), out=out, config=config, overrides=overrides, chunk_ticks=chunk_ticks)
     sys.stdout.write(f"{folder / 'report.html'}\n")
 
 
-commands.register(app)
+live.register(app)
 
 
 def main() -> None:

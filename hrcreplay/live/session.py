@@ -29,7 +29,7 @@ from hrcreplay.live.control.session_controller import (
     SessionController,
     reason_of_signals,
 )
-from hrcreplay.live.control.setup import build_controller, compile_kernels, live_job, start_table
+from hrcreplay.live.control.setup import build_controller, compile_kernels, live_run_config, start_table
 from hrcreplay.live.processes import HelperProcess, raise_priority, restore_priority
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import Signal
@@ -129,19 +129,19 @@ class _Prepared:
 
 def _prepare(request: Request, partial: Path, stack: ExitStack) -> _Prepared:
     """Settings, controller, port, space on the disk; every kernel compiled."""
-    job, header = live_job(request.human, request.config, request.overrides, request.cell)
-    port = job.settings.live.port if request.port is None else request.port
-    start = start_table(job, header, sending=request.send)
+    run_config, header = live_run_config(request.human, request.config, request.overrides, request.cell)
+    port = run_config.settings.live.port if request.port is None else request.port
+    start = start_table(run_config, header, sending=request.send)
     controller = build_controller(start)
     unguarded = controller.setup.robot.unguarded_tool
     if unguarded is not None:
         sys.stderr.write(f"hrcreplay: {unguarded}\n")
-    live = job.settings.live
+    live = run_config.settings.live
     link = EgmServer(live.listen_address, port, WAIT_S, robot=live.robot_address, silence_s=live.silent_s)
     stack.enter_context(closing(link))
     _check_disk(partial, live.disk_start_mb)
     compile_kernels(start)
-    return _Prepared(job.settings, start, controller, link)
+    return _Prepared(run_config.settings, start, controller, link)
 
 
 def _check_disk(partial: Path, least_mb: float) -> None:

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from hrcreplay.commands import replay
 from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.errors import EXIT_DIFFERS, EXIT_SAME_DECISIONS, LogError, SettingsError
 from hrcreplay.live.control import setup
@@ -34,9 +35,8 @@ from hrcreplay.live.differences import (
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import SessionLogReader
+from hrcreplay.pipeline.run_config import versions
 from hrcreplay.records import STATUSES, Floats, SweptVolumes
-from hrcreplay.run import replay
-from hrcreplay.run.job import versions
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import state_columns
 from hrcreplay.store.machine import describe_machine, name_machine

@@ -13,7 +13,7 @@ import numpy as np
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs import joints
 from hrcreplay.logs.camera_checks import BodyInWorld, CameraChecks, LimbAgreement, agreement_lines, body_line
-from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.cleaning import PersonMemory, select_person
 from hrcreplay.logs.clocks import late_remark
 from hrcreplay.logs.joints import Clock
 from hrcreplay.logs.reader import DEFAULT, Log

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs import joints, log_files, messages, plausibility
-from hrcreplay.logs.clean import DEFECTS, STILL_M, STILL_S, Cleaner
+from hrcreplay.logs.cleaning import DEFECTS, STILL_M, STILL_S, Cleaner
 from hrcreplay.logs.clocks import ArrivalOrder, CameraClock, clock_remarks
 from hrcreplay.logs.decoders import (
     DECODABLE,

@@ -1,1 +1,1 @@
-"""Evaluation of a run: metrics, figures, HTML page."""
+"""Reports of a run: metrics, figures, the HTML page, and the 3-D scene."""

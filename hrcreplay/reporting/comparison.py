@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 
 from hrcreplay.records import Floats
-from hrcreplay.reporting import drawing, figures_robot
-from hrcreplay.reporting.metrics import Metric, MetricTable, times, true_runs
-from hrcreplay.reporting.metrics_contact import PERSONS, add_contact
-from hrcreplay.reporting.metrics_plan import PAPER, add_plan, is_moving
+from hrcreplay.reporting.figures import drawing, planning
+from hrcreplay.reporting.metrics.contact import PERSONS, add_contact
+from hrcreplay.reporting.metrics.planning import PAPER, add_plan, is_moving
+from hrcreplay.reporting.metrics.series import Metric, MetricTable, times, true_runs
 from hrcreplay.reporting.tables import PageTable
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
@@ -435,7 +435,7 @@ def write(found: Mapping[str, Any], writer: RunWriter) -> None:
     folder = writer.partial / "figures"
     folder.mkdir(exist_ok=True)
     with drawing.style():
-        drawing.save(figures_robot.methods(found), folder, "compare")
+        drawing.save(planning.methods(found), folder, "compare")
 
 
 def as_csv(found: Mapping[str, Any]) -> str:

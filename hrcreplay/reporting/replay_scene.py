@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
-from hrcreplay.reporting.drawing import BONES
-from hrcreplay.reporting.metrics import seconds_from, times
-from hrcreplay.reporting.metrics_contact import StopEvent, method_prefixes, stop_events
-from hrcreplay.reporting.metrics_plan import numeric_column
+from hrcreplay.reporting.figures.drawing import BONES
+from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, stop_events
+from hrcreplay.reporting.metrics.planning import numeric_column
+from hrcreplay.reporting.metrics.series import seconds_from, times
 from hrcreplay.robot.control.control_step import axis_by_axis
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import setting

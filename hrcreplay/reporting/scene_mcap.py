@@ -21,8 +21,8 @@ from hrcreplay.geometry.distances import nearest_pair
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.reporting import scene_messages as parts
-from hrcreplay.reporting.drawing import BONES
-from hrcreplay.reporting.metrics import times
+from hrcreplay.reporting.figures.drawing import BONES
+from hrcreplay.reporting.metrics.series import times
 from hrcreplay.reporting.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, at_rate, placements, posed
 from hrcreplay.reporting.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
 

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 from hrcreplay.geometry.convex_hull import above
 from hrcreplay.records import FLOOR_Z_M, POINTS, Floats, Ints
-from hrcreplay.reporting.drawing import BONES
+from hrcreplay.reporting.figures.drawing import BONES
 
 Rgba = tuple[float, float, float, float]
 

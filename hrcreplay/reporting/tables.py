@@ -14,7 +14,7 @@ import pandas as pd
 from hrcreplay.human.model import LimitSet
 from hrcreplay.logs import camera_checks
 from hrcreplay.records import BODY, BORDER, JOINTS
-from hrcreplay.reporting.metrics import ANGLES, Metric
+from hrcreplay.reporting.metrics.series import ANGLES, Metric
 from hrcreplay.robot.model import RobotModel
 
 #: Rows of the comparisons: label, and suffix of the metrics' names.

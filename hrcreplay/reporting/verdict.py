@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hrcreplay.records import LIMBS
-from hrcreplay.reporting.metrics import Metric, MetricTable
-from hrcreplay.reporting.metrics_contact import PERSONS, SHOWN_PARTS, method_prefixes
-from hrcreplay.reporting.metrics_data import add_limbs
+from hrcreplay.reporting.metrics.contact import PERSONS, SHOWN_PARTS, method_prefixes
+from hrcreplay.reporting.metrics.fusion import add_limbs
+from hrcreplay.reporting.metrics.series import Metric, MetricTable
 from hrcreplay.reporting.tables import PageTable, limb_names_text, part_name_text, percent, text_of
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run

@@ -3,7 +3,7 @@
 It is what the robot would do if nobody were there.
 
 The structure of the waypoints is a task file (TOML) and the task that travels inside a log; ``hrcreplay init`` writes
-one that explains every key (``run/task_template.toml``).
+one that explains every key (``commands/task_template.toml``).
 
 The robot stops at every waypoint, and stands at the first for its dwell before it starts. ``cycles`` times from the
 first to the last; between two cycles it goes back to the first by the first's own ``move``. On a straight line the TCP

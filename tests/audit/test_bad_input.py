@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hrcreplay import limits
-from hrcreplay.run import replay
+from hrcreplay.commands import replay
 from tests.audit.standing import frames, log_of_one_who_does_not_stir, standing
 from tests.cli.test_app import Run, run
 from tests.logs import own

@@ -6,8 +6,8 @@ import pytest
 from hrcreplay.audit import metrics as audit_checked
 from hrcreplay.audit import metrics as audit_metrics
 from hrcreplay.audit.measures import Resampling, block_ticks, resample
+from hrcreplay.evaluation.containment import Outcome
 from hrcreplay.records import BODY, Floats
-from hrcreplay.run.containment import Outcome
 
 
 def _once(n: int) -> Resampling:

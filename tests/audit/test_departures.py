@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit.departures import LimbDepartures, departures
+from hrcreplay.commands import replay
+from hrcreplay.evaluation.recorded_person import CAMERAS, TRUTH, Recording
 from hrcreplay.human.model import Departure, skeleton
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.run_config import resolve
 from hrcreplay.records import BODY, DOF, LIMBS, Floats
-from hrcreplay.run import build, replay
-from hrcreplay.run.job import resolve
-from hrcreplay.run.recording import CAMERAS, TRUTH, Recording
 from tests.human.people import states
 
 #: What people do upwards [m/s], how often it is recorded [s], and the residual that they are said to have [m].
@@ -35,7 +36,7 @@ def measured(up_m_per_s: float, seen_s: float = 0.0, source: str = TRUTH) -> Lim
     points[..., 2] += up_m_per_s * after_s[:, None]
     t_ns = people.t_ns[0] + np.round(after_s * 1e9).astype(np.int64)
     recording = Recording(people, t_ns, points, t_ns, np.repeat(posture, len(after_s), axis=0), source, {})
-    return departures(build.prediction_stage(resolve("audit", replay.demo_log())), recording, np.array([0]))
+    return departures(assembly.prediction_stage(resolve("audit", replay.demo_log())), recording, np.array([0]))
 
 
 def gone_m(of: LimbDepartures) -> Floats:

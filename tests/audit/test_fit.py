@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit import fit
+from hrcreplay.commands import replay
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS
-from hrcreplay.run import replay
 from hrcreplay.store import run_folder
 from tests.audit.standing import log_of_one_who_does_not_stir
 from tests.cli.test_app import Run, run

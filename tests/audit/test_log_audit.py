@@ -10,15 +10,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hrcreplay.audit import driver
+from hrcreplay.commands import audit, replay
 from hrcreplay.records import DOF, JOINTS
-from hrcreplay.run import replay
 
 
 def _audit(out: Path, *overrides: str) -> tuple[dict[str, Any], pd.DataFrame]:
     """Of two seconds in which the demo's person is busy."""
     overrides = ("limits.prediction=paper", *overrides)
-    folder = driver.run([replay.demo_log()], out=out, overrides=overrides, start_s=10.0, end_s=12.0)
+    folder = audit.run([replay.demo_log()], out=out, overrides=overrides, start_s=10.0, end_s=12.0)
     return json.loads((folder / "audit.json").read_text()), pd.read_parquet(folder / "audit.parquet")
 
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit.log_audit import joint_travel, joints_inside
+from hrcreplay.evaluation import recorded_person
+from hrcreplay.evaluation.containment import RecordedFuture, check_containment, recorded_future
+from hrcreplay.evaluation.recorded_person import Recording
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Floats, HumanStates, Measurements, SweptVolumes
-from hrcreplay.run import recording
-from hrcreplay.run.containment import RecordedFuture, check_containment, recorded_future
-from hrcreplay.run.recording import Recording
 from tests.human.people import states
 
 
 def _recording(points: Floats, joints: Floats, people: HumanStates) -> Recording:
     t_ns = people.t_ns[0] + np.arange(len(points)) * 100_000_000
-    return Recording(people, t_ns, points, t_ns, joints, recording.TRUTH, {})
+    return Recording(people, t_ns, points, t_ns, joints, recorded_person.TRUTH, {})
 
 
 def _future(points: Floats, people: HumanStates) -> RecordedFuture:
@@ -102,8 +102,8 @@ def test_every_camera_and_the_limbs_flesh_decide_whether_a_volume_held() -> None
     arm = LIMBS.index("LLA")
     for cameras, farthest_m in (([0], 0.0), ([1], 0.1), ([0, 1], 0.1)):
         mine = np.isin(seen.camera, cameras)
-        source, at_ns, points_m = recording._recorded_points(seen.rows(mine), both[mine], people)
-        assert source == recording.CAMERAS
+        source, at_ns, points_m = recorded_person._recorded_points(seen.rows(mine), both[mine], people)
+        assert source == recorded_person.CAMERAS
         future = recorded_future(at_ns, points_m, people, 0.4)
         outcome = check_containment(_balls(people, 0.12), future, dict.fromkeys(BODY, 0.05), np.array([False]))
         assert outcome.beyond_m[0, arm] == pytest.approx(farthest_m)

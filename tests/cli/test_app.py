@@ -11,7 +11,7 @@ import pytest
 
 from hrcreplay import __version__
 from hrcreplay.cli import app
-from hrcreplay.run import replay
+from hrcreplay.commands import replay
 from tests.logs import own
 
 Run = Callable[..., tuple[int, str, str]]

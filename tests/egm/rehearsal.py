@@ -6,8 +6,8 @@ import heapq
 from collections.abc import Callable, Iterable
 
 from hrcreplay.egm.robot_double.faults import Datagram
+from hrcreplay.egm.robot_double.robot_simulator import TwinCore
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
-from hrcreplay.egm.robot_double.twin import TwinCore
 
 #: ``guide(t_ns, datagrams) -> answers``: called once a cycle at least, without datagrams where none came.
 Guide = Callable[[int, list[bytes]], Iterable[bytes]]

@@ -9,8 +9,8 @@ import numpy as np
 
 from hrcreplay.egm.codec import Correction, RobotPacket, decode_robot, encode_correction
 from hrcreplay.egm.robot_double.faults import Fault
+from hrcreplay.egm.robot_double.robot_simulator import TwinCore, TwinSettings
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
-from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
 from hrcreplay.egm.robot_double.udp_client import TwinReport, report_of
 from hrcreplay.records import Floats
 from tests.egm.rehearsal import rehearse

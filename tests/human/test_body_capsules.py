@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from hrcreplay.evaluation.recorded_person import at_instants
 from hrcreplay.human.model import PARTS, part_axes, part_radii, skeleton
 from hrcreplay.records import JOINTS, POINTS
-from hrcreplay.run.recording import at_instants
 from hrcreplay.settings.sections import Occupancy
 
 LENGTHS_M = np.array([[0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.26]])

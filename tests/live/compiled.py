@@ -14,8 +14,8 @@ from numba.core.registry import CPUDispatcher
 
 from hrcreplay.egm.robot_double.faults import random_faults
 from hrcreplay.live.control.setup import compile_kernels
-from tests.live import campaign
 from tests.live.flights import Flight, start
+from tests.tools import campaign
 from tests.visits import cell_around
 
 SECONDS = 4.0

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 from hrcreplay.egm.link import Address, Received
 from hrcreplay.egm.robot_double.faults import Datagram
+from hrcreplay.egm.robot_double.robot_simulator import TwinCore
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
-from hrcreplay.egm.robot_double.twin import TwinCore
 from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.live.control.loop import Loop, LoopSettings
 from hrcreplay.live.record.codec import Decision, Perception, TickEvent

@@ -13,11 +13,11 @@ import numpy as np
 from hrcreplay.egm.codec import Correction, decode_correction
 from hrcreplay.egm.link import ALARMS
 from hrcreplay.egm.robot_double.faults import Fault
+from hrcreplay.egm.robot_double.robot_simulator import TwinCore, TwinSettings
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
-from hrcreplay.egm.robot_double.twin import TwinCore, TwinSettings
 from hrcreplay.human.model import skeleton
 from hrcreplay.live.control.session_controller import SessionController
-from hrcreplay.live.control.setup import build_controller, live_job, start_table
+from hrcreplay.live.control.setup import build_controller, live_run_config, start_table
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Decision, MotionRow, Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
@@ -44,8 +44,8 @@ def far_away(_s: float) -> tuple[float, float]:
 @cache
 def start(*overrides: str, cell: Path | None = None) -> dict[str, Any]:
     """The table of a session in the demo's cell."""
-    job, header = live_job(DEMO, None, overrides, cell)
-    return start_table(job, header, sending=True)
+    run_config, header = live_run_config(DEMO, None, overrides, cell)
+    return start_table(run_config, header, sending=True)
 
 
 @dataclass

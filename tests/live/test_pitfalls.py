@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hrcreplay.egm.robot_double.faults import Fault
+from hrcreplay.egm.robot_double.robot_simulator import TwinSettings
 from hrcreplay.egm.robot_double.servo import ServoSettings
-from hrcreplay.egm.robot_double.twin import TwinSettings
 from hrcreplay.live.control import session_controller
 from hrcreplay.live.control.loop import FINAL_ANSWERS
 from hrcreplay.live.record import codec

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hrcreplay.commands import replay
 from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.egm.robot_double.faults import KINDS, Fault
 from hrcreplay.errors import LogError, SettingsError
@@ -21,9 +22,8 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.live.verify import Agreement, Verdict, verify
+from hrcreplay.pipeline.run_config import versions
 from hrcreplay.records import DOF
-from hrcreplay.run import replay
-from hrcreplay.run.job import versions
 from hrcreplay.store import run_folder
 from hrcreplay.store.machine import describe_machine
 from tests.live import made

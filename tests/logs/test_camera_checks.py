@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from hrcreplay.cli import commands
+from hrcreplay.commands import replay
 from hrcreplay.logs.camera_checks import LIMB_POINTS, CameraChecks
 from hrcreplay.logs.info import Summary, lines, summarize
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import BODY, MIRROR, POINTS, CameraFrames, Floats, SkeletonTrack
-from hrcreplay.run import replay
 from hrcreplay.store import run_folder
 from tests.logs import own
 from tests.realdata import data_path

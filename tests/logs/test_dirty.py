@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay.logs.clean import DEFECTS
+from hrcreplay.logs.cleaning import DEFECTS
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import POINTS, CameraFrames
 from hrcreplay.settings.sections import Logs

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.calibration.registration import rigid
-from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.cleaning import PersonMemory, select_person
 from hrcreplay.records import CameraFrames, Floats
 
 UNKNOWN = np.full((2, 4, 4), np.nan)

@@ -10,7 +10,7 @@ import pytest
 from hrcreplay.errors import LogError
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import Floats
-from tests.fuzz.clip import clip, write
+from tests.tools.fuzz.clip import clip, write
 
 
 def pose(rotation: Floats, place: float = 1.0, last: float = 1.0) -> list[float]:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from hrcreplay.human.model import PARTS, part_axes, skeleton
 from hrcreplay.records import Floats
-from hrcreplay.reporting.metrics import start_ns
+from hrcreplay.reporting.metrics.series import start_ns
 from hrcreplay.reporting.replay_scene import ReplayScene, replay_scene
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.store.columns import body_columns

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from hrcreplay.logs.clean import DEFECTS
-from hrcreplay.reporting.story import defect_notes
+from hrcreplay.logs.cleaning import DEFECTS
+from hrcreplay.reporting.summary_text import defect_notes
 from tests.reporting.synthetic import make_run
 from tests.reporting.test_page import read, rendered
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hrcreplay.reporting import figures, figures_prediction, figures_robot
-from hrcreplay.reporting.figures import FIGURES, FigureData
-from hrcreplay.reporting.figures_prediction import Growth, Sweep, Walk
-from hrcreplay.reporting.figures_scene import ABOVE, RenderedHull, render_hulls, view_from
-from hrcreplay.reporting.metrics import instants
-from hrcreplay.run.report import compute
+from hrcreplay.commands.report import compute
+from hrcreplay.reporting.figures import catalogue, planning, prediction
+from hrcreplay.reporting.figures.catalogue import FIGURES, FigureData
+from hrcreplay.reporting.figures.prediction import Growth, Sweep, Walk
+from hrcreplay.reporting.figures.scene import ABOVE, RenderedHull, render_hulls, view_from
+from hrcreplay.reporting.metrics.series import instants
 from hrcreplay.store.run_folder import Run
 from tests.reporting.moving import moving_run
 from tests.reporting.synthetic import RADII_M, T0_NS, make_run, volumes_at
@@ -49,7 +49,7 @@ def data_of(run: Run, *, predicted: bool = True) -> FigureData:
 
 
 def draw(run: Run, folder: Path, *, predicted: bool = True) -> set[str]:
-    return set(figures.draw_all(data_of(run, predicted=predicted), folder))
+    return set(catalogue.draw_all(data_of(run, predicted=predicted), folder))
 
 
 def test_the_same_run_draws_the_same_bytes(tmp_path: Path) -> None:
@@ -89,9 +89,9 @@ def test_volumes_show_every_method_and_limb_in_its_own_size() -> None:
     limbs = {limb: (vertices, 0.1) for limb, vertices in volumes_at(2.0, 0.05).items()}
     tall = limbs | {"LEGS": (np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), 0.5)}
     k = T0_NS + 2_000_000_000
-    plain = figures_prediction.volumes([(k, {"paper": limbs})], run.state, T0_NS)
+    plain = prediction.volumes([(k, {"paper": limbs})], run.state, T0_NS)
     assert "LEGS" not in {text.get_text() for text in plain.legends[0].get_texts()}
-    found = figures_prediction.volumes([(k, {"paper": limbs, "sound": tall})], run.state, T0_NS)
+    found = prediction.volumes([(k, {"paper": limbs, "sound": tall})], run.state, T0_NS)
     assert {text.get_text() for text in found.legends[0].get_texts()} == {*limbs, "LEGS"}
     assert [ax.get_ylabel().split("\n")[0] for ax in found.axes] == ["paper", "sound"]
     low, high = found.axes[1].get_ylim()
@@ -104,11 +104,11 @@ def test_a_robot_that_kept_to_its_path_left_it_nowhere(tmp_path: Path) -> None:
     run = make_run(5.0)
     assert run.motion is not None
     kept = run.motion.assign(tcp_x=run.motion["ref_x"], tcp_y=run.motion["ref_y"], tcp_z=run.motion["ref_z"])
-    (ax,) = figures_robot.deviation(run.motion, None, T0_NS).axes
-    assert [text.get_text() for text in ax.texts] == [f"{figures_robot.largest_deviation(run.motion).length_m:.3f} m"]
+    (ax,) = planning.deviation(run.motion, None, T0_NS).axes
+    assert [text.get_text() for text in ax.texts] == [f"{planning.largest_deviation(run.motion).length_m:.3f} m"]
     kept_run = dataclasses.replace(run, motion=kept)
-    (kind,) = figures.find("13b")
-    why = figures.missing(kind, kept_run, data_of(kept_run).metrics)
+    (kind,) = catalogue.find("13b")
+    why = catalogue.missing(kind, kept_run, data_of(kept_run).metrics)
     assert why == "its TCP never left the programmed path"
     assert draw(kept_run, tmp_path, predicted=False) >= {"fig13a_path", "fig14_speed"}
     assert not (tmp_path / "fig13b_deviation.png").exists()
@@ -118,7 +118,7 @@ def test_every_figure_is_one_column_wide_and_has_a_name_of_its_own(tmp_path: Pat
     names, numbers = [kind.name for kind in FIGURES], [n for kind in FIGURES for n in kind.numbers]
     assert len(set(names)) == len(names)
     assert numbers == ["5", "7", "8", "9", "13a", "13b", "14", "15", "16", "17", "18"]
-    assert all(kind.caption.endswith(".") and set(kind.needs) <= set(figures.NEEDS) for kind in FIGURES)
+    assert all(kind.caption.endswith(".") and set(kind.needs) <= set(catalogue.NEEDS) for kind in FIGURES)
     for name in draw(make_run(5.0), tmp_path):
         assert 'width="252pt"' in (tmp_path / f"{name}.svg").read_text()[:600], name  # 3.5 in
         with Image.open(tmp_path / f"{name}.png") as image:
@@ -126,7 +126,9 @@ def test_every_figure_is_one_column_wide_and_has_a_name_of_its_own(tmp_path: Pat
 
 
 def test_a_figure_is_found_by_number_and_by_name() -> None:
-    found = {key: [kind.name for kind in figures.find(key)] for key in ("14", "Fig. 14", "16", "13", "13b", "horizon")}
+    found = {
+        key: [kind.name for kind in catalogue.find(key)] for key in ("14", "Fig. 14", "16", "13", "13b", "horizon")
+    }
     assert found == {
         "14": ["fig14_speed"],
         "Fig. 14": ["fig14_speed"],
@@ -135,7 +137,7 @@ def test_a_figure_is_found_by_number_and_by_name() -> None:
         "13b": ["fig13b_deviation"],
         "horizon": ["horizon"],
     }
-    assert [figures.find(key) for key in ("12", "", "a", "fig99")] == [()] * 4
+    assert [catalogue.find(key) for key in ("12", "", "a", "fig99")] == [()] * 4
 
 
 def test_speed_and_horizon_show_the_runs_columns() -> None:
@@ -144,8 +146,8 @@ def test_speed_and_horizon_show_the_runs_columns() -> None:
     assert motion is not None
     motion["tau_s"] = np.linspace(0.0, 0.3, len(motion))
     seconds = (motion["t_ns"].to_numpy() - motion["t_ns"].iloc[0]) / 1e9
-    nominal, actual, separation = figures_robot.speed(motion, T0_NS, 0.5).axes
-    drawn = figures_robot.horizon(motion, T0_NS, 0.377).axes[0]
+    nominal, actual, separation = planning.speed(motion, T0_NS, 0.5).axes
+    drawn = planning.horizon(motion, T0_NS, 0.377).axes[0]
     lines = [*(ax.lines[0] for ax in (nominal, actual, separation)), *drawn.lines[:2]]
     for line, name in zip(lines, ("ref_speed", "tcp_speed", "distance_m", "horizon_s", "tau_s"), strict=True):
         np.testing.assert_allclose(np.asarray(line.get_xdata(), dtype=float), seconds, atol=1e-9)
@@ -158,14 +160,14 @@ def test_volumes_against_the_horizon_are_those_stored() -> None:
     assert run.occupancy is not None
     occupancy = run.occupancy.assign(horizon_s=np.arange(len(run.occupancy)) // 6 * 0.001)
     found = Growth(T0_NS, np.array([0.0, 0.1, 0.2]), {"paper": np.array([0.1, 0.2, 0.4])})
-    ax = figures_prediction.growth(found, occupancy, T0_NS).axes[0]
+    ax = prediction.growth(found, occupancy, T0_NS).axes[0]
     lines = {str(line.get_label()): np.asarray(line.get_xydata(), dtype=float) for line in ax.lines}
     stored = lines["_"]
     np.testing.assert_allclose(stored[:, 0], 0.001 * np.arange(len(occupancy) // 6))
     np.testing.assert_allclose(stored[:, 1], 0.01 * (1 + 2 + 3 + 4 + 5 + 6))
     assert lines["paper"][:, 1].tolist() == [0.1, 0.2, 0.4]
     without = occupancy[(occupancy["limb"] != "HD") | (occupancy["horizon_s"] > 0.0)]  # one limb of one tick not known
-    assert len(figures_prediction.stored_sums(without)[0]) == len(occupancy) // 6 - 1
+    assert len(prediction.stored_sums(without)[0]) == len(occupancy) // 6 - 1
 
 
 def test_the_largest_deviation_is_where_the_tcp_was_furthest_from_every_point_of_the_path() -> None:
@@ -173,7 +175,7 @@ def test_the_largest_deviation_is_where_the_tcp_was_furthest_from_every_point_of
     assert run.motion is not None
     reference, tcp = (run.motion[[f"{point}_{axis}" for axis in "xyz"]].to_numpy() for point in ("ref", "tcp"))
     nearest = np.linalg.norm(tcp[:, None] - reference, axis=2).min(axis=1)  # to the vertices, which are dense
-    found = figures_robot.largest_deviation(run.motion)
+    found = planning.largest_deviation(run.motion)
     assert found.length_m == pytest.approx(nearest.max(), abs=2e-3)
     assert nearest[found.row] == pytest.approx(nearest.max(), abs=2e-3)
     np.testing.assert_array_equal(found.at_m, tcp[found.row])

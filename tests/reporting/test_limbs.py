@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hrcreplay.commands import replay
+from hrcreplay.commands.report import compute
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats
-from hrcreplay.reporting import metrics_data, story, verdict
-from hrcreplay.run import replay
-from hrcreplay.run.report import compute
+from hrcreplay.reporting import summary_text, verdict
+from hrcreplay.reporting.metrics import fusion
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
 from tests.reporting.synthetic import make_run
@@ -41,11 +42,11 @@ def test_shares_are_of_the_ticks_with_the_person_in_view() -> None:
     unseen_s[:, 5] = np.inf  # never
     unseen_s[:50] = np.inf  # nobody yet
     unseen_s[200:260] = 3.0  # gone for a while
-    found = metrics_data.unmeasured_shares(unseen_s, MEMORY_S)
+    found = fusion.unmeasured_shares(unseen_s, MEMORY_S)
     assert found == pytest.approx(by_counting(unseen_s))
     assert found[5] == 1.0
     assert 0.0 < found[2] < 1.0
-    assert np.isnan(metrics_data.unmeasured_shares(np.full((9, 6), np.inf), MEMORY_S)).all()
+    assert np.isnan(fusion.unmeasured_shares(np.full((9, 6), np.inf), MEMORY_S)).all()
 
 
 def seen(run: Run, **unseen_s: float | Floats) -> Run:
@@ -60,8 +61,8 @@ def kept(run: Run) -> Run:
     return dataclasses.replace(run, motion=run.motion.assign(status="tracking", reason=""))
 
 
-def answered(run: Run) -> story.Answer:
-    return story.answers(run, compute(run, near_m=0.5, stationary_m_per_s=0.001))[0]
+def answered(run: Run) -> summary_text.Answer:
+    return summary_text.answers(run, compute(run, near_m=0.5, stationary_m_per_s=0.001))[0]
 
 
 def test_the_verdict_says_first_which_limb_nobody_measured() -> None:
@@ -70,7 +71,9 @@ def test_the_verdict_says_first_which_limb_nobody_measured() -> None:
     safe = answered(seen(run, LLA=np.inf, LRA=np.inf))
     assert safe.short == "Not known of the right lower arm (LRA) and left lower arm (LLA): never measured."
     assert "Of what was measured: by the paper's criterion at every moving tick" in safe.words
-    card = story.cards(seen(run, LLA=np.inf), compute(seen(run, LLA=np.inf), near_m=0.5, stationary_m_per_s=0.001))[0]
+    card = summary_text.cards(
+        seen(run, LLA=np.inf), compute(seen(run, LLA=np.inf), near_m=0.5, stationary_m_per_s=0.001)
+    )[0]
     assert card.detail.endswith("; LLA never measured")
 
 

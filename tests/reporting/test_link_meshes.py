@@ -13,15 +13,15 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial import ConvexHull
 
+from hrcreplay.pipeline.run_config import read_urdf
 from hrcreplay.records import Floats, Ints
-from hrcreplay.reporting.replay_page import replay_part
+from hrcreplay.reporting.page.replay_page import replay_part
 from hrcreplay.reporting.replay_scene import LinkMesh, ReplayScene, coarser, robot_geometry
 from hrcreplay.robot.model import from_urdf
-from hrcreplay.run.job import read_urdf
 from hrcreplay.settings.sections import Robot
+from tests.commands.arms import ARMS
 from tests.reporting.browser import chromium, opened
 from tests.reporting.moving import moving_run, moving_scene
-from tests.run.arms import ARMS
 
 PROGRAM = chromium()
 

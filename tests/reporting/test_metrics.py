@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from hrcreplay.commands.report import compute
 from hrcreplay.records import JOINTS
-from hrcreplay.reporting.metrics import MetricTable, path_feet
-from hrcreplay.reporting.metrics_plan import add_plan, cycles, waited_s
-from hrcreplay.run.report import compute
+from hrcreplay.reporting.metrics.planning import add_plan, cycles, waited_s
+from hrcreplay.reporting.metrics.series import MetricTable, path_feet
 from hrcreplay.store.run_folder import Run
 from tests.reporting.synthetic import T0_NS, make_run
 

@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hrcreplay.commands.report import compute
 from hrcreplay.human.model import LimitSet
 from hrcreplay.records import DOF
-from hrcreplay.reporting import figures, page, story, tables
+from hrcreplay.reporting import summary_text, tables
 from hrcreplay.reporting import tables as wording
-from hrcreplay.reporting.figures import FigureData
+from hrcreplay.reporting.figures import catalogue
+from hrcreplay.reporting.figures.catalogue import FigureData
+from hrcreplay.reporting.page import report_page
 from hrcreplay.robot.control import control_step
-from hrcreplay.run.report import compute
 from hrcreplay.store.run_folder import Run
 from tests.reporting.synthetic import make_run
 
@@ -73,7 +75,7 @@ def rendered(run: Run, folder: Path) -> str:
     """The page with the figures that the folder holds."""
     metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
     used = [tables.limit_table(PAPER, use="prediction"), tables.radius_table(RADII)]
-    return page.render(run, metrics, folder, used)
+    return report_page.render(run, metrics, folder, used)
 
 
 def read(html: str) -> Reader:
@@ -87,7 +89,7 @@ def read(html: str) -> Reader:
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, run = tmp_path_factory.mktemp("figures"), make_run(8.0)
     metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
-    assert figures.draw_all(FigureData(run, metrics, near_m=0.5, stationary_m_per_s=0.001), folder)
+    assert catalogue.draw_all(FigureData(run, metrics, near_m=0.5, stationary_m_per_s=0.001), folder)
     return folder
 
 
@@ -107,7 +109,7 @@ def test_page_is_self_contained_and_well_formed(html: str) -> None:
 
 
 def test_page_shows_every_figure_drawn_under_its_caption(html: str, drawn: Path) -> None:
-    kinds = [kind for kind in figures.FIGURES if (drawn / f"{kind.name}.svg").exists()]
+    kinds = [kind for kind in catalogue.FIGURES if (drawn / f"{kind.name}.svg").exists()]
     assert len(kinds) > 8
     assert html.count("<figure>") == len(kinds)
     text = " ".join(read(html).text)
@@ -183,13 +185,13 @@ def test_the_smallest_distance_says_which_it_is() -> None:
     assert run.motion is not None
     touching = dataclasses.replace(run, motion=run.motion.assign(distance_m=0.0, status="limited", reason=""))
     metrics = compute(touching, near_m=0.5, stationary_m_per_s=0.001)
-    safe, _ = story.answers(touching, metrics)
+    safe, _ = summary_text.answers(touching, metrics)
     assert (
         "The smallest distance while it moved was 0.000 m: from the surface of a link to the surface of all that the "
         "person could reach within T_s = 0.377 s, not to the body."
     ) in safe.words
     assert "At 0 the constraint lets a link move along that space or away from it, but not into it." in safe.words
-    card = story.cards(touching, metrics)[1]
+    card = summary_text.cards(touching, metrics)[1]
     assert card.value == "0.000 m"
     assert "from a link's surface to that of what the person could reach within T_s" in card.label
     assert card.detail.startswith("not to the body")
@@ -264,7 +266,7 @@ def test_a_robot_that_was_never_let_go_is_said_to_have_stood() -> None:
     run = make_run(4.0)
     assert run.motion is not None
     still = dataclasses.replace(run, motion=run.motion.assign(tcp_speed=0.0))
-    safe, _ = story.answers(still, compute(still, near_m=0.5, stationary_m_per_s=0.001))
+    safe, _ = summary_text.answers(still, compute(still, near_m=0.5, stationary_m_per_s=0.001))
     assert safe.short == "The robot never moved."
     assert safe.words.startswith("It stood at all 400 ticks.")
 
@@ -272,5 +274,5 @@ def test_a_robot_that_was_never_let_go_is_said_to_have_stood() -> None:
 def test_an_interval_does_not_break_at_its_dash(tmp_path: Path) -> None:
     run = make_run(2.0)
     shown = tables.PageTable("shares", ("", "here"), (("limb", "99.5 (97.1\u2013100.0)"),))
-    html = page.render(run, compute(run, near_m=0.5, stationary_m_per_s=0.001), tmp_path, [shown])
+    html = report_page.render(run, compute(run, near_m=0.5, stationary_m_per_s=0.001), tmp_path, [shown])
     assert "<td>99.5 (97.1\u2013\u2060100.0)</td>" in html

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from hrcreplay.commands.report import compute
 from hrcreplay.records import Floats
-from hrcreplay.reporting.metrics_plan import programme_progress
-from hrcreplay.run.report import compute
+from hrcreplay.reporting.metrics.planning import programme_progress
 from tests.reporting.synthetic import T0_NS, make_run
 
 HZ = 100.0

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hrcreplay.commands.report import compute
 from hrcreplay.geometry.distances import distances
-from hrcreplay.reporting import page
+from hrcreplay.reporting.page import report_page
 from hrcreplay.reporting.replay_scene import ReplayScene
-from hrcreplay.run.report import compute
 from tests.reporting.browser import Tab, chromium, opened
 from tests.reporting.moving import moving_run, moving_scene, robot
 from tests.reporting.test_page import read
@@ -30,7 +30,7 @@ def scene() -> ReplayScene:
 def file(scene: ReplayScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run, folder = moving_run(8.0), tmp_path_factory.mktemp("page")
     metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
-    (folder / "report.html").write_text(page.render(run, metrics, folder, scene=scene), encoding="utf-8")
+    (folder / "report.html").write_text(report_page.render(run, metrics, folder, scene=scene), encoding="utf-8")
     return folder / "report.html"
 
 

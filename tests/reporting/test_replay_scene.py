@@ -12,8 +12,8 @@ from scipy.linalg import expm
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import LIMBS, POINTS, Floats
-from hrcreplay.reporting.metrics_contact import stop_events
-from hrcreplay.reporting.replay_page import MISSING, NumberBlock, replay_data
+from hrcreplay.reporting.metrics.contact import stop_events
+from hrcreplay.reporting.page.replay_page import MISSING, NumberBlock, replay_data
 from hrcreplay.reporting.replay_scene import SHOWN_POINTS, ReplayScene
 from hrcreplay.robot.control.control_step import axis_by_axis, straight
 from tests.reporting.moving import joints, moving_run, moving_scene, robot

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from hrcreplay.records import DOF
-from hrcreplay.reporting import metrics
+from hrcreplay.reporting.metrics import series
 
 
 def test_interpolation_of_angles_goes_the_short_way_round() -> None:
     values = np.zeros((2, DOF))
     values[0, 2], values[1, 2] = np.pi - 0.1, -np.pi + 0.1
     values[:, 0] = [1.0, 3.0]
-    found = metrics.interpolate(np.array([0, 100]), values, np.array([25, 50]), angles=True)
+    found = series.interpolate(np.array([0, 100]), values, np.array([25, 50]), angles=True)
     assert found[:, 2] == pytest.approx([np.pi - 0.05, np.pi])
     assert found[:, 0] == pytest.approx([1.5, 2.0])
 
@@ -19,23 +19,23 @@ def test_interpolation_of_angles_goes_the_short_way_round() -> None:
 def test_interpolation_of_rates_does_not_wrap() -> None:
     values = np.zeros((2, DOF))
     values[1, 2] = 10.0
-    assert metrics.interpolate(np.array([0, 10]), values, np.array([5]), angles=False)[0, 2] == pytest.approx(5.0)
+    assert series.interpolate(np.array([0, 10]), values, np.array([5]), angles=False)[0, 2] == pytest.approx(5.0)
 
 
 def test_interpolation_is_missing_outside_and_beside_a_missing_sample() -> None:
     values = np.zeros((4, DOF))
     values[2] = np.nan
     at = np.array([-1, 0, 10, 15, 25, 30, 31])
-    found = metrics.interpolate(np.array([0, 10, 20, 30]), values, at, angles=True)
+    found = series.interpolate(np.array([0, 10, 20, 30]), values, at, angles=True)
     assert np.isnan(found).all(axis=1).tolist() == [True, False, False, True, True, False, True]
 
 
 def test_central_differences_of_a_turning_heading() -> None:
     t_ns = np.arange(0, 3_000_000_000, 10_000_000)
     values = np.zeros((len(t_ns), DOF))
-    values[:, 2] = metrics.wrap(2.0 * metrics.seconds_from(t_ns, 0) + 3.0)
+    values[:, 2] = series.wrap(2.0 * series.seconds_from(t_ns, 0) + 3.0)
     values[:, 1] = -0.5 * t_ns * 1e-9
-    rate = metrics.central_differences(t_ns, values)
+    rate = series.central_differences(t_ns, values)
     assert np.isnan(rate[[0, -1]]).all()
     assert rate[1:-1, 2] == pytest.approx(2.0)
     assert rate[1:-1, 1] == pytest.approx(-0.5)
@@ -46,7 +46,7 @@ def test_central_differences_of_a_turning_heading() -> None:
     [([], []), ([0, 0], []), ([1, 1], [[0, 2]]), ([0, 1, 1, 0, 1], [[1, 3], [4, 5]])],
 )
 def test_stretches(mask: list[int], expected: list[list[int]]) -> None:
-    assert metrics.true_runs(np.array(mask, dtype=bool)).tolist() == expected
+    assert series.true_runs(np.array(mask, dtype=bool)).tolist() == expected
 
 
 def test_envelope_keeps_every_extreme_and_every_gap() -> None:
@@ -55,7 +55,7 @@ def test_envelope_keeps_every_extreme_and_every_gap() -> None:
     y[7_000:7_003] = np.nan
     y[12_345], y[3] = 99.0, -99.0
     x = np.arange(len(y), dtype=float)
-    thin_x, thin_y = metrics.envelope(x, y, bins=100)
+    thin_x, thin_y = series.envelope(x, y, bins=100)
     assert len(thin_x) <= 300
     assert np.nanmax(thin_y) == 99.0
     assert np.nanmin(thin_y) == -99.0
@@ -66,11 +66,11 @@ def test_envelope_keeps_every_extreme_and_every_gap() -> None:
 
 def test_envelope_leaves_short_lines_alone() -> None:
     x = np.arange(10.0)
-    assert metrics.envelope(x, x)[0] is x
+    assert series.envelope(x, x)[0] is x
 
 
 def test_broken_lines_get_a_gap() -> None:
-    x, y = metrics.break_at_gaps(np.array([0.0, 0.1, 5.0]), np.array([1.0, 2.0, 3.0]), 0.2)
+    x, y = series.break_at_gaps(np.array([0.0, 0.1, 5.0]), np.array([1.0, 2.0, 3.0]), 0.2)
     assert x.tolist() == [0.0, 0.1, 0.1, 5.0]
     assert np.isnan(y).tolist() == [False, False, True, False]
 
@@ -78,7 +78,7 @@ def test_broken_lines_get_a_gap() -> None:
 def test_thinned_path_stays_within_its_tolerance() -> None:
     angle = np.linspace(0, 2 * np.pi, 5000)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    thin = metrics.thin_path(circle, 0.01)
+    thin = series.thin_path(circle, 0.01)
     assert len(thin) < 700
     assert (thin[0] == circle[0]).all()
     assert (thin[-1] == circle[-1]).all()

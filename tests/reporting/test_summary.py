@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from hrcreplay.commands.report import compute
 from hrcreplay.records import LIMBS
-from hrcreplay.reporting.story import lines
-from hrcreplay.run.report import compute
+from hrcreplay.reporting.summary_text import lines
 from hrcreplay.store.run_folder import Run
 from tests.reporting.synthetic import make_run
 

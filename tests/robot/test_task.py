@@ -17,7 +17,7 @@ def example() -> dict[str, Any]:
 
 
 def template() -> str:
-    return (resources.files("hrcreplay.run") / "task_template.toml").read_text("utf-8")
+    return (resources.files("hrcreplay.commands") / "task_template.toml").read_text("utf-8")
 
 
 def pair(**second: Any) -> dict[str, Any]:

@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.pipeline.assembly import _robot as build_robot
+from hrcreplay.pipeline.run_config import UrdfFiles
 from hrcreplay.robot.model import from_urdf
 from hrcreplay.robot.urdf import describe
-from hrcreplay.run.build import _robot as build_robot
-from hrcreplay.run.job import UrdfFiles
 from hrcreplay.settings.load import load_settings
 from tests.robot.test_model import AT_ORIGIN, joint, link, pedestal, robot_xml
 

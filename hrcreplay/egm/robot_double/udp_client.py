@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hrcreplay.egm.robot_double.faults import Datagram, Fault, FaultOutcome, fault_outcome
+from hrcreplay.egm.robot_double.robot_simulator import TwinCore, TwinRecord, TwinSettings, columns
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
-from hrcreplay.egm.robot_double.twin import TwinCore, TwinRecord, TwinSettings, columns
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats, Ints
 

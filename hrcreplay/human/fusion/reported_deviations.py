@@ -27,7 +27,7 @@ _MEMORY_S = 2.0
 #: Of JOINTS, the row of FITTED: both arms share theirs.
 KIND = np.array([0, 0, 1, 2, 3, 4, 5, 6, 3, 4, 5, 6, 7])
 #: For the variances of p and of v: logarithm of the factor without autocorrelation, and its slope over the
-#: autocorrelation. Fitted by ``python -m tests.deviations``.
+#: autocorrelation. Fitted by ``python -m tests.tools.deviations``.
 FITTED = np.array(
     [
         [[-1.65, 2.03], [-1.64, 2.67]],  # x, y

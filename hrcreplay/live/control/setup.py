@@ -29,12 +29,12 @@ from hrcreplay.logs import skeleton_pb2
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
 from hrcreplay.logs.reader import open_log
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.run_config import RunConfig, recorded_limits, resolve, resolve_without_log
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.controllers import Controller
 from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.task import Reference
-from hrcreplay.run import build
-from hrcreplay.run.job import Job, job_without_log, recorded_limits, resolve
 from hrcreplay.settings.load import Settings, load_settings
 from hrcreplay.version import __version__
 
@@ -52,9 +52,9 @@ class HeaderOnlyLog:
         return None
 
 
-def live_job(
+def live_run_config(
     human: Path | None, config: Path | None, overrides: tuple[str, ...], cell_file: Path | None
-) -> tuple[Job, Header]:
+) -> tuple[RunConfig, Header]:
     """Settings and cameras of a session.
 
     Args:
@@ -68,15 +68,15 @@ def live_job(
         LogError: The recording cannot be read.
     """
     if human is not None:
-        job = resolve("live", human, config=config, overrides=overrides, cell_file=cell_file)
-        return job, open_log(job.log, job.settings.logs).header
+        run_config = resolve("live", human, config=config, overrides=overrides, cell_file=cell_file)
+        return run_config, open_log(run_config.log, run_config.settings.logs).header
     settings = load_settings(config, overrides)
     cameras = tuple(sorted(settings.live.zenoh.keys))
     if not cameras:
         raise SettingsError("live.zenoh.keys: no camera; name one there, or play a recording with --human LOG")
     where = Path("live.zenoh")
-    job = job_without_log("live", where, settings, cell_file)
-    return job, _header(where, cameras, {}, None, None)
+    run_config = resolve_without_log("live", where, settings, cell_file)
+    return run_config, _header(where, cameras, {}, None, None)
 
 
 def _header(
@@ -100,30 +100,30 @@ def _header(
     )
 
 
-def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
+def start_table(run_config: RunConfig, header: Header, *, sending: bool) -> dict[str, Any]:
     """Everything that the session's decisions depend on beside its inputs, as JSON.
 
     Raises:
         SettingsError: There is no task, or it is not known where the robot stands.
         LogError: The pose of a camera is not known.
     """
-    task = job.task or header.task
+    task = run_config.task or header.task
     if task is None:
         raise SettingsError(
             f"{header.path}: no task; a live robot needs one: name a task file with --set plan.task=FILE"
         )
-    if job.settings.plan.method == "none":
+    if run_config.settings.plan.method == "none":
         raise SettingsError("plan.method: none looks at nobody; a live robot needs qp, scaling, shield or ssm")
-    known, scene = job.meta(), HeaderOnlyLog(header)
-    T_world_base, fusion_stage = build.robot_base(job, scene), build.fusion_stage(job, scene)
-    robot = build.robot(job, T_world_base)
+    known, scene = run_config.meta(), HeaderOnlyLog(header)
+    T_world_base, fusion_stage = assembly.robot_base(run_config, scene), assembly.fusion_stage(run_config, scene)
+    robot = assembly.robot(run_config, T_world_base)
     if not ARM_JOINTS <= robot.nv <= MOST_JOINTS:
         raise SettingsError(
             f"robot.urdf: {robot.name} has {robot.nv} axes; live drives robots of {ARM_JOINTS} to {MOST_JOINTS} over "
             "EGM"
         )
-    joint_order(robot.name, robot.joint_names, job.settings.live.joint_order)
-    predicted = build.prediction_stage(job)
+    joint_order(robot.name, robot.joint_names, run_config.settings.live.joint_order)
+    predicted = assembly.prediction_stage(run_config)
     return {
         "hrcreplay": __version__,
         "settings": known["settings"],
@@ -136,7 +136,7 @@ def start_table(job: Job, header: Header, *, sending: bool) -> dict[str, Any]:
         "task": task,
         "sending": sending,
         "limbs": list(predicted.limbs),
-        "neighbours": list(build.surroundings(job, robot).names),
+        "neighbours": list(assembly.surroundings(run_config, robot).names),
         "method": predicted.method,
         "links": [segment.name for segment in robot.segments],
     }
@@ -175,14 +175,17 @@ def build_controller(start: dict[str, Any]) -> SessionController:
     Raises:
         SettingsError: A setting of the table cannot be used.
     """
-    job = job_of(start, Path("live session"), "")
+    run_config = run_config_of(start, Path("live session"), "")
     poses = {name: np.array(T) for name, T in start["cameras"].items()}
-    header = _header(job.log, tuple(start["cameras"]), poses, np.array(start["T_world_base"]), job.task)
+    header = _header(run_config.log, tuple(start["cameras"]), poses, np.array(start["T_world_base"]), run_config.task)
     scene = HeaderOnlyLog(header)
-    setup = _setup(job, scene, sending=start["sending"])
-    robot, live = setup.robot, job.settings.live
+    setup = _setup(run_config, scene, sending=start["sending"])
+    robot, live = setup.robot, run_config.settings.live
     observer = Observer(
-        build.fusion_stage(job, scene), build.surroundings(job, robot), header.cameras, job.settings.logs.gap_s
+        assembly.fusion_stage(run_config, scene),
+        assembly.surroundings(run_config, robot),
+        header.cameras,
+        run_config.settings.logs.gap_s,
     )
     session = EgmSession(
         robot.q_min,
@@ -195,8 +198,8 @@ def build_controller(start: dict[str, Any]) -> SessionController:
     return SessionController(setup, observer, session)
 
 
-def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
-    """The job of a session, from its start table.
+def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfig:
+    """The run of a session, from its start table.
 
     Raises:
         SettingsError: Its settings or its limit sets are not those of this version.
@@ -207,7 +210,7 @@ def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
         raise SettingsError(
             f"{log}: recorded by {start.get('hrcreplay')}, whose settings are not ours: {error}"
         ) from error
-    return Job(
+    return RunConfig(
         command="live",
         log=log,
         log_sha256=log_sha256,
@@ -222,14 +225,14 @@ def job_of(start: dict[str, Any], log: Path, log_sha256: str) -> Job:
     )
 
 
-def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
-    live, plan = job.settings.live, job.settings.plan
-    robot = build.robot(job, build.robot_base(job, scene))
-    programme, _ = build.reference(job, scene, robot)
-    settings = build.plan_settings(job, live.cycle_s, plan.method)
+def _setup(run_config: RunConfig, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
+    live, plan = run_config.settings.live, run_config.settings.plan
+    robot = assembly.robot(run_config, assembly.robot_base(run_config, scene))
+    programme, _ = assembly.reference(run_config, scene, robot)
+    settings = assembly.plan_settings(run_config, live.cycle_s, plan.method)
 
     def follow(path: Reference, s_s: float) -> Controller:
-        return build.make_controller(plan.method, robot, path, settings, s_s)
+        return assembly.make_controller(plan.method, robot, path, settings, s_s)
 
     return ControlSetup(
         robot=robot,
@@ -239,7 +242,7 @@ def _setup(job: Job, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
         waypoint_m=plan.waypoint_m,
         approach_speed=live.approach_speed,
         bounds=live,
-        fresh_s=job.settings.fusion.fresh_s,
+        fresh_s=run_config.settings.fusion.fresh_s,
         sending=sending,
         joint_order=joint_order(robot.name, robot.joint_names, live.joint_order),
     )

@@ -20,10 +20,13 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from hrcreplay.live.record.codec import Perception
-from hrcreplay.logs.clean import Cleaner
+from hrcreplay.logs.cleaning import Cleaner
 from hrcreplay.logs.decoders import own_row
 from hrcreplay.logs.messages import Undecodable
 from hrcreplay.logs.skeleton_pb2 import Skeleton
+from hrcreplay.pipeline.assembly import FusionStage, Surroundings
+from hrcreplay.pipeline.person_fuser import PersonFuser
+from hrcreplay.pipeline.stages import NS
 from hrcreplay.records import CameraFrames, Floats, Ints
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import (
@@ -41,9 +44,6 @@ from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import approach
 from hrcreplay.robot.task import Reference
-from hrcreplay.run.build import FusionStage, Surroundings
-from hrcreplay.run.fusion import PersonFuser
-from hrcreplay.run.stages import NS
 from hrcreplay.settings.sections import Live
 
 

@@ -35,7 +35,7 @@ from hrcreplay.live.person.log_playback import Outgoing, frames_of, play, ready_
 from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.logs import decoders, ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.logs.clean import DEFECTS, Cleaner
+from hrcreplay.logs.cleaning import DEFECTS, Cleaner
 from hrcreplay.logs.clocks import STAMP_FAR_S
 from hrcreplay.logs.decoders import GenericDecoder, OwnDecoder, TfDecoder
 from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder

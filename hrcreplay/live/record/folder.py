@@ -13,20 +13,20 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from hrcreplay.commands.report import write_report
 from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.evaluation.contact import write_contact
 from hrcreplay.live import processes
-from hrcreplay.live.control.setup import job_of
+from hrcreplay.live.control.setup import run_config_of
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, MotionRow
 from hrcreplay.live.record.recorder import SessionLogReader
-from hrcreplay.logs.clean import PersonMemory
+from hrcreplay.logs.cleaning import PersonMemory
 from hrcreplay.logs.reader import open_log
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.pipeline.stages import store_volumes
 from hrcreplay.records import BODY, DOF, LENGTHS, POINTS, Floats, HumanStates, Motion
-from hrcreplay.run import build
-from hrcreplay.run.contact import write_contact
-from hrcreplay.run.job import Job
-from hrcreplay.run.report import write_report
-from hrcreplay.run.stages import store_volumes
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import Columns, measurement_columns, motion_columns, state_columns
 from hrcreplay.store.run_folder import RunWriter, TableWriter
@@ -180,20 +180,20 @@ def finish(partial: Path) -> Path:
         raise SettingsError(f"{writer.folder}: exists already; move it away, then finish {partial}")
     log = SessionLogReader(partial / LOG)
     start = log.start()
-    job = job_of(start, writer.folder / LOG, run_folder.sha256(partial / LOG))
+    run_config = run_config_of(start, writer.folder / LOG, run_folder.sha256(partial / LOG))
     cameras, links, limbs = (tuple(start[name]) for name in ("cameras", "links", "limbs"))
     neighbours = tuple(start.get("neighbours", limbs))  # sessions of earlier versions had no watched area
     tables = SessionTables(writer, cameras, links, limbs, neighbours, start["method"])
     for message in log.messages():
         tables.add(message)
     tables.flush()
-    _measure(job, writer)
+    _measure(run_config, writer)
     writer.close_tables()
     crashes = processes.read_crashes(partial)
-    meta = _meta(job, start, tables, log, crashes)
+    meta = _meta(run_config, start, tables, log, crashes)
     if tables.counts["looks"] and tables.counts["answers"]:
-        _compare(job, writer, start)
-    write_report(job, writer, meta)
+        _compare(run_config, writer, start)
+    write_report(run_config, writer, meta)
     writer.timing.update(tables.timing())
     writer.finish(meta, complete=not crashes)
     return writer.folder
@@ -229,23 +229,23 @@ def _crashed(crashes: list[str]) -> dict[str, Any]:
     return {"crashes": crashes, "reason": crashes[0]} if crashes else {}
 
 
-def _measure(job: Job, writer: RunWriter) -> None:
+def _measure(run_config: RunConfig, writer: RunWriter) -> None:
     """The table of measurements: what each frame says by itself."""
-    log = open_log(writer.partial / LOG, job.settings.logs, skeletons=False)
-    fusion_stage, memory = build.fusion_stage(job, log), PersonMemory()
+    log = open_log(writer.partial / LOG, run_config.settings.logs, skeletons=False)
+    fusion_stage, memory = assembly.fusion_stage(run_config, log), PersonMemory()
     for frames in log.frames():
         memory, seen = fusion_stage.measure(frames, memory)
         writer.table("measurements", measurement_columns(seen.measured))
 
 
-def _compare(job: Job, writer: RunWriter, start: dict[str, Any]) -> None:
+def _compare(run_config: RunConfig, writer: RunWriter, start: dict[str, Any]) -> None:
     """The table of contact: robot against recorded person."""
-    log = open_log(writer.partial / LOG, job.settings.logs, skeletons=False)
-    write_contact(job, log, writer, np.array(start["T_world_base"]))
+    log = open_log(writer.partial / LOG, run_config.settings.logs, skeletons=False)
+    write_contact(run_config, log, writer, np.array(start["T_world_base"]))
 
 
 def _meta(
-    job: Job, start: dict[str, Any], tables: SessionTables, log: SessionLogReader, crashes: list[str]
+    run_config: RunConfig, start: dict[str, Any], tables: SessionTables, log: SessionLogReader, crashes: list[str]
 ) -> dict[str, Any]:
     """run.json of the session."""
     end: dict[str, Any] = next((event for event in tables.events if event.get("what") == "end"), {})
@@ -258,10 +258,10 @@ def _meta(
     counts |= dict(tables.counts) | {"messages_dropped": int(end.get("dropped", 0))}
     counts |= {"looks_skipped": int(end.get("looks_skipped", 0))}
     return {
-        **job.meta(),
+        **run_config.meta(),
         "versions": start["versions"],
         "machine": start.get("machine"),  # of the session, wherever its folder is made
-        "inputs": [{"path": LOG, "sha256": job.log_sha256}],  # beside it, wherever the folder is moved to
+        "inputs": [{"path": LOG, "sha256": run_config.log_sha256}],  # beside it, wherever the folder is moved to
         "stages": {},  # a replay of the log has ticks of its own: it takes nothing over
         "T_world_base": start["T_world_base"],
         "sending": start["sending"],

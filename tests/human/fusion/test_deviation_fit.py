@@ -6,7 +6,7 @@ import numpy as np
 
 from hrcreplay.human.fusion.reported_deviations import FITTED, KIND
 from hrcreplay.records import DOF, Floats
-from tests.deviations import Sample, fit, pooled
+from tests.tools.deviations import Sample, fit, pooled
 
 
 def drawn(seed: int, constants: Floats, n: int = 3000) -> Sample:

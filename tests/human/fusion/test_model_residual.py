@@ -15,7 +15,7 @@ from hrcreplay.human.fusion.fuse import fuse, start
 from hrcreplay.human.fusion.inverse_kinematics import inverse, measure
 from hrcreplay.human.fusion.model_residual import LEAST
 from hrcreplay.human.model import skeleton
-from hrcreplay.logs.clean import PersonMemory, select_person
+from hrcreplay.logs.cleaning import PersonMemory, select_person
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion

@@ -11,8 +11,8 @@ from hrcreplay.egm.codec import decode_robot
 from hrcreplay.egm.link import ALARMS
 from hrcreplay.live.record.codec import PHASES, Decision
 from tests.live.attacks.forged import KINDS
-from tests.live.campaign import violations
 from tests.live.flights import BEGIN_NS, CYCLE_S, Flight
+from tests.tools.campaign import violations
 
 #: What a forged datagram must do to a moving robot: stop it, or nothing.
 STOPS = {

@@ -16,13 +16,13 @@ from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.control.stages import Observer, start_approach
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES, Signal
-from hrcreplay.logs.clean import PersonMemory
+from hrcreplay.logs.cleaning import PersonMemory
 from hrcreplay.logs.skeleton_pb2 import Skeleton
 from hrcreplay.records import STATUSES, CameraFrames, Floats, HumanStates
 from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.model import RobotModel, RobotPose
-from tests.live.campaign import violations
 from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, far_away, is_a_stop, start, steps_keep_the_limits
+from tests.tools.campaign import violations
 
 
 def moved(flight: Flight, after: int = 0) -> bool:

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.egm.codec import decode_correction
+from hrcreplay.egm.robot_double.robot_simulator import TwinSettings
 from hrcreplay.egm.robot_double.servo import ServoSettings, axes_of
-from hrcreplay.egm.robot_double.twin import TwinSettings
 from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.errors import SettingsError
 from hrcreplay.live.control.loop import _brake
@@ -22,9 +22,9 @@ from hrcreplay.live.control.setup import joint_order
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import PHASES
 from hrcreplay.live.verify import verify
+from tests.commands.arms import ARMS
 from tests.live import made
 from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, start
-from tests.run.arms import ARMS
 
 SEVEN = [1, 2, 4, 5, 6, 7, 3]
 

@@ -14,7 +14,7 @@ from hrcreplay.live.control.setup import build_controller
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import PHASES
 from hrcreplay.live.verify import verify
-from hrcreplay.logs.clean import PersonMemory
+from hrcreplay.logs.cleaning import PersonMemory
 from hrcreplay.records import BORDER, CameraFrames, HumanStates
 from tests.live import made
 from tests.live.flights import BEGIN_NS, Flight, steps_keep_the_limits

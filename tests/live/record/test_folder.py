@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from hrcreplay.commands import replay
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.live.verify import verify
 from hrcreplay.records import BODY, STATUSES
-from hrcreplay.run import replay
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
 from tests.live import made

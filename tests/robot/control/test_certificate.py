@@ -108,11 +108,12 @@ def test_the_verdict_does_not_depend_on_planes_that_are_wrong(robot: RobotModel)
     box = Box(link_points(q[None])[0, 4, -1] + np.array([0.3, 0.0, 0.0]), np.eye(3), np.full(3, 0.05), 0.05)
     wrong = rng.normal(size=(5, 1, 3))
     wrong /= np.linalg.norm(wrong, axis=2, keepdims=True)
+    given = wrong.copy()
     for planes in (NO_PLANES, wrong, np.zeros((5, 1, 3))):
         ok, kept = clear(robot, at_rest(q), at_rest(q), as_obstacles([box]), 0.0, DT_S, planes)
         assert ok
         assert kept.shape == (5, 1, 3)
-    np.testing.assert_array_equal(wrong, wrong.copy())
+    np.testing.assert_array_equal(wrong, given)
 
 
 def test_the_separating_normal_is_that_of_least_squares() -> None:

@@ -1,0 +1,440 @@
+"""The command ``compare``: one recording and one programme by several methods, beside the same recorded person.
+
+A variant is a method with an occupancy and a horizon. The person is fused once and recorded once; each variant then
+plans by itself, so two processes share them and the result does not depend on which took which. A motion that an
+earlier run made by the same settings is taken over; what is computed of it is computed again.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, Unpack, get_args
+
+import pandas as pd
+import pyarrow.parquet as pq
+
+from hrcreplay import kernels
+from hrcreplay.commands import replay
+from hrcreplay.commands.notes import notes_of
+from hrcreplay.errors import SettingsError
+from hrcreplay.evaluation.contact import Predicted, contact_table, full_coverage, own_coverage, recorded_people
+from hrcreplay.evaluation.containment import Outcome
+from hrcreplay.evaluation.recorded_person import RecordedPeople
+from hrcreplay.logs.reader import Log, open_log
+from hrcreplay.pipeline import assembly, reuse, stages
+from hrcreplay.pipeline.assembly import Forecast
+from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
+from hrcreplay.pipeline.stages import ProgressBar, Sink, print_note, told_of_plan
+from hrcreplay.records import Floats, Ints
+from hrcreplay.reporting import comparison
+from hrcreplay.reporting.comparison import Variant
+from hrcreplay.reporting.summary_text import defect_notes
+from hrcreplay.robot.control.controllers import Planner
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.task import Reference
+from hrcreplay.settings.load import Settings
+from hrcreplay.settings.sections import Occupancy, Plan
+from hrcreplay.store.columns import motion_columns, read_states
+from hrcreplay.store.run_folder import RunWriter, Stopwatch
+
+#: The eight that matter: the programme run blind, four methods with the sound volumes of each tick's own stop, the same
+#: to a fixed horizon, and the paper's two methods with its volumes and its horizon.
+PRESET = "none,ssm,shield,scaling,qp,qp:sound:fixed,qp:paper:fixed,scaling:paper:fixed"
+
+#: What a tick of a method costs beside that of another, about: long ones are begun first.
+_COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3}
+
+
+@dataclass(frozen=True)
+class PlacedProgramme:
+    """Programme and place of the robot; found once for all variants."""
+
+    T_world_base: Floats  #: (4, 4)
+    path: Reference
+    start_s: float  #: programmed time at the first tick [s]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Goes to another process without the robot, which is made again there."""
+        return PlacedProgramme, (self.T_world_base, replace(self.path, model=None), self.start_s)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class VariantTask:
+    """One variant on one log."""
+
+    run_config: RunConfig  #: its settings are those of the variant
+    variant: Variant
+    folder: Path  #: with state.parquet; gets motion and contact
+    people: RecordedPeople
+    full: Outcome | None  #: how its volumes hold until the braking time, the same for all with its occupancy
+    programme: PlacedProgramme
+    ready: bool  #: whether the motion is there already
+    size: int  #: ticks of a batch
+
+
+def run(
+    sources: Sequence[Path],
+    *,
+    methods: str = PRESET,
+    out: Path | None = None,
+    chunk_ticks: int = 250,
+    processes: int = 2,
+    **options: Unpack[RunOptions],
+) -> Path:
+    """Compares methods on logs, or on the logs of earlier runs with the settings and cells of those runs.
+
+    Args:
+        sources: Logs, or run folders of earlier commands.
+        methods: ``METHOD[:OCCUPANCY[:HORIZON]]``, commas between; what is left out is as the settings say.
+        out: Run folder to make; None: ``reports/<log>/<UTC>-compare``.
+        chunk_ticks: Ticks of a batch; changes no result.
+        processes: How many plan at the same time, 1 or 2; changes no result.
+        **options: Settings, cell and span, as ``run_config.resolve`` takes them.
+
+    Returns:
+        The run folder: compare.json, compare.csv, compare.md, figures, and a folder a log with the tables.
+
+    Raises:
+        SettingsError: A setting, a method, a cell, the task or the output folder cannot be used.
+        LogError: A log cannot be read, or lacks what a stage needs.
+    """
+    began = datetime.now(UTC)
+    run_configs = [resolve("compare", source, **options) for source in sources]
+    per_run = [parse(methods, run_config.settings) for run_config in run_configs]
+    if any(variants != per_run[0] for variants in per_run):
+        raise SettingsError(
+            "occupancy.method, plan.horizon: the runs given differ, and one table has one of each; name them in "
+            "--methods, as qp:sound:adaptive"
+        )
+    with RunWriter(out or replay.REPORTS / run_configs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-compare") as writer:
+        watch = Stopwatch(time.perf_counter_ns)
+        logs = [
+            _compare_log(run_config, name, per_run[0], writer, watch, chunk_ticks, processes)
+            for run_config, name in zip(run_configs, _names(run_configs), strict=True)
+        ]
+        found = comparison.results(per_run[0], logs)
+        for log_name, note in comparison.notes(found):
+            print_note(f"{log_name}: {note}" if len(logs) > 1 else note)
+        comparison.write(found, writer)
+        comparison.print_tables(found)
+        writer.timing.update(watch.summary(1.0 / run_configs[0].settings.fusion.rate_hz))
+        writer.finish(_meta(run_configs, per_run[0], began))
+        return writer.folder
+
+
+def parse(text: str, settings: Settings) -> tuple[Variant, ...]:
+    """The variants that a list of methods names, each once.
+
+    Raises:
+        SettingsError: A part of one is not known.
+    """
+    known = {
+        "method": get_args(Plan.model_fields["method"].annotation),
+        "occupancy": get_args(Occupancy.model_fields["method"].annotation),
+        "horizon": get_args(Plan.model_fields["horizon"].annotation),
+    }
+    found = []
+    for word in map(str.strip, text.split(",")):
+        parts = word.split(":")
+        if len(parts) > len(known) or (parts[0] == "none" and len(parts) > 1):
+            why = "none heeds nobody" if parts[0] == "none" else "too many parts"
+            raise SettingsError(
+                f"--methods {word}: {why}; would be right: METHOD[:OCCUPANCY[:HORIZON]], as in {PRESET}"
+            )
+        for part, (what, names) in zip(parts, known.items(), strict=False):
+            if part not in names:
+                raise SettingsError(f"--methods {word}: {part!r} is no {what}; known are {', '.join(names)}")
+        default = (settings.plan.method, settings.occupancy.method, settings.plan.horizon)
+        found.append(Variant(*parts, *default[len(parts) :]))
+    return tuple(dict.fromkeys(found))
+
+
+def _names(run_configs: Sequence[RunConfig]) -> list[str]:
+    """A short name for each log; the same name twice gets numbers."""
+    stems = [run_config.log.stem for run_config in run_configs]
+    return [s if stems.count(s) == 1 else f"{s}-{stems[:i].count(s) + 1}" for i, s in enumerate(stems)]
+
+
+def variant_run_config(run_config: RunConfig, variant: Variant) -> RunConfig:
+    """The run that plans a variant and nothing else."""
+    settings = run_config.settings
+    plan = settings.plan.model_copy(update={"method": variant.method, "baselines": (), "horizon": variant.horizon})
+    occupancy = settings.occupancy.model_copy(update={"method": variant.occupancy})
+    return replace(
+        run_config, command="plan", settings=settings.model_copy(update={"plan": plan, "occupancy": occupancy})
+    )
+
+
+def _compare_log(
+    run_config: RunConfig,
+    name: str,
+    variants: Sequence[Variant],
+    writer: RunWriter,
+    watch: Stopwatch,
+    size: int,
+    processes: int,
+) -> comparison.LogResult:
+    """All variants on one log; its tables are in the run folder's ``<name>``.
+
+    Args:
+        run_config: What was asked for.
+        name: Of the log.
+        variants: To run.
+        writer: The run folder.
+        watch: Takes the times.
+        size: Ticks of a batch.
+        processes: How many plan at the same time.
+    """
+    part = RunWriter(writer.partial / name)
+    part.partial.mkdir()
+    log = open_log(run_config.log, run_config.settings.logs)
+    ticks_ns, fusing = stages.span_ticks(run_config, log), replace(run_config, command="fuse")
+    reused = reuse.take_over(fusing, reuse.dependencies(fusing, log, ticks_ns), part, smooth=False)
+    with ProgressBar(name, len(ticks_ns) * len(variants)) as bar:
+        sink = Sink(part, watch, _silent)
+        told = replay.run_stages(
+            fusing, log, ticks_ns, size, sink, reused, folder=part.partial, smooth=not log.header.has_truth
+        )
+        part.close_tables()
+        people = recorded_people(run_config, log, part)
+        part.close_tables()
+        have = _motions(run_config, log, variants, ticks_ns, part)
+        programme = _programme(run_config, log, int(ticks_ns[0]))
+        sink.notes["plan"].extend(assembly.programme_notes(run_config, log, programme.path))
+        full = _full_coverages(run_config, variants, people, part.partial)
+        tasks = [
+            VariantTask(
+                *(variant_run_config(run_config, variant), variant, part.partial, people, full[variant.occupancy]),
+                *(programme, variant in have, size),
+            )
+            for variant in variants
+        ]
+        took = _plan_all(tasks, processes, partial(bar.advance, name))
+    told |= {"plan": told_of_plan(log, sink)}
+    notes = _notes(run_config, part.partial, variants, programme, replay.findings(run_config, told, reused))
+    writer.timing[f"plan {name}"] = {variant.label: {"seconds": took[variant]} for variant in variants}
+    part.partial.rename(part.folder)
+    rows = {
+        variant: comparison.figures(variant, motion, contact, _report_settings(run_config))
+        for variant in variants
+        for motion, contact in [tables(part.folder, variant)]
+    }
+    return comparison.LogResult(
+        name, run_config.log_sha256, people.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, notes, rows
+    )
+
+
+def _full_coverages(
+    run_config: RunConfig, variants: Sequence[Variant], people: RecordedPeople, folder: Path
+) -> dict[str, Outcome | None]:
+    """Coverage of the person by the volumes of each occupancy until the braking time."""
+    found: dict[str, Outcome | None] = {}
+    for variant in sorted(variants, key=lambda variant: variant.method == "none"):
+        if variant.occupancy not in found:
+            mine = variant_run_config(run_config, variant)
+            found[variant.occupancy] = full_coverage(
+                mine, people, Predicted(assembly.prediction_stage(mine), folder / "state.parquet")
+            )
+    return found
+
+
+def _notes(
+    run_config: RunConfig,
+    folder: Path,
+    variants: Sequence[Variant],
+    programme: PlacedProgramme,
+    found: Mapping[str, Any],
+) -> tuple[str, ...]:
+    """Remarks on a log and its robot, as in a report, and on methods whose robot stands inside the person.
+
+    Args:
+        run_config: What was asked for.
+        folder: Tables of the log.
+        variants: That were run.
+        programme: Where the robot stands.
+        found: What the stages found in the log.
+    """
+    motions = {v.label: folder / f"motion_{v.slug}.parquet" for v in variants if v.method != "none"}
+    robot = assembly.robot(run_config, programme.T_world_base)
+    notes = notes_of(folder, run_config.meta(), found["notes"], motions, robot, run_config.settings.fusion.rate_hz)
+    return defect_notes(found["counts"], notes)
+
+
+def _programme(run_config: RunConfig, log: Log, start_ns: int) -> PlacedProgramme:
+    base = assembly.robot_base(run_config, log)
+    path, begin_ns = assembly.reference(run_config, log, assembly.robot(run_config, base))
+    return PlacedProgramme(base, path, 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9)
+
+
+def _silent(_stage: str, _ticks: int) -> None:
+    """Ignores fusion progress."""
+
+
+def tables(folder: Path, variant: Variant) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Motion and contact of a variant."""
+    return tuple(pq.read_table(folder / f"{what}_{variant.slug}.parquet").to_pandas() for what in ("motion", "contact"))
+
+
+def _report_settings(run_config: RunConfig) -> comparison.Bounds:
+    report, plan = run_config.settings.report, run_config.settings.plan
+    return comparison.Bounds(report.near_m, report.stationary_m_per_s, plan.leash_m)
+
+
+def _motions(
+    run_config: RunConfig, log: Log, variants: Sequence[Variant], ticks_ns: Ints, part: RunWriter
+) -> set[Variant]:
+    """Takes over the motions that an earlier run made by the same settings, and says which variants those are.
+
+    Args:
+        run_config: What was asked for.
+        log: Log of the run.
+        variants: To run.
+        ticks_ns: (n,) ticks of the run [ns].
+        part: Folder of the log.
+    """
+    if run_config.earlier is None:
+        return set()
+    theirs = resolve("plan", run_config.earlier)
+    ticks = stages.span_ticks(theirs, log)
+    if "plan" in reuse.stale_stages(theirs, reuse.dependencies(theirs, log, ticks)):
+        return set()
+    have, made = set(), _parts(theirs, log, ticks)
+    for variant in variants:
+        chosen = variant.method == theirs.settings.plan.method
+        if not chosen and variant.method not in theirs.settings.plan.baselines:
+            continue
+        if _parts(variant_run_config(run_config, variant), log, ticks_ns) == made:
+            name = "motion.parquet" if chosen else f"motion_{variant.method}.parquet"
+            shutil.copyfile(run_config.earlier / name, part.partial / f"motion_{variant.slug}.parquet")
+            have.add(variant)
+            print_note(f"{variant.label}: taken over from {run_config.earlier}")
+    return have
+
+
+def _parts(run_config: RunConfig, log: Log, ticks_ns: Ints) -> dict[str, str]:
+    """Digests of what the motion of a method depends on beside the method; which methods ran beside it is nothing."""
+    plan = run_config.settings.plan.model_copy(update={"method": "qp", "baselines": ()})
+    plain = replace(run_config, command="plan", settings=run_config.settings.model_copy(update={"plan": plan}))
+    found = reuse.dependencies(plain, log, ticks_ns)
+    return {name: found[name] for name in reuse.PARTS["plan"]}
+
+
+def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[int], None]) -> dict[Variant, float]:
+    """Plans every task: a second process takes one after the other, the first takes those that are left.
+
+    Args:
+        tasks: To do.
+        processes: 1 or 2.
+        advance: Called with ticks done.
+
+    Returns:
+        How long each took [s].
+    """
+    order = sorted(tasks, key=lambda task: (task.ready, -_COST[task.variant.method]))
+    if processes < 2 or len(order) < 2:
+        return {task.variant: plan(task, advance)[1] for task in order}
+    took = {}
+    with _second_process() as pool:
+        futures = [pool.submit(plan, task) for task in order]
+        try:
+            for task, future in zip(order, futures, strict=True):
+                if future.cancel():
+                    took[task.variant] = plan(task, advance)[1]
+            for task, future in zip(order, futures, strict=True):
+                if not future.cancelled():
+                    ticks, took[task.variant] = future.result()
+                    advance(ticks)
+        except BaseException:
+            for process in multiprocessing.active_children():  # it would go on to the end of its task
+                process.terminate()
+            pool.shutdown(cancel_futures=True)
+            raise
+    return took
+
+
+def _second_process() -> ProcessPoolExecutor:
+    """A process with compiled kernels of its own, since numba does not lock its files; it begins with all there are."""
+    second = kernels.folder() / "second"
+    kernels.share(kernels.folder(), second)
+    pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+    mine = os.environ.get("NUMBA_CACHE_DIR")
+    os.environ["NUMBA_CACHE_DIR"] = str(second)  # read by the process as it begins
+    try:
+        pool.submit(os.getpid).result()
+    finally:
+        os.environ.pop("NUMBA_CACHE_DIR")
+        if mine is not None:
+            os.environ["NUMBA_CACHE_DIR"] = mine
+    return pool
+
+
+def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tuple[int, float]:
+    """Motion and contact of a variant, into its folder; returns the number of ticks and the time that it took [s].
+
+    Args:
+        task: What to do.
+        progress: Called with the ticks of each batch done; or None.
+    """
+    began_s, run_config, slug = time.perf_counter(), task.run_config, task.variant.slug
+    robot = assembly.robot(run_config, task.programme.T_world_base)
+    states, writer = task.folder / "state.parquet", _TablesOf(task.folder)
+    surroundings = assembly.surroundings(run_config, robot)
+    done, planner = 0, None if task.ready else _planner(task, robot)
+    for batch in read_states(states, task.size):
+        if planner is not None:
+            forecast = Forecast(surroundings, batch)
+            around = [forecast.predict(tick) for tick in range(len(batch))]
+            made = planner.follow(batch.t_ns, around, surroundings.names)
+            writer.table(f"motion_{slug}", motion_columns(made))
+        done += len(batch)
+        if progress is not None:
+            progress(len(batch))
+    writer.close_tables()
+    motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
+    predicted = Predicted(surroundings.prediction, states)
+    own = own_coverage(run_config, task.people, predicted, motion)
+    full = None if task.variant.method == "none" else task.full
+    rows = contact_table(run_config, robot, task.variant.method, motion, task.people, predicted, own, full)
+    writer.table(f"contact_{slug}", rows)
+    writer.close_tables()
+    return done, time.perf_counter() - began_s
+
+
+def _planner(task: VariantTask, robot: RobotModel) -> Planner:
+    """The variant's method at the start of the programme."""
+    run_config, programme = task.run_config, task.programme
+    settings = assembly.plan_settings(run_config, 1.0 / run_config.settings.fusion.rate_hz, task.variant.method)
+    path = replace(programme.path, model=robot)
+    controller = assembly.make_controller(task.variant.method, robot, path, settings, programme.start_s)
+    return Planner(controller, chosen=True)
+
+
+class _TablesOf(RunWriter):
+    """Tables in a folder that is there already."""
+
+    @property
+    def partial(self) -> Path:
+        """The folder itself."""
+        return self.folder
+
+
+def _meta(run_configs: Sequence[RunConfig], variants: Sequence[Variant], began: datetime) -> dict[str, Any]:
+    others = [run_config.meta() for run_config in run_configs]
+    return {
+        **others[0],
+        "command": "compare",
+        "inputs": [part["inputs"][0] for part in others],
+        "cells": [part["cell"] for part in others],
+        "settings_by_log": [part["settings"] for part in others],
+        "methods": [variant.label for variant in variants],
+        "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
+    }

@@ -1,0 +1,412 @@
+"""The command ``why``: what held the robot at one tick of a run, computed again from the run's own tables.
+
+The tick is made anew from the records of the ticks before it, with the same code and from the same numbers. Only where
+that gives the recorded step to the last bit is anything said about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+
+from hrcreplay.errors import SettingsError
+from hrcreplay.logs.reader import Log, open_log
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.assembly import Forecast
+from hrcreplay.pipeline.run_config import RunConfig, resolve
+from hrcreplay.records import LIMBS, STATUSES, Floats, HumanStates, Ints
+from hrcreplay.reporting.metrics.planning import stationary
+from hrcreplay.reporting.metrics.series import true_runs
+from hrcreplay.reporting.tables import PageTable, neighbour_text, reason_text
+from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.active_constraints import TickContext, explain_refusal, propose_explained
+from hrcreplay.robot.control.certificate import NO_PLANES
+from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, standstill_reason, straight
+from hrcreplay.robot.control.controllers import Controller, Predict, QpController
+from hrcreplay.store.columns import read_states
+
+#: A TCP slower than this is said to stand [m/s].
+_STANDS = 1e-3
+#: Ticks before the one asked for from which the run is made again, where one alone does not give the record.
+_BEFORE = (0, 25, 250)
+
+
+@dataclass
+class Record:
+    """A run folder whose ticks can be made again."""
+
+    folder: Path
+    method: str
+    run_config: RunConfig
+    log: Log
+    motion: pd.DataFrame
+    _q: Floats = field(init=False)
+    _dq: Floats = field(init=False)
+    _u: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        axes = range(1, 1 + sum(name[0] == "u" and name[1:].isdigit() for name in self.motion.columns))
+        self._q, self._dq, self._u = (
+            self.motion[[f"{name}{i}" for i in axes]].to_numpy(dtype=float) for name in ("q", "dq", "u")
+        )
+        self._status = self.motion["status"].astype(str).to_numpy()
+        self.states = HumanStates.join(list(read_states(self.folder / "state.parquet", 4096)))
+        plan = self.run_config.settings.plan.model_copy(update={"method": self.method, "baselines": ()})
+        self.run_config = replace(self.run_config, settings=self.run_config.settings.model_copy(update={"plan": plan}))
+
+    @cached_property
+    def surroundings(self) -> assembly.Surroundings:
+        """Obstacles of the robot."""
+        return assembly.surroundings(self.run_config, self.controller.robot)
+
+    @cached_property
+    def controller(self) -> Controller:
+        """The method's robot, at the start of its programme."""
+        (planner,) = assembly.planners(self.run_config, self.log, int(self.states.t_ns[0])).values()
+        return planner.controller
+
+    def predict(self, tick: int) -> Predict:
+        """Obstacles at a tick."""
+        return Forecast(self.surroundings, self.states.rows(slice(tick, tick + 1))).predict(0)
+
+    def again(self, tick: int) -> TickContext | None:
+        """The tick made again; None where no attempt gives the recorded step to the last bit."""
+        for first, current_stop in self._starts(tick):
+            controller = self.controller
+            controller.stop, controller.s_s = current_stop, float(self.motion["programme_s"].iloc[first])
+            controller.point = controller.reference.sample(controller.s_s)
+            controller.u = self._u[first - 1].copy() if first else np.zeros(controller.robot.nv)
+            controller.planes = NO_PLANES
+            context = None
+            for now in range(first, tick + 1):
+                context = self._context(now)
+                with np.errstate(all="ignore"):
+                    step = controller.step(context.seen.predict).step
+                if not self._as_recorded(now, step):
+                    context = None
+                    break
+            if context is not None:
+                return context
+        return None
+
+    def _context(self, tick: int) -> TickContext:
+        controller = self.controller
+        with np.errstate(all="ignore"):
+            return TickContext(controller.stop, controller.u, controller.s_s, controller.observe(self.predict(tick)))
+
+    def _as_recorded(self, tick: int, step: control_step.Step) -> bool:
+        """Return whether a step is that of the record, bit for bit."""
+        row = self.motion.iloc[tick]
+        same = STATUSES[step.status] == row["status"] and REASONS[step.reason] == (row["reason"] or "")
+        same = same and np.array_equal(step.u, self._u[tick]) and step.certified == row["certified"]
+        same = same and np.array_equal(step.distance_m, row["distance_m"], equal_nan=True)
+        if tick + 1 < len(self.motion):
+            same = same and np.array_equal(step.next.q, self._q[tick + 1])
+            same = same and np.array_equal(step.next.dq, self._dq[tick + 1])
+        return bool(same)
+
+    def _starts(self, tick: int) -> Iterator[tuple[int, Stop]]:
+        """Ticks from which the run can be made again, nearest first, with the stop that was under way there."""
+        if isinstance(self.controller, QpController):
+            for before in _BEFORE:
+                first = max(0, tick - before)
+                for stop in self._stops(first):
+                    yield first, stop
+        else:
+            rest = np.flatnonzero((self._dq[: tick + 1] == 0.0).all(axis=1))[::-1]
+            programme_s = self.motion["programme_s"].to_numpy(dtype=float)
+            for first in rest[[i for i in (0, 25, 250) if i < len(rest)]].tolist():
+                yield first, at_rest(self._q[first], np.array([programme_s[first], 0.0]))
+        first_s = float(self.motion["programme_s"].iloc[0])
+        yield 0, at_rest(self._q[0], np.array([first_s, 0.0]))
+
+    def _stops(self, tick: int) -> Iterator[Stop]:
+        """The stops that may be under way at a tick of ``qp``: that after the last step that was taken."""
+        if not self._dq[tick].any():
+            yield at_rest(self._q[tick])
+            return
+        first = tick
+        while first and self._status[first - 1] == "braking":
+            first -= 1
+        robot, dt_s = self.controller.robot, self.controller.settings.dt_s
+        for form in (straight, axis_by_axis):
+            stop = form(self._q[first], self._dq[first], robot.ddq_max, dt_s)
+            gone = tick - first
+            if gone <= stop.ticks and np.array_equal(stop.q[gone], self._q[tick]):
+                yield Stop(stop.q[gone:], stop.dq[gone:], stop.along[gone:])
+
+
+def open_record(folder: Path, method: str | None = None) -> Record:
+    """The record of a run, of its own method or of a baseline.
+
+    Args:
+        folder: Run folder with a plan.
+        method: None: the run's own.
+
+    Raises:
+        SettingsError: Not such a run folder, or the method was not run.
+    """
+    run_config = resolve("plan", folder)
+    own = run_config.settings.plan.method
+    name = "motion" if method in (None, own) else f"motion_{method}"
+    path = folder / f"{name}.parquet"
+    if not path.is_file() or not (folder / "state.parquet").is_file():
+        raise SettingsError(f"{folder}: holds no {name}.parquet; give a run folder of plan or report that ran it")
+    log = open_log(run_config.log, run_config.settings.logs)
+    return Record(folder, method or own, run_config, log, pq.read_table(path).to_pandas())
+
+
+def explain(folder: Path, at_s: float, method: str | None = None) -> dict[str, Any]:
+    """Explain the robot's step at an instant of a run.
+
+    Args:
+        folder: Run folder with a plan.
+        at_s: From the first tick on [s].
+        method: None: the run's own; else one of its baselines.
+
+    Raises:
+        SettingsError: The run has no such instant or method, or the tick does not come out as recorded.
+    """
+    record = open_record(folder, method)
+    t_ns = record.motion["t_ns"].to_numpy()
+    ends_s = float(t_ns[-1] - t_ns[0]) * 1e-9
+    if not 0.0 <= at_s <= ends_s:
+        raise SettingsError(f"--at {at_s:g}: would be right: seconds from the first tick, 0 to {ends_s:.3f}")
+    found = facts(record, int(np.argmin(np.abs(t_ns - t_ns[0] - round(at_s * 1e9)))))
+    if found is None:
+        raise SettingsError(
+            f"{folder}: the tick at {at_s:g} s does not come out as recorded, so there is nothing to say about it; run "
+            "plan or report again with this version"
+        )
+    return found
+
+
+def facts(record: Record, tick: int) -> dict[str, Any] | None:
+    """All that is known of a tick; None where it does not come out as recorded.
+
+    Args:
+        record: Of the run.
+        tick: Row of its motion.
+    """
+    context = record.again(tick)
+    if context is None:
+        return None
+    robot, settings, row = record.controller.robot, record.controller.settings, record.motion.iloc[tick]
+    links, all_names = [segment.name for segment in robot.segments], record.surroundings.names
+    limbs = all_names[context.seen.obstacles.first :]  # of the hulls of this tick
+    found: dict[str, Any] = {
+        "at_s": float(row["t_ns"] - record.motion["t_ns"].iloc[0]) * 1e-9,
+        "tick": tick,
+        "method": record.method,
+        "status": str(row["status"]),
+        "reason": str(row["reason"] or ""),
+        "tcp_speed_m_per_s": float(row["tcp_speed"]),
+        "horizon_s": context.seen.horizon_s,
+        "tau_s": float(row["tau_s"]),
+        "cameras": _cameras(record, tick),
+    }
+    sight = context.seen.sight
+    if sight.limb >= 0:
+        found["nearest"] = {"link": links[sight.link], "limb": all_names[sight.limb]}
+        found["nearest"] |= {"distance_m": sight.distance_m, "overlap_m": sight.overlap_m}
+        found["unseen_s"] = _unseen(record, tick, all_names[sight.limb])
+    if record.states.nobody_s is not None:
+        found["watched"] = {
+            name: float(since[tick]) if since is not None and np.isfinite(since[tick]) else None
+            for name, since in (
+                ("nobody_s", record.states.nobody_s),
+                ("nobody_else_s", record.states.nobody_else_s),
+            )
+        }
+    if record.method == "none" or standstill_reason(sight, settings):
+        return found
+    proposals, more = propose_explained(record.controller, context)
+    found |= _named(more, links, limbs)
+    if isinstance(proposals, list) and settings.certified and record.motion["reason"].iloc[tick] == "not certified":
+        obstacles, horizon_s = context.seen.obstacles, context.seen.horizon_s
+        found["refused"] = [
+            _named(explain_refusal(robot, context.current_stop, proposal, obstacles, horizon_s, settings), links, limbs)
+            for proposal in proposals
+        ]
+    return found
+
+
+def _cameras(record: Record, tick: int) -> dict[str, dict[str, float | None]]:
+    """Camera -> since its frames last entered the fused person, and the age of its newest frame by then [s]."""
+    t_ns = int(record.states.t_ns[tick])
+    path = record.folder / "measurements.parquet"
+    frames = pq.read_table(path, columns=["camera", "capture_ns", "arrival_ns"]).to_pandas() if path.exists() else None
+    found = {}
+    for i, camera in enumerate(record.states.cameras):
+        used = np.flatnonzero(record.states.valid[: tick + 1, i])
+        newest = None
+        if frames is not None:
+            arrived = frames[(frames["camera"] == camera) & (frames["arrival_ns"] <= t_ns)]
+            newest = None if arrived.empty else (t_ns - int(arrived["capture_ns"].max())) * 1e-9
+        ago = None if not len(used) else (t_ns - int(record.states.t_ns[used[-1]])) * 1e-9
+        found[camera] = {"used_s_ago": ago, "newest_frame_s_ago": newest}
+    return found
+
+
+def _unseen(record: Record, tick: int, limb: str) -> float | None:
+    """Time since a camera last saw the joints of a limb [s]; None for the lower body, and before the first time."""
+    since = record.states.unseen_s[tick, LIMBS.index(limb)] if limb in LIMBS else np.inf
+    return float(since) if np.isfinite(since) else None
+
+
+def _named(found: dict[str, Any], links: Sequence[str], limbs: Sequence[str]) -> dict[str, Any]:
+    """The same with names of links and limbs in place of their numbers, at any depth."""
+    named: dict[str, Any] = {}
+    for key, value in found.items():
+        if key in ("link", "limb"):
+            named[key] = (links if key == "link" else limbs)[value]
+        elif isinstance(value, dict):
+            named[key] = _named(value, links, limbs)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            named[key] = [_named(part, links, limbs) for part in value]
+        else:
+            named[key] = value
+    return named
+
+
+def longest_stops(motion: pd.DataFrame, slow_m_per_s: float, most: int = 10) -> Ints:
+    """(k, 2) the longest stretches of ticks, [first, past the last), in which the robot stood though it should move.
+
+    Args:
+        motion: A table of motion.
+        slow_m_per_s: A TCP slower than this stands [m/s].
+        most: How many.
+    """
+    _, standing = stationary(motion, np.inf, slow_m_per_s)
+    runs = true_runs(standing)
+    return runs[np.argsort(runs[:, 0] - runs[:, 1], kind="stable")[:most]]
+
+
+def sentences(found: Mapping[str, Any]) -> list[str]:
+    """The facts of a tick in words, the cause first.
+
+    Args:
+        found: What ``facts`` found.
+    """
+    lines = [f"{found['at_s']:.3f} s, tick {found['tick']}, {found['method']}: {_state(found)}."]
+    lines += [f"Cause: {cause(found)}."]
+    if "nearest" in found:
+        near = found["nearest"]
+        apart = f"{1e3 * near['overlap_m']:.1f} mm deep" if near["overlap_m"] else f"{1e3 * near['distance_m']:.1f} mm"
+        lines.append(
+            f"Nearest: {_pair(near)}, {apart}; volumes up to {1e3 * found['horizon_s']:.0f} ms after the tick."
+        )
+    lines += [f"Row that holds: {_row(row)}, multiplier {row['multiplier']:.3g}." for row in _weighted(found)[1:]]
+    lines += [f"Limit that holds: {_row(row)}." for row in found.get("limits", ())]
+    lines += [f"Next row: {_row(row)}, {1e3 * row['margin_m_per_s']:.1f} mm/s left." for row in found.get("next", ())]
+    for stop, one in zip(("first", "second"), found.get("refused", ()), strict=False):
+        lines.append(f"The {stop} stop proposed, {1e3 * one['stop_s']:.0f} ms long: {_failure(one)}.")
+    if found.get("unseen_s") is not None:
+        lines.append(f"That limb was last seen {1e3 * found['unseen_s']:.0f} ms before.")
+    if "watched" in found:
+        lines += [_watched_text(found["watched"])]
+    for camera, ages in found["cameras"].items():
+        used, newest = ages["used_s_ago"], ages["newest_frame_s_ago"]
+        words = "not used yet" if used is None else f"last used {1e3 * used:.0f} ms before"
+        lines.append(
+            f"Camera {camera}: {words}" + (f", its newest frame {1e3 * newest:.0f} ms old." if newest else ".")
+        )
+    return lines
+
+
+def _watched_text(since_s: Mapping[str, float | None]) -> str:
+    """Time since the watched area was without people, in words."""
+    parts = [
+        f"{whom} {'never' if since is None else f'{1e3 * since:.0f} ms before'}"
+        for whom, since in (("anybody", since_s["nobody_s"]), ("anybody but the person", since_s["nobody_else_s"]))
+    ]
+    return f"The watched area was last known to be without {' and without '.join(parts)}."
+
+
+def _state(found: Mapping[str, Any]) -> str:
+    speed = found["tcp_speed_m_per_s"]
+    moved = "the robot stood" if speed < _STANDS else f"the TCP moved at {speed:.3f} m/s"
+    return f"{moved}, {found['status']}" + (f" ({found['reason']})" if found["reason"] else "")
+
+
+def cause(found: Mapping[str, Any]) -> str:
+    """Cause that held the robot, in a sentence without its full stop."""
+    if found.get("conflict"):
+        return f"no velocity keeps all of these: {'; '.join(_row(row) for row in found['conflict'])}"
+    if found.get("refused"):
+        return f"no certificate: {_failure(found['refused'][0])}"
+    if "protective" in found and found["reason"] == "too near":
+        near = found["protective"]
+        apart = f"{1e3 * near['distance_m']:.1f} mm apart, and {1e3 * near['needed_m']:.1f} mm are needed"
+        return f"{_pair(near)} are {apart}"
+    if found["reason"] == "inside a volume" and "nearest" in found:
+        return f"{_pair(found['nearest'])} overlap by {1e3 * found['nearest']['overlap_m']:.1f} mm"
+    if found["reason"]:
+        return reason_text(found["reason"])
+    if rows := _weighted(found):
+        return _row(rows[0])
+    return "no person: its programme, or the robot's own limits"
+
+
+def _weighted(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The rows of people that hold, the heaviest first; of ``scaling`` the tightest."""
+    return [{"multiplier": 1.0, **row} for row in found.get("binding", ())]
+
+
+def _pair(of: Mapping[str, Any]) -> str:
+    return f"{of['link']} and {neighbour_text(of['limb'])}"
+
+
+def _row(row: Mapping[str, Any]) -> str:
+    """A row in words."""
+    if row["kind"] == "axis":
+        return f"axis {row['axis']}, {row['side']} bound on its next velocity"
+    if row["kind"] == "tcp":
+        turn = "turning about" if row["direction"] >= 3 else "along"
+        return f"TCP {turn} {'xyz'[row['direction'] % 3]}, {row['side']} bound"
+    if row["kind"] == "speed":
+        return "TCP, the programme's speed limit"
+    if row["kind"] == "path":
+        return str(row["what"])
+    at = ", ".join(f"{value:.3f}" for value in row["vertex_m"])
+    which = ("first", "second")[row["end"]]
+    return f"{_pair(row)}, {which} row of Eq. (12), vertex {row['vertex']} at ({at}) m"
+
+
+def _failure(one: Mapping[str, Any]) -> str:
+    """Place at which a stop is not clear, in words."""
+    if "link" not in one:
+        return one["why"] + (f", axis {one['axis']}" if "axis" in one else "")
+    when = f"{1e3 * one['failed_s']:.0f} ms after the tick"
+    if one["gap_m"] <= 0.0:
+        return f"{_pair(one)} overlap by {-1e3 * one['gap_m']:.1f} mm {when}"
+    moves = f"may move by {1e3 * one['travel_m']:.1f} mm until the next"
+    return f"{_pair(one)} are {1e3 * one['gap_m']:.1f} mm apart {when}, and {moves}"
+
+
+def stop_table(record: Record, slow_m_per_s: float) -> tuple[PageTable, list[dict[str, Any]]]:
+    """The longest stops of a run, and the facts of the first tick of each.
+
+    Args:
+        record: Of the run.
+        slow_m_per_s: A TCP slower than this stands [m/s].
+    """
+    rows, every, t_ns = [], [], record.motion["t_ns"].to_numpy()
+    for first, past in longest_stops(record.motion, slow_m_per_s).tolist():
+        found = facts(record, first)
+        lasted_s = float(t_ns[past - 1] - t_ns[first]) * 1e-9 + record.controller.settings.dt_s
+        at_s = float(t_ns[first] - t_ns[0]) * 1e-9
+        words = reason_text(str(record.motion["reason"].iloc[first] or "")) if found is None else cause(found)
+        rows.append((f"{at_s:.2f} s", f"{lasted_s:.2f} s", str(record.motion["status"].iloc[first]), words))
+        every.append({"at_s": at_s, "duration_s": lasted_s, "cause": words})
+    note = (
+        "What held the robot at the first tick at which it stood. hrcreplay why RUN --at SECONDS says more of any tick."
+    )
+    return PageTable("The longest stops", ("at", "for", "status", "held by"), tuple(rows), note), every

@@ -1,0 +1,83 @@
+"""Remarks beside the results of a run: the same for ``report``, which has one motion, and ``compare``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from hrcreplay.reporting import tables, verdict
+from hrcreplay.reporting.metrics import fusion as fusion_metrics
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.store.run_folder import Run
+
+_FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
+
+
+def notes_of(
+    folder: Path,
+    meta: dict[str, Any],
+    told: list[str],
+    motions: Mapping[str, Path],
+    robot: RobotModel | None,
+    rate_hz: float,
+) -> list[str]:
+    """All notes of a run, each once.
+
+    Args:
+        folder: Tables of the run.
+        meta: What is known of the run so far.
+        told: What the stages have noted.
+        motions: Method -> its table of motion; the programme run blind is not asked.
+        robot: None where the run has none.
+        rate_hz: Ticks a second [Hz].
+    """
+    notes = [*told, *_unmeasured(folder, meta, told), *_overlaps(folder, motions, rate_hz)]
+    return list(dict.fromkeys([*notes, *([] if robot is None else tables.remarks(robot))]))
+
+
+def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str]:
+    """Remarks on limbs that were not measured, from the tables of the first stage."""
+
+    def table(name: str) -> Any:
+        path = folder / f"{name}.parquet"
+        return (
+            pq.read_table(path, columns=list(fusion_metrics.LIMB_COLUMNS[name])).to_pandas() if path.exists() else None
+        )
+
+    return verdict.limb_remarks(Run(folder, meta, state=table("state"), measurements=table("measurements")), told)
+
+
+def _overlaps(folder: Path, motions: Mapping[str, Path], rate_hz: float) -> list[str]:
+    """Remarks on robots that stand inside people from the start; which methods', where not all do."""
+    found: dict[str, list[str]] = {}
+    for method, path in motions.items():
+        remark = initial_overlap(folder / "state.parquet", path, rate_hz)
+        if remark is not None:
+            found.setdefault(remark, []).append(method)
+    return [text if len(of) == len(motions) else f"{', '.join(of)}: {text}" for text, of in found.items()]
+
+
+def initial_overlap(state: Path, motion: Path, rate_hz: float) -> str | None:
+    """Remark where robot and person overlap at every tick of the first second with a person in view, else None.
+
+    Args:
+        state: Table of the fused person.
+        motion: Table of the robot's motion, at the same ticks.
+        rate_hz: Ticks a second [Hz].
+    """
+    person = pq.read_table(state, columns=["x"])["x"].to_numpy()
+    table = pq.read_table(motion, columns=["distance_m", "link", "limb"])
+    distance_m, links, limbs = (table[name].to_pylist() for name in ("distance_m", "link", "limb"))
+    near = [i for i in np.flatnonzero(np.isfinite(person)).tolist() if limbs[i] is not None]
+    near = near[: max(1, round(_FIRST_S * rate_hz))]
+    if not near or not all(distance_m[i] <= 0.0 for i in near):
+        return None
+    return (
+        f"the robot's link {links[near[0]]} stands inside the volume of the person's {limbs[near[0]]} from the first "
+        f"tick with a person on, for {len(near) / rate_hz:.2f} s at least; is T_world_base right? "
+        "hrcreplay calibrate tells where the person stood"
+    )

@@ -1,0 +1,246 @@
+"""The offline driver: runs the stages of a command on a log and writes the run folder.
+
+Stages of an earlier run are reused where digests show that nothing has changed that their results depend on.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from importlib import resources
+from pathlib import Path
+from typing import Any, Unpack
+
+import pyarrow.parquet as pq
+
+from hrcreplay.commands.notes import notes_of
+from hrcreplay.logs.reader import Log, open_log
+from hrcreplay.pipeline import assembly, reuse, stages
+from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
+from hrcreplay.pipeline.stages import ProgressBar, Sink, Told, print_note, told_of_fusion, told_of_plan
+from hrcreplay.records import HumanStates, Ints
+from hrcreplay.reporting import tables
+from hrcreplay.reporting.summary_text import defect_notes
+from hrcreplay.store import run_folder
+from hrcreplay.store.columns import read_states
+from hrcreplay.store.run_folder import RunWriter, Stopwatch
+
+REPORTS = Path("reports")
+
+
+def run(
+    command: str,
+    source: Path,
+    *,
+    out: Path | None = None,
+    smooth: bool = False,
+    chunk_ticks: int = 250,
+    **options: Unpack[RunOptions],
+) -> Path:
+    """Runs the stages up to that of ``command`` on a log or an earlier run.
+
+    Args:
+        command: ``fuse``, ``predict``, ``plan`` or ``report``.
+        source: A log, or the run folder of an earlier command.
+        out: Run folder to make; None: ``reports/<log>/<UTC>-<command>``.
+        smooth: Whether to write the smoothed person too (smooth.parquet).
+        chunk_ticks: Ticks of a batch; changes no result.
+        **options: Settings, cell and span, as ``run_config.resolve`` takes them.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        SettingsError: A setting, the cell, the task or the output folder cannot be used.
+        LogError: The log cannot be read, or lacks what a stage needs.
+    """
+    began = datetime.now(UTC)
+    run_config = resolve(command, source, **options)
+    known = run_config.meta()
+    with RunWriter(out or _folder(run_config, began)) as writer:
+        log = open_log(run_config.log, run_config.settings.logs)
+        ticks_ns = stages.span_ticks(run_config, log)
+        parts = reuse.dependencies(run_config, log, ticks_ns)
+        reused = reuse.take_over(run_config, parts, writer, smooth=smooth)
+        last = [stage for stage in run_config.stages if stage not in reused][-1:]
+        with ProgressBar(last[0] if last else "", len(ticks_ns)) as bar:
+            sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
+            compared = command == "report" and not log.header.has_truth  # then with the smoothed person
+            told = run_stages(
+                run_config, log, ticks_ns, chunk_ticks, sink, reused, folder=writer.partial, smooth=smooth or compared
+            )
+        found = findings(run_config, told, reused)
+        complete(
+            run_config,
+            log,
+            writer,
+            sink.watch,
+            {**known, **found, **about_run(run_config, began, parts, smooth=smooth)},
+        )
+        return writer.folder
+
+
+def about_run(run_config: RunConfig, began: datetime, parts: Mapping[str, str], *, smooth: bool) -> dict[str, Any]:
+    """Entries of run.json on how a run came to be.
+
+    Args:
+        run_config: What was asked for.
+        began: When.
+        parts: What ``dependencies`` found.
+        smooth: Whether the smoothed person was asked for.
+    """
+    return {
+        "arguments": run_config.arguments(smooth=smooth),
+        "depends_on": parts,
+        "stages": reuse.stage_digests(run_config, parts),
+        "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
+    }
+
+
+def complete(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any]) -> None:
+    """Completes a run whose stages have written their tables; with the report where that was asked for.
+
+    Args:
+        run_config: What was asked for.
+        log: Log of the run.
+        writer: Run folder.
+        watch: Times of the stages; takes those of the report.
+        meta: What run.json says so far.
+    """
+    base = assembly.known_robot_base(run_config, log)
+    writer.close_tables()
+    meta |= _about_results(run_config, log, writer.partial, meta, meta["notes"])
+    for line in defect_notes(meta["counts"], meta["notes"]):
+        print_note(line)
+    meta["T_world_base"] = None if base is None else base.tolist()
+    if run_config.command == "report":
+        _report(run_config, log, writer, watch, meta)
+    writer.timing.update(watch.summary(1.0 / run_config.settings.fusion.rate_hz))
+    writer.finish(meta)
+
+
+def _report(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any]) -> None:
+    """The contact table and the report of a run whose other tables are written."""
+    from hrcreplay.commands.report import write_report
+    from hrcreplay.evaluation.contact import (
+        write_contact,  # both are slow to load, and the other commands ask for neither
+    )
+
+    ticks = pq.read_metadata(writer.partial / "state.parquet").num_rows
+    with watch.stage("contact", ticks):
+        write_contact(run_config, log, writer, assembly.robot_base(run_config, log))
+    with watch.stage("report", ticks):
+        write_report(run_config, writer, meta, log)
+
+
+def run_stages(
+    run_config: RunConfig,
+    log: Log,
+    ticks_ns: Ints,
+    size: int,
+    sink: Sink,
+    reused: tuple[str, ...],
+    *,
+    folder: Path,
+    smooth: bool,
+) -> dict[str, Told]:
+    """All stages of the run in one pass, without those whose tables were taken over.
+
+    Args:
+        run_config: What was asked for.
+        log: Log of the run.
+        ticks_ns: (n,) ticks of the run, increasing [ns].
+        size: Ticks of a batch.
+        sink: Where rows, counts and times go.
+        reused: Stages whose tables were taken over from an earlier run.
+        folder: Where those are.
+        smooth: Whether to write the smoothed person too.
+
+    Returns:
+        What the stages that read the log found in it.
+    """
+    todo = [stage for stage in run_config.stages if stage not in reused]
+    states: Iterable[HumanStates]
+    if "fuse" in todo:
+        stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
+        states = stages.fused(log, ticks_ns, size, assembly.fusion_stage(run_config, log), sink, smooth=smooth)
+    else:
+        states = read_states(folder / "state.parquet", size)
+    flow: Iterable[Any] = states
+    if "plan" in todo:
+        chosen = assembly.planners(run_config, log, int(ticks_ns[0]))
+        robot, path = (getattr(next(iter(chosen.values())).controller, name) for name in ("robot", "reference"))
+        sink.notes["plan"].extend(assembly.programme_notes(run_config, log, path))
+        every = stages.store_every(run_config) if "predict" in todo else math.inf
+        flow = stages.planned(states, assembly.surroundings(run_config, robot), chosen, every, sink)
+    elif "predict" in todo:
+        flow = stages.predicted(states, assembly.prediction_stage(run_config), stages.store_every(run_config), sink)
+    if todo:
+        for _ in flow:
+            pass
+    return {"fuse": told_of_fusion(log, sink), "plan": told_of_plan(log, sink)}
+
+
+def _about_results(
+    run_config: RunConfig, log: Log, folder: Path, meta: dict[str, Any], told: list[str]
+) -> dict[str, Any]:
+    """Entries of run.json beside the findings of the stages: more remarks, and the robot where there is a plan.
+
+    Args:
+        run_config: What was asked for.
+        log: Log of the run.
+        folder: Tables of the run.
+        meta: What is known of the run so far.
+        told: Remarks so far.
+
+    Returns:
+        ``notes``, those told before among them, and ``robot``.
+    """
+    robot = assembly.robot(run_config, assembly.robot_base(run_config, log)) if "plan" in run_config.stages else None
+    method = run_config.settings.plan.method
+    motions = {} if robot is None or method == "none" else {str(method): folder / "motion.parquet"}
+    notes = notes_of(folder, meta, told, motions, robot, run_config.settings.fusion.rate_hz)
+    return {"notes": notes} | ({} if robot is None else {"robot": tables.summary(robot)})
+
+
+def findings(run_config: RunConfig, told: Mapping[str, Told], reused: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Findings of the stages in the log; of a stage taken over, those of the earlier run.
+
+    Damage to the files that only this run met is told all the same.
+
+    Args:
+        run_config: What was asked for.
+        told: What ``run_stages`` returned.
+        reused: Stages whose tables were taken over from an earlier run.
+
+    Returns:
+        ``counts`` and ``notes`` about the data, for run.json, and ``found_by``: those of each stage that reads the log.
+    """
+    by_stage: dict[str, Any] = {}
+    for stage, (counts, notes) in told.items():
+        if stage in reused and run_config.earlier is not None:
+            theirs = run_folder.read_meta(run_config.earlier)["found_by"][stage]
+            counts = Counter[str](theirs["counts"]) | counts
+            notes = (*theirs["notes"], *notes)
+        if stage in run_config.stages:
+            by_stage[stage] = {"counts": _plain(counts), "notes": list(dict.fromkeys(notes))}
+    total = sum((Counter(part["counts"]) for part in by_stage.values()), Counter[str]())
+    notes_of_all = [note for part in by_stage.values() for note in part["notes"]]
+    return {"counts": _plain(total), "notes": notes_of_all, "found_by": by_stage}
+
+
+def _plain(counts: Counter[str]) -> dict[str, int]:
+    return {name: int(count) for name, count in sorted((+counts).items())}
+
+
+def _folder(run_config: RunConfig, began: datetime) -> Path:
+    return REPORTS / run_config.log.stem / f"{began:%Y%m%dT%H%M%SZ}-{run_config.command}"
+
+
+def demo_log() -> Path:
+    """The log that ships with the package; in a checkout, that of datasets/."""
+    shipped = Path(str(resources.files("hrcreplay"))) / "data" / "demo.mcap"
+    return shipped if shipped.exists() else Path(__file__).parents[2] / "datasets" / "demo.mcap"

@@ -1,0 +1,258 @@
+"""The report of a run: computes all metrics from its tables, then the figures and the page that show them."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hrcreplay.commands.explain import Record, stop_table
+from hrcreplay.errors import SettingsError
+from hrcreplay.human.model import PARTS, part_radii
+from hrcreplay.logs.reader import Log
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.run_config import RunConfig, read_run_config
+from hrcreplay.reporting import tables
+from hrcreplay.reporting.figures import catalogue, drawing
+from hrcreplay.reporting.figures.catalogue import FigureData, FigureKind
+from hrcreplay.reporting.figures.figure_data import computed
+from hrcreplay.reporting.metrics.contact import add_contact
+from hrcreplay.reporting.metrics.fusion import add_fusion, add_limbs, add_occupancy, add_quality
+from hrcreplay.reporting.metrics.planning import add_plan
+from hrcreplay.reporting.metrics.series import Metric, MetricTable, start_ns
+from hrcreplay.reporting.page import report_page
+from hrcreplay.reporting.page.replay_page import snapshot
+from hrcreplay.reporting.replay_scene import ReplayScene, replay_scene
+from hrcreplay.reporting.scene_mcap import write_scene
+from hrcreplay.reporting.summary_text import lines
+from hrcreplay.reporting.tables import PageTable
+from hrcreplay.settings.sections import Logs, setting
+from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import Run, RunWriter
+
+
+def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any], log: Log | None = None) -> None:
+    """Writes metrics.json, the figures, report.html and scene.mcap beside the tables that have just been written.
+
+    Args:
+        run_config: What was asked for.
+        writer: Run folder.
+        meta: Content of run.json.
+        log: Of a replay, whose ticks can be computed again; None: a live session's are not.
+    """
+    near = _bounds(run_config.settings.model_dump())
+    run = run_folder.read(writer.partial, meta, shown=True)
+    found = compute(run, **near)
+    stops = _stops(run_config, log, run, near["stationary_m_per_s"], found) if log else ()
+    writer.text("metrics.json", run_folder.to_json(found))
+    prediction_stage = assembly.prediction_stage(run_config)
+    occupancy = prediction_stage.occupancy
+    parts = ("head", "thorax", "upper_arm", "lower_arm")
+    radii = {part.replace("_", " "): getattr(occupancy, f"radius_{part}_m") for part in parts}
+    if prediction_stage.method == "sound" and occupancy.legs:
+        radii["legs, of sound"] = occupancy.legs_radius_m
+    folder = writer.partial / "figures"
+    catalogue.draw_all(figure_data(run_config, run, found, catalogue.wanted(run, found)), folder)
+    shown = [
+        tables.limit_table(run_config.prediction, use="prediction"),
+        tables.limit_table(run_config.tracking, use="tracking"),
+        tables.radius_table(radii),
+    ]
+    scene = scene_of(run_config, run)
+    writer.text("report.html", report_page.render(run, found, folder, shown, stops=stops, scene=scene))
+    if scene is not None:
+        write_scene(writer.partial / "scene.mcap", scene, run.measurements)
+
+
+def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:
+    """Scene of a run's 3-D replay; None where it moved no robot."""
+    if run.motion is None or run.T_world_base is None:
+        return None
+    radii_m = part_radii(run_config.settings.occupancy, run_config.settings.report.leg_radius_m)
+    parts = dict(zip(PARTS, radii_m.tolist(), strict=True))
+    return replay_scene(run, assembly.robot(run_config, run.T_world_base), start_ns(run), parts)
+
+
+def _stops(
+    run_config: RunConfig, log: Log, run: Run, slow_m_per_s: float, found: dict[str, Metric]
+) -> tuple[PageTable, ...]:
+    """The longest stops of the plan as a table, and among the metrics.
+
+    Args:
+        run_config: What was asked for.
+        log: That was replayed.
+        run: The run's tables.
+        slow_m_per_s: A TCP slower than this stands [m/s].
+        found: The metrics so far; gets those of the stops.
+    """
+    if run.motion is None or not len(run.motion):
+        return ()
+    record = Record(run.folder, run_config.settings.plan.method, run_config, log, run.motion)
+    table, every = stop_table(record, slow_m_per_s)
+    metrics = MetricTable()
+    for i, stop in enumerate(every, start=1):
+        which = f"of the plan's longest stops number {i}"
+        metrics.add(f"plan_stop_{i:02}_at_s", stop["at_s"], "s", f"{which}: its first tick, from the first of the run")
+        metrics.add(f"plan_stop_{i:02}_duration_s", stop["duration_s"], "s", f"{which}: how long it lasted")
+        metrics.add(f"plan_stop_{i:02}_cause", stop["cause"], "name", f"{which}: what held the robot at its first tick")
+    both = {**found, **metrics.sorted()}
+    found.clear()
+    found.update(sorted(both.items()))
+    return (table,) if table.rows else ()
+
+
+def summary(folder: Path) -> list[str]:
+    """The main figures of a run, a line a stage."""
+    run = run_folder.read(folder)
+    return lines(run, compute(run, **_bounds(run.meta["settings"])))
+
+
+def _bounds(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings that the metrics need."""
+    return {
+        "near_m": settings["report"]["near_m"],
+        "stationary_m_per_s": settings["report"]["stationary_m_per_s"],
+        "gap_s": settings["logs"]["gap_s"],
+    }
+
+
+def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float = Logs().gap_s) -> dict[str, Metric]:
+    """Metrics of a run: name -> value, unit, meaning; null with a reason where one does not apply, never 0.
+
+    Args:
+        run: The run's tables; those of stages that were not run are None.
+        near_m: The stationary share counts ticks with a separation of at most this [m].
+        stationary_m_per_s: A TCP slower than this stands [m/s].
+        gap_s: A camera silent for longer has a gap [s].
+
+    Returns:
+        Sorted by name, plain Python values, finite numbers only.
+    """
+    recorded = run.meta.get("settings", {})
+    metrics = MetricTable()
+    add_quality(metrics, run, gap_s)
+    add_limbs(metrics, run)
+    add_occupancy(metrics, run.occupancy)
+    add_fusion(metrics, run, gap_s)
+    add_plan(
+        metrics,
+        run.motion,
+        run.baselines,
+        method=str(setting(recorded, "plan", "method")),
+        near_m=near_m,
+        stationary_m_per_s=stationary_m_per_s,
+        leash_m=float(setting(recorded, "plan", "leash_m")),
+        contact=run.contact,
+    )
+    add_contact(metrics, run, stationary_m_per_s)
+    return metrics.sorted()
+
+
+def take_still(folder: Path, at_s: float, out: Path | None) -> Path:
+    """Draws a run at the instant of its replay that is nearest to ``at_s``.
+
+    Args:
+        folder: A run folder whose run moved a robot.
+        at_s: By the report's clock [s].
+        out: PNG file to make; None: ``snapshot-<seconds>.png`` in the folder that one works in.
+
+    Raises:
+        SettingsError: No run folder, no such instant, or the file is there or cannot be written.
+    """
+    if not run_folder.is_run(folder):
+        raise SettingsError(f"--snapshot: {folder} is no run folder; make one with: hrcreplay report {folder}")
+    run = run_folder.read(folder)
+    scene = scene_of(read_run_config(folder), run)
+    if scene is None:
+        raise SettingsError(f"--snapshot: {folder} moved no robot; make a report of it first")
+    first, last = scene.seconds[[0, -1]].tolist()
+    if not first <= at_s <= last:
+        raise SettingsError(f"--snapshot {at_s:g}: found an instant outside the run; from {first:g} to {last:g} s")
+    row = int(abs(scene.seconds - at_s).argmin())
+    path = out or Path(f"snapshot-{scene.seconds[row]:.2f}.png")
+    with drawing.style():
+        figure = snapshot(scene, row)
+        figure.set_facecolor("white")
+        run_folder.write_whole(path, drawing.png_bytes(figure))
+    return path
+
+
+def figure_data(
+    run_config: RunConfig, run: Run, metrics: Mapping[str, Metric], kinds: Sequence[FigureKind]
+) -> FigureData:
+    """All that some figures of a run are drawn from.
+
+    Args:
+        run_config: That made the run.
+        run: The run's tables.
+        metrics: The run's metrics.
+        kinds: The figures.
+    """
+    predicted = computed(run_config, run, [kind.predicted for kind in kinds])
+    return FigureData(run=run, metrics=metrics, **_bounds(run_config.settings.model_dump()), **predicted)
+
+
+def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
+    """Draws the figures of a number or a name from a run folder alone: the same bytes as a report of that run has.
+
+    Args:
+        folder: A run folder.
+        key: Number as the paper has it, or name of the file.
+        out: Folder for them; None: the one that one works in.
+
+    Returns:
+        The files written: PNG and SVG of each figure.
+
+    Raises:
+        SettingsError: No run folder, no such figure, the run lacks what it needs, or a file is there already.
+    """
+    kinds = catalogue.find(key)
+    if not kinds:
+        there = ", ".join(map(catalogue.label, catalogue.FIGURES))
+        raise SettingsError(f"--figure {key}: no such figure; there are {there}")
+    run, metrics = _recorded(folder, "--figure")
+    for kind in kinds:
+        if why := catalogue.missing(kind, run, metrics):
+            raise SettingsError(f"--figure {key}: {folder} has not what it needs: {why}")
+    to = out or Path()
+    paths = [to / f"{kind.name}.{suffix}" for kind in kinds for suffix in ("png", "svg")]
+    if taken := [path for path in paths if path.exists()]:
+        raise SettingsError(f"{taken[0]}: exists already; name another folder with --out, or remove it")
+    data = figure_data(read_run_config(folder), run, metrics, kinds)
+    with tempfile.TemporaryDirectory() as made:
+        drawn = catalogue.draw_all(data, Path(made), kinds)
+        if len(drawn) < len(kinds):
+            raise SettingsError(
+                f"--figure {key}: {folder} has not what it needs: the person was not known well enough then"
+            )
+        try:
+            to.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SettingsError(f"{to}: cannot be made ({error.strerror}); name another folder with --out") from error
+        for path in paths:
+            run_folder.write_whole(path, (Path(made) / path.name).read_bytes())
+    return paths
+
+
+def list_figures(folder: Path | None) -> list[str]:
+    """A line for each figure: number or name, title and, of a run folder, whether the run has what it needs."""
+    run = None if folder is None else _recorded(folder, "--list-figures")
+    lines = []
+    for kind in catalogue.FIGURES:
+        why = "" if run is None else catalogue.missing(kind, *run)
+        state = "" if run is None else f"lacks: {why}" if why else "there"
+        lines.append(f"{catalogue.label(kind):<17}{kind.title:<76}{state}".rstrip())
+    return lines
+
+
+def _recorded(folder: Path, option: str) -> tuple[Run, dict[str, Metric]]:
+    """The tables and metrics of a run folder; without metrics.json these are computed."""
+    if not run_folder.is_run(folder):
+        raise SettingsError(f"{option}: {folder} is no run folder; make one with: hrcreplay report {folder}")
+    run = run_folder.read(folder)
+    if "settings" not in run.meta or "occupancy" not in run.meta["settings"]:
+        raise SettingsError(f"{option}: {folder} is no run of fuse, predict, plan, report or live")
+    path = folder / "metrics.json"
+    return run, json.loads(path.read_text()) if path.exists() else compute(run, **_bounds(run.meta["settings"]))

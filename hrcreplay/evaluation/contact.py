@@ -1,0 +1,364 @@
+"""The robot against everybody recorded: a row a tick and method in contact.parquet.
+
+The links' capsules at the commanded joint positions, and the capsules of every recorded body by every source: the
+ground truth, else the smoothed person and each camera's points; and every other body of every camera. None of them
+knows of predictions, and the worst counts. Where the moving robot touches the person, the row also says whether the
+part that is touched was inside the volume by which the motion had been certified: then the robot is at fault, else the
+prediction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+
+from hrcreplay.evaluation.containment import Outcome, coverage
+from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, read_people
+from hrcreplay.geometry.distances import nearest_pair, protrusion_m
+from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
+from hrcreplay.logs.reader import Log
+from hrcreplay.pipeline import assembly, stages
+from hrcreplay.pipeline.assembly import PredictionStage
+from hrcreplay.pipeline.person_fuser import PersonFuser
+from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints
+from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.model import LinkMotion, RobotModel
+from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states, state_columns
+from hrcreplay.store.run_folder import RunWriter
+
+_BATCH = 4096
+
+#: Part of the body -> limb whose volume it has to be in.
+VOLUME_OF = (
+    {part: part for part in PARTS}
+    | dict.fromkeys((*LEG_PARTS, "FOOT_R", "FOOT_L"), "LEGS")
+    | {"HAND_R": "LRA", "HAND_L": "LLA"}
+)
+
+#: Rows of body.parquet a second, for those who draw it.
+_BODY_HZ = 25.0
+
+#: Limb -> vertices (m, 3) and radius of the volume around them [m].
+Volumes = Mapping[str, tuple[Floats, float]]
+
+
+def recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> RecordedPeople:
+    """Everybody in the log of a run. Without ground truth and smooth.parquet the log is fused again, and that written.
+
+    Args:
+        run_config: What was asked for.
+        log: Log of the run.
+        writer: Run folder, its tables complete.
+    """
+    ticks_ns = np.concatenate([states.t_ns for states in read_states(writer.partial / "state.parquet", _BATCH)])
+    fusion_stage = assembly.fusion_stage(run_config, log)
+    path = writer.partial / "smooth.parquet"
+
+    def smoothed() -> HumanStates:
+        if not path.exists():
+            for part in _smooth(run_config, log, ticks_ns):
+                writer.table("smooth", state_columns(part))
+            writer.close_tables()
+        return HumanStates.join(list(read_states(path, _BATCH)))
+
+    return read_people(log, ticks_ns, fusion_stage, smoothed)
+
+
+def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanStates]:
+    """The person fused and smoothed, where the stage was not run or was taken over."""
+    fusion_stage, cameras = assembly.fusion_stage(run_config, log), log.header.cameras
+    fuser = PersonFuser(replace(fusion_stage, watched=None), cameras, traced=True)
+    smoother = stages.StretchSmoother(fusion_stage.filter)
+    for ticks, seen in stages.batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
+        fused, _ = fuser.update(ticks, seen)
+        yield from smoother.add(fused.states, fused.trace)
+    yield from smoother.finish()
+
+
+def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_base: Floats) -> None:
+    """Writes contact.parquet for every motion table of a run, and the recorded body for those who draw it.
+
+    Args:
+        run_config: What was asked for.
+        log: Log of the run.
+        writer: Run folder, its tables complete.
+        T_world_base: (4, 4) robot base in the world.
+    """
+    robot = assembly.robot(run_config, T_world_base)
+    people = recorded_people(run_config, log, writer)
+    predicted = Predicted(assembly.prediction_stage(run_config), writer.partial / "state.parquet")
+    chosen = run_config.settings.plan.method
+    for path in sorted(writer.partial.glob("motion*.parquet")):
+        method = path.stem.removeprefix("motion").removeprefix("_") or chosen
+        motion = pq.read_table(path).to_pandas()
+        own = full = None
+        if path.stem == "motion":
+            own, full = (
+                own_coverage(run_config, people, predicted, motion),
+                full_coverage(run_config, people, predicted),
+            )
+            shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
+            axes_m = body_axes(people.person, shown_ns, run_config.settings.occupancy.hand_m)
+            writer.table("body", body_columns(shown_ns, axes_m, PARTS))
+        writer.table("contact", contact_table(run_config, robot, method, motion, people, predicted, own, full))
+    writer.close_tables()
+
+
+def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats:
+    """(m, 14, 2, 3) axes of the person's capsules, of each part by the first source that knows it [m]."""
+    axes_m = person[0].axes_m(at_ns, hand_m)
+    for track in person[1:]:
+        axes_m = np.where(np.isnan(axes_m), track.axes_m(at_ns, hand_m), axes_m)
+    return axes_m
+
+
+def own_coverage(
+    run_config: RunConfig, people: RecordedPeople, predicted: Predicted, motion: pd.DataFrame
+) -> Outcome | None:
+    """Coverage of every checked tick until the horizon that the motion's tick was decided with.
+
+    Args:
+        run_config: What was asked for.
+        people: As recorded.
+        predicted: Volumes of any tick.
+        motion: Rows of a motion table.
+    """
+    if run_config.settings.plan.method == "none":
+        return None
+    states = predicted.all_states
+    horizon_s = _at(states.t_ns, motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float))
+    return coverage(predicted.stage, people, states, run_config.settings.fusion, horizon_s)
+
+
+def full_coverage(run_config: RunConfig, people: RecordedPeople, predicted: Predicted) -> Outcome | None:
+    """Coverage of every checked tick until the braking time T_s, as ``audit`` counts it."""
+    if run_config.settings.plan.method == "none":
+        return None
+    states = predicted.all_states
+    horizon_s = np.full(len(states), predicted.stage.horizon_s)
+    return coverage(predicted.stage, people, states, run_config.settings.fusion, horizon_s)
+
+
+def contact_table(
+    run_config: RunConfig,
+    robot: RobotModel,
+    method: str,
+    motion: pd.DataFrame,
+    people: RecordedPeople,
+    predicted: Predicted,
+    own: Outcome | None,
+    full: Outcome | None,
+) -> Columns:
+    """The rows of contact.parquet for one motion.
+
+    Args:
+        run_config: What was asked for.
+        robot: At its place in the world.
+        method: That made the motion.
+        motion: Rows of a motion table.
+        people: As recorded.
+        predicted: Volumes of any tick.
+        own: What ``own_coverage`` found; None where it was not asked.
+        full: What ``full_coverage`` found; None likewise.
+    """
+    occupancy, t_ns = run_config.settings.occupancy, motion["t_ns"].to_numpy()
+    radii_m = part_radii(occupancy, run_config.settings.report.leg_radius_m)
+    person, other = nearest(robot, motion, (people.person, people.others), radii_m, occupancy.hand_m)
+    worst, of_other = worse(person, other)
+    outside_m = np.full(len(t_ns), np.nan)
+    if method != "none":
+        outside_m = by_volume(motion, person, people.person, radii_m, occupancy.hand_m, predicted)
+    sources = tuple(track.source for track in people.tracks)
+    return contact_columns(
+        t_ns=t_ns,
+        method=method,
+        person=people.source,
+        moving=_is_turning(motion),
+        distance_m=worst.distance_m,
+        part=(worst.part, PARTS),
+        link=(worst.link, tuple(segment.name for segment in robot.segments)),
+        speeds=(motion["tcp_speed"].to_numpy(dtype=float), worst.speed),
+        source=(np.where(of_other, len(people.person) + worst.track, worst.track), sources),
+        apart=(person.distance_m, other.distance_m),
+        outside_m=outside_m,
+        left=(*_left(own, t_ns), BODY),
+        left_full=(*_left(full, t_ns), BODY),
+    )
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """Nearest pair of the robot and some bodies, a row a tick."""
+
+    distance_m: Floats  #: (n,) surface to surface, negative in overlap; NaN where no body is known [m]
+    link: Ints  #: (n,) index into the robot's segments; -1 where no body is known
+    part: Ints  #: (n,) index into PARTS; -1 likewise
+    track: Ints  #: (n,) index into the bodies' tracks; -1 likewise
+    speed: Floats  #: (n,) of the link's surface where it is nearest to the body [m/s]
+
+
+def worse(first: Nearest, second: Nearest) -> tuple[Nearest, Bools]:
+    """Of two at the same ticks the nearer one, tick by tick, and (n,) where that is the second."""
+    is_second: Bools = np.asarray(~(first.distance_m <= second.distance_m) & np.isfinite(second.distance_m))
+    pairs = ((getattr(first, name), getattr(second, name)) for name in first.__dataclass_fields__)
+    return Nearest(*(np.where(is_second, b, a) for a, b in pairs)), is_second
+
+
+def nearest(
+    robot: RobotModel, motion: pd.DataFrame, groups: Sequence[Sequence[BodyTrack]], radii_m: Floats, hand_m: float
+) -> tuple[Nearest, ...]:
+    """The nearest pair of link and body of each group of tracks, at every tick of a motion.
+
+    Args:
+        robot: The manipulator.
+        motion: Rows of a motion table.
+        groups: Of bodies.
+        radii_m: (14,) radii of PARTS [m].
+        hand_m: Length of a hand beyond the wrist [m].
+    """
+    q, dq = (motion[[f"{name}{i + 1}" for i in range(robot.nv)]].to_numpy(dtype=float) for name in ("q", "dq"))
+    t_ns, parts = motion["t_ns"].to_numpy(), []
+    for first in range(0, len(t_ns), _BATCH):
+        rows = slice(first, first + _BATCH)
+        links = robot.link_motion(q[rows], dq[rows])
+        parts.append([_nearest(robot, links, t_ns[rows], tracks, radii_m, hand_m) for tracks in groups])
+    return tuple(_join(batches) for batches in zip(*parts, strict=True))
+
+
+def _nearest(
+    robot: RobotModel, links: LinkMotion, t_ns: Ints, tracks: Sequence[BodyTrack], radii_m: Floats, hand_m: float
+) -> Nearest:
+    """The nearest pair among some tracks, at a batch of ticks."""
+    unknown, nothing = np.full(len(t_ns), np.nan), np.full(len(t_ns), -1)
+    found = Nearest(unknown, nothing, nothing, nothing, unknown)
+    link_radius_m = np.array([segment.radius_m for segment in robot.segments])
+    for k, track in enumerate(tracks):
+        if not track.is_near(int(t_ns[0]), int(t_ns[-1])):
+            continue
+        pair = nearest_pair(links.ends_m, link_radius_m, track.axes_m(t_ns, hand_m), radii_m)
+        apart = pair.at_second_m - pair.at_first_m
+        length = np.linalg.norm(apart, axis=1, keepdims=True)
+        towards = apart / np.where(length > 0.0, length, np.inf)  # on the axis itself where the axes cross
+        at_m = pair.at_first_m + link_radius_m[pair.first][:, None] * towards
+        index = np.where(pair.first >= 0, k, -1)
+        speed = links.speed(pair.first, at_m)
+        found, _ = worse(found, Nearest(pair.distance_m, pair.first, pair.second, index, speed))
+    return found
+
+
+def _join(batches: Sequence[Nearest]) -> Nearest:
+    """Those of consecutive ticks as one."""
+    return Nearest(*(np.concatenate([getattr(b, name) for b in batches]) for name in Nearest.__dataclass_fields__))
+
+
+def _is_turning(motion: pd.DataFrame) -> Bools:
+    """(n,) whether any axis turns."""
+    joints = [name for name in motion.columns if name[:2] == "dq" and name[2:].isdigit()]
+    return np.asarray((motion[joints].to_numpy(dtype=float) != 0.0).any(axis=1))
+
+
+def _at(from_ns: Ints, motion_ns: Ints, values: Floats) -> Floats:
+    """Values of a motion's ticks at other instants: those of the same instant, else NaN."""
+    row = np.clip(np.searchsorted(motion_ns, from_ns), 0, len(motion_ns) - 1)
+    return np.where(motion_ns[row] == from_ns, values[row], np.nan)
+
+
+def _left(outcome: Outcome | None, t_ns: Ints) -> tuple[Floats, Ints]:
+    """(n,) how far at most a limb left its volume, 0 where all were held, NaN where not asked [m]; (n,) that limb."""
+    out_m, limb = np.full(len(t_ns), np.nan), np.full(len(t_ns), -1)
+    if outcome is None:
+        return out_m, limb
+    row = np.clip(np.searchsorted(t_ns, outcome.t_ns), 0, len(t_ns) - 1)
+    same = t_ns[row] == outcome.t_ns
+    escape_m = outcome.escape_m()
+    out_m[row[same]] = outcome.worst_m()[same]
+    worst = np.argmax(np.where(np.isnan(escape_m), -1.0, escape_m), axis=1)
+    limb[row[same]] = np.where(outcome.worst_m() > 0.0, [BODY.index(outcome.limbs[k]) for k in worst], -1)[same]
+    return out_m, limb
+
+
+@dataclass
+class Predicted:
+    """The volumes of any tick at any horizon, predicted again from the fused person."""
+
+    stage: PredictionStage
+    states: Path  #: state.parquet
+
+    @cached_property
+    def all_states(self) -> HumanStates:
+        """The fused person at every tick."""
+        return HumanStates.join(list(read_states(self.states, _BATCH)))
+
+    def volumes(self, t_ns: int, horizon_s: float) -> Volumes:
+        """Those of the last state that is not later than ``t_ns``; none where the person was not known."""
+        row = int(np.searchsorted(self.all_states.t_ns, t_ns, side="right")) - 1
+        if row < 0:
+            return {}
+        volumes = self.stage.volumes(self.all_states.rows(slice(row, row + 1)), horizon_s)
+        return solids(obstacles(volumes, 0), volumes.limbs)
+
+
+def solids(around: Obstacles, limbs: tuple[str, ...]) -> Volumes:
+    """Limb -> vertices and radius, of those of one tick that are known."""
+    found = {
+        limb: (around.vertices_m[around.offsets[i] : around.offsets[i + 1]], float(around.radius_m[i]))
+        for i, limb in enumerate(limbs)
+    }
+    return {limb: solid for limb, solid in found.items() if np.isfinite(solid[0]).all() and np.isfinite(solid[1])}
+
+
+def by_volume(
+    motion: pd.DataFrame,
+    found: Nearest,
+    tracks: Sequence[BodyTrack],
+    radii_m: Floats,
+    hand_m: float,
+    predicted: Predicted,
+) -> Floats:
+    """(n,) how far the touched part was outside the volume by which the motion had been certified, negative inside [m].
+
+    The volumes of the tick at which it was decided what moves the robot hold until the stop that was found clear of
+    them has ended. NaN where the robot touches nobody or stands, or nothing was predicted.
+
+    Args:
+        motion: Rows of a motion table.
+        found: The nearest of the person's tracks at the same ticks.
+        tracks: Of the person.
+        radii_m: (14,) radii of PARTS [m].
+        hand_m: Length of a hand beyond the wrist [m].
+        predicted: Volumes of any tick.
+    """
+    outside_m = np.full(len(motion), np.nan)
+    t_ns, horizon_s = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float)
+    decided = deciding_rows(motion)
+    volumes: Volumes = {}
+    last = -1
+    for i in np.flatnonzero(_is_turning(motion) & (found.distance_m <= 0.0)).tolist():
+        k = int(decided[i])
+        if k < 0:
+            continue
+        if k != last:
+            volumes, last = predicted.volumes(int(t_ns[k]), float(horizon_s[k])), k
+        part = int(found.part[i])
+        solid = volumes.get(VOLUME_OF[PARTS[part]])
+        if solid is not None:
+            axes_m = tracks[int(found.track[i])].axes_m(t_ns[i : i + 1], hand_m)[:, part]
+            outside_m[i] = protrusion_m(axes_m, float(radii_m[part]), *solid)[0]
+    return outside_m
+
+
+def deciding_rows(motion: pd.DataFrame) -> Ints:
+    """(n,) the row at which it was decided what moves the robot at each tick; -1 where none was.
+
+    That is the last row before the tick that did not only go on braking.
+    """
+    going_on = motion["status"].astype(str).to_numpy() == "braking"
+    last = np.maximum.accumulate(np.where(going_on, -1, np.arange(len(motion))))
+    return np.concatenate([[-1], last])[:-1]

@@ -1,0 +1,222 @@
+"""Coverage of the recorded person by the predicted volumes: one meaning of 'held' for report, compare and audit.
+
+A limb is held at a tick where all its recorded points, those of every camera and with the limb's radius about each,
+stay inside its volume until the horizon has passed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPeople
+from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
+from hrcreplay.human.prediction.sound_reach import THIGH_M
+from hrcreplay.human.prediction.swept_volumes import limb_radii
+from hrcreplay.pipeline.assembly import PredictionStage
+from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
+from hrcreplay.settings.sections import Fusion
+
+#: Ticks a second that are asked [Hz].
+AUDIT_HZ = 25.0
+#: The end of the horizon: its last quarter. A limb that was last seen before could have left later.
+_END = 0.75
+#: Points with which the union of a tick's volumes is counted out.
+_COUNT = 1024
+#: Rounding of a distance [m].
+_ROUNDING_M = 1e-9
+_SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
+
+
+@dataclass(frozen=True)
+class Outcome(Table):
+    """One method's volumes compared with the recorded motion, a row an audited tick."""
+
+    t_ns: Ints  #: (n,)
+    beyond_m: (
+        Floats  #: (n, l) farthest that a recorded point of the limb got from the hull, before the ball; NaN: unseen
+    )
+    radius_m: Floats  #: (n, l) of the ball
+    volume_m3: Floats  #: (n, l) NaN where the limb could not be predicted
+    union_m3: Floats  #: (n,) of all limbs together; NaN where not computed
+    union_std_m3: Floats  #: (n,) standard error of the counting behind it
+    upper_m3: Floats  #: (n,) of the six LIMBS together, for which every method has volumes
+    upper_std_m3: Floats  #: (n,)
+    limbs: tuple[str, ...]  #: LIMBS first
+    limb_radius_m: tuple[float, ...]  #: radius of each limb itself, Table 2 and a thigh's [m]
+
+    def escape_m(self, *, points_alone: bool = False) -> Floats:
+        """(n, l) how far the limb left its volume within the horizon; 0 inside, NaN where not audited [m].
+
+        The whole limb: a ball of the limb radius around each of its recorded points. Volumes are convex, so what is
+        between two points is no further out than the worse of them. With ``points_alone`` limb thickness is ignored.
+        """
+        radius = np.zeros(len(self.limbs)) if points_alone else np.array(self.limb_radius_m)
+        depth = self.beyond_m + radius - self.radius_m
+        return np.where(np.isnan(depth), np.nan, np.where(depth > _ROUNDING_M, depth, 0.0))
+
+    def worst_m(self, limbs: int | None = None, *, points_alone: bool = False) -> Floats:
+        """(n,) largest escape of all limbs or the first so many, each from its own volume; NaN: none checked [m]."""
+        escapes = self.escape_m(points_alone=points_alone)[:, :limbs]
+        known = np.isfinite(escapes).any(axis=1)
+        return np.where(known, np.where(np.isnan(escapes), -1.0, escapes).max(axis=1), np.nan)
+
+
+@dataclass(frozen=True)
+class RecordedFuture:
+    """The recorded future of some ticks."""
+
+    states: HumanStates  #: (n,) the fused person at the ticks
+    limbs: dict[str, Floats]  #: limb -> (m, k, 3) its recorded points, world [m]
+    first: Ints  #: (n,) row of the first recorded instant after the tick
+    last: Ints  #: (n,) row past the last one within the horizon
+    seen: dict[str, Bools]  #: limb -> (n, k) whether a point was seen in the last quarter of the horizon
+
+    def rows(self, which: slice | Ints) -> RecordedFuture:
+        """The same for some of the ticks."""
+        seen = {limb: part[which] for limb, part in self.seen.items()}
+        return RecordedFuture(self.states.rows(which), self.limbs, self.first[which], self.last[which], seen)
+
+    def checked(self, limb: str) -> Bools:
+        """(n,) whether the limb can be checked: both its ends were seen near the horizon's end."""
+        return np.asarray(self.seen[limb][:, :2].all(axis=1))
+
+    def points(self) -> dict[str, dict[str, int]]:
+        """Limb -> each point beyond its ends -> at how many of the ticks that check the limb it was seen too."""
+        return {
+            limb: {
+                point: int((self.seen[limb][:, 2 + k] & self.checked(limb)).sum()) for k, point in enumerate(names[2:])
+            }
+            for limb, names in LIMB_POINTS.items()
+        }
+
+
+def recorded_future(t_ns: Ints, points_m: Floats, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
+    """The recorded future (t, t + T] of some ticks.
+
+    Args:
+        t_ns: (m,) instants of the recorded points, increasing [ns].
+        points_m: (m, 20, 3) POINTS of the person, world [m]; NaN where not recorded or not believed.
+        states: (n,) the fused person at the ticks.
+        horizon_s: T, the prediction's horizon and the latency, of each tick or of all [s].
+    """
+    points = points_m.copy()
+    # the model's neck is the middle of the shoulders, not the bone that cameras call so
+    points[:, POINTS.index("neck")] = 0.5 * (points[:, _SHOULDERS[0]] + points[:, _SHOULDERS[1]])
+    limbs = {
+        limb: np.ascontiguousarray(points[:, [POINTS.index(n) for n in names]]) for limb, names in LIMB_POINTS.items()
+    }
+    horizon_ns = np.round(np.asarray(horizon_s) * 1e9).astype(np.int64)
+    first = np.searchsorted(t_ns, states.t_ns, side="right")
+    last = np.searchsorted(t_ns, states.t_ns + horizon_ns, side="right")
+    end = np.searchsorted(t_ns, states.t_ns + np.round(_END * horizon_ns).astype(np.int64), side="right")
+    return RecordedFuture(states, limbs, first, last, {limb: _seen(part, end, last) for limb, part in limbs.items()})
+
+
+def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
+    """(n, k) whether each of the points (m, k, 3) was recorded in any row from ``first`` (n,) up to ``last`` (n,)."""
+    count = np.zeros((len(recorded) + 1, recorded.shape[1]), np.int64)
+    np.cumsum(np.isfinite(recorded).all(axis=2), axis=0, out=count[1:])
+    return np.asarray(count[last] > count[first])
+
+
+def body_radii_m(prediction_stage: PredictionStage) -> dict[str, float]:
+    """Limb -> its radius, Table 2; of the legs that of a thigh [m]."""
+    return dict(zip(BODY, (*limb_radii(prediction_stage.occupancy).tolist(), THIGH_M), strict=True))
+
+
+def check_containment(
+    volumes: SweptVolumes,
+    future: RecordedFuture,
+    limb_radius: Mapping[str, float],
+    counted: Bools,
+    first_sample: int = 0,
+    *,
+    sizes: bool = True,
+) -> Outcome:
+    """Compares one method's volumes with the recorded future.
+
+    Args:
+        volumes: Of the n ticks.
+        future: Of the same ticks.
+        limb_radius: Limb -> its radius, as ``body_radii_m`` gives it [m].
+        counted: (n,) the ticks whose union volume is estimated.
+        first_sample: Number of ticks counted before, see ``union_volume_m3``.
+        sizes: Whether the volume of each limb is measured.
+    """
+    n, limbs = len(volumes), volumes.limbs
+    beyond, size = np.full((n, len(limbs)), np.nan), np.full((n, len(limbs)), np.nan)
+    union, union_std, upper, upper_std = np.full((4, n), np.nan)
+    checked = np.column_stack([future.checked(limb) for limb in limbs])
+    for i in range(n):
+        solids = []
+        for k, limb in enumerate(limbs):
+            vertices = volumes.vertices(i, k)
+            if np.isnan(vertices).any():
+                continue
+            solid = InflatedHull.around(vertices, float(volumes.radius_m[i, k]))
+            if sizes:
+                size[i, k] = solid.volume_m3()
+            solids.append(solid)
+            if checked[i, k]:
+                beyond[i, k] = _farthest(solid, future, i, limb)
+        if counted[i] and len(solids) == len(limbs):
+            upper[i], upper_std[i] = union_volume_m3(solids[: len(LIMBS)], _COUNT, _COUNT * (first_sample + i))
+            union[i], union_std[i] = upper[i], upper_std[i]
+            if len(limbs) > len(LIMBS):
+                union[i], union_std[i] = union_volume_m3(solids, _COUNT, _COUNT * (first_sample + i))
+    radius = np.array(volumes.radius_m)
+    thick = tuple(limb_radius[limb] for limb in limbs)
+    return Outcome(volumes.t_ns, beyond, radius, size, union, union_std, upper, upper_std, limbs, thick)
+
+
+def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str) -> float:
+    """Largest distance of the recorded points of a limb, some of them seen, from a hull [m]."""
+    points = future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
+    return float(np.nanmax(solid.distances_m(points)))
+
+
+def asked_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: float | Floats, fresh_s: float) -> Ints:
+    """Rows of the states that are asked: one in so many, with a known person, a whole horizon before the end.
+
+    Args:
+        states: (n,) every tick of a run.
+        last_ns: The last instant of the recording [ns].
+        rate_hz: Ticks a second of ``states`` [Hz].
+        horizon_s: Of all ticks or of each, with the latency [s].
+        fresh_s: A person whose newest frame is older is not known [s].
+    """
+    every = max(1.0, rate_hz / AUDIT_HZ)
+    number = np.arange(len(states))
+    chosen = np.floor(number / every) != np.floor((number - 1) / every)
+    chosen &= np.isfinite(states.p).all(axis=1) & (states.frame_age_s <= fresh_s)
+    left_ns = max(int(states.t_ns[-1]), last_ns) - states.t_ns
+    chosen &= np.round(np.asarray(horizon_s) * 1e9) <= left_ns
+    return np.flatnonzero(chosen)
+
+
+def coverage(
+    stage: PredictionStage, people: RecordedPeople, states: HumanStates, fusion: Fusion, horizon_s: Floats
+) -> Outcome | None:
+    """Coverage of the recorded person by a run's volumes, at the checked ticks; None where none is.
+
+    Args:
+        stage: That predicts.
+        people: As recorded.
+        states: (n,) every tick of the run.
+        fusion: Settings of stage 1.
+        horizon_s: (n,) for which each tick's volumes were predicted, without the latency; NaN: not asked [s].
+    """
+    until_s = horizon_s + stage.occupancy.latency_s
+    last_ns = int(people.t_ns[-1]) if len(people.t_ns) else 0
+    rows = asked_rows(states, last_ns, fusion.rate_hz, np.where(np.isfinite(until_s), until_s, np.inf), fusion.fresh_s)
+    asked = states.rows(rows)
+    future = recorded_future(people.t_ns, people.points_m, asked, until_s[rows])
+    radii_m, nothing = body_radii_m(stage), np.zeros(1, dtype=np.bool_)
+    outcomes = []
+    for i, row in enumerate(rows.tolist()):
+        volumes = stage.volumes(asked.rows(slice(i, i + 1)), float(horizon_s[row]))
+        outcomes.append(check_containment(volumes, future.rows(slice(i, i + 1)), radii_m, nothing, sizes=False))
+    return Outcome.join(outcomes) if outcomes else None

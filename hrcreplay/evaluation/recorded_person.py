@@ -1,0 +1,399 @@
+"""The people in a recording, as its ground truth or its cameras show them: what contact and coverage are asked of.
+
+The person is whom the robot plans for. Everybody else in a frame counts for contact, too, although nothing was
+predicted of them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hrcreplay.errors import LogError
+from hrcreplay.human.fusion import fuse, inverse_kinematics
+from hrcreplay.human.model import part_axes, skeleton
+from hrcreplay.logs.cleaning import PersonMemory
+from hrcreplay.logs.reader import Log
+from hrcreplay.pipeline.assembly import FusionStage
+from hrcreplay.pipeline.person_fuser import PersonFuser
+from hrcreplay.pipeline.stages import StretchSmoother, batches
+from hrcreplay.records import LENGTHS, POINTS, Bools, CameraFrames, Floats, HumanStates, Ints, Measurements
+
+TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
+
+#: Recorded points of a limb. The first two, its ends, must have been seen near the end of the horizon, or the limb is
+#: not checked.
+LIMB_POINTS = {
+    "HD": ("neck", "head"),
+    "THX": ("pelvis", "shoulder_r", "shoulder_l"),
+    "URA": ("shoulder_r", "elbow_r"),
+    "LRA": ("elbow_r", "wrist_r", "hand_r"),
+    "ULA": ("shoulder_l", "elbow_l"),
+    "LLA": ("elbow_l", "wrist_l", "hand_l"),
+    "LEGS": tuple(f"{part}_{side}" for part in ("hip", "knee", "ankle", "foot") for side in "rl"),
+}
+#: Points that the model has no say about -> the point they hang from and the longest a body makes that bone [m].
+_HANGING = {
+    "hand": ("wrist", 0.30),
+    "hip": ("pelvis", 0.30),
+    "knee": ("hip", 0.65),
+    "ankle": ("knee", 0.65),
+    "foot": ("ankle", 0.40),
+}
+#: Points of the model from the root on, where their bone starts, and its length: so many times one of LENGTHS.
+_BONES: tuple[tuple[str, str, str, float], ...] = (
+    ("shoulder_r", "shoulder_l", "pi_half_shoulder", 2.0),
+    ("shoulder_l", "shoulder_r", "pi_half_shoulder", 2.0),
+    ("pelvis", "neck", "pi_torso", 1.0),
+    ("head", "neck", "pi_head", 1.0),
+    *((f"elbow_{side}", f"shoulder_{side}", f"pi_upper_arm_{side}", 1.0) for side in "rl"),
+    *((f"wrist_{side}", f"elbow_{side}", f"pi_forearm_{side}", 1.0) for side in "rl"),
+)
+#: A bone that is so near to the person's own length is that person's: people are not the model [m].
+_BONE_M = 0.08
+#: Ticks fused at a time.
+_BATCH = 15_000
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A log as an audit needs it."""
+
+    states: HumanStates  #: the fused person at every tick, knowing only what had arrived
+    t_ns: Ints  #: (m,) instants of the recorded points, increasing
+    points_m: Floats  #: (m, 20, 3) POINTS, world [m]; NaN where not recorded or not believed
+    joints_t_ns: Ints  #: (k,) instants of the recorded joints, increasing
+    joints: Floats  #: (k, 13) JOINTS [m, m, rad..., m]
+    source: str  #: TRUTH, CAMERAS or SMOOTHED
+    counts: dict[str, int]
+
+
+#: Between samples of a body further apart nothing is known [s].
+GAP_S = 0.1
+#: A camera's point counts for so long before and after its frame, where no neighbouring frame shows it: half a period
+#: of a slow camera [s].
+_HOLD_S = 0.02
+
+
+@dataclass(frozen=True)
+class BodyTrack:
+    """Points of one body over time, from one source."""
+
+    source: str  #: TRUTH, SMOOTHED, or a camera; of another body than the person, the camera and the tracker's id
+    t_ns: Ints  #: (n,) increasing
+    points_m: Floats  #: (n, 20, 3) POINTS, world [m]; NaN where not known
+    hold_s: float = 0.0  #: a point counts for so long around its sample, where its neighbour lacks it [s]
+
+    def axes_m(self, at_ns: Ints, hand_m: float) -> Floats:
+        """(m, 14, 2, 3) axes of the capsules of ``PARTS`` at some instants; a part with one known end is a ball [m]."""
+        axes = part_axes(at_instants(self.t_ns, self.points_m, at_ns, GAP_S, self.hold_s), hand_m)
+        known: Bools = np.asarray(np.isfinite(axes).all(axis=3, keepdims=True))
+        return np.where(known, axes, axes[:, :, ::-1])
+
+    def is_near(self, first_ns: int, last_ns: int) -> bool:
+        """Return whether the track has a sample so near to a span of time that it may count in it."""
+        margin_ns = round(GAP_S * 1e9)
+        return bool(len(self.t_ns)) and self.t_ns[0] - margin_ns <= last_ns and first_ns <= self.t_ns[-1] + margin_ns
+
+
+@dataclass(frozen=True)
+class RecordedPeople:
+    """Everybody whom a log shows."""
+
+    source: str  #: TRUTH, CAMERAS or SMOOTHED: where ``points_m`` is from
+    t_ns: Ints  #: (m,) instants of the person's recorded points, increasing
+    points_m: Floats  #: (m, 20, 3) POINTS of the person, of all cameras in order of time, world [m]; NaN: not believed
+    person: tuple[BodyTrack, ...]  #: the truth alone; else the smoothed person and each camera's points
+    others: tuple[BodyTrack, ...]  #: every other body of every camera
+
+    @property
+    def tracks(self) -> tuple[BodyTrack, ...]:
+        """The person's, then those of all others."""
+        return (*self.person, *self.others)
+
+
+def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float, hold_s: float = 0.0) -> Floats:
+    """Body points at some instants: linear between the two samples around each, or held for a moment.
+
+    Args:
+        t_ns: (n,) instants of the samples, increasing [ns].
+        points_m: (n, 20, 3) samples, world [m].
+        at_ns: (m,) instants asked for [ns].
+        gap_s: Between samples further apart nothing is known [s].
+        hold_s: A point counts for so long before and after its sample where there is nothing to interpolate [s].
+
+    Returns:
+        (m, 20, 3); NaN where not known. An instant that meets a sample gets that sample.
+    """
+    if not len(t_ns):
+        return np.full((len(at_ns), *points_m.shape[1:]), np.nan)
+    right = np.clip(np.searchsorted(t_ns, at_ns, side="left"), 0, len(t_ns) - 1)
+    left = np.where(t_ns[right] > at_ns, np.maximum(right - 1, 0), right)
+    step_ns = t_ns[right] - t_ns[left]
+    inside: Bools = np.asarray((at_ns >= t_ns[left]) & (at_ns <= t_ns[right]) & (step_ns * 1e-9 <= gap_s))
+    share = np.where(step_ns > 0, (at_ns - t_ns[left]) / np.maximum(step_ns, 1), 0.0)[:, None, None]
+    found = np.where(share > 0.0, (1.0 - share) * points_m[left] + share * points_m[right], points_m[left])
+    found[~inside] = np.nan
+    if hold_s > 0.0:
+        for side in (left, right):
+            near = np.abs(at_ns - t_ns[side]) * 1e-9 <= hold_s
+            found = np.where(np.isnan(found) & near[:, None, None], points_m[side], found)
+    return found
+
+
+def from_states(states: HumanStates, memory_s: float) -> BodyTrack:
+    """The smoothed person, but for where no camera saw them: there is nothing to smooth.
+
+    Args:
+        states: The smoothed states.
+        memory_s: Between two ticks that used a camera further apart than this, nothing is known [s].
+    """
+    points_m = skeleton(states.p, states.lengths_m)
+    points_m[~_seen(states, memory_s)] = np.nan
+    return BodyTrack(SMOOTHED, states.t_ns, points_m)
+
+
+def _seen(states: HumanStates, memory_s: float) -> Bools:
+    """(n,) ticks that lie between two ticks with a camera not further apart than ``memory_s`` [s], both included."""
+    used = np.flatnonzero(states.valid.any(axis=1))
+    if not len(used):
+        return np.zeros(len(states), dtype=np.bool_)
+    ticks = np.arange(len(states))
+    before = used[np.maximum(np.searchsorted(used, ticks, side="right") - 1, 0)]
+    after = used[np.minimum(np.searchsorted(used, ticks, side="left"), len(used) - 1)]
+    apart_s = (states.t_ns[after] - states.t_ns[before]) * 1e-9
+    return np.asarray((before <= ticks) & (ticks <= after) & (apart_s <= memory_s))
+
+
+def read_people(
+    log: Log, ticks_ns: Ints, fusion_stage: FusionStage, smoothed_states: Callable[[], HumanStates]
+) -> RecordedPeople:
+    """Everybody whom a log shows within a span.
+
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks of the span, increasing [ns].
+        fusion_stage: Cameras, and settings of stage 1.
+        smoothed_states: Gives the smoothed states of these ticks; asked where the log has no ground truth.
+    """
+    memory, seen, others = PersonMemory(), [], []
+    frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
+    for _, due in batches(frames, ticks_ns, _BATCH):
+        if due is not None:
+            memory, found = fusion_stage.measure(due, memory)
+            seen.append(found.measured)
+            others.append(found.everybody.rows(~found.mine))
+    truth = _truth(log, ticks_ns)
+    if truth is not None:
+        tracks = _people_off(truth, seen, others, fusion_stage)
+        return RecordedPeople(TRUTH, truth.t_ns, truth.points_m, (truth,), tracks)
+    best = smoothed_states()
+    tracks = tuple(_tracks_of(CameraFrames.join(others), fusion_stage)) if others else ()
+    smoothed = from_states(best, fusion_stage.filter.memory_s)
+    if not seen:
+        return RecordedPeople(SMOOTHED, smoothed.t_ns, smoothed.points_m, (smoothed,), tracks)
+    measurements = Measurements.join(seen)
+    points, _ = _believed(measurements, best, fusion_stage)
+    source, t_ns, points_m = _recorded_points(measurements, points, best)
+    cameras = [
+        _track(camera, measurements.capture_ns[mine], points[mine])
+        for c, camera in enumerate(measurements.cameras)
+        for mine in [measurements.camera == c]
+        if np.isfinite(points[mine]).any()
+    ]
+    return RecordedPeople(source, t_ns, points_m, (smoothed, *cameras), tracks)
+
+
+def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
+    """The ground truth within a span; None where the log has none there."""
+    if not log.header.has_truth:
+        return None
+    truth = [part.rows((part.t_ns >= ticks_ns[0]) & (part.t_ns <= ticks_ns[-1])) for part in log.truth()]
+    truth = [part for part in truth if len(part)]
+    if not truth:
+        return None
+    t_ns = np.concatenate([part.t_ns for part in truth])
+    return BodyTrack(TRUTH, t_ns, np.concatenate([part.points_m for part in truth]))
+
+
+def _track(source: str, t_ns: Ints, points_m: Floats) -> BodyTrack:
+    """A camera's track, in order of capture; the neck is the model's, the middle of the shoulders, where they are."""
+    order = np.argsort(t_ns, kind="stable")
+    t_ns, points_m = t_ns[order], points_m[order].copy()
+    neck, right, left = (POINTS.index(name) for name in ("neck", "shoulder_r", "shoulder_l"))
+    middle = 0.5 * (points_m[:, right] + points_m[:, left])
+    points_m[:, neck] = np.where(np.isnan(middle), points_m[:, neck], middle)
+    return BodyTrack(source, t_ns, points_m, _HOLD_S)
+
+
+def _tracks_of(bodies: CameraFrames, fusion_stage: FusionStage) -> Iterator[BodyTrack]:
+    """A track for each camera and body id; points that the camera trusts."""
+    trusted = (bodies.confidence > 0.0) & (bodies.confidence >= fusion_stage.filter.confidence_min)
+    points_m = np.where(trusted[..., None], bodies.points_m, np.nan)
+    shown = np.isfinite(points_m).any(axis=(1, 2))
+    keys = sorted(set(zip(bodies.camera[shown].tolist(), bodies.body[shown].tolist(), strict=True)))
+    for camera, body in keys:
+        mine = shown & (bodies.camera == camera) & (bodies.body == body)
+        yield _track(f"{bodies.cameras[camera]}, body {body}", bodies.capture_ns[mine], points_m[mine])
+
+
+def _people_off(
+    truth: BodyTrack, seen: Sequence[Measurements], others: Sequence[CameraFrames], fusion_stage: FusionStage
+) -> tuple[BodyTrack, ...]:
+    """Tracks of all bodies that are not where the ground truth is, chosen or not."""
+    tables = []
+    for measured, rest in zip(seen, others, strict=True):
+        chosen = CameraFrames(
+            measured.capture_ns,
+            measured.arrival_ns,
+            measured.camera,
+            np.full(len(measured), _CHOSEN),
+            measured.points_m,
+            measured.confidence,
+            measured.cameras,
+        )
+        tables += [chosen, rest]
+    if not tables:
+        return ()
+    bodies = CameraFrames.join(tables)
+    there = at_instants(truth.t_ns, truth.points_m, bodies.capture_ns, GAP_S)
+    shown = np.isfinite(bodies.points_m).all(axis=2) & (bodies.confidence > 0.0) & np.isfinite(there).all(axis=2)
+    apart = np.where(shown, np.linalg.norm(bodies.points_m - there, axis=2), 0.0).sum(axis=1)
+    apart_m = apart / np.maximum(shown.sum(axis=1), 1)
+    known = shown.any(axis=1)
+    off = np.where(known, apart_m > fusion_stage.person_jump_m, bodies.body != _CHOSEN)
+    return tuple(_tracks_of(bodies.rows(np.asarray(off)), fusion_stage))
+
+
+#: Body id of the person in each frame, whatever the tracker calls them.
+_CHOSEN = -1
+
+
+def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress: Callable[[int], None]) -> Recording:
+    """Reads the span of ``ticks_ns``.
+
+    The recorded future is the ground truth where the log has it. Else the points of the cameras, at their capture
+    times, that the cameras trust (confidence 0 is not seen) and that are either within the filter's outlier distance of
+    the smoothed person, who knows what came later, or at the end of a bone of the person's own length: who squats or
+    bends sideways leaves the model, not the room, and must not be thrown out for it; a marker that jumps away takes no
+    bone along. Else the smoothed person. Recorded joints are those of the truth, else of the smoothed person.
+
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks of the span, increasing [ns].
+        fusion_stage: Cameras and settings of stage 1.
+        progress: Called with the number of ticks done since the last call.
+
+    Raises:
+        LogError: No camera saw anybody.
+    """
+    counts: Counter[str] = Counter()
+    stretches = fused_stretches(log, ticks_ns, fusion_stage, counts, progress)
+    truth = _truth(log, ticks_ns)
+    if truth is not None:
+        states = HumanStates.join([states for _, states, _ in stretches])
+        joints, _ = inverse_kinematics.inverse(truth.points_m)
+        return Recording(states, truth.t_ns, truth.points_m, truth.t_ns, joints, TRUTH, _plain(log, counts))
+    smoother, seen, passed, best = StretchSmoother(fusion_stage.filter), [], [], []
+    for measured, states, trace in stretches:
+        seen.append(measured)
+        passed.append(states)
+        best += smoother.add(states, trace)
+    smoothed, measurements = HumanStates.join([*best, *smoother.finish()]), Measurements.join(seen)
+    points, rejected = _believed(measurements, smoothed, fusion_stage)
+    counts.update(rejected)
+    source, t_ns, points_m = _recorded_points(measurements, points, smoothed)
+    return Recording(HumanStates.join(passed), t_ns, points_m, smoothed.t_ns, smoothed.p, source, _plain(log, counts))
+
+
+def _recorded_points(seen: Measurements, points: Floats, best: HumanStates) -> tuple[str, Ints, Floats]:
+    """Source, instants and points of the person: the believed points of all cameras, else the smoothed person."""
+    if not np.isfinite(points).any():
+        return SMOOTHED, best.t_ns, skeleton(best.p, best.lengths_m)
+    order = np.argsort(seen.capture_ns, kind="stable")
+    return CAMERAS, seen.capture_ns[order], points[order]
+
+
+#: What was measured, what was fused from it, and how.
+Stretch = tuple[Measurements, HumanStates, fuse.Trace]
+
+
+def fused_stretches(
+    log: Log, ticks_ns: Ints, fusion_stage: FusionStage, counts: Counter[str], progress: Callable[[int], None]
+) -> Iterator[Stretch]:
+    """Stage 1, traced, from the first stretch on in which a camera saw somebody.
+
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks, increasing [ns].
+        fusion_stage: Cameras and settings of stage 1.
+        counts: Receives the counts of events.
+        progress: Called with the number of ticks done since the last call.
+
+    Raises:
+        LogError: No camera saw anybody.
+    """
+    fuser, ever = PersonFuser(replace(fusion_stage, watched=None), log.header.cameras, traced=True), False
+    for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
+        progress(len(ticks))
+        ever = ever or due is not None
+        if ever:
+            fused, seen = fuser.update(ticks, due)
+            counts.update(seen.counts)
+            counts.update(fused.counts)
+            yield seen.measured, fused.states, fused.trace
+    log.check()
+    if not ever:
+        raise LogError(f"{log.header.path}: no camera saw anybody; an audit needs a person")
+
+
+def _believed(seen: Measurements, best: HumanStates, fusion_stage: FusionStage) -> tuple[Floats, Counter[str]]:
+    """The measured points (m, 20, 3) that are believed, and how many per camera are not, by why.
+
+    A missing point and one of confidence 0 were not seen. One that the camera trusts too little, that hangs from such a
+    point, or that was seen before the person was known, is doubted: nobody can say whether it is right. One that the
+    camera trusts and that fails a gate jumps off the person: it is rejected, with what hangs from it.
+    """
+    tick = np.clip(np.searchsorted(best.t_ns, seen.capture_ns), 0, len(best) - 1)
+    expected = skeleton(best.p[tick], best.lengths_m[tick])
+    measured: Bools = np.asarray(np.isfinite(seen.points_m).all(axis=2)) & (seen.confidence > 0.0)
+    trusted = measured & (seen.confidence >= fusion_stage.filter.confidence_min)
+    good, jumped = trusted.copy(), np.zeros_like(trusted)
+    points = seen.points_m.copy()
+    neck, right, left = (POINTS.index(name) for name in ("neck", "shoulder_r", "shoulder_l"))
+    points[:, neck] = 0.5 * (points[:, left] + points[:, right])  # the model's: the middle of the shoulders
+    good[:, neck] = trusted[:, left] & trusted[:, right]
+    off = np.linalg.norm(points - expected, axis=2)
+    for name, start, length, part in _BONES:
+        k, j = POINTS.index(name), POINTS.index(start)
+        own = part * best.lengths_m[tick, LENGTHS.index(length)]
+        fits = np.abs(np.linalg.norm(points[:, k] - points[:, j], axis=1) - own) <= _BONE_M
+        good[:, k] &= (off[:, k] <= fusion_stage.filter.outlier_m) | (fits & good[:, j])
+        jumped[:, k] = trusted[:, k] & ~good[:, k] & np.isfinite(off[:, k])
+    for name, (parent, longest_m) in _HANGING.items():
+        for side in "lr":
+            k = POINTS.index(f"{name}_{side}")
+            j = POINTS.index(parent if parent in POINTS else f"{parent}_{side}")
+            fits = np.linalg.norm(seen.points_m[:, k] - seen.points_m[:, j], axis=1) <= longest_m
+            jumped[:, k] = trusted[:, k] & (jumped[:, j] | (good[:, j] & ~fits))
+            good[:, k] &= good[:, j] & fits
+    return np.where((good & measured)[..., None], seen.points_m, np.nan), _disbelieved(seen, measured, good, jumped)
+
+
+def _disbelieved(seen: Measurements, measured: Bools, good: Bools, jumped: Bools) -> Counter[str]:
+    """Per camera the points that were not seen, were doubted, or jump; and the frames with one that jumps."""
+    counts: Counter[str] = Counter()
+    for c, camera in enumerate(seen.cameras):
+        mine = seen.camera == c
+        counts[f"audit_unseen_points_{camera}"] = int((~measured[mine]).sum())
+        counts[f"audit_doubted_points_{camera}"] = int((measured & ~good & ~jumped)[mine].sum())
+        counts[f"audit_rejected_points_{camera}"] = int(jumped[mine].sum())
+        counts[f"audit_rejected_frames_{camera}"] = int(jumped[mine].any(axis=1).sum())
+    return counts
+
+
+def _plain(log: Log, found: Counter[str]) -> dict[str, int]:
+    return {name: int(count) for name, count in sorted((log.defects + found).items())}

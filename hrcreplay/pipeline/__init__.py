@@ -1,0 +1,1 @@
+"""Stages of a run, assembled from its configuration."""

@@ -1,0 +1,440 @@
+"""The stages with their settings, and the robot, built from settings, cell and log.
+
+The rooms of the stages take sections of the settings as they are, and plain values of the rest; only drivers load them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hrcreplay.calibration.cell import Cell
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.human.fusion import inverse_kinematics
+from hrcreplay.human.fusion.vacancy import WatchedArea
+from hrcreplay.human.model import LimitSet
+from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.logs.cleaning import PersonMemory, select_person
+from hrcreplay.logs.joints import JointTrack
+from hrcreplay.logs.log_files import Header
+from hrcreplay.pipeline.run_config import RunConfig, UrdfFiles, link_capsules
+from hrcreplay.records import BORDER, NOBODY, Bools, CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.robot.control.border import Border
+from hrcreplay.robot.control.control_step import PlanSettings
+from hrcreplay.robot.control.controllers import CONTROLLERS, Controller, Planner, Predict
+from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
+from hrcreplay.robot.path import programmed, recorded, recorded_remarks
+from hrcreplay.robot.task import Reference, Task, parse_task
+from hrcreplay.settings.sections import Fusion, Occupancy, Robot
+
+
+class Sightings(NamedTuple):
+    """Content of some frames."""
+
+    measured: Measurements  #: of the person
+    everybody: CameraFrames  #: all bodies, and frames that show nobody; points in the world [m]
+    mine: Bools  #: which of ``everybody`` are the person
+    counts: Counter[str]  #: of ``select_person``, and ``frames_late_<camera>``
+
+
+@dataclass(frozen=True)
+class FusionStage:
+    """Stage 1: camera poses and clocks, point noise, and the settings of filter and person selection."""
+
+    T_world_camera: Floats  #: (c, 4, 4)
+    clock_offset_ns: Ints  #: (c,) camera's clock minus the reference camera's
+    filter: Fusion
+    limits: LimitSet
+    person_jump_m: float
+    person_memory_s: float
+    watched: WatchedArea | None = None  #: where nobody can be whom no camera shows
+
+    def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Sightings]:
+        """Measure frames by the clock of the reference camera; see ``clean.select_person``.
+
+        A frame that was captured more than ``fresh_s`` before its arrival shows where the person was, not where they
+        are: it is left out, and counted as ``frames_late_<camera>``.
+        """
+        frames = self.on_one_clock(frames)
+        late = np.asarray(frames.arrival_ns - frames.capture_ns > self.filter.fresh_s * 1e9)
+        bodies = frames.body != NOBODY
+        counts = Counter(f"frames_late_{frames.cameras[camera]}" for camera in frames.camera[late & bodies])
+        frames, bodies = frames.rows(~late), bodies[~late]
+        mine = np.zeros(len(frames), dtype=np.bool_)
+        memory, mine[bodies], found = select_person(
+            frames.rows(bodies), memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
+        )
+        measured = inverse_kinematics.measure(frames.rows(mine), self.T_world_camera, self.filter)
+        T = self.T_world_camera[frames.camera]
+        points_m = np.einsum("nij,npj->npi", T[:, :3, :3], frames.points_m) + T[:, None, :3, 3]
+        return memory, Sightings(measured, replace(frames, points_m=points_m), mine, found + counts)
+
+    def on_one_clock(self, frames: CameraFrames) -> CameraFrames:
+        """Frames with captures by the clock of the reference camera, none of them after its arrival."""
+        capture_ns = frames.capture_ns - self.clock_offset_ns[frames.camera]
+        return replace(frames, capture_ns=np.minimum(capture_ns, frames.arrival_ns))
+
+
+@dataclass(frozen=True)
+class PredictionStage:
+    """Stage 2: limit set, horizon, radii, margins and method of the swept volumes."""
+
+    limits: LimitSet
+    occupancy: Occupancy
+    memory_s: float  #: how long the filter goes on without a measurement [s]
+
+    @property
+    def horizon_s(self) -> float:
+        """Braking time T_s of the robot [s]."""
+        return self.occupancy.stop_s
+
+    @property
+    def method(self) -> str:
+        """Method of the prediction."""
+        return self.occupancy.method
+
+    @property
+    def limbs(self) -> tuple[str, ...]:
+        """Limbs that have volumes."""
+        return swept_volumes.limbs_of(self.occupancy)
+
+    def by(self, method: str) -> PredictionStage:
+        """The same by another method."""
+        return replace(self, occupancy=self.occupancy.model_copy(update={"method": method}))
+
+    def reachable(self, states: HumanStates) -> swept_volumes.Reach:
+        """Reachable interval of every joint at every tick."""
+        return swept_volumes.reachable(
+            states, self.limits, self.occupancy, horizon_s=self.horizon_s, memory_s=self.memory_s
+        )
+
+    def volumes(
+        self, states: HumanStates, horizon_s: float | None = None, *, method: str | None = None
+    ) -> SweptVolumes:
+        """Swept volumes of every tick: the one call by which replay, live and audit ask for them.
+
+        Args:
+            states: The fused person.
+            horizon_s: Until when after each tick they hold; None: the braking time T_s [s].
+            method: None: that of the settings.
+        """
+        if method is not None:
+            return self.by(method).volumes(states, horizon_s)
+        horizon_s = self.horizon_s if horizon_s is None else horizon_s
+        return swept_volumes.predict(states, self.limits, self.occupancy, horizon_s=horizon_s, memory_s=self.memory_s)
+
+
+@dataclass(frozen=True)
+class WatchedBorder:
+    """The border of a watched area around the robot, and how fast it comes in."""
+
+    area: WatchedArea
+    border: Border
+    latency_s: float  #: from the newest capture to the robot's reaction [s]
+
+    def depth_m(self, since_s: float, horizon_s: float) -> float:
+        """Depth that somebody outside ``since_s`` [s] ago can reach within ``horizon_s`` [m]."""
+        return float(self.area.reached_m(since_s + horizon_s + self.latency_s))
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Obstacles of a robot: the person's volumes, and the border behind which others may be.
+
+    A person whose newest frame is too old is not known. Where nobody can be in the watched area, nobody needs to be.
+    """
+
+    prediction: PredictionStage
+    fresh_s: float  #: a person whose newest frame was captured longer ago is not known [s]
+    watched: WatchedBorder | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the obstacles: the limbs that have volumes, then the sides of the border."""
+        sides = 0 if self.watched is None else len(self.watched.border.normals)
+        return (*self.prediction.limbs, *(BORDER,) * sides)
+
+    def obstacles(self, states: HumanStates, tick: int, person: Obstacles) -> Obstacles:
+        """The volumes of a tick and the border, as far as they are known.
+
+        Args:
+            states: The fused person.
+            tick: Row of ``states``.
+            person: Volumes of that tick.
+        """
+        fresh = bool(states.frame_age_s[tick] <= self.fresh_s)
+        if self.watched is None or states.nobody_s is None or states.nobody_else_s is None:
+            return person if fresh else replace(person, known=False)
+        since_s = float((states.nobody_else_s if fresh else states.nobody_s)[tick])
+        depth_m = self.watched.depth_m(since_s, person.horizon_s)
+        return self.watched.border.obstacles(depth_m, person.horizon_s, person if fresh else len(person.radius_m))
+
+
+@dataclass
+class Forecast:
+    """Obstacles of a batch of ticks, at any horizon."""
+
+    around: Surroundings
+    states: HumanStates
+
+    @cached_property
+    def full(self) -> SweptVolumes:
+        """The volumes of all ticks that hold for the braking time T_s."""
+        return self.around.prediction.volumes(self.states)
+
+    def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
+        """Those of one tick that hold for ``horizon_s`` [s]."""
+        stage, states = self.around.prediction, self.states
+        if horizon_s == stage.horizon_s:
+            person = obstacles(self.full, tick, horizon_s)
+        else:
+            person = obstacles(stage.volumes(states.rows(slice(tick, tick + 1)), horizon_s), 0, horizon_s)
+        return self.around.obstacles(states, tick, person)
+
+    def predict(self, tick: int) -> Predict:
+        """The same of one tick as a function of the horizon."""
+        return partial(self.obstacles, tick)
+
+
+class LogLike(Protocol):
+    """Part of a log that the stages need; in a live session a header without one."""
+
+    @property
+    def header(self) -> Header:
+        """Cameras, task and robot base as far as they are known."""
+
+    @property
+    def joint_notes(self) -> tuple[str, ...]:
+        """Remarks of the latest reading of the joints."""
+
+    def joints(self, axes: Sequence[str], /) -> JointTrack | None:
+        """The recorded track of the robot's axes, where there is one."""
+
+
+def fusion_stage(run_config: RunConfig, log: LogLike) -> FusionStage:
+    """Stage 1 of a run. A camera pose of the cell file has priority over the log's.
+
+    Raises:
+        LogError: A camera's pose is known to neither.
+    """
+    cell = run_config.cell or Cell()
+    poses = {**log.header.T_world_camera, **cell.T_world_camera}
+    for camera in log.header.cameras:
+        if camera not in poses:
+            raise LogError(
+                f"{log.header.path}: the pose of camera {camera} is not known; "
+                f"find it with: hrcreplay calibrate {log.header.path} --out cell.toml, then give --cell cell.toml"
+            )
+    unknown = sorted(set(cell.T_world_camera) - set(log.header.cameras))
+    if unknown:
+        raise SettingsError(
+            f"cell: camera {unknown[0]} is not in the log; its cameras are {', '.join(log.header.cameras)}"
+        )
+    offsets_s = [cell.clock_offset_s.get(camera, 0.0) for camera in log.header.cameras]
+    logs = run_config.settings.logs
+    return FusionStage(
+        T_world_camera=np.array([poses[camera] for camera in log.header.cameras]),
+        clock_offset_ns=np.round(np.array(offsets_s) * 1e9).astype(np.int64),
+        filter=run_config.settings.fusion,
+        limits=run_config.tracking,
+        person_jump_m=logs.person_jump_m,
+        person_memory_s=logs.person_memory_s,
+        watched=watched_area(run_config),
+    )
+
+
+def watched_area(run_config: RunConfig) -> WatchedArea | None:
+    """Area that the cameras of a run see together, where its cell names one."""
+    given = None if run_config.cell is None else run_config.cell.watched
+    if given is None:
+        return None
+    return WatchedArea(
+        given.polygon, given.margin_m, given.clear_s, run_config.settings.fusion.fresh_s, given.speed_m_per_s
+    )
+
+
+def prediction_stage(run_config: RunConfig) -> PredictionStage:
+    """Stage 2 of a run. For a live robot the latency includes ``live.reaction_s``, so the volumes are larger."""
+    occupancy = run_config.settings.occupancy
+    if run_config.command == "live":
+        occupancy = occupancy.model_copy(
+            update={"latency_s": occupancy.latency_s + run_config.settings.live.reaction_s}
+        )
+    return PredictionStage(run_config.prediction, occupancy, run_config.settings.fusion.memory_s)
+
+
+def surroundings(run_config: RunConfig, model: RobotModel) -> Surroundings:
+    """Obstacles of a run's robot.
+
+    Raises:
+        SettingsError: The robot stands outside the area that its cell says is watched.
+    """
+    stage, area = prediction_stage(run_config), watched_area(run_config)
+    border = None
+    if area is not None:
+        border = WatchedBorder(area, Border.around(model, area.polygon), stage.occupancy.latency_s)
+        if not border.border.room_m.min() > 0.0:
+            base_m = np.round(model.T_world_base[:2, 3], 3).tolist()
+            raise SettingsError(
+                f"cell: watched.corners_m: the robot's base at {base_m} m lies outside; would be right: an area around "
+                "the robot, in the world's coordinates"
+            )
+    return Surroundings(stage, run_config.settings.fusion.fresh_s, border)
+
+
+def known_robot_base(run_config: RunConfig, log: LogLike) -> Floats | None:
+    """(4, 4) pose of the robot's base in the world: of the cell file, else of the log; None where neither has it."""
+    if run_config.cell is not None and run_config.cell.T_world_base is not None:
+        return run_config.cell.T_world_base
+    return log.header.T_world_base
+
+
+def robot(run_config: RunConfig, T_world_base: Floats) -> RobotModel:
+    """The robot of a run at its place in the world.
+
+    Raises:
+        SettingsError: The URDF or a robot setting cannot be used.
+    """
+    return _robot(run_config.settings.robot, run_config.urdf, run_config.settings.occupancy.stop_s, T_world_base)
+
+
+def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base: Floats) -> RobotModel:
+    """The same from what of a run it depends on."""
+    T_tool_tcp = np.eye(4)
+    T_tool_tcp[:3, :3] = Rotation.from_euler("xyz", settings.tcp_offset.rpy_deg, degrees=True).as_matrix()
+    T_tool_tcp[:3, 3] = settings.tcp_offset.position_m
+    tool_segments = tuple(Segment(**dict(link)) for link in settings.tool_links)
+    if files is None:
+        other = [key for key in ("links", "tcp_frame", "base_frame", "packages") if getattr(settings, key)]
+        if other:
+            raise SettingsError(f"robot.{other[0]}: found {other[0]} for the IRB 140; it goes with a robot.urdf")
+        return irb140(
+            T_world_base,
+            stop_s=stop_s,
+            tool_m=settings.tool_m,
+            T_tool_tcp=T_tool_tcp,
+            tool_segments=tool_segments,
+            acceleration=settings.acceleration,
+        )
+    return from_urdf(
+        files.text,
+        T_world_base,
+        stop_s=stop_s,
+        tcp_frame=settings.tcp_frame,
+        base_frame=settings.base_frame,
+        tool_m=settings.tool_m,
+        T_tool_tcp=T_tool_tcp,
+        segments=(*link_capsules(settings, files), *tool_segments),
+        acceleration=settings.acceleration,
+    )
+
+
+def reference(run_config: RunConfig, log: LogLike, model: RobotModel) -> tuple[Reference, int | None]:
+    """The programmed path: of the task file, else of the log's task, else the log's joint track.
+
+    Returns:
+        The path, and the instant at which it starts where the log says [ns].
+
+    Raises:
+        SettingsError: The task cannot be used, or there is none.
+        LogError: The joint track does not fit the robot.
+    """
+    own = (log.header.task, f"{log.header.path}: task")
+    file = run_config.settings.plan.task
+    table, where = (run_config.task, own[1] if file is None else str(file)) if run_config.task else own
+    if table is not None:
+        parts = run_config.settings.robot, run_config.urdf, run_config.settings.occupancy.stop_s
+        path = _programme(parse_task(table, where), where, *parts, model.T_world_base.tobytes())
+        return replace(path, model=model), None
+    track = log.joints(model.joint_names)
+    if track is None:
+        empty = f" ({', '.join(log.header.joint_topics)}: no positions that go with their names)"
+        raise SettingsError(
+            f"{log.header.path}: no task and no joint track{empty if log.header.joint_topics else ''}; "
+            "name a task file with --set plan.task=FILE.toml"
+        )
+    return recorded(track.t_ns, track.q, model), int(track.t_ns[0])
+
+
+def programme_notes(run_config: RunConfig, log: LogLike, path: Reference) -> list[str]:
+    """Remarks on a recorded joint track that is the programme; none on a task.
+
+    Args:
+        run_config: What was asked for.
+        log: Log of the run; its joints were read for the path.
+        path: What ``reference`` made.
+    """
+    if run_config.task or log.header.task:
+        return []
+    return [*log.joint_notes, *recorded_remarks(path)]
+
+
+@lru_cache(maxsize=4)  # a live session makes its controller twice: to compile the kernels, and to fly
+def _programme(
+    task: Task, where: str, settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base: bytes
+) -> Reference:
+    """The path of a task by the robot of the other arguments, which are those of ``_robot``."""
+    model = _robot(settings, files, stop_s, np.frombuffer(T_world_base).reshape(4, 4))
+    return programmed(task, model, where)
+
+
+def planners(run_config: RunConfig, log: LogLike, start_ns: int) -> dict[str, Planner]:
+    """Stage 3: the chosen method and its baselines, each with a robot of its own."""
+    plan, model = run_config.settings.plan, robot(run_config, robot_base(run_config, log))
+    path, begin_ns = reference(run_config, log, model)
+    dt_s = 1.0 / run_config.settings.fusion.rate_hz
+    s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
+
+    def planner(name: str) -> Planner:
+        controller = make_controller(name, model, path, plan_settings(run_config, dt_s, name), s_s)
+        return Planner(controller, chosen=name == plan.method)
+
+    return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
+
+
+def robot_base(run_config: RunConfig, log: LogLike) -> Floats:
+    """(4, 4) pose of the robot's base in the world, which must be known.
+
+    Raises:
+        SettingsError: Neither the cell nor the log knows.
+    """
+    T_world_base = known_robot_base(run_config, log)
+    if T_world_base is None:
+        raise SettingsError(
+            f"{log.header.path}: where the robot stands is not known; give a --cell file with T_world_base"
+        )
+    return T_world_base
+
+
+def plan_settings(run_config: RunConfig, dt_s: float, method: str) -> PlanSettings:
+    """Section 5 for ticks of ``dt_s`` [s] by a method."""
+    plan, occupancy = run_config.settings.plan, prediction_stage(run_config).occupancy
+    return PlanSettings(
+        plan,
+        dt_s=dt_s,
+        stop_s=occupancy.stop_s,
+        latency_s=occupancy.latency_s,
+        spare_ticks=int(run_config.command == "live"),
+        certified=plan.certify and method != "none",
+        retreat_m=plan.retreat_m if plan.certify and method == "qp" else 0.0,
+    )
+
+
+def make_controller(method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float) -> Controller:
+    """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on.
+
+    Args:
+        method: One of ``plan.method``.
+        model: Robot that follows.
+        path: Programmed path.
+        settings: Section 5 for the length of a tick.
+        s_s: Programmed time at the start [s].
+    """
+    return CONTROLLERS[method](model, path, settings, s_s)

@@ -1,0 +1,165 @@
+"""Reuse of an earlier run's stages: the parts that a result depends on, their digests, and what is out of date."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.assembly import LogLike
+from hrcreplay.pipeline.run_config import TABLES, RunConfig, urdf_digest, versions
+from hrcreplay.pipeline.stages import print_note
+from hrcreplay.records import Ints
+from hrcreplay.settings.sections import Logs
+from hrcreplay.store import run_folder
+from hrcreplay.store.columns import missing_columns
+from hrcreplay.store.run_folder import RunWriter
+
+#: What the fused person depends on, and the volumes; each stage works on what those before it hand on.
+_PERSON = ("versions", "log", "ticks", "cameras", "watched", "settings logs", "settings fusion", "limits.tracking")
+_VOLUMES = (*_PERSON, "settings occupancy", "limits.prediction")
+_PROGRAMME = ("base", "programme", "settings robot", "settings plan")
+_JOINT_SETTINGS = tuple(key for key in Logs.model_fields if key.startswith("joint"))
+#: Stage -> the parts that its tables, counts and notes depend on. The plan takes the volumes of every tick: how many
+#: of them are stored changes nothing for it.
+PARTS = {
+    "fuse": (*_PERSON, "logs.gap_s"),
+    "predict": (*_VOLUMES, "occupancy.store_hz"),
+    "plan": (*_VOLUMES, *_PROGRAMME),
+}
+
+
+def parts_of(run_config: RunConfig, stage: str) -> tuple[str, ...]:
+    """The parts that a stage of a run depends on.
+
+    Volumes that are stored beside a plan reach as far ahead as the chosen robot asked for, so they depend on it.
+    """
+    planned = "plan" in run_config.stages and run_config.settings.plan.horizon == "adaptive"
+    return (*PARTS[stage], *_PROGRAMME) if planned and stage == "predict" else PARTS[stage]
+
+
+def dependencies(run_config: RunConfig, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
+    """Digest of every part that a stage of the run depends on.
+
+    A section of the settings counts whole, so that a new setting cannot be forgotten, but for the keys that stand here
+    by themselves: a file counts by its content, what is set of the joints as the programme, for want of a task.
+
+    Args:
+        run_config: What was asked for.
+        log: Where the run's cell and task say nothing, the log's own hold.
+        ticks_ns: (n,) of the run [ns].
+
+    Raises:
+        SettingsError: The cell or the URDF cannot be used.
+        LogError: The pose of a camera is not known.
+    """
+    settings = run_config.settings.model_dump(mode="json")
+    fusion_stage = assembly.fusion_stage(run_config, log)
+    found: dict[str, Any] = {
+        "versions": versions(),
+        "log": run_config.log_sha256,
+        "ticks": [int(ticks_ns[0]), int(ticks_ns[-1]), len(ticks_ns)],
+        "cameras": [log.header.cameras, fusion_stage.T_world_camera.tolist(), fusion_stage.clock_offset_ns.tolist()],
+        "watched": None
+        if run_config.cell is None or run_config.cell.watched is None
+        else run_config.cell.watched.model_dump(),
+        "settings logs": _without(settings["logs"], *_JOINT_SETTINGS, "gap_s"),
+        "logs.gap_s": settings["logs"]["gap_s"],
+        "settings fusion": settings["fusion"],
+        "limits.tracking": _without(run_config.tracking.plain(), "name"),
+        "settings occupancy": _without(settings["occupancy"], "store_hz"),
+        "occupancy.store_hz": settings["occupancy"]["store_hz"],
+        "limits.prediction": _without(run_config.prediction.plain(), "name"),
+    }
+    if "plan" in run_config.stages:
+        base = assembly.known_robot_base(run_config, log)
+        found |= {
+            "base": None if base is None else base.tolist(),
+            "programme": run_config.task or log.header.task or {key: settings["logs"][key] for key in _JOINT_SETTINGS},
+            "settings robot": [_without(settings["robot"], "urdf", "packages"), urdf_digest(run_config.settings)],
+            "settings plan": _without(settings["plan"], "task"),
+        }
+    return {name: _digest(part) for name, part in found.items()}
+
+
+def stage_digests(run_config: RunConfig, found: Mapping[str, str]) -> dict[str, str]:
+    """Digest of all that the result of each stage of the run depends on, from those of ``dependencies``."""
+    return {stage: _digest([found[name] for name in parts_of(run_config, stage)]) for stage in run_config.stages}
+
+
+def stale_stages(run_config: RunConfig, found: Mapping[str, str]) -> dict[str, str]:
+    """Stage -> why the earlier run's result is not the one that this run would make.
+
+    A table that is damaged or of an earlier version speaks against the stages after its own, too.
+    """
+    if run_config.earlier is None:
+        return {}
+    meta, mine = run_folder.read_meta(run_config.earlier), stage_digests(run_config, found)
+    why: dict[str, str] = {}
+    damage = None
+    for stage in run_config.stages:
+        damage = damage or _damage(run_config.earlier, stage, meta["outputs"])
+        if meta.get("stages", {}).get(stage) != mine[stage]:
+            why[stage] = _difference(parts_of(run_config, stage), found, meta, run_config.earlier)
+        elif damage is not None:
+            why[stage] = damage
+    if "predict" in why and "plan" in run_config.stages and run_config.settings.plan.horizon == "adaptive":
+        why.setdefault("plan", "the volumes to store are those that it asks for")
+    return why
+
+
+def _difference(parts: tuple[str, ...], found: Mapping[str, str], meta: Mapping[str, Any], earlier: Path) -> str:
+    theirs = meta.get("depends_on", {})
+    different = [name for name in parts if theirs.get(name) != found[name]]
+    if not theirs or not different:  # of a live session, or of an earlier version
+        return f"{earlier} does not say what its tables depend on"
+    return f"{', '.join(different)} {'is' if len(different) == 1 else 'are'} not as in {earlier}"
+
+
+def _damage(folder: Path, stage: str, outputs: Mapping[str, str]) -> str | None:
+    """Reason not to take an earlier run's tables of a stage for ours."""
+    for name in sorted(name for name in outputs if any(fnmatch(name, pattern) for pattern in TABLES[stage])):
+        path = folder / name
+        if not path.exists() or run_folder.sha256(path) != outputs[name]:
+            return f"{path} is not as its run left it"
+        if missing := missing_columns(path):
+            return f"{path} is of an earlier version, without {missing[0]}"
+    return None
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def _without(table: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    return {name: value for name, value in table.items() if name not in keys}
+
+
+def take_over(run_config: RunConfig, parts: Mapping[str, str], writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
+    """Copies the tables of the earlier run's stages that would come out the same, and says which those are.
+
+    Args:
+        run_config: What was asked for.
+        parts: What ``dependencies`` found.
+        writer: Run folder.
+        smooth: Whether the smoothed person is asked for, too.
+    """
+    if run_config.earlier is None:
+        return ()
+    stale = stale_stages(run_config, parts)
+    if smooth:
+        stale.setdefault("fuse", f"{run_config.earlier} holds no covariances to smooth with")
+    reused = tuple(stage for stage in run_config.stages if stage not in stale)
+    for stage in run_config.stages:
+        names = [name for pattern in TABLES[stage] for name in sorted(p.name for p in run_config.earlier.glob(pattern))]
+        if stage in reused:
+            for name in names:
+                writer.copy(name, run_config.earlier)
+            print_note(f"{stage}: taken over from {run_config.earlier}")
+        elif names:
+            print_note(f"{stage}: {stale[stage]}; computed again")
+    return reused

@@ -1,0 +1,470 @@
+"""The three stages as generators over batches of ticks, and the progress bar of a run.
+
+Each stage passes its rows on to the next and writes its tables. The progress bar shows on a terminal only.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, NamedTuple, Protocol, Self
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from hrcreplay.calibration.clock_check import ClockCheck
+from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.geometry.inflated_hull import InflatedHull
+from hrcreplay.human.fusion import fuse, inverse_kinematics, vacancy
+from hrcreplay.logs.camera_checks import CameraChecks
+from hrcreplay.logs.clocks import delay_text
+from hrcreplay.logs.reader import Log
+from hrcreplay.pipeline.assembly import Forecast, FusionStage, PredictionStage, Surroundings
+from hrcreplay.pipeline.person_fuser import PersonFuser
+from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.records import (
+    FLOOR_Z_M,
+    NOBODY,
+    CameraFrames,
+    Floats,
+    HumanStates,
+    Ints,
+    SkeletonTrack,
+    SweptVolumes,
+)
+from hrcreplay.robot.control.controllers import Planner
+from hrcreplay.settings.sections import Fusion
+from hrcreplay.store.columns import (
+    measurement_columns,
+    motion_columns,
+    occupancy_columns,
+    record_columns,
+    state_columns,
+    truth_columns,
+)
+from hrcreplay.store.run_folder import Stopwatch
+
+NS = 1_000_000_000
+#: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
+_LOST = (
+    "points_",
+    "person_frames_without",
+    "frames_late",
+    "frames_repeated",
+    "frames_trembling",
+    "frames_out_of_order",
+)
+
+#: Of a session; a longer log has an arrival of another clock among its messages [s].
+LONGEST_S = 24 * 3600
+
+
+class Tables(Protocol):
+    """Destination of the rows of tables: a run folder, or memory."""
+
+    def table(self, name: str, columns: Mapping[str, Any], /) -> None:
+        """Appends rows to a table."""
+
+
+class Told(NamedTuple):
+    """Counts and notes of a stage."""
+
+    counts: Counter[str]
+    notes: tuple[str, ...]
+
+
+@dataclass
+class Sink:
+    """Output of the stages: tables, times, progress, counters and notes."""
+
+    tables: Tables
+    watch: Stopwatch
+    progress: Callable[[str, int], None]  #: stage, ticks done
+    counts: Counter[str] = field(default_factory=Counter)
+    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> what is odd
+
+
+def told_of_fusion(log: Log, sink: Sink) -> Told:
+    """Findings of the latest pass over a log's frames and of stage 1, in files, frames and person."""
+    return Told(log.defects - log.joint_defects + sink.counts, (*log.notes, *sink.notes["fuse"]))
+
+
+def told_of_plan(log: Log, sink: Sink) -> Told:
+    """Findings of the latest reading of a log's joints and of stage 3."""
+    return Told(log.joint_defects, tuple(sink.notes["plan"]))
+
+
+def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
+    """(n,) tick times: from the first instant on, at the filter's rate, none after the last [ns].
+
+    Raises:
+        LogError: So long a span is no session, but a message with an arrival that cannot be.
+    """
+    if end_ns - start_ns > LONGEST_S * NS:
+        raise LogError(
+            f"arrivals: the log goes on for {(end_ns - start_ns) / (3600 * NS):.0f} h from its first message to its "
+            f"last; would be right: at most {LONGEST_S // 3600} h, as a span with --start and --end"
+        )
+    count = int((end_ns - start_ns) * rate_hz / NS) + 1
+    ticks: Ints = start_ns + np.round(np.arange(count) * (NS / rate_hz)).astype(np.int64)
+    return ticks[ticks <= end_ns]
+
+
+def span_ticks(run_config: RunConfig, log: Log) -> Ints:
+    """(n,) ticks of a run [ns]."""
+    first, last = log.header.start_ns, log.header.end_ns
+    if first == last:
+        raise LogError(f"{run_config.log}: holds a single instant; would be right: two frames or more")
+    start_ns = first + round((run_config.start_s or 0.0) * NS)
+    end_ns = last if run_config.end_s is None else min(last, first + round(run_config.end_s * NS))
+    if not first <= start_ns < end_ns:
+        option = (
+            f"--start {run_config.start_s:g}" if run_config.start_s is not None else f"--end {run_config.end_s or 0:g}"
+        )
+        raise SettingsError(f"{option}: nothing of the log is left; it lasts {(last - first) / NS:.1f} s")
+    return tick_times(start_ns, end_ns, run_config.settings.fusion.rate_hz)
+
+
+def store_every(run_config: RunConfig) -> float:
+    """Number of ticks for one whose volumes are stored."""
+    store_hz = run_config.settings.occupancy.store_hz
+    return 1.0 if store_hz == "all" else max(1.0, run_config.settings.fusion.rate_hz / store_hz)
+
+
+def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterator[tuple[Ints, CameraFrames | None]]:
+    """Ticks by the batch, each with the frames that arrived up to its last tick and not before."""
+    waiting: list[CameraFrames] = []
+    arrived_ns = -1
+    for first in range(0, len(ticks_ns), size):
+        ticks = ticks_ns[first : first + size]
+        while arrived_ns <= ticks[-1] and (chunk := next(frames, None)) is not None:
+            waiting.append(chunk)
+            arrived_ns = int(chunk.arrival_ns[-1])
+        due = None
+        if waiting:
+            table = CameraFrames.join(waiting)
+            count = int(np.searchsorted(table.arrival_ns, ticks[-1], side="right"))
+            due = table.rows(slice(0, count)) if count else None
+            waiting = [table.rows(slice(count, None))] if count < len(table) else []
+        yield ticks, due
+
+
+def fused(
+    log: Log, ticks_ns: Ints, size: int, fusion_stage: FusionStage, sink: Sink, *, smooth: bool = False
+) -> Iterator[HumanStates]:
+    """Stage 1: camera frames to the fused person; writes measurements and state, and ``smooth`` where asked.
+
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks, increasing [ns].
+        size: Ticks of a batch.
+        fusion_stage: Cameras and settings of the stage.
+        sink: Where rows, counts and times go.
+        smooth: Whether to write the smoothed person at the end.
+
+    Raises:
+        LogError: At the end: what the log shows is certainly no person, or nobody was ever seen.
+    """
+    fuser = PersonFuser(fusion_stage, log.header.cameras, traced=smooth)
+    watched = fusion_stage.watched is not None
+    frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1, nobody=watched)
+    smoother = StretchSmoother(fusion_stage.filter)
+    checks = CameraChecks(log.header.cameras)
+    clocks = ClockCheck(log.header.cameras, fusion_stage.T_world_camera, int(ticks_ns[0]), int(ticks_ns[-1]))
+    ever = False
+    for ticks, seen in batches(frames, ticks_ns, size):
+        sightings = fuser.nothing
+        if seen is not None:
+            with sink.watch.stage("angles", len(ticks)):
+                sightings = fuser.measure(seen)
+            clocks.add(fusion_stage.on_one_clock(seen.rows(seen.body != NOBODY)))
+            measured = sightings.measured
+            sink.tables.table("measurements", measurement_columns(measured))
+            track = SkeletonTrack(measured.capture_ns, measured.points_m, measured.confidence)
+            checks.add(measured.camera, track)
+        with sink.watch.stage("fuse", len(ticks)):
+            states, events, trace = fuser.advance(ticks, sightings)
+        if smooth:
+            for part in smoother.add(states, trace):
+                sink.tables.table("smooth", state_columns(part))
+        sink.counts.update(sightings.counts)
+        sink.counts.update(events)
+        ever = ever or bool(states.valid.any()) or max(fuser.area.vacant_ns) >= 0
+        sink.tables.table("state", state_columns(states))
+        sink.progress("fuse", len(ticks))
+        yield states
+    log.check()
+    if not ever:
+        raise _nobody(log, sink.counts)
+    with sink.watch.stage("clocks", len(ticks_ns)):
+        sink.notes["fuse"].extend(clocks.remarks())
+    sink.notes["fuse"].extend(_late(log, sink.counts, fusion_stage.clock_offset_ns))
+    write_checks(checks, sink)
+    sink.notes["fuse"].extend(_about_area(log, fuser.area, sink.counts) if watched else ())
+    sink.notes["fuse"].extend(_about_others(sink.counts))
+    if smooth:
+        for part in smoother.finish():
+            sink.tables.table("smooth", state_columns(part))
+
+
+def _about_others(counts: Counter[str]) -> Iterator[str]:
+    """A note on bodies that are not the person."""
+    if others := counts["person_frames_beside_others"]:
+        yield (
+            f"{others} frames show at least one other body than the person: it counts for contact, but nothing is "
+            "predicted of it and the robot does not heed it"
+        )
+
+
+def _about_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -> Iterator[str]:
+    """Notes on a watched area: what was never known of it, and what contradicts it."""
+    if refuting := counts["watched_frames_refuting"]:
+        yield (
+            f"watched area: {refuting} frames show somebody further inside than anybody could have walked since all "
+            "cameras showed it without people: they do not see all of it, or people came faster; would be right: a "
+            "smaller area, or a larger watched.margin_m, in the cell file"
+        )
+    if max(seen.vacant_ns) >= 0:
+        return
+    silent = [camera for camera, newest_ns in zip(log.header.cameras, seen.newest_ns, strict=True) if newest_ns < 0]
+    if silent:
+        yield f"watched area: never known to be without people, as no frame came from {', '.join(silent)}"
+    else:
+        yield (
+            "watched area: never known to be without people beside the person: another body was in it all along, or "
+            "not all cameras showed it for watched.clear_s without a gap; trackers whose messages only name people, as "
+            "on tf, cannot show that nobody is there"
+        )
+
+
+def write_checks(checks: CameraChecks, sink: Sink) -> None:
+    """Writes how each camera's person stands and how far two cameras differ, and notes what is out of bounds."""
+    sink.notes["fuse"].extend(checks.remarks())
+    for name, rows in zip(("bodies", "agreement"), checks.figures(), strict=True):
+        if rows:
+            sink.tables.table(name, record_columns(rows))
+
+
+class StretchSmoother:
+    """Smooths a run stretch by stretch: each tick given all measurements of its stretch and some of what came later.
+
+    A stretch knows 500 ticks of the next one, and what comes later tells no more. The result does not depend on the
+    batches in which the ticks come; a trace takes 1.5 kB a tick, so it holds two stretches at most.
+    """
+
+    TICKS, LATER = 15_000, 500
+
+    def __init__(self, settings: Fusion) -> None:
+        self._settings = settings
+        self._parts: list[tuple[HumanStates, fuse.Trace]] = []
+        self._count = 0
+
+    def add(self, states: HumanStates, trace: fuse.Trace) -> list[HumanStates]:
+        """Takes the next ticks; returns the stretches that are complete with them, smoothed."""
+        self._parts.append((states, trace))
+        self._count += len(states)
+        found = []
+        while self._count >= self.TICKS + self.LATER:
+            found.append(self._smooth(self.TICKS))
+        return found
+
+    def finish(self) -> list[HumanStates]:
+        """The smoothed ticks that are left."""
+        found = []
+        while self._count:
+            found.append(self._smooth(min(self._count, self.TICKS)))
+        return found
+
+    def _smooth(self, count: int) -> HumanStates:
+        """The next so many ticks, smoothed, and no longer held."""
+        states = HumanStates.join([part for part, _ in self._parts])
+        trace = fuse.Trace.join([part for _, part in self._parts])
+        known = slice(0, count + self.LATER)
+        smoothed = fuse.smooth(states.rows(known), trace.rows(known), self._settings).rows(slice(0, count))
+        self._parts = [(states.rows(slice(count, None)), trace.rows(slice(count, None)))]
+        self._count -= count
+        return smoothed
+
+
+def _nobody(log: Log, found: Counter[str]) -> LogError:
+    """Error for a log in which nobody was ever seen: what there was, and what would be right."""
+    rows = sum(log.defects[f"frames_{camera}"] for camera in log.header.cameras)
+    text = (
+        f"{log.header.path}: nobody was ever seen: {rows} bodies in the frames of {', '.join(log.header.cameras)} hold "
+        f"{log.points_seen} points with a place and a confidence"
+    )
+    why = [f"{name} {count}" for name, count in sorted((log.defects + found).items()) if name.startswith(_LOST)]
+    text += f" ({', '.join(why)})" if why else ""
+    if any(found[f"frames_late_{camera}"] for camera in log.header.cameras):
+        return LogError(
+            f"{text}: by their stamps the frames came more than fusion.fresh_s after their capture; would be right: "
+            "the clocks of cameras and recorder set, or what is wrong with them as clock_offset_s in the cell file"
+        )
+    return LogError(
+        f"{text}; would be right: a person's pelvis, shoulders and arms, confidence at least fusion.confidence_min. "
+        "Look at it with hrcreplay info"
+    )
+
+
+def _late(log: Log, counts: Counter[str], offsets_ns: Ints) -> Iterator[str]:
+    """Notes on frames that came too late."""
+    for camera, offset_ns in zip(log.header.cameras, offsets_ns.tolist(), strict=True):
+        late = counts[f"frames_late_{camera}"]
+        if late:
+            yield (
+                f"camera {camera}: {late} of {log.defects[f'frames_{camera}']} rows came more than fusion.fresh_s "
+                f"after their capture and are not used; {delay_text(log.clocks[camera], offset_ns / 1e9)}"
+            )
+
+
+def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
+    """Writes the closed-form joints of the log's ground truth, where it has one.
+
+    Args:
+        log: Log to read.
+        start_ns: First instant to write [ns].
+        end_ns: Last instant to write [ns].
+        sink: Where the rows go.
+    """
+    for truth in log.truth():
+        within = truth.rows((truth.t_ns >= start_ns) & (truth.t_ns <= end_ns))
+        if len(within):
+            sink.tables.table("truth", truth_columns(within.t_ns, *inverse_kinematics.inverse(within.points_m)))
+
+
+def stored_ticks(first: int, count: int, store_every: float) -> Ints:
+    """Select those of ``count`` ticks from the ``first`` on whose volumes are stored: one in ``store_every``."""
+    if math.isinf(store_every):
+        return np.zeros(0, np.int64)
+    number = np.arange(first, first + count)
+    return np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
+
+
+def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, tables: Tables) -> None:
+    """Writes hull vertices and size above the floor of some ticks' volumes; a tick without a person has none.
+
+    Args:
+        volumes: Of any ticks.
+        ticks: Rows of ``volumes`` to write.
+        horizon_s: (n,) how long after its tick each row holds [s].
+        tables: Where they go.
+    """
+    t_ns: list[int] = []
+    limbs: list[str] = []
+    radii: list[float] = []
+    sizes: list[float] = []
+    hulls: list[Floats] = []
+    horizons: list[float] = []
+    for tick in ticks.tolist():
+        for i, limb in enumerate(volumes.limbs):
+            vertices = volumes.vertices(tick, i)
+            if np.isnan(vertices).any():
+                continue
+            solid = InflatedHull.around(vertices, float(volumes.radius_m[tick, i]))
+            t_ns.append(int(volumes.t_ns[tick]))
+            limbs.append(limb)
+            radii.append(solid.radius_m)
+            sizes.append(solid.volume_above_m3(FLOOR_Z_M))
+            hulls.append(solid.vertices_m)
+            horizons.append(float(horizon_s[tick]))
+    if t_ns:
+        tables.table(
+            "occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls, horizons)
+        )
+
+
+def predicted(
+    states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink
+) -> Iterator[HumanStates]:
+    """Stage 2 alone: writes the volumes that hold for the braking time T_s, of one tick in ``store_every``.
+
+    Args:
+        states: Batches of the fused person.
+        prediction_stage: Settings of the stage.
+        store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole.
+        sink: Where rows and times go.
+    """
+    done = 0
+    for batch in states:
+        stored = stored_ticks(done, len(batch), store_every)
+        with sink.watch.stage("predict", len(batch)):
+            volumes = prediction_stage.volumes(batch)
+        with sink.watch.stage("hulls", len(stored)):
+            store_volumes(volumes, stored, np.full(len(batch), prediction_stage.horizon_s), sink.tables)
+        done += len(batch)
+        sink.progress("predict", len(batch))
+        yield batch
+
+
+def planned(
+    states: Iterable[HumanStates],
+    surroundings: Surroundings,
+    planners: dict[str, Planner],
+    store_every: float,
+    sink: Sink,
+) -> Iterator[None]:
+    """Stages 2 and 3: what the robot would have done by each method; each asks for the volumes that it needs.
+
+    Writes a motion for each, and the volumes of the chosen method, of one tick in ``store_every``.
+
+    Args:
+        states: Batches of the fused person.
+        surroundings: What is predicted around the robot.
+        planners: Method -> its robot; the chosen one is first.
+        store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole; inf: none are.
+        sink: Where rows and times go.
+    """
+    done = 0
+    for batch in states:
+        forecast = Forecast(surroundings, batch)
+        with sink.watch.stage("predict", len(batch)):
+            around = [forecast.predict(tick) for tick in range(len(batch))]
+        for name, planner in planners.items():
+            with sink.watch.stage(f"plan {name}", len(batch)):
+                motion = planner.follow(batch.t_ns, around, surroundings.names)
+            sink.tables.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
+            if planner.chosen:
+                stored = stored_ticks(done, len(batch), store_every)
+                with sink.watch.stage("hulls", len(stored)):
+                    for tick in stored.tolist():
+                        row = slice(tick, tick + 1)
+                        volumes = surroundings.prediction.volumes(batch.rows(row), float(motion.horizon_s[tick]))
+                        store_volumes(volumes, np.zeros(1, np.int64), motion.horizon_s[row], sink.tables)
+        done += len(batch)
+        sink.progress("plan", len(batch))
+        yield
+
+
+def print_note(text: str) -> None:
+    """Prints a line for the user on standard error, where it does not mix with the result."""
+    sys.stderr.write(f"hrcreplay: {text}\n")
+
+
+class ProgressBar:
+    """A progress bar over the ticks of a run's last stage; shown on a terminal only."""
+
+    def __init__(self, stage: str, ticks: int) -> None:
+        self._stage = stage
+        console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
+        self._bar = Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal)
+        self._task: TaskID = self._bar.add_task(stage, total=ticks)
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def advance(self, stage: str, ticks: int) -> None:
+        """Adds ticks that a stage has done."""
+        if stage == self._stage:
+            self._bar.advance(self._task, ticks)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()

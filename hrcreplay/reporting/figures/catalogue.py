@@ -1,0 +1,363 @@
+"""The figures of a run: one table of what there is and what each needs, and the drawing of what the data allow."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from hrcreplay.reporting.figures import drawing, fusion, planning, prediction, scene
+from hrcreplay.reporting.figures.planning import SHORTEST_M, Deviation
+from hrcreplay.reporting.figures.prediction import Growth, Instant, Sweep, Walk
+from hrcreplay.reporting.figures.scene import LinkPose, Storyboard
+from hrcreplay.reporting.metrics.fusion import cameras
+from hrcreplay.reporting.metrics.series import Metric, instants, known_ticks_ns, moment_ns, start_ns
+from hrcreplay.settings.sections import Logs
+from hrcreplay.store.run_folder import Run
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class FigureData:
+    """Input of figures: the run's tables and metrics, and the prediction at some instants."""
+
+    run: Run
+    metrics: Mapping[str, Metric]
+    near_m: float  #: the stationary share counts ticks with a separation of at most this
+    stationary_m_per_s: float  #: a TCP slower than this stands
+    gap_s: float = Logs().gap_s  #: a camera silent for longer has a gap
+    instants: Sequence[Instant] = ()  #: the swept volumes by several methods at the ticks that ``instants`` names
+    walk: Walk | None = None
+    sweep: Sweep | None = None
+    growth: Growth | None = None
+    story: Storyboard | None = None
+    pose: LinkPose | None = None  #: the robot at the tick that ``nearest_tick`` names
+
+    @property
+    def t0_ns(self) -> int:
+        """Instant of time zero [ns]."""
+        return start_ns(self.run)
+
+    @property
+    def motion(self) -> pd.DataFrame:
+        """Rows of motion.parquet."""
+        return given(self.run.motion)
+
+    @property
+    def state(self) -> pd.DataFrame:
+        """Rows of state.parquet."""
+        return given(self.run.state)
+
+    @cached_property
+    def worst(self) -> Deviation:
+        """The largest deviation of the TCP from its programmed path."""
+        return planning.largest_deviation(self.motion)
+
+
+def given(value: _T | None) -> _T:
+    """A value that is there: a figure without what it needs is not drawn."""
+    if value is None:
+        raise ValueError("a figure is drawn without what it needs")
+    return value
+
+
+@dataclass(frozen=True)
+class FigureKind:
+    """A figure that a run may have."""
+
+    name: str  #: of its files
+    numbers: tuple[str, ...]  #: the paper's; none for our own
+    title: str
+    section: str  #: of the page
+    needs: tuple[str, ...]  #: of NEEDS
+    draw: Callable[[FigureData], Figure]
+    caption: str
+    predicted: str = ""  #: the field of FigureData that has to be computed for it
+
+
+#: What a run may lack: how to tell whether it is there, and what to say when it is not.
+NEEDS: dict[str, tuple[Callable[[Run, Mapping[str, Metric]], bool], str]] = {
+    "motion": (
+        lambda run, _: run.motion is not None and len(run.motion) > 1,
+        "it moved no robot; run plan or report on its log",
+    ),
+    "path": (
+        lambda _, metrics: metrics["plan_deviation_max_m"]["value"] is not None,
+        "the way of the TCP is not known",
+    ),
+    "deviation": (
+        lambda _, metrics: metrics["plan_deviation_max_m"]["value"] >= SHORTEST_M,
+        "its TCP never left the programmed path",
+    ),
+    "horizon": (
+        lambda run, _: run.motion is not None and "horizon_s" in run.motion,
+        "its motion.parquet has no horizon_s; make it anew from its log",
+    ),
+    "base": (lambda run, _: run.T_world_base is not None, "where the robot stands is not known"),
+    "joints": (
+        lambda run, _: run.motion is not None and "q1" in run.motion and bool(run.motion["q1"].notna().any()),
+        "the joint positions of the robot are not known",
+    ),
+    "alone": (
+        lambda run, _: "none" in run.baselines,
+        'no robot without regard to the person beside it; run it with "none" among plan.baselines',
+    ),
+    "person": (lambda run, _: len(known_ticks_ns(run)) > 0, "nobody was seen in it"),
+    "seconds": (lambda run, _: len(instants(run)) > 0, "the person is not known for three seconds"),
+    "occupancy": (
+        lambda run, _: run.occupancy is not None and len(run.occupancy) > 0,
+        "it has no swept volumes; run predict, plan or report on its log",
+    ),
+    "measurements": (
+        lambda run, _: run.measurements is not None and len(run.measurements) > 0,
+        "no camera saw a person",
+    ),
+    "ticks": (lambda run, _: run.state is not None and len(run.state) > 1, "no person was fused"),
+    "truth": (
+        lambda _, metrics: metrics["fusion_angle_rmse"]["value"] is not None,
+        "its log has no ground truth",
+    ),
+}
+
+FIGURES = (
+    FigureKind(
+        "fig05_walking",
+        ("5",),
+        "what of the floor a person can reach, at the fastest step",
+        "prediction",
+        ("person",),
+        lambda data: prediction.walking(given(data.walk), data.t0_ns),
+        "As the paper's Fig. 5, at the instant of the fastest walking. Dashed: the circular sectors that a unicycle "
+        "reaches within the stopping time, as the paper has them. Orange: their convex approximation, Eq. (22)-(30), "
+        "corrected. Blue: every walk under the joints' bounds, of every likely state. Red: where the person walked.",
+        "walk",
+    ),
+    FigureKind(
+        "fig07_sweeps",
+        ("7", "8"),
+        "a forearm swept by walking (7) and by the elbow (8)",
+        "prediction",
+        ("person",),
+        lambda data: prediction.sweeps(given(data.sweep), data.t0_ns),
+        "As the paper's Fig. 7 and 8, on the forearm of this run's person. On the right the elbow turns it through all "
+        "angles that the paper's method says it can reach: arcs in triangles, and their hull. On the left that set is "
+        "displaced to all places that walking can reach, seen from above.",
+        "sweep",
+    ),
+    FigureKind(
+        "fig09_volumes",
+        ("9",),
+        "swept volumes as the run used them",
+        "prediction",
+        ("occupancy", "person"),
+        lambda data: prediction.volumes_at(
+            given(data.run.occupancy), data.state, given(moment_ns(data.run)), data.t0_ns
+        ),
+        "As the paper's Fig. 9. The swept volumes that this run used, limb radii included, with the fused skeleton.",
+    ),
+    FigureKind(
+        "fig13a_path",
+        ("13a",),
+        "programmed and actual path of the TCP",
+        "cost",
+        ("motion", "path"),
+        lambda data: planning.path(data.motion, data.run.occupancy, data.t0_ns, data.run.T_world_base, data.worst),
+        "As the paper's Fig. 13(a). Programmed and actual path of the TCP. The two dots are the ends of the largest "
+        "deviation; shaded: the swept volumes of the person at that tick.",
+    ),
+    FigureKind(
+        "fig13b_deviation",
+        ("13b",),
+        "largest deviation from the programmed path",
+        "cost",
+        ("motion", "path", "deviation"),
+        lambda data: planning.deviation(data.motion, data.run.occupancy, data.t0_ns, data.worst),
+        "As the paper's Fig. 13(b). The largest deviation from the programmed path with its length, in the vertical "
+        "plane that holds it. The paper's own deviation is 0.221 m.",
+    ),
+    FigureKind(
+        "fig14_speed",
+        ("14",),
+        "programmed speed, actual speed, separation",
+        "safety",
+        ("motion",),
+        lambda data: planning.speed(data.motion, data.t0_ns, data.near_m),
+        "As the paper's Fig. 14. Programmed speed of the TCP; its actual speed, braking shaded; and the smallest "
+        "distance, surface to surface, between the robot and what the person could reach within the tick's horizon.",
+    ),
+    FigureKind(
+        "fig15_storyboard",
+        ("15", "16"),
+        "the same stretch of the programme without the person (15) and with (16)",
+        "cost",
+        ("motion", "joints", "base", "alone", "occupancy", "person"),
+        lambda data: scene.storyboard(given(data.story), data.t0_ns),
+        "As the paper's Fig. 15 and 16. Each row is the same instant of the programme: on the left as the robot passes "
+        "it with nobody to mind (the baseline none), on the right beside the person, when it got there.",
+        "story",
+    ),
+    FigureKind(
+        "fig17_volumes",
+        ("17",),
+        "swept volumes at four instants, by method",
+        "prediction",
+        ("seconds",),
+        lambda data: prediction.volumes(data.instants, data.state, data.t0_ns),
+        "As the paper's Fig. 17. What the person could reach within the stopping time at four instants, limb radii "
+        "included: from positions and velocities (paper); by the older method, from positions alone; and as this run "
+        "did it, where that is neither.",
+        "instants",
+    ),
+    FigureKind(
+        "fig18_coordinate",
+        ("18",),
+        "one coordinate of the person as measured and as fused",
+        "fusion",
+        ("measurements",),
+        lambda data: fusion.coordinate(data.run, data.t0_ns, data.gap_s),
+        "As the paper's Fig. 18. One coordinate of the person as each camera saw it and as fused, and where the log "
+        "has ground truth, the errors.",
+    ),
+    FigureKind(
+        "horizon",
+        (),
+        "horizon and stop time over time",
+        "safety",
+        ("motion", "horizon"),
+        lambda data: planning.horizon(data.motion, data.t0_ns, _stop_s(data.run)),
+        "Until when the swept volumes hold by which each tick was decided, and how long the stop takes that the robot "
+        "would make from there; T\u209b is the stop from full speed. Braking is shaded.",
+    ),
+    FigureKind(
+        "volume_horizon",
+        (),
+        "swept volume against the horizon, by method",
+        "prediction",
+        ("person",),
+        lambda data: prediction.growth(given(data.growth), data.run.occupancy, data.t0_ns),
+        "How the swept volumes of the six limbs, added up, grow with the horizon: by each method at one instant "
+        "(lines), and as this run stored them at all others (dots).",
+        "growth",
+    ),
+    FigureKind(
+        "status",
+        (),
+        "what each method did over time",
+        "safety",
+        ("motion",),
+        lambda data: planning.status(
+            data.motion,
+            data.run.baselines,
+            method=str(data.metrics["plan_method"]["value"]),
+            t0_ns=data.t0_ns,
+            near_m=data.near_m,
+            slow_m_per_s=data.stationary_m_per_s,
+        ),
+        "What the robot did over time. Limited: held by a safety constraint or a limit. Above each bar, in grey, when "
+        "it was near the person; solid, when it then stood although its programme moves. Where stretches are narrower "
+        "than a line, the gravest status is drawn.",
+    ),
+    FigureKind(
+        "stationary_share",
+        (),
+        "share of the near ticks at which each method stood",
+        "cost",
+        ("motion",),
+        lambda data: planning.stationary_share(data.metrics),
+        "Share of the ticks near the person at which the robot stood still although its programme moves. The hatched "
+        "bars are the paper's own numbers, from its own data: they can be compared in kind only.",
+    ),
+    FigureKind(
+        "robot_links",
+        (),
+        "the robot's capsules where it was nearest to the person",
+        "robot",
+        ("motion", "joints", "base"),
+        lambda data: scene.links(given(data.pose), data.t0_ns, given(data.run.T_world_base)),
+        "The robot as its distances see it: a capsule around each collision shape of its links, at the tick of the "
+        "smallest separation, beside the swept volumes of the person. The square is the robot's base.",
+        "pose",
+    ),
+    FigureKind(
+        "fusion_error",
+        (),
+        "errors against ground truth, by joint",
+        "fusion",
+        ("truth",),
+        lambda data: fusion.fusion_error(data.metrics, cameras(data.run)),
+        "Root mean square error against ground truth, of each camera's raw angles and of the fused state.",
+    ),
+    FigureKind(
+        "joint_angles",
+        (),
+        "all joints of the person over time",
+        "fusion",
+        ("ticks",),
+        lambda data: fusion.joint_angles(data.run, data.t0_ns, data.gap_s),
+        "All joints of the human model: the cameras' raw values (dots) and the fused state (line).",
+    ),
+    FigureKind(
+        "data_quality",
+        (),
+        "when each camera saw the person",
+        "data",
+        ("measurements",),
+        lambda data: fusion.data_quality(data.run, data.t0_ns, data.gap_s),
+        "When each camera's frames held the person (pale), when the filter used them (solid), and when it had none.",
+    ),
+)
+
+
+def label(kind: FigureKind) -> str:
+    """Name that a user types for it: its number, or where the paper has none its name."""
+    return ", ".join(kind.numbers) or kind.name
+
+
+def find(key: str) -> tuple[FigureKind, ...]:
+    """The figures of a number or a name; ``13`` stands for 13a and 13b. Empty for one that there is not."""
+    wanted = re.sub(r"^fig\.?\s*", "", key.strip().lower())
+    found = [kind for kind in FIGURES if wanted in (*kind.numbers, kind.name) or key == kind.name]
+    return tuple(found or (kind for kind in FIGURES if wanted and wanted in [n.rstrip("ab") for n in kind.numbers]))
+
+
+def missing(kind: FigureKind, run: Run, metrics: Mapping[str, Metric]) -> str:
+    """Reason why a run lacks data for a figure; empty where it has them."""
+    return next((why for there, why in map(NEEDS.__getitem__, kind.needs) if not there(run, metrics)), "")
+
+
+def wanted(run: Run, metrics: Mapping[str, Metric]) -> tuple[FigureKind, ...]:
+    """The figures that a run has all for."""
+    return tuple(kind for kind in FIGURES if not missing(kind, run, metrics))
+
+
+def draw_all(data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None = None) -> tuple[str, ...]:
+    """Draws figures into ``folder`` as ``<name>.png`` and ``<name>.svg``.
+
+    Args:
+        data: What to draw from.
+        folder: Made if need be.
+        kinds: Which; None: all that the run has all for. One without what had to be computed for it is left out.
+
+    Returns:
+        The names drawn.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = []
+    for kind in wanted(data.run, data.metrics) if kinds is None else kinds:
+        if kind.predicted and not getattr(data, kind.predicted):
+            continue
+        with drawing.style(column=True):
+            drawing.save(kind.draw(data), folder, kind.name, drawing.COLUMN_DPI)
+        names.append(kind.name)
+    return tuple(names)
+
+
+def _stop_s(run: Run) -> float:
+    return float(run.meta["settings"]["occupancy"]["stop_s"])

@@ -1,0 +1,394 @@
+"""Figures of the robot: path (Fig. 13), speed (Fig. 14), horizon, status, stationary share, methods compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from hrcreplay.records import STATUSES, Bools, Floats
+from hrcreplay.reporting.figures import drawing
+from hrcreplay.reporting.figures.prediction import Limbs, stored_at
+from hrcreplay.reporting.figures.scene import ABOVE, View, bounds_of, draw_outlines, view_from
+from hrcreplay.reporting.metrics.planning import numeric_column, position_columns, stationary
+from hrcreplay.reporting.metrics.series import Metric, envelope, path_feet, seconds_from, thin_path, times, true_runs
+
+SIDE = view_from(-0.5 * np.pi, 0.0)
+#: The path this long before and after the largest deviation is drawn boldly [s].
+_PASS_S = 2.0
+#: A deviation below this is none [m].
+SHORTEST_M = 0.5e-3
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Largest deviation of the TCP from the programmed path."""
+
+    row: int  #: of motion.parquet
+    at_m: Floats  #: (3,) the TCP, world
+    foot_m: Floats  #: (3,) the nearest point of the programmed path, world
+
+    @property
+    def length_m(self) -> float:
+        """Its length."""
+        return float(np.linalg.norm(self.at_m - self.foot_m))
+
+
+def largest_deviation(motion: pd.DataFrame) -> Deviation:
+    """The largest distance between the TCP and the programmed path."""
+    reference, tcp = position_columns(motion, "ref"), position_columns(motion, "tcp")
+    feet = path_feet(tcp, reference)
+    far = np.linalg.norm(tcp - feet, axis=1)
+    row = int(np.argmax(np.where(np.isfinite(far), far, -1.0)))
+    return Deviation(row, tcp[row], feet[row])
+
+
+def path(
+    motion: pd.DataFrame,
+    occupancy: pd.DataFrame | None,
+    t0_ns: int,
+    T_world_base: Floats | None = None,
+    worst: Deviation | None = None,
+) -> Figure:
+    """Fig. 13a: programmed and actual TCP path from above and from the side; dots: the largest deviation.
+
+    The swept volumes are those stored last before that tick, in outline.
+
+    Args:
+        motion: Rows of motion.parquet.
+        occupancy: Rows of occupancy.parquet; None without stored volumes.
+        t0_ns: Instant of time zero [ns].
+        T_world_base: (4, 4) pose of the robot's base, drawn as a square; None: not drawn.
+        worst: The largest deviation, where it is known already.
+    """
+    worst = worst or largest_deviation(motion)
+    limbs = _limbs_at(occupancy, motion, worst)
+    figure = drawing.column_figure(2.45)
+    (above, side), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.62)
+    shown = np.vstack([position_columns(motion, "ref"), position_columns(motion, "tcp")])
+    if T_world_base is not None:
+        shown = np.vstack([shown, T_world_base[:3, 3]])
+    for ax, view in ((above, ABOVE), (side, SIDE)):
+        _draw_path(ax, view, motion, limbs, worst)
+        low, high = bounds_of([view.flat(shown)], 0.08)
+        drawing.set_window(ax, low.tolist(), high.tolist())
+        if T_world_base is not None:
+            ax.plot(*view.flat(T_world_base[None, :3, 3]).T, "s", color=drawing.INK, ms=4, zorder=3)
+    at = f", at {(int(times(motion)[worst.row]) - t0_ns) * 1e-9:.1f} s" if worst.length_m >= SHORTEST_M else ""
+    above.set(title=f"From above{at}", xlabel="x [m]", ylabel="y [m]")
+    side.set(title="From the side", xlabel="x [m]", ylabel="z [m]")
+    _path_legend(figure, with_limbs=bool(limbs), with_base=T_world_base is not None)
+    return figure
+
+
+def deviation(
+    motion: pd.DataFrame, occupancy: pd.DataFrame | None, t0_ns: int, worst: Deviation | None = None
+) -> Figure:
+    """Fig. 13b: the largest deviation, in the vertical plane that holds it, so that its length is not distorted.
+
+    Args:
+        motion: Rows of motion.parquet.
+        occupancy: Rows of occupancy.parquet; None without stored volumes.
+        t0_ns: Instant of time zero [ns].
+        worst: The largest deviation, where it is known already.
+    """
+    worst = worst or largest_deviation(motion)
+    limbs = _limbs_at(occupancy, motion, worst)
+    figure = drawing.column_figure(2.6)
+    ((ax,),) = drawing.column_panels(figure, bottom_in=0.62)
+    away = worst.at_m - worst.foot_m
+    view = view_from(float(np.arctan2(away[1], away[0]) - 0.5 * np.pi), 0.0)
+    ends = view.flat(np.vstack([worst.foot_m, worst.at_m]))
+    _draw_path(ax, view, motion, limbs, worst)
+    low, high = bounds_of([ends], 0.4 * worst.length_m + 0.06)
+    drawing.set_window(ax, low.tolist(), high.tolist())
+    at = f"At {(int(times(motion)[worst.row]) - t0_ns) * 1e-9:.1f} s"
+    ax.set(title=at, xlabel="in the vertical plane of the deviation [m]", ylabel="z [m]")
+    tcp = view.flat(position_columns(motion, "tcp"))
+    _label_length(
+        ax, ends, f"{worst.length_m:.3f} m", tcp[np.linalg.norm(tcp - ends.mean(axis=0), axis=1) < worst.length_m]
+    )
+    _path_legend(figure, with_limbs=bool(limbs), with_base=False)
+    return figure
+
+
+def _label_length(ax: Axes, ends: Floats, text: str, crowd: Floats) -> None:
+    """Writes beside the middle of a line, away from most of a crowd of points (n, 2)."""
+    along, middle = ends[1] - ends[0], ends.mean(axis=0)
+    beside = np.array([along[1], -along[0]]) / max(float(np.linalg.norm(along)), 1e-12)
+    if np.nanmean(np.sign((crowd - middle) @ beside)) > 0.0:
+        beside = -beside
+    ax.annotate(
+        text,
+        middle,
+        xytext=(5 * beside).tolist(),
+        textcoords="offset points",
+        ha="left" if beside[0] > 0.0 else "right",
+        va="center",
+        fontweight="bold",
+        zorder=8,
+    )
+
+
+def _path_legend(figure: Figure, *, with_limbs: bool, with_base: bool) -> None:
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=drawing.NOMINAL, lw=1.8, label="programmed"),
+        Line2D([], [], color=drawing.ACTUAL, lw=1.2, label="actual"),
+    ]
+    if with_base:
+        handles.append(Line2D([], [], ls="", marker="s", ms=4, color=drawing.INK, label="robot base"))
+    if with_limbs:
+        handles.append(Patch(color=drawing.FAINT, alpha=0.4, label="swept volumes"))
+    height = figure.get_figheight()
+    figure.legend(handles=handles, loc="lower center", bbox_to_anchor=(0.5, 0.04 / height), ncols=4)
+
+
+def _limbs_at(occupancy: pd.DataFrame | None, motion: pd.DataFrame, worst: Deviation) -> Limbs:
+    """The volumes stored last before the deviation; none before the first."""
+    t_ns = int(times(motion)[worst.row])
+    if occupancy is None or not (times(occupancy) <= t_ns).any():
+        return {}
+    return stored_at(occupancy, t_ns)[1]
+
+
+def _draw_path(ax: Axes, view: View, motion: pd.DataFrame, limbs: Limbs, worst: Deviation) -> None:
+    reference, tcp = position_columns(motion, "ref"), position_columns(motion, "tcp")
+    draw_outlines(ax, limbs, view)
+    seconds = seconds_from(times(motion), int(times(motion)[worst.row]))
+    then = np.abs(seconds) <= _PASS_S
+    ax.plot(*view.flat(thin_path(tcp, 0.004)).T, color=drawing.ACTUAL, lw=0.5, alpha=0.35, zorder=4)
+    ax.plot(*view.flat(thin_path(reference, 0.004)).T, color=drawing.NOMINAL, lw=1.8, zorder=5)
+    ax.plot(*view.flat(thin_path(tcp[then], 0.004)).T, color=drawing.ACTUAL, lw=1.0, zorder=6)
+    ends = view.flat(np.vstack([worst.foot_m, worst.at_m]))
+    ax.plot(*ends.T, color=drawing.INK, lw=0.9, ls=(0, (2, 1)), zorder=7)
+    ax.plot(*ends[0], "o", color=drawing.NOMINAL, ms=3.5, zorder=7)
+    ax.plot(*ends[1], "o", color=drawing.ACTUAL, ms=3.5, zorder=7)
+
+
+def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
+    """Fig. 14: programmed speed; actual speed with braking shaded; separation from the swept volumes."""
+    seconds = seconds_from(times(motion), t0_ns)
+    figure = drawing.column_figure(3.3)
+    rows = drawing.column_panels(figure, 3, share_x=True)
+    nominal, actual, separation = (row[0] for row in rows)
+    nominal.plot(*envelope(seconds, numeric_column(motion, "ref_speed"), 500), color=drawing.NOMINAL, lw=0.7)
+    nominal.set(title="Programmed TCP speed", ylabel="speed [m/s]")
+    actual.plot(*envelope(seconds, numeric_column(motion, "tcp_speed"), 500), color=drawing.ACTUAL, lw=0.7)
+    actual.set(title="Actual TCP speed", ylabel="speed [m/s]")
+    separation.plot(*envelope(seconds, numeric_column(motion, "distance_m"), 500), color=drawing.PURPLE)
+    separation.axhline(near_m, color=drawing.INK, lw=0.7, ls=(0, (4, 3)))
+    separation.set(title="Separation", ylabel="distance [m]", xlabel="time [s]", ylim=(0, None))
+    high = max(_top(motion, "ref_speed"), _top(motion, "tcp_speed")) * 1.08
+    nominal.set_ylim(0, high)
+    actual.set_ylim(0, high)
+    for ax in (actual, separation):
+        _shade(ax, seconds, motion, "braking")
+    separation.set_xlim(seconds[0], seconds[-1])
+    figure.align_ylabels()
+    drawing.legend_above(actual, handles=[_BRAKING])
+    near = Line2D([], [], color=drawing.INK, lw=0.7, ls=(0, (4, 3)), label=f"near: {near_m:g} m")
+    drawing.legend_above(separation, handles=[near])
+    return figure
+
+
+def horizon(motion: pd.DataFrame, t0_ns: int, stop_s: float) -> Figure:
+    """Horizon of the volumes used at each tick, and duration of the stop from its velocity.
+
+    Args:
+        motion: Rows of motion.parquet.
+        t0_ns: Instant of time zero [ns].
+        stop_s: Worst-case braking time T_s [s].
+    """
+    seconds = seconds_from(times(motion), t0_ns)
+    figure = drawing.column_figure(1.9)
+    ((ax,),) = drawing.column_panels(figure, top_in=0.26)
+    ax.plot(*envelope(seconds, numeric_column(motion, "horizon_s"), 500), color=drawing.BLUE, label="horizon")
+    ax.plot(*envelope(seconds, numeric_column(motion, "tau_s"), 500), color=drawing.ORANGE, lw=0.7, label="stop time")
+    ax.axhline(stop_s, color=drawing.INK, lw=0.7, ls=(0, (4, 3)), label="T\u209b")
+    _shade(ax, seconds, motion, "braking")
+    ax.set(xlim=(seconds[0], seconds[-1]), xlabel="time [s]", ylabel="from the tick on [s]")
+    ax.set_ylim(0, 1.08 * max(stop_s, _top(motion, "horizon_s"), _top(motion, "tau_s")))
+    drawing.legend_above(ax, handles=[*ax.get_lines(), _BRAKING])
+    return figure
+
+
+#: Of the shading that ``_shade`` makes.
+_BRAKING = Patch(color=drawing.STATUS["braking"], alpha=0.25, lw=0, label="braking")
+
+
+def _top(motion: pd.DataFrame, name: str) -> float:
+    values = numeric_column(motion, name)
+    values = values[np.isfinite(values)]
+    return max(float(values.max()), 1e-3) if len(values) else 1.0
+
+
+def _shade(ax: Axes, seconds: Floats, motion: pd.DataFrame, status: str) -> None:
+    bars = _bars(seconds, (motion["status"] == status).to_numpy(dtype=bool))
+    ax.broken_barh(
+        bars, (0, 1), transform=ax.get_xaxis_transform(), facecolors=drawing.STATUS[status], alpha=0.2, lw=0, zorder=0
+    )
+
+
+def _bars(seconds: Floats, mask: Bools) -> list[tuple[float, float]]:
+    """Stretches as (start, width) [s]; neighbours closer than a line's width on paper are one bar."""
+    bars: list[tuple[float, float]] = []
+    resolution = (seconds[-1] - seconds[0]) / 1000.0 if len(seconds) else 0.0
+    for first, last in true_runs(mask):
+        start, end = float(seconds[first]), float(seconds[min(last, len(seconds) - 1)])
+        if bars and start - sum(bars[-1]) < resolution:
+            bars[-1] = (bars[-1][0], end - bars[-1][0])
+        else:
+            bars.append((start, end - start))
+    return bars
+
+
+def status(
+    motion: pd.DataFrame,
+    baselines: Mapping[str, pd.DataFrame],
+    *,
+    method: str,
+    t0_ns: int,
+    near_m: float,
+    slow_m_per_s: float,
+) -> Figure:
+    """Status of the plan and each baseline over time, and when each stood near the person though it should move.
+
+    Args:
+        motion: Rows of motion.parquet.
+        baselines: Name of each baseline -> rows of its motion.
+        method: Method of the plan.
+        t0_ns: Instant of time zero [ns].
+        near_m: The person is near at a separation of at most this [m].
+        slow_m_per_s: The robot stands where its TCP is slower than this [m/s].
+    """
+    tables = {f"plan: {method}": motion, **baselines}
+    figure = drawing.column_figure(0.8 + 0.32 * len(tables))
+    ((ax,),) = drawing.column_panels(figure, left_in=0.66, top_in=0.4)
+    for row, table in enumerate(tables.values()):
+        seconds = seconds_from(times(table), t0_ns)
+        kind = table["status"].to_numpy()
+        for value in STATUSES:  # the gravest is drawn last and stays visible
+            bars = _bars(seconds, kind == value)
+            ax.broken_barh(bars, (row - 0.12, 0.44), facecolors=drawing.STATUS[value], lw=0)
+        near, stands = stationary(table, near_m, slow_m_per_s)
+        ax.broken_barh(_bars(seconds, near), (row - 0.36, 0.16), facecolors=drawing.FAINT, alpha=0.45, lw=0)
+        ax.broken_barh(_bars(seconds, near & stands), (row - 0.36, 0.16), facecolors=drawing.INK, lw=0)
+    seconds = seconds_from(times(motion), t0_ns)
+    ax.set(ylim=(len(tables) - 0.5, -0.55), xlim=(seconds[0], seconds[-1]), xlabel="time [s]")
+    ax.set_yticks(range(len(tables)), list(tables))
+    ax.tick_params(axis="y", length=0)
+    ax.grid(visible=False, axis="y")
+    handles = [Patch(color=drawing.STATUS[value], lw=0, label=value) for value in STATUSES]
+    handles += [
+        Patch(color=drawing.FAINT, alpha=0.45, lw=0, label=f"within {near_m:g} m"),
+        Patch(color=drawing.INK, lw=0, label="and standing"),
+    ]
+    drawing.legend_above(ax, columns=3, handles=handles)
+    return figure
+
+
+def stationary_share(metrics: Mapping[str, Metric]) -> Figure:
+    """Stationary share of the plan and its baselines on this log, with the paper's two figures beside them."""
+    method = metrics["plan_method"]["value"]
+    rows = [(f"this log: {method}", "plan", drawing.BLUE)]
+    rows += [
+        (f"this log: {name}", f"baseline_{name}", drawing.ORANGE)
+        for name in sorted(n.split("_")[1] for n in metrics if n.startswith("baseline_") and n.endswith("_near_ticks"))
+    ]
+    paper = [
+        ("the paper's: qp", "paper_stationary_share_qp"),
+        ("the paper's: scaling", "paper_stationary_share_scaling"),
+    ]
+    count = len(rows) + len(paper)
+    figure = drawing.column_figure(0.45 + 0.2 * count)
+    ((ax,),) = drawing.column_panels(figure, left_in=1.0, top_in=0.06, right_in=0.95)
+    for y, (_, prefix, colour) in enumerate(rows):
+        share = metrics[f"{prefix}_stationary_share"]["value"]
+        ticks = metrics[f"{prefix}_near_ticks"]["value"]
+        text = "never that near" if share is None else f"{100 * share:.2f} % of {ticks} ticks"
+        ax.barh(y, 100 * (share or 0.0), height=0.62, color=colour)
+        ax.annotate(
+            text, (100 * (share or 0.0), y), xytext=(3, 0), textcoords="offset points", va="center", fontsize=6.5
+        )
+    for y, (_, name) in enumerate(paper, start=len(rows)):
+        value = 100 * metrics[name]["value"]
+        ax.barh(y, value, height=0.62, facecolor="none", edgecolor=drawing.FAINT, hatch="////", lw=0.8)
+        words = f"{value:.2f} %, other data"
+        ax.annotate(words, (value, y), xytext=(3, 0), textcoords="offset points", va="center", fontsize=6.5)
+    ax.set(xlim=(0, 100), ylim=(count - 0.45, -0.55), xlabel="standing, of the near ticks [%]")
+    ax.set_yticks(range(count), [row[0] for row in rows] + [row[0] for row in paper])
+    ax.tick_params(axis="y", length=0)
+    ax.grid(visible=False, axis="y")
+    return figure
+
+
+#: Method -> colour, and (occupancy, horizon) -> marker.
+_COLOURS = {
+    "qp": drawing.BLUE,
+    "scaling": drawing.ORANGE,
+    "shield": drawing.GREEN,
+    "ssm": drawing.PURPLE,
+    "none": drawing.VERMILLION,
+}
+_MARKERS = {"sound": "o", "paper": "s", "positions": "D"}
+
+
+def methods(found: Mapping[str, Any]) -> Figure:
+    """Safety against productivity: the smallest distance while moving over the pace kept, a point a method.
+
+    Args:
+        found: The content of compare.json.
+    """
+    figure = drawing.new_figure(3.7)
+    ((ax,),) = drawing.panels(figure, 1, bottom_in=0.5, top_in=0.3, right_in=2.7)
+    several = len(found["logs"]) > 1
+    for label, row in found["total"].items():
+        of, alone = found["methods"][label], log_rows(found, label) if several else []
+        colour, marker = _COLOURS[of["method"]], _MARKERS.get(of.get("occupancy", ""), "X")
+        for other in alone:
+            ax.plot(*_place(other), ".", ms=5, color=colour, alpha=0.45)
+        words = label.replace(":", ", ") + (f": {row['stillness']}" if row["stillness"] else "")
+        if row["pace"] is None or row["nearest_moving_m"] is None:
+            if row["stillness"]:  # it has no place, but is not left out
+                ax.plot([], [], "x", ms=8, color=colour, label=words)
+            continue
+        if row["touch_ticks"]:
+            words += f": {row['touch_ticks']:,} ticks in contact,\nup to {row['touch_speed_m_per_s']:.2f} m/s"
+        face = "white" if of.get("horizon") == "fixed" else colour
+        ax.plot(
+            *_place(row), marker, ms=8, mfc=face, mec=colour, mew=1.6, alpha=0.9, zorder=3, label=words, clip_on=False
+        )
+    ax.set_yscale("symlog", linthresh=20.0, linscale=1.5)
+    ticks = [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200, 500]
+    low, high = min(ax.get_ylim()[0], -12.0), max(ax.get_ylim()[1], 25.0)
+    ax.set_yticks([tick for tick in ticks if low <= tick <= high])
+    ax.yaxis.set_major_formatter("{x:.0f}")
+    ax.minorticks_off()
+    ax.set_ylim(low, high)
+    ax.set_xlim(0.0, 103.0)
+    ax.axhspan(low, 0.0, color=drawing.VERMILLION, alpha=0.08, lw=0)
+    ax.text(1.5, 0.97 * low, "in contact while moving", va="bottom", ha="left", color=drawing.VERMILLION, fontsize=8.0)
+    ax.legend(loc="upper left", bbox_to_anchor=(1.03, 1.0), labelspacing=0.9)
+    ax.set_xlabel("pace kept, of the programmed [%]")
+    ax.set_ylabel("nearest to the person while moving [cm]")
+    what = f"; {len(found['logs'])} logs, small dots: each" if several else ""
+    ax.set_title(f"Safety and pace by method (hollow: fixed horizon{what})")
+    return figure
+
+
+def log_rows(found: Mapping[str, Any], label: str) -> list[Mapping[str, Any]]:
+    """The figures of a method on each log that can be placed."""
+    rows = [log["methods"][label] for log in found["logs"]]
+    return [row for row in rows if row["pace"] is not None and row["nearest_moving_m"] is not None]
+
+
+def _place(row: Mapping[str, Any]) -> tuple[float, float]:
+    """Pace [%] and smallest distance [cm]."""
+    return 100.0 * row["pace"], 100.0 * row["nearest_moving_m"]

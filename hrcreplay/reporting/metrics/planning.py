@@ -1,0 +1,426 @@
+"""Metrics of the robot's motion: separation, stops, path deviation, and progress along the programme.
+
+The reference may be ahead of the robot (by the leash, or without bound where it does not wait), so its time does not
+say how far the robot came. Progress is measured at the foot point of the TCP on the programmed path: the nearest point
+of the next section of the path, which never moves back and never passes the reference. The programmed time at the foot
+point is the time that the robot reached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from hrcreplay.records import STATUSES, Bools, Floats, Ints
+from hrcreplay.reporting.metrics.series import MetricTable, durations_s, path_feet, times
+
+#: Less way than this is rounding [m].
+_ROUNDING_M = 1e-9
+#: Where the programme stands, a TCP this near is there, and its standing counts [m].
+_THERE_M = 1e-3
+#: The foot is sought anew when the TCP has gone so far: a robot that waits costs no time [m].
+_STEP_M = 1e-3
+
+
+@dataclass(frozen=True)
+class Programme:
+    """The programmed path as far as the reference went, without the points at which it stood."""
+
+    points_m: Floats  #: (m, 3) world [m]
+    way_m: Floats  #: (m,) along the path from its first point [m]
+    from_s: Floats  #: (m,) programmed time of the arrival at a point [s]
+    until_s: Floats  #: (m,) and of the departure; later where the programme stands there [s]
+    at: Ints  #: (n,) the reference's point at each tick
+
+
+def programme(ref_m: Floats, programme_s: Floats) -> Programme:
+    """The path that references (n, 3) [m] of programmed times (n,) [s] went along; at least one row, all finite."""
+    steps = np.linalg.norm(np.diff(ref_m, axis=0), axis=1)
+    moved = np.concatenate([[True], steps > _ROUNDING_M])
+    first = np.flatnonzero(moved)
+    last = np.append(first[1:], len(ref_m)) - 1
+    points = ref_m[first]
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return Programme(points, way, programme_s[first], programme_s[last], np.cumsum(moved) - 1)
+
+
+def foot(path: Programme, tcp_m: Floats, ahead_m: float) -> tuple[int, float]:
+    """Final position of a TCP along the path.
+
+    Args:
+        path: The programmed path.
+        tcp_m: (n, 3) the TCP at the ticks of ``path.at`` [m].
+        ahead_m: The foot is sought on the next so much of the way, so that it does not pass over a part of the
+            programme that was left out to where the path comes by again [m].
+
+    Returns:
+        The point of the path that was passed last, and the share of the way to the next one.
+    """
+    passed, share, before = 0, 0.0, tcp_m[0].tolist()
+    for tick, (here, reference) in enumerate(zip(tcp_m.tolist(), path.at.tolist(), strict=True), start=1):
+        waits = tick < len(tcp_m) and sum((a - b) ** 2 for a, b in zip(here, before, strict=True)) < _STEP_M**2
+        if waits or passed == reference:
+            continue
+        before, tcp = here, tcp_m[tick - 1]
+        here_m = path.way_m[passed] + share * (path.way_m[passed + 1] - path.way_m[passed])
+        end = min(reference, max(passed + 1, int(np.searchsorted(path.way_m, here_m + ahead_m))))
+        start = path.points_m[passed:end]
+        along = path.points_m[passed + 1 : end + 1] - start
+        part = np.clip(((tcp - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0.0, 1.0)
+        part[0] = max(part[0], share)
+        nearest = int(np.argmin(((start + part[:, None] * along - tcp) ** 2).sum(axis=1)))
+        passed, share = passed + nearest, float(part[nearest])
+        if share == 1.0:
+            passed, share = passed + 1, 0.0
+    return passed, share
+
+
+def reached_s(path: Programme, passed: int, share: float) -> float:
+    """Programmed time from the start to a foot [s]; exactly 0 for a robot that made no way."""
+    if passed + 1 == len(path.way_m):
+        made_m, time_s = path.way_m[passed], path.until_s[passed]
+    else:
+        made_m = path.way_m[passed] + share * (path.way_m[passed + 1] - path.way_m[passed])
+        time_s = path.until_s[passed] + share * (path.from_s[passed + 1] - path.until_s[passed])
+        near = np.flatnonzero((path.way_m >= made_m) & (path.way_m <= made_m + _THERE_M))
+        stands = near[path.until_s[near] > path.from_s[near]]
+        time_s = max(time_s, *path.until_s[stands], -np.inf)
+    return float(time_s - path.from_s[0]) if made_m > _ROUNDING_M else 0.0
+
+
+def programme_progress(motion: pd.DataFrame, ahead_m: float) -> tuple[float, float] | None:
+    """Programmed time that the robot reached, and the time that it had [s]; None where its programme only stands.
+
+    Args:
+        motion: A table of motion.
+        ahead_m: As for ``foot``: the leash [m].
+    """
+    names = ["programme_s", *(f"{what}_{axis}" for what in ("ref", "tcp") for axis in "xyz")]
+    rows = motion[names].to_numpy(dtype=float)
+    rows, t_ns = rows[np.isfinite(rows).all(axis=1)], times(motion)
+    if len(rows) < 2:
+        return None
+    given_s = float(t_ns[-1] - t_ns[0]) * 1e-9
+    path = programme(rows[:, 1:4], rows[:, 0])
+    waited_s = given_s - (rows[-1, 0] - rows[0, 0])
+    if len(path.way_m) == 1 and waited_s < 1e-6:
+        return None
+    return min(reached_s(path, *foot(path, rows[:, 4:], ahead_m)), given_s), given_s
+
+
+#: Figures that the paper prints for its own experiments; its logs were never published.
+PAPER = {
+    "paper_stationary_share_qp": (0.3006, "1", "stationary share that the paper prints for its QP, on its own data"),
+    "paper_stationary_share_scaling": (
+        0.8644,
+        "1",
+        "stationary share that the paper prints for kinematic scaling ([24]-[26]), on its own data",
+    ),
+    "paper_deviation_m": (0.221, "m", "deviation from the nominal path that the paper prints for its Fig. 13"),
+    "paper_fusion_rate_hz": (205.0, "Hz", "rate of fusion and swept volumes that the paper prints for its own PC"),
+}
+
+
+def position_columns(motion: pd.DataFrame, what: str) -> Floats:
+    """(n, 3) ``ref`` or ``tcp`` positions, world [m]."""
+    return motion[[f"{what}_x", f"{what}_y", f"{what}_z"]].to_numpy(dtype=float)
+
+
+def numeric_column(motion: pd.DataFrame, name: str) -> Floats:
+    """(n,) one column."""
+    return motion[name].to_numpy(dtype=float)
+
+
+def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -> tuple[Bools, Bools]:
+    """Mark the near ticks (separation at most ``near_m``), and all at which the robot stands though it should move.
+
+    It stands when the TCP is slower than ``stationary_m_per_s``. It should move when the reference is not, and when the
+    reference waits for the robot: at a waypoint it stands itself.
+    """
+    near = numeric_column(motion, "distance_m") <= near_m
+    stands = numeric_column(motion, "tcp_speed") < stationary_m_per_s
+    wanted = numeric_column(motion, "ref_speed") >= stationary_m_per_s
+    waits = waited_s(motion) > 0.5 * durations_s(times(motion))
+    return near, stands & (wanted | waits)
+
+
+def is_moving(motion: pd.DataFrame, slow_m_per_s: float) -> Bools:
+    """(n,) ticks at which the robot moves: its TCP, or any joint at 1 mrad/s, for a link can sweep past a still TCP."""
+    joints = [name for name in motion.columns if name.startswith("dq")]
+    turning = (np.abs(motion[joints].to_numpy(dtype=float)) >= 1e-3).any(axis=1)
+    return np.asarray((numeric_column(motion, "tcp_speed") >= slow_m_per_s) | turning)
+
+
+def deviation_m(motion: pd.DataFrame) -> Floats:
+    """(n,) distance of the TCP from the programmed path [m]."""
+    tcp = position_columns(motion, "tcp")
+    return np.asarray(np.linalg.norm(tcp - path_feet(tcp, position_columns(motion, "ref")), axis=1))
+
+
+def waited_s(motion: pd.DataFrame) -> Floats:
+    """(n,) how much of each tick the reference waited for the robot instead of going on [s]; 0 after the last tick."""
+    waited = durations_s(times(motion))
+    waited[:-1] -= np.diff(numeric_column(motion, "programme_s"))
+    waited[-1:] = 0.0  # what the reference does after the last tick is not known
+    return np.clip(waited, 0.0, None)
+
+
+def cycles(motion: pd.DataFrame, *, at_m: float = 0.002, away_m: float = 0.05) -> int:
+    """Number of returns of the reference to its first point (within ``at_m``) after being ``away_m`` from it."""
+    reference = position_columns(motion, "ref")
+    gap = np.linalg.norm(reference - reference[0], axis=1)
+    marks = np.where(gap >= away_m, 1, np.where(gap <= at_m, -1, 0))
+    marks = marks[marks != 0]
+    return int(((marks[1:] == -1) & (marks[:-1] == 1)).sum())
+
+
+def add_plan(
+    metrics: MetricTable,
+    motion: pd.DataFrame | None,
+    baselines: dict[str, pd.DataFrame],
+    *,
+    method: str,
+    near_m: float,
+    stationary_m_per_s: float,
+    leash_m: float,
+    contact: pd.DataFrame | None = None,
+) -> None:
+    """Everything about the motion, the baselines' likewise, and the paper's own figures beside them.
+
+    Args:
+        metrics: Table that the metrics are added to.
+        motion: Rows of motion.parquet; None where nothing was planned.
+        baselines: Name of each baseline -> rows of its motion.
+        method: Method of the plan.
+        near_m: The person is near at a separation of at most this [m].
+        stationary_m_per_s: The robot stands where its TCP is slower than this [m/s].
+        leash_m: How far the TCP may be from the reference before the reference waits [m].
+        contact: Rows of contact.parquet; None where the recorded body was not looked for.
+    """
+    if motion is None:
+        metrics.add("plan_method", None, "name", "method of the plan", reason="not planned")
+    else:
+        metrics.add("plan_method", method, "name", "method of the plan; baselines ran beside it on the same volumes")
+    tables = {} if motion is None else {"plan": motion, **{f"baseline_{name}": baselines[name] for name in baselines}}
+    for prefix, table in tables.items():
+        what = "the plan" if prefix == "plan" else f"the baseline '{prefix.removeprefix('baseline_')}'"
+        _add_status(metrics, prefix, table, what, stationary_m_per_s)
+        _add_separation(metrics, prefix, table, what, stationary_m_per_s)
+        _add_stationary(metrics, prefix, table, what, near_m, stationary_m_per_s)
+        _add_path(metrics, prefix, table, what)
+        _add_progress(metrics, prefix, table, what, leash_m)
+        by = method if prefix == "plan" else prefix.removeprefix("baseline_")
+        rows = None if contact is None else contact[contact["method"] == by]
+        _add_fastest(metrics, prefix, table, rows, what, near_m)
+    for name, (value, unit, meaning) in PAPER.items():
+        metrics.add(name, value, unit, meaning)
+
+
+def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
+    status = motion["status"].astype(str).to_numpy()
+    moving = is_moving(motion, slow)
+    braking = status == "braking"
+    metrics.add(f"{prefix}_ticks", len(motion), "1", f"ticks of {what}")
+    for name in STATUSES:
+        share = float((status == name).mean()) if len(status) else None
+        metrics.add(f"{prefix}_{name}_share", share, "1", f"share of all ticks of {what} with status '{name}'")
+    deep = numeric_column(motion, "overlap_m")[status == "retreating"] if "overlap_m" in motion else np.zeros(0)
+    metrics.add(
+        f"{prefix}_retreating_overlap_max_m",
+        float(np.nanmax(deep)) if np.isfinite(deep).any() else None,
+        "m",
+        f"how deep, at most, a link was inside a swept volume where a retreating step of {what} began: such a step is "
+        "certified to bring no point of the link nearer to any point of the volume, not to be clear of it",
+        reason="the table of motion does not say" if (status == "retreating").any() else "it never retreated",
+    )
+    reasons = motion["reason"].astype(str).to_numpy()
+    for reason in sorted(set(reasons[braking])):
+        count = int((reasons[braking] == reason).sum())
+        slug = "_".join("".join(c if c.isalnum() else " " for c in reason.lower()).split()) or "unnamed"
+        because = f"ticks of {what} that braked because: {reason}"
+        metrics.add(f"{prefix}_braking_ticks_{slug}", count, "1", because)
+        metrics.add(f"{prefix}_braking_share_{slug}", count / len(motion), "1", f"share of all {because}")
+    metrics.add(
+        f"{prefix}_moving_ticks",
+        int(moving.sum()),
+        "1",
+        f"ticks of {what} with the robot moving: its TCP at {slow:g} m/s or more, or a joint at 0.001 rad/s",
+    )
+    metrics.add(
+        f"{prefix}_braking_moving_ticks",
+        int((braking & moving).sum()),
+        "1",
+        f"ticks of {what} in braking with the robot still moving: inequality (2) may not hold there",
+    )
+    overlap = numeric_column(motion, "distance_m") <= 0.0
+    metrics.add(
+        f"{prefix}_contact_moving_ticks",
+        int((overlap & moving).sum()),
+        "1",
+        f"ticks of {what} with the robot moving while a link touched a swept volume",
+    )
+    closest = numeric_column(motion, "distance_m")[braking & moving]
+    closest = closest[np.isfinite(closest)]
+    metrics.add(
+        f"{prefix}_braking_moving_separation_min_m",
+        float(closest.min()) if len(closest) else None,
+        "m",
+        f"smallest separation from the swept volumes at such braking ticks of {what}",
+        reason="no braking tick with a moving robot and a known separation",
+    )
+
+
+def _add_separation(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
+    distance = numeric_column(motion, "distance_m")
+    known = np.isfinite(distance)
+    reason = "no tick has a separation"
+    k = int(np.argmin(np.where(known, distance, np.inf))) if known.any() else None
+    name = f"{prefix}_separation"
+    metrics.add(
+        f"{name}_min_m",
+        None if k is None else float(distance[k]),
+        "m",
+        f"smallest distance, surface to surface, between robot and swept volumes during {what}",
+        reason=reason,
+    )
+    at_s = None if k is None else float((times(motion)[k] - times(motion)[0]) * 1e-9)
+    metrics.add(f"{name}_min_at_s", at_s, "s", f"its first instant, from the first tick of {what}", reason=reason)
+    for part in ("limb", "link"):
+        found = None if k is None or pd.isna(motion[part].iloc[k]) else str(motion[part].iloc[k])
+        metrics.add(f"{name}_min_{part}", found, "name", f"the {part} of that pair", reason=reason)
+    moving = distance[known & is_moving(motion, slow)]
+    metrics.add(
+        f"{name}_min_moving_m",
+        float(moving.min()) if len(moving) else None,
+        "m",
+        f"smallest separation at ticks of {what} with the robot moving",
+        reason="the robot never moved at a known separation",
+    )
+    metrics.add(f"{name}_unknown_ticks", int((~known).sum()), "1", f"ticks of {what} without a separation")
+
+
+def _add_stationary(
+    metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, near_m: float, slow: float
+) -> None:
+    near, stands = stationary(motion, near_m, slow)
+    both = int((near & stands).sum())
+    metrics.add(f"{prefix}_near_ticks", int(near.sum()), "1", f"ticks of {what} with a separation <= {near_m:g} m")
+    metrics.add(
+        f"{prefix}_stationary_ticks",
+        both,
+        "1",
+        f"of those, ticks with the TCP below {slow:g} m/s, and a reference at or over it or waiting",
+    )
+    metrics.add(
+        f"{prefix}_stationary_share",
+        both / int(near.sum()) if near.any() else None,
+        "1",
+        f"stationary ticks / near ticks of {what}: ticks at which its programme stands, as in a dwell, do not count as "
+        f"standing; {prefix}_null_speed_share counts them; compare only runs on the same log",
+        reason=f"the separation never was <= {near_m:g} m",
+    )
+    null = int((near & (numeric_column(motion, "tcp_speed") < slow)).sum())
+    metrics.add(
+        f"{prefix}_null_speed_ticks",
+        null,
+        "1",
+        f"near ticks of {what} with the TCP below {slow:g} m/s, whatever its programme does: dwells count",
+    )
+    metrics.add(
+        f"{prefix}_null_speed_share",
+        null / int(near.sum()) if near.any() else None,
+        "1",
+        f"those / near ticks of {what}: null velocity when near, as the paper counts",
+        reason=f"the separation never was <= {near_m:g} m",
+    )
+
+
+def _add_path(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str) -> None:
+    along = np.linalg.norm(position_columns(motion, "tcp") - position_columns(motion, "ref"), axis=1)
+    for name, values, meaning in (
+        ("deviation", deviation_m(motion), "distance from the TCP to the nearest point of the programmed path"),
+        ("tracking_error", along, "distance from the TCP to the reference of the same tick"),
+    ):
+        values = values[np.isfinite(values)]
+        for kind, number in (("mean", np.mean), ("p95", _p95), ("max", np.max)):
+            value = float(number(values)) if len(values) else None
+            metrics.add(f"{prefix}_{name}_{kind}_m", value, "m", f"{kind} over all ticks of {what}: {meaning}")
+
+
+def _p95(values: Floats) -> float:
+    return float(np.quantile(values, 0.95))
+
+
+def _add_fastest(
+    metrics: MetricTable, prefix: str, motion: pd.DataFrame, contact: pd.DataFrame | None, what: str, near_m: float
+) -> None:
+    """The greatest speeds: of the TCP at all and near the recorded body, and of the programme."""
+    speeds = {
+        "tcp_speed_max": (numeric_column(motion, "tcp_speed"), "speed of the TCP"),
+        "ref_speed_max": (
+            numeric_column(motion, "ref_speed"),
+            "programmed speed of the TCP where the reference is; the programme's own where it went all the way",
+        ),
+    }
+    close = np.zeros(0)
+    if contact is not None:
+        close = numeric_column(contact, "tcp_speed")[numeric_column(contact, "distance_m") <= near_m]
+    speeds["tcp_speed_near_body_max"] = (
+        close,
+        f"speed of the TCP at ticks with a link within {near_m:g} m of the recorded body, surface to surface",
+    )
+    for name, (speed, meaning) in speeds.items():
+        known = speed[np.isfinite(speed)]
+        metrics.add(
+            f"{prefix}_{name}_m_per_s",
+            float(known.max()) if len(known) else None,
+            "m/s",
+            f"greatest over the ticks of {what}: {meaning}",
+            reason="the recorded body was never known to be that near" if name.endswith("body_max") else "no tick",
+        )
+
+
+def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, leash_m: float) -> None:
+    tcp_speed, ref_speed = numeric_column(motion, "tcp_speed"), numeric_column(motion, "ref_speed")
+    for name, speed, meaning in (
+        ("tcp_speed", tcp_speed, "speed of the TCP"),
+        ("ref_speed", ref_speed, "programmed speed of the TCP where the reference is"),
+    ):
+        known = speed[np.isfinite(speed)]
+        mean = float(known.mean()) if len(known) else None
+        metrics.add(f"{prefix}_{name}_mean_m_per_s", mean, "m/s", f"mean over all ticks of {what}: {meaning}")
+    for name, what_moved in (("tcp", "TCP"), ("ref", "reference")):
+        steps = np.linalg.norm(np.diff(position_columns(motion, name), axis=0), axis=1)
+        metrics.add(
+            f"{prefix}_{name}_travelled_m",
+            float(np.nansum(steps)),
+            "m",
+            f"path that the {what_moved} travelled, {what}",
+        )
+    count = cycles(motion) if len(motion) else 0
+    metrics.add(
+        f"{prefix}_cycles",
+        count or None,
+        "1",
+        f"times the reference came back to its first point, {what}",
+        reason="the reference never came back to its first point",
+    )
+    found = programme_progress(motion, leash_m)
+    reason = "the programme stands for all of the time"
+    metrics.add(
+        f"{prefix}_time_lost_s",
+        None if found is None else found[1] - found[0],
+        "s",
+        f"by how much {what} was behind its programme at the last tick: the way made, in the programme's own time",
+        reason=reason,
+    )
+    metrics.add(
+        f"{prefix}_progress_share",
+        None if found is None or found[1] <= 0 else found[0] / found[1],
+        "1",
+        f"pace kept: the programmed time of the way that the robot itself made, over the time it had, {what}; 1 is the "
+        "programme at full speed, 0 a robot that did not move. The reference, which runs ahead, does not count",
+        reason=reason,
+    )

@@ -1,0 +1,367 @@
+"""The 3-D replay on the page: its data, our scripts, the two libraries bundled with it, and a still at one instant.
+
+The data are a JSON header and one block of deflated numbers, as small as they can be: positions are whole millimetres,
+joints 0.1 mrad, speeds mm/s, int16, column by column, each as the difference from the one before it, low bytes before
+high bytes. ``static/data.js`` reads it again.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib import resources
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+from numpy.typing import NDArray
+
+from hrcreplay.records import Floats, Ints
+from hrcreplay.reporting.figures import drawing
+from hrcreplay.reporting.figures.drawing import BONES
+from hrcreplay.reporting.figures.scene import RenderedHull, render_hulls, view_from, volume_solids
+from hrcreplay.reporting.metrics.series import seconds_from
+from hrcreplay.reporting.replay_scene import (
+    RATE_HZ,
+    SHOWN_POINTS,
+    VOLUME_HZ,
+    MethodTrack,
+    ReplayScene,
+    VolumeTrack,
+    at_rate,
+    posed,
+)
+from hrcreplay.reporting.tables import part_name_text, reason_text
+
+#: What the browser imports by name, and the file that it is.
+MODULES = {
+    "three/core": "three/three.core.min.js",
+    "three": "three/three.module.min.js",
+    "three/orbit": "three/OrbitControls.js",
+    "replay/data": "data.js",
+    "replay/geometry": "geometry.js",
+    "replay/scene": "scene.js",
+    "replay/plots": "plots.js",
+    "replay/app": "app.js",
+}
+#: Key of the scene, colour, words.
+LAYERS = (
+    ("person", "person", "recorded person"),
+    ("skeleton", "bones", "fused skeleton"),
+    ("volumes", "volume", "what the person could reach"),
+    ("stop", "stop", "where the robot would stop"),
+    ("paths", "driven", "paths"),
+    ("distance", "toBody", "distances"),
+)
+MESHES = ("meshes", "robot", "meshes of the links")  #: the same, where the robot has some
+ROBOT_LEGEND = {
+    False: "Orange: the robot as the capsules that its distances are measured from",
+    True: "Orange: the robot, in the shell of the capsules that its distances are measured from",
+}
+LEGEND = (
+    "red: where the stop ends that it could begin at that instant, and the way of its TCP until then. Blue: the "
+    "recorded body; the dark lines in it are the person as fused from the cameras. Yellow: all that the person could "
+    "reach until the robot would have stood. Blue line: programmed path; orange line: driven path. Violet: from the "
+    "robot to the nearest part of the body; dashed: to the nearest volume."
+)
+
+
+@dataclass(frozen=True)
+class ReplayPart:
+    """Parts that the page's template inserts."""
+
+    html: Markup
+    style: Markup
+    licences: tuple[str, ...]
+
+
+def replay_part(scene: ReplayScene) -> ReplayPart:
+    """The replay of a run, its data and scripts with it."""
+    header, numbers = replay_data(scene)
+    modules = {name: _text(f"static/{path}") for name, path in MODULES.items()}
+    modules["three"] = modules["three"].replace('"./three.core.min.js"', '"three/core"')  # a blob has no neighbours
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    html = environment.from_string(_text("replay.html.j2")).render(
+        replay={
+            "header": script(header),
+            "numbers": numbers,
+            "modules": [(name, script(text)) for name, text in modules.items()],
+            "scripts": [script(_text(f"static/{path}")) for path in ("uplot/uPlot.iife.min.js", "boot.js")],
+            "layers": (*LAYERS, MESHES) if scene.robot.meshes else LAYERS,
+            "legend": f"{ROBOT_LEGEND[bool(scene.robot.meshes)]}; {LEGEND}",
+        }
+    )
+    return ReplayPart(
+        html=Markup(html),  # noqa: S704  our own template
+        style=Markup(_text("static/uplot/uPlot.min.css") + _text("static/replay.css")),  # noqa: S704  files of ours
+        licences=(_text("static/three/LICENSE"), _text("static/uplot/LICENSE")),
+    )
+
+
+def script(text: str) -> Markup:
+    """Text that may stand in a script element."""
+    if "</script" in text.lower() or "<!--" in text:
+        raise ValueError("a script must not end its own element")
+    return Markup(text)  # noqa: S704  our own file
+
+
+def _text(path: str) -> str:
+    return resources.files("hrcreplay.reporting.page").joinpath(*path.split("/")).read_text("utf-8")
+
+
+#: Stored for NaN.
+MISSING = -32768
+_LARGEST = 32767
+#: The block may take so many bytes in base64; the volumes come at the highest of these rates that keeps to it.
+BUDGET_BYTES = 9_000_000
+VOLUME_RATES_HZ = (VOLUME_HZ, 5.0, 2.5, 1.0, 0.5, 0.2)
+#: Hulls are hardly ever deflated below this share.
+_AT_BEST = 0.3
+
+
+class NumberBlock:
+    """Arrays of int16 one behind the other, and a list of where each is."""
+
+    def __init__(self) -> None:
+        self.entries: dict[str, dict[str, Any]] = {}
+        self._parts: list[bytes] = []
+        self._at = 0
+
+    def add(self, name: str, values: Floats | Ints, unit: float = 1.0) -> None:
+        """Adds an array whose rows are instants; ``unit`` is the step of one count. NaN stays NaN.
+
+        Where a value is too large for 16 bits, all steps are larger.
+        """
+        table = np.asarray(values).reshape(len(values), math.prod(values.shape[1:]))
+        largest = max((float(np.abs(column[np.isfinite(column)]).max(initial=0.0)) for column in table.T), default=0.0)
+        unit = max(unit, largest / _LARGEST)
+        steps = np.array([_steps(column, unit) for column in table.T], dtype=np.uint16)
+        self._parts += [(steps & 0xFF).astype(np.uint8).tobytes(), (steps >> 8).astype(np.uint8).tobytes()]
+        self.entries[name] = {"at": self._at, "rows": len(table), "columns": table.shape[1], "unit": unit}
+        self._at += 2 * steps.size
+
+    def deflated(self) -> bytes:
+        """All of it as a zlib stream."""
+        return zlib.compress(b"".join(self._parts), 6)
+
+
+def _steps(column: NDArray[Any], unit: float) -> NDArray[np.uint16]:
+    """(n,) the differences of a column's counts, modulo 2^16."""
+    finite = np.isfinite(column)
+    counts = np.where(finite, np.round(np.where(finite, column, 0.0) / unit), MISSING).astype(np.int32)
+    return np.diff(counts, prepend=0).astype(np.uint16)
+
+
+def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tuple[str, str]:
+    """The header as JSON and the block in base64.
+
+    Args:
+        scene: What to show.
+        budget_bytes: The block may be so long; the volumes' rate gives way first.
+    """
+    block = NumberBlock()
+    header = _header(scene)
+    block.add("points", scene.points_m, 1e-3)
+    block.add("body", scene.body_m, 1e-3)
+    for number, mesh in enumerate(scene.robot.meshes):
+        block.add(f"mesh/{number}/vertices", mesh.vertices_m, 1e-4)
+        block.add(f"mesh/{number}/triangles", mesh.triangles)
+    for name, track in scene.methods.items():
+        _add_track(block, name, track)
+    motion = block.deflated()
+    left = budget_bytes * 3 // 4 - len(motion)
+    volumes, hulls, rate_hz = _volumes_within(scene.volumes, left)
+    header["volumes"] = {
+        "limbs": list(scene.volumes.limbs),
+        "limb_names": [part_name_text(limb) for limb in scene.volumes.limbs],
+        "rate_hz": rate_hz,
+        "at_s": [round(at_s, 4) for at_s in seconds_from(hulls.t_ns, scene.t0_ns).tolist()],
+        "entries": volumes.entries,
+    }
+    header["entries"] = block.entries
+    packed = volumes.deflated()
+    header["bytes"] = [len(motion), len(packed)]
+    text = json.dumps(header, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c"), base64.b64encode(motion + packed).decode()
+
+
+def _header(scene: ReplayScene) -> dict[str, Any]:
+    robot = scene.robot
+    return {
+        "rate_hz": RATE_HZ,
+        "count": len(scene.t_ns),
+        "start_s": round((int(scene.t_ns[0]) - scene.t0_ns) * 1e-9, 6),
+        "bones": [[SHOWN_POINTS.index(a), SHOWN_POINTS.index(b)] for a, b in BONES],
+        "body": {
+            "parts": [part_name_text(part) for part in scene.body_parts],
+            "radius_m": scene.body_radius_m.tolist(),
+        },
+        "robot": {
+            "links": list(robot.links),
+            "radius_m": robot.radius_m.tolist(),
+            "ends_m": robot.ends_m.tolist(),
+            "moved_by": robot.moved_by.tolist(),
+            "screws": robot.screws.tolist(),
+            "tcp_m": robot.tcp_m.tolist(),
+            "base_m": robot.base_m.tolist(),
+            "meshes": [mesh.link for mesh in robot.meshes],
+        },
+        "methods": {
+            name: {
+                "events": [_event(asdict(event)) for event in track.events],
+                "names": {kind: list(texts) for kind, (texts, _) in track.names.items()},
+            }
+            for name, track in scene.methods.items()
+        },
+        "order": list(scene.methods),
+        "watched": scene.watched_m.tolist(),
+    }
+
+
+def _event(event: Mapping[str, Any]) -> dict[str, Any]:
+    """An event with rounded numbers; null for what is not known."""
+    found: dict[str, Any] = {}
+    for name, value in event.items():
+        found[name] = (round(value, 3) if math.isfinite(value) else None) if isinstance(value, float) else value
+    found["limb"] = part_name_text(event["limb"]) if event["limb"] else ""
+    return found
+
+
+def _add_track(block: NumberBlock, name: str, track: MethodTrack) -> None:
+    for joints in ("q", "stop_q"):
+        block.add(f"{name}/{joints}", getattr(track, joints), 1e-4)
+    for metres in ("ref_m", "tcp_m", "ref_speed", "tcp_speed", "distance_m", "body_m", "horizon_s"):
+        block.add(f"{name}/{metres}", getattr(track, metres), 1e-3)
+    block.add(f"{name}/certified", track.certified)
+    for kind, (_, index) in track.names.items():
+        block.add(f"{name}/{kind}", index)
+
+
+def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, VolumeTrack, float | None]:
+    """The volumes at the highest rate that fits into so many deflated bytes; None: at no rate."""
+    counts = np.diff(volumes.offsets)
+    for rate_hz in VOLUME_RATES_HZ if len(volumes.t_ns) else ():
+        rows = at_rate(volumes.t_ns, rate_hz)
+        if _AT_BEST * 6 * counts[rows].sum() > left:
+            continue
+        hulls = volumes.rows(rows)
+        block = _hulls(hulls)
+        if len(block.deflated()) <= left:
+            return block, hulls, rate_hz
+    nothing = volumes.rows(np.zeros(0, np.int64))
+    return _hulls(nothing), nothing, None
+
+
+def _hulls(hulls: VolumeTrack) -> NumberBlock:
+    """The vertices in order of their height within each hull, which makes their differences small."""
+    block = NumberBlock()
+    owner = np.repeat(np.arange(len(hulls.t_ns)), np.diff(hulls.offsets))
+    order = np.lexsort((hulls.vertices_m[:, 0], hulls.vertices_m[:, 1], hulls.vertices_m[:, 2], owner))
+    block.add("vertices", hulls.vertices_m[order], 1e-3)
+    block.add("limb", hulls.limb)
+    block.add("count", np.diff(hulls.offsets))
+    block.add("radius", hulls.radius_m, 1e-3)
+    block.add("horizon", hulls.horizon_s, 1e-3)
+    return block
+
+
+_ROBOT, _PERSON = "#d9823b", "#7fb2d9"
+#: Seconds of the paths around the instant that are drawn.
+_PATH_S = 8.0
+_MARGIN_M = 0.12
+
+
+def snapshot(scene: ReplayScene, row: int) -> Figure:
+    """The scene of the run's own method at one of its instants, seen with robot and person side by side.
+
+    Args:
+        scene: What moves.
+        row: Which of its instants.
+    """
+    name, track = next(iter(scene.methods.items()))
+    ends = posed(scene.robot, track.q[row : row + 1])[0]
+    body = scene.body_m[row]
+    view = view_from(_beside(scene, row), 0.18)
+    robot = [RenderedHull(pair, float(r), to_rgb(_ROBOT)) for pair, r in zip(ends, scene.robot.radius_m, strict=True)]
+    person = [
+        RenderedHull(pair, float(r), to_rgb(_PERSON))
+        for pair, r in zip(body, scene.body_radius_m, strict=True)
+        if np.isfinite(pair).all()
+    ]
+    figure = drawing.new_figure(6.2)
+    axes = drawing.panels(figure, 1, 1, left_in=0.62, top_in=0.62, bottom_in=0.75)[0][0]
+    edges = [solid.outline(view) for solid in (*robot, *person)]
+    reach = [solid.outline(view) for solid in volume_solids(_stored(scene, row))]
+    corners = np.vstack([*edges, *(edge for edge in reach if len(edge))])
+    low, high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
+    drawing.set_window(axes, low.tolist(), high.tolist())
+    for edge in reach:
+        axes.add_patch(Polygon(edge, facecolor=drawing.ORANGE, edgecolor=drawing.ORANGE, alpha=0.16, lw=0.7, zorder=1))
+    image = render_hulls([*robot, *person], view, low, high, float(high[1] - low[1]) / 700.0)
+    limits = axes.get_xlim(), axes.get_ylim()
+    extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    axes.imshow(image, origin="lower", extent=extent, aspect="auto", interpolation="bilinear", zorder=2)
+    around = slice(max(0, row - round(_PATH_S * RATE_HZ)), row + round(_PATH_S * RATE_HZ) + 1)
+    axes.plot(*view.flat(track.ref_m[around]).T, color=drawing.NOMINAL, lw=1.2, zorder=3)
+    axes.plot(*view.flat(track.tcp_m[around.start : row + 1]).T, color=drawing.ACTUAL, lw=1.4, zorder=4)
+    axes.set(xlim=limits[0], ylim=limits[1], xlabel="across [m]", ylabel="up [m]")
+    axes.set_title(f"{scene.seconds[row]:.2f} s, {name}: {_words(track, row)}", wrap=True)
+    figure.legend(handles=_legend(), loc="lower center", ncols=5, bbox_to_anchor=(0.5, 0.01))
+    return figure
+
+
+def _legend() -> list[Patch | Line2D]:
+    return [
+        Patch(color=_ROBOT, lw=0, label="robot"),
+        Patch(color=_PERSON, lw=0, label="recorded person"),
+        Patch(color=drawing.ORANGE, alpha=0.3, lw=0, label="what the person could reach"),
+        Line2D([], [], color=drawing.NOMINAL, lw=1.4, label="programmed"),
+        Line2D([], [], color=drawing.ACTUAL, lw=1.4, label="driven"),
+    ]
+
+
+def _words(track: MethodTrack, row: int) -> str:
+    """Describe the record at an instant."""
+    found = {kind: known[index[row]] if index[row] >= 0 else "" for kind, (known, index) in track.names.items()}
+    words = [found["status"] or "no record", f"{track.tcp_speed[row]:.2f} m/s"]
+    if np.isfinite(track.body_m[row]):
+        words.append(f"{track.body_m[row]:.2f} m from the body")
+    if np.isfinite(track.distance_m[row]):
+        words.append(f"{track.distance_m[row]:.2f} m from the volumes")
+    reason = f"\n{reason_text(found['reason'])}" if found["reason"] else ""
+    return ", ".join(words) + reason
+
+
+def _stored(scene: ReplayScene, row: int) -> dict[str, tuple[Floats, float]]:
+    """The volumes stored last before an instant, not more than a fifth of a second: limb -> vertices and radius [m]."""
+    stored, now_ns = scene.volumes, int(scene.t_ns[row])
+    before = stored.t_ns[(stored.t_ns <= now_ns) & (stored.t_ns >= now_ns - 200_000_000)]
+    if not len(before):
+        return {}
+    return {
+        stored.limbs[stored.limb[k]]: (
+            stored.vertices_m[stored.offsets[k] : stored.offsets[k + 1]],
+            float(stored.radius_m[k]),
+        )
+        for k in np.flatnonzero(stored.t_ns == before.max()).tolist()
+    }
+
+
+def _beside(scene: ReplayScene, row: int) -> float:
+    """The azimuth of who sees robot and person side by side [rad]."""
+    known = scene.body_m[row] if len(scene.body_parts) else scene.points_m[row]
+    person = known.reshape(-1, 3)
+    person = person[np.isfinite(person).all(axis=1)]
+    if not len(person):
+        return -0.5 * np.pi
+    towards = person.mean(axis=0) - scene.robot.base_m
+    return float(np.arctan2(towards[1], towards[0]) - 0.5 * np.pi)

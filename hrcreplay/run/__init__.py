@@ -1,1 +1,0 @@
-"""Offline runs: job, stages, controllers, report."""

@@ -1,0 +1,257 @@
+"""Robot against recorded person: constructed contacts at known ticks, and runs with and without ground truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from hrcreplay.commands import replay
+from hrcreplay.evaluation import contact
+from hrcreplay.evaluation.contact import VOLUME_OF, Volumes
+from hrcreplay.evaluation.recorded_person import BodyTrack, from_states
+from hrcreplay.human.model import PARTS
+from hrcreplay.logs import reader
+from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates
+from hrcreplay.robot.model import RobotModel, from_urdf
+from hrcreplay.store import run_folder
+from hrcreplay.store.columns import read_states
+from tests.robot.test_model import ONE_AXIS
+from tests.undrawn import undrawn
+
+RADII_M = np.full(len(PARTS), 0.05)
+LRA = PARTS.index("LRA")
+ELBOW, WRIST = POINTS.index("elbow_r"), POINTS.index("wrist_r")
+DT_NS = 4_000_000
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    """One axis along y, which turns a bar of 0.4 m about its middle at (0, 0, 0.5)."""
+    return from_urdf(ONE_AXIS, np.eye(4), stop_s=0.4)
+
+
+def turning(robot: RobotModel, q: Floats, dq: Floats) -> pd.DataFrame:
+    """A motion table with what contact reads of it."""
+    n = len(q)
+    table = {"t_ns": np.arange(n) * DT_NS, "q1": q, "dq1": dq, "tcp_speed": np.abs(dq), "horizon_s": np.full(n, 0.04)}
+    return pd.DataFrame(table | {"status": ["tracking"] * n})
+
+
+def standing_beside(point_m: Floats, ticks: int, source: str = "ground truth") -> BodyTrack:
+    """A body of which only the right elbow and wrist are known, along y, at every tick."""
+    points = np.full((ticks, len(POINTS), 3), np.nan)
+    points[:, [ELBOW, WRIST]] = point_m + np.array([[0.0, -0.2, 0.0], [0.0, 0.2, 0.0]])
+    return BodyTrack(source, np.arange(ticks) * DT_NS, points)
+
+
+def surface_distance(robot: RobotModel, q: float, points_m: Floats) -> float:
+    """Between robot and forearm by points sampled on both axes."""
+    shares = np.linspace(0.0, 1.0, 400)[:, None]
+    least = np.inf
+    for segment, ends in zip(robot.segments, robot.ends_m(np.array([q])), strict=True):
+        a = ends[0] + shares * (ends[1] - ends[0])
+        b = points_m[ELBOW] + shares * (points_m[WRIST] - points_m[ELBOW])
+        gap = np.linalg.norm(a[:, None] - b[None], axis=2).min() - segment.radius_m - RADII_M[LRA]
+        least = np.fmin(least, gap)
+    return float(least)
+
+
+def near(robot: RobotModel, motion: pd.DataFrame, *tracks: BodyTrack) -> contact.Nearest:
+    """The nearest of some bodies, without a hand."""
+    return contact.nearest(robot, motion, (tracks,), RADII_M, 0.0)[0]
+
+
+def around(q: float, away_m: float = 0.33) -> Floats:
+    """A point so far from the axis, where the bar points at ``q``."""
+    return np.array([away_m * np.sin(q), 0.0, 0.5 + away_m * np.cos(q)])
+
+
+def test_a_bar_that_swings_past_a_forearm_touches_at_the_ticks_worked_out(robot: RobotModel) -> None:
+    q = np.linspace(-0.8, 0.8, 81)
+    dq = np.full(81, 5.0)
+    dq[60:] = 0.0
+    body = standing_beside(around(0.0), 81)
+    body = dataclasses.replace(body, points_m=np.where(np.arange(81)[:, None, None] == 45, np.nan, body.points_m))
+    found = near(robot, turning(robot, q, dq), body)
+    expected = [surface_distance(robot, q[i], body.points_m[i]) if i != 45 else np.nan for i in range(81)]
+    np.testing.assert_allclose(found.distance_m, expected, atol=2e-3)
+    touching = np.flatnonzero(np.array(expected) <= 0.0)
+    assert len(touching) > 5
+    np.testing.assert_array_equal(np.flatnonzero(found.distance_m <= 0.0), touching)
+    assert set(found.part[np.isfinite(found.distance_m)]) == {LRA}
+    assert found.part[45] == found.link[45] == found.track[45] == -1
+
+
+def test_the_speed_is_that_of_the_surface_that_touches(robot: RobotModel) -> None:
+    q, dq = np.linspace(-0.5, 0.5, 21), np.full(21, 2.0)
+    body = standing_beside(around(0.3, 0.5), 21)
+    found = near(robot, turning(robot, q, dq), body)
+    for i in range(21):
+        ends = robot.ends_m(q[i : i + 1])[found.link[i]]
+        radius_m = robot.segments[found.link[i]].radius_m
+        shares = np.linspace(0.0, 1.0, 2001)[:, None]
+        a, b = (e[0] + shares * (e[1] - e[0]) for e in (ends, body.points_m[i, [ELBOW, WRIST]]))
+        gaps = np.linalg.norm(a[:, None] - b[None, ::100], axis=2)
+        row, column = np.unravel_index(np.argmin(gaps), gaps.shape)
+        towards = b[100 * column] - a[row]
+        at = a[row] + radius_m * towards / np.linalg.norm(towards) - (0.0, 0.0, 0.5)
+        assert found.speed[i] == pytest.approx(2.0 * float(np.hypot(at[0], at[2])), rel=5e-3)
+
+
+def test_of_several_sources_the_nearest_counts(robot: RobotModel) -> None:
+    """One camera shows the forearm where the bar goes, the other and the mean of both do not."""
+    q, dq = np.linspace(-0.8, 0.8, 81), np.full(81, 5.0)
+    tracks = [standing_beside(around(0.0, away), 81, name) for away, name in ((0.9, "mean"), (0.33, "a"), (1.4, "b"))]
+    motion = turning(robot, q, dq)
+    found = near(robot, motion, *tracks)
+    alone = near(robot, motion, tracks[1])
+    assert (alone.distance_m <= 0.0).sum() > 5
+    assert (near(robot, motion, tracks[0], tracks[2]).distance_m > 0.0).all()
+    np.testing.assert_array_equal(found.distance_m, alone.distance_m)
+    assert set(found.track) == {1}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_every_part_of_a_body_counts(robot: RobotModel, part: str) -> None:
+    """The two points of one part alone, on the bar's way."""
+    n = 5
+    points = np.full((n, len(POINTS), 3), np.nan)
+    ends = {
+        "HD": ("neck", "head"),
+        "THX": ("pelvis", "neck"),
+        "URA": ("shoulder_r", "elbow_r"),
+        "LRA": ("elbow_r", "wrist_r"),
+        "ULA": ("shoulder_l", "elbow_l"),
+        "LLA": ("elbow_l", "wrist_l"),
+        "THIGH_R": ("hip_r", "knee_r"),
+        "SHANK_R": ("knee_r", "ankle_r"),
+        "THIGH_L": ("hip_l", "knee_l"),
+        "SHANK_L": ("knee_l", "ankle_l"),
+        "HAND_R": ("wrist_r", "hand_r"),
+        "HAND_L": ("wrist_l", "hand_l"),
+        "FOOT_R": ("ankle_r", "foot_r"),
+        "FOOT_L": ("ankle_l", "foot_l"),
+    }[part]
+    away_m = around(0.0)
+    half_m = np.array([0.0, 0.2, 0.0])
+    points[:, POINTS.index(ends[0])] = away_m - half_m
+    points[:, POINTS.index(ends[1])] = away_m + half_m
+    motion = turning(robot, np.zeros(n), np.ones(n))
+    found = near(robot, motion, BodyTrack("cam", np.arange(n) * DT_NS, points))
+    assert (found.distance_m < 0.0).all()
+    points[:, POINTS.index(ends[1])] = np.nan
+    points[:, POINTS.index(ends[0])] = away_m  # one end of it is all that is seen
+    found = near(robot, motion, BodyTrack("cam", np.arange(n) * DT_NS, points))
+    assert (found.distance_m < 0.0).all()
+
+
+class Known:
+    """Volumes of any tick: a ball around one point."""
+
+    def __init__(self, centre_m: Floats, radius_m: float) -> None:
+        self.solid = {"LRA": (centre_m + 1e-3 * np.vstack([np.zeros(3), np.eye(3)]), radius_m)}
+        self.asked: list[tuple[int, float]] = []
+
+    def volumes(self, t_ns: int, horizon_s: float) -> Volumes:
+        self.asked.append((t_ns, horizon_s))
+        return self.solid
+
+
+def test_a_contact_is_laid_at_the_door_of_robot_or_prediction(robot: RobotModel) -> None:
+    q, dq = np.linspace(-0.8, 0.8, 81), np.full(81, 5.0)
+    at = around(0.0)
+    body = standing_beside(at, 81)
+    motion = turning(robot, q, dq)
+    found = near(robot, motion, body)
+    touching = np.flatnonzero(found.distance_m <= 0.0)
+    motion.loc[touching[2] - 3 : touching[-1], "status"] = "braking"  # what was decided before goes on
+    for ball_m, sign in ((0.5, -1.0), (0.1, 1.0)):
+        known = Known(at, ball_m)
+        outside = contact.by_volume(motion, found, [body], RADII_M, 0.0, known)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(outside)), touching)
+        np.testing.assert_allclose(outside[touching], 0.2 + 0.05 - ball_m, atol=3e-3)
+        assert (np.sign(outside[touching]) == sign).all()
+        decided = touching[2] - 4
+        assert known.asked[-1] == (decided * DT_NS, 0.04)
+    no_legs = Known(at, 0.5)
+    no_legs.solid = {"LEGS": no_legs.solid["LRA"]}
+    assert np.isnan(contact.by_volume(motion, found, [body], RADII_M, 0.0, no_legs)).all()  # type: ignore[arg-type]
+
+
+def test_parts_are_held_against_the_volume_of_their_limb() -> None:
+    assert {part for part in PARTS if VOLUME_OF[part] == "LEGS"} == {
+        f"{part}_{side}" for part in ("THIGH", "SHANK", "FOOT") for side in "RL"
+    }
+    assert (VOLUME_OF["HAND_R"], VOLUME_OF["HAND_L"]) == ("LRA", "LLA")
+    assert all(VOLUME_OF[name] == name for name in LIMBS)
+    assert set(VOLUME_OF) == set(PARTS)
+
+
+def test_nothing_is_known_in_a_gap_of_the_truth() -> None:
+    t_ns = np.array([0, 10, 20, 320, 330], dtype=np.int64) * 10**6
+    person = BodyTrack("ground truth", t_ns, np.zeros((5, len(POINTS), 3)) + np.arange(20.0)[:, None])
+    at_ns = np.arange(0, 340, 4, dtype=np.int64) * 10**6
+    known = np.isfinite(person.axes_m(at_ns, 0.19)).all(axis=(1, 2, 3))
+    np.testing.assert_array_equal(known, (at_ns <= 20 * 10**6) | ((at_ns >= 320 * 10**6) & (at_ns <= 330 * 10**6)))
+
+
+@pytest.fixture(scope="module")
+def with_truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("truth") / "run"
+    with undrawn():
+        return replay.run("report", replay.demo_log(), out=out, start_s=8.0, end_s=9.0)
+
+
+def test_a_report_compares_every_method_with_the_truth(with_truth: Path) -> None:
+    run = run_folder.read(with_truth)
+    assert run.contact is not None
+    assert run.motion is not None
+    assert set(run.contact["person"]) == set(run.contact["source"]) == {"ground truth"}
+    assert set(run.contact["method"]) == {"qp", *run.baselines}
+    assert len(run.contact) == len(run.motion) * (1 + len(run.baselines))
+    assert run.contact["distance_m"].notna().all()
+    assert "contact.parquet" in run.meta["outputs"]
+    assert not (with_truth / "smooth.parquet").exists()
+    own = run.contact[run.contact["method"] == "qp"]
+    assert own["left_full_m"].notna().sum() == pytest.approx(25 * (1.0 - 0.377), abs=1.5)
+    page = (with_truth / "report.html").read_text()
+    assert page.index("Had this controller been running, ") < page.index("Robot against everybody recorded")
+
+
+def test_without_truth_it_is_the_smoothed_person(
+    with_truth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    header = reader._header
+    monkeypatch.setattr(reader, "_header", lambda *a, **k: dataclasses.replace(header(*a, **k), has_truth=False))
+    options = {"start_s": 8.0, "end_s": 9.0}
+    with undrawn():
+        fresh = replay.run("report", replay.demo_log(), out=tmp_path / "fresh", **options)  # type: ignore[arg-type]
+        again = replay.run("report", with_truth, out=tmp_path / "again")  # stage 1 taken over: smoothed by itself
+    for name in ("smooth.parquet", "contact.parquet"):
+        assert (fresh / name).read_bytes() == (again / name).read_bytes()
+    table = pq.read_table(fresh / "contact.parquet").to_pandas()
+    assert set(table["person"]) == {"camera points"}
+    assert set(table["source"]) <= {"smoothed estimate", "kinect", "xtion"}
+    assert len(set(table["source"])) > 1
+    truth = pq.read_table(with_truth / "contact.parquet").to_pandas()
+    assert table["distance_m"].notna().mean() > 0.9
+    off_m = table["distance_m"] - truth["distance_m"]
+    assert off_m.abs().median() < 0.05
+    assert off_m.median() < 0.01  # the nearest of three sources is seldom further off than the truth
+
+
+def test_where_no_camera_saw_anybody_the_smoothed_person_is_not_known(with_truth: Path) -> None:
+    (states,) = read_states(with_truth / "state.parquet", 10_000)
+    valid = np.zeros_like(states.valid)
+    valid[[40, 100, 180], 0] = True  # 0.24 s and 0.32 s apart
+    seen: HumanStates = dataclasses.replace(states, valid=valid)
+    known = np.isfinite(from_states(seen, 0.3).points_m[:, POINTS.index("wrist_r"), 0])
+    expected = np.zeros(len(states), dtype=bool)
+    expected[40:101] = True
+    expected[180] = True
+    np.testing.assert_array_equal(known, expected)

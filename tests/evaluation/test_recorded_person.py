@@ -1,0 +1,178 @@
+"""Everybody in a recording: whole runs on logs with a second person, and one coverage for report, compare and audit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from hrcreplay.commands import replay
+from hrcreplay.commands.report import summary
+from hrcreplay.geometry.distances import segment_distance
+from hrcreplay.logs.reader import open_log
+from hrcreplay.logs.writer import LogWriter
+from hrcreplay.records import POINTS, CameraFrames, Floats
+from hrcreplay.robot.model import irb140
+from tests.coverage_figures import assert_one_coverage
+from tests.undrawn import undrawn
+
+SPAN = {"start_s": 8.0, "end_s": 12.0}
+BLIND = ("plan.method=none", "plan.baselines=[]")
+#: Where the bystander stands beside the worker in the world: nearer to both cameras, out of the robot's reach [m].
+ASIDE_M = np.array([-2.4, 0.0, 0.0])
+
+
+def rewritten(
+    path: Path, *, bystander: bool = False, legs: bool = True, truth: bool = False, apart_m: float = 0.0
+) -> Path:
+    """The demo log anew, by default without ground truth.
+
+    With a second person, with cameras that see no legs, or with a second camera that shows forearms nearer to the robot
+    than the first does.
+    """
+    log = open_log(replay.demo_log())
+    first_ns = log.header.start_ns
+    frames = CameraFrames.join(list(log.frames(first_ns + 7_900_000_000, first_ns + 12_100_000_000)))
+    if not legs:
+        hidden = [POINTS.index(f"{point}_{side}") for point in ("knee", "ankle", "foot") for side in "lr"]
+        points, confidence = frames.points_m.copy(), frames.confidence.copy()
+        points[:, hidden], confidence[:, hidden] = np.nan, 0.0
+        frames = replace(frames, points_m=points, confidence=confidence)
+    if apart_m:
+        points = frames.points_m.copy()
+        second = np.flatnonzero(frames.camera == 1)
+        nearer = log.header.T_world_camera[frames.cameras[1]][:3, :3].T @ [-apart_m, 0.0, 0.0]
+        for name in ("wrist_l", "hand_l", "wrist_r", "hand_r"):
+            points[second, POINTS.index(name)] += nearer
+        frames = replace(frames, points_m=points)
+    if bystander:
+        T = np.array([log.header.T_world_camera[camera] for camera in frames.cameras])[frames.camera]
+        aside = np.einsum("nji,j->ni", T[:, :3, :3], ASIDE_M)
+        others = replace(frames, points_m=frames.points_m + aside[:, None], body=frames.body + 50)
+        order = np.argsort(np.concatenate([others.arrival_ns, frames.arrival_ns]), kind="stable")
+        frames = CameraFrames.join([others, frames]).rows(order)
+    with LogWriter(path) as writer:
+        for camera, pose in log.header.T_world_camera.items():
+            writer.camera(camera, pose)
+        assert log.header.task is not None
+        assert log.header.T_world_base is not None
+        writer.task(log.header.task)
+        writer.base(log.header.T_world_base)
+        writer.frames(frames)
+        if truth:
+            for part in log.truth():
+                rows = (part.t_ns >= first_ns + 7_900_000_000) & (part.t_ns <= first_ns + 12_100_000_000)
+                writer.truth(part.t_ns[rows], part.points_m[rows])
+    return path
+
+
+def reported(log: Path, out: Path, *overrides: str) -> tuple[dict[str, object], pd.DataFrame, pd.DataFrame]:
+    """Metrics, contact and motion of a report without figures."""
+    with undrawn():
+        replay.run("report", log, out=out, overrides=overrides)
+    metrics = {name: metric["value"] for name, metric in json.loads((out / "metrics.json").read_text()).items()}
+    return metrics, *(pq.read_table(out / f"{name}.parquet").to_pandas() for name in ("contact", "motion"))
+
+
+def nearest_by_hand(log: Path, motion: pd.DataFrame, *, bodies: range) -> dict[int, float]:
+    """Tick -> smallest distance between the robot's links and the bodies' upper limbs, at ticks that meet a frame."""
+    header = open_log(log).header
+    robot = irb140(header.T_world_base, stop_s=0.377) if header.T_world_base is not None else None
+    assert robot is not None
+    t_ns = motion["t_ns"].to_numpy()
+    found: dict[int, float] = {}
+    for frames in open_log(log).frames():
+        for i in range(len(frames)):
+            tick = int(np.argmin(np.abs(t_ns - frames.capture_ns[i])))
+            if frames.body[i] not in bodies or abs(int(t_ns[tick]) - int(frames.capture_ns[i])) > 300_000:
+                continue
+            T = header.T_world_camera[frames.cameras[frames.camera[i]]]
+            points = frames.points_m[i] @ T[:3, :3].T + T[:3, 3]
+            q = motion[[f"q{k}" for k in range(1, 7)]].to_numpy(dtype=float)[tick]
+            found[tick] = min(found.get(tick, np.inf), _links_to_arms(robot.ends_m(q), robot.segments, points))
+    return found
+
+
+def _links_to_arms(ends_m: Floats, segments: object, points: Floats) -> float:
+    """Smallest distance of links and forearms with hands of 0.19 m, a radius of 0.07 m."""
+    least = np.inf
+    for side in "lr":
+        elbow, wrist = (points[POINTS.index(f"{name}_{side}")] for name in ("elbow", "wrist"))
+        if not np.isfinite(elbow + wrist).all():
+            continue
+        hand = wrist + 0.19 * (wrist - elbow) / np.linalg.norm(wrist - elbow)
+        for segment, link in zip(segments, ends_m, strict=True):  # type: ignore[call-overload]
+            gap, _, _ = segment_distance(np.ascontiguousarray(link), np.array([elbow, hand]))
+            least = min(least, gap - segment.radius_m - 0.07)
+    return float(least)
+
+
+@pytest.fixture(scope="module")
+def beside(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rewritten(tmp_path_factory.mktemp("beside") / "beside.mcap", bystander=True)
+
+
+def test_a_worker_whom_a_bystander_hides_is_touched_all_the_same(beside: Path, tmp_path: Path) -> None:
+    """The bystander is nearer to the cameras, so the robot's person is that one: the worker is another body."""
+    metrics, contact, motion = reported(beside, tmp_path / "run", *BLIND)
+    alone, _, _ = reported(rewritten(tmp_path / "alone.mcap"), tmp_path / "alone", *BLIND)
+    frames = sum(len(part) for part in open_log(beside).frames())
+    assert metrics["others_frames"] == pytest.approx(frames / 2, abs=3)
+    assert metrics["plan_touch_person_ticks"] == 0
+    assert metrics["plan_touch_other_ticks"] == metrics["plan_touch_moving_ticks"]
+    # the smoothed person counts beside the cameras' points where the worker is the person
+    assert 20 < int(str(metrics["plan_touch_moving_ticks"])) <= int(str(alone["plan_touch_person_ticks"]))
+    by_hand = nearest_by_hand(beside, motion, bodies=range(50))
+    assert len(by_hand) > 10
+    for tick, least_m in by_hand.items():
+        if least_m <= 0.2:
+            assert contact["other_m"].iloc[tick] <= least_m + 0.02
+    said = summary(tmp_path / "run")[-1]
+    assert f"another body than the person it heeds ({metrics['plan_touch_other_ticks']} ticks)" in said
+    assert f"{metrics['others_frames']} frames show at least one other body" in said
+
+
+def test_with_ground_truth_whoever_stands_elsewhere_is_another_body(tmp_path: Path) -> None:
+    log = rewritten(tmp_path / "both.mcap", bystander=True, truth=True)
+    metrics, contact, _ = reported(log, tmp_path / "run", *BLIND)
+    assert metrics["contact_person"] == "ground truth"
+    assert int(str(metrics["plan_touch_person_ticks"])) > 20
+    assert metrics["plan_touch_other_ticks"] == 0
+    assert contact["other_m"].notna().mean() > 0.9  # the chosen bystander
+    assert contact["other_m"].min() > 0.3
+
+
+def test_legs_that_no_camera_shows_are_told_and_those_it_shows_count(tmp_path: Path) -> None:
+    shown, _, _ = reported(rewritten(tmp_path / "legs.mcap"), tmp_path / "legs", *BLIND)
+    hidden, _, _ = reported(rewritten(tmp_path / "none.mcap", legs=False), tmp_path / "none", *BLIND)
+    assert float(str(shown["contact_legs_known_share"])) > 0.9
+    assert hidden["contact_legs_known_share"] == 0.0
+    assert "the legs (never seen)" in summary(tmp_path / "none")[-1]
+    assert "the legs (never seen)" not in summary(tmp_path / "legs")[-1]
+
+
+def test_of_two_cameras_that_disagree_both_count(tmp_path: Path) -> None:
+    """Contact and coverage are asked of what each camera shows, not of their mean."""
+    log = rewritten(tmp_path / "apart.mcap", apart_m=0.18)
+    metrics, contact, motion = reported(log, tmp_path / "run", "plan.baselines=[]")
+    by_hand = nearest_by_hand(log, motion, bodies=range(50))
+    near = {tick: least_m for tick, least_m in by_hand.items() if least_m <= 0.3}
+    assert len(near) > 5
+    for tick, least_m in near.items():
+        assert contact["person_m"].iloc[tick] <= least_m + 0.02
+    assert contact["source"].isin(["xtion"]).sum() > 100  # it shows the forearms nearest
+    together, _, _ = reported(rewritten(tmp_path / "together.mcap"), tmp_path / "together", "plan.baselines=[]")
+    shares = [float(str(found["volumes_full_held_share"])) for found in (metrics, together)]
+    assert shares[0] <= shares[1]
+
+
+def test_report_compare_and_audit_have_one_coverage(tmp_path: Path) -> None:
+    """On a log without ground truth, until the braking time, to the last digit."""
+    log = rewritten(tmp_path / "log.mcap")
+    reported(log, tmp_path / "report")
+    assert assert_one_coverage(tmp_path / "report", tmp_path) > 40
