@@ -35,7 +35,7 @@ from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.assembly import Forecast
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig, resolve
-from hrcreplay.pipeline.stages import Sink, Told, told_of_fusion, told_of_plan
+from hrcreplay.pipeline.stages import Sink, Told, collect_fusion_findings, collect_plan_findings
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Motion, SweptVolumes
 from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.task import parse_task
@@ -210,9 +210,9 @@ def fuse(
     sink = found.sink()
     stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
     smooth = not log.header.has_truth if smooth is None else smooth
-    batches = stages.fused(log, ticks_ns, _BATCH, assembly.fusion_stage(run_config, log), sink, smooth=smooth)
+    batches = stages.fuse_batches(log, ticks_ns, _BATCH, assembly.fusion_stage(run_config, log), sink, smooth=smooth)
     states = HumanStates.join(list(batches))
-    return People(replace(recording, run_config=run_config), states, found.tables, told_of_fusion(log, sink))
+    return People(replace(recording, run_config=run_config), states, found.tables, collect_fusion_findings(log, sink))
 
 
 @dataclass(frozen=True)
@@ -335,9 +335,9 @@ def plan(
     sink.notes["plan"].extend(assembly.programme_notes(run_config, log, controller.reference))
     batches = (people.states.rows(slice(i, i + _BATCH)) for i in range(0, len(people), _BATCH))
     around = assembly.surroundings(run_config, controller.robot)
-    for _ in stages.planned(batches, around, chosen, stages.store_every(run_config), sink):
+    for _ in stages.plan_batches(batches, around, chosen, stages.store_every(run_config), sink):
         pass
-    return Plan(run_config, found.tables, told_of_plan(log, sink))
+    return Plan(run_config, found.tables, collect_plan_findings(log, sink))
 
 
 def report(recording: Recording, people: People, motion: Plan, out: str | Path) -> Path:
@@ -361,7 +361,7 @@ def report(recording: Recording, people: People, motion: Plan, out: str | Path) 
             writer.table(name, {column: table[column] for column in table.column_names})
         parts = reuse.dependencies(run_config, log, people.states.t_ns)
         found = replay.findings(run_config, {"fuse": people.told, "plan": motion.told})
-        meta = {**run_config.meta(), **found, **replay.about_run(run_config, began, parts, smooth=False)}
+        meta = {**run_config.meta(), **found, **replay.describe_run(run_config, began, parts, smooth=False)}
         replay.complete(run_config, log, writer, Stopwatch(time.perf_counter_ns), meta)
         return writer.folder
 

@@ -46,3 +46,7 @@ class CoverageMissed(HrcReplayError):
     """A fit that was written and holds fewer people that it was not fitted to than was asked for."""
 
     exit_code = 5
+
+
+class SettingRenamed(FutureWarning):
+    """A setting is given by a name of an earlier version."""

@@ -21,7 +21,7 @@ from hrcreplay.limits import load_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline.run_config import read_urdf
 from hrcreplay.robot.model import from_urdf, irb140
-from hrcreplay.robot.path import MOVE_S, programmed
+from hrcreplay.robot.path import MOVE_S, plan_programme
 from hrcreplay.robot.task import CYCLE_S, parse_task
 from hrcreplay.robot.urdf import MOST_LINKS
 from hrcreplay.settings.load import load_settings
@@ -106,14 +106,14 @@ HERE, THERE = ({"position_m": [0.5, y, 0.5], "rpy_deg": [180, 0, 0], "move": "li
 def test_endless_tasks_are_told(facts: str, task: dict[str, object]) -> None:
     robot = irb140(np.eye(4), stop_s=0.377)
     with pytest.raises(SettingsError, match=facts) as told:
-        programmed(parse_task(task), robot)
+        plan_programme(parse_task(task), robot)
     assert "\n" not in str(told.value)
     assert len(str(told.value)) < 700
 
 
 def test_slow_tasks_that_end_are_planned() -> None:
     robot = irb140(np.eye(4), stop_s=0.377)
-    path = programmed(parse_task({"speed": 0.002, "waypoints": [HOME, AWAY]}), robot)
+    path = plan_programme(parse_task({"speed": 0.002, "waypoints": [HOME, AWAY]}), robot)
     assert 30.0 < path.duration_s < MOVE_S
 
 

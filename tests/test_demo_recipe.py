@@ -15,7 +15,7 @@ from hrcreplay.human.fusion.inverse_kinematics import inverse
 from hrcreplay.human.model import HEIGHT, nearest, skeleton
 from hrcreplay.records import POINTS, CameraFrames, Floats
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.path import programmed
+from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task
 
 SHIPPED = Path(__file__).parents[1] / "datasets" / "demo.mcap"
@@ -145,7 +145,7 @@ def test_sensors_are_as_noisy_as_real_ones(sensor: Sensor, truth: tuple[Floats, 
 
 def test_a_robot_that_knows_of_nobody_hits_the_worker_often_and_at_speed(truth: tuple[Floats, Floats]) -> None:
     model = irb140(scene.T_WORLD_BASE, stop_s=0.377)
-    reference = programmed(parse_task(scene.TASK), model)
+    reference = plan_programme(parse_task(scene.TASK), model)
     points = [reference.sample(s) for s in np.arange(0.0, reference.cycle_s, 0.08)]
     ends_m = np.array([model.pose(point.q, np.zeros(6)).ends_m for point in points])
     speed = np.array([np.linalg.norm(point.twist[:3]) for point in points])

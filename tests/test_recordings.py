@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from hrcreplay.cli import commands
-from hrcreplay.commands import replay
+from hrcreplay.commands import inputs, replay
 from hrcreplay.store import run_folder
 from tests.coverage_figures import assert_one_coverage
 from tests.realdata import data_path
@@ -98,9 +97,9 @@ def test_an_imported_recording_from_import_to_page(tmp_path: Path, name: str) ->
     paths = [
         f"{camera}={data_path(file)}" if kind != "keraal" else str(data_path(file)) for camera, file in files.items()
     ]
-    commands.import_files(kind, paths, log, 30.0)
+    inputs.import_files(kind, paths, log, 30.0)
     place = {"reference": None, "up": None, "height_m": None, "base": "1.0,0,0.65,0", **options}
-    commands.calibrate(log, cell, None, (), **place)
+    inputs.calibrate(log, cell, None, (), **place)
     folder = replay.run(
         "report", log, out=tmp_path / "run", cell_file=cell, end_s=4.0, overrides=(f"plan.task={task}",)
     )

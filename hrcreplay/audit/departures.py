@@ -86,7 +86,7 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
     states, nothing = recording.states.rows(ticks), np.zeros(len(ticks), dtype=bool)
     futures = [recorded_future(recording.t_ns, recording.points_m, states, h) for h in horizon_s.tolist()]
     bare = tube_stage(stage, _bare(horizon_s, 0.0, 0.0), residual=False)
-    unknown_m = bare.occupancy.residual_unknown_m
+    unknown_m = bare.settings.residual_unknown_m
     at = [tubes(states, bare.limits, True, unknown_m, h, stage.memory_s) for h in horizon_s.tolist()]
 
     # seen so lately that a limb has departed for no longer
@@ -143,15 +143,15 @@ def tube_stage(
     """
     changed = {"method": "sound", "legs": legs, "latency_s": 0.0, "residual": residual}
     limits = replace(stage.limits, departure=departure)
-    return replace(stage, limits=limits, occupancy=stage.occupancy.model_copy(update=changed))
+    return replace(stage, limits=limits, settings=stage.settings.model_copy(update=changed))
 
 
-def not_recorded(samples: Sequence[LimbDepartures]) -> list[str]:
+def find_unrecorded_limbs(samples: Sequence[LimbDepartures]) -> list[str]:
     """Limbs of BODY that no log shows near a horizon's end, so that nothing is said of them."""
-    return [limb for k, limb in enumerate(BODY) if not any(_recorded(s)[k] for s in samples)]
+    return [limb for k, limb in enumerate(BODY) if not any(_find_recorded(s)[k] for s in samples)]
 
 
-def _recorded(sample: LimbDepartures) -> Bools:
+def _find_recorded(sample: LimbDepartures) -> Bools:
     """(7,) whether a limb was recorded near any horizon's end."""
     return np.any([np.isfinite(sample.beyond_m(k, 0.0, 0.0)).any(axis=0) for k in range(len(sample.horizon_s))], axis=0)
 
@@ -176,7 +176,7 @@ def union_m3(stage: PredictionStage, sample: LimbDepartures, departure: Departur
 
 def capsules_m3(stage: PredictionStage, sample: LimbDepartures) -> list[float]:
     """The same of capsules that grow by 2 m/s and 50 m/s^2, which have no lower body [m^3]."""
-    radii, hand = limb_radii(stage.occupancy), stage.occupancy.hand_m
+    radii, hand = limb_radii(stage.settings), stage.settings.hand_m
     states = _some(sample.states)
     return [
         _union_m3(baselines.predict(states, horizon_s=h, radii_m=radii, hand_m=hand, method="v2_a50"))

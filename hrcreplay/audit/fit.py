@@ -17,7 +17,7 @@ import numpy as np
 from hrcreplay.audit import COVER, COVERAGE, HELD_BACK, fit_limits
 from hrcreplay.audit.departure_fit import EACH, counted
 from hrcreplay.audit.departure_fit import fit as fit_departures
-from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, not_recorded, union_m3
+from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, find_unrecorded_limbs, union_m3
 from hrcreplay.audit.fit_limits import Fit, Futures
 from hrcreplay.audit.measures import Estimate, block_ticks, resample
 from hrcreplay.errors import LogError, SettingsError
@@ -194,7 +194,7 @@ def _refuse(logs: Sequence[Path], out: Path, coverage: float, held_back: float, 
 def _horizon_s(run_configs: Sequence[RunConfig]) -> float:
     horizons = {assembly.prediction_stage(run_config).horizon_s for run_config in run_configs}
     if len(horizons) > 1:
-        raise SettingsError(f"occupancy.stop_s: found {sorted(horizons)} s; all logs need one horizon, set it")
+        raise SettingsError(f"prediction.stop_s: found {sorted(horizons)} s; all logs need one horizon, set it")
     return horizons.pop()
 
 
@@ -293,7 +293,7 @@ def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departur
         "pooled_are": "all logs" if all(recorded) else "logs without the truth",
         "training": pooled([[one.inside(found, k) for k in horizons] for one in fitted]),
         "unknown": pooled(inside),
-        "not_checked": not_recorded(known),
+        "not_checked": find_unrecorded_limbs(known),
         "logs": logs,
     }
     return found, facts, _missed(facts, coverage)
@@ -341,7 +341,7 @@ def _limits(found: Fit, samples: Sequence[FitSample], name: str) -> LimitSet:
 
 def _share(within: Sequence[Floats], horizon_s: float, rate_hz: float = FIT_HZ) -> Estimate:
     """Share of the ticks of some logs in which all joints stayed inside, with its interval."""
-    hits = [fit_limits.all_joints_inside(part) for part in within]
+    hits = [fit_limits.are_all_inside(part) for part in within]
     lengths = [len(part) for part in hits]
     drawn = resample(lengths, block_ticks(horizon_s, rate_hz, max(lengths)), horizon_s * rate_hz, SEED)
     return drawn.share(np.concatenate(hits))

@@ -155,7 +155,7 @@ def inside_intervals(some: Futures, bounds: Fit | LimitSet, horizon_s: float) ->
     return np.where(np.isfinite(some.moved), within.astype(float), np.nan)
 
 
-def all_joints_inside(within: Floats) -> Floats:
+def are_all_inside(within: Floats) -> Floats:
     """(n,) whether all joints (n, k) that were recorded stayed inside: 1, 0, or NaN where none was."""
     return np.where(np.isfinite(within).any(axis=1), (within != 0.0).all(axis=1).astype(float), np.nan)
 

@@ -16,10 +16,10 @@ from hrcreplay.evaluation.containment import (
     AUDIT_HZ,
     Outcome,
     RecordedFuture,
-    asked_rows,
     body_radii_m,
     check_containment,
     recorded_future,
+    select_rows,
 )
 from hrcreplay.evaluation.recorded_person import Recording, read_recording
 from hrcreplay.human.model import LimitSet
@@ -37,7 +37,7 @@ from hrcreplay.store.run_folder import Stopwatch
 
 def standstill_s(prediction_stage: PredictionStage) -> float:
     """Time for which the person must stay in the prediction: until the robot has reacted and braked [s]."""
-    return prediction_stage.horizon_s + prediction_stage.occupancy.latency_s
+    return prediction_stage.horizon_s + prediction_stage.settings.latency_s
 
 
 def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horizon_s: float) -> Floats:
@@ -125,8 +125,8 @@ def volumes(prediction_stage: PredictionStage, window: RecordedFuture, method: s
         return baselines.predict(
             window.states,
             horizon_s=standstill_s(prediction_stage),
-            radii_m=limb_radii(prediction_stage.occupancy),
-            hand_m=prediction_stage.occupancy.hand_m,
+            radii_m=limb_radii(prediction_stage.settings),
+            hand_m=prediction_stage.settings.hand_m,
             method=method,
         )
     return prediction_stage.volumes(window.states, method=method)
@@ -176,7 +176,7 @@ def audit_log(run_config: RunConfig, name: str, watch: Stopwatch) -> LogAudit:
             log, ticks_ns, assembly.fusion_stage(run_config, log), lambda n: bar.advance(f"reading {name}", n)
         )
     fusion = run_config.settings.fusion
-    rows = asked_rows(recording.states, int(recording.t_ns[-1]), fusion.rate_hz, horizon_s, fusion.fresh_s)
+    rows = select_rows(recording.states, int(recording.t_ns[-1]), fusion.rate_hz, horizon_s, fusion.fresh_s)
     if not len(rows):
         raise LogError(f"{run_config.log}: nobody was seen for longer than the horizon of {horizon_s:g} s")
     future = recorded_future(recording.t_ns, recording.points_m, recording.states.rows(rows), horizon_s)
@@ -250,9 +250,9 @@ def _shorter(
     """The same question at shorter horizons: latency and all, from tick to standstill."""
     found: dict[float, dict[str, Outcome]] = {}
     for horizon_s in shorter(prediction_stage):
-        stop_s = horizon_s - prediction_stage.occupancy.latency_s
-        occupancy = prediction_stage.occupancy.model_copy(update={"stop_s": stop_s})
-        stage, states = replace(prediction_stage, occupancy=occupancy), recording.states.rows(rows)
+        stop_s = horizon_s - prediction_stage.settings.latency_s
+        prediction = prediction_stage.settings.model_copy(update={"stop_s": stop_s})
+        stage, states = replace(prediction_stage, settings=prediction), recording.states.rows(rows)
         future = recorded_future(recording.t_ns, recording.points_m, states, horizon_s)
         found[horizon_s] = {m: _hold(stage, future, m, 1, progress) for m in compared_methods(stage)}
     return found

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import signal
 import sys
+import warnings
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 import typer
 
@@ -29,7 +30,7 @@ from hrcreplay.cli import (
     live,
     span,
 )
-from hrcreplay.errors import CoverageMissed, HrcReplayError, SettingsError
+from hrcreplay.errors import CoverageMissed, HrcReplayError, SettingRenamed, SettingsError
 from hrcreplay.version import __version__
 
 app = typer.Typer(
@@ -404,8 +405,27 @@ def demo(
 live.register(app)
 
 
+_show_other_warning = warnings.showwarning
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Writes a user's warning as one line; any other with its place in the code."""
+    if issubclass(category, SettingRenamed):
+        sys.stderr.write(f"hrcreplay: {message}\n")
+    else:
+        _show_other_warning(message, category, filename, lineno, file, line)
+
+
 def main() -> None:
     """Runs the command line. A user's error is one line and an exit code, a bug keeps its traceback."""
+    warnings.showwarning = _show_warning
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         app()

@@ -109,9 +109,9 @@ def twin(
     It is the robot of the settings, as of live: --set robot.urdf=FILE, and live.joint_order.
     """
     from hrcreplay.egm.robot_double.faults import load_faults
-    from hrcreplay.egm.robot_double.robot_simulator import TwinSettings
+    from hrcreplay.egm.robot_double.robot_simulator import SimulatorSettings
     from hrcreplay.egm.robot_double.servo import ServoSettings
-    from hrcreplay.egm.robot_double.udp_client import run_twin
+    from hrcreplay.egm.robot_double.udp_client import run_simulator
 
     servo = ServoSettings(
         gain=gain,
@@ -121,11 +121,11 @@ def twin(
         comm_timeout_s=comm_timeout,
         axes=_axes_of_double(config, as_overrides(settings, None, None)),
     )
-    double = TwinSettings(servo=servo, start_deg=_degrees(start), version=version, radians=radians)  # type: ignore[arg-type]
+    double = SimulatorSettings(servo=servo, start_deg=_degrees(start), version=version, radians=radians)  # type: ignore[arg-type]
     script = () if faults is None else load_faults(faults, seed=seed, duration_s=_positive(duration))
     duration_s = None if duration is None else _positive(duration)
     port = 6510 if port is None else port
-    report = run_twin(host, port, settings=double, faults=script, seed=seed, duration_s=duration_s, out=out)
+    report = run_simulator(host, port, settings=double, faults=script, seed=seed, duration_s=duration_s, out=out)
     sys.stdout.write("\n".join(report.lines()) + "\n")
 
 

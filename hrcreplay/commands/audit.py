@@ -85,7 +85,7 @@ def run(sources: Sequence[Path], *, out: Path | None = None, **options: Unpack[R
     """
     began = datetime.now(UTC)
     run_configs = [resolve("audit", source, **options) for source in sources]
-    _alike(run_configs)
+    _check_alike(run_configs)
     with RunWriter(out or Path("reports") / run_configs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-audit") as writer:
         watch = Stopwatch(time.perf_counter_ns)
         audits = [
@@ -133,14 +133,14 @@ def _summary(found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _alike(run_configs: Sequence[RunConfig]) -> None:
+def _check_alike(run_configs: Sequence[RunConfig]) -> None:
     """Refuses logs whose ticks cannot be counted together."""
     stages = [assembly.prediction_stage(run_config) for run_config in run_configs]
     for what, values in (
-        ("occupancy.stop_s and latency_s", [standstill_s(one) for one in stages]),
-        ("occupancy.method", [one.method for one in stages]),
-        ("occupancy.radius_*", [limb_radii(one.occupancy).tolist() for one in stages]),
-        ("the margins of occupancy", [_margins(one) for one in stages]),
+        ("prediction.stop_s and latency_s", [standstill_s(one) for one in stages]),
+        ("prediction.method", [one.method for one in stages]),
+        ("prediction.radius_*", [limb_radii(one.settings).tolist() for one in stages]),
+        ("the margins of prediction", [_margins(one) for one in stages]),
     ):
         for run_config, value in zip(run_configs, values, strict=True):
             if value != values[0]:
@@ -168,7 +168,7 @@ def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
                 "log": audit.name,
                 "sha256": audit.run_config.log_sha256,
                 "recorded_future": audit.recording.source,
-                "limits": audit.run_config.prediction.name,
+                "limits": audit.run_config.prediction_limits.name,
                 "ticks": lengths[k],
                 "counts": audit.recording.counts,
                 "cameras": _cameras(audit),
@@ -207,9 +207,9 @@ def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
 
 def _margins(prediction_stage: PredictionStage) -> tuple[Any, ...]:
     """Margins that ``sound`` adds to the model."""
-    occupancy = prediction_stage.occupancy
+    prediction = prediction_stage.settings
     names = ("sigmas", "latency_s", "hand_m", "legs_radius_m", "legs", "residual", "residual_unknown_m")
-    return (*(getattr(occupancy, name) for name in names), prediction_stage.memory_s)
+    return (*(getattr(prediction, name) for name in names), prediction_stage.memory_s)
 
 
 def _methods(audits: Sequence[LogAudit], drawn: Resampling) -> dict[str, Any]:

@@ -26,14 +26,20 @@ from hrcreplay import kernels
 from hrcreplay.commands import replay
 from hrcreplay.commands.notes import notes_of
 from hrcreplay.errors import SettingsError
-from hrcreplay.evaluation.contact import Predicted, contact_table, full_coverage, own_coverage, recorded_people
+from hrcreplay.evaluation.contact import (
+    Predicted,
+    compute_full_coverage,
+    compute_own_coverage,
+    contact_table,
+    read_recorded_people,
+)
 from hrcreplay.evaluation.containment import Outcome
 from hrcreplay.evaluation.recorded_person import RecordedPeople
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.assembly import Forecast
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
-from hrcreplay.pipeline.stages import ProgressBar, Sink, print_note, told_of_plan
+from hrcreplay.pipeline.stages import ProgressBar, Sink, collect_plan_findings, print_note
 from hrcreplay.records import Floats, Ints
 from hrcreplay.reporting import comparison
 from hrcreplay.reporting.comparison import Variant
@@ -42,7 +48,7 @@ from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference
 from hrcreplay.settings.load import Settings
-from hrcreplay.settings.sections import Occupancy, Plan
+from hrcreplay.settings.sections import Plan, Prediction
 from hrcreplay.store.columns import motion_columns, read_states
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
@@ -112,7 +118,7 @@ def run(
     per_run = [parse(methods, run_config.settings) for run_config in run_configs]
     if any(variants != per_run[0] for variants in per_run):
         raise SettingsError(
-            "occupancy.method, plan.horizon: the runs given differ, and one table has one of each; name them in "
+            "prediction.method, plan.horizon: the runs given differ, and one table has one of each; name them in "
             "--methods, as qp:sound:adaptive"
         )
     with RunWriter(out or replay.REPORTS / run_configs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-compare") as writer:
@@ -139,7 +145,7 @@ def parse(text: str, settings: Settings) -> tuple[Variant, ...]:
     """
     known = {
         "method": get_args(Plan.model_fields["method"].annotation),
-        "occupancy": get_args(Occupancy.model_fields["method"].annotation),
+        "occupancy": get_args(Prediction.model_fields["method"].annotation),
         "horizon": get_args(Plan.model_fields["horizon"].annotation),
     }
     found = []
@@ -153,7 +159,7 @@ def parse(text: str, settings: Settings) -> tuple[Variant, ...]:
         for part, (what, names) in zip(parts, known.items(), strict=False):
             if part not in names:
                 raise SettingsError(f"--methods {word}: {part!r} is no {what}; known are {', '.join(names)}")
-        default = (settings.plan.method, settings.occupancy.method, settings.plan.horizon)
+        default = (settings.plan.method, settings.prediction.method, settings.plan.horizon)
         found.append(Variant(*parts, *default[len(parts) :]))
     return tuple(dict.fromkeys(found))
 
@@ -168,9 +174,9 @@ def variant_run_config(run_config: RunConfig, variant: Variant) -> RunConfig:
     """The run that plans a variant and nothing else."""
     settings = run_config.settings
     plan = settings.plan.model_copy(update={"method": variant.method, "baselines": (), "horizon": variant.horizon})
-    occupancy = settings.occupancy.model_copy(update={"method": variant.occupancy})
+    prediction = settings.prediction.model_copy(update={"method": variant.occupancy})
     return replace(
-        run_config, command="plan", settings=settings.model_copy(update={"plan": plan, "occupancy": occupancy})
+        run_config, command="plan", settings=settings.model_copy(update={"plan": plan, "prediction": prediction})
     )
 
 
@@ -205,7 +211,7 @@ def _compare_log(
             fusing, log, ticks_ns, size, sink, reused, folder=part.partial, smooth=not log.header.has_truth
         )
         part.close_tables()
-        people = recorded_people(run_config, log, part)
+        people = read_recorded_people(run_config, log, part)
         part.close_tables()
         have = _motions(run_config, log, variants, ticks_ns, part)
         programme = _programme(run_config, log, int(ticks_ns[0]))
@@ -219,7 +225,7 @@ def _compare_log(
             for variant in variants
         ]
         took = _plan_all(tasks, processes, partial(bar.advance, name))
-    told |= {"plan": told_of_plan(log, sink)}
+    told |= {"plan": collect_plan_findings(log, sink)}
     notes = _notes(run_config, part.partial, variants, programme, replay.findings(run_config, told, reused))
     writer.timing[f"plan {name}"] = {variant.label: {"seconds": took[variant]} for variant in variants}
     part.partial.rename(part.folder)
@@ -241,7 +247,7 @@ def _full_coverages(
     for variant in sorted(variants, key=lambda variant: variant.method == "none"):
         if variant.occupancy not in found:
             mine = variant_run_config(run_config, variant)
-            found[variant.occupancy] = full_coverage(
+            found[variant.occupancy] = compute_full_coverage(
                 mine, people, Predicted(assembly.prediction_stage(mine), folder / "state.parquet")
             )
     return found
@@ -286,7 +292,7 @@ def tables(folder: Path, variant: Variant) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 def _report_settings(run_config: RunConfig) -> comparison.Bounds:
     report, plan = run_config.settings.report, run_config.settings.plan
-    return comparison.Bounds(report.near_m, report.stationary_m_per_s, plan.leash_m)
+    return comparison.Bounds(report.near_m, report.stationary_m_per_s, plan.max_reference_lead_m)
 
 
 def _motions(
@@ -401,7 +407,7 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     writer.close_tables()
     motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
     predicted = Predicted(surroundings.prediction, states)
-    own = own_coverage(run_config, task.people, predicted, motion)
+    own = compute_own_coverage(run_config, task.people, predicted, motion)
     full = None if task.variant.method == "none" else task.full
     rows = contact_table(run_config, robot, task.variant.method, motion, task.people, predicted, own, full)
     writer.table(f"contact_{slug}", rows)

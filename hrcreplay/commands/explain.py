@@ -28,7 +28,14 @@ from hrcreplay.reporting.tables import PageTable, neighbour_text, reason_text
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.active_constraints import TickContext, explain_refusal, propose_explained
 from hrcreplay.robot.control.certificate import NO_PLANES
-from hrcreplay.robot.control.control_step import REASONS, Stop, at_rest, axis_by_axis, standstill_reason, straight
+from hrcreplay.robot.control.control_step import (
+    REASONS,
+    Stop,
+    at_rest,
+    standstill_reason,
+    stop_axis_by_axis,
+    stop_straight,
+)
 from hrcreplay.robot.control.controllers import Controller, Predict, QpController
 from hrcreplay.store.columns import read_states
 
@@ -136,7 +143,7 @@ class Record:
         while first and self._status[first - 1] == "braking":
             first -= 1
         robot, dt_s = self.controller.robot, self.controller.settings.dt_s
-        for form in (straight, axis_by_axis):
+        for form in (stop_straight, stop_axis_by_axis):
             stop = form(self._q[first], self._dq[first], robot.ddq_max, dt_s)
             gone = tick - first
             if gone <= stop.ticks and np.array_equal(stop.q[gone], self._q[tick]):

@@ -20,7 +20,14 @@ from hrcreplay.commands.notes import notes_of
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
-from hrcreplay.pipeline.stages import ProgressBar, Sink, Told, print_note, told_of_fusion, told_of_plan
+from hrcreplay.pipeline.stages import (
+    ProgressBar,
+    Sink,
+    Told,
+    collect_fusion_findings,
+    collect_plan_findings,
+    print_note,
+)
 from hrcreplay.records import HumanStates, Ints
 from hrcreplay.reporting import tables
 from hrcreplay.reporting.summary_text import defect_notes
@@ -78,12 +85,12 @@ def run(
             log,
             writer,
             sink.watch,
-            {**known, **found, **about_run(run_config, began, parts, smooth=smooth)},
+            {**known, **found, **describe_run(run_config, began, parts, smooth=smooth)},
         )
         return writer.folder
 
 
-def about_run(run_config: RunConfig, began: datetime, parts: Mapping[str, str], *, smooth: bool) -> dict[str, Any]:
+def describe_run(run_config: RunConfig, began: datetime, parts: Mapping[str, str], *, smooth: bool) -> dict[str, Any]:
     """Entries of run.json on how a run came to be.
 
     Args:
@@ -112,7 +119,7 @@ def complete(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatc
     """
     base = assembly.known_robot_base(run_config, log)
     writer.close_tables()
-    meta |= _about_results(run_config, log, writer.partial, meta, meta["notes"])
+    meta |= _describe_results(run_config, log, writer.partial, meta, meta["notes"])
     for line in defect_notes(meta["counts"], meta["notes"]):
         print_note(line)
     meta["T_world_base"] = None if base is None else base.tolist()
@@ -166,7 +173,7 @@ def run_stages(
     states: Iterable[HumanStates]
     if "fuse" in todo:
         stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
-        states = stages.fused(log, ticks_ns, size, assembly.fusion_stage(run_config, log), sink, smooth=smooth)
+        states = stages.fuse_batches(log, ticks_ns, size, assembly.fusion_stage(run_config, log), sink, smooth=smooth)
     else:
         states = read_states(folder / "state.parquet", size)
     flow: Iterable[Any] = states
@@ -175,16 +182,18 @@ def run_stages(
         robot, path = (getattr(next(iter(chosen.values())).controller, name) for name in ("robot", "reference"))
         sink.notes["plan"].extend(assembly.programme_notes(run_config, log, path))
         every = stages.store_every(run_config) if "predict" in todo else math.inf
-        flow = stages.planned(states, assembly.surroundings(run_config, robot), chosen, every, sink)
+        flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), chosen, every, sink)
     elif "predict" in todo:
-        flow = stages.predicted(states, assembly.prediction_stage(run_config), stages.store_every(run_config), sink)
+        flow = stages.predict_batches(
+            states, assembly.prediction_stage(run_config), stages.store_every(run_config), sink
+        )
     if todo:
         for _ in flow:
             pass
-    return {"fuse": told_of_fusion(log, sink), "plan": told_of_plan(log, sink)}
+    return {"fuse": collect_fusion_findings(log, sink), "plan": collect_plan_findings(log, sink)}
 
 
-def _about_results(
+def _describe_results(
     run_config: RunConfig, log: Log, folder: Path, meta: dict[str, Any], told: list[str]
 ) -> dict[str, Any]:
     """Entries of run.json beside the findings of the stages: more remarks, and the robot where there is a plan.

@@ -17,7 +17,7 @@ from hrcreplay.pipeline.run_config import RunConfig, read_run_config
 from hrcreplay.reporting import tables
 from hrcreplay.reporting.figures import catalogue, drawing
 from hrcreplay.reporting.figures.catalogue import FigureData, FigureKind
-from hrcreplay.reporting.figures.figure_data import computed
+from hrcreplay.reporting.figures.figure_data import compute_fields
 from hrcreplay.reporting.metrics.contact import add_contact
 from hrcreplay.reporting.metrics.fusion import add_fusion, add_limbs, add_occupancy, add_quality
 from hrcreplay.reporting.metrics.planning import add_plan
@@ -48,16 +48,16 @@ def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any],
     stops = _stops(run_config, log, run, near["stationary_m_per_s"], found) if log else ()
     writer.text("metrics.json", run_folder.to_json(found))
     prediction_stage = assembly.prediction_stage(run_config)
-    occupancy = prediction_stage.occupancy
+    prediction = prediction_stage.settings
     parts = ("head", "thorax", "upper_arm", "lower_arm")
-    radii = {part.replace("_", " "): getattr(occupancy, f"radius_{part}_m") for part in parts}
-    if prediction_stage.method == "sound" and occupancy.legs:
-        radii["legs, of sound"] = occupancy.legs_radius_m
+    radii = {part.replace("_", " "): getattr(prediction, f"radius_{part}_m") for part in parts}
+    if prediction_stage.method == "sound" and prediction.legs:
+        radii["legs, of sound"] = prediction.legs_radius_m
     folder = writer.partial / "figures"
-    catalogue.draw_all(figure_data(run_config, run, found, catalogue.wanted(run, found)), folder)
+    catalogue.draw_all(figure_data(run_config, run, found, catalogue.select_figures(run, found)), folder)
     shown = [
-        tables.limit_table(run_config.prediction, use="prediction"),
-        tables.limit_table(run_config.tracking, use="tracking"),
+        tables.limit_table(run_config.prediction_limits, use="prediction"),
+        tables.limit_table(run_config.tracking_limits, use="tracking"),
         tables.radius_table(radii),
     ]
     scene = scene_of(run_config, run)
@@ -70,7 +70,7 @@ def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:
     """Scene of a run's 3-D replay; None where it moved no robot."""
     if run.motion is None or run.T_world_base is None:
         return None
-    radii_m = part_radii(run_config.settings.occupancy, run_config.settings.report.leg_radius_m)
+    radii_m = part_radii(run_config.settings.prediction, run_config.settings.report.leg_radius_m)
     parts = dict(zip(PARTS, radii_m.tolist(), strict=True))
     return replay_scene(run, assembly.robot(run_config, run.T_world_base), start_ns(run), parts)
 
@@ -143,7 +143,7 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
         method=str(setting(recorded, "plan", "method")),
         near_m=near_m,
         stationary_m_per_s=stationary_m_per_s,
-        leash_m=float(setting(recorded, "plan", "leash_m")),
+        max_reference_lead_m=float(setting(recorded, "plan", "max_reference_lead_m")),
         contact=run.contact,
     )
     add_contact(metrics, run, stationary_m_per_s)
@@ -190,7 +190,7 @@ def figure_data(
         metrics: The run's metrics.
         kinds: The figures.
     """
-    predicted = computed(run_config, run, [kind.predicted for kind in kinds])
+    predicted = compute_fields(run_config, run, [kind.predicted for kind in kinds])
     return FigureData(run=run, metrics=metrics, **_bounds(run_config.settings.model_dump()), **predicted)
 
 
@@ -252,7 +252,7 @@ def _recorded(folder: Path, option: str) -> tuple[Run, dict[str, Metric]]:
     if not run_folder.is_run(folder):
         raise SettingsError(f"{option}: {folder} is no run folder; make one with: hrcreplay report {folder}")
     run = run_folder.read(folder)
-    if "settings" not in run.meta or "occupancy" not in run.meta["settings"]:
+    if "settings" not in run.meta or "fusion" not in run.meta["settings"]:
         raise SettingsError(f"{option}: {folder} is no run of fuse, predict, plan, report or live")
     path = folder / "metrics.json"
     return run, json.loads(path.read_text()) if path.exists() else compute(run, **_bounds(run.meta["settings"]))

@@ -49,7 +49,7 @@ _BODY_HZ = 25.0
 Volumes = Mapping[str, tuple[Floats, float]]
 
 
-def recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> RecordedPeople:
+def read_recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> RecordedPeople:
     """Everybody in the log of a run. Without ground truth and smooth.parquet the log is fused again, and that written.
 
     Args:
@@ -92,7 +92,7 @@ def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_ba
         T_world_base: (4, 4) robot base in the world.
     """
     robot = assembly.robot(run_config, T_world_base)
-    people = recorded_people(run_config, log, writer)
+    people = read_recorded_people(run_config, log, writer)
     predicted = Predicted(assembly.prediction_stage(run_config), writer.partial / "state.parquet")
     chosen = run_config.settings.plan.method
     for path in sorted(writer.partial.glob("motion*.parquet")):
@@ -101,11 +101,11 @@ def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_ba
         own = full = None
         if path.stem == "motion":
             own, full = (
-                own_coverage(run_config, people, predicted, motion),
-                full_coverage(run_config, people, predicted),
+                compute_own_coverage(run_config, people, predicted, motion),
+                compute_full_coverage(run_config, people, predicted),
             )
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
-            axes_m = body_axes(people.person, shown_ns, run_config.settings.occupancy.hand_m)
+            axes_m = body_axes(people.person, shown_ns, run_config.settings.prediction.hand_m)
             writer.table("body", body_columns(shown_ns, axes_m, PARTS))
         writer.table("contact", contact_table(run_config, robot, method, motion, people, predicted, own, full))
     writer.close_tables()
@@ -119,7 +119,7 @@ def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats
     return axes_m
 
 
-def own_coverage(
+def compute_own_coverage(
     run_config: RunConfig, people: RecordedPeople, predicted: Predicted, motion: pd.DataFrame
 ) -> Outcome | None:
     """Coverage of every checked tick until the horizon that the motion's tick was decided with.
@@ -137,7 +137,7 @@ def own_coverage(
     return coverage(predicted.stage, people, states, run_config.settings.fusion, horizon_s)
 
 
-def full_coverage(run_config: RunConfig, people: RecordedPeople, predicted: Predicted) -> Outcome | None:
+def compute_full_coverage(run_config: RunConfig, people: RecordedPeople, predicted: Predicted) -> Outcome | None:
     """Coverage of every checked tick until the braking time T_s, as ``audit`` counts it."""
     if run_config.settings.plan.method == "none":
         return None
@@ -165,16 +165,16 @@ def contact_table(
         motion: Rows of a motion table.
         people: As recorded.
         predicted: Volumes of any tick.
-        own: What ``own_coverage`` found; None where it was not asked.
-        full: What ``full_coverage`` found; None likewise.
+        own: What ``compute_own_coverage`` found; None where it was not asked.
+        full: What ``compute_full_coverage`` found; None likewise.
     """
-    occupancy, t_ns = run_config.settings.occupancy, motion["t_ns"].to_numpy()
-    radii_m = part_radii(occupancy, run_config.settings.report.leg_radius_m)
-    person, other = nearest(robot, motion, (people.person, people.others), radii_m, occupancy.hand_m)
-    worst, of_other = worse(person, other)
+    prediction, t_ns = run_config.settings.prediction, motion["t_ns"].to_numpy()
+    radii_m = part_radii(prediction, run_config.settings.report.leg_radius_m)
+    person, other = nearest(robot, motion, (people.person, people.others), radii_m, prediction.hand_m)
+    worst, of_other = choose_nearer(person, other)
     outside_m = np.full(len(t_ns), np.nan)
     if method != "none":
-        outside_m = by_volume(motion, person, people.person, radii_m, occupancy.hand_m, predicted)
+        outside_m = by_volume(motion, person, people.person, radii_m, prediction.hand_m, predicted)
     sources = tuple(track.source for track in people.tracks)
     return contact_columns(
         t_ns=t_ns,
@@ -188,8 +188,8 @@ def contact_table(
         source=(np.where(of_other, len(people.person) + worst.track, worst.track), sources),
         apart=(person.distance_m, other.distance_m),
         outside_m=outside_m,
-        left=(*_left(own, t_ns), BODY),
-        left_full=(*_left(full, t_ns), BODY),
+        left=(*_measure_left(own, t_ns), BODY),
+        left_full=(*_measure_left(full, t_ns), BODY),
     )
 
 
@@ -204,7 +204,7 @@ class Nearest:
     speed: Floats  #: (n,) of the link's surface where it is nearest to the body [m/s]
 
 
-def worse(first: Nearest, second: Nearest) -> tuple[Nearest, Bools]:
+def choose_nearer(first: Nearest, second: Nearest) -> tuple[Nearest, Bools]:
     """Of two at the same ticks the nearer one, tick by tick, and (n,) where that is the second."""
     is_second: Bools = np.asarray(~(first.distance_m <= second.distance_m) & np.isfinite(second.distance_m))
     pairs = ((getattr(first, name), getattr(second, name)) for name in first.__dataclass_fields__)
@@ -249,7 +249,7 @@ def _nearest(
         at_m = pair.at_first_m + link_radius_m[pair.first][:, None] * towards
         index = np.where(pair.first >= 0, k, -1)
         speed = links.speed(pair.first, at_m)
-        found, _ = worse(found, Nearest(pair.distance_m, pair.first, pair.second, index, speed))
+        found, _ = choose_nearer(found, Nearest(pair.distance_m, pair.first, pair.second, index, speed))
     return found
 
 
@@ -270,7 +270,7 @@ def _at(from_ns: Ints, motion_ns: Ints, values: Floats) -> Floats:
     return np.where(motion_ns[row] == from_ns, values[row], np.nan)
 
 
-def _left(outcome: Outcome | None, t_ns: Ints) -> tuple[Floats, Ints]:
+def _measure_left(outcome: Outcome | None, t_ns: Ints) -> tuple[Floats, Ints]:
     """(n,) how far at most a limb left its volume, 0 where all were held, NaN where not asked [m]; (n,) that limb."""
     out_m, limb = np.full(len(t_ns), np.nan), np.full(len(t_ns), -1)
     if outcome is None:

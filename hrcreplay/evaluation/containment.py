@@ -112,10 +112,12 @@ def recorded_future(t_ns: Ints, points_m: Floats, states: HumanStates, horizon_s
     first = np.searchsorted(t_ns, states.t_ns, side="right")
     last = np.searchsorted(t_ns, states.t_ns + horizon_ns, side="right")
     end = np.searchsorted(t_ns, states.t_ns + np.round(_END * horizon_ns).astype(np.int64), side="right")
-    return RecordedFuture(states, limbs, first, last, {limb: _seen(part, end, last) for limb, part in limbs.items()})
+    return RecordedFuture(
+        states, limbs, first, last, {limb: _find_seen(part, end, last) for limb, part in limbs.items()}
+    )
 
 
-def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
+def _find_seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
     """(n, k) whether each of the points (m, k, 3) was recorded in any row from ``first`` (n,) up to ``last`` (n,)."""
     count = np.zeros((len(recorded) + 1, recorded.shape[1]), np.int64)
     np.cumsum(np.isfinite(recorded).all(axis=2), axis=0, out=count[1:])
@@ -124,7 +126,7 @@ def _seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
 
 def body_radii_m(prediction_stage: PredictionStage) -> dict[str, float]:
     """Limb -> its radius, Table 2; of the legs that of a thigh [m]."""
-    return dict(zip(BODY, (*limb_radii(prediction_stage.occupancy).tolist(), THIGH_M), strict=True))
+    return dict(zip(BODY, (*limb_radii(prediction_stage.settings).tolist(), THIGH_M), strict=True))
 
 
 def check_containment(
@@ -178,7 +180,7 @@ def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str)
     return float(np.nanmax(solid.distances_m(points)))
 
 
-def asked_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: float | Floats, fresh_s: float) -> Ints:
+def select_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: float | Floats, fresh_s: float) -> Ints:
     """Rows of the states that are asked: one in so many, with a known person, a whole horizon before the end.
 
     Args:
@@ -209,9 +211,9 @@ def coverage(
         fusion: Settings of stage 1.
         horizon_s: (n,) for which each tick's volumes were predicted, without the latency; NaN: not asked [s].
     """
-    until_s = horizon_s + stage.occupancy.latency_s
+    until_s = horizon_s + stage.settings.latency_s
     last_ns = int(people.t_ns[-1]) if len(people.t_ns) else 0
-    rows = asked_rows(states, last_ns, fusion.rate_hz, np.where(np.isfinite(until_s), until_s, np.inf), fusion.fresh_s)
+    rows = select_rows(states, last_ns, fusion.rate_hz, np.where(np.isfinite(until_s), until_s, np.inf), fusion.fresh_s)
     asked = states.rows(rows)
     future = recorded_future(people.t_ns, people.points_m, asked, until_s[rows])
     radii_m, nothing = body_radii_m(stage), np.zeros(1, dtype=np.bool_)

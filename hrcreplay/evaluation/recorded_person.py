@@ -152,11 +152,11 @@ def from_states(states: HumanStates, memory_s: float) -> BodyTrack:
         memory_s: Between two ticks that used a camera further apart than this, nothing is known [s].
     """
     points_m = skeleton(states.p, states.lengths_m)
-    points_m[~_seen(states, memory_s)] = np.nan
+    points_m[~_find_seen(states, memory_s)] = np.nan
     return BodyTrack(SMOOTHED, states.t_ns, points_m)
 
 
-def _seen(states: HumanStates, memory_s: float) -> Bools:
+def _find_seen(states: HumanStates, memory_s: float) -> Bools:
     """(n,) ticks that lie between two ticks with a camera not further apart than ``memory_s`` [s], both included."""
     used = np.flatnonzero(states.valid.any(axis=1))
     if not len(used):
@@ -196,7 +196,7 @@ def read_people(
     if not seen:
         return RecordedPeople(SMOOTHED, smoothed.t_ns, smoothed.points_m, (smoothed,), tracks)
     measurements = Measurements.join(seen)
-    points, _ = _believed(measurements, best, fusion_stage)
+    points, _ = _select_believed(measurements, best, fusion_stage)
     source, t_ns, points_m = _recorded_points(measurements, points, best)
     cameras = [
         _track(camera, measurements.capture_ns[mine], points[mine])
@@ -291,7 +291,7 @@ def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress
         LogError: No camera saw anybody.
     """
     counts: Counter[str] = Counter()
-    stretches = fused_stretches(log, ticks_ns, fusion_stage, counts, progress)
+    stretches = fuse_stretches(log, ticks_ns, fusion_stage, counts, progress)
     truth = _truth(log, ticks_ns)
     if truth is not None:
         states = HumanStates.join([states for _, states, _ in stretches])
@@ -303,7 +303,7 @@ def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress
         passed.append(states)
         best += smoother.add(states, trace)
     smoothed, measurements = HumanStates.join([*best, *smoother.finish()]), Measurements.join(seen)
-    points, rejected = _believed(measurements, smoothed, fusion_stage)
+    points, rejected = _select_believed(measurements, smoothed, fusion_stage)
     counts.update(rejected)
     source, t_ns, points_m = _recorded_points(measurements, points, smoothed)
     return Recording(HumanStates.join(passed), t_ns, points_m, smoothed.t_ns, smoothed.p, source, _plain(log, counts))
@@ -321,7 +321,7 @@ def _recorded_points(seen: Measurements, points: Floats, best: HumanStates) -> t
 Stretch = tuple[Measurements, HumanStates, fuse.Trace]
 
 
-def fused_stretches(
+def fuse_stretches(
     log: Log, ticks_ns: Ints, fusion_stage: FusionStage, counts: Counter[str], progress: Callable[[int], None]
 ) -> Iterator[Stretch]:
     """Stage 1, traced, from the first stretch on in which a camera saw somebody.
@@ -350,7 +350,7 @@ def fused_stretches(
         raise LogError(f"{log.header.path}: no camera saw anybody; an audit needs a person")
 
 
-def _believed(seen: Measurements, best: HumanStates, fusion_stage: FusionStage) -> tuple[Floats, Counter[str]]:
+def _select_believed(seen: Measurements, best: HumanStates, fusion_stage: FusionStage) -> tuple[Floats, Counter[str]]:
     """The measured points (m, 20, 3) that are believed, and how many per camera are not, by why.
 
     A missing point and one of confidence 0 were not seen. One that the camera trusts too little, that hangs from such a
@@ -380,10 +380,12 @@ def _believed(seen: Measurements, best: HumanStates, fusion_stage: FusionStage) 
             fits = np.linalg.norm(seen.points_m[:, k] - seen.points_m[:, j], axis=1) <= longest_m
             jumped[:, k] = trusted[:, k] & (jumped[:, j] | (good[:, j] & ~fits))
             good[:, k] &= good[:, j] & fits
-    return np.where((good & measured)[..., None], seen.points_m, np.nan), _disbelieved(seen, measured, good, jumped)
+    return np.where((good & measured)[..., None], seen.points_m, np.nan), _count_disbelieved(
+        seen, measured, good, jumped
+    )
 
 
-def _disbelieved(seen: Measurements, measured: Bools, good: Bools, jumped: Bools) -> Counter[str]:
+def _count_disbelieved(seen: Measurements, measured: Bools, good: Bools, jumped: Bools) -> Counter[str]:
     """Per camera the points that were not seen, were doubted, or jump; and the frames with one that jumps."""
     counts: Counter[str] = Counter()
     for c, camera in enumerate(seen.cameras):

@@ -21,7 +21,7 @@ import numpy as np
 
 from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, POINTS, Floats
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.settings.sections import Prediction
 
 #: First of the four joints of each arm in JOINTS, and s of the kinematics: +1 on the left.
 RIGHT_ARM, LEFT_ARM = 4, 8
@@ -395,9 +395,9 @@ def part_axes(points_m: Floats, hand_m: float) -> Floats:
     return np.asarray(axes)
 
 
-def part_radii(occupancy: Occupancy, leg_m: float) -> Floats:
+def part_radii(prediction: Prediction, leg_m: float) -> Floats:
     """(14,) radii of PARTS: Table 2, a hand's that of the lower arm; ``leg_m`` for thighs, shanks and feet [m]."""
-    upper, lower = occupancy.radius_upper_arm_m, occupancy.radius_lower_arm_m
+    upper, lower = prediction.radius_upper_arm_m, prediction.radius_lower_arm_m
     arms = (upper, lower, upper, lower)
     legs, ends = (leg_m,) * len(LEG_PARTS), (lower, lower, leg_m, leg_m)
-    return np.array([occupancy.radius_head_m, occupancy.radius_thorax_m, *arms, *legs, *ends])
+    return np.array([prediction.radius_head_m, prediction.radius_thorax_m, *arms, *legs, *ends])

@@ -312,7 +312,7 @@ def _await_person(person: HelperProcess, human: Path | None) -> None:
 
 
 def _loop_settings(request: Request, settings: Settings) -> LoopSettings:
-    live, store_hz = settings.live, settings.occupancy.store_hz
+    live, store_hz = settings.live, settings.prediction.store_hz
     return LoopSettings(
         duration_s=request.duration_s,
         sending=request.send,

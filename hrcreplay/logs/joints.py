@@ -196,7 +196,7 @@ def read_track(
     defects["joint_gaps_ms"] += round(_covered_ns(gaps_ns) / 1e6)
     read = dict.fromkeys(topic.name for topic in chosen.values())
     notes = [
-        *_named(topics, names, chosen),
+        *_match_names(topics, names, chosen),
         *agreed,
         *(clocks[name].remark for name in read if clocks[name].remark),
         *_small_degrees(track, options.joints_unit),
@@ -224,7 +224,7 @@ def match_names(topics: Sequence[JointTopic], axes: Sequence[str], given: Sequen
     """
     found = dict.fromkeys(name for topic in topics for name in topic.joints)
     if given:
-        return _given(list(found), axes, given)
+        return _check_names(list(found), axes, given)
     plain: dict[str, list[str]] = {}
     for name in found:
         plain.setdefault(_plain(name), []).append(name)
@@ -242,7 +242,7 @@ def match_names(topics: Sequence[JointTopic], axes: Sequence[str], given: Sequen
     raise _unfit(topics, axes, more, where)
 
 
-def _given(found: Sequence[str], axes: Sequence[str], given: Sequence[str]) -> dict[str, str]:
+def _check_names(found: Sequence[str], axes: Sequence[str], given: Sequence[str]) -> dict[str, str]:
     setting = "logs.joint_names"
     if len(given) != len(axes):
         raise SettingsError(
@@ -251,7 +251,7 @@ def _given(found: Sequence[str], axes: Sequence[str], given: Sequence[str]) -> d
         )
     missing = [name for name in given if name not in found]
     if missing:
-        raise SettingsError(f"{setting}: {missing[0]!r} is not in the log; its joints are {_listed(found)}")
+        raise SettingsError(f"{setting}: {missing[0]!r} is not in the log; its joints are {_list_names(found)}")
     return dict(zip(axes, given, strict=True))
 
 
@@ -273,12 +273,12 @@ def _beyond(found: Sequence[str], axes: Sequence[str]) -> list[str]:
 def _unfit(topics: Sequence[JointTopic], axes: Sequence[str], more: Sequence[str], where: str) -> LogError:
     found = list(dict.fromkeys(name for topic in topics for name in topic.joints))
     nameless = sum(name.startswith(_NAMELESS) for name in found)
-    told = f"{nameless} positions without names" if nameless == len(found) else f"joints {_listed(found)}"
+    told = f"{nameless} positions without names" if nameless == len(found) else f"joints {_list_names(found)}"
     ends = [[name for name in found if _plain(name).endswith(_plain(axis))] for axis in axes]
     likely = [names[0] for names in ends if len(names) == 1]
     example = likely if len(set(likely)) == len(axes) else [f"name of {axis}" for axis in axes]
     setting = ", ".join(f'"{name}"' for name in example)
-    why = f" ({_listed(more)} would be one more of them)" if more else ""
+    why = f" ({_list_names(more)} would be one more of them)" if more else ""
     return LogError(
         f"{where}: {', '.join(topic.name for topic in topics)}: found {told}; the robot's axes are "
         f"{', '.join(axes)}{why}. Name the log's joints in the order of the axes, "
@@ -287,7 +287,7 @@ def _unfit(topics: Sequence[JointTopic], axes: Sequence[str], more: Sequence[str
     )
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     most = 20
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
@@ -371,7 +371,7 @@ def place_in_time(
     defects["joints_stamp_wrong"] += int(wrong.sum())
     stamp = np.where(wrong, arrival - delays, stamp - given_ns)
     match = _match_clocks(arrival, stamp, delays, wrong)
-    basis, remark = _judge(match, f"robot joints: the stamps of {topic.name}", offset_s)
+    basis, remark = _check_track(match, f"robot joints: the stamps of {topic.name}", offset_s)
     shift_ns = match.quickest_ns if basis == "stamps, shifted" else 0
     if basis != "arrival":
         t_ns[mine] = stamp + shift_ns
@@ -404,7 +404,7 @@ def _match_clocks(arrival_ns: Ints, stamp_ns: Ints, delays_ns: Ints, wrong: Bool
     return _Match((float(np.median(late)) / _NS, low / _NS, high / _NS), low, least_s, len(steps), at_s, by_s)
 
 
-def _judge(match: _Match, stamps: str, offset_s: float | None) -> tuple[str, str]:
+def _check_track(match: _Match, stamps: str, offset_s: float | None) -> tuple[str, str]:
     """Basis of the instants (see ``Clock.basis``), and the remark."""
     median_s, low_s, high_s = match.delay_s
     least_s, most_s = min(match.least_s), max(match.least_s)
@@ -550,7 +550,9 @@ def coverage_remarks(reading: JointReading, start_ns: int, end_ns: int) -> Itera
     )
 
 
-def _named(topics: Sequence[JointTopic], names: Mapping[str, str], chosen: Mapping[str, JointTopic]) -> Iterator[str]:
+def _match_names(
+    topics: Sequence[JointTopic], names: Mapping[str, str], chosen: Mapping[str, JointTopic]
+) -> Iterator[str]:
     """Remarks on names that are not the robot's, and on joints that are no axis."""
     if all(name.startswith(_NAMELESS) for name in names.values()):
         order = ", ".join(names)
@@ -566,10 +568,8 @@ def _named(topics: Sequence[JointTopic], names: Mapping[str, str], chosen: Mappi
     if others:
         moving = {name: f"{name} (moves by {way:.3g})" for name, way in others.items() if way > _AT_REST}
         carrying = "; if one that moves carries the arm, the robot's base is not where it is taken to be"
-        yield (
-            f"robot joints: ignored, as no axis of the robot: {_listed([moving.get(name, name) for name in others])}"
-            f"{carrying if moving else ''}"
-        )
+        ignored = _list_names([moving.get(name, name) for name in others])
+        yield f"robot joints: ignored, as no axis of the robot: {ignored}{carrying if moving else ''}"
 
 
 def _small_degrees(track: JointTrack, unit: str) -> Iterator[str]:

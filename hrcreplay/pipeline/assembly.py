@@ -30,9 +30,9 @@ from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.controllers import CONTROLLERS, Controller, Planner, Predict
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
-from hrcreplay.robot.path import programmed, recorded, recorded_remarks
+from hrcreplay.robot.path import plan_programme, recorded_remarks, smooth_recorded
 from hrcreplay.robot.task import Reference, Task, parse_task
-from hrcreplay.settings.sections import Fusion, Occupancy, Robot
+from hrcreplay.settings.sections import Fusion, Prediction, Robot
 
 
 class Sightings(NamedTuple):
@@ -87,32 +87,32 @@ class PredictionStage:
     """Stage 2: limit set, horizon, radii, margins and method of the swept volumes."""
 
     limits: LimitSet
-    occupancy: Occupancy
+    settings: Prediction
     memory_s: float  #: how long the filter goes on without a measurement [s]
 
     @property
     def horizon_s(self) -> float:
         """Braking time T_s of the robot [s]."""
-        return self.occupancy.stop_s
+        return self.settings.stop_s
 
     @property
     def method(self) -> str:
         """Method of the prediction."""
-        return self.occupancy.method
+        return self.settings.method
 
     @property
     def limbs(self) -> tuple[str, ...]:
         """Limbs that have volumes."""
-        return swept_volumes.limbs_of(self.occupancy)
+        return swept_volumes.limbs_of(self.settings)
 
     def by(self, method: str) -> PredictionStage:
         """The same by another method."""
-        return replace(self, occupancy=self.occupancy.model_copy(update={"method": method}))
+        return replace(self, settings=self.settings.model_copy(update={"method": method}))
 
     def reachable(self, states: HumanStates) -> swept_volumes.Reach:
         """Reachable interval of every joint at every tick."""
         return swept_volumes.reachable(
-            states, self.limits, self.occupancy, horizon_s=self.horizon_s, memory_s=self.memory_s
+            states, self.limits, self.settings, horizon_s=self.horizon_s, memory_s=self.memory_s
         )
 
     def volumes(
@@ -128,7 +128,7 @@ class PredictionStage:
         if method is not None:
             return self.by(method).volumes(states, horizon_s)
         horizon_s = self.horizon_s if horizon_s is None else horizon_s
-        return swept_volumes.predict(states, self.limits, self.occupancy, horizon_s=horizon_s, memory_s=self.memory_s)
+        return swept_volumes.predict(states, self.limits, self.settings, horizon_s=horizon_s, memory_s=self.memory_s)
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ def fusion_stage(run_config: RunConfig, log: LogLike) -> FusionStage:
         T_world_camera=np.array([poses[camera] for camera in log.header.cameras]),
         clock_offset_ns=np.round(np.array(offsets_s) * 1e9).astype(np.int64),
         filter=run_config.settings.fusion,
-        limits=run_config.tracking,
+        limits=run_config.tracking_limits,
         person_jump_m=logs.person_jump_m,
         person_memory_s=logs.person_memory_s,
         watched=watched_area(run_config),
@@ -262,12 +262,12 @@ def watched_area(run_config: RunConfig) -> WatchedArea | None:
 
 def prediction_stage(run_config: RunConfig) -> PredictionStage:
     """Stage 2 of a run. For a live robot the latency includes ``live.reaction_s``, so the volumes are larger."""
-    occupancy = run_config.settings.occupancy
+    prediction = run_config.settings.prediction
     if run_config.command == "live":
-        occupancy = occupancy.model_copy(
-            update={"latency_s": occupancy.latency_s + run_config.settings.live.reaction_s}
+        prediction = prediction.model_copy(
+            update={"latency_s": prediction.latency_s + run_config.settings.live.reaction_s}
         )
-    return PredictionStage(run_config.prediction, occupancy, run_config.settings.fusion.memory_s)
+    return PredictionStage(run_config.prediction_limits, prediction, run_config.settings.fusion.memory_s)
 
 
 def surroundings(run_config: RunConfig, model: RobotModel) -> Surroundings:
@@ -279,7 +279,7 @@ def surroundings(run_config: RunConfig, model: RobotModel) -> Surroundings:
     stage, area = prediction_stage(run_config), watched_area(run_config)
     border = None
     if area is not None:
-        border = WatchedBorder(area, Border.around(model, area.polygon), stage.occupancy.latency_s)
+        border = WatchedBorder(area, Border.around(model, area.polygon), stage.settings.latency_s)
         if not border.border.room_m.min() > 0.0:
             base_m = np.round(model.T_world_base[:2, 3], 3).tolist()
             raise SettingsError(
@@ -302,7 +302,7 @@ def robot(run_config: RunConfig, T_world_base: Floats) -> RobotModel:
     Raises:
         SettingsError: The URDF or a robot setting cannot be used.
     """
-    return _robot(run_config.settings.robot, run_config.urdf, run_config.settings.occupancy.stop_s, T_world_base)
+    return _robot(run_config.settings.robot, run_config.urdf, run_config.settings.prediction.stop_s, T_world_base)
 
 
 def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base: Floats) -> RobotModel:
@@ -350,7 +350,7 @@ def reference(run_config: RunConfig, log: LogLike, model: RobotModel) -> tuple[R
     file = run_config.settings.plan.task
     table, where = (run_config.task, own[1] if file is None else str(file)) if run_config.task else own
     if table is not None:
-        parts = run_config.settings.robot, run_config.urdf, run_config.settings.occupancy.stop_s
+        parts = run_config.settings.robot, run_config.urdf, run_config.settings.prediction.stop_s
         path = _programme(parse_task(table, where), where, *parts, model.T_world_base.tobytes())
         return replace(path, model=model), None
     track = log.joints(model.joint_names)
@@ -360,7 +360,7 @@ def reference(run_config: RunConfig, log: LogLike, model: RobotModel) -> tuple[R
             f"{log.header.path}: no task and no joint track{empty if log.header.joint_topics else ''}; "
             "name a task file with --set plan.task=FILE.toml"
         )
-    return recorded(track.t_ns, track.q, model), int(track.t_ns[0])
+    return smooth_recorded(track.t_ns, track.q, model), int(track.t_ns[0])
 
 
 def programme_notes(run_config: RunConfig, log: LogLike, path: Reference) -> list[str]:
@@ -382,7 +382,7 @@ def _programme(
 ) -> Reference:
     """The path of a task by the robot of the other arguments, which are those of ``_robot``."""
     model = _robot(settings, files, stop_s, np.frombuffer(T_world_base).reshape(4, 4))
-    return programmed(task, model, where)
+    return plan_programme(task, model, where)
 
 
 def planners(run_config: RunConfig, log: LogLike, start_ns: int) -> dict[str, Planner]:
@@ -415,12 +415,12 @@ def robot_base(run_config: RunConfig, log: LogLike) -> Floats:
 
 def plan_settings(run_config: RunConfig, dt_s: float, method: str) -> PlanSettings:
     """Section 5 for ticks of ``dt_s`` [s] by a method."""
-    plan, occupancy = run_config.settings.plan, prediction_stage(run_config).occupancy
+    plan, prediction = run_config.settings.plan, prediction_stage(run_config).settings
     return PlanSettings(
         plan,
         dt_s=dt_s,
-        stop_s=occupancy.stop_s,
-        latency_s=occupancy.latency_s,
+        stop_s=prediction.stop_s,
+        latency_s=prediction.latency_s,
         spare_ticks=int(run_config.command == "live"),
         certified=plan.certify and method != "none",
         retreat_m=plan.retreat_m if plan.certify and method == "qp" else 0.0,

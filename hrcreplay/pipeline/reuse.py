@@ -21,14 +21,14 @@ from hrcreplay.store.run_folder import RunWriter
 
 #: What the fused person depends on, and the volumes; each stage works on what those before it hand on.
 _PERSON = ("versions", "log", "ticks", "cameras", "watched", "settings logs", "settings fusion", "limits.tracking")
-_VOLUMES = (*_PERSON, "settings occupancy", "limits.prediction")
+_VOLUMES = (*_PERSON, "settings prediction", "limits.prediction")
 _PROGRAMME = ("base", "programme", "settings robot", "settings plan")
 _JOINT_SETTINGS = tuple(key for key in Logs.model_fields if key.startswith("joint"))
 #: Stage -> the parts that its tables, counts and notes depend on. The plan takes the volumes of every tick: how many
 #: of them are stored changes nothing for it.
 PARTS = {
     "fuse": (*_PERSON, "logs.gap_s"),
-    "predict": (*_VOLUMES, "occupancy.store_hz"),
+    "predict": (*_VOLUMES, "prediction.store_hz"),
     "plan": (*_VOLUMES, *_PROGRAMME),
 }
 
@@ -70,10 +70,10 @@ def dependencies(run_config: RunConfig, log: LogLike, ticks_ns: Ints) -> dict[st
         "settings logs": _without(settings["logs"], *_JOINT_SETTINGS, "gap_s"),
         "logs.gap_s": settings["logs"]["gap_s"],
         "settings fusion": settings["fusion"],
-        "limits.tracking": _without(run_config.tracking.plain(), "name"),
-        "settings occupancy": _without(settings["occupancy"], "store_hz"),
-        "occupancy.store_hz": settings["occupancy"]["store_hz"],
-        "limits.prediction": _without(run_config.prediction.plain(), "name"),
+        "limits.tracking": _without(run_config.tracking_limits.plain(), "name"),
+        "settings prediction": _without(settings["prediction"], "store_hz"),
+        "prediction.store_hz": settings["prediction"]["store_hz"],
+        "limits.prediction": _without(run_config.prediction_limits.plain(), "name"),
     }
     if "plan" in run_config.stages:
         base = assembly.known_robot_base(run_config, log)

@@ -185,8 +185,8 @@ class RunConfig:
     task: dict[str, Any] | None
     start_s: float | None
     end_s: float | None
-    tracking: LimitSet
-    prediction: LimitSet
+    tracking_limits: LimitSet
+    prediction_limits: LimitSet
     earlier: Path | None  #: run folder given instead of a log
     recorded_urdf: UrdfFiles | None = None  #: of the run folder that the run is from; else the settings' own file
 
@@ -230,7 +230,7 @@ class RunConfig:
             "cell": None if self.cell is None else self.cell.to_dict(),
             "task": self.task,
             "span_s": [self.start_s, self.end_s],
-            "limits": {"tracking": self.tracking.plain(), "prediction": self.prediction.plain()},
+            "limits": {"tracking": self.tracking_limits.plain(), "prediction": self.prediction_limits.plain()},
         }
 
 
@@ -303,8 +303,8 @@ def resolve(
         task=_task(settings, earlier),
         start_s=start_s,
         end_s=end_s,
-        tracking=load_limits(settings.limits.tracking),
-        prediction=load_limits(settings.limits.prediction),
+        tracking_limits=load_limits(settings.limits.tracking),
+        prediction_limits=load_limits(settings.limits.prediction),
         earlier=source if earlier is not None else None,
     )
 
@@ -327,8 +327,8 @@ def read_run_config(folder: Path) -> RunConfig:
         task=meta["task"],
         start_s=meta["span_s"][0],
         end_s=meta["span_s"][1],
-        tracking=recorded_limits(meta["limits"]["tracking"], folder),
-        prediction=recorded_limits(meta["limits"]["prediction"], folder),
+        tracking_limits=recorded_limits(meta["limits"]["tracking"], folder),
+        prediction_limits=recorded_limits(meta["limits"]["prediction"], folder),
         earlier=folder,
         recorded_urdf=_recorded_urdf(meta),
     )
@@ -367,8 +367,8 @@ def resolve_without_log(command: str, where: Path, settings: Settings, cell_file
         task=_task(settings, None),
         start_s=None,
         end_s=None,
-        tracking=load_limits(settings.limits.tracking),
-        prediction=load_limits(settings.limits.prediction),
+        tracking_limits=load_limits(settings.limits.tracking),
+        prediction_limits=load_limits(settings.limits.prediction),
         earlier=None,
     )
 

@@ -89,12 +89,12 @@ class Sink:
     notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> what is odd
 
 
-def told_of_fusion(log: Log, sink: Sink) -> Told:
+def collect_fusion_findings(log: Log, sink: Sink) -> Told:
     """Findings of the latest pass over a log's frames and of stage 1, in files, frames and person."""
     return Told(log.defects - log.joint_defects + sink.counts, (*log.notes, *sink.notes["fuse"]))
 
 
-def told_of_plan(log: Log, sink: Sink) -> Told:
+def collect_plan_findings(log: Log, sink: Sink) -> Told:
     """Findings of the latest reading of a log's joints and of stage 3."""
     return Told(log.joint_defects, tuple(sink.notes["plan"]))
 
@@ -132,7 +132,7 @@ def span_ticks(run_config: RunConfig, log: Log) -> Ints:
 
 def store_every(run_config: RunConfig) -> float:
     """Number of ticks for one whose volumes are stored."""
-    store_hz = run_config.settings.occupancy.store_hz
+    store_hz = run_config.settings.prediction.store_hz
     return 1.0 if store_hz == "all" else max(1.0, run_config.settings.fusion.rate_hz / store_hz)
 
 
@@ -154,7 +154,7 @@ def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterat
         yield ticks, due
 
 
-def fused(
+def fuse_batches(
     log: Log, ticks_ns: Ints, size: int, fusion_stage: FusionStage, sink: Sink, *, smooth: bool = False
 ) -> Iterator[HumanStates]:
     """Stage 1: camera frames to the fused person; writes measurements and state, and ``smooth`` where asked.
@@ -203,16 +203,16 @@ def fused(
         raise _nobody(log, sink.counts)
     with sink.watch.stage("clocks", len(ticks_ns)):
         sink.notes["fuse"].extend(clocks.remarks())
-    sink.notes["fuse"].extend(_late(log, sink.counts, fusion_stage.clock_offset_ns))
+    sink.notes["fuse"].extend(_describe_late_frames(log, sink.counts, fusion_stage.clock_offset_ns))
     write_checks(checks, sink)
-    sink.notes["fuse"].extend(_about_area(log, fuser.area, sink.counts) if watched else ())
-    sink.notes["fuse"].extend(_about_others(sink.counts))
+    sink.notes["fuse"].extend(_describe_area(log, fuser.area, sink.counts) if watched else ())
+    sink.notes["fuse"].extend(_describe_others(sink.counts))
     if smooth:
         for part in smoother.finish():
             sink.tables.table("smooth", state_columns(part))
 
 
-def _about_others(counts: Counter[str]) -> Iterator[str]:
+def _describe_others(counts: Counter[str]) -> Iterator[str]:
     """A note on bodies that are not the person."""
     if others := counts["person_frames_beside_others"]:
         yield (
@@ -221,7 +221,7 @@ def _about_others(counts: Counter[str]) -> Iterator[str]:
         )
 
 
-def _about_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -> Iterator[str]:
+def _describe_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -> Iterator[str]:
     """Notes on a watched area: what was never known of it, and what contradicts it."""
     if refuting := counts["watched_frames_refuting"]:
         yield (
@@ -311,7 +311,7 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
     )
 
 
-def _late(log: Log, counts: Counter[str], offsets_ns: Ints) -> Iterator[str]:
+def _describe_late_frames(log: Log, counts: Counter[str], offsets_ns: Ints) -> Iterator[str]:
     """Notes on frames that came too late."""
     for camera, offset_ns in zip(log.header.cameras, offsets_ns.tolist(), strict=True):
         late = counts[f"frames_late_{camera}"]
@@ -337,7 +337,7 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
             sink.tables.table("truth", truth_columns(within.t_ns, *inverse_kinematics.inverse(within.points_m)))
 
 
-def stored_ticks(first: int, count: int, store_every: float) -> Ints:
+def select_stored_ticks(first: int, count: int, store_every: float) -> Ints:
     """Select those of ``count`` ticks from the ``first`` on whose volumes are stored: one in ``store_every``."""
     if math.isinf(store_every):
         return np.zeros(0, np.int64)
@@ -378,7 +378,7 @@ def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, tables:
         )
 
 
-def predicted(
+def predict_batches(
     states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink
 ) -> Iterator[HumanStates]:
     """Stage 2 alone: writes the volumes that hold for the braking time T_s, of one tick in ``store_every``.
@@ -391,7 +391,7 @@ def predicted(
     """
     done = 0
     for batch in states:
-        stored = stored_ticks(done, len(batch), store_every)
+        stored = select_stored_ticks(done, len(batch), store_every)
         with sink.watch.stage("predict", len(batch)):
             volumes = prediction_stage.volumes(batch)
         with sink.watch.stage("hulls", len(stored)):
@@ -401,7 +401,7 @@ def predicted(
         yield batch
 
 
-def planned(
+def plan_batches(
     states: Iterable[HumanStates],
     surroundings: Surroundings,
     planners: dict[str, Planner],
@@ -429,7 +429,7 @@ def planned(
                 motion = planner.follow(batch.t_ns, around, surroundings.names)
             sink.tables.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
             if planner.chosen:
-                stored = stored_ticks(done, len(batch), store_every)
+                stored = select_stored_ticks(done, len(batch), store_every)
                 with sink.watch.stage("hulls", len(stored)):
                     for tick in stored.tolist():
                         row = slice(tick, tick + 1)

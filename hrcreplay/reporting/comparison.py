@@ -59,7 +59,7 @@ class Bounds:
 
     near_m: float
     stationary_m_per_s: float
-    leash_m: float
+    max_reference_lead_m: float
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bound
     for prefix, until in (("", "volumes"), ("full_", "volumes_full")):
         left, checked = metrics[f"{until}_left_ticks"]["value"], found[f"{prefix}checked_ticks"]
         found[f"{prefix}held_ticks"] = None if checked is None else checked - left
-    return _with_ratios(found) | {"braking_events_by_cause": causes}
+    return _add_ratios(found) | {"braking_events_by_cause": causes}
 
 
 def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Metric]:
@@ -217,7 +217,7 @@ def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, boun
         method=variant.method,
         near_m=bounds.near_m,
         stationary_m_per_s=bounds.stationary_m_per_s,
-        leash_m=bounds.leash_m,
+        max_reference_lead_m=bounds.max_reference_lead_m,
         contact=contact,
     )
     run = Run(Path(), {"settings": settings}, motion=motion, contact=contact)
@@ -243,7 +243,7 @@ def _jerk(motion: pd.DataFrame) -> Floats:
     return np.asarray(np.diff(u, axis=0) / (np.diff(times(motion)) * 1e-9)[:, None])
 
 
-def _with_ratios(found: dict[str, Any]) -> dict[str, Any]:
+def _add_ratios(found: dict[str, Any]) -> dict[str, Any]:
     """The figures in the order of FIELDS, with those that are one over another."""
     for field in FIELDS:
         if "/" in field.how:
@@ -272,7 +272,7 @@ def total(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for row in each:
         for cause, count in row["braking_events_by_cause"].items():
             causes[cause] = causes.get(cause, 0) + count
-    return _with_ratios(found) | {"braking_events_by_cause": dict(sorted(causes.items()))}
+    return _add_ratios(found) | {"braking_events_by_cause": dict(sorted(causes.items()))}
 
 
 def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str, Any]:
@@ -291,12 +291,13 @@ def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str,
                 "person": log.person,
                 "seconds": log.seconds,
                 "notes": list(log.notes),
-                "methods": {variant.label: _told(log.figures[variant], 1) for variant in variants},
+                "methods": {variant.label: _select_told(log.figures[variant], 1) for variant in variants},
             }
             for log in logs
         ],
         "total": {
-            variant.label: _told(total([log.figures[variant] for log in logs]), len(logs)) for variant in variants
+            variant.label: _select_told(total([log.figures[variant] for log in logs]), len(logs))
+            for variant in variants
         },
         "paper": {
             name: {"value": PAPER[f"paper_stationary_share_{name}"][0], "unit": "1", "meaning": _PAPER}
@@ -305,7 +306,7 @@ def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str,
     }
 
 
-def _told(row: Mapping[str, Any], logs: int) -> dict[str, Any]:
+def _select_told(row: Mapping[str, Any], logs: int) -> dict[str, Any]:
     """The figures of a variant with what they say of its motion, in words; None where it made its way."""
     return {**row, "stillness": stillness(row, logs) or None}
 

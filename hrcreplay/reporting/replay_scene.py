@@ -15,7 +15,7 @@ from hrcreplay.reporting.figures.drawing import BONES
 from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, stop_events
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import seconds_from, times
-from hrcreplay.robot.control.control_step import axis_by_axis
+from hrcreplay.robot.control.control_step import stop_axis_by_axis
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
@@ -192,7 +192,7 @@ def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floa
         yield turned, at_m
 
 
-def posed(robot: RobotGeometry, q: Floats) -> Floats:
+def pose_links(robot: RobotGeometry, q: Floats) -> Floats:
     """(n, s, 2, 3) ends of the links' axes in the world at joint positions (n, nv) [rad]; NaN where these are [m]."""
     known = np.asarray(np.isfinite(q).all(axis=1))
     ends = np.repeat(robot.ends_m[None], len(q), axis=0)
@@ -364,7 +364,7 @@ def _stops(
         if setting(run.meta.get("settings", {}), "plan", "certify"):
             return straight
         dt_s = float(np.median(np.diff(times(motion)))) * 1e-9
-        ends = [axis_by_axis(*row, robot.ddq_max, dt_s).q[-1] for row in zip(q, dq, strict=True)]  # Eq. (67)
+        ends = [stop_axis_by_axis(*row, robot.ddq_max, dt_s).q[-1] for row in zip(q, dq, strict=True)]  # Eq. (67)
         return np.where(np.isfinite(tau_s)[:, None], np.array(ends), np.nan)
     if "programme_s" not in motion:
         return straight

@@ -23,7 +23,7 @@ from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.reporting import scene_messages as parts
 from hrcreplay.reporting.figures.drawing import BONES
 from hrcreplay.reporting.metrics.series import times
-from hrcreplay.reporting.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, at_rate, placements, posed
+from hrcreplay.reporting.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, at_rate, placements, pose_links
 from hrcreplay.reporting.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
 
 #: Volumes a second at most.
@@ -200,7 +200,7 @@ def _distances(scene: ReplayScene) -> Iterator[Message]:
     if not len(scene.body_parts):
         return
     robot, track = scene.robot, next(iter(scene.methods.values()))
-    pair = nearest_pair(posed(robot, track.q), robot.radius_m, scene.body_m, scene.body_radius_m)
+    pair = nearest_pair(pose_links(robot, track.q), robot.radius_m, scene.body_m, scene.body_radius_m)
     apart = pair.at_second_m - pair.at_first_m
     with np.errstate(invalid="ignore"):
         towards = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-12)

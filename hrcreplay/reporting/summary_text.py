@@ -15,6 +15,7 @@ from hrcreplay.reporting.metrics.fusion import cameras
 from hrcreplay.reporting.metrics.series import Metric
 from hrcreplay.reporting.tables import limb_names_text, percent, reason_text, text_of
 from hrcreplay.reporting.verdict import unmeasured
+from hrcreplay.settings.sections import setting, with_new_names
 from hrcreplay.store.run_folder import Run
 
 #: Between groups of digits.
@@ -201,11 +202,11 @@ def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
 
 def _horizon(run: Run, metrics: Mapping[str, Metric]) -> str:
     """Horizon of the prediction, in words."""
-    settings = run.meta.get("settings", {})
+    settings, _ = with_new_names(run.meta.get("settings", {}))
     median, most = metrics["plan_horizon_median_s"], metrics["plan_horizon_max_s"]
     if settings.get("plan", {}).get("horizon") == "adaptive" and median["value"] is not None:
         return f"the horizon of the tick (median {text_of(median)}, at most {text_of(most)})"
-    stop_s = settings.get("occupancy", {}).get("stop_s")
+    stop_s = settings.get("prediction", {}).get("stop_s")
     return "the stopping time" if stop_s is None else f"T_s = {stop_s:g} s"
 
 
@@ -379,10 +380,10 @@ def _vacant(metrics: Metrics) -> str:
 
 
 def _predict(run: Run, metrics: Metrics) -> str:
-    settings = run.meta["settings"]["occupancy"]
+    method = setting(run.meta["settings"], "prediction", "method")
     limits = run.meta["limits"]["prediction"]["name"]
-    name = f"occupancy_{settings['method']}"
-    words = f"{settings['method']}, {limits}: the six limbs {text_of(metrics.get(f'{name}_sum_m3'))}"
+    name = f"occupancy_{method}"
+    words = f"{method}, {limits}: the six limbs {text_of(metrics.get(f'{name}_sum_m3'))}"
     if f"{name}_LEGS_m3" in metrics:
         words += f", lower body {text_of(metrics[f'{name}_LEGS_m3'])}"
     return words + " (means of the stored ticks, above the floor; overlaps of limbs count twice)"

@@ -13,7 +13,7 @@ from hrcreplay.reporting.metrics.contact import PERSONS, SHOWN_PARTS, method_pre
 from hrcreplay.reporting.metrics.fusion import add_limbs
 from hrcreplay.reporting.metrics.series import Metric, MetricTable
 from hrcreplay.reporting.tables import PageTable, limb_names_text, part_name_text, percent, text_of
-from hrcreplay.settings.sections import setting
+from hrcreplay.settings.sections import setting, with_new_names
 from hrcreplay.store.run_folder import Run
 
 Metrics = Mapping[str, Metric]
@@ -343,8 +343,8 @@ def _ticks(metric: Metric) -> str:
 
 def _note(run: Run, metrics: Metrics) -> str:
     """Person and body that were judged."""
-    settings = run.meta.get("settings", {})
-    hand_m, leg_m = settings.get("occupancy", {}).get("hand_m"), settings.get("report", {}).get("leg_radius_m")
+    settings, _ = with_new_names(run.meta.get("settings", {}))
+    hand_m, leg_m = settings.get("prediction", {}).get("hand_m"), settings.get("report", {}).get("leg_radius_m")
     person = str(metrics["contact_person"]["value"])
     hand = "" if hand_m is None else f", the forearms prolonged by a hand of {hand_m:g} m"
     leg = "" if leg_m is None else f" with a radius of {leg_m:g} m"

@@ -209,7 +209,7 @@ _MOSTLY = 0.1
 _TURNS_RAD = 6 * math.pi
 
 
-def programmed(task: Task, model: RobotModel, where: str = "task") -> Reference:
+def plan_programme(task: Task, model: RobotModel, where: str = "task") -> Reference:
     """The path of a task, time-parametrised within the limits of the axes.
 
     Args:
@@ -250,7 +250,7 @@ def programmed(task: Task, model: RobotModel, where: str = "task") -> Reference:
     )
 
 
-def recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
+def smooth_recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
     """The path of a recorded joint track, smoothed by cubics over 0.1 s on a regular time grid.
 
     Programmed time 0 is ``t_ns[0]``. Gaps are bridged on straight lines. Positions and velocities are held against the
@@ -342,7 +342,7 @@ def recorded_remarks(path: Reference) -> list[str]:
     """Remarks on a recorded path that the robot cannot follow, or that looks like another unit.
 
     Args:
-        path: What ``recorded`` made.
+        path: What ``smooth_recorded`` made.
     """
     model, found = path.model, []
     turned_rad = np.where(np.isinf(model.q_max), np.abs(path.q).max(axis=0), 0.0)

@@ -390,7 +390,7 @@ def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, p
     """
     if plan.reference == "time":
         return s_s + dt_s, 1.0
-    slack = 2.0 - 2.0 * tcp_error_m / plan.leash_m  # 1 at half the leash, 0 where it is taut
+    slack = 2.0 - 2.0 * tcp_error_m / plan.max_reference_lead_m  # 1 at half the leash, 0 where it is taut
     if not slack > 0.0:
         return s_s, 0.0
     rate = 1.0 if slack >= 1.0 else slack * slack * (3.0 - 2.0 * slack)

@@ -8,14 +8,15 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+import warnings
 from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from hrcreplay.errors import SettingsError, shown
-from hrcreplay.settings.sections import Settings
+from hrcreplay.errors import SettingRenamed, SettingsError, shown
+from hrcreplay.settings.sections import Settings, with_new_names
 from hrcreplay.toml_file import read_toml
 
 __all__ = ["SHIPPED", "Settings", "as_overrides", "load_settings"]
@@ -56,22 +57,37 @@ def load_settings(
     Raises:
         SettingsError: The file cannot be read, or a key or value is not known.
     """
-    table: dict[str, Any] = {name: dict(section) for name, section in (base or {}).items()}
+    table, _ = with_new_names(base or {})
     where = "settings"
     if path is not None:
         where = str(path)
         file = SHIPPED.get(where, path) if not path.exists() else path
         read = read_toml(file, f"name a TOML file, or {', '.join(SHIPPED)}")
-        for name, section in _beside(read, file.parent).items():
-            table[name] = table.get(name, {}) | section if isinstance(section, dict) else section
-    for name, section in (given or {}).items():
-        table[name] = {**table.get(name, {}), **section}
+        _merge(table, _beside(_renamed(read, where), file.parent))
+    _merge(table, given or {})
     for override in overrides:
-        _override(table, override)
+        _merge(table, _renamed(_override(override), f"--set {override}"))
     try:
         return Settings.model_validate(table)
     except ValidationError as error:
         raise SettingsError(f"{where}: {_first_problem(error)}") from error
+
+
+def _renamed(table: dict[str, Any], where: str) -> dict[str, Any]:
+    """The table by new names; warns of old ones."""
+    found, replaced = with_new_names(table)
+    for old, new in replaced.items():
+        warnings.warn(
+            f"{where}: {old} is now called {new}; this version still reads the old name", SettingRenamed, stacklevel=3
+        )
+    return found
+
+
+def _merge(table: dict[str, Any], layer: Mapping[str, Any]) -> None:
+    """Puts the sections of a layer over those of the table; what is no section stays, and is refused later."""
+    for name, section in layer.items():
+        below = table.get(name, {})
+        table[name] = {**below, **section} if isinstance(section, Mapping) and isinstance(below, Mapping) else section
 
 
 def _beside(table: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -126,7 +142,8 @@ def _toml(value: Any, *, inside: bool = False) -> str:
     return str(value) if plain and not inside else json.dumps(value)
 
 
-def _override(table: dict[str, Any], text: str) -> None:
+def _override(text: str) -> dict[str, Any]:
+    """Section -> key -> value of ``section.key=value``."""
     key, equals, value = text.partition("=")
     parts = key.strip().split(".")
     if not equals or len(parts) != 2:
@@ -137,10 +154,7 @@ def _override(table: dict[str, Any], text: str) -> None:
         parsed = value.strip()
     except RecursionError as error:
         raise SettingsError(f"--set {key}=...: nested too deep; at most some hundred brackets are read") from error
-    section = table.setdefault(parts[0], {})
-    if not isinstance(section, dict):
-        raise SettingsError(f"--set {text}: {parts[0]} is not a section of the settings file")
-    section[parts[1]] = parsed
+    return {parts[0]: {parts[1]: parsed}}
 
 
 def _first_problem(error: ValidationError) -> str:

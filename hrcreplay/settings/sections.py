@@ -176,7 +176,7 @@ class LimitNames(Section):
     """Bounds the reachable sets, Alg. 1. people: fitted on recordings; see docs/validation.md."""
 
 
-class Occupancy(Section):
+class Prediction(Section):
     """Section 3: what the person can reach."""
 
     method: Literal["paper", "positions", "sound"] = "sound"
@@ -274,13 +274,13 @@ class Plan(Section):
     baselines: tuple[Literal["qp", "scaling", "shield", "ssm", "none"], ...] = ("scaling", "none")
     """Methods run beside it, for comparison."""
     horizon: Literal["adaptive", "fixed"] = "adaptive"
-    """adaptive: the volumes reach to the end of the stop that would follow; fixed: always to occupancy.stop_s."""
+    """adaptive: the volumes reach to the end of the stop that would follow; fixed: always to prediction.stop_s."""
     certify: bool = True
     """Whether a step is taken only if it and the stop after it keep clear of every volume; else the stop that was found
     clear before goes on. False: as printed, where Eq. (67) brakes when Eq. (66) has no solution."""
     rows: Literal["soft", "hard"] = "soft"
     """qp: whether Eq. (66i) may be broken at a cost, so that there is always a solution, or not."""
-    room: Literal["product", "square"] = "product"
+    constraint_rhs: Literal["product", "square"] = "product"
     """Right-hand side of Eq. (14): distance (distance - clearance), or (distance - clearance)^2 as printed."""
     lead_s: NotNegative = 0.05
     """The rows of Eq. (66i) look this much further ahead than the horizon, so that the robot slows down early [s]."""
@@ -302,7 +302,7 @@ class Plan(Section):
     """Task file (TOML); none: the one inside the log, else the joint track inside the log."""
     reference: Literal["time", "path"] = "path"
     """time: the reference runs with the clock; path: only as far as the robot has followed."""
-    leash_m: Positive = 0.4
+    max_reference_lead_m: Positive = 0.4
     """path: the reference waits when the TCP is this far away, so no way round a person leads further off [m]."""
     catch_up_speed_m_per_s: NotNegative | Literal["free"] = 0.0
     """qp: the TCP is never faster than the programme's speed limit where the reference is, not even to catch up; this
@@ -404,7 +404,7 @@ class Live(Section):
     reaction_s: NotNegative = 0.05
     """Latency from perception to robot response: up to two cycles until a look is used, the delay of an answer, a cycle
     and the robot's own lag. The swept volumes of method sound reach this much further than T_s [s]."""
-    look_s: Positive = 0.016
+    perception_max_age_s: Positive = 0.016
     """plan.certify: largest age of a perception update that a step may use; after it the certified stop goes on [s]."""
     approach_speed: Annotated[float, Field(gt=0, le=1)] = 0.1
     """Share of the axes' top speeds on the way from where the robot stands to its programme."""
@@ -444,7 +444,7 @@ class Settings(Section):
     logs: Logs = Logs()
     fusion: Fusion = Fusion()
     limits: LimitNames = LimitNames()
-    occupancy: Occupancy = Occupancy()
+    prediction: Prediction = Prediction()
     robot: Robot = Robot()
     plan: Plan = Plan()
     report: Report = Report()
@@ -459,4 +459,39 @@ def setting(recorded: Mapping[str, Any], section: str, key: str) -> Any:
         section: Name of the section.
         key: Name of the setting.
     """
-    return recorded.get(section, {}).get(key, getattr(getattr(Settings(), section), key))
+    known, _ = with_new_names(recorded)
+    return known.get(section, {}).get(key, getattr(getattr(Settings(), section), key))
+
+
+#: Names of sections and of settings before version 0.9; read for one version more.
+RENAMED = {
+    "occupancy": "prediction",
+    "plan.leash_m": "plan.max_reference_lead_m",
+    "plan.room": "plan.constraint_rhs",
+    "live.look_s": "live.perception_max_age_s",
+}
+
+
+def with_new_names(table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Replace the old names of sections and settings by the new ones.
+
+    Args:
+        table: Section -> key -> value.
+
+    Returns:
+        The table by new names, and old name -> new name of those that it had. A name that is there in both forms
+        stays as it is, so that it is refused as unknown.
+    """
+    found: dict[str, Any] = dict(table)
+    replaced = {}
+    for old, new in RENAMED.items():
+        section, _, key = old.partition(".")
+        if not key and section in found and new not in found:
+            found[new] = found.pop(section)
+            replaced[old] = new
+        elif key and isinstance(within := found.get(section), Mapping) and key in within:
+            name = new.partition(".")[2]
+            if name not in within:
+                found[section] = {name if k == key else k: value for k, value in within.items()}
+                replaced[old] = new
+    return found, replaced

@@ -14,10 +14,10 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.settings.sections import Prediction
 from tests.human.people import random_states, states
 
-RADII_M, HAND_M, HORIZON_S = limb_radii(Occupancy()), 0.19, 0.377
+RADII_M, HAND_M, HORIZON_S = limb_radii(Prediction()), 0.19, 0.377
 AXES = {
     "HD": ("neck", "head"),
     "THX": ("pelvis", "shoulder_r", "shoulder_l"),

@@ -10,7 +10,7 @@ import pytest
 
 from hrcreplay.audit import departure_fit
 from hrcreplay.audit.departure_fit import fit
-from hrcreplay.audit.departures import LimbDepartures, not_recorded
+from hrcreplay.audit.departures import LimbDepartures, find_unrecorded_limbs
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.velocity_tube import NOISE_M
 from hrcreplay.limits import load_limits
@@ -173,8 +173,8 @@ def test_a_limb_that_was_never_recorded_has_no_departure_and_is_named() -> None:
         beyond = table(one)
         beyond[..., BODY.index("LEGS")] = np.nan
         blind.append(given(beyond, one.residual_m))
-    assert not_recorded(blind) == ["LEGS"]
-    assert not_recorded(logs) == []
+    assert find_unrecorded_limbs(blind) == ["LEGS"]
+    assert find_unrecorded_limbs(logs) == []
     found = fit(blind, 0.95)
     assert found.beyond_m[BODY.index("LEGS")].tolist() == [0.0, 0.0]
     assert np.isfinite(found.beyond_m).all()

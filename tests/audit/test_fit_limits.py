@@ -56,7 +56,7 @@ def test_known_bounds_are_found_and_hold_on_a_motion_that_was_not_used(training:
         # trapezoids of the made motion against Alg. 1's parabolas, and the grid of velocity bounds
         np.testing.assert_allclose(fitted, bounds, rtol=0.12)
     held_back = fit_limits.inside_intervals(seen(bang_bang(120.0, seed=2)), found, T_S)
-    share = np.nanmean(fit_limits.all_joints_inside(held_back[:, list(KNOWN)]))
+    share = np.nanmean(fit_limits.are_all_inside(held_back[:, list(KNOWN)]))
     assert share > 0.99
 
 
@@ -72,9 +72,7 @@ def test_joints_at_rest_keep_the_standard_bounds(training: Futures) -> None:
 @pytest.mark.parametrize("share", [0.8, 0.9])
 def test_the_share_is_reached_by_all_joints_together_and_hardly_exceeded(training: Futures, share: float) -> None:
     found = fit_limits.fit(training, PAPER, share, T_S)
-    reached = np.nanmean(
-        fit_limits.all_joints_inside(fit_limits.inside_intervals(training, found, T_S)[:, ~found.kept])
-    )
+    reached = np.nanmean(fit_limits.are_all_inside(fit_limits.inside_intervals(training, found, T_S)[:, ~found.kept]))
     assert share <= reached <= share + 0.3 * (1.0 - share)
 
 
@@ -182,4 +180,4 @@ def test_postures_outside_the_positions_are_seen() -> None:
 
 def test_together_counts_a_tick_where_any_joint_was_recorded() -> None:
     within: Floats = np.array([[1.0, 1.0], [1.0, np.nan], [0.0, np.nan], [np.nan, np.nan], [1.0, 0.0]])
-    np.testing.assert_array_equal(fit_limits.all_joints_inside(within), [1.0, 1.0, 0.0, np.nan, 0.0])
+    np.testing.assert_array_equal(fit_limits.are_all_inside(within), [1.0, 1.0, 0.0, np.nan, 0.0])

@@ -23,7 +23,7 @@ def _audit(out: Path, *overrides: str) -> tuple[dict[str, Any], pd.DataFrame]:
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], pd.DataFrame]:
-    return _audit(tmp_path_factory.mktemp("bare") / "run", "occupancy.sigmas=0")
+    return _audit(tmp_path_factory.mktemp("bare") / "run", "prediction.sigmas=0")
 
 
 def _inside(found: dict[str, Any], method: str) -> list[float]:
@@ -34,7 +34,7 @@ def _inside(found: dict[str, Any], method: str) -> list[float]:
 def test_the_joints_have_the_intervals_of_the_runs_own_margins(
     tmp_path: Path, bare: tuple[dict[str, Any], pd.DataFrame]
 ) -> None:
-    wide, _ = _audit(tmp_path / "run", "occupancy.sigmas=6")
+    wide, _ = _audit(tmp_path / "run", "prediction.sigmas=6")
     narrow = bare[0]
     assert _inside(wide, "sound") == [1.0] * DOF  # six deviations of the velocity alone are 3 rad/s
     assert min(_inside(narrow, "sound")) < 0.9
@@ -44,7 +44,7 @@ def test_the_joints_have_the_intervals_of_the_runs_own_margins(
 def test_the_person_must_stay_until_the_robot_has_reacted_and_braked(
     tmp_path: Path, bare: tuple[dict[str, Any], pd.DataFrame]
 ) -> None:
-    late, rows = _audit(tmp_path / "run", "occupancy.sigmas=0", "occupancy.latency_s=0.2", "occupancy.hand_m=0.5")
+    late, rows = _audit(tmp_path / "run", "prediction.sigmas=0", "prediction.latency_s=0.2", "prediction.hand_m=0.5")
     found, before = bare
     assert found["horizon_s"] == pytest.approx(0.377)
     assert late["horizon_s"] == pytest.approx(0.577)

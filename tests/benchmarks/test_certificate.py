@@ -15,7 +15,7 @@ from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.path import programmed
+from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task
 from hrcreplay.settings.sections import Plan
 from tests.robot.distances import by_coal
@@ -45,7 +45,7 @@ def test_the_certificate(benchmark: BenchmarkFixture, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(certificate, "clear", listening)
     controller = QpController(
-        robot, programmed(parse_task(TASK), robot), PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)
+        robot, plan_programme(parse_task(TASK), robot), PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)
     )
     for tick in range(TICKS):
         controller.step(lambda _, tick=tick: obstacles(people, tick))  # type: ignore[misc]

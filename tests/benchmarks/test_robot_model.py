@@ -10,7 +10,7 @@ import pytest
 
 from hrcreplay.robot import irb140 as description
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.path import programmed
+from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task
 
 Q, DQ = np.array([0.3, 0.2, -0.4, 0.5, 0.6, -0.7]), np.array([1.0, -0.5, 0.4, 2.0, -1.0, 3.0])
@@ -50,5 +50,5 @@ def test_bare_pinocchio(benchmark: Any) -> None:
 @pytest.mark.benchmark(group="reference")
 def test_sample(benchmark: Any) -> None:
     task = parse_task({"waypoints": [{"joints_deg": [0] * 6}, {"joints_deg": [90, 0, 0, 0, 0, 0]}]})
-    reference = programmed(task, irb140(np.eye(4), stop_s=0.377))
+    reference = plan_programme(task, irb140(np.eye(4), stop_s=0.377))
     assert np.isfinite(benchmark(reference.sample, 0.5).twist).all()

@@ -130,7 +130,7 @@ def test_kinematics_agree_with_the_urdf_joint_after_joint(name: str) -> None:
 def test_it_drives_the_demo_to_the_page(name: str, tmp_path: Path) -> None:
     arm = ARMS[name]
     command = "plan" if name in {"ur3", "xarm7"} else "report"
-    overrides = (*arm.overrides(tmp_path), "occupancy.method=paper", "limits.prediction=paper")
+    overrides = (*arm.overrides(tmp_path), "prediction.method=paper", "limits.prediction=paper")
     if command == "report":  # the scaling beside it is tried with the others
         overrides = (*overrides, "plan.baselines=[]")
     folder = replay.run(command, replay.demo_log(), out=tmp_path / "run", start_s=8.0, end_s=9.0, overrides=overrides)

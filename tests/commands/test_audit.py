@@ -134,7 +134,7 @@ def test_an_audit_of_a_shorter_horizon_has_that_as_its_own(tmp_path: Path, found
         out=tmp_path / "run",
         start_s=START_S,
         end_s=END_S,
-        overrides=(*TABLE_1, "occupancy.stop_s=0.1"),
+        overrides=(*TABLE_1, "prediction.stop_s=0.1"),
     )
     short = json.loads((folder / "audit.json").read_text())["total"]
     assert [point["horizon_s"] for point in short["horizons"]] == [0.05, 0.1]
@@ -220,7 +220,7 @@ def test_the_total_counts_every_tick_once(both: Path) -> None:
 
 def test_logs_of_two_horizons_have_no_total(tmp_path: Path) -> None:
     short = replay.run(
-        "fuse", replay.demo_log(), out=tmp_path / "a", start_s=8.0, end_s=9.0, overrides=("occupancy.stop_s=0.2",)
+        "fuse", replay.demo_log(), out=tmp_path / "a", start_s=8.0, end_s=9.0, overrides=("prediction.stop_s=0.2",)
     )
     with pytest.raises(SettingsError, match=r"occupancy\.stop_s and latency_s: demo\.mcap and demo\.mcap differ"):
         audit.run([short, replay.demo_log()], out=tmp_path / "x")

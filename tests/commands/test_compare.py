@@ -16,7 +16,7 @@ import pytest
 
 from hrcreplay.commands import compare, replay
 from hrcreplay.errors import SettingsError
-from hrcreplay.evaluation.contact import recorded_people
+from hrcreplay.evaluation.contact import read_recorded_people
 from hrcreplay.evaluation.recorded_person import at_instants
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
@@ -426,7 +426,7 @@ def test_a_recording_with_the_robot_in_the_way_by_the_same_checker(tmp_path: Pat
     run_config = resolve("plan", fused, cell_file=place)
     base = assembly.robot_base(run_config, open_log(run_config.log, run_config.settings.logs))
     smoothed = smoothed_points(out / of_log["log"])
-    people = recorded_people(
+    people = read_recorded_people(
         run_config, open_log(run_config.log, run_config.settings.logs), _Written(out / of_log["log"])
     )
     assert {track.source for track in people.person} > {"smoothed estimate"}

@@ -62,7 +62,7 @@ def every_row(task: Problem) -> tuple[Floats, Floats, list[tuple[int, int, int, 
             segment = LinkSegment(*of.ends_m[link], *of.J_ends[link])
             rows = approach_rows(segment, vertices, 1.0, clearance_m=0.0, stop_s=of.stop_s)
             A.append(rows.A / of.per_speed[link, limb])
-            b.append(np.full(len(rows.A), of.room_m2[link, limb] / of.per_speed[link, limb]))
+            b.append(np.full(len(rows.A), of.rhs_m2[link, limb] / of.per_speed[link, limb]))
             which += [(link, limb, end, j) for end in (0, 1) for j in range(len(vertices))]
     return np.concatenate(A), np.concatenate(b), which
 

@@ -23,10 +23,10 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.run_config import resolve
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, Floats, SweptVolumes
-from hrcreplay.robot.control.control_step import RobotState, Stop, along_path, axis_by_axis, straight
+from hrcreplay.robot.control.control_step import RobotState, Stop, stop_along_path, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.path import programmed
+from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
@@ -168,7 +168,7 @@ def test_volumes_of_every_tick_are_stored_where_asked(tmp_path: Path) -> None:
         out=tmp_path / "run",
         start_s=8.0,
         end_s=9.0,
-        overrides=("occupancy.store_hz=all",),
+        overrides=("prediction.store_hz=all",),
     )
     run = run_folder.read(folder)
     assert run.state is not None
@@ -200,7 +200,7 @@ def test_every_step_and_the_stop_after_it_keep_clear_of_the_volumes_of_its_tick(
     task = open_log(replay.demo_log()).header.task
     assert task is not None
     robot = irb140(demo.T_world_base, stop_s=0.377)
-    path, radius = programmed(parse_task(task), robot), np.array([segment.radius_m for segment in robot.segments])
+    path, radius = plan_programme(parse_task(task), robot), np.array([segment.radius_m for segment in robot.segments])
     q, dq = (table[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq"))
     moving = (dq != 0.0).any(axis=1)
     assert table["certified"].to_numpy()[moving].all()
@@ -217,11 +217,11 @@ def test_every_step_and_the_stop_after_it_keep_clear_of_the_volumes_of_its_tick(
             return float(np.min(apart))
 
         if name == "qp":
-            after = (brake(q[k + 1], dq[k + 1], robot.ddq_max, 0.004) for brake in (straight, axis_by_axis))
+            after = (brake(q[k + 1], dq[k + 1], robot.ddq_max, 0.004) for brake in (stop_straight, stop_axis_by_axis))
             assert max(gap_m(stop) for stop in after) > 0.0
         else:
             rate = float(np.linalg.norm(dq[k + 1]) / np.linalg.norm(path.sample(s[k + 1]).dq))
-            stop = along_path(path.grid, float(s[k + 1]), rate, robot.ddq_max, 0.004)
+            stop = stop_along_path(path.grid, float(s[k + 1]), rate, robot.ddq_max, 0.004)
             assert stop is not None
             assert gap_m(stop) > -1e-6
 
@@ -356,7 +356,7 @@ def test_a_thousand_ticks_of_the_demo_are_those_of_another_solver(printed: Run, 
     task = open_log(replay.demo_log()).header.task
     assert task is not None
     robot = irb140(printed.T_world_base, stop_s=0.377)
-    path, volumes = programmed(parse_task(task), robot), printed_volumes
+    path, volumes = plan_programme(parse_task(task), robot), printed_volumes
     q, dq, u = (printed.motion[[f"{kind}{i}" for i in range(1, 7)]].to_numpy() for kind in ("q", "dq", "u"))
     s, status = printed.motion["programme_s"].to_numpy(), printed.motion["status"].to_numpy()
     known = np.flatnonzero(printed.motion["distance_m"].notna().to_numpy()[:-1])

@@ -23,7 +23,7 @@ from hrcreplay.records import LIMBS
 from hrcreplay.reporting.figures import drawing, figure_data
 from hrcreplay.reporting.figures.catalogue import FIGURES, FigureData
 from hrcreplay.reporting.page.replay_page import snapshot
-from hrcreplay.reporting.replay_scene import posed, robot_geometry
+from hrcreplay.reporting.replay_scene import pose_links, robot_geometry
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
 from tests.reporting.moving import moving_run, moving_scene
@@ -32,7 +32,7 @@ from tests.reporting.moving import moving_run, moving_scene
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Run:
     out = tmp_path_factory.mktemp("sound") / "run"
-    overrides = ("occupancy.method=sound", "occupancy.store_hz=5")
+    overrides = ("prediction.method=sound", "prediction.store_hz=5")
     return run_folder.read(
         replay.run("report", replay.demo_log(), out=out, overrides=overrides, start_s=8.0, end_s=12.0)
     )
@@ -101,10 +101,10 @@ def test_every_figure_is_drawn_again_from_the_folder_alone(sound: Run, tmp_path:
 
 def test_the_limits_of_a_run_are_read_back_from_it(sound: Run) -> None:
     run_config, want = read_run_config(sound.folder), load_limits("people")
-    departure, wanted = run_config.prediction.departure, want.departure
+    departure, wanted = run_config.prediction_limits.departure, want.departure
     assert departure is not None
     assert wanted is not None
-    for found, right in ((vars(run_config.prediction), vars(want)), (vars(departure), vars(wanted))):
+    for found, right in ((vars(run_config.prediction_limits), vars(want)), (vars(departure), vars(wanted))):
         for name in right.keys() - {"departure"}:
             np.testing.assert_array_equal(found[name], right[name], err_msg=name)
 
@@ -136,7 +136,7 @@ def test_the_storyboard_has_both_robots_at_the_same_programmed_instant(sound: Ru
             row = int(np.flatnonzero(table["t_ns"].to_numpy() == t_ns)[0])
             assert 0.0 <= table["programme_s"].iloc[row] - scene.programme_s < 0.0041
             q = table[[f"q{i}" for i in range(1, 7)]].to_numpy(dtype=float)[[row]]
-            np.testing.assert_allclose(posed(geometry, q)[0], ends_m, atol=1e-9)
+            np.testing.assert_allclose(pose_links(geometry, q)[0], ends_m, atol=1e-9)
         assert scene.volumes
 
 

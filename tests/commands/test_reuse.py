@@ -66,20 +66,20 @@ STALE = {
     "fusion.fresh_s": ALL,
     "limits.tracking": ALL,
     "limits.prediction": "predict plan",
-    "occupancy.method": "predict plan",
-    "occupancy.stop_s": "predict plan",
-    "occupancy.store_hz": "predict",
-    "occupancy.radius_head_m": "predict plan",
-    "occupancy.radius_thorax_m": "predict plan",
-    "occupancy.radius_upper_arm_m": "predict plan",
-    "occupancy.radius_lower_arm_m": "predict plan",
-    "occupancy.sigmas": "predict plan",
-    "occupancy.latency_s": "predict plan",
-    "occupancy.hand_m": "predict plan",
-    "occupancy.legs_radius_m": "predict plan",
-    "occupancy.legs": "predict plan",
-    "occupancy.residual": "predict plan",
-    "occupancy.residual_unknown_m": "predict plan",
+    "prediction.method": "predict plan",
+    "prediction.stop_s": "predict plan",
+    "prediction.store_hz": "predict",
+    "prediction.radius_head_m": "predict plan",
+    "prediction.radius_thorax_m": "predict plan",
+    "prediction.radius_upper_arm_m": "predict plan",
+    "prediction.radius_lower_arm_m": "predict plan",
+    "prediction.sigmas": "predict plan",
+    "prediction.latency_s": "predict plan",
+    "prediction.hand_m": "predict plan",
+    "prediction.legs_radius_m": "predict plan",
+    "prediction.legs": "predict plan",
+    "prediction.residual": "predict plan",
+    "prediction.residual_unknown_m": "predict plan",
     "robot.urdf": "plan",
     "robot.packages": "",  # what they hold counts, by the digests of its files
     "robot.base_frame": "plan",
@@ -94,7 +94,7 @@ STALE = {
     "plan.horizon": "predict plan",
     "plan.certify": "plan",
     "plan.rows": "plan",
-    "plan.room": "plan",
+    "plan.constraint_rhs": "plan",
     "plan.lead_s": "plan",
     "plan.give_way_m": "plan",
     "plan.jerk_s": "plan",
@@ -104,7 +104,7 @@ STALE = {
     "plan.human_speed": "plan",
     "plan.task": "plan",
     "plan.reference": "plan",
-    "plan.leash_m": "plan",
+    "plan.max_reference_lead_m": "plan",
     "plan.catch_up_speed_m_per_s": "plan",
     "plan.waypoint_m": "plan",
     "plan.q_p": "plan",
@@ -122,7 +122,7 @@ STALE = {
     "live.joint_order": "",
     "live.cycle_s": "",
     "live.reaction_s": "",
-    "live.look_s": "",
+    "live.perception_max_age_s": "",
     "live.approach_speed": "",
     "live.resume": "",
     "live.resume_s": "",
@@ -153,8 +153,8 @@ OTHER: dict[str, Any] = {
     "fusion.delay": "ignore",
     "limits.tracking": "paper",
     "limits.prediction": "paper",
-    "occupancy.method": "paper",
-    "occupancy.store_hz": "all",
+    "prediction.method": "paper",
+    "prediction.store_hz": "all",
     "robot.urdf": "robot.urdf",
     "robot.base_frame": "base",
     "robot.packages": ("meshes",),
@@ -169,7 +169,7 @@ OTHER: dict[str, Any] = {
     "plan.reference": "time",
     "plan.horizon": "fixed",
     "plan.rows": "hard",
-    "plan.room": "square",
+    "plan.constraint_rhs": "square",
     "live.robot_address": "10.0.0.1",
     "live.listen_address": "10.0.0.2",
     "live.joint_order": (1, 2, 4, 5, 6, 7, 3),
@@ -217,7 +217,7 @@ def _run_config(settings: Settings, tmp: Path, **changes: Any) -> RunConfig:
     overrides = () if settings.plan.task is None else (f"plan.task={settings.plan.task}",)
     run_config = resolve("report", replay.demo_log(), **{**known, "overrides": overrides})
     tracking, prediction = load_limits(settings.limits.tracking), load_limits(settings.limits.prediction)
-    return replace(run_config, settings=settings, tracking=tracking, prediction=prediction, **changes)
+    return replace(run_config, settings=settings, tracking_limits=tracking, prediction_limits=prediction, **changes)
 
 
 def _ticks(run_config: RunConfig, log: Any) -> Any:
@@ -254,7 +254,7 @@ def test_a_setting_makes_the_stages_stale_that_depend_on_it(
     before, after = _run_config(Settings(), tmp_path), _run_config(_changed(name), tmp_path)
     expected = "predict plan" if STALE[name] in ("plan", "predict") else STALE[name]
     found = _stale((before, source), (after, source))
-    assert found == (STALE[name] if name == "occupancy.store_hz" else expected)
+    assert found == (STALE[name] if name == "prediction.store_hz" else expected)
     if name != "plan.horizon":
         before, after = _run_config(_fixed(Settings()), tmp_path), _run_config(_fixed(_changed(name)), tmp_path)
         assert _stale((before, source), (after, source)) == STALE[name]
@@ -380,7 +380,11 @@ def test_another_base_takes_over_the_person_and_comes_out_like_a_fresh_run(
 
 @pytest.mark.parametrize(
     ("override", "again"),
-    [("occupancy.store_hz=50", "predict plan"), ("logs.gap_s=0.01", "fuse"), ("plan.leash_m=0.1", "predict plan")],
+    [
+        ("prediction.store_hz=50", "predict plan"),
+        ("logs.gap_s=0.01", "fuse"),
+        ("plan.max_reference_lead_m=0.1", "predict plan"),
+    ],
 )
 def test_only_what_a_setting_touches_is_computed_again(
     reported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], override: str, again: str

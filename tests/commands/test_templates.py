@@ -13,7 +13,7 @@ from hrcreplay.calibration.cell import Cell, load_cell
 from hrcreplay.commands.templates import write_templates
 from hrcreplay.errors import SettingsError
 from hrcreplay.robot.model import irb140
-from hrcreplay.robot.path import programmed
+from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task
 from hrcreplay.settings.listing import as_toml
 from hrcreplay.settings.load import Settings, load_settings
@@ -48,7 +48,7 @@ def test_the_files_to_begin_with_are_read(tmp_path: Path) -> None:
     assert [path.name for path in paths] == ["cell.toml", "task.toml", "settings.toml"]
     cell, task, settings = paths
     assert load_cell(cell) == Cell()  # so that no robot is moved by a file that nobody has filled in
-    path = programmed(parse_task(tomllib.loads(task.read_text())), irb140(np.eye(4), stop_s=0.377))
+    path = plan_programme(parse_task(tomllib.loads(task.read_text())), irb140(np.eye(4), stop_s=0.377))
     np.testing.assert_allclose(path.sample(0.0).q, np.radians([0, 0, 0, 0, 90, 0]), atol=1e-9)
     assert load_settings(settings) == Settings()
     with pytest.raises(SettingsError, match="exists already"):

@@ -6,14 +6,14 @@ import heapq
 from collections.abc import Callable, Iterable
 
 from hrcreplay.egm.robot_double.faults import Datagram
-from hrcreplay.egm.robot_double.robot_simulator import TwinCore
+from hrcreplay.egm.robot_double.robot_simulator import SimulatedRobot
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 
 #: ``guide(t_ns, datagrams) -> answers``: called once a cycle at least, without datagrams where none came.
 Guide = Callable[[int, list[bytes]], Iterable[bytes]]
 
 
-def rehearse(core: TwinCore, guide: Guide, *, cycles: int, begin_ns: int = 0, response_ns: int = 300_000) -> None:
+def rehearse(core: SimulatedRobot, guide: Guide, *, cycles: int, begin_ns: int = 0, response_ns: int = 300_000) -> None:
     """Runs so many cycles; what the guide was told and how it answered is in the core's record.
 
     Args:

@@ -9,9 +9,9 @@ import numpy as np
 
 from hrcreplay.egm.codec import Correction, RobotPacket, decode_robot, encode_correction
 from hrcreplay.egm.robot_double.faults import Fault
-from hrcreplay.egm.robot_double.robot_simulator import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.robot_simulator import SimulatedRobot, SimulatorSettings
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
-from hrcreplay.egm.robot_double.udp_client import TwinReport, report_of
+from hrcreplay.egm.robot_double.udp_client import SimulatorReport, report_of
 from hrcreplay.records import Floats
 from tests.egm.rehearsal import rehearse
 
@@ -56,11 +56,11 @@ def ramp_until(end_s: float, *, then: Callable[[float], tuple[Floats, Floats] | 
 
 def rehearsed(
     seconds: float, guide: Guide, *faults: Fault, seed: int = 0, response_ns: int = 300_000, **settings: Any
-) -> TwinCore:
-    core = TwinCore(TwinSettings(**settings), faults, seed)
+) -> SimulatedRobot:
+    core = SimulatedRobot(SimulatorSettings(**settings), faults, seed)
     rehearse(core, guide, cycles=round(seconds / T), response_ns=response_ns)
     return core
 
 
-def shown(core: TwinCore, *faults: Fault) -> TwinReport:
+def shown(core: SimulatedRobot, *faults: Fault) -> SimulatorReport:
     return report_of(core, faults)

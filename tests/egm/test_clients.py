@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
-from hrcreplay.egm.robot_double.udp_client import run_twin
+from hrcreplay.egm.robot_double.udp_client import run_simulator
 from tests.egm.guide_client import SWAY_DEG
 
 #: The issue asks for 30; the suite has less time.
@@ -32,7 +32,7 @@ def test_a_client_of_others_drives_the_double_without_a_gap(library: str, odd_st
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as client:
         assert client.stdout is not None
         assert client.stdout.readline() == "ready\n"
-        report = run_twin("127.0.0.1", port, duration_s=SECONDS)
+        report = run_simulator("127.0.0.1", port, duration_s=SECONDS)
         answered = int(client.communicate(timeout=600)[0])  # closes its standard input
     answers, arrivals = report.answers, report.record.arrivals()
     assert answers.garbage == 0

@@ -8,27 +8,27 @@ from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import Reach
 from hrcreplay.records import HumanStates, SweptVolumes
-from hrcreplay.settings.sections import Fusion, Occupancy
+from hrcreplay.settings.sections import Fusion, Prediction
 
 MEMORY_S = Fusion().memory_s
 
 
-def margins(**changes: Any) -> Occupancy:
+def margins(**changes: Any) -> Prediction:
     """Settings whose estimates are wide: 3 standard deviations, unless another number is given."""
-    return Occupancy(**({"sigmas": 3.0} | changes))
+    return Prediction(**({"sigmas": 3.0} | changes))
 
 
 def predict(
-    people: HumanStates, limits: LimitSet, *, horizon_s: float, method: str, margins: Occupancy | None = None
+    people: HumanStates, limits: LimitSet, *, horizon_s: float, method: str, margins: Prediction | None = None
 ) -> SweptVolumes:
     """See swept_volumes.predict."""
-    occupancy = (margins or Occupancy()).model_copy(update={"method": method})
+    occupancy = (margins or Prediction()).model_copy(update={"method": method})
     return swept_volumes.predict(people, limits, occupancy, horizon_s=horizon_s, memory_s=MEMORY_S)
 
 
 def reachable(
-    people: HumanStates, limits: LimitSet, horizon_s: float, method: str, margins: Occupancy | None = None
+    people: HumanStates, limits: LimitSet, horizon_s: float, method: str, margins: Prediction | None = None
 ) -> Reach:
     """See swept_volumes.reachable."""
-    occupancy = (margins or Occupancy()).model_copy(update={"method": method})
+    occupancy = (margins or Prediction()).model_copy(update={"method": method})
     return swept_volumes.reachable(people, limits, occupancy, horizon_s=horizon_s, memory_s=MEMORY_S)

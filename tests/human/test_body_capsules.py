@@ -7,7 +7,7 @@ import numpy as np
 from hrcreplay.evaluation.recorded_person import at_instants
 from hrcreplay.human.model import PARTS, part_axes, part_radii, skeleton
 from hrcreplay.records import JOINTS, POINTS
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.settings.sections import Prediction
 
 LENGTHS_M = np.array([[0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.26]])
 
@@ -29,7 +29,7 @@ def test_the_hand_prolongs_the_forearm() -> None:
 
 
 def test_radii_are_those_of_table_2() -> None:
-    found = dict(zip(PARTS, part_radii(Occupancy(), 0.08), strict=True))
+    found = dict(zip(PARTS, part_radii(Prediction(), 0.08), strict=True))
     assert found == {
         "HD": 0.12,
         "THX": 0.15,

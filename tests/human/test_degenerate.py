@@ -15,7 +15,7 @@ from hrcreplay.human.fusion.inverse_kinematics import inverse, measure
 from hrcreplay.human.model import LimitSet, skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, CameraFrames, Floats, HumanStates
-from hrcreplay.settings.sections import Fusion, Occupancy
+from hrcreplay.settings.sections import Fusion, Prediction
 from tests.human import sightings
 from tests.human.predictions import predict
 
@@ -107,7 +107,7 @@ def test_no_skeleton_breaks_the_kernels(seed: int, value: float, reuse: bool) ->
         warnings.simplefilter("ignore", RuntimeWarning)  # overflow: the numbers ask for it
         states = followed(frames(points, confidence), Fusion(stale="reuse" if reuse else "skip"))
         for method in ("sound", "paper", "positions"):
-            volumes = predict(states, LIMITS, horizon_s=0.4, method=method, margins=Occupancy(sigmas=3.0))
+            volumes = predict(states, LIMITS, horizon_s=0.4, method=method, margins=Prediction(sigmas=3.0))
             for tick in (20, len(states) - 1):
                 for limb in range(len(volumes.limbs)):
                     if np.isfinite(vertices := volumes.vertices(tick, limb)).all() and abs(vertices).max() < 1e6:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from hrcreplay.egm.link import Address, Received
 from hrcreplay.egm.robot_double.faults import Datagram
-from hrcreplay.egm.robot_double.robot_simulator import TwinCore
+from hrcreplay.egm.robot_double.robot_simulator import SimulatedRobot
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.live.control.loop import Loop, LoopSettings
@@ -29,7 +29,7 @@ class Clock:
 class Cable:
     """A Link in counted time. The robot goes on while the loop is busy, and its packets queue up."""
 
-    def __init__(self, core: TwinCore, clock: Clock) -> None:
+    def __init__(self, core: SimulatedRobot, clock: Clock) -> None:
         self._core = core
         self._clock = clock
         self._cycle_ns = clock.t_ns

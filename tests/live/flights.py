@@ -13,7 +13,7 @@ import numpy as np
 from hrcreplay.egm.codec import Correction, decode_correction
 from hrcreplay.egm.link import ALARMS
 from hrcreplay.egm.robot_double.faults import Fault
-from hrcreplay.egm.robot_double.robot_simulator import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.robot_simulator import SimulatedRobot, SimulatorSettings
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.human.model import skeleton
 from hrcreplay.live.control.session_controller import SessionController
@@ -56,7 +56,7 @@ class Flight:
     walk: Walk = far_away
     faults: tuple[Fault, ...] = ()
     seed: int = 0
-    twin: TwinSettings = field(default_factory=TwinSettings)
+    twin: SimulatorSettings = field(default_factory=SimulatorSettings)
     signals: Callable[[float], Signal] = lambda _s: Signal.NONE
     messages: list[bytes] = field(default_factory=list)  #: what the recorder would get
     answers: list[Decision] = field(default_factory=list)
@@ -73,7 +73,7 @@ class Flight:
         self.start = start(*self.overrides, cell=self.cell)
         self._watched = "watched" in (self.start["cell"] or {})
         self.controller: SessionController = build_controller(self.start)
-        self.core = TwinCore(self.twin, self.faults, self.seed)
+        self.core = SimulatedRobot(self.twin, self.faults, self.seed)
         self._framed_ns = BEGIN_NS
         self._cycles = 0
 

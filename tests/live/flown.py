@@ -19,7 +19,7 @@ from tests.live.sessions import PATIENT, Session, Twin, alive, children, free_po
 #: Goes on where the machine has stopped it, and leaves it time for others.
 QUICK = (
     *PATIENT,
-    "occupancy.method=paper",
+    "prediction.method=paper",
     "limits.prediction=paper",
     "live.approach_speed=1.0",
     "live.resume=true",
@@ -97,7 +97,7 @@ def brakes_for(reason: str, folder: Path) -> None:
     moving = motion[[f"dq{axis}" for axis in range(1, 7)]].to_numpy().any(axis=1)
     after = (motion["t_ns"] >= stops(folder)[reason]).to_numpy()
     assert moving[~after].any()
-    assert np.count_nonzero(moving[after]) * CYCLE_S <= start()["settings"]["occupancy"]["stop_s"] + 2 * CYCLE_S
+    assert np.count_nonzero(moving[after]) * CYCLE_S <= start()["settings"]["prediction"]["stop_s"] + 2 * CYCLE_S
     assert not moving[-1]
     assert set(motion["phase"][after]) <= {"stopping", "holding", "echo"}  # a robot that timed out begins anew
 

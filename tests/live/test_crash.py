@@ -26,7 +26,7 @@ from hrcreplay.live.record import codec, folder
 from hrcreplay.live.verify import SessionRecomputation
 from hrcreplay.live.view import status
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import straight
+from hrcreplay.robot.control.control_step import stop_straight
 from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.model import RobotModel
 from tests.live.counted import Cable, CountedLoop, counted
@@ -99,7 +99,7 @@ def test_a_bug_anywhere_in_control_brakes_a_moving_robot_to_rest(
     found = Sent(place, MOVING_S, tmp_path, monkeypatch)
     robot, replies = found.flight.robot, found.after()
     assert np.abs(replies[0].dq).max() > 3.0, "it was fast"
-    stop = straight(replies[0].q, replies[0].dq, robot.ddq_max, CYCLE_S)
+    stop = stop_straight(replies[0].q, replies[0].dq, robot.ddq_max, CYCLE_S)
     assert len(replies) > stop.ticks
     for row, reply in enumerate(replies):
         np.testing.assert_allclose(reply.q, stop.q[min(row, stop.ticks)], rtol=0, atol=1e-12)

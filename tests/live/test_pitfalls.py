@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.egm.robot_double.faults import Fault
-from hrcreplay.egm.robot_double.robot_simulator import TwinSettings
+from hrcreplay.egm.robot_double.robot_simulator import SimulatorSettings
 from hrcreplay.egm.robot_double.servo import ServoSettings
 from hrcreplay.live.control import session_controller
 from hrcreplay.live.control.loop import FINAL_ANSWERS
@@ -36,7 +36,7 @@ def planned(flight: Flight) -> tuple[Floats, Floats]:
 
 def test_3_a_session_starts_where_the_robot_is_and_blends() -> None:
     """A robot far from its programme: its first target is itself, and it sets out slowly. So in the next session."""
-    away = TwinSettings(start_deg=(90.0, 40.0, -60.0, 50.0, -40.0, 120.0))
+    away = SimulatorSettings(start_deg=(90.0, 40.0, -60.0, 50.0, -40.0, 120.0))
     flight = Flight(overrides=RESUME, twin=away, faults=(Fault("egm_error", 2.0),)).fly(6.0)  # it was moving
     arrivals, cycles = flight.core.record.arrivals(), flight.core.record.cycles()
     assert set(arrivals["session"]) == {1, 2}
@@ -71,7 +71,7 @@ def test_5_silence_finds_the_robot_standing() -> None:
 
 def test_7_a_session_that_ends_by_convergence_is_told_and_the_next_one_served() -> None:
     """Nobody is seen, so it does not start; standing still for CondTime, the controller hangs up, and calls again."""
-    converging = TwinSettings(servo=ServoSettings(cond_time_s=1.0), restart_s=0.5)
+    converging = SimulatorSettings(servo=ServoSettings(cond_time_s=1.0), restart_s=0.5)
     flight = Flight(overrides=FAST, twin=converging, walk=lambda s: None if s < 1.4 else (3.0, 0.0)).fly(2.4)
     assert flight.core.ends == ["converged", ""]
     assert flight.controller.fault is None
@@ -84,7 +84,7 @@ def test_7_a_session_that_ends_by_convergence_is_told_and_the_next_one_served() 
 
 def test_7_idling_in_a_stop_ends_a_session_but_not_ours() -> None:
     """Held by a stop, it converges too: motion goes on in the next session, from where the robot stands."""
-    converging = TwinSettings(servo=ServoSettings(cond_time_s=1.5), restart_s=0.5)
+    converging = SimulatorSettings(servo=ServoSettings(cond_time_s=1.5), restart_s=0.5)
     seen = lambda s: None if 0.4 < s < 2.6 else (3.0, 0.0)  # noqa: E731
     flight = Flight(overrides=RESUME, twin=converging, walk=seen).fly(4.2)
     assert flight.core.ends == ["converged", ""]
@@ -98,7 +98,7 @@ def test_7_idling_in_a_stop_ends_a_session_but_not_ours() -> None:
 def test_8_the_robot_follows_without_a_lag_at_the_gains_of_its_controller(gain: float) -> None:
     """Position alone trails by 1 / gain: 200 ms as delivered. With its speed, only the controller's filter is left."""
     servo = ServoSettings(gain=gain, filter_hz=20.0)
-    flight = Flight(overrides=FAST, twin=TwinSettings(servo=servo)).fly(6.0)
+    flight = Flight(overrides=FAST, twin=SimulatorSettings(servo=servo)).fly(6.0)
     cycles = flight.core.record.cycles()[-1000:]
     speed = np.abs(cycles["ref_rad_per_s"]).max(axis=0)
     behind = np.abs(cycles["ref_rad"] - cycles["planned_rad"]).max(axis=0)

@@ -43,7 +43,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Flown]
     it."""
     with ExitStack() as stack:
         group = Group(tmp_path_factory.mktemp("flown"), stack)
-        group.prepare("fine", "--send", "--duration", 12, settings=("occupancy.method=sound",), figures=True)
+        group.prepare("fine", "--send", "--duration", 12, settings=("prediction.method=sound",), figures=True)
         group.prepare("shadow", "--duration", 12)
         found = {name: group.robot(name) for name in ("shadow", "fine")}
         for one in found.values():

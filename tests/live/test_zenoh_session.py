@@ -97,7 +97,7 @@ def test_a_publisher_that_dies_stops_the_robot_and_one_that_comes_back_does_not_
     assert verify(session.folder).identical
     meta = json.loads((session.folder / "run.json").read_text())
     assert {stop["reason"] for stop in meta["stops"]} >= {"no fresh frame", "Ctrl-C"}
-    moves_only_while_seen(session.folder / "log.mcap", stop_s=meta["settings"]["occupancy"]["stop_s"])
+    moves_only_while_seen(session.folder / "log.mcap", stop_s=meta["settings"]["prediction"]["stop_s"])
 
 
 def moves_only_while_seen(log: Path, stop_s: float) -> None:

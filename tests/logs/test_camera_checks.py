@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hrcreplay.cli import commands
-from hrcreplay.commands import replay
+from hrcreplay.commands import inputs, replay
 from hrcreplay.logs.camera_checks import LIMB_POINTS, CameraChecks
 from hrcreplay.logs.info import Summary, lines, summarize
 from hrcreplay.logs.reader import open_log
@@ -240,7 +239,7 @@ def test_a_cell_corrects_clocks_and_poses_in_info(tmp_path: Path) -> None:
         f"[cameras.right]\nT_world_camera = {POSES['right'].tolist()}\nclock_offset_s = -0.4\n"
         f"[cameras.attic]\nT_world_camera = {np.eye(4).tolist()}\n"
     )
-    without, corrected = commands.describe(log, None, ()), commands.describe(log, None, (), cell)
+    without, corrected = inputs.describe(log, None, ()), inputs.describe(log, None, (), cell)
     assert any("cameras left and right show a limb apart" in line for line in without)
     assert not any("cameras left and right show a limb apart" in line for line in corrected)
     assert any("right: " in line and "extrinsics in the cell" in line for line in corrected)
@@ -312,16 +311,16 @@ def _recorded(tmp_path: Path) -> Iterator[tuple[str, list[str]]]:
     for name, (kind, files, options) in IMPORTS.items():
         log, cell = tmp_path / f"{name}.mcap", tmp_path / f"{name}.toml"
         paths = [str(data_path(file)) if kind == "keraal" else f"{c}={data_path(file)}" for c, file in files.items()]
-        commands.import_files(kind, paths, log, 30.0)
+        inputs.import_files(kind, paths, log, 30.0)
         place = {"reference": None, "up": None, "height_m": None, "base": None, **options}
-        commands.calibrate(log, cell, None, (), **place)
-        yield name, commands.describe(log, None, (), cell)
+        inputs.calibrate(log, cell, None, (), **place)
+        yield name, inputs.describe(log, None, (), cell)
     settings, cell = tmp_path / "s.toml", tmp_path / "sara_cell.toml"
     settings.write_text(SARA)
     cell.write_text(SARA_CELL)
     for name in ("exp_appraoching", "exp_box"):
-        yield name, commands.describe(data_path(f"sara_human_robot_bags/{name}.bag"), settings, (), cell)
-    yield "demo", commands.describe(replay.demo_log(), None, ())
+        yield name, inputs.describe(data_path(f"sara_human_robot_bags/{name}.bag"), settings, (), cell)
+    yield "demo", inputs.describe(replay.demo_log(), None, ())
 
 
 def test_real_people_have_no_odd_bones_and_no_exchanged_sides(tmp_path: Path) -> None:

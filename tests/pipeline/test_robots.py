@@ -23,7 +23,7 @@ def _plan(log: Path, out: Path, *overrides: str) -> run_folder.Run:
 
 
 #: The prediction with which the robot moves most.
-PRINTED = ("occupancy.method=paper", "limits.prediction=paper")
+PRINTED = ("prediction.method=paper", "limits.prediction=paper")
 
 
 def _without_task(path: Path, **joints: Any) -> Path:

@@ -51,13 +51,14 @@ def test_the_arguments_of_a_run_are_the_same_however_it_was_asked_for(planned: P
     file = tmp_path / "settings.toml"
     file.write_text(f'[plan]\nleash_m = 0.2\n[limits]\nprediction = "{tmp_path / "own.toml"}"\n')
     (tmp_path / "own.toml").write_text((resources.files("hrcreplay.limits") / "people.toml").read_text())
-    overrides = (f"limits.prediction={tmp_path / 'own.toml'}", "plan.leash_m=0.2")
+    overrides = (f"limits.prediction={tmp_path / 'own.toml'}", "plan.max_reference_lead_m=0.2")
     asked = [
         resolve("report", replay.demo_log(), config=file, overrides=(), **shared),
         resolve("report", replay.demo_log(), config=None, overrides=overrides, **shared),
         resolve("report", planned, config=None, overrides=overrides, cell_file=None, start_s=None, end_s=None),
     ]
-    told = "report demo.mcap --start 9 --end 10 --smooth --set limits.prediction=own.toml --set plan.leash_m=0.2"
+    told = "report demo.mcap --start 9 --end 10 --smooth --set limits.prediction=own.toml "
+    told += "--set plan.max_reference_lead_m=0.2"
     for run_config in asked:
         assert run_config.arguments(smooth=True) == told.split()
     plain = run_folder.read_meta(planned)["arguments"]

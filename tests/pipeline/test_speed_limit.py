@@ -69,7 +69,7 @@ def test_no_tick_of_the_demo_is_faster_than_the_move_allows(demo_folder: Path, t
 
 @pytest.mark.parametrize("method", ["shield", "ssm"])
 def test_nor_is_one_of_the_other_methods(tmp_path: Path, method: str) -> None:
-    settings = (f"plan.method={method}", "plan.baselines=[]", "occupancy.store_hz=1")
+    settings = (f"plan.method={method}", "plan.baselines=[]", "prediction.store_hz=1")
     folder = replay.run("plan", replay.demo_log(), out=tmp_path / "run", end_s=5.0, overrides=settings)
     motion = pq.read_table(folder / "motion.parquet").to_pandas()
     assert tcp(folder, motion)[1].max() <= 0.9 * (1 + TOLERANCE)
@@ -77,7 +77,7 @@ def test_nor_is_one_of_the_other_methods(tmp_path: Path, method: str) -> None:
 
 @pytest.mark.parametrize(("allowed", "least", "most"), [('"free"', 1.3, 4.4), ("1.1", 1.05, 1.1)])
 def test_a_setting_lets_it_catch_up_faster(tmp_path: Path, allowed: str, least: float, most: float) -> None:
-    settings = (f"plan.catch_up_speed_m_per_s={allowed}", "plan.baselines=[]", "occupancy.store_hz=1")
+    settings = (f"plan.catch_up_speed_m_per_s={allowed}", "plan.baselines=[]", "prediction.store_hz=1")
     folder = replay.run("plan", replay.demo_log(), out=tmp_path / "run", end_s=5.0, overrides=settings)
     motion = pq.read_table(folder / "motion.parquet").to_pandas()
     assert least < tcp(folder, motion)[1].max() <= most * (1 + TOLERANCE)

@@ -22,7 +22,7 @@ from hrcreplay.pipeline.run_config import resolve
 from hrcreplay.records import BORDER
 from tests.visits import Visitors, cell_around, visit_log
 
-ALONE = ("plan.baselines=[]", "occupancy.store_hz=1")
+ALONE = ("plan.baselines=[]", "prediction.store_hz=1")
 HALF_M = 2.5
 
 
@@ -88,7 +88,7 @@ def test_in_an_empty_cell_that_is_watched_the_robot_does_its_work(tmp_path: Path
         row = motion.loc[tick]
         ends = robot.ends_m(row[[f"q{i}" for i in range(1, 7)]].to_numpy(dtype=float))
         out = np.abs(ends[..., :2] - base[:2, 3]).max(axis=(1, 2))
-        walked = 1.6 * (state["nobody_s"][tick] + row["horizon_s"] + run_config.settings.occupancy.latency_s)
+        walked = 1.6 * (state["nobody_s"][tick] + row["horizon_s"] + run_config.settings.prediction.latency_s)
         expected = (HALF_M - out - radius).min() - walked - run_config.settings.plan.clearance_m
         assert row["distance_m"] == pytest.approx(expected, abs=1e-6)
 

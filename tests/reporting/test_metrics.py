@@ -197,7 +197,7 @@ def test_the_greatest_speeds_at_all_and_near_the_body(run: Run) -> None:
         {"t_ns": motion["t_ns"], "method": "qp", "tcp_speed": speed, "distance_m": apart, "moving": True}
     )
     metrics = MetricTable()
-    bounds = {"near_m": 0.5, "stationary_m_per_s": 0.001, "leash_m": 0.4}
+    bounds = {"near_m": 0.5, "stationary_m_per_s": 0.001, "max_reference_lead_m": 0.4}
     add_plan(metrics, motion, {"scaling": motion}, method="qp", contact=rows, **bounds)
     found = metrics.sorted()
     assert found["plan_tcp_speed_max_m_per_s"]["value"] == 1.4

@@ -15,7 +15,7 @@ from hrcreplay.records import LIMBS, POINTS, Floats
 from hrcreplay.reporting.metrics.contact import stop_events
 from hrcreplay.reporting.page.replay_page import MISSING, NumberBlock, replay_data
 from hrcreplay.reporting.replay_scene import SHOWN_POINTS, ReplayScene
-from hrcreplay.robot.control.control_step import axis_by_axis, straight
+from hrcreplay.robot.control.control_step import stop_axis_by_axis, stop_straight
 from tests.reporting.moving import joints, moving_run, moving_scene, robot
 from tests.reporting.synthetic import LENGTHS_M, T0_NS, pose
 
@@ -57,7 +57,7 @@ def test_a_certified_stop_ends_where_it_would(scene: ReplayScene) -> None:
     q, dq = joints(scene.seconds)
     ticks = 50
     limit = np.abs(dq[77]).max() / (ticks * 0.004) * (1 + 1e-9)
-    stop = straight(q[77], dq[77], np.full(6, limit), 0.004)
+    stop = stop_straight(q[77], dq[77], np.full(6, limit), 0.004)
     assert stop.ticks == ticks  # 0.2 s, as the made-up table has it
     np.testing.assert_allclose(scene.methods["qp"].stop_q[77], stop.q[-1], atol=1e-9)
 
@@ -67,7 +67,9 @@ def test_a_stop_without_certificates_is_that_of_each_axis() -> None:
     plain = dataclasses.replace(run, meta={**run.meta, "settings": {"plan": {"method": "qp", "certify": False}}})
     found = moving_scene(plain).methods["qp"]
     q, dq = joints(np.array([0.4]))
-    np.testing.assert_allclose(found.stop_q[10], axis_by_axis(q[0], dq[0], robot(run).ddq_max, 0.01).q[-1], atol=1e-9)
+    np.testing.assert_allclose(
+        found.stop_q[10], stop_axis_by_axis(q[0], dq[0], robot(run).ddq_max, 0.01).q[-1], atol=1e-9
+    )
 
 
 def test_a_stop_on_the_path_stays_on_it(scene: ReplayScene) -> None:

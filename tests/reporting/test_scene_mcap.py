@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import hrcreplay
-from hrcreplay.reporting.replay_scene import ReplayScene, posed
+from hrcreplay.reporting.replay_scene import ReplayScene, pose_links
 from hrcreplay.reporting.scene_mcap import write_scene
 from hrcreplay.reporting.scene_messages import surface, surface_mesh
 from tests.reporting.moving import moving_run, moving_scene, robot
@@ -94,7 +94,7 @@ def test_the_links_hang_on_frames_that_bring_them_where_they_are(
 def test_many_poses_at_once_are_those_of_the_robot(scene: ReplayScene) -> None:
     q = scene.methods["qp"].q
     model = robot(moving_run(2.0))
-    np.testing.assert_allclose(posed(scene.robot, q[::17]), [model.ends_m(row) for row in q[::17]], atol=1e-12)
+    np.testing.assert_allclose(pose_links(scene.robot, q[::17]), [model.ends_m(row) for row in q[::17]], atol=1e-12)
 
 
 def test_the_distance_is_drawn_as_long_as_it_is(topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene) -> None:

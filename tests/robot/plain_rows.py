@@ -48,9 +48,9 @@ def approach_rows(
     Returns:
         ``A`` (2m, nv) [m^2 s/rad] and ``b`` (2m,) [m^2] with ``A @ dq_next <= b``.
     """
-    room_m2 = max(0.0, distance_m - clearance_m) ** 2  # Eq. (10): squared, so m^2
+    rhs_m2 = max(0.0, distance_m - clearance_m) ** 2  # Eq. (10): squared, so m^2
     from_a = vertices_m - link.a_m
     rows_a = from_a @ link.J_a  # Eq. (12), first row
     rows_b = from_a @ link.J_b - (link.b_m - link.a_m) @ link.J_a  # Eq. (12), second row
     A = stop_s * np.vstack([rows_a, rows_b])  # Eq. (66i), corrected: T_s belongs here
-    return Rows(A=A, b=np.full(len(A), room_m2))
+    return Rows(A=A, b=np.full(len(A), rhs_m2))

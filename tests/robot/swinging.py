@@ -17,10 +17,10 @@ from hrcreplay.robot.control.control_step import (
     PlanSettings,
     RobotState,
     Step,
-    axis_by_axis,
     make_step,
     observe,
     standstill_reason,
+    stop_axis_by_axis,
 )
 from hrcreplay.robot.control.minimiser import SLACK, Problem
 from hrcreplay.robot.control.qp_controller import Target, problem, propose
@@ -60,7 +60,7 @@ def step(
     robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles, settings: PlanSettings = SETTINGS
 ) -> Step:
     """One tick without a past: the acceleration before was 0, and where nothing is proposed Eq. (67) brakes."""
-    going = axis_by_axis(state.q, state.dq, robot.ddq_max, DT_S)
+    going = stop_axis_by_axis(state.q, state.dq, robot.ddq_max, DT_S)
     horizon_s = settings.horizon_s(going)
     with np.errstate(all="ignore"):
         sight = observe(robot, state, seen, settings.plan.clearance_m)

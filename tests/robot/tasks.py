@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.path import programmed
+from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import Reference, parse_task
 
 HOME: dict[str, Any] = {"name": "home", "joints_deg": [0, 0, 0, 0, 90, 0]}
@@ -34,7 +34,7 @@ def robot() -> RobotModel:
 
 
 def plan(robot: RobotModel, *waypoints: dict[str, Any], **task: Any) -> Reference:
-    return programmed(parse_task({"waypoints": list(waypoints), **task}), robot)
+    return plan_programme(parse_task({"waypoints": list(waypoints), **task}), robot)
 
 
 @pytest.fixture(scope="module")

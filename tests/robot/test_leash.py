@@ -20,7 +20,7 @@ def test_time_runs_with_the_clock(pick_and_place: Reference) -> None:
 
 
 def test_path_waits_on_a_taut_leash_and_never_turns_back(pick_and_place: Reference) -> None:
-    leash = Plan(reference="path", leash_m=0.05, waypoint_m=0.05)
+    leash = Plan(reference="path", max_reference_lead_m=0.05, waypoint_m=0.05)
     errors = np.linspace(0, 0.08, 400)
     steps = [advance(pick_and_place, 1.0, 0.004, e, leash) for e in errors]
     rates = np.array([rate for _, rate in steps])
@@ -34,7 +34,7 @@ def test_path_waits_on_a_taut_leash_and_never_turns_back(pick_and_place: Referen
 
 def test_a_held_robot_is_waited_for_and_skips_no_waypoint(pick_and_place: Reference) -> None:
     """The robot stands for two seconds in the middle of a move, then evades by 12 cm, and goes on from there."""
-    tick, leash = 0.004, Plan(reference="path", leash_m=0.25, waypoint_m=0.01)
+    tick, leash = 0.004, Plan(reference="path", max_reference_lead_m=0.25, waypoint_m=0.01)
     s, tcp = 0.0, pick_and_place.sample(0.0).T_world_tcp[:3, 3]
     passed, evaded = [], 0.0
     for k in range(4500):
@@ -44,7 +44,7 @@ def test_a_held_robot_is_waited_for_and_skips_no_waypoint(pick_and_place: Refere
         if not 100 <= k < 600:
             tcp = tcp + min(1.0, 1.2 * tick / max(way, 1e-12)) * (goal - tcp)
         error = float(np.linalg.norm(target - tcp))
-        assert error < leash.leash_m + 2.2 * tick
+        assert error < leash.max_reference_lead_m + 2.2 * tick
         s_next, rate = advance(pick_and_place, s, tick, error, leash)
         assert s <= s_next <= s + tick
         passed += [error for arrival in pick_and_place.waypoints_s if s <= arrival < s_next]

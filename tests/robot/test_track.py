@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from hrcreplay.errors import LogError
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, from_urdf
-from hrcreplay.robot.path import recorded, recorded_remarks
+from hrcreplay.robot.path import recorded_remarks, smooth_recorded
 from hrcreplay.robot.task import STEP_S
 from tests.realdata import data_path
 from tests.robot.tasks import robot
@@ -26,7 +26,7 @@ def test_a_recorded_track_is_followed(robot: RobotModel) -> None:
     q = amplitude * np.sin(np.outer(t, rate)) + rng.normal(0, 1e-4, (1200, 6))
     order = rng.permutation(1200)
     t_ns = (t * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
-    reference = recorded(t_ns[order], q[order], robot)
+    reference = smooth_recorded(t_ns[order], q[order], robot)
     for s in np.linspace(0.2, 5.7, 40):
         point = reference.sample(s)
         at = s + t[0]
@@ -40,7 +40,7 @@ def test_recorded_rows_without_values_are_left_out(robot: RobotModel) -> None:
     t_ns = np.arange(0, 1_000_000_000, 10_000_000)
     q = np.outer(t_ns * 1e-9, np.ones(6)) * 0.3
     q[40:45, 2] = np.nan
-    assert_allclose(recorded(t_ns, q, robot).sample(0.42).q, 0.42 * 0.3, atol=1e-9)
+    assert_allclose(smooth_recorded(t_ns, q, robot).sample(0.42).q, 0.42 * 0.3, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_recorded_rows_without_values_are_left_out(robot: RobotModel) -> None:
 )
 def test_a_track_of_another_robot_is_refused(robot: RobotModel, q: Floats, message: str) -> None:
     with pytest.raises(LogError, match=message):
-        recorded(np.arange(50) * 10_000_000, q, robot)
+        smooth_recorded(np.arange(50) * 10_000_000, q, robot)
 
 
 def _turned(t_s: Floats, amplitude_rad: float, rate: float) -> Floats:
@@ -66,11 +66,11 @@ def test_degrees_taken_for_radians_are_named_as_such(robot: RobotModel) -> None:
     t_s = np.arange(0, 6, 0.01)
     degrees = np.degrees(_turned(t_s, 1.3, 1.0))
     with pytest.raises(LogError, match=r"joint_1 has position .*logs\.joints_unit = deg"):
-        recorded((t_s * 1e9).astype(np.int64), degrees, robot)
+        smooth_recorded((t_s * 1e9).astype(np.int64), degrees, robot)
     spike = _turned(t_s, 1.3, 1.0)
     spike[300, 1] = 60.0
     with pytest.raises(LogError, match=r"joint_2 has position 60\.000 rad after 3\.000 s") as caught:
-        recorded((t_s * 1e9).astype(np.int64), spike, robot)
+        smooth_recorded((t_s * 1e9).astype(np.int64), spike, robot)
     assert "joints_unit" not in str(caught.value), "one wrong row is no unit"
 
 
@@ -85,24 +85,24 @@ def test_small_degrees_are_told_by_their_speed_and_of_an_endless_axis_by_its_tur
     t_s = np.arange(0, 20, 0.01)
     t_ns = (t_s * 1e9).astype(np.int64)
     with pytest.raises(LogError, match=r"j has speed .*logs\.joints_unit = deg"):
-        recorded(t_ns, np.degrees(np.sin(0.5 * t_s))[:, None], arm)
-    (remark,) = recorded_remarks(recorded(t_ns, np.degrees(0.025 * t_s)[:, None], arm))
+        smooth_recorded(t_ns, np.degrees(np.sin(0.5 * t_s))[:, None], arm)
+    (remark,) = recorded_remarks(smooth_recorded(t_ns, np.degrees(0.025 * t_s)[:, None], arm))
     assert "logs.joints_unit = deg" in remark
     assert "28." in remark
-    assert recorded_remarks(recorded(t_ns, (1.5 * np.sin(0.5 * t_s))[:, None], arm)) == []
+    assert recorded_remarks(smooth_recorded(t_ns, (1.5 * np.sin(0.5 * t_s))[:, None], arm)) == []
 
 
 def test_what_the_robot_cannot_follow_is_told_with_axis_and_number(robot: RobotModel) -> None:
     """Of a sine of amplitude a and rate w the greatest acceleration is a w^2: of 0.1 and 12 that is 14.4."""
     t_s = np.arange(0, 6, 0.004)
     t_ns = np.round(t_s * 1e9).astype(np.int64)
-    assert recorded_remarks(recorded(t_ns, _turned(t_s, 1.0, 2.0), robot)) == []
-    (remark,) = recorded_remarks(recorded(t_ns, _turned(t_s, 0.1, 12.0), robot))
+    assert recorded_remarks(smooth_recorded(t_ns, _turned(t_s, 1.0, 2.0), robot)) == []
+    (remark,) = recorded_remarks(smooth_recorded(t_ns, _turned(t_s, 0.1, 12.0), robot))
     assert "joint_1" in remark
     assert "robot.acceleration" in remark
     found = float(re.findall(r"by up to ([\d.]+) rad/s\^2", remark)[0])
     assert 0.85 * 14.4 < found < 14.4, "a mean over a tenth of a second is less than the peak"
-    fast = recorded(t_ns, _turned(t_s, 1.8, 2.0), robot)
+    fast = smooth_recorded(t_ns, _turned(t_s, 1.8, 2.0), robot)
     assert any("move faster" in one and "3.6" in one for one in recorded_remarks(fast))
 
 
@@ -120,7 +120,7 @@ def test_a_real_track_moves_as_its_own_log_says(measurement: int) -> None:
             "<limit velocity='4' effort='0'/></joint>"
         )
     arm = from_urdf("".join(parts) + "</robot>", np.eye(4), stop_s=0.377)
-    reference = recorded(t_ns, rows[:, :6], arm)
+    reference = smooth_recorded(t_ns, rows[:, :6], arm)
     inner = slice(30, -30)
     points = [reference.sample(t) for t in (t_ns[inner] - t_ns[0]) * 1e-9]
     assert np.abs(np.array([p.q for p in points]) - rows[inner, :6]).max() < 5e-3

@@ -101,10 +101,10 @@ def test_no_source_has_a_default_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("source", "found"),
     [
-        ('plan.get("leash_m", 0.25)', ["leash_m"]),
+        ('plan.get("max_reference_lead_m", 0.25)', ["max_reference_lead_m"]),
         ('plan.get("certify", True)', ["certify"]),
         ('zenoh.get("mode", "peer")', ["mode"]),
-        ('plan.get("leash_m")', []),
+        ('plan.get("max_reference_lead_m")', []),
         ('fusion.pop("memory_s", 0.5)', ["memory_s"]),
         ('getattr(fusion, "memory_s", 0.5)', ["memory_s"]),
         ('getattr(fusion, "memory_s")', []),
@@ -124,8 +124,8 @@ def test_a_default_of_its_own_is_found(source: str, found: list[str]) -> None:
 
 
 def test_a_setting_is_what_was_recorded_else_the_default() -> None:
-    assert setting({"plan": {"leash_m": 0.7}}, "plan", "leash_m") == 0.7
-    assert setting({"plan": {"leash_m": 0.7}}, "logs", "gap_s") == Settings().logs.gap_s
+    assert setting({"plan": {"max_reference_lead_m": 0.7}}, "plan", "max_reference_lead_m") == 0.7
+    assert setting({"plan": {"max_reference_lead_m": 0.7}}, "logs", "gap_s") == Settings().logs.gap_s
     assert setting({}, "plan", "certify") is Settings().plan.certify
     with pytest.raises(AttributeError):
         setting({}, "plan", "no_such_setting")

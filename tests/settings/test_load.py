@@ -4,25 +4,26 @@ from pathlib import Path
 
 import pytest
 
-from hrcreplay.errors import SettingsError
+from hrcreplay.errors import SettingRenamed, SettingsError
 from hrcreplay.settings.load import Settings, as_overrides, load_settings
+from hrcreplay.settings.sections import setting
 
 
 def test_defaults_are_the_papers() -> None:
     settings = Settings()
-    assert settings.occupancy.stop_s == 0.377  # Eq. (70)
+    assert settings.prediction.stop_s == 0.377  # Eq. (70)
     assert settings.plan.q_p == (0.10, 0.10)  # Eq. (71)
     assert settings.plan.q_v == (1.0, 1.0)  # Eq. (72)
-    occupancy = settings.occupancy
-    assert (occupancy.radius_head_m, occupancy.radius_thorax_m) == (0.12, 0.15)  # Table 2
-    assert (occupancy.radius_upper_arm_m, occupancy.radius_lower_arm_m) == (0.07, 0.07)
+    prediction = settings.prediction
+    assert (prediction.radius_head_m, prediction.radius_thorax_m) == (0.12, 0.15)  # Table 2
+    assert (prediction.radius_upper_arm_m, prediction.radius_lower_arm_m) == (0.07, 0.07)
 
 
 def test_the_paper_as_printed_is_one_word_and_the_command_line_wins_over_it(tmp_path: Path) -> None:
     settings = load_settings(Path("paper"), ("plan.rows=soft",))
     plan = settings.plan
-    assert (settings.occupancy.method, settings.limits.prediction) == ("paper", "paper")
-    assert (plan.horizon, plan.certify, plan.rows, plan.room) == ("fixed", False, "soft", "square")
+    assert (settings.prediction.method, settings.limits.prediction) == ("paper", "paper")
+    assert (plan.horizon, plan.certify, plan.rows, plan.constraint_rhs) == ("fixed", False, "soft", "square")
     assert (plan.lead_s, plan.give_way_m, plan.jerk_s, plan.smooth_s) == (0.0, 0.0, 0.0, 0.0)
     with pytest.raises(SettingsError, match="name a TOML file, or paper"):
         load_settings(tmp_path / "paper")
@@ -39,7 +40,7 @@ def test_command_line_wins_over_file_and_file_over_defaults(tmp_path: Path) -> N
 
 
 def test_settings_of_an_earlier_run_come_back_whole() -> None:
-    settings = load_settings(None, ("occupancy.store_hz=all", "plan.q_p=[0.2, 0.3]"))
+    settings = load_settings(None, ("prediction.store_hz=all", "plan.q_p=[0.2, 0.3]"))
     again = load_settings(None, (), settings.model_dump(mode="json"))
     assert again == settings
 
@@ -52,7 +53,7 @@ def test_settings_that_are_not_the_defaults_as_a_command_line_gives_them() -> No
         'live.zenoh={connect = ["tcp/cell:7447"], mode = "client"}',
         'logs.decoders=[{topic = "/bodies", camera = "left", points = "bodies.points", index = {head = 3}}]',
         'logs.topics=["/tf", "/two words"]',
-        "occupancy.method=paper",
+        "prediction.method=paper",
         "plan.q_p=[0.2, 0.3]",
         "robot.urdf=/somewhere/on/disk/arm.urdf",
     )
@@ -74,7 +75,7 @@ def test_settings_that_are_not_the_defaults_as_a_command_line_gives_them() -> No
         ("[fusion]\nrate_hz = nan\n", r"fusion\.rate_hz: found nan"),
         ("fusion = 3\n", r"fusion: found 3"),
         ("[fusion\n", r"not TOML"),
-        ("[occupancy]\nmethod = 'hopeful'\n", r"occupancy\.method: found 'hopeful'; input should be 'paper'"),
+        ("[prediction]\nmethod = 'hopeful'\n", r"prediction\.method: found 'hopeful'; input should be 'paper'"),
         (
             "[[logs.decoders]]\ntopic='/a'\ncamera='a'\npoints='p'\nindex={nose=1}\n",
             r"unknown body point 'nose'; known are pelvis",
@@ -139,3 +140,44 @@ def test_the_word_none_stands_for_no_value_where_there_may_be_none() -> None:
     assert found.logs.joints_topic is None
     assert found.plan.method == "none"
     assert load_settings(None, as_overrides(found)) == found  # a command line that makes the same run again
+
+
+OLD_NAMES = {
+    "occupancy.store_hz=50": "prediction.store_hz=50",
+    "plan.leash_m=0.2": "plan.max_reference_lead_m=0.2",
+    "plan.room=square": "plan.constraint_rhs=square",
+    "live.look_s=0.03": "live.perception_max_age_s=0.03",
+}
+
+
+@pytest.mark.parametrize("old", OLD_NAMES)
+def test_names_of_the_version_before_are_read_and_told(tmp_path: Path, old: str) -> None:
+    new = OLD_NAMES[old]
+    with pytest.warns(SettingRenamed, match=rf"--set {old}: \S+ is now called {new.partition('.')[0]}"):
+        assert load_settings(None, (old,)) == load_settings(None, (new,)) != Settings()
+    (section, _, key), value = old.partition("=")[0].partition("."), old.partition("=")[2]
+    file = tmp_path / "old.toml"
+    file.write_text(f"[{section}]\n{key} = {value if value[0].isdigit() else repr(value)}\n")
+    with pytest.warns(SettingRenamed, match="old.toml: "):
+        assert load_settings(file) == load_settings(None, (new,))
+    with pytest.warns(SettingRenamed):  # and wins over the settings of the file and of an earlier run
+        assert load_settings(file, (old,), load_settings(None, (new,)).model_dump(mode="json")) == load_settings(
+            None, (new,)
+        )
+
+
+def test_settings_that_an_earlier_version_recorded_are_read_without_a_word(recwarn: pytest.WarningsRecorder) -> None:
+    recorded = {"occupancy": {"stop_s": 0.5}, "plan": {"leash_m": 0.1}}
+    settings = load_settings(None, ("plan.max_reference_lead_m=0.3",), recorded)
+    assert (settings.prediction.stop_s, settings.plan.max_reference_lead_m) == (0.5, 0.3)
+    assert setting(recorded, "prediction", "stop_s") == 0.5
+    assert setting(recorded, "plan", "max_reference_lead_m") == 0.1
+    assert setting(recorded, "plan", "constraint_rhs") == "product"
+    assert not recwarn.list
+
+
+def test_a_setting_under_both_names_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "both.toml"
+    file.write_text("[plan]\nleash_m = 0.1\nmax_reference_lead_m = 0.2\n")
+    with pytest.raises(SettingsError, match=r"unknown setting 'plan\.leash_m'"):
+        load_settings(file)

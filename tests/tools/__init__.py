@@ -1,1 +1,1 @@
-"""What measures and fits, each ``python -m tests.tools.NAME --help``; the README's and docs' figures come from these."""
+"""Tools that measure and fit; each answers ``python -m tests.tools.NAME --help``. Documents quote their figures."""

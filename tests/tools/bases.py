@@ -19,8 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hrcreplay.cli import commands
-from hrcreplay.commands import replay
+from hrcreplay.commands import inputs, replay
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import POINTS, Floats, HumanStates
 from hrcreplay.reporting.metrics.contact import retreats
@@ -73,9 +72,9 @@ def recorded(name: str, tmp: Path) -> tuple[Path, Path, Path | None]:
         return data_path(f"sara_human_robot_bags/{name}.bag"), cell, tmp / "s.toml"
     kind, files, options = IMPORTS[name]
     paths = [f"{c}={data_path(file)}" if kind != "keraal" else str(data_path(file)) for c, file in files.items()]
-    commands.import_files(kind, paths, tmp / "log.mcap", 30.0)
+    inputs.import_files(kind, paths, tmp / "log.mcap", 30.0)
     place = {"reference": None, "up": None, "height_m": None, "base": None, **options}
-    commands.calibrate(tmp / "log.mcap", cell, None, (), **place)
+    inputs.calibrate(tmp / "log.mcap", cell, None, (), **place)
     return tmp / "log.mcap", cell, None
 
 
@@ -86,7 +85,7 @@ def tried(name: str, seconds: float, tmp: Path) -> int:
     states = HumanStates.join(list(read_states(fused / "state.parquet", 4096)))
     (tmp / "task.toml").write_text(TASK)
     others = ", ".join(f'"{method}"' for method in METHODS[1:])
-    overrides = (f"plan.task={tmp / 'task.toml'}", f"plan.baselines=[{others}]", "occupancy.store_hz=1")
+    overrides = (f"plan.task={tmp / 'task.toml'}", f"plan.baselines=[{others}]", "prediction.store_hz=1")
     faults = 0
     for number, base in enumerate(bases(states)):
         place = with_base(cell, base, tmp / f"cell{number}.toml")

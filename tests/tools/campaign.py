@@ -61,7 +61,7 @@ def violations(flight: Flight) -> list[str]:
 def _motion_after_stops(flight: Flight) -> list[str]:
     """Whether each stop is a certified one to standstill, straight or Eq. (67), within T_s and two cycles."""
     found = []
-    stop_s = flight.start["settings"]["occupancy"]["stop_s"]
+    stop_s = flight.start["settings"]["prediction"]["stop_s"]
     ddq_max, dt_s = flight.robot.ddq_max, flight.controller.setup.plan.dt_s
     for at_ns, reason in flight.controller.stops:
         rows = [answer for answer in flight.answers if answer.t_ns >= at_ns and answer.row is not None]

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from hrcreplay.audit.recorded_motion import errors_in_deviations
-from hrcreplay.evaluation.recorded_person import TRUTH, fused_stretches, read_recording
+from hrcreplay.evaluation.recorded_person import TRUTH, fuse_stretches, read_recording
 from hrcreplay.human.fusion.fuse import Trace
 from hrcreplay.human.fusion.reported_deviations import FITTED, KIND
 from hrcreplay.logs.reader import open_log
@@ -57,7 +57,7 @@ def sample(run: Path) -> Sample:
     log, settings = open_log(run_config.log, run_config.settings.logs), run_config.settings.fusion
     stage, ticks_ns = assembly.fusion_stage(run_config, log), stages.span_ticks(run_config, log)
     recording = read_recording(log, ticks_ns, stage, lambda _: None)
-    parts = fused_stretches(
+    parts = fuse_stretches(
         open_log(run_config.log, run_config.settings.logs), ticks_ns, stage, Counter(), lambda _: None
     )
     trace = Trace.join([part for *_, part in parts])

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hrcreplay.audit import fit
-from hrcreplay.cli import commands
-from hrcreplay.commands import replay
+from hrcreplay.commands import inputs, replay
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import CameraFrames, Ints
 from tests.human import rising
@@ -60,9 +59,9 @@ def fused(folder: Path) -> list[Path]:
     for name, (kind, files, options) in IMPORTS.items():
         log, cell = folder / f"{name}.mcap", folder / f"{name}.toml"
         paths = [str(data_path(f)) if kind == "keraal" else f"{c}={data_path(f)}" for c, f in files.items()]
-        commands.import_files(kind, paths, log, 30.0)
+        inputs.import_files(kind, paths, log, 30.0)
         place = {"reference": None, "up": None, "height_m": None, "base": "1.0,0,0.65,0", **options}
-        commands.calibrate(log, cell, None, (), **place)
+        inputs.calibrate(log, cell, None, (), **place)
         runs.append(replay.run("fuse", log, out=folder / name, cell_file=cell))
     settings, cell = folder / "sara.toml", folder / "sara_cell.toml"
     settings.write_text(SARA)

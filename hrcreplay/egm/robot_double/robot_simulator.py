@@ -57,7 +57,7 @@ def _arrival_row(axes: int) -> np.dtype[Any]:
     return np.dtype([*((name, np.int64) for name in counts), *((name, np.float64, axes) for name in joints)])
 
 
-class TwinRecord:
+class SimulatorRecord:
     """Record of one run of the robot double.
 
     Attributes:
@@ -161,7 +161,7 @@ _QUEUE = 1024
 
 
 @dataclass(frozen=True, slots=True)
-class TwinSettings:
+class SimulatorSettings:
     """Settings of the simulated controller, and the joints at the start."""
 
     servo: ServoSettings = field(default_factory=ServoSettings)
@@ -192,7 +192,7 @@ class TwinSettings:
             raise SettingsError(f"robot double: restart_s is {self.restart_s}; a finite number from 0 would be right")
 
 
-class TwinCore:
+class SimulatedRobot:
     """The simulated controller and robot: the same instants, datagrams and seed give the same answers.
 
     Attributes:
@@ -202,10 +202,10 @@ class TwinCore:
         ends: How each session ended, empty for one that is cut off or goes on.
     """
 
-    def __init__(self, settings: TwinSettings, faults: Sequence[Fault] = (), seed: int = 0) -> None:
+    def __init__(self, settings: SimulatorSettings, faults: Sequence[Fault] = (), seed: int = 0) -> None:
         self._settings = settings
         self.servo = ServoController(settings.servo, np.radians(settings.start_deg))
-        self.record = TwinRecord(len(settings.start_deg))
+        self.record = SimulatorRecord(len(settings.start_deg))
         self.session = 1
         self.ends = [""]
         link = [fault for fault in faults if fault.of_link]

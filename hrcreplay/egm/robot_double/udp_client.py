@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hrcreplay.egm.robot_double.faults import Datagram, Fault, FaultOutcome, fault_outcome
-from hrcreplay.egm.robot_double.robot_simulator import TwinCore, TwinRecord, TwinSettings, columns
+from hrcreplay.egm.robot_double.robot_simulator import SimulatedRobot, SimulatorRecord, SimulatorSettings, columns
 from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats, Ints
@@ -73,7 +73,7 @@ class Commanded:
 
 
 @dataclass(frozen=True)
-class TwinReport:
+class SimulatorReport:
     """The report of a run, with the record that it was made from."""
 
     duration_s: float
@@ -85,7 +85,7 @@ class TwinReport:
     answers: Answers
     commanded: Commanded
     faults: list[FaultOutcome]
-    record: TwinRecord
+    record: SimulatorRecord
 
     def as_json(self) -> dict[str, Any]:
         """All but the record, ready for JSON."""
@@ -135,10 +135,10 @@ class TwinReport:
             raise SettingsError(f"{folder}: cannot be written ({error.strerror}); name another folder") from error
 
 
-def report_of(core: TwinCore, faults: Sequence[Fault], *, overruns: int = 0) -> TwinReport:
+def report_of(core: SimulatedRobot, faults: Sequence[Fault], *, overruns: int = 0) -> SimulatorReport:
     """The report of a run of the robot double."""
     cycles, arrivals = core.record.cycles(), core.record.arrivals()
-    return TwinReport(
+    return SimulatorReport(
         duration_s=len(cycles) and float(cycles["t_ns"][-1] - cycles["t_ns"][0] + PERIOD_NS) * 1e-9,
         cycles=len(cycles),
         overruns=overruns,
@@ -218,16 +218,16 @@ _LAST_ANSWERS_NS = 50_000_000  # so long the end waits for answers that are unde
 _RANK = 10  # lowest of what matters: never ahead of the guide on its own machine
 
 
-def run_twin(
+def run_simulator(
     host: str,
     port: int,
     *,
-    settings: TwinSettings | None = None,
+    settings: SimulatorSettings | None = None,
     faults: Sequence[Fault] = (),
     seed: int = 0,
     duration_s: float | None = None,
     out: Path | None = None,
-) -> TwinReport:
+) -> SimulatorReport:
     """Plays the robot against a server at ``host:port`` until the time is up, or SIGINT or SIGTERM.
 
     Args:
@@ -251,7 +251,7 @@ def run_twin(
         raise SettingsError(f"robot double: port is {port}; a whole number from 1 to 65535 would be right")
     if out is not None:
         _make_folder(out)
-    core = TwinCore(replace(settings or TwinSettings(), epoch_ns=time.time_ns()), faults, seed)
+    core = SimulatedRobot(replace(settings or SimulatorSettings(), epoch_ns=time.time_ns()), faults, seed)
     with _client(host, port) as client, _quiet():
         overruns = _run(core, client, duration_s)
     report = report_of(core, faults, overruns=overruns)
@@ -260,7 +260,7 @@ def run_twin(
     return report
 
 
-def _run(core: TwinCore, client: socket.socket, duration_s: float | None) -> int:
+def _run(core: SimulatedRobot, client: socket.socket, duration_s: float | None) -> int:
     """Cycles until the end. Returns the cycles that the machine has kept from happening in time."""
     overruns = 0
     late: list[tuple[int, int, bytes]] = []

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, ROWS
-from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Rules, Track, ago, delay
+from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Rules, Track, delay, extrapolate_back
 from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, LENGTHS, POINTS, Bools, Floats
@@ -53,7 +53,7 @@ _UNKNOWN_M = 0.1
 
 
 @njit(cache=True)
-def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
+def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
     """Select the valid rows of a new frame, 4.1.2 and Eq. (58), and the limbs that it shows whole.
 
     Args:
@@ -71,7 +71,7 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
         agreeing, believed = _agreeing(filter_, c, now, whole, rules)
         trusted = (agreeing | believed) & whole
         track.outliers[c] += len(trusted) - np.sum(trusted)
-    _judge_rows(filter_, c, trusted, rules)
+    _validate_rows(filter_, c, trusted, rules)
     for row in np.flatnonzero(filter_.valid[c]):
         if (DEPENDS[row] & believed).any():
             filter_.row_ns[row] = min(filter_.row_ns[row], now - rules.memory_ns - 1)  # lost: it starts anew
@@ -89,7 +89,7 @@ def judge(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None
 
 
 @njit(cache=True)
-def _judge_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> None:
+def _validate_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> None:
     """Select the valid rows, Eq. (58), given the points (20,) to be trusted."""
     confidence, points = filter_.confidence[c], filter_.points[c]
     for row in range(ROWS):
@@ -143,7 +143,7 @@ def _gates(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Floats, Flo
     That is ``outlier_m`` widened by three standard deviations of the prediction towards the point, each joint's carried
     through the forward kinematics. Those across say nothing: left and right exchanged would pass.
     """
-    p, lengths = ago(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths
+    p, lengths = extrapolate_back(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths
     expected, moved = np.empty_like(filter_.points[c]), np.empty_like(filter_.points[c])
     skeleton_row(p, lengths, expected)
     towards, variance = np.zeros_like(expected), np.zeros(len(expected))

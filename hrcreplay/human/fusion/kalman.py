@@ -222,7 +222,7 @@ def process_variance(a: int, dt: float, damping: float, sigma: Floats, rest_std:
 
 
 @njit(cache=True)
-def ago(mean: Floats, d: float) -> Floats:
+def extrapolate_back(mean: Floats, d: float) -> Floats:
     """Joint positions (13,) d seconds before, by the Taylor polynomial of Eq. (43)."""
     return mean[:, 0] - d * mean[:, 1] + d**2 / 2.0 * mean[:, 2] - d**3 / 6.0 * mean[:, 3]
 

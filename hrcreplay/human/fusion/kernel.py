@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 
 from hrcreplay.human.fusion.body_points import place
-from hrcreplay.human.fusion.gating import judge
+from hrcreplay.human.fusion.gating import validate_frame
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, correct, delay, dot, predict
-from hrcreplay.human.fusion.model_residual import observe, told, unseen
+from hrcreplay.human.fusion.model_residual import observe, write_residual, write_unseen_times
 from hrcreplay.human.fusion.reported_deviations import add_innovation, autocorrelation, reset, variance_factor
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row, nearest_arm, wrap
 from hrcreplay.kernels import njit
@@ -45,7 +45,7 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
         fresh = filter_.uses == 0
         for c in range(len(fresh)):
             if fresh[c]:
-                judge(filter_, c, now, rules, track)
+                validate_frame(filter_, c, now, rules, track)
         if filter_.started[0]:
             observe(filter_, fresh, now, rules)
         for c in range(len(fresh)):
@@ -189,8 +189,8 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
             track.motion[4 + a, k, j] = np.sqrt(variance_factor(filter_, j, a, rules) * filter_.cov[j, a, a])
     track.lengths[0, k] = filter_.lengths
     track.lengths[1, k] = np.sqrt(filter_.lengths_var)
-    told(filter_, filter_.tick_ns[0], rules, track.residual[k])
-    unseen(filter_, track.unseen[k])
+    write_residual(filter_, filter_.tick_ns[0], rules, track.residual[k])
+    write_unseen_times(filter_, track.unseen[k])
     track.frame_age[k] = (filter_.tick_ns[0] - filter_.newest_ns[0]) * 1e-9
     place(filter_, filter_.mean[:, 0].copy(), track.points[k])
     if len(track.cov) > 0:

@@ -19,7 +19,7 @@ import numpy as np
 
 from hrcreplay.human.fusion.body_points import REACH_M, learn, shift
 from hrcreplay.human.fusion.gating import distance
-from hrcreplay.human.fusion.kalman import Filter, Rules, ago, delay
+from hrcreplay.human.fusion.kalman import Filter, Rules, delay, extrapolate_back
 from hrcreplay.human.model import ARM_POINTS, BENDS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
@@ -61,7 +61,7 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
         rules: Settings of the filter.
     """
     for c in np.flatnonzero(fresh):
-        p = ago(filter_.mean, delay(filter_, c, now, rules))
+        p = extrapolate_back(filter_.mean, delay(filter_, c, now, rules))
         plain = np.full(filter_.points[0].shape, np.nan)
         skeleton_row(p, filter_.lengths, plain)
         model = plain.copy()
@@ -109,7 +109,7 @@ def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> N
 
 
 @njit(cache=True)
-def told(filter_: Filter, now: int, rules: Rules, residual: Floats) -> None:
+def write_residual(filter_: Filter, now: int, rules: Rules, residual: Floats) -> None:
     """Writes the residual of each limb of BODY that counts at a tick, (7,) [m]; NaN until known.
 
     It holds what cameras show that the gates still refuse, so that volumes hold both, what the filter has and what the
@@ -154,13 +154,13 @@ def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
     if 2 <= limb < _LEGS:
         first = _FIRST[limb - 2]
         newest = max(newest, filter_.acquired_ns[first - first % 4 : first + 2].max())
-        for pair in range(first - first % 4, first + 2, 2):  # one of the two is enough, see ``unseen``
+        for pair in range(first - first % 4, first + 2, 2):  # one of the two is enough, see ``write_unseen_times``
             last = min(last, filter_.row_ns[pair : pair + 2].max())
     return now - newest > rules.memory_ns and now - last <= rules.memory_ns
 
 
 @njit(cache=True)
-def unseen(filter_: Filter, seconds: Floats) -> None:
+def write_unseen_times(filter_: Filter, seconds: Floats) -> None:
     """Writes how long ago the last valid row of each limb's own joints came, (7,) [s]; of the legs, knees and ankles.
 
     Head and thorax have been seen when all four joints of the torso have. Of the two joints of a part of an arm one is

@@ -86,7 +86,7 @@ def watch(
                 counts["watched_frames_refuting"] += 1
             state = _met(state, who, seen, round(area.gap_s * 1e9))
         row = last[tick]
-        state = _judged(state, round(area.clear_s * 1e9))
+        state = _decide_vacancy(state, round(area.clear_s * 1e9))
         ages[tick] = [np.inf if at < 0 else (t_ns - at) / 1e9 for at in state.vacant_ns]
     return state, replace(states, nobody_s=ages[:, 0], nobody_else_s=ages[:, 1]), counts
 
@@ -117,7 +117,7 @@ def _met(state: VacancyState, who: tuple[int, int], seen: Sighting, gap_ns: int)
     return state._replace(newest_ns=tuple(newest), begin_ns=tuple(begin), bodies=tuple(bodies.items()))
 
 
-def _judged(state: VacancyState, clear_ns: int) -> VacancyState:
+def _decide_vacancy(state: VacancyState, clear_ns: int) -> VacancyState:
     """The state after all frames of a tick: whether the area is vacant at the newest capture that all cameras have."""
     watched_ns = min(state.newest_ns)
     if watched_ns < 0:

@@ -29,7 +29,7 @@ from hrcreplay.human.model import SHOWN_BY
 from hrcreplay.human.prediction.joint_reach import Stops, fastest, interval, rise, saturation_s, stops
 from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, Floats, HumanStates
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.settings.sections import Prediction
 
 Range = tuple[float, float]
 
@@ -53,10 +53,10 @@ class SoundMotionLimits(NamedTuple):
     memory: float  #: how long the filter goes on without a measurement [s]
 
 
-def likely(states: HumanStates, occupancy: Occupancy, memory_s: float) -> Likely:
+def start_states(states: HumanStates, prediction: Prediction, memory_s: float) -> Likely:
     """The states that ``sound`` starts from; a limb unseen for longer than ``memory_s`` [s] may have moved since."""
     unseen = np.where(states.unseen_s > memory_s, states.unseen_s, 0.0)[:, SHOWN_BY]
-    off = (occupancy.sigmas * states.p_std, occupancy.sigmas * states.v_std)
+    off = (prediction.sigmas * states.p_std, prediction.sigmas * states.v_std)
     return Likely(*(np.ascontiguousarray(a) for a in (states.p, states.v, *off, unseen)))
 
 
@@ -125,7 +125,7 @@ def _walk(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high: Floa
     corners_of(far, p[2], corners)
     for k in range(2):
         low[k], high[k] = corners[:, k].min(), corners[:, k].max()
-    low[2], high[2] = turned(heading, velocity[2], bounds, span)
+    low[2], high[2] = turn_heading(heading, velocity[2], bounds, span)
 
 
 def enclose(at: Likely, within: SoundMotionLimits) -> tuple[Floats, Floats]:
@@ -149,7 +149,7 @@ _PIECES = 4
 
 
 @njit(cache=True)
-def turned_range(x: float, y: float, low: float, high: float) -> Range:
+def rotate_range(x: float, y: float, low: float, high: float) -> Range:
     """Range of x cos(phi) + y sin(phi) for phi in [low, high].
 
     Args:
@@ -171,10 +171,10 @@ def turned_range(x: float, y: float, low: float, high: float) -> Range:
 @njit(cache=True)
 def body_velocity(v: Floats, spread: Floats, heading: Range) -> tuple[Range, Range]:
     """Ranges of v and v_perp, Eq. (33), for a velocity in v +- spread (2,), world, and any heading in the range."""
-    forward = turned_range(v[0], v[1], heading[0], heading[1])
-    left = turned_range(v[1], -v[0], heading[0], heading[1])
-    cosine = turned_range(1.0, 0.0, heading[0], heading[1])
-    sine = turned_range(0.0, 1.0, heading[0], heading[1])
+    forward = rotate_range(v[0], v[1], heading[0], heading[1])
+    left = rotate_range(v[1], -v[0], heading[0], heading[1])
+    cosine = rotate_range(1.0, 0.0, heading[0], heading[1])
+    sine = rotate_range(0.0, 1.0, heading[0], heading[1])
     c, s = max(-cosine[0], cosine[1]), max(-sine[0], sine[1])
     ahead, aside = c * spread[0] + s * spread[1], s * spread[0] + c * spread[1]
     return (forward[0] - ahead, forward[1] + ahead), (left[0] - aside, left[1] + aside)
@@ -220,7 +220,7 @@ def _turn(omega: Range, bounds: Floats, t: float) -> Range:
 
 
 @njit(cache=True)
-def turned(heading: Range, omega: Range, bounds: Floats, horizon: float) -> Range:
+def turn_heading(heading: Range, omega: Range, bounds: Floats, horizon: float) -> Range:
     """All headings at any time in [0, horizon] [rad].
 
     Args:
@@ -266,7 +266,7 @@ def _farthest(box: tuple[Range, Range], low: float, high: float) -> float:
     largest = -np.inf
     for v in box[0]:
         for v_perp in box[1]:
-            largest = max(largest, turned_range(v, v_perp, low, high)[1])
+            largest = max(largest, rotate_range(v, v_perp, low, high)[1])
     return largest
 
 

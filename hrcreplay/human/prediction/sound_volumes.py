@@ -42,7 +42,7 @@ from hrcreplay.human.prediction.sound_reach import (
     enclose_row,
     knees_out,
     legs_around,
-    likely,
+    start_states,
 )
 from hrcreplay.human.prediction.sweep import (
     TRIANGLE_RAD,
@@ -66,7 +66,7 @@ from hrcreplay.human.prediction.velocity_tube import (
 )
 from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, LIMBS, POINTS, Floats, HumanStates, Ints
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.settings.sections import Prediction
 
 #: Added to every radius: more than all rounding on the way [m].
 ROUNDING_M = 1e-9
@@ -85,14 +85,14 @@ _MANY_CORNERS = 40
 
 
 def sweep_sound(
-    states: HumanStates, limits: LimitSet, occupancy: Occupancy, limbs_m: Floats, span_s: float, memory_s: float
+    states: HumanStates, limits: LimitSet, prediction: Prediction, limbs_m: Floats, span_s: float, memory_s: float
 ) -> tuple[Floats, Ints, Floats]:
     """Swept volumes of all ticks and limbs.
 
     Args:
         states: The fused person.
         limits: Bounds on the joints, and on the limbs where it has them.
-        occupancy: What is added to the model.
+        prediction: What is added to the model.
         limbs_m: (6,) radii of LIMBS, Table 2 [m].
         span_s: Horizon and latency [s].
         memory_s: How long the filter goes on without a measurement [s].
@@ -100,16 +100,16 @@ def sweep_sound(
     Returns:
         Vertices (m, 3) [m] and the offsets of ``SweptVolumes``, and (n, limbs) radii [m].
     """
-    tubed = tubes(states, limits, occupancy.residual, occupancy.residual_unknown_m, span_s, memory_s)
-    radii = sound_radii(states, limbs_m, occupancy)
+    tubed = tubes(states, limits, prediction.residual, prediction.residual_unknown_m, span_s, memory_s)
+    radii = sound_radii(states, limbs_m, prediction)
     vertices, offsets = _sweep_rows(
-        likely(states, occupancy, memory_s),
+        start_states(states, prediction, memory_s),
         tubed,
         np.ascontiguousarray(states.lengths_m),
-        np.ascontiguousarray(occupancy.sigmas * states.lengths_std_m),
+        np.ascontiguousarray(prediction.sigmas * states.lengths_std_m),
         SoundMotionLimits(bounds_of(limits), limits.coupled, span_s, memory_s),
-        occupancy.hand_m,
-        occupancy.legs_radius_m,
+        prediction.hand_m,
+        prediction.legs_radius_m,
         np.append(limbs_m, THIGH_M) + ROUNDING_M,
         radii,
         surface(),
@@ -117,7 +117,7 @@ def sweep_sound(
     return vertices, offsets, radii
 
 
-def sound_radii(states: HumanStates, limbs_m: Floats, occupancy: Occupancy) -> Floats:
+def sound_radii(states: HumanStates, limbs_m: Floats, prediction: Prediction) -> Floats:
     """(n, limbs) radii of volumes from the joints: of the limb (6,) [m], and what the model may be off by.
 
     That is what an unknown length up the chain displaces, the residual, and how far the points are beside the model
@@ -126,10 +126,10 @@ def sound_radii(states: HumanStates, limbs_m: Floats, occupancy: Occupancy) -> F
     are more, they are the radius. Legs that were close when they were last seen make it no smaller: a table may hide
     that they are not now.
     """
-    found = np.empty((len(states), len(LIMBS) + occupancy.legs))
-    unknown_m = occupancy.residual_unknown_m if occupancy.residual else np.nan
-    off = occupancy.sigmas * states.lengths_std_m
-    _radii_rows(off, states.residual_m, _beside_m(states), limbs_m, occupancy.legs_radius_m, unknown_m, found)
+    found = np.empty((len(states), len(LIMBS) + prediction.legs))
+    unknown_m = prediction.residual_unknown_m if prediction.residual else np.nan
+    off = prediction.sigmas * states.lengths_std_m
+    _radii_rows(off, states.residual_m, _beside_m(states), limbs_m, prediction.legs_radius_m, unknown_m, found)
     return found
 
 

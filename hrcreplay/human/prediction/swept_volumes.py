@@ -13,12 +13,12 @@ import numpy as np
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
 from hrcreplay.human.model import HEIGHT, SHOWN_BY, LimitSet, alpha_2_bounds, alpha_3_bounds, bounds_of
-from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, likely
+from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, start_states
 from hrcreplay.human.prediction.sound_volumes import sweep_sound
 from hrcreplay.human.prediction.sweep import MOST_COPIES, append, box, kinematic_chain, sweep_rot, sweep_walk
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.settings.sections import Prediction
 
 #: Ways to predict, in the order of their codes in the kernels: the two of the literature, and what encloses.
 PRINTED = ("paper", "positions")
@@ -45,7 +45,7 @@ class MotionLimits(NamedTuple):
 
 
 def reachable(
-    states: HumanStates, limits: LimitSet, occupancy: Occupancy, *, horizon_s: float, memory_s: float
+    states: HumanStates, limits: LimitSet, prediction: Prediction, *, horizon_s: float, memory_s: float
 ) -> Reach:
     """Reachable sets within the horizon, Eq. (36), (38), (39), joint by joint.
 
@@ -59,26 +59,26 @@ def reachable(
     Args:
         states: The fused person.
         limits: Bounds.
-        occupancy: Method, one of METHODS, and what ``sound`` adds; the printed methods add nothing.
+        prediction: Method, one of METHODS, and what ``sound`` adds; the printed methods add nothing.
         horizon_s: Braking time T_s of the robot [s].
         memory_s: How long the filter goes on without a measurement [s].
 
     Raises:
         SettingsError: There is no such method.
     """
-    code = code_of(occupancy.method)
+    code = code_of(prediction.method)
     if code == SOUND:
-        within = SoundMotionLimits(bounds_of(limits), limits.coupled, horizon_s + occupancy.latency_s, memory_s)
-        low, high = enclose(likely(states, occupancy, memory_s), within)
+        within = SoundMotionLimits(bounds_of(limits), limits.coupled, horizon_s + prediction.latency_s, memory_s)
+        low, high = enclose(start_states(states, prediction, memory_s), within)
         return Reach(states.t_ns, low, high)
     low, high = np.empty_like(states.p), np.empty_like(states.p)
     p, v = np.ascontiguousarray(states.p), np.ascontiguousarray(states.v)
     allowed = MotionLimits(bounds_of(limits), limits.coupled, horizon_s, code)
-    _reach_rows(p, v, never_measured(states), allowed, low, high)
+    _reach_rows(p, v, find_never_measured(states), allowed, low, high)
     return Reach(states.t_ns, low, high)
 
 
-def never_measured(states: HumanStates) -> Bools:
+def find_never_measured(states: HumanStates) -> Bools:
     """(n, 13) joints of which no camera has shown anything yet: the filter only has a guess of them."""
     return np.ascontiguousarray(np.isinf(states.unseen_s)[:, SHOWN_BY])
 
@@ -90,7 +90,7 @@ def code_of(method: str) -> int:
         SettingsError: There is no such method.
     """
     if method not in METHODS:
-        raise SettingsError(f"occupancy.method: found {method!r}; choose one of {', '.join(METHODS)}")
+        raise SettingsError(f"prediction.method: found {method!r}; choose one of {', '.join(METHODS)}")
     return METHODS.index(method)
 
 
@@ -198,21 +198,21 @@ _WORTH_REDUCING = 50
 _TOO_MANY = 256
 
 
-def limb_radii(occupancy: Occupancy) -> Floats:
+def limb_radii(prediction: Prediction) -> Floats:
     """(6,) radii of the balls that give the limbs their thickness, Eq. (41), Table 2, in the order of LIMBS [m]."""
-    upper, lower = occupancy.radius_upper_arm_m, occupancy.radius_lower_arm_m
-    return np.array([occupancy.radius_head_m, occupancy.radius_thorax_m, upper, lower, upper, lower])
+    upper, lower = prediction.radius_upper_arm_m, prediction.radius_lower_arm_m
+    return np.array([prediction.radius_head_m, prediction.radius_thorax_m, upper, lower, upper, lower])
 
 
-def limbs_of(occupancy: Occupancy) -> tuple[str, ...]:
+def limbs_of(prediction: Prediction) -> tuple[str, ...]:
     """Limbs that have volumes under these settings."""
-    return BODY if code_of(occupancy.method) == SOUND and occupancy.legs else LIMBS
+    return BODY if code_of(prediction.method) == SOUND and prediction.legs else LIMBS
 
 
 def predict(
     states: HumanStates,
     limits: LimitSet,
-    occupancy: Occupancy,
+    prediction: Prediction,
     *,
     horizon_s: float,
     memory_s: float,
@@ -222,33 +222,33 @@ def predict(
     Args:
         states: The fused person; a row gives the same bits alone and among others.
         limits: Bounds on the joints.
-        occupancy: Method, radii of Table 2, and what ``sound`` adds; the printed methods add nothing.
+        prediction: Method, radii of Table 2, and what ``sound`` adds; the printed methods add nothing.
         horizon_s: Braking time T_s of the robot [s].
         memory_s: How long the filter goes on without a measurement [s].
 
     Returns:
         Points whose convex hulls are those of Alg. 2: every corner of a hull is among them, and few others. For
-        ``sound``, points whose hulls enclose all motions; with ``occupancy.legs`` the last limb is ``LEGS``. A limb
+        ``sound``, points whose hulls enclose all motions; with ``prediction.legs`` the last limb is ``LEGS``. A limb
         whose state or lengths are NaN has one NaN vertex.
 
     Raises:
         SettingsError: There is no such method.
     """
-    code, radius = code_of(occupancy.method), limb_radii(occupancy)
+    code, radius = code_of(prediction.method), limb_radii(prediction)
     if code == SOUND:
         vertices, offsets, radii = sweep_sound(
-            states, limits, occupancy, radius, horizon_s + occupancy.latency_s, memory_s
+            states, limits, prediction, radius, horizon_s + prediction.latency_s, memory_s
         )
-        return SweptVolumes(states.t_ns, offsets, vertices, radii, limbs_of(occupancy), occupancy.method)
+        return SweptVolumes(states.t_ns, offsets, vertices, radii, limbs_of(prediction), prediction.method)
     vertices, offsets = _predict_rows(
         np.ascontiguousarray(states.p),
         np.ascontiguousarray(states.v),
-        never_measured(states),
+        find_never_measured(states),
         np.ascontiguousarray(states.lengths_m),
         MotionLimits(bounds_of(limits), limits.coupled, horizon_s, code),
         surface(),
     )
-    return SweptVolumes(states.t_ns, offsets, vertices, np.tile(radius, (len(states), 1)), LIMBS, occupancy.method)
+    return SweptVolumes(states.t_ns, offsets, vertices, np.tile(radius, (len(states), 1)), LIMBS, prediction.method)
 
 
 @njit(cache=True)

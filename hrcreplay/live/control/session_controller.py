@@ -336,7 +336,7 @@ class SessionController:
     def _look_late(self, t_ns: int) -> None:
         """Return whether the volumes are older than the reaction time allows: then only the certified stop is."""
         age_s = math.inf if self.perception is None else (t_ns - self.perception.t_ns) * 1e-9
-        self._late = self.setup.plan.certified and age_s > self.setup.bounds.look_s
+        self._late = self.setup.plan.certified and age_s > self.setup.bounds.perception_max_age_s
         if self._late:
             self._ready = None
 

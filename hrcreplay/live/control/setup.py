@@ -36,6 +36,7 @@ from hrcreplay.robot.control.controllers import Controller
 from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.task import Reference
 from hrcreplay.settings.load import Settings, load_settings
+from hrcreplay.settings.sections import with_new_names
 from hrcreplay.version import __version__
 
 
@@ -205,7 +206,7 @@ def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfi
         SettingsError: Its settings or its limit sets are not those of this version.
     """
     try:
-        settings = Settings.model_validate(start["settings"])
+        settings = Settings.model_validate(with_new_names(start["settings"])[0])
     except ValidationError as error:
         raise SettingsError(
             f"{log}: recorded by {start.get('hrcreplay')}, whose settings are not ours: {error}"
@@ -219,8 +220,8 @@ def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfi
         task=start["task"],
         start_s=None,
         end_s=None,
-        tracking=recorded_limits(start["limits"]["tracking"], log),
-        prediction=recorded_limits(start["limits"]["prediction"], log),
+        tracking_limits=recorded_limits(start["limits"]["tracking"], log),
+        prediction_limits=recorded_limits(start["limits"]["prediction"], log),
         earlier=None,
     )
 

@@ -35,9 +35,9 @@ from hrcreplay.robot.control.control_step import (
     Step,
     Stop,
     Taken,
-    axis_by_axis,
     make_step,
-    straight,
+    stop_axis_by_axis,
+    stop_straight,
 )
 from hrcreplay.robot.control.controllers import Controller, Predict
 from hrcreplay.robot.control.separation import Obstacles, obstacles
@@ -136,7 +136,7 @@ class ControlSetup:
 
     def stop_from(self, state: RobotState) -> Stop:
         """The stop of a robot whose last one ended elsewhere: it was held at a limit, or only echoed."""
-        brake = straight if self.plan.certified else axis_by_axis
+        brake = stop_straight if self.plan.certified else stop_axis_by_axis
         # a copy: for an array that is read-only numba would compile the kernel anew, while the robot waits
         return brake(state.q.copy(), state.dq.copy(), self.robot.ddq_max, self.plan.dt_s)
 

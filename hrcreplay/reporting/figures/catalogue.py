@@ -17,8 +17,8 @@ from hrcreplay.reporting.figures.planning import SHORTEST_M, Deviation
 from hrcreplay.reporting.figures.prediction import Growth, Instant, Sweep, Walk
 from hrcreplay.reporting.figures.scene import LinkPose, Storyboard
 from hrcreplay.reporting.metrics.fusion import cameras
-from hrcreplay.reporting.metrics.series import Metric, instants, known_ticks_ns, moment_ns, start_ns
-from hrcreplay.settings.sections import Logs
+from hrcreplay.reporting.metrics.series import Metric, find_known_ticks, instants, moment_ns, start_ns
+from hrcreplay.settings.sections import Logs, setting
 from hrcreplay.store.run_folder import Run
 
 _T = TypeVar("_T")
@@ -48,12 +48,12 @@ class FigureData:
     @property
     def motion(self) -> pd.DataFrame:
         """Rows of motion.parquet."""
-        return given(self.run.motion)
+        return require(self.run.motion)
 
     @property
     def state(self) -> pd.DataFrame:
         """Rows of state.parquet."""
-        return given(self.run.state)
+        return require(self.run.state)
 
     @cached_property
     def worst(self) -> Deviation:
@@ -61,7 +61,7 @@ class FigureData:
         return planning.largest_deviation(self.motion)
 
 
-def given(value: _T | None) -> _T:
+def require(value: _T | None) -> _T:
     """A value that is there: a figure without what it needs is not drawn."""
     if value is None:
         raise ValueError("a figure is drawn without what it needs")
@@ -109,7 +109,7 @@ NEEDS: dict[str, tuple[Callable[[Run, Mapping[str, Metric]], bool], str]] = {
         lambda run, _: "none" in run.baselines,
         'no robot without regard to the person beside it; run it with "none" among plan.baselines',
     ),
-    "person": (lambda run, _: len(known_ticks_ns(run)) > 0, "nobody was seen in it"),
+    "person": (lambda run, _: len(find_known_ticks(run)) > 0, "nobody was seen in it"),
     "seconds": (lambda run, _: len(instants(run)) > 0, "the person is not known for three seconds"),
     "occupancy": (
         lambda run, _: run.occupancy is not None and len(run.occupancy) > 0,
@@ -133,7 +133,7 @@ FIGURES = (
         "what of the floor a person can reach, at the fastest step",
         "prediction",
         ("person",),
-        lambda data: prediction.walking(given(data.walk), data.t0_ns),
+        lambda data: prediction.walking(require(data.walk), data.t0_ns),
         "As the paper's Fig. 5, at the instant of the fastest walking. Dashed: the circular sectors that a unicycle "
         "reaches within the stopping time, as the paper has them. Orange: their convex approximation, Eq. (22)-(30), "
         "corrected. Blue: every walk under the joints' bounds, of every likely state. Red: where the person walked.",
@@ -145,7 +145,7 @@ FIGURES = (
         "a forearm swept by walking (7) and by the elbow (8)",
         "prediction",
         ("person",),
-        lambda data: prediction.sweeps(given(data.sweep), data.t0_ns),
+        lambda data: prediction.sweeps(require(data.sweep), data.t0_ns),
         "As the paper's Fig. 7 and 8, on the forearm of this run's person. On the right the elbow turns it through all "
         "angles that the paper's method says it can reach: arcs in triangles, and their hull. On the left that set is "
         "displaced to all places that walking can reach, seen from above.",
@@ -158,7 +158,7 @@ FIGURES = (
         "prediction",
         ("occupancy", "person"),
         lambda data: prediction.volumes_at(
-            given(data.run.occupancy), data.state, given(moment_ns(data.run)), data.t0_ns
+            require(data.run.occupancy), data.state, require(moment_ns(data.run)), data.t0_ns
         ),
         "As the paper's Fig. 9. The swept volumes that this run used, limb radii included, with the fused skeleton.",
     ),
@@ -198,7 +198,7 @@ FIGURES = (
         "the same stretch of the programme without the person (15) and with (16)",
         "cost",
         ("motion", "joints", "base", "alone", "occupancy", "person"),
-        lambda data: scene.storyboard(given(data.story), data.t0_ns),
+        lambda data: scene.storyboard(require(data.story), data.t0_ns),
         "As the paper's Fig. 15 and 16. Each row is the same instant of the programme: on the left as the robot passes "
         "it with nobody to mind (the baseline none), on the right beside the person, when it got there.",
         "story",
@@ -241,7 +241,7 @@ FIGURES = (
         "swept volume against the horizon, by method",
         "prediction",
         ("person",),
-        lambda data: prediction.growth(given(data.growth), data.run.occupancy, data.t0_ns),
+        lambda data: prediction.growth(require(data.growth), data.run.occupancy, data.t0_ns),
         "How the swept volumes of the six limbs, added up, grow with the horizon: by each method at one instant "
         "(lines), and as this run stored them at all others (dots).",
         "growth",
@@ -280,7 +280,7 @@ FIGURES = (
         "the robot's capsules where it was nearest to the person",
         "robot",
         ("motion", "joints", "base"),
-        lambda data: scene.links(given(data.pose), data.t0_ns, given(data.run.T_world_base)),
+        lambda data: scene.links(require(data.pose), data.t0_ns, require(data.run.T_world_base)),
         "The robot as its distances see it: a capsule around each collision shape of its links, at the tick of the "
         "smallest separation, beside the swept volumes of the person. The square is the robot's base.",
         "pose",
@@ -332,7 +332,7 @@ def missing(kind: FigureKind, run: Run, metrics: Mapping[str, Metric]) -> str:
     return next((why for there, why in map(NEEDS.__getitem__, kind.needs) if not there(run, metrics)), "")
 
 
-def wanted(run: Run, metrics: Mapping[str, Metric]) -> tuple[FigureKind, ...]:
+def select_figures(run: Run, metrics: Mapping[str, Metric]) -> tuple[FigureKind, ...]:
     """The figures that a run has all for."""
     return tuple(kind for kind in FIGURES if not missing(kind, run, metrics))
 
@@ -350,7 +350,7 @@ def draw_all(data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None 
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = []
-    for kind in wanted(data.run, data.metrics) if kinds is None else kinds:
+    for kind in select_figures(data.run, data.metrics) if kinds is None else kinds:
         if kind.predicted and not getattr(data, kind.predicted):
             continue
         with drawing.style(column=True):
@@ -360,4 +360,4 @@ def draw_all(data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None 
 
 
 def _stop_s(run: Run) -> float:
-    return float(run.meta["settings"]["occupancy"]["stop_s"])
+    return float(setting(run.meta["settings"], "prediction", "stop_s"))

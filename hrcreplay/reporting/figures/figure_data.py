@@ -21,7 +21,7 @@ from hrcreplay.reporting.figures import planning, prediction
 from hrcreplay.reporting.figures.prediction import Growth, Instant, Sweep, Walk
 from hrcreplay.reporting.figures.scene import LinkPose, Storyboard, StoryScene
 from hrcreplay.reporting.metrics.planning import numeric_column, position_columns
-from hrcreplay.reporting.metrics.series import instants, known_ticks_ns, moment_ns, nearest_tick, times
+from hrcreplay.reporting.metrics.series import find_known_ticks, instants, moment_ns, nearest_tick, times
 from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run
 
@@ -36,7 +36,7 @@ _HORIZONS = 7
 X, Y, THETA = (JOINTS.index(name) for name in ("x", "y", "theta"))
 
 
-def computed(run_config: RunConfig, run: Run, fields: Iterable[str]) -> dict[str, Any]:
+def compute_fields(run_config: RunConfig, run: Run, fields: Iterable[str]) -> dict[str, Any]:
     """Those fields of ``FigureData`` that are not in the tables; None or empty where the run has nothing for one."""
     wanted = [name for name in dict.fromkeys(fields) if name]
     people = _states(run_config, run) if wanted else None
@@ -59,14 +59,14 @@ def volumes_by_method(run_config: RunConfig, run: Run, people: HumanStates) -> l
 
 def fastest_walk(run_config: RunConfig, run: Run, people: HumanStates) -> Walk | None:
     """Reachable places from the tick of the fastest walking, Eq. (18)-(30), corrected, and by ``sound``."""
-    t_ns = _fastest_ns(run, run_config.settings.occupancy.stop_s)
+    t_ns = _fastest_ns(run, run_config.settings.prediction.stop_s)
     if run.state is None or t_ns is None:
         return None
     stage, states = assembly.prediction_stage(run_config), _at(people, t_ns)
     reach, p, v = stage.by("paper").reachable(states), states.p[0], states.v[0]
     ahead = float(np.cos(p[THETA]) * v[X] + np.sin(p[THETA]) * v[Y])  # Eq. (33)
     fastest = min(ahead + float(stage.limits.a_max[X]) * stage.horizon_s, float(stage.limits.v_max[X]))  # Eq. (18)
-    legs = stage.occupancy.model_copy(update={"method": "sound", "legs": True})
+    legs = stage.settings.model_copy(update={"method": "sound", "legs": True})
     sound = type(stage)(stage.limits, legs, stage.memory_s).volumes(states)
     floor = sound.vertices(0, sound.limbs.index("LEGS"))[:, :2]
     later = (times(run.state) >= t_ns) & (times(run.state) <= t_ns + round(stage.horizon_s * 1e9))
@@ -221,7 +221,7 @@ def _joints(motion: pd.DataFrame, row: int, axes: int) -> Floats:
 
 def _fastest_ns(run: Run, span_s: float) -> int | None:
     """The tick from which the person walks furthest within ``span_s`` [s], as fused [ns]; else the last known."""
-    known_ns = known_ticks_ns(run)
+    known_ns = find_known_ticks(run)
     if run.state is None or not len(known_ns):
         return None
     place = run.state[["x", "y"]].to_numpy(dtype=float)[np.isin(times(run.state), known_ns)]
@@ -236,7 +236,7 @@ def _states(run_config: RunConfig, run: Run) -> HumanStates | None:
     """The fused person at the ticks that any figure asks for, read once; None without a person."""
     if run.state is None:
         return None
-    wanted_ns = [*instants(run).tolist(), moment_ns(run), _fastest_ns(run, run_config.settings.occupancy.stop_s)]
+    wanted_ns = [*instants(run).tolist(), moment_ns(run), _fastest_ns(run, run_config.settings.prediction.stop_s)]
     if run.motion is not None and len(run.motion):
         wanted_ns.append(int(times(run.motion)[nearest_tick(run.motion)]))
     known_ns = np.array([t for t in wanted_ns if t is not None], dtype=np.int64)

@@ -184,7 +184,7 @@ def add_plan(
     method: str,
     near_m: float,
     stationary_m_per_s: float,
-    leash_m: float,
+    max_reference_lead_m: float,
     contact: pd.DataFrame | None = None,
 ) -> None:
     """Everything about the motion, the baselines' likewise, and the paper's own figures beside them.
@@ -196,7 +196,7 @@ def add_plan(
         method: Method of the plan.
         near_m: The person is near at a separation of at most this [m].
         stationary_m_per_s: The robot stands where its TCP is slower than this [m/s].
-        leash_m: How far the TCP may be from the reference before the reference waits [m].
+        max_reference_lead_m: How far the TCP may be from the reference before the reference waits [m].
         contact: Rows of contact.parquet; None where the recorded body was not looked for.
     """
     if motion is None:
@@ -210,7 +210,7 @@ def add_plan(
         _add_separation(metrics, prefix, table, what, stationary_m_per_s)
         _add_stationary(metrics, prefix, table, what, near_m, stationary_m_per_s)
         _add_path(metrics, prefix, table, what)
-        _add_progress(metrics, prefix, table, what, leash_m)
+        _add_progress(metrics, prefix, table, what, max_reference_lead_m)
         by = method if prefix == "plan" else prefix.removeprefix("baseline_")
         rows = None if contact is None else contact[contact["method"] == by]
         _add_fastest(metrics, prefix, table, rows, what, near_m)
@@ -382,7 +382,9 @@ def _add_fastest(
         )
 
 
-def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, leash_m: float) -> None:
+def _add_progress(
+    metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, max_reference_lead_m: float
+) -> None:
     tcp_speed, ref_speed = numeric_column(motion, "tcp_speed"), numeric_column(motion, "ref_speed")
     for name, speed, meaning in (
         ("tcp_speed", tcp_speed, "speed of the TCP"),
@@ -407,7 +409,7 @@ def _add_progress(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what:
         f"times the reference came back to its first point, {what}",
         reason="the reference never came back to its first point",
     )
-    found = programme_progress(motion, leash_m)
+    found = programme_progress(motion, max_reference_lead_m)
     reason = "the programme stands for all of the time"
     metrics.add(
         f"{prefix}_time_lost_s",

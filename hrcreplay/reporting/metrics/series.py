@@ -233,7 +233,7 @@ def start_ns(run: Run) -> int:
     return 0
 
 
-def known_ticks_ns(run: Run) -> Ints:
+def find_known_ticks(run: Run) -> Ints:
     """Ticks at which the person is known [ns]."""
     if run.state is None:
         return np.zeros(0, dtype=np.int64)
@@ -245,7 +245,7 @@ def moment_ns(run: Run) -> int | None:
 
     The person is known there.
     """
-    known_ns = known_ticks_ns(run)
+    known_ns = find_known_ticks(run)
     if run.state is None or not len(known_ns):
         return None
     if run.motion is not None and run.motion["distance_m"].notna().any():
@@ -261,7 +261,7 @@ def instants(run: Run, count: int = 4, step_s: float = 1.0) -> Ints:
 
     Empty where the person is not known at that many ticks.
     """
-    moment, known_ns = moment_ns(run), known_ticks_ns(run)
+    moment, known_ns = moment_ns(run), find_known_ticks(run)
     if moment is None or len(known_ns) < 2:
         return np.zeros(0, dtype=np.int64)
     step_ns = round(step_s * 1e9)

@@ -38,7 +38,7 @@ from hrcreplay.reporting.replay_scene import (
     ReplayScene,
     VolumeTrack,
     at_rate,
-    posed,
+    pose_links,
 )
 from hrcreplay.reporting.tables import part_name_text, reason_text
 
@@ -288,7 +288,7 @@ def snapshot(scene: ReplayScene, row: int) -> Figure:
         row: Which of its instants.
     """
     name, track = next(iter(scene.methods.items()))
-    ends = posed(scene.robot, track.q[row : row + 1])[0]
+    ends = pose_links(scene.robot, track.q[row : row + 1])[0]
     body = scene.body_m[row]
     view = view_from(_beside(scene, row), 0.18)
     robot = [RenderedHull(pair, float(r), to_rgb(_ROBOT)) for pair, r in zip(ends, scene.robot.radius_m, strict=True)]

@@ -96,7 +96,7 @@ def _by_program(controller: QpController, seen: Observation) -> tuple[list[Propo
             task = qp_controller.problem(*programme, settings.without_jerk())
             solved = minimise(task)
     if isinstance(solved, Solution):
-        return proposals, held_by(task, solved)
+        return proposals, find_holding_rows(task, solved)
     return proposals, {"unsolved": solved.status, "conflict": conflict(all_rows(task))}
 
 
@@ -105,8 +105,8 @@ def _rows(controller: Controller, seen: Observation, give_way_m: float) -> Appro
     pairs, plan = seen.sight.pairs, controller.settings.plan
     if pairs is None:
         raise ValueError("why: the distances from people are not known")
-    room = pairs.room_m2(plan.room, give_way_m)
-    return tick_rows(seen.sight.pose, seen.obstacles, room, pairs.distance_m, seen.horizon_s + plan.lead_s)
+    rhs_m2 = pairs.constraint_rhs_m2(plan.constraint_rhs, give_way_m)
+    return tick_rows(seen.sight.pose, seen.obstacles, rhs_m2, pairs.distance_m, seen.horizon_s + plan.lead_s)
 
 
 def _protective(controller: SsmController, seen: Observation) -> dict[str, Any]:
@@ -119,7 +119,7 @@ def _protective(controller: SsmController, seen: Observation) -> dict[str, Any]:
     return {"protective": {**pair, "needed_m": needed_m}}
 
 
-def held_by(task: Problem, solved: Solution) -> dict[str, Any]:
+def find_holding_rows(task: Problem, solved: Solution) -> dict[str, Any]:
     """The rows of people that a solution lies on, by their multipliers, the limits of the robot, and the next rows.
 
     Args:
@@ -183,7 +183,7 @@ def margins_of(rows: Approach, w: Floats, slack: float) -> list[dict[str, Any]]:
                 first, last = rows.offsets[limb : limb + 2]
                 vertex = int(first + np.argmax(rows.vertices_m[first:last] @ v))
                 value = rows.stop_s * (rows.vertices_m[vertex] @ v + rest)
-                margin = (rows.room_m2[link, limb] - value) / rows.per_speed[link, limb] + slack
+                margin = (rows.rhs_m2[link, limb] - value) / rows.per_speed[link, limb] + slack
                 found.append(
                     {"kind": "approach", "link": link, "limb": limb, "end": end, "vertex": vertex - int(first)}
                     | {"vertex_m": rows.vertices_m[vertex].tolist(), "margin_m_per_s": float(margin)}
@@ -220,7 +220,7 @@ def all_rows(task: Problem) -> LinearRows:
             from_a = vertices - start
             for end, written in ((0, from_a @ J_a), (1, from_a @ J_b - (stop - start) @ J_a)):
                 rows.append(scale * written)
-                bounds.append(np.full(len(vertices), of.room_m2[link, limb] / of.per_speed[link, limb]))
+                bounds.append(np.full(len(vertices), of.rhs_m2[link, limb] / of.per_speed[link, limb]))
                 named += [
                     {"kind": "approach", "link": link, "limb": limb, "end": end, "vertex": j, "vertex_m": r.tolist()}
                     for j, r in enumerate(vertices)

@@ -42,7 +42,7 @@ class Stop:
         return Stop(self.q[1:], self.dq[1:], self.along[1:]) if self.ticks else self
 
 
-def straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
+def stop_straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
     """The stop in which all axes come to rest together, as soon as the slowest of them can.
 
     The velocity falls by the same share of itself in each of n ticks, so that no axis turns back, none decelerates by
@@ -74,7 +74,7 @@ def _straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floa
     return rows_q, rows_dq
 
 
-def axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
+def stop_axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
     """The stop of Eq. (67): every axis comes to rest as soon as it can.
 
     Args:
@@ -83,12 +83,12 @@ def axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
         ddq_max: (nv,) [rad/s^2].
         dt_s: Length of a tick [s].
     """
-    rows_q, rows_dq = _axis_by_axis(q, np.where(np.isfinite(dq), dq, 0.0), ddq_max, dt_s)
+    rows_q, rows_dq = _stop_axis_by_axis(q, np.where(np.isfinite(dq), dq, 0.0), ddq_max, dt_s)
     return Stop(rows_q, rows_dq, np.full((len(rows_q), 2), math.nan))
 
 
 @njit(cache=True)
-def _axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floats, Floats]:
+def _stop_axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floats, Floats]:
     ticks = 0
     for j in range(len(q)):
         ticks = max(ticks, math.ceil(abs(dq[j]) / (ddq_max[j] * dt_s)))
@@ -109,7 +109,7 @@ MOST_TICKS = 2000
 _ROUNDS, _SHARE = 30, 1e-9
 
 
-def along_path(grid: Grid, s_s: float, rate: float, ddq_max: Floats, dt_s: float) -> Stop | None:
+def stop_along_path(grid: Grid, s_s: float, rate: float, ddq_max: Floats, dt_s: float) -> Stop | None:
     """The stop of a robot that stays on its path: its rate falls as fast as the axes' limits allow.
 
     Args:
@@ -122,12 +122,14 @@ def along_path(grid: Grid, s_s: float, rate: float, ddq_max: Floats, dt_s: float
     Returns:
         None where the path does not let the robot come to rest.
     """
-    q, dq, along, ticks = _along_path(grid, s_s, rate, ddq_max * dt_s, dt_s)
+    q, dq, along, ticks = _stop_along_path(grid, s_s, rate, ddq_max * dt_s, dt_s)
     return Stop(q[: ticks + 1], dq[: ticks + 1], along[: ticks + 1]) if ticks < MOST_TICKS else None
 
 
 @njit(cache=True)
-def _along_path(grid: Grid, s_s: float, rate: float, gain: Floats, dt_s: float) -> tuple[Floats, Floats, Floats, int]:
+def _stop_along_path(
+    grid: Grid, s_s: float, rate: float, gain: Floats, dt_s: float
+) -> tuple[Floats, Floats, Floats, int]:
     nv = grid.q.shape[1]
     rows_q, rows_dq, along = np.empty((128, nv)), np.empty((128, nv)), np.empty((128, 2))
     q, towards, _ = place(grid, s_s)

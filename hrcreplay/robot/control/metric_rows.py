@@ -63,7 +63,7 @@ class Found(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def known_numbers(H: Floats, g: Floats, limits: Limits, rows: Approach) -> bool:
+def are_numbers_known(H: Floats, g: Floats, limits: Limits, rows: Approach) -> bool:
     """Return whether nothing is NaN, and nothing infinite but for bounds that do not exist.
 
     Args:
@@ -74,14 +74,14 @@ def known_numbers(H: Floats, g: Floats, limits: Limits, rows: Approach) -> bool:
     """
     total = H.sum() + g.sum() + limits.J.sum() + rows.ends_m.sum() + rows.J_ends.sum() + rows.vertices_m.sum()
     total += rows.boxes_m.sum() + rows.per_speed.sum() + rows.stop_s
-    known = math.isfinite(total) and not np.isnan(rows.room_m2.sum())
+    known = math.isfinite(total) and not np.isnan(rows.rhs_m2.sum())
     for bounds in (limits.low, limits.high, limits.J_low, limits.J_high):
         known = known and not np.isnan(bounds.sum())
     return known
 
 
 @njit(cache=True, error_model="numpy")
-def in_metric(H: Floats, g: Floats, limits: Limits, soft: bool, slack_weight: float) -> Metric:
+def build_metric(H: Floats, g: Floats, limits: Limits, soft: bool, slack_weight: float) -> Metric:
     """The problem without approach rows; NaN where H is not positive definite.
 
     Args:
@@ -216,7 +216,7 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
     x = solve_transposed(L, y)
     w = np.minimum(np.maximum(x[:nv], limits.low), limits.high)
     slack = max(0.0, x[nv]) if n > nv else 0.0
-    loose = rows.room_m2 + rows.per_speed * slack
+    loose = rows.rhs_m2 + rows.per_speed * slack
     ends, J_ends, vertices, offsets, boxes, _, per_speed, stop_s = rows
     which, A, values = worst_rows(Approach(ends, J_ends, vertices, offsets, boxes, loose, per_speed, stop_s), w, 0.0)
     outcome, best, most = CLEAR, -1, HELD
@@ -233,7 +233,7 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
                 outcome = HOPELESS
                 break
             continue
-        bound = rows.room_m2[pair] / per_speed[pair] / length
+        bound = rows.rhs_m2[pair] / per_speed[pair] / length
         broken = dot_n(e, y) / length - bound
         if broken > most:
             if _among(known, which[i]):

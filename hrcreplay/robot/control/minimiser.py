@@ -29,12 +29,12 @@ from hrcreplay.robot.control.metric_rows import (
     NONE,
     Limits,
     Metric,
+    are_numbers_known,
+    build_metric,
     denied,
     descend,
     gather,
-    in_metric,
     join,
-    known_numbers,
     next_row,
     residual,
 )
@@ -107,9 +107,9 @@ _dense = _proxqp.dense
 def minimise(task: Problem) -> Solution | Unsolved:
     """The minimiser over all rows. Never raises for numbers."""
     limits, rows = task.limits, task.rows
-    if not known_numbers(task.H, task.g, limits, rows):
+    if not are_numbers_known(task.H, task.g, limits, rows):
         return Unsolved("not finite")
-    problem = in_metric(task.H, task.g, limits, task.soft, SLACK)
+    problem = build_metric(task.H, task.g, limits, task.soft, SLACK)
     if not math.isfinite(problem.b.sum() + problem.E.sum()):
         return Unsolved("not finite")
     if np.any(problem.low > problem.high):

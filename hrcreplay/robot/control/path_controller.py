@@ -18,7 +18,7 @@ from hrcreplay.geometry.small_matrices import apply
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Sight, Stop, along_path
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Sight, Stop, stop_along_path
 from hrcreplay.robot.control.qp_controller import cartesian_bounds
 from hrcreplay.robot.control.separation import Obstacles, tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, RobotPose
@@ -74,7 +74,7 @@ def propose(
     fastest, slowed = _fastest(robot, reference, state, sight, obstacles, horizon_s, settings)
     if fastest is None or fastest.rate < slowest - SAME:
         return control_step.NO_SOLUTION
-    stop = along_path(reference.grid, fastest.s_s, fastest.rate, robot.ddq_max, settings.dt_s)
+    stop = stop_along_path(reference.grid, fastest.s_s, fastest.rate, robot.ddq_max, settings.dt_s)
     if stop is None:
         return control_step.NO_SOLUTION
     return [Proposal(stop, control_step.LIMITED if slowed else control_step.TRACKING)]
@@ -162,13 +162,13 @@ def _safe_rate(
     pairs = sight.pairs
     if pairs is None:
         return math.nan
-    room = pairs.room_m2(settings.plan.room)
-    rows = tick_rows(sight.pose, obstacles, room, pairs.distance_m, ahead_s)
+    rhs_m2 = pairs.constraint_rhs_m2(settings.plan.constraint_rhs)
+    rows = tick_rows(sight.pose, obstacles, rhs_m2, pairs.distance_m, ahead_s)
     for _ in range(ROUNDS):
         which, _, values = worst_rows(rows, rate * towards, HELD)
         if not len(which):
             return rate
-        rate *= float((rows.room_m2[which[:, 0], which[:, 1]] / values).min())
+        rate *= float((rows.rhs_m2[which[:, 0], which[:, 1]] / values).min())
     return math.nan
 
 

@@ -23,7 +23,14 @@ from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import RETREAT_SPEED
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, Sight, axis_by_axis, straight
+from hrcreplay.robot.control.control_step import (
+    PlanSettings,
+    Proposal,
+    RobotState,
+    Sight,
+    stop_axis_by_axis,
+    stop_straight,
+)
 from hrcreplay.robot.control.metric_rows import Limits
 from hrcreplay.robot.control.minimiser import Problem, Solution, minimise
 from hrcreplay.robot.control.separation import Obstacles, tick_rows
@@ -260,7 +267,11 @@ def problem(
     if pairs is None:
         raise ValueError("problem: the distances from people are not known")
     rows = tick_rows(
-        pose, obstacles, pairs.room_m2(plan.room, plan.give_way_m), pairs.distance_m, horizon_s + plan.lead_s
+        pose,
+        obstacles,
+        pairs.constraint_rhs_m2(plan.constraint_rhs, plan.give_way_m),
+        pairs.distance_m,
+        horizon_s + plan.lead_s,
     )
     return Problem(H, g, limits, rows, plan.rows == "soft")
 
@@ -415,5 +426,5 @@ def propose(
     q_next = state.q + 0.5 * settings.dt_s * (state.dq + dq_next)  # Eq. (68), (69)
     status = control_step.LIMITED if found.held else control_step.TRACKING
     # a straight stop may leave the range of an axis, one by Eq. (67) does not
-    stops = (straight, axis_by_axis) if settings.certified else (axis_by_axis,)
+    stops = (stop_straight, stop_axis_by_axis) if settings.certified else (stop_axis_by_axis,)
     return [Proposal(stop(q_next, dq_next, robot.ddq_max, settings.dt_s), status) for stop in stops]

@@ -71,16 +71,16 @@ class Separation:
     distance_m: Floats  #: (s, l) proven lower bound, tight to rounding, 0 in penetration [m]
     clearance_m: Floats  #: (s, l) Delta of Eq. (2) [m]
 
-    def room_m2(self, room: str, give_way_m: float = 0.0) -> Floats:
+    def constraint_rhs_m2(self, form: str, give_way_m: float = 0.0) -> Floats:
         """(s, l) right-hand side of Eq. (14), corrected (docs/paper.md), Eq. (6), (10) [m^2].
 
         Args:
-            room: ``square`` is (distance - clearance)^2, as printed; what (3) needs is no more than ``product``,
+            form: ``square`` is (distance - clearance)^2, as printed; what (3) needs is no more than ``product``,
                 distance (distance - clearance).
             give_way_m: product: less than this short of a volume it is negative, so the link must move away [m].
         """
         gap = self.distance_m - self.clearance_m
-        if room == "square":
+        if form == "square":
             return np.asarray(np.maximum(0.0, gap) ** 2)
         return np.asarray(self.distance_m * (np.maximum(0.0, gap) - give_way_m))
 
@@ -114,7 +114,7 @@ class Approach(NamedTuple):
     vertices_m: Floats  #: (m, 3) of all limbs [m]
     offsets: Ints  #: (l + 1,) where each limb's vertices begin
     boxes_m: Floats  #: (l, 2, 3) around each limb's vertices [m]
-    room_m2: Floats  #: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2]
+    rhs_m2: Floats  #: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2]
     per_speed: Floats  #: (s, l) what a link approaching at 1 m/s adds to the left-hand side of Eq. (14) [m s]
     stop_s: float  #: T_s of Eq. (70), or how far ahead the rows look [s]
 
@@ -123,19 +123,19 @@ class Approach(NamedTuple):
 _LEAST_M = 1e-3
 
 
-def tick_rows(pose: RobotPose, obstacles: Obstacles, room_m2: Floats, distance_m: Floats, stop_s: float) -> Approach:
+def tick_rows(pose: RobotPose, obstacles: Obstacles, rhs_m2: Floats, distance_m: Floats, stop_s: float) -> Approach:
     """The approach rows of a tick, none of them written down.
 
     Args:
         pose: The robot.
         obstacles: The swept volumes, all known.
-        room_m2: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2].
+        rhs_m2: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2].
         distance_m: (s, l) between the link's axis and the limb's hull [m].
         stop_s: T_s of Eq. (70), or how far ahead the rows look [s].
     """
     per_speed = stop_s * np.maximum(distance_m, _LEAST_M)
     around = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
-    return Approach(pose.ends_m, pose.J_ends, *around, room_m2, per_speed, stop_s)
+    return Approach(pose.ends_m, pose.J_ends, *around, rhs_m2, per_speed, stop_s)
 
 
 @njit(cache=True)
@@ -155,8 +155,8 @@ def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, 
         For the n broken ones: ``which`` (n, 4) link, limb, row of Eq. (12), row of ``vertices_m``; ``A`` (n, nv)
         [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2].
     """
-    ends, J_ends, vertices, offsets, boxes, room, _, stop_s = rows
-    links, limbs = room.shape
+    ends, J_ends, vertices, offsets, boxes, rhs_m2, _, stop_s = rows
+    links, limbs = rhs_m2.shape
     which = np.empty((2 * links * limbs, 4), dtype=np.int64)
     A, values = np.empty((len(which), len(dq_next))), np.empty(len(which))
     n = 0
@@ -167,7 +167,7 @@ def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, 
             if end == 1:
                 rest -= dot3(ends[s, 1] - ends[s, 0], _times(J_ends[s, 0], dq_next))
             for k in range(limbs):
-                bound = room[s, k] + above_m2
+                bound = rhs_m2[s, k] + above_m2
                 if stop_s * (_box_top(boxes[k], v) + rest) <= bound:
                     continue
                 best, top = offsets[k], -np.inf

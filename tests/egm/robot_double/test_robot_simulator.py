@@ -18,9 +18,9 @@ import pytest
 from hrcreplay.egm import motion_link_pb2 as messages
 from hrcreplay.egm.codec import Correction, Mci, Motors, Rapid, decode_robot, encode_correction
 from hrcreplay.egm.robot_double.faults import Datagram
-from hrcreplay.egm.robot_double.robot_simulator import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.robot_simulator import SimulatedRobot, SimulatorSettings
 from hrcreplay.egm.robot_double.servo import PERIOD_NS, ServoSettings
-from hrcreplay.egm.robot_double.udp_client import run_twin
+from hrcreplay.egm.robot_double.udp_client import run_simulator
 from hrcreplay.errors import SettingsError
 from tests.egm.echo import echo
 from tests.egm.rehearsals import HOME, Guide, ramp, ramp_until, rehearsed, still
@@ -82,7 +82,7 @@ def test_position_alone_is_followed_200_ms_later() -> None:
 
 
 def test_one_message_is_read_a_cycle_so_a_second_answer_builds_lag() -> None:
-    core = TwinCore(TwinSettings())
+    core = SimulatedRobot(SimulatorSettings())
     told = [encode_correction(Correction(number, 0, HOME, np.zeros(6))) for number in range(10)]
     core.cycle(0, [])
     core.cycle(PERIOD_NS, [Datagram(PERIOD_NS, data) for data in told])
@@ -95,7 +95,7 @@ def test_one_message_is_read_a_cycle_so_a_second_answer_builds_lag() -> None:
 
 
 def test_what_is_no_message_takes_the_cycle_and_changes_nothing() -> None:
-    core = TwinCore(TwinSettings())
+    core = SimulatedRobot(SimulatorSettings())
     good = encode_correction(Correction(1, 0, HOME, np.zeros(6)))
     core.cycle(0, [Datagram(0, b"\xff\xff"), Datagram(0, b""), Datagram(0, good)])
     for cycle in (1, 2):
@@ -105,7 +105,7 @@ def test_what_is_no_message_takes_the_cycle_and_changes_nothing() -> None:
 
 
 def test_a_robot_that_was_held_up_has_moved_on_meanwhile() -> None:
-    prompt, held = TwinCore(TwinSettings()), TwinCore(TwinSettings())
+    prompt, held = SimulatedRobot(SimulatorSettings()), SimulatedRobot(SimulatorSettings())
     told = [Datagram(0, encode_correction(Correction(1, 0, *ramp(0.0))))]
     for cycle in range(20):
         prompt.cycle(cycle * PERIOD_NS, told if cycle == 0 else [])
@@ -115,7 +115,7 @@ def test_a_robot_that_was_held_up_has_moved_on_meanwhile() -> None:
 
 
 def test_a_cycle_that_is_a_little_late_is_one_cycle() -> None:
-    prompt, shaky = TwinCore(TwinSettings()), TwinCore(TwinSettings())
+    prompt, shaky = SimulatedRobot(SimulatorSettings()), SimulatedRobot(SimulatorSettings())
     told = [Datagram(0, encode_correction(Correction(1, 0, *ramp(0.0))))]
     for cycle in range(60):
         prompt.cycle(cycle * PERIOD_NS, told if cycle == 0 else [])
@@ -161,7 +161,7 @@ def server() -> Any:
 def test_at_a_socket_it_converses_with_the_bare_echo(server: socket.socket, tmp_path: Path) -> None:
     thread = threading.Thread(target=echo, args=(server, 0.8))
     thread.start()
-    report = run_twin("127.0.0.1", server.getsockname()[1], duration_s=0.5, out=tmp_path / "new" / "folder")
+    report = run_simulator("127.0.0.1", server.getsockname()[1], duration_s=0.5, out=tmp_path / "new" / "folder")
     thread.join()
     assert report.cycles + report.overruns == pytest.approx(124, abs=1)
     assert report.answers.answered > 0
@@ -177,7 +177,7 @@ def test_at_a_socket_it_converses_with_the_bare_echo(server: socket.socket, tmp_
 def test_with_nobody_there_it_goes_on(server: socket.socket, tmp_path: Path) -> None:
     port = server.getsockname()[1]
     server.close()
-    report = run_twin("127.0.0.1", port, duration_s=0.1, out=tmp_path)
+    report = run_simulator("127.0.0.1", port, duration_s=0.1, out=tmp_path)
     assert len((tmp_path / "twin_arrivals.csv").read_text().splitlines()) == 1
     assert report.answers.answered == 0
     assert report.cycles > 0
@@ -186,8 +186,8 @@ def test_with_nobody_there_it_goes_on(server: socket.socket, tmp_path: Path) -> 
 def test_sigterm_ends_it_with_its_report(server: socket.socket) -> None:
     port = server.getsockname()[1]
     code = (
-        "from hrcreplay.egm.robot_double.udp_client import run_twin; "
-        f"print(run_twin('127.0.0.1', {port}).answers.packets)"
+        "from hrcreplay.egm.robot_double.udp_client import run_simulator; "
+        f"print(run_simulator('127.0.0.1', {port}).answers.packets)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         server.recvfrom(65536)
@@ -207,7 +207,7 @@ def test_sigterm_ends_it_with_its_report(server: socket.socket) -> None:
 )
 def test_what_cannot_be_is_refused(call: dict[str, Any], text: str) -> None:
     with pytest.raises(SettingsError, match=text):
-        run_twin(**call)
+        run_simulator(**call)
 
 
 @pytest.mark.parametrize(
@@ -221,4 +221,4 @@ def test_what_cannot_be_is_refused(call: dict[str, Any], text: str) -> None:
 )
 def test_settings_that_cannot_be_are_refused(settings: dict[str, Any], text: str) -> None:
     with pytest.raises(SettingsError, match=text):
-        TwinSettings(**settings)
+        SimulatorSettings(**settings)

@@ -10,7 +10,7 @@ import pytest
 from hrcreplay.egm import motion_link_pb2 as messages
 from hrcreplay.egm.codec import Correction, Motors, Rapid, encode_correction
 from hrcreplay.egm.robot_double.faults import KINDS, Datagram, Fault, random_faults
-from hrcreplay.egm.robot_double.robot_simulator import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.robot_simulator import SimulatedRobot, SimulatorSettings
 from hrcreplay.egm.robot_double.servo import PERIOD_NS, ServoSettings
 from tests.egm.rehearsals import HOME, Guide, T, ramp, ramp_until, rehearsed, shown
 
@@ -67,7 +67,7 @@ def test_a_new_session_counts_from_0_and_holds_until_it_is_told() -> None:
 
 def test_a_new_session_forgets_what_was_queued_or_under_way() -> None:
     late = Fault("delay", 0.0, 0.002, direction="in", delay_s=0.05)
-    core = TwinCore(TwinSettings(), [late, Fault("new_session", 3.5 * T, 0.0)])
+    core = SimulatedRobot(SimulatorSettings(), [late, Fault("new_session", 3.5 * T, 0.0)])
     told = encode_correction(Correction(1, 0, *ramp(1.0)))
     core.cycle(0, [Datagram(0, told)])
     core.cycle(PERIOD_NS, [Datagram(PERIOD_NS, told)] * 9)

@@ -11,7 +11,7 @@ import pytest
 
 from hrcreplay.egm.codec import Correction, encode_correction
 from hrcreplay.egm.robot_double.faults import Datagram, Fault
-from hrcreplay.egm.robot_double.robot_simulator import TwinCore, TwinSettings
+from hrcreplay.egm.robot_double.robot_simulator import SimulatedRobot, SimulatorSettings
 from hrcreplay.records import Floats
 from tests.egm.rehearsals import HOME, Guide, T, ramp, ramp_until, rehearsed, shown, still
 
@@ -66,7 +66,7 @@ def test_an_answer_that_comes_after_the_next_packet_is_late_not_missed() -> None
 
 
 def test_of_packets_that_come_at_once_the_newest_is_owed_an_answer() -> None:
-    core = TwinCore(TwinSettings())
+    core = SimulatedRobot(SimulatorSettings())
     core.cycle(0, [])
     core.record.departed_ns += [3_800_000, 4_032_000, 8_064_000]
     for t_ns in (300_000, 4_332_000, 8_364_000):

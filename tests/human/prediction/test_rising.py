@@ -14,7 +14,7 @@ from hrcreplay.human.model import HEIGHT, skeleton
 from hrcreplay.human.prediction.swept_volumes import predict
 from hrcreplay.limits import load_limits
 from hrcreplay.records import BODY, POINTS, Floats, HumanStates, SweptVolumes
-from hrcreplay.settings.sections import Fusion, Occupancy
+from hrcreplay.settings.sections import Fusion, Prediction
 from tests.human import rising
 from tests.human.filtered import fused, ticks
 
@@ -58,7 +58,7 @@ def coverage(duration_s: float, kind: str, seed: int, horizon_s: float) -> Float
     t_ns = states.t_ns
     some = np.arange(250, len(t_ns) - round(250 * horizon_s) - 1, EVERY)
     volumes = predict(
-        states.rows(some), load_limits("people"), Occupancy(), horizon_s=horizon_s, memory_s=Fusion().memory_s
+        states.rows(some), load_limits("people"), Prediction(), horizon_s=horizon_s, memory_s=Fusion().memory_s
     )
     inside = np.zeros((len(some), len(BODY)))
     for i, tick in enumerate(some):
@@ -100,7 +100,7 @@ def legs_outside_m(states: HumanStates, duration_s: float, kind: str, horizon_s:
     """(n,) how far the legs leave their volume, flesh and all, at every eighth tick; below 0 inside [m]."""
     some = np.arange(500, len(states) - round(250 * horizon_s) - 1, 8)
     limits, k = load_limits("people"), BODY.index("LEGS")
-    volumes = predict(states.rows(some), limits, Occupancy(), horizon_s=horizon_s, memory_s=Fusion().memory_s)
+    volumes = predict(states.rows(some), limits, Prediction(), horizon_s=horizon_s, memory_s=Fusion().memory_s)
     return np.array(
         [
             limb_outside_m(volumes, i, k, float(states.t_ns[tick]) * 1e-9, duration_s, kind, horizon_s)

@@ -15,17 +15,17 @@ from hrcreplay.human.prediction.joint_reach import rise
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.settings.sections import Prediction
 from tests.human.people import limb_points, random_states, states
 from tests.human.predictions import predict, reachable
 
 T = 0.377
 PAPER, HUMAN = load_limits("paper"), load_limits("human")
-BARE = Occupancy(sigmas=0.0, hand_m=0.0, legs=False)
+BARE = Prediction(sigmas=0.0, hand_m=0.0, legs=False)
 STEPS = 40
 
 
-def volumes(people: HumanStates, limits: LimitSet = PAPER, margins: Occupancy = BARE) -> SweptVolumes:
+def volumes(people: HumanStates, limits: LimitSet = PAPER, margins: Prediction = BARE) -> SweptVolumes:
     return predict(people, limits, horizon_s=T, method="sound", margins=margins)
 
 
@@ -82,14 +82,14 @@ def motions(
     return seen
 
 
-def worst(people: HumanStates, limits: LimitSet, margins: Occupancy, seed: int, count: int = 120) -> tuple[float, str]:
+def worst(people: HumanStates, limits: LimitSet, margins: Prediction, seed: int, count: int = 120) -> tuple[float, str]:
     """How far any sampled motion is out of its volume [m], and which."""
     rng = np.random.default_rng(seed)
     swept = volumes(people, limits, margins)
     k, largest, where = margins.sigmas, -np.inf, ""
     for i in range(len(people)):
         solids = [ConvexHull(swept.vertices(i, limb)).equations for limb in range(len(LIMBS))]
-        room = swept.radius_m[i] - np.append(limb_radii(Occupancy()), np.zeros(len(swept.limbs) - 6))
+        room = swept.radius_m[i] - np.append(limb_radii(Prediction()), np.zeros(len(swept.limbs) - 6))
         for sharp in (True, False):
             side = rng.choice([-1.0, 1.0], (3, DOF)) if sharp else rng.uniform(-1, 1, (3, DOF))
             p, v = people.p[i] + k * people.p_std[i] * side[0], people.v[i] + k * people.v_std[i] * side[1]
@@ -111,7 +111,7 @@ def worst(people: HumanStates, limits: LimitSet, margins: Occupancy, seed: int, 
 @pytest.mark.parametrize("std", [0.0, 0.1], ids=["known", "uncertain"])
 def test_no_motion_leaves(limits: LimitSet, std: float) -> None:
     people = uncertain(random_states(limits, 40, 3), 0.5 * std, std, 0.05 * std)
-    margins = BARE if std == 0.0 else Occupancy(sigmas=2.0, legs=False)
+    margins = BARE if std == 0.0 else Prediction(sigmas=2.0, legs=False)
     out, where = worst(people, limits, margins, 1)
     assert out <= 0.0, where
 
@@ -212,7 +212,7 @@ def test_a_polytope_holds_every_turned_point() -> None:
 
 def test_unknown_lengths_are_in_the_volumes() -> None:
     people = uncertain(random_states(PAPER, 30, 9), 0.0, 0.0, 0.01)
-    margins = Occupancy(sigmas=3.0, legs=False)
+    margins = Prediction(sigmas=3.0, legs=False)
     out, where = worst(people, PAPER, margins, 5)
     assert out <= 0.0, where
     assert volumes(people, PAPER, margins).radius_m[0, LIMBS.index("URA")] == pytest.approx(0.07 + np.hypot(0.03, 0.03))
@@ -257,12 +257,12 @@ def test_residual_hand_and_legs() -> None:
     people = random_states(PAPER, 2, 13)
     residual = np.array([[np.nan] * 7, [*[0.05] * 6, np.nan]])
     people = dataclasses.replace(people, residual_m=residual)
-    swept = volumes(people, PAPER, Occupancy(sigmas=0.0))
+    swept = volumes(people, PAPER, Prediction(sigmas=0.0))
     assert swept.limbs == (*LIMBS, "LEGS")
     assert swept.radius_m[:, -1] == pytest.approx([0.20 + 0.10, 0.20 + 0.05])  # not known yet: that of most people
     assert swept.radius_m[0, :-1] - swept.radius_m[1, :-1] == pytest.approx(0.05)
     assert volumes(people, PAPER, BARE.model_copy(update={"residual": False})).radius_m[1] == pytest.approx(
-        limb_radii(Occupancy())
+        limb_radii(Prediction())
     )
     legs = swept.vertices(0, len(LIMBS))
     assert (legs[:, 2].min(), legs[:, 2].max()) == (0.0, people.p[0, HEIGHT])
@@ -274,7 +274,7 @@ def test_a_low_pelvis_puts_the_knees_further_out() -> None:
     """Knees of two bones of 0.47 m between the pelvis and a foot under it, all around, and a thigh of 8 cm."""
     p = np.tile(random_states(PAPER, 1, 15).p, (4, 1))
     p[:, HEIGHT] = (0.94, 0.7, 0.5, 0.3)
-    swept = volumes(states(p, np.zeros_like(p)), margins=Occupancy(sigmas=0.0, residual=False))
+    swept = volumes(states(p, np.zeros_like(p)), margins=Prediction(sigmas=0.0, residual=False))
     for i, height in enumerate(p[:, HEIGHT]):
         solid = ConvexHull(swept.vertices(i, 6)).equations
         knee = np.sqrt(0.47**2 - 0.25 * height**2)
@@ -305,7 +305,7 @@ def test_legs_are_as_wide_as_they_were_seen() -> None:
 
 def test_one_tick_has_the_bits_of_many() -> None:
     people = uncertain(random_states(HUMAN, 20, 16), 0.05, 0.3, 0.004)
-    whole = volumes(people, HUMAN, Occupancy(sigmas=3.0))
-    alone = [volumes(people.rows(slice(i, i + 1)), HUMAN, Occupancy(sigmas=3.0)) for i in range(len(people))]
+    whole = volumes(people, HUMAN, Prediction(sigmas=3.0))
+    alone = [volumes(people.rows(slice(i, i + 1)), HUMAN, Prediction(sigmas=3.0)) for i in range(len(people))]
     assert np.concatenate([tick.vertices_m for tick in alone]).tobytes() == whole.vertices_m.tobytes()
     assert len(volumes(people.rows(slice(0, 0)))) == 0

@@ -12,7 +12,7 @@ from hrcreplay.human.model import LimitSet, clamp, skeleton
 from hrcreplay.human.prediction.swept_volumes import METHODS, PRINTED, limb_radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.settings.sections import Prediction
 from tests.human import predictions
 from tests.human.people import LENGTHS_M, directions, limb_points, random_states, raw_cloud, states
 from tests.human.predictions import reachable
@@ -89,7 +89,7 @@ def test_every_posture_in_the_reachable_sets_is_inside(method: str) -> None:
 def test_the_older_method_needs_more_room() -> None:
     """Fig. 17."""
     people = random_states(PAPER, 60, 15)
-    radii = limb_radii(Occupancy())
+    radii = limb_radii(Prediction())
     paper, positions = (
         np.array(
             [

@@ -13,11 +13,11 @@ from hrcreplay.human.prediction.swept_volumes import predict
 from hrcreplay.human.prediction.velocity_tube import NOISE_M
 from hrcreplay.limits import load_limits
 from hrcreplay.records import BODY, LIMBS, POINTS, Floats, HumanStates
-from hrcreplay.settings.sections import Fusion, Occupancy
+from hrcreplay.settings.sections import Fusion, Prediction
 from tests.human.people import random_states
 
 PEOPLE = load_limits("people")
-MEMORY_S, HAND_M = Fusion().memory_s, Occupancy().hand_m
+MEMORY_S, HAND_M = Fusion().memory_s, Prediction().hand_m
 FLESH_M = dict(zip(BODY, (0.12, 0.15, 0.07, 0.07, 0.07, 0.07, 0.08), strict=True))
 ENDS = {
     "HD": ("neck", "head"),
@@ -98,7 +98,7 @@ def distance_m(point: Floats, vertices: Floats) -> float:
 def test_who_keeps_to_the_departures_is_inside_and_nobody_much_further(horizon_s: float) -> None:
     """500 places a limb, in the hull and as far from it as is allowed; and 1 mm further they are outside."""
     states, rng = people(10, seed=3), np.random.default_rng(4)
-    volumes = predict(states, PEOPLE, Occupancy(), horizon_s=horizon_s, memory_s=MEMORY_S)
+    volumes = predict(states, PEOPLE, Prediction(), horizon_s=horizon_s, memory_s=MEMORY_S)
     assert PEOPLE.departure is not None
     assert volumes.limbs == BODY
     for tick in range(len(states)):
@@ -121,7 +121,7 @@ def test_who_keeps_to_the_departures_is_inside_and_nobody_much_further(horizon_s
 def test_a_limb_may_be_where_the_residual_says_whatever_the_departures() -> None:
     states = people(8, seed=12)
     nothing = Departure(np.array([0.1]), *np.zeros((2, len(BODY), 1)), *np.zeros((2, 1)))
-    volumes = predict(states, replace(PEOPLE, departure=nothing), Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    volumes = predict(states, replace(PEOPLE, departure=nothing), Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     for k, limb in enumerate(LIMBS):
         np.testing.assert_allclose(volumes.radius_m[:, k], FLESH_M[limb] + states.residual_m[:, k], atol=2e-9)
 
@@ -135,8 +135,8 @@ def test_a_limb_that_is_out_of_sight_has_the_volume_of_its_joints() -> None:
     unseen = states.unseen_s.copy()
     unseen[:, LIMBS.index("LRA")] = MEMORY_S + 0.1
     states = replace(states, unseen_s=unseen)
-    tubes = predict(states, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
-    joints = predict(states, without(PEOPLE), Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    tubes = predict(states, PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
+    joints = predict(states, without(PEOPLE), Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     for tick in range(3):
         for k, limb in enumerate(BODY):
             same = np.array_equal(tubes.vertices(tick, k), joints.vertices(tick, k))
@@ -160,8 +160,8 @@ def test_what_an_unseen_limb_carries_has_no_tube_either(hidden: str, gone: set[s
     unseen = states.unseen_s.copy()
     unseen[:, LIMBS.index(hidden)] = MEMORY_S + 0.5
     states = replace(states, unseen_s=unseen)
-    tubes = predict(states, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
-    joints = predict(states, without(PEOPLE), Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    tubes = predict(states, PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
+    joints = predict(states, without(PEOPLE), Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     for k, limb in enumerate(BODY):
         same = np.array_equal(tubes.vertices(0, k), joints.vertices(0, k))
         assert same == (limb in gone), limb
@@ -172,8 +172,8 @@ def test_a_limb_seen_a_while_ago_may_have_departed_for_longer() -> None:
     states = people(3, seed=7)
     unseen = states.unseen_s.copy()
     unseen[:, LIMBS.index("ULA")] = 0.3
-    early = predict(states, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
-    late = predict(replace(states, unseen_s=unseen), PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    early = predict(states, PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
+    late = predict(replace(states, unseen_s=unseen), PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     assert PEOPLE.departure is not None
     k = BODY.index("ULA")
     for tick in range(3):
@@ -186,7 +186,7 @@ def test_legs_that_were_hidden_just_now_may_have_departed_for_longer() -> None:
     states = people(3, seed=7)
     unseen, k = states.unseen_s.copy(), BODY.index("LEGS")
     unseen[:, k] = 0.18
-    late = predict(replace(states, unseen_s=unseen), PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    late = predict(replace(states, unseen_s=unseen), PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     assert PEOPLE.departure is not None
     for tick in range(3):
         reach = allowed_m(PEOPLE.departure, "LEGS", 0.18, states.residual_m[tick, BODY.index("THX")])
@@ -201,7 +201,7 @@ def test_hidden_legs_are_the_line_below_the_pelvis_as_thick_as_they_were(gone: t
     points[:, [POINTS.index(name) for name in gone]] = np.nan
     hidden = replace(states, points_m=points)
     k = BODY.index("LEGS")
-    volumes = predict(hidden, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    volumes = predict(hidden, PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     assert PEOPLE.departure is not None
     for tick in range(3):
         pelvis = points[tick, 0]
@@ -219,7 +219,7 @@ def test_a_hidden_foot_or_hip_makes_legs_no_thicker() -> None:
     points = states.points_m.copy()
     points[:, [POINTS.index(name) for name in ("hip_l", "foot_l", "foot_r")]] = np.nan
     shown, fewer = (
-        predict(of, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+        predict(of, PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
         for of in (states, replace(states, points_m=points))
     )
     np.testing.assert_array_equal(fewer.radius_m, shown.radius_m)
@@ -228,14 +228,14 @@ def test_a_hidden_foot_or_hip_makes_legs_no_thicker() -> None:
 def test_nobody_known_has_no_tube() -> None:
     states = people(2, seed=9)
     nobody = replace(states, p=np.full_like(states.p, np.nan), points_m=np.full_like(states.points_m, np.nan))
-    volumes = predict(nobody, PEOPLE, Occupancy(), horizon_s=0.1, memory_s=MEMORY_S)
+    volumes = predict(nobody, PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     assert all(np.isnan(volumes.vertices(tick, k)).all() for tick in range(2) for k in range(len(BODY)))
 
 
 def test_a_tick_has_the_same_bits_alone() -> None:
     states = people(5, seed=10)
-    together = predict(states, PEOPLE, Occupancy(), horizon_s=0.2, memory_s=MEMORY_S)
-    alone = predict(states.rows(slice(3, 4)), PEOPLE, Occupancy(), horizon_s=0.2, memory_s=MEMORY_S)
+    together = predict(states, PEOPLE, Prediction(), horizon_s=0.2, memory_s=MEMORY_S)
+    alone = predict(states.rows(slice(3, 4)), PEOPLE, Prediction(), horizon_s=0.2, memory_s=MEMORY_S)
     for k in range(len(BODY)):
         np.testing.assert_array_equal(together.vertices(3, k), alone.vertices(0, k))
     np.testing.assert_array_equal(together.radius_m[3], alone.radius_m[0])

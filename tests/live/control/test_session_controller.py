@@ -98,7 +98,7 @@ def test_every_reason_of_the_watchdog_goes_on_with_the_certified_stop_and_holds(
     assert is_a_stop(speeds, robot.ddq_max, dt_s)
     assert all(answer.row.certified for answer in later if answer.row is not None)
     still = np.flatnonzero(~np.any(speeds, axis=1))
-    assert still[0] * CYCLE_S <= flight.start["settings"]["occupancy"]["stop_s"] + 2 * CYCLE_S
+    assert still[0] * CYCLE_S <= flight.start["settings"]["prediction"]["stop_s"] + 2 * CYCLE_S
     assert not np.any(speeds[still[0] :])  # and does not move again
     assert later[-1].reason == reason
     assert PHASES[later[-1].phase] in ("holding", "stopping", "echo")

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.egm.codec import decode_correction
-from hrcreplay.egm.robot_double.robot_simulator import TwinSettings
+from hrcreplay.egm.robot_double.robot_simulator import SimulatorSettings
 from hrcreplay.egm.robot_double.servo import ServoSettings, axes_of
 from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.errors import SettingsError
@@ -37,7 +37,7 @@ def flight_of(folder: Path, order: list[int], *, told: list[int] | None = None, 
     by_egm = np.array(order) - 1
     axes = axes_of(*(bound[by_egm] for bound in (robot.q_min, robot.q_max, robot.dq_max)))
     begin = tuple(np.array([float(angle) + 3.0 for angle in arm.home_deg])[by_egm].tolist())
-    double = TwinSettings(servo=ServoSettings(axes=axes), start_deg=begin)
+    double = SimulatorSettings(servo=ServoSettings(axes=axes), start_deg=begin)
     return Flight(settings, twin=double).fly(seconds)
 
 

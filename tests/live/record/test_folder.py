@@ -35,7 +35,7 @@ class Stored(Flight):
 def flight() -> Flight:
     """Somebody comes near; Ctrl-C after 2 s. By the method with the most limbs."""
     return Stored(
-        overrides=("occupancy.method=sound",),
+        overrides=("prediction.method=sound",),
         walk=lambda s: (3.0 - 0.9 * s, 0.2),
         signals=lambda s: Signal.INTERRUPT if s > 2.0 else Signal.NONE,
     ).fly(2.3)
@@ -127,7 +127,7 @@ def test_a_real_pilot_says_the_same_again(run: Path) -> None:
 
 def test_the_record_can_be_replayed(run: Path, tmp_path: Path) -> None:
     own = replay.run("plan", run, out=tmp_path / "a", end_s=1.0)  # with the settings of the session
-    log = replay.run("plan", run / "log.mcap", out=tmp_path / "b", end_s=1.0, overrides=("occupancy.method=sound",))
+    log = replay.run("plan", run / "log.mcap", out=tmp_path / "b", end_s=1.0, overrides=("prediction.method=sound",))
     assert run_folder.read_meta(own)["outputs"] == run_folder.read_meta(log)["outputs"]
     assert run_folder.read_meta(log)["T_world_base"] == run_folder.read_meta(run)["T_world_base"]
 

@@ -16,7 +16,7 @@ import numpy as np
 from hrcreplay.kernels import njit
 from hrcreplay.records import LIMBS, Floats, SweptVolumes
 from hrcreplay.robot.control.certificate import NO_PLANES, clear
-from hrcreplay.robot.control.control_step import Stop, at_rest, axis_by_axis, straight
+from hrcreplay.robot.control.control_step import Stop, at_rest, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, irb140
 
@@ -156,7 +156,7 @@ def random_step(rng: np.random.Generator, robot: RobotModel, *, together: bool) 
     dq_next = np.clip(dq + rng.uniform(-1.0, 1.0, 6) * DT_S * robot.ddq_max, -robot.dq_max, robot.dq_max)
     going = at_rest(q)
     going.dq[0] = dq
-    brake = straight if together else axis_by_axis
+    brake = stop_straight if together else stop_axis_by_axis
     return going, brake(q + 0.5 * DT_S * (dq + dq_next), dq_next, robot.ddq_max, DT_S)
 
 

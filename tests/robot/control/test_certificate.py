@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import certificate
 from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, clear, separating_normal
-from hrcreplay.robot.control.control_step import RobotState, Stop, at_rest, axis_by_axis, observe, straight
+from hrcreplay.robot.control.control_step import RobotState, Stop, at_rest, observe, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.control.separation import tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, irb140
 from tests.robot.control.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, random_step, run
@@ -37,7 +37,7 @@ def _ball(centre_m: Floats, radius_m: float = 0.05) -> Box:
 def test_the_stop_that_the_rows_allow_and_that_enters_is_refused(robot: RobotModel) -> None:
     """Every row of (2) holds with 30 mm between wrist and ball, and the stop (67) ends nearly 5 cm inside it."""
     q = np.array([-0.54, -0.349, -1.529, -1.409, 2.005, 1.335])  # the worst that a search of a minute found
-    stop = axis_by_axis(q, FAST, robot.ddq_max, DT_S)
+    stop = stop_axis_by_axis(q, FAST, robot.ddq_max, DT_S)
     start, velocities = link_points(q[None])[0, 3], robot.pose(q, FAST).J_ends[3] @ FAST
     along = velocities[1] / np.linalg.norm(velocities[1])
     way = link_points(stop.q[-1:])[0, 3, -1] - start[-1]
@@ -49,13 +49,13 @@ def test_the_stop_that_the_rows_allow_and_that_enters_is_refused(robot: RobotMod
     sight = observe(robot, RobotState(q, FAST), seen, 0.0)
     assert sight.pairs is not None
     assert sight.distance_m == pytest.approx(0.03, abs=1e-3)
-    rows = tick_rows(sight.pose, seen, sight.pairs.room_m2("square"), sight.pairs.distance_m, 0.377)
+    rows = tick_rows(sight.pose, seen, sight.pairs.constraint_rhs_m2("square"), sight.pairs.distance_m, 0.377)
     assert not len(worst_rows(rows, FAST, 0.0)[0]), "all rows hold"
     assert np.all(np.abs(FAST) <= robot.dq_max)
     going = Stop(q[None], FAST[None], np.full((1, 2), np.nan))
     assert deepest_m(going, stop, [ball]) > 0.045
     assert clear(robot, going, stop, seen, 0.0, DT_S, NO_PLANES)[0] == REFUSED
-    together = straight(q, FAST, robot.ddq_max, DT_S)
+    together = stop_straight(q, FAST, robot.ddq_max, DT_S)
     entered = deepest_m(going, together, [ball])
     assert (clear(robot, going, together, seen, 0.0, DT_S, NO_PLANES)[0] == CLEAR) <= (entered <= 0.0)
 
@@ -159,10 +159,10 @@ def test_a_leap_is_refused_however_clear_the_way(robot: RobotModel) -> None:
     there = q + np.array([0.0, 0.001, 0.0, 0.0, 0.0, 0.0])
     assert clear(robot, at_rest(q), at_rest(there), far, 0.0, DT_S, NO_PLANES)[0] == REFUSED
     dq = np.array([0.0, 0.5 * DT_S * robot.ddq_max[1], 0.0, 0.0, 0.0, 0.0])
-    further = straight(q + 3.0 * DT_S * dq, dq, robot.ddq_max, DT_S)
+    further = stop_straight(q + 3.0 * DT_S * dq, dq, robot.ddq_max, DT_S)
     assert clear(robot, at_rest(q), further, far, 0.0, DT_S, NO_PLANES)[0] == REFUSED
     dq = np.array([0.0, 1.2 * DT_S * robot.ddq_max[1], 0.0, 0.0, 0.0, 0.0])
-    sudden = straight(q + 0.5 * DT_S * dq, dq, robot.ddq_max, DT_S)
+    sudden = stop_straight(q + 0.5 * DT_S * dq, dq, robot.ddq_max, DT_S)
     assert clear(robot, at_rest(q), sudden, far, 0.0, DT_S, NO_PLANES)[0] == REFUSED
-    slow = straight(q + 0.5 * DT_S * dq / 1.2, dq / 1.2, robot.ddq_max, DT_S)
+    slow = stop_straight(q + 0.5 * DT_S * dq / 1.2, dq / 1.2, robot.ddq_max, DT_S)
     assert clear(robot, at_rest(q), slow, far, 0.0, DT_S, NO_PLANES)[0] == CLEAR

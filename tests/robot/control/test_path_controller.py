@@ -9,12 +9,12 @@ import pytest
 
 from hrcreplay.records import Floats, SweptVolumes
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import PlanSettings, Step, along_path
+from hrcreplay.robot.control.control_step import PlanSettings, Step, stop_along_path
 from hrcreplay.robot.control.controllers import ScalingController
 from hrcreplay.robot.control.path_controller import PathState, rates
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.path import programmed
+from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import Reference, parse_task
 from hrcreplay.settings.sections import Plan
 from tests.robot.checker import violation
@@ -42,7 +42,7 @@ def robot() -> RobotModel:
 def reference(robot: RobotModel) -> Reference:
     places = [{"joints_deg": [40, 20, -10, 0, 60, 0]}, {"joints_deg": [-40, 30, -20, 0, 70, 0], "dwell_s": 0.2}]
     task = {"name": "to and fro", "repeat": True, "speed": 0.6, "acceleration": 0.5, "waypoints": places}
-    return programmed(parse_task(task), robot)
+    return plan_programme(parse_task(task), robot)
 
 
 def step(
@@ -50,7 +50,7 @@ def step(
 ) -> tuple[Step, PathState]:
     """One tick from a given state of the path."""
     controller = ScalingController(robot, reference, settings)
-    going = along_path(reference.grid, state.s_s, state.rate, robot.ddq_max, settings.dt_s)
+    going = stop_along_path(reference.grid, state.s_s, state.rate, robot.ddq_max, settings.dt_s)
     assert going is not None
     controller.stop = going
     made = controller.step(lambda _: seen).step

@@ -10,10 +10,10 @@ import pytest
 from hrcreplay.records import STATUSES, Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, OPENING, REFUSED, clear
-from hrcreplay.robot.control.control_step import PlanSettings, Step, at_rest, straight
+from hrcreplay.robot.control.control_step import PlanSettings, Step, at_rest, stop_straight
 from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.path import programmed
+from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task
 from hrcreplay.settings.sections import Plan
 from tests.robot.control.random_stops import (
@@ -56,7 +56,7 @@ def test_what_is_called_opening_brings_no_point_of_the_link_nearer_to_any_of_the
             continue
         dq = -np.linalg.pinv(robot.pose(q, np.zeros(6)).J_ends[link, 1]) @ (normal * rng.uniform(0.0, 0.3))
         dq += rng.normal(0.0, 0.05, 6)
-        stop, going = straight(q + DT_S * dq, dq, robot.ddq_max, DT_S), at_rest(q)
+        stop, going = stop_straight(q + DT_S * dq, dq, robot.ddq_max, DT_S), at_rest(q)
         going.dq[0] = dq
         verdict, _ = clear(robot, going, stop, as_obstacles([box]), 0.0, DT_S, NO_PLANES, 0.05)
         assert clear(robot, going, stop, as_obstacles([box]), 0.0, DT_S, NO_PLANES)[0] == REFUSED
@@ -77,7 +77,7 @@ def test_what_is_called_opening_brings_no_point_of_the_link_nearer_to_any_of_the
 
 def controller(robot: RobotModel, retreat_m: float) -> QpController:
     waypoints = [{"joints_deg": [0, 30, -20, 0, 60, 0]}, {"joints_deg": [5, 30, -20, 0, 60, 0]}]
-    path = programmed(parse_task({"name": "small", "repeat": True, "waypoints": waypoints}), robot)
+    path = plan_programme(parse_task({"name": "small", "repeat": True, "waypoints": waypoints}), robot)
     settings = PlanSettings(Plan(retreat_m=retreat_m), dt_s=DT_S, stop_s=0.377, retreat_m=retreat_m)
     return QpController(robot, path, settings)
 

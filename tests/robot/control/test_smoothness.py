@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.control_step import PlanSettings, RobotState, axis_by_axis, observe
+from hrcreplay.robot.control.control_step import PlanSettings, RobotState, observe, stop_axis_by_axis
 from hrcreplay.robot.control.minimiser import Solution, minimise
 from hrcreplay.robot.control.qp_controller import Target, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles
@@ -88,7 +88,7 @@ def test_a_wild_reference_takes_no_axis_beyond_its_limits(robot: RobotModel, set
         assert np.all(np.abs(u_next) <= robot.ddq_max * (1 + 1e-9))
         assert np.abs(pose.J_tcp[:3] @ dq + DT_S * pose.dJdq_tcp[:3]).max() <= settings.plan.tcp_speed_max + 1e-6
         q = state.q + 0.5 * DT_S * (state.dq + dq)
-        stop = axis_by_axis(q, dq, robot.ddq_max, DT_S)
+        stop = stop_axis_by_axis(q, dq, robot.ddq_max, DT_S)
         assert np.all((robot.q_min - 1e-9 <= stop.q[-1]) & (stop.q[-1] <= robot.q_max + 1e-9))
         near += int(np.any((stop.q[-1] - robot.q_min < 0.1) | (robot.q_max - stop.q[-1] < 0.1)))
         state, u = RobotState(q, dq), u_next

@@ -15,13 +15,13 @@ from hrcreplay.robot.control.control_step import (
     Proposal,
     RobotState,
     observe,
-    straight,
+    stop_straight,
 )
 from hrcreplay.robot.control.minimiser import Solution, minimise
 from hrcreplay.robot.control.qp_controller import Target, problem, propose
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.path import approach, recorded
+from hrcreplay.robot.path import approach, smooth_recorded
 from hrcreplay.robot.task import Reference, tcp_speed_cap
 from hrcreplay.settings.sections import Plan
 from tests.robot.checker import links
@@ -132,7 +132,7 @@ def test_a_certified_stop_goes_on_above_the_limit(robot: RobotModel) -> None:
     """What was certified is executed, bit for bit: no limit has a say in it."""
     rng = np.random.default_rng(8)
     state = moving(robot, rng, 0.8)
-    going = straight(state.q, state.dq, robot.ddq_max, DT_S)
+    going = stop_straight(state.q, state.dq, robot.ddq_max, DT_S)
     everywhere = replace(NOBODY, known=False)
     taken, _ = decide(robot, going, [Proposal(going, 0)], everywhere, 1.0, NO_PLANES, SETTINGS)
     assert taken.status == BRAKING
@@ -177,7 +177,7 @@ def test_what_a_robot_may_reach(path: Reference) -> None:
 def test_a_path_without_a_task_has_its_own_greatest_speed(robot: RobotModel) -> None:
     t_s = np.arange(500) * 0.01
     q = HOME + np.outer(0.3 * np.sin(2.0 * t_s), np.arange(1.0, 7.0) / 6)
-    path = recorded(np.round(t_s * 1e9).astype(np.int64), q, robot)
+    path = smooth_recorded(np.round(t_s * 1e9).astype(np.int64), q, robot)
     speeds = [speed(q, dq) for q, dq in zip(path.q, path.dq, strict=True)]
     assert path.tcp_speed_limit(1.0) == path.tcp_speed_limit(3.3) == pytest.approx(max(speeds), rel=1e-9)
     way = approach(robot, HOME, HOME + 0.2, 0.1)

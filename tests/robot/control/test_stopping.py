@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.control_step import Stop, along_path, at_rest, axis_by_axis, straight
+from hrcreplay.robot.control.control_step import Stop, at_rest, stop_along_path, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.model import RobotModel, irb140
-from hrcreplay.robot.path import programmed
+from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import Reference, parse_task
 
 DT_S = 0.004
@@ -23,7 +23,7 @@ def robot() -> RobotModel:
 def reference(robot: RobotModel) -> Reference:
     places = [{"joints_deg": [40, 20, -10, 0, 60, 0]}, {"joints_deg": [-40, 30, -20, 0, 70, 0], "dwell_s": 0.2}]
     task = {"name": "to and fro", "repeat": True, "speed": 0.9, "acceleration": 0.5, "waypoints": places}
-    return programmed(parse_task(task), robot)
+    return plan_programme(parse_task(task), robot)
 
 
 def _starts(robot: RobotModel, count: int) -> list[tuple[Floats, Floats]]:
@@ -45,7 +45,7 @@ def _check(stop: Stop, ddq_max: Floats) -> None:
 
 def test_a_straight_stop_is_straight_and_as_short_as_the_slowest_axis_allows(robot: RobotModel) -> None:
     for q, dq in _starts(robot, 200):
-        stop = straight(q, dq, robot.ddq_max, DT_S)
+        stop = stop_straight(q, dq, robot.ddq_max, DT_S)
         _check(stop, robot.ddq_max)
         slowest_s = (np.abs(dq) / robot.ddq_max).max()
         assert slowest_s <= stop.ticks * DT_S * (1 + 1e-12) < slowest_s + DT_S * (1 + 1e-9)
@@ -57,7 +57,7 @@ def test_a_straight_stop_is_straight_and_as_short_as_the_slowest_axis_allows(rob
 
 def test_the_stop_of_equation_67_is_that_of_every_axis_by_itself(robot: RobotModel) -> None:
     for q, dq in _starts(robot, 200):
-        stop = axis_by_axis(q, dq, robot.ddq_max, DT_S)
+        stop = stop_axis_by_axis(q, dq, robot.ddq_max, DT_S)
         _check(stop, robot.ddq_max)
         for row in range(stop.ticks + 1):
             left = np.sign(dq) * np.maximum(0.0, np.abs(dq) - row * DT_S * robot.ddq_max)
@@ -67,7 +67,7 @@ def test_the_stop_of_equation_67_is_that_of_every_axis_by_itself(robot: RobotMod
 def test_what_is_left_of_a_stop_is_the_same_stop(robot: RobotModel) -> None:
     """Bit for bit: what was certified is what is executed."""
     for q, dq in _starts(robot, 20):
-        for brake in (straight, axis_by_axis):
+        for brake in (stop_straight, stop_axis_by_axis):
             stop = whole = brake(q, dq, robot.ddq_max, DT_S)
             for row in range(whole.ticks + 3):
                 at = min(row, whole.ticks)
@@ -82,7 +82,7 @@ def test_a_stop_along_the_path_stays_on_it_and_uses_what_the_axes_have(
     robot: RobotModel, reference: Reference, rate: float
 ) -> None:
     for s_s in np.arange(0.0, reference.cycle_s * 1.2, 0.05):
-        stop = along_path(reference.grid, float(s_s), rate, robot.ddq_max, DT_S)
+        stop = stop_along_path(reference.grid, float(s_s), rate, robot.ddq_max, DT_S)
         assert stop is not None
         assert not stop.dq[-1].any()
         for row, (at_s, now) in enumerate(stop.along):

@@ -36,7 +36,7 @@ LIVE = "live"
 PORT = "HRCREPLAY_FUZZ_PORT"
 
 #: A live session's settings: nobody waits for an approach at a tenth of the speed.
-_SETTINGS = (*PATIENT, "live.approach_speed=1.0", "occupancy.method=paper", "limits.prediction=paper")
+_SETTINGS = (*PATIENT, "live.approach_speed=1.0", "prediction.method=paper", "limits.prediction=paper")
 _SECONDS = 0.8
 _LEAST = 4  # frames of a camera that is clean, from which there must be a state
 

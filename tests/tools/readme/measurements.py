@@ -59,9 +59,9 @@ EXCERPT = f"{DEMO} --start 8 --end 23"
 MARGINS = {
     "default": "",
     "joints": "--limits human",
-    "no hand": "--set occupancy.hand_m=0",
-    "no residual": "--set occupancy.residual=false",
-    "bare, paper": "--limits paper --set occupancy.sigmas=0 --set occupancy.hand_m=0 --set occupancy.residual=false",
+    "no hand": "--set prediction.hand_m=0",
+    "no residual": "--set prediction.residual=false",
+    "bare, paper": "--limits paper --set prediction.sigmas=0 --set prediction.hand_m=0 --set prediction.residual=false",
 }
 #: Motions that are sampled for each method and limit set.
 SAMPLES = {

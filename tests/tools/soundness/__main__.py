@@ -76,10 +76,10 @@ def figures(plan: Plan, result: Result) -> dict[str, Any]:
 
 def _plan(options: argparse.Namespace) -> Plan:
     """What the arguments ask for; margins that are not given are the method's own."""
-    occupancy, bare = _DEFAULTS.occupancy, options.method in PRINTED
-    sigmas = 0.0 if bare else occupancy.sigmas
-    hand_m = 0.0 if bare else occupancy.hand_m
-    latency_s = 0.0 if bare else occupancy.latency_s
+    prediction, bare = _DEFAULTS.prediction, options.method in PRINTED
+    sigmas = 0.0 if bare else prediction.sigmas
+    hand_m = 0.0 if bare else prediction.hand_m
+    latency_s = 0.0 if bare else prediction.latency_s
     return Plan(
         method=options.method,
         limits=options.limits,
@@ -94,8 +94,10 @@ def _plan(options: argparse.Namespace) -> Plan:
 
 
 def _parser() -> argparse.ArgumentParser:
-    own = _DEFAULTS.occupancy
-    parser = argparse.ArgumentParser(prog="python -m tests.tools.soundness", description=(__doc__ or "").splitlines()[0])
+    own = _DEFAULTS.prediction
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.tools.soundness", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("--samples", type=_positive, default=1_000_000, help="motions to follow")
     parser.add_argument("--method", choices=METHODS, default=own.method)
     parser.add_argument("--limits", default=_DEFAULTS.limits.prediction, help="paper, human, people or a TOML file")

@@ -14,7 +14,7 @@ from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import PRINTED
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats, HumanStates, Ints, SweptVolumes
-from hrcreplay.settings.sections import Occupancy
+from hrcreplay.settings.sections import Prediction
 from tests.human.predictions import MEMORY_S
 from tests.tools.soundness.facets import distance_m, facets_of
 from tests.tools.soundness.joint import bounds_of
@@ -47,14 +47,14 @@ class Plan:
             raise ValueError(f"motions_a_state: found {self.motions_a_state}; take a multiple of {BLOCK}")
 
     @property
-    def occupancy(self) -> Occupancy:
+    def occupancy(self) -> Prediction:
         """That of the volumes, without what is the same on both sides: the thickness of limbs, and the residual.
 
         A body that is off the model by no more than the residual is inside a volume with that ball around it wherever
         the model is inside the volume without: so the model is held against the latter.
         """
         limbs = ("head", "thorax", "upper_arm", "lower_arm")
-        return Occupancy(
+        return Prediction(
             method=self.method, residual=False, sigmas=self.sigmas, latency_s=self.latency_s, hand_m=self.hand_m
         ).model_copy(update={f"radius_{limb}_m": 0.0 for limb in limbs} | {"legs_radius_m": 0.0})
 

@@ -113,9 +113,9 @@ def test_the_command_samples_what_predict_does_by_default(method: str, capsys: p
     prediction_stage = assembly.prediction_stage(resolve_without_log("predict", Path(), settings, None))
     assert (found["method"], found["limits"]) == (method, prediction_stage.limits.name)
     assert found["horizon_s"] == prediction_stage.horizon_s
-    assert found["latency_s"] == prediction_stage.occupancy.latency_s
-    assert found["sigmas"] == (prediction_stage.occupancy.sigmas if sound else 0.0)  # the print knows no margins
-    assert found["hand_m"] == (prediction_stage.occupancy.hand_m if sound else 0.0)
+    assert found["latency_s"] == prediction_stage.settings.latency_s
+    assert found["sigmas"] == (prediction_stage.settings.sigmas if sound else 0.0)  # the print knows no margins
+    assert found["hand_m"] == (prediction_stage.settings.hand_m if sound else 0.0)
     plan = Plan(method, "people", 0, sigmas=found["sigmas"], hand_m=found["hand_m"])
     result = run(plan, 2000, processes=1)
     assert (found["samples"], found["states"]) == (2000, 2)
