@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -226,9 +226,47 @@ class SweptVolumes:
 STATUSES = ("tracking", "limited", "braking", "retreating")
 
 
+class MotionRow(NamedTuple):
+    """Commanded motion of one tick: what a controller decides, ``Motion`` collects and a session records.
+
+    This is the one schema of a tick. Tables, the session's record and ``verify`` take its fields in this order.
+    """
+
+    q: Floats  #: (nv,) at the tick [rad]
+    dq: Floats  #: (nv,) at the tick [rad/s]
+    u: Floats  #: (nv,) applied from the tick on [rad/s^2]
+    ref_m: Floats  #: (3,) programmed TCP position, world [m]
+    tcp_m: Floats  #: (3,) TCP position at ``q``, world [m]
+    tcp_speed: float  #: [m/s]
+    ref_speed: float  #: of the reference [m/s]
+    programme_s: float  #: programmed time of the reference [s]
+    distance_m: float  #: surface to surface, smallest over all pairs; 0 in contact, NaN where not known [m]
+    overlap_m: float  #: depth of the link inside the volume, radii included; NaN where not known [m]
+    limb: int  #: of the nearest pair; -1 without one
+    link: int  #: of the nearest pair; -1 without one
+    status: int  #: index into STATUSES
+    reason: str  #: why it braked or stood; empty where it did neither
+    horizon_s: float  #: horizon of the volumes used, from the tick on [s]
+    tau_s: float  #: duration of the stop from the tick's velocity [s]
+    certified: bool  #: whether the step, or the stop it continues, has a certificate that holds
+
+
+#: Fields of a MotionRow with a number an axis of the robot, and those with one an axis of the world.
+_OF_AXES, _OF_POINTS = ("q", "dq", "u"), ("ref_m", "tcp_m")
+
+
+def number_names(field: str, axes: int) -> tuple[str, ...]:
+    """Names of the numbers of a field of a MotionRow, as in motion.parquet: q1 ..., ref_x ..., tcp_speed."""
+    if field in _OF_AXES:
+        return tuple(f"{field}{axis}" for axis in range(1, axes + 1))
+    if field in _OF_POINTS:
+        return tuple(f"{field.removesuffix('_m')}_{axis}" for axis in "xyz")
+    return (field,)
+
+
 @dataclass(frozen=True)
 class Motion(Table):
-    """Commanded motion of the robot, a row a tick."""
+    """Commanded motion of the robot, a row a tick: the fields of ``MotionRow`` as arrays."""
 
     t_ns: Ints  #: (n,)
     q: Floats  #: (n, nv) at the tick [rad]
@@ -251,3 +289,20 @@ class Motion(Table):
     limbs: tuple[str, ...]
     links: tuple[str, ...]
     reasons: tuple[str, ...]
+
+    @classmethod
+    def of_rows(
+        cls,
+        t_ns: Ints,
+        rows: Sequence[MotionRow],
+        *,
+        limbs: tuple[str, ...],
+        links: tuple[str, ...],
+        reasons: tuple[str, ...],
+    ) -> Self:
+        """Collect the rows of the ticks ``t_ns``; ``reasons`` has the text of every row's reason."""
+        columns = {
+            name: np.array([getattr(row, name) for row in rows]) for name in MotionRow._fields if name != "reason"
+        }
+        reason = np.array([reasons.index(row.reason) for row in rows])
+        return cls(t_ns=t_ns, **columns, reason=reason, limbs=limbs, links=links, reasons=reasons)

@@ -270,7 +270,8 @@ def encode_robot(
 
 def _all_joints(place: Any) -> list[float]:
     """Joints of the arm, then external ones, of one part of a message."""
-    return [*place.joints.joints, *place.external_joints.joints]
+    arm = place.joints.joints[:]
+    return arm + place.external_joints.joints[:] if place.HasField("external_joints") else arm
 
 
 def _joints(place: Any, what: str) -> list[float]:

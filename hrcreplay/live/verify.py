@@ -185,16 +185,6 @@ def _context(key: str, recorded: Any, now: Any) -> Iterator[str]:
 
 
 LOG = "log.mcap"
-_OTHERS = (
-    *("ref_x", "ref_y", "ref_z", "tcp_x", "tcp_y", "tcp_z", "tcp_speed", "ref_speed", "programme_s", "distance_m"),
-    *("horizon_s", "tau_s", "certified"),
-)
-
-
-def _row_names(count: int) -> tuple[str, ...]:
-    """So many numbers of a MotionRow, named as in motion.parquet."""
-    axes = range(1, 1 + (count - len(_OTHERS)) // 4)
-    return (*(f"{name}{axis}" for name in ("q_measured", "q", "dq", "u") for axis in axes), *_OTHERS)
 
 
 class DecisionMaker(Protocol):
@@ -407,7 +397,7 @@ class SessionRecomputation:
         names = ("phase", "status", "reason", "look_ns", "limb", "link")
         return [
             *decisions_differing(names, _decision(recorded), _decision(said)),
-            *numbers_differing(_row_names(len(_numbers(recorded))), _numbers(recorded), _numbers(said)),
+            *numbers_differing(*_numbers(recorded), _numbers(said)[1]),
         ]
 
     def _replied(self, message: bytes) -> list[Difference]:
@@ -429,8 +419,11 @@ def _decision(found: codec.RecordedDecision) -> list[Any]:
     ]
 
 
-def _numbers(found: codec.RecordedDecision) -> Floats:
-    return np.empty(0) if found.row is None else found.row
+def _numbers(found: codec.RecordedDecision) -> tuple[list[str], Floats]:
+    """The numbers of a decision that are no decisions themselves, with their names."""
+    names = codec.number_names_of(len(found.measured)) if found.row is not None else ()
+    kept = [i for i, name in enumerate(names) if name not in codec.INTEGERS]
+    return [names[i] for i in kept], codec.numbers_of(found)[kept]
 
 
 def _digests_differing(recorded: tuple[bytes, ...], volumes: SweptVolumes) -> list[Difference]:

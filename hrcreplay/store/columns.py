@@ -23,6 +23,8 @@ from hrcreplay.records import (
     Ints,
     Measurements,
     Motion,
+    MotionRow,
+    number_names,
 )
 
 Columns = dict[str, Any]
@@ -90,9 +92,7 @@ COLUMNS = {
     "occupancy": ("t_ns", "limb", "method", "radius_m", "volume_m3", "vertices", "horizon_s"),
     "motion": (
         "t_ns",
-        *(f"{point}_{axis}" for point in ("ref", "tcp") for axis in "xyz"),
-        *("tcp_speed", "ref_speed", "programme_s", "distance_m", "overlap_m", "limb", "link", "status", "reason"),
-        *("horizon_s", "tau_s", "certified"),
+        *(name for field in MotionRow._fields for name in number_names(field, 0)),  # those of the axes aside
     ),
     "contact": (
         *("t_ns", "method", "person", "moving", "distance_m", "limb", "link", "tcp_speed", "contact_speed"),
@@ -162,27 +162,17 @@ def occupancy_columns(
 
 def motion_columns(motion: Motion) -> Columns:
     """A row a tick: the commanded motion, and the distance from the person."""
-    numbers = range(1, motion.q.shape[1] + 1)
-    return {
-        "t_ns": motion.t_ns,
-        **_spread(motion.q, [f"q{i}" for i in numbers]),
-        **_spread(motion.dq, [f"dq{i}" for i in numbers]),
-        **_spread(motion.u, [f"u{i}" for i in numbers]),
-        **_spread(motion.ref_m, ["ref_x", "ref_y", "ref_z"]),
-        **_spread(motion.tcp_m, ["tcp_x", "tcp_y", "tcp_z"]),
-        "tcp_speed": motion.tcp_speed,
-        "ref_speed": motion.ref_speed,
-        "programme_s": motion.programme_s,
-        "distance_m": motion.distance_m,
-        "overlap_m": motion.overlap_m,
-        "limb": _names(motion.limb, motion.limbs),
-        "link": _names(motion.link, motion.links),
-        "status": _names(motion.status, STATUSES),
-        "reason": _names(motion.reason, motion.reasons),
-        "horizon_s": motion.horizon_s,
-        "tau_s": motion.tau_s,
-        "certified": motion.certified,
-    }
+    names = {"limb": motion.limbs, "link": motion.links, "status": STATUSES, "reason": motion.reasons}
+    columns: Columns = {"t_ns": motion.t_ns}
+    for field in MotionRow._fields:
+        values = getattr(motion, field)
+        if field in names:
+            columns[field] = _names(values, names[field])
+        elif values.ndim == 2:
+            columns |= _spread(values, number_names(field, values.shape[1]))
+        else:
+            columns[field] = values
+    return columns
 
 
 def contact_columns(

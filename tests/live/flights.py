@@ -19,9 +19,9 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.live.control.session_controller import SessionController
 from hrcreplay.live.control.setup import build_controller, live_run_config, start_table
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import PHASES, Decision, MotionRow, Signal, TickEvent
+from hrcreplay.live.record.codec import PHASES, Decision, Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
-from hrcreplay.records import NOBODY, POINTS, Floats, HumanStates
+from hrcreplay.records import NOBODY, POINTS, Floats, HumanStates, MotionRow
 from hrcreplay.robot.model import RobotModel
 from tests.egm.rehearsal import rehearse
 
@@ -167,9 +167,9 @@ def _without_points(camera: str, body: int, t_ns: int) -> bytes:
     return data
 
 
-def echoed(one: MotionRow, two: MotionRow) -> bool:
+def echoed(one: MotionRow, measured: Floats, two: MotionRow) -> bool:
     """Whether the second of two answers takes a robot that may not move for where it is, or goes towards that."""
-    low, high = np.minimum(one.q, one.q_measured), np.maximum(one.q, one.q_measured)
+    low, high = np.minimum(one.q, measured), np.maximum(one.q, measured)
     return bool(np.all((low <= two.q) & (two.q <= high)) and not np.any(two.dq))
 
 
@@ -177,12 +177,13 @@ def steps_keep_the_limits(flight: Flight) -> None:
     """What was told: each step within the axes' speeds; while the robot may move, within their accelerations, too."""
     robot = flight.robot
     told = [answer for answer in flight.answers if answer.datagram is not None]
-    rows = [(answer.t_ns * 1e-9, answer.row, PHASES[answer.phase]) for answer in told if answer.row is not None]
+    rows = [(answer.t_ns * 1e-9, answer, answer.row) for answer in told if answer.row is not None]
     said = [decode_correction(answer.datagram) for answer in told if answer.datagram is not None]
-    for (before_s, one, _), (now_s, two, phase), first, second in zip(rows, rows[1:], said, said[1:], strict=False):
+    pairs = zip(rows, rows[1:], said, said[1:], strict=False)
+    for (before_s, earlier, one), (now_s, later, two), first, second in pairs:
         step_s = max(CYCLE_S, now_s - before_s)
         assert np.all(np.abs(second.q - first.q) <= robot.dq_max * step_s * (1 + 1e-6) + 1e-9)
-        if phase == "echo" or echoed(one, two):
+        if PHASES[later.phase] == "echo" or echoed(one, earlier.measured, two):
             continue
         assert np.all(np.abs(two.dq - one.dq) <= robot.ddq_max * CYCLE_S * (1 + 1e-9))
         assert np.all((two.q >= robot.q_min - 1e-9) & (two.q <= robot.q_max + 1e-9))

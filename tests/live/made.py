@@ -10,10 +10,10 @@ import numpy as np
 
 from hrcreplay.egm import motion_link_pb2 as egm
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
+from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import SessionLogWriter
 from hrcreplay.logs import skeleton_pb2 as pb
-from hrcreplay.records import DOF, LENGTHS, LIMBS, HumanStates, SweptVolumes
+from hrcreplay.records import DOF, LENGTHS, LIMBS, HumanStates, MotionRow, SweptVolumes
 from hrcreplay.robot.control.separation import obstacles
 
 START_NS = 1_700_000_000_000_000_000
@@ -64,12 +64,24 @@ class MadeController:
     def answer(self, event: TickEvent) -> Decision:
         """Every byte of every datagram moves the robot."""
         self.q += 1e-6 * sum(sum(data) for data in event.datagrams) + 1e-9 * self.p[:6] + 1e-4 * self.silences
-        row = MotionRow(self.q - 0.01, self.q.copy(), self.q / 2, self.q / 3, self.q[:3], self.q[3:], *[0.25] * 7)
         numbers = (self.q * 10).tolist()
         reply = egm.SensorMessage(planned=egm.Planned(joints=egm.Joints(joints=numbers))).SerializeToString()
-        reason = "Ctrl-C" if Signal.INTERRUPT in event.signals else ""
-        status = 2 if reason else 0
-        return Decision(event.t_ns, self.looked_ns, reply, codec.FOLLOWING, status, reason, 1, -1, row, None)
+        row = MotionRow(
+            q=self.q.copy(),
+            dq=self.q / 2,
+            u=self.q / 3,
+            ref_m=self.q[:3],
+            tcp_m=self.q[3:],
+            **dict.fromkeys(("tcp_speed", "ref_speed", "programme_s", "distance_m", "overlap_m"), 0.25),
+            limb=1,
+            link=-1,
+            status=2 if Signal.INTERRUPT in event.signals else 0,
+            reason="Ctrl-C" if Signal.INTERRUPT in event.signals else "",
+            horizon_s=0.25,
+            tau_s=0.25,
+            certified=True,
+        )
+        return Decision(event.t_ns, self.looked_ns, reply, codec.FOLLOWING, self.q - 0.01, row, "", None)
 
     def silence(self, t_ns: int, signals: Signal) -> None:  # noqa: ARG002 - part of what a controller is
         """A silence moves the robot too."""

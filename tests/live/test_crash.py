@@ -190,9 +190,7 @@ def test_a_session_that_crashed_comes_out_the_same_again_until_then(
     crashed_at = next(i for i, message in enumerate(messages) if b'"crash"' in message)
     assert not any(again.differences_at(message) for message in messages[: crashed_at + 1])
     assert again.crashed.startswith("ZeroDivisionError: put there by a test")
-    rows = [
-        codec.motion_row(codec.decode_decision(m)) for m in messages[crashed_at:] if codec.kind(m) == codec.DECISION
-    ]
+    rows = [codec.decode_decision(m).row for m in messages[crashed_at:] if codec.kind(m) == codec.DECISION]
     assert kinds[crashed_at:].count(codec.REPLY) == len(rows) > 50 + FINAL_ANSWERS
     assert rows[0] is not None
     assert rows[0].dq.any()

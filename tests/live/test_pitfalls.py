@@ -119,7 +119,7 @@ def test_10_a_loop_slower_than_the_robot_brakes_by_name_and_builds_no_backlog(tu
     arrivals, cycles = flight.core.record.arrivals(), flight.core.record.cycles()
     assert set(np.diff(arrivals["seqno"])) == {1}
     assert cycles["queued"].max() == 0
-    looked_at = np.array([answer.row.q_measured for answer in loop.seen if answer.row is not None])[-1]
+    looked_at = np.array([answer.measured for answer in loop.seen if answer.row is not None])[-1]
     age = np.flatnonzero(np.all(np.abs(cycles["q_rad"] - looked_at) < 1e-9, axis=1))
     assert len(cycles) - age[-1] <= 2 + turn_s / CYCLE_S  # the newest packet, not one of a queue
     assert np.abs(cycles["planned_rad_per_s"][-50:]).max() < 0.01

@@ -81,10 +81,9 @@ class Drifting(made.MadeController):
 def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messages: list[bytes]) -> None:
     verdict = _verdict(tmp_path, messages, Drifting)
     assert not verdict.identical
-    recorded = codec.decode_decision(messages[_at(messages, codec.DECISION, 19)]).row
-    assert recorded is not None
+    recorded = codec.decode_decision(messages[_at(messages, codec.DECISION, 19)])
     seconds = 20 * made.TICK_NS / 1e9
-    q = float(recorded[2])  # of q_measured, which this controller derives from q
+    q = float(recorded.measured[2])  # which this controller derives from q
     assert verdict.lines[0].startswith(f"tick 19 at {seconds:.3f} s: q_measured3: recorded {q!r}, again ")
     assert verdict.lines[0] != f"tick 19 at {seconds:.3f} s: q_measured3: recorded {q!r}, again {q!r}"
     assert verdict.lines[-1] == "identical until then: 20 ticks"
@@ -95,8 +94,8 @@ def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messa
     [
         (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * (DOF + 3), "rho_vel: recorded "),
         (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * (6 * DOF + 6), "pi_forearm_r: recorded "),
-        (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 17, "dq6: recorded "),
-        (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhH") + 1 + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
+        (codec.DECISION, 7, struct.calcsize("<cqqIIBHB") + 8 * 17, "dq6: recorded "),
+        (codec.DECISION, 7, struct.calcsize("<cqqIIBHB") + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
         (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
         (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 5), "radius of LLA: recorded 1.1, again 0.1"),
     ],

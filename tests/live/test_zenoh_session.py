@@ -114,7 +114,7 @@ def moves_only_while_seen(log: Path, stop_s: float) -> None:
             if PHASES[rows[-1].phase] in MOVING:
                 assert rows[-1].t_ns - max(captured.values()) <= FRESH_S * 1e9
     assert all(captured.values())  # both came through
-    told = [(PHASES[row.phase], codec.motion_row(row)) for row in rows]
+    told = [(PHASES[row.phase], row.row) for row in rows]
     braking = 0
     for (_, one), (phase, two) in pairwise(told):
         assert one is not None

@@ -23,7 +23,7 @@ from hrcreplay.robot.control.control_step import (
     stop_axis_by_axis,
 )
 from hrcreplay.robot.control.minimiser import SLACK, Problem
-from hrcreplay.robot.control.qp_controller import Target, problem, propose
+from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, RobotPose, irb140
 from hrcreplay.settings.load import load_settings
@@ -65,7 +65,7 @@ def step(
     with np.errstate(all="ignore"):
         sight = observe(robot, state, seen, settings.plan.clearance_m)
         wanted = standstill_reason(sight, settings) or propose(
-            robot, state, np.zeros(6), Target(T, twist, HOME), sight, seen, horizon_s, settings
+            QpContext(robot, state, np.zeros(6), Target(T, twist, HOME), sight, seen, horizon_s), settings
         )
         taken, _ = decide(robot, going, wanted, seen, horizon_s, NO_PLANES, settings)
     return make_step(sight, going, taken, horizon_s, DT_S)
@@ -132,7 +132,7 @@ def asked(
     robot: RobotModel, state: RobotState, T: Floats, twist: Floats, seen: Obstacles, settings: PlanSettings = SETTINGS
 ) -> Asked:
     sight = observe(robot, state, seen, 0.0)
-    task = problem(robot, state, np.zeros(6), Target(T, twist, HOME), sight, seen, STOP_S, settings)
+    task = problem(QpContext(robot, state, np.zeros(6), Target(T, twist, HOME), sight, seen, STOP_S), settings)
     return Asked(task, sight.pose, seen)
 
 

@@ -52,7 +52,7 @@ def violations(flight: Flight) -> list[str]:
     for answer in flight.answers:
         if answer.datagram is not None and answer.row is not None:
             try:
-                gate.check(answer.datagram, answer.row.q_measured, answer.t_ns)
+                gate.check(answer.datagram, answer.measured, answer.t_ns)
             except UnsafeCommandError as error:
                 found.append(f"withheld: {error}")
     return [*found, *_motion_after_stops(flight), *_unanswered(flight)]

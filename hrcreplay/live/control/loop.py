@@ -28,8 +28,9 @@ from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.live.control.session_controller import FAULT, REFUSED, SessionController
 from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Decision, MotionRow, Signal, TickEvent
+from hrcreplay.live.record.codec import Decision, Signal, TickEvent
 from hrcreplay.live.record.recorder import LOW
+from hrcreplay.records import MotionRow
 from hrcreplay.robot.control.control_step import BRAKING, Stop
 
 _BIN_NS = 5_000
@@ -410,8 +411,26 @@ def _record(
     u = (after - dq) / brake.cycle_s
     where = np.full(len(q), np.nan) if measured is None else np.radians(measured)[by_axis]
     unknown = np.full(3, np.nan)
-    row = MotionRow(where, q, dq, u, unknown, unknown, *[np.nan] * 7)
+    row = MotionRow(
+        q=q,
+        dq=dq,
+        u=u,
+        ref_m=unknown,
+        tcp_m=unknown,
+        tcp_speed=np.nan,
+        ref_speed=np.nan,
+        programme_s=np.nan,
+        distance_m=np.nan,
+        overlap_m=np.nan,
+        limb=-1,
+        link=-1,
+        status=BRAKING,
+        reason=FAULT,
+        horizon_s=np.nan,
+        tau_s=np.nan,
+        certified=False,
+    )
     phase = codec.HOLDING if brake.at_rest else codec.STOPPING
-    answer = Decision(t_ns, 0, data, phase, BRAKING, FAULT, -1, -1, row, None)
+    answer = Decision(t_ns, 0, data, phase, where, row, "", None)
     loop.recorder.send(codec.encode_decision(answer, Signal.NONE, len(datagrams), 0))
     loop.recorder.send(codec.encode_reply(t_ns, data, sent=sent))

@@ -18,10 +18,9 @@ from hrcreplay.egm.codec import BadPacket, Correction, RobotPacket, decode_robot
 from hrcreplay.egm.link import ALARMS, EgmSession, PacketStatus
 from hrcreplay.live.control.stages import ControlSetup, MotionState, MotionStep, Observer, brake, follow, start_approach
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Decision, MotionRow, Perception, Signal, TickEvent
+from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.records import Floats
-from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import RobotState, at_rest
+from hrcreplay.robot.control.control_step import RobotState, at_rest, motion_row
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.settings.sections import Live
 
@@ -124,6 +123,7 @@ class SessionController:
         self.observer = observer
         self._session = session
         self._still = np.zeros(setup.robot.nv)
+        self._reorders = not np.array_equal(setup.joint_order, np.arange(setup.robot.nv))
         self.perception: Perception | None = None
         self.phase = codec.WAITING
         self.stop = ""  #: why the robot was stopped; empty while it may move
@@ -194,7 +194,7 @@ class SessionController:
         look_ns = self.perception.t_ns if self.perception is not None else 0
         if packet is None:
             self._refuse(event.t_ns, packet_status)
-            return Decision(event.t_ns, look_ns, None, self.phase, control_step.BRAKING, self.stop, -1, -1, None, None)
+            return Decision(event.t_ns, look_ns, None, self.phase, np.empty(0), None, self.stop, None)
         measured = packet.q
         self._heard_ns = event.t_ns
         if packet_status.fresh or self._motion is None:
@@ -213,11 +213,10 @@ class SessionController:
         self._motion = replace(result.after, state=told, stop=stop)
         self._programme_s = result.after.programme_s
         self._settle()
-        step, row = result.step, _row(measured, before, result)
-        reason = (self.stop or self.waiting) if result.after.controller is None else control_step.REASONS[step.reason]
-        return Decision(
-            event.t_ns, look_ns, self._encoded(reply), phase, step.status, reason, step.limb, step.link, row, stop
-        )
+        reason = (self.stop or self.waiting) if result.after.controller is None else None
+        reference, programme_s = (result.reference_m, result.reference_speed), result.after.programme_s
+        row = motion_row(before.state, result.step, *reference, programme_s, reason)
+        return Decision(event.t_ns, look_ns, self._encoded(reply), phase, measured, row, "", stop)
 
     def _decoded(self, data: bytes) -> RobotPacket | None:
         """A packet, its joints in the order of the robot's axes; of another number of axes as it is."""
@@ -226,7 +225,7 @@ class SessionController:
         except BadPacket:
             return None
         order = self.setup.joint_order
-        if len(packet.q) != len(order):
+        if len(packet.q) != len(order) or not self._reorders:
             return packet
         by_axis = np.empty_like(packet.q)
         by_axis[order] = packet.q
@@ -234,6 +233,8 @@ class SessionController:
 
     def _encoded(self, reply: Correction) -> bytes:
         """A reply, its joints in the order of EGM."""
+        if not self._reorders:
+            return encode_correction(reply)
         order = self.setup.joint_order
         return encode_correction(replace(reply, q=reply.q[order], dq=reply.dq[order]))
 
@@ -352,22 +353,3 @@ class SessionController:
         if self.perception is None:
             return _UNSEEN
         return self.observer.around(self.perception, horizon_s, believed=not self._late)
-
-
-def _row(measured: Floats, before: MotionState, result: MotionStep) -> MotionRow:
-    pose, state = result.step.pose, before.state
-    return MotionRow(
-        q_measured=measured,
-        q=state.q,
-        dq=state.dq,
-        u=result.step.u,
-        ref_m=result.reference_m,
-        tcp_m=pose.T_world_tcp[:3, 3],
-        tcp_speed=pose.tcp_speed(state.dq),
-        ref_speed=result.reference_speed,
-        programme_s=result.after.programme_s,
-        distance_m=result.step.distance_m,
-        horizon_s=result.step.horizon_s,
-        tau_s=result.step.tau_s,
-        certified=float(result.step.certified),
-    )

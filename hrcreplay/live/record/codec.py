@@ -23,14 +23,14 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hrcreplay.logs import messages
-from hrcreplay.records import Floats, HumanStates, SweptVolumes
+from hrcreplay.records import STATUSES, Floats, HumanStates, MotionRow, SweptVolumes, number_names
 
 if TYPE_CHECKING:  # recorder and screen need nothing of the robot, whose imports take three quarters of their start
     from hrcreplay.robot.control.control_step import Stop
@@ -72,42 +72,6 @@ class TickEvent:
 
 
 @dataclass(frozen=True, slots=True)
-class MotionRow:
-    """The commanded motion of one answer. Angles in rad, positions in the world in m; recorded in this order."""
-
-    q_measured: Floats  #: (n,) where it said it was
-    q: Floats  #: (n,) commanded position at the tick
-    dq: Floats  #: (n,) commanded velocity at the tick
-    u: Floats  #: (n,) acceleration applied from the tick on
-    ref_m: Floats  #: (3,) programmed TCP position
-    tcp_m: Floats  #: (3,) TCP position at ``q``
-    tcp_speed: float  #: [m/s]
-    ref_speed: float  #: of the reference [m/s]
-    programme_s: float  #: programmed time [s]
-    distance_m: float  #: separation [m]
-    horizon_s: float  #: until when the volumes held that it was decided with [s]
-    tau_s: float  #: how long the stop from the velocity of the tick takes [s]
-    certified: float  #: 1 where the step, or the stop that it continues, has a certificate that still holds, else 0
-
-    def flat(self) -> Floats:
-        """(4 n + 13,) all numbers one after another."""
-        where = (self.tcp_speed, self.ref_speed, self.programme_s, self.distance_m)
-        numbers = (*where, self.horizon_s, self.tau_s, self.certified)
-        return np.concatenate((self.q_measured, self.q, self.dq, self.u, self.ref_m, self.tcp_m, numbers))
-
-    @classmethod
-    def of(cls, flat: Floats) -> MotionRow:
-        """The inverse of ``flat``."""
-        axes = (len(flat) - _OTHERS) // 4
-        q_measured, q, dq, u, ref_m, tcp_m, numbers = np.split(flat, np.cumsum((*(axes,) * 4, 3, 3)))
-        return cls(q_measured, q, dq, u, ref_m, tcp_m, *numbers.tolist())
-
-
-#: Numbers of a MotionRow beside the four of each axis.
-_OTHERS = 13
-
-
-@dataclass(frozen=True, slots=True)
 class Decision:
     """Decision of the controller on an event."""
 
@@ -115,12 +79,30 @@ class Decision:
     look_ns: int  #: of the perception update whose volumes it kept clear of
     datagram: bytes | None  #: reply to the robot; None where none is due
     phase: int  #: index into PHASES
-    status: int  #: index into records.STATUSES
-    reason: str  #: why it braked: of the controller or of the watchdog; empty where it did not
-    limb: int  #: of the nearest pair, index into the volumes' limbs; -1 without one
-    link: int  #: of the nearest pair; -1 without one
-    row: MotionRow | None  #: None where no reply was due
+    measured: Floats  #: (nv,) where the robot said it was [rad]; empty where no reply was due
+    row: MotionRow | None  #: the commanded motion; None where no reply was due
+    refusal: str  #: why no reply was due
     stop: Stop | None  #: what goes on after the reply if nobody decides any more; not recorded
+
+    @property
+    def status(self) -> int:
+        """Index into records.STATUSES."""
+        return STATUSES.index("braking") if self.row is None else self.row.status
+
+    @property
+    def reason(self) -> str:
+        """Why it braked, by the controller or by the watchdog; empty where it did not."""
+        return self.refusal if self.row is None else self.row.reason
+
+    @property
+    def limb(self) -> int:
+        """Index of the nearest pair's limb among the volumes; -1 without one."""
+        return -1 if self.row is None else self.row.limb
+
+    @property
+    def link(self) -> int:
+        """Index of the nearest pair's link; -1 without one."""
+        return -1 if self.row is None else self.row.link
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +122,7 @@ _HEAD = struct.Struct("<cq")
 _REPLY = struct.Struct("<cqB")
 _LOOK = struct.Struct("<cqHHHH")
 _VOLUMES = struct.Struct("<cqHId")
-_ANSWER = struct.Struct("<cqqIIBBhhH")
+_ANSWER = struct.Struct("<cqqIIBHB")
 _SILENCE = struct.Struct("<cqI")
 _DIGEST = 8
 _DIGESTS = 3  #: of a limb: of its bits, and of its numbers on the two grids
@@ -294,20 +276,31 @@ def decode_volumes(message: bytes, limbs: tuple[str, ...], method: str) -> tuple
 
 
 @dataclass(frozen=True, slots=True)
-class RecordedDecision:
+class RecordedDecision(Decision):
     """A decision as it is recorded; its reply is the REPLY message right after it, where one was due."""
 
-    t_ns: int
-    look_ns: int
     took_us: int  #: from the datagram's arrival to the reply's departure; not part of what must come out the same
     signals: Signal
-    phase: int
-    status: int
-    reason: str
-    limb: int
-    link: int
     datagrams: int  #: the ROBOT messages right before it
-    row: Floats | None  #: (4 n + 13,) of a MotionRow
+
+
+#: Fields of a MotionRow that are recorded as numbers: all but the text.
+_NUMBERS = tuple(name for name in MotionRow._fields if name != "reason")
+#: Those of them that are decisions.
+INTEGERS = ("limb", "link", "status")
+
+
+def numbers_of(found: Decision) -> Floats:
+    """All numbers of a decision's motion, measured joints first; empty without a motion."""
+    if found.row is None:
+        return np.empty(0)
+    return np.concatenate([found.measured, *(np.atleast_1d(getattr(found.row, name)) for name in _NUMBERS)])
+
+
+def number_names_of(axes: int) -> tuple[str, ...]:
+    """Names of ``numbers_of`` a robot of so many axes, as in motion.parquet."""
+    measured = (f"q_measured{axis}" for axis in range(1, axes + 1))
+    return (*measured, *(one for name in _NUMBERS for one in number_names(name, axes)))
 
 
 def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: int) -> bytes:
@@ -319,35 +312,34 @@ def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: i
         datagrams: Number of the robot's datagrams that the decision answers.
         took_us: From the first datagram's arrival to the reply's departure [us].
     """
-    numbers = b"" if found.row is None else found.row.flat().tobytes()
     head = _ANSWER.pack(
-        DECISION,
-        found.t_ns,
-        found.look_ns,
-        took_us,
-        signals,
-        found.phase,
-        found.status,
-        found.limb,
-        found.link,
-        datagrams,
+        DECISION, found.t_ns, found.look_ns, took_us, signals, found.phase, datagrams, len(found.measured)
     )
-    return b"".join([head, bytes([len(numbers) // 8]), numbers, found.reason.encode()])
+    return b"".join([head, numbers_of(found).tobytes(), found.reason.encode()])
 
 
 def decode_decision(message: bytes) -> RecordedDecision:
     """Decodes a decision."""
-    _, t_ns, look_ns, took_us, signals, phase, status, limb, link, datagrams = _ANSWER.unpack_from(message)
-    at = _ANSWER.size
-    numbers = message[at]
-    row = np.frombuffer(message, "<f8", numbers, at + 1) if numbers else None
-    reason = message[at + 1 + 8 * numbers :].decode()
-    return RecordedDecision(t_ns, look_ns, took_us, Signal(signals), phase, status, reason, limb, link, datagrams, row)
+    _, t_ns, look_ns, took_us, signals, phase, datagrams, axes = _ANSWER.unpack_from(message)
+    names = number_names_of(axes) if axes else ()
+    text_at = _ANSWER.size + 8 * len(names)
+    numbers, text = np.frombuffer(message, "<f8", len(names), _ANSWER.size), message[text_at:].decode()
+    found = RecordedDecision(
+        t_ns, look_ns, None, phase, numbers[:axes], None, text, None, took_us, Signal(signals), datagrams
+    )
+    return replace(found, row=_row(numbers[axes:], axes, text), refusal="") if axes else found
 
 
-def motion_row(answered: RecordedDecision) -> MotionRow | None:
-    """The commanded motion of a recorded decision; None without a reply."""
-    return None if answered.row is None else MotionRow.of(answered.row)
+def _row(numbers: Floats, axes: int, reason: str) -> MotionRow:
+    """The inverse of ``numbers_of``, the measured joints aside."""
+    values: dict[str, Any] = {"reason": reason}
+    at = 0
+    for name in _NUMBERS:
+        names = number_names(name, axes)
+        part = numbers[at : at + len(names)]
+        at += len(names)
+        values[name] = part if names != (name,) else int(part[0]) if name in INTEGERS else float(part[0])
+    return MotionRow(**values | {"certified": values["certified"] != 0.0})
 
 
 ROBOT_TOPIC = "/egm/robot"  #: datagrams of the robot, whatever is in them

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,14 @@ from hrcreplay.evaluation.contact import write_contact
 from hrcreplay.live import processes
 from hrcreplay.live.control.setup import run_config_of
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import PHASES, MotionRow
+from hrcreplay.live.record.codec import PHASES
 from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.logs.cleaning import PersonMemory
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.stages import store_volumes
-from hrcreplay.records import BODY, DOF, LENGTHS, POINTS, Floats, HumanStates, Motion
+from hrcreplay.records import BODY, DOF, LENGTHS, POINTS, HumanStates, Motion
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import Columns, measurement_columns, motion_columns, state_columns
 from hrcreplay.store.run_folder import RunWriter, TableWriter
@@ -127,23 +127,12 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
 
 
 def _motion(answers: list[codec.RecordedDecision], neighbours: tuple[str, ...], links: tuple[str, ...]) -> Columns:
-    rows = [row for answered in answers if (row := codec.motion_row(answered)) is not None]
-    column: dict[str, Floats] = {f.name: np.array([getattr(row, f.name) for row in rows]) for f in fields(MotionRow)}
-    reasons = ("", *sorted({answered.reason for answered in answers} - {""}))
-    motion = Motion(
-        t_ns=np.array([answered.t_ns for answered in answers]),
-        **{name: values for name, values in column.items() if name not in ("q_measured", "certified")},
-        certified=column["certified"] != 0.0,
-        overlap_m=np.full(len(rows), np.nan),  # not recorded; a report on the session's log has it
-        limb=np.array([answered.limb for answered in answers]),
-        link=np.array([answered.link for answered in answers]),
-        status=np.array([answered.status for answered in answers]),
-        reason=np.array([reasons.index(answered.reason) for answered in answers]),
-        limbs=neighbours,
-        links=links,
-        reasons=reasons,
-    )
-    measured = {f"q_measured{i + 1}": np.ascontiguousarray(q) for i, q in enumerate(column["q_measured"].T)}
+    rows = [answered.row for answered in answers if answered.row is not None]
+    t_ns = np.array([answered.t_ns for answered in answers])
+    reasons = ("", *sorted({row.reason for row in rows} - {""}))
+    motion = Motion.of_rows(t_ns, rows, limbs=neighbours, links=links, reasons=reasons)
+    joints = np.array([answered.measured for answered in answers])
+    measured = {f"q_measured{i + 1}": np.ascontiguousarray(q) for i, q in enumerate(joints.T)}
     phases = pa.array([PHASES[answered.phase] for answered in answers], type=pa.string())
     return {**motion_columns(motion), **measured, "phase": phases}
 

@@ -16,7 +16,7 @@ from hrcreplay.geometry.distances import distances
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import qp_controller
 from hrcreplay.robot.control.certificate import MARGIN_M
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Stop
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Proposals, Stop
 from hrcreplay.robot.control.controllers import (
     Controller,
     Observation,
@@ -58,7 +58,7 @@ class LinearRows(NamedTuple):
     names: tuple[dict[str, Any], ...]
 
 
-def propose_explained(controller: Controller, context: TickContext) -> tuple[list[Proposal] | int, dict[str, Any]]:
+def propose_explained(controller: Controller, context: TickContext) -> tuple[Proposals, dict[str, Any]]:
     """Proposals of a method at a tick, and the constraints that bound them.
 
     Args:
@@ -84,16 +84,16 @@ def propose_explained(controller: Controller, context: TickContext) -> tuple[lis
     return proposals, {}
 
 
-def _by_program(controller: QpController, seen: Observation) -> tuple[list[Proposal] | int, dict[str, Any]]:
+def _by_program(controller: QpController, seen: Observation) -> tuple[Proposals, dict[str, Any]]:
     """The proposals of Eq. (66), the rows that its solution lies on, or those that leave none."""
     settings = controller.settings
     with np.errstate(all="ignore"):
-        programme = controller.programme(seen)
-        proposals = qp_controller.propose(*programme, settings)
-        task = qp_controller.problem(*programme, settings)
+        qp = controller.qp_context(seen)
+        proposals = qp_controller.propose(qp, settings)
+        task = qp_controller.problem(qp, settings)
         solved = minimise(task)
         if not isinstance(solved, Solution) and settings.plan.jerk_s > 0.0:
-            task = qp_controller.problem(*programme, settings.without_jerk())
+            task = qp_controller.problem(qp, settings.without_jerk())
             solved = minimise(task)
     if isinstance(solved, Solution):
         return proposals, find_holding_rows(task, solved)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hrcreplay.kernels import njit
-from hrcreplay.records import Floats
+from hrcreplay.records import Floats, MotionRow
 from hrcreplay.robot.control.separation import Obstacles, Separation, separation
 from hrcreplay.robot.model import RobotModel, RobotPose
 from hrcreplay.robot.task import Grid, place
@@ -245,6 +245,10 @@ class Proposal(NamedTuple):
     status: int  #: index into ``records.STATUSES``
 
 
+#: Steps that a method would take, best first; or the index into REASONS of why there are none.
+Proposals = list[Proposal] | int
+
+
 @dataclass(frozen=True, slots=True)
 class Step:
     """Decision of the controller in one tick."""
@@ -324,6 +328,40 @@ def standstill_reason(sight: Sight, settings: PlanSettings) -> int:
     if sight.reason:
         return sight.reason
     return INSIDE if settings.certified and sight.overlap_m >= settings.retreat_m and sight.distance_m <= 0.0 else 0
+
+
+def motion_row(
+    state: RobotState, step: Step, ref_m: Floats, ref_speed: float, programme_s: float, reason: str | None = None
+) -> MotionRow:
+    """The row of a tick.
+
+    Args:
+        state: Of the robot at the tick.
+        step: What was decided.
+        ref_m: (3,) programmed TCP position, world [m].
+        ref_speed: Of the reference [m/s].
+        programme_s: Programmed time of the reference [s].
+        reason: Why it braked or stood, in place of the step's own reason.
+    """
+    return MotionRow(
+        q=state.q,
+        dq=state.dq,
+        u=step.u,
+        ref_m=ref_m,
+        tcp_m=step.pose.T_world_tcp[:3, 3],
+        tcp_speed=step.pose.tcp_speed(state.dq),
+        ref_speed=ref_speed,
+        programme_s=programme_s,
+        distance_m=step.distance_m,
+        overlap_m=step.overlap_m,
+        limb=step.limb,
+        link=step.link,
+        status=step.status,
+        reason=REASONS[step.reason] if reason is None else reason,
+        horizon_s=step.horizon_s,
+        tau_s=step.tau_s,
+        certified=step.certified,
+    )
 
 
 def make_step(sight: Sight, current_stop: Stop, taken: Taken, horizon_s: float, dt_s: float) -> Step:

@@ -10,24 +10,28 @@ from typing import NamedTuple
 import numpy as np
 
 from hrcreplay.geometry.vectors import norm_n
-from hrcreplay.records import Floats, Ints, Motion
-from hrcreplay.robot.control import control_step, path_controller, qp_controller
+from hrcreplay.records import Ints, Motion
+from hrcreplay.robot.control import path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
 from hrcreplay.robot.control.control_step import (
     NO_SOLUTION,
     NOT_FINITE,
+    REASONS,
     TOO_NEAR,
     PlanSettings,
     Proposal,
+    Proposals,
     RobotState,
     Sight,
     Step,
     Stop,
     at_rest,
     make_step,
+    motion_row,
     observe,
     standstill_reason,
 )
+from hrcreplay.robot.control.qp_controller import QpContext
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference, ReferencePoint, advance, tcp_speed_cap
@@ -104,7 +108,7 @@ class Controller(ABC):
         )
 
     @abstractmethod
-    def propose(self, seen: Observation) -> list[Proposal] | int:
+    def propose(self, seen: Observation) -> Proposals:
         """Proposals of the method, or the reason why there are none."""
 
     @abstractmethod
@@ -112,26 +116,22 @@ class Controller(ABC):
         """Takes over the reference of the tick that follows."""
 
 
-#: What ``qp_controller`` makes Eq. (66) of, but for the settings.
-Programme = tuple[RobotModel, RobotState, Floats, qp_controller.Target, Sight, Obstacles, float]
-
-
 class QpController(Controller):
     """The trajectory generator of Section 5 along a reference that waits for it or not."""
 
-    def propose(self, seen: Observation) -> list[Proposal] | int:
+    def propose(self, seen: Observation) -> Proposals:
         """The step that Eq. (66) finds best, and the stop after it."""
-        programme = self.programme(seen)
-        return standstill_reason(seen.sight, self.settings) or qp_controller.propose(*programme, self.settings)
+        context = self.qp_context(seen)
+        return standstill_reason(seen.sight, self.settings) or qp_controller.propose(context, self.settings)
 
-    def programme(self, seen: Observation) -> Programme:
+    def qp_context(self, seen: Observation) -> QpContext:
         """Input of Eq. (66). Its target is the reference one tick later, to which the reference moves on."""
         error_m = norm_n(seen.sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3])
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
         cap = tcp_speed_cap(self.reference, self.s_s, self.settings.plan)
         target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q, cap)
-        return self.robot, self.state, self.u, target, seen.sight, seen.obstacles, seen.horizon_s
+        return QpContext(self.robot, self.state, self.u, target, seen.sight, seen.obstacles, seen.horizon_s)
 
     def _move_on(self) -> None:
         """The reference has moved already: the program is solved for where it will be."""
@@ -143,7 +143,7 @@ class PathController(Controller):
     #: Whether the method looks at people at all, and whether the rows of Eq. (66i) bound its rate.
     careful, by_rows = True, False
 
-    def propose(self, seen: Observation) -> list[Proposal] | int:
+    def propose(self, seen: Observation) -> Proposals:
         """The largest rate along the path that is allowed, and the stop after it."""
         sight = seen.sight
         reason = standstill_reason(sight, self.settings) if self.careful else 0
@@ -179,7 +179,7 @@ class BlindController(PathController):
 class SsmController(PathController):
     """Speed and separation monitoring, ISO/TS 15066: goes while the protective separation distance is kept."""
 
-    def propose(self, seen: Observation) -> list[Proposal] | int:
+    def propose(self, seen: Observation) -> Proposals:
         """The same, while the protective separation distance is kept."""
         proposals = super().propose(seen)
         if isinstance(proposals, int):
@@ -221,29 +221,10 @@ class Planner:
     def follow(self, t_ns: Ints, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
         """The motion of a batch of ticks, beside what is predicted for each; ``limbs`` names all that can be there."""
         robot = self.controller.robot
-        rows = [self.controller.step(predict) for predict in around]
-        found, points, steps = ([getattr(row, name) for row in rows] for name in ("state", "point", "step"))
-        poses = [step.pose for step in steps]
-        return Motion(
-            t_ns=t_ns,
-            q=np.array([state.q for state in found]),
-            dq=np.array([state.dq for state in found]),
-            u=np.array([step.u for step in steps]),
-            ref_m=np.array([point.T_world_tcp[:3, 3] for point in points]),
-            tcp_m=np.array([pose.T_world_tcp[:3, 3] for pose in poses]),
-            tcp_speed=np.array([pose.tcp_speed(state.dq) for pose, state in zip(poses, found, strict=True)]),
-            ref_speed=np.array([point.tcp_speed for point in points]),
-            programme_s=np.array([row.programme_s for row in rows]),
-            distance_m=np.array([step.distance_m for step in steps]),
-            overlap_m=np.array([step.overlap_m for step in steps]),
-            limb=np.array([step.limb for step in steps]),
-            link=np.array([step.link for step in steps]),
-            status=np.array([step.status for step in steps]),
-            reason=np.array([step.reason for step in steps]),
-            horizon_s=np.array([step.horizon_s for step in steps]),
-            tau_s=np.array([step.tau_s for step in steps]),
-            certified=np.array([step.certified for step in steps]),
-            limbs=limbs,
-            links=tuple(segment.name for segment in robot.segments),
-            reasons=control_step.REASONS,
-        )
+        ticks = [self.controller.step(predict) for predict in around]
+        rows = [
+            motion_row(tick.state, tick.step, tick.point.T_world_tcp[:3, 3], tick.point.tcp_speed, tick.programme_s)
+            for tick in ticks
+        ]
+        links = tuple(segment.name for segment in robot.segments)
+        return Motion.of_rows(t_ns, rows, limbs=limbs, links=links, reasons=REASONS)

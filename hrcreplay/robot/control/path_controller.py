@@ -18,7 +18,7 @@ from hrcreplay.geometry.small_matrices import apply
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Sight, Stop, stop_along_path
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Proposals, Sight, Stop, stop_along_path
 from hrcreplay.robot.control.qp_controller import cartesian_bounds
 from hrcreplay.robot.control.separation import Obstacles, tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, RobotPose
@@ -50,7 +50,7 @@ def propose(
     obstacles: Obstacles | None,
     horizon_s: float,
     settings: PlanSettings,
-) -> list[Proposal] | int:
+) -> Proposals:
     """One tick: the largest rate in [0, 1] that meets the limits of the robot and, where asked for, Eq. (66i).
 
     The robot is where the path is, to the last bit: position and velocity one tick later are those of the path, and

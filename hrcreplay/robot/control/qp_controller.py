@@ -26,6 +26,7 @@ from hrcreplay.robot.control.certificate import RETREAT_SPEED
 from hrcreplay.robot.control.control_step import (
     PlanSettings,
     Proposal,
+    Proposals,
     RobotState,
     Sight,
     stop_axis_by_axis,
@@ -136,6 +137,18 @@ class Target(NamedTuple):
     tcp_speed_max: float = math.inf  #: on the way there, however far it is [m/s]
 
 
+class QpContext(NamedTuple):
+    """Input of Eq. (66) at one tick, the settings aside."""
+
+    robot: RobotModel
+    state: RobotState  #: at the tick
+    u_before: Floats  #: (nv,) acceleration of the tick before [rad/s^2]
+    target: Target  #: the reference one tick later
+    sight: Sight  #: the robot's pose, and its distances from people
+    obstacles: Obstacles  #: the swept volumes of the tick
+    horizon_s: float  #: until when they hold [s]
+
+
 def pose_error(T_world_tcp: Floats, T_world_ref: Floats) -> Floats:
     """(6,) from the reference to the TCP: way [m], then rotation vector in the world [rad]."""
     turn = turn_between(T_world_ref, T_world_tcp)
@@ -216,16 +229,7 @@ def with_posture(H: Floats, g: Floats, away: Floats, weight: float) -> tuple[Flo
     return H + weight * mean * np.eye(len(g)), g + weight * mean * away
 
 
-def problem(
-    robot: RobotModel,
-    state: RobotState,
-    u_before: Floats,
-    target: Target,
-    sight: Sight,
-    obstacles: Obstacles,
-    horizon_s: float,
-    settings: PlanSettings,
-) -> Problem:
+def problem(context: QpContext, settings: PlanSettings) -> Problem:
     """Eq. (66) at one instant; building it is separate from solving it.
 
     Beside what is printed the posture counts a little (`with_posture`), the TCP keeps the programme's speed limit
@@ -235,15 +239,10 @@ def problem(
     next tick's velocity (`dq_after`).
 
     Args:
-        robot: The manipulator.
-        state: At the tick.
-        u_before: (nv,) acceleration of the tick before [rad/s^2].
-        target: The reference one tick later.
-        sight: The robot's pose, and its distances from people.
-        obstacles: The swept volumes of the tick.
-        horizon_s: Until when they hold [s].
+        context: Robot, reference and people of the tick.
         settings: Weights and limits.
     """
+    robot, state, u_before, target, sight, obstacles, horizon_s = context
     plan, dt_s, pose = settings.plan, settings.dt_s, sight.pose
     J, dJdq = pose.J_tcp, pose.dJdq_tcp
     error = pose_error(pose.T_world_tcp, target.T_world_tcp)
@@ -389,33 +388,18 @@ def smooth_bounds(low: Floats, high: Floats, steady: Floats, change: Floats) -> 
     return near_low, near_high
 
 
-def propose(
-    robot: RobotModel,
-    state: RobotState,
-    u_before: Floats,
-    target: Target,
-    sight: Sight,
-    obstacles: Obstacles,
-    horizon_s: float,
-    settings: PlanSettings,
-) -> list[Proposal] | int:
+def propose(context: QpContext, settings: PlanSettings) -> Proposals:
     """One tick of Section 5: the step that Eq. (66) finds best, and the stop after it; a reason where there is none.
 
     Args:
-        robot: The manipulator.
-        state: At the tick.
-        u_before: (nv,) acceleration of the tick before [rad/s^2].
-        target: The reference one tick later.
-        sight: The robot's pose, and its distances from people.
-        obstacles: The swept volumes of the tick.
-        horizon_s: Until when they hold [s].
+        context: Robot, reference and people of the tick.
         settings: Weights and limits.
     """
-    task = problem(robot, state, u_before, target, sight, obstacles, horizon_s, settings)
+    robot, state, target, sight = context.robot, context.state, context.target, context.sight
+    task = problem(context, settings)
     found = minimise(task)
     if not isinstance(found, Solution) and settings.plan.jerk_s > 0.0:  # a limit may ask for a sudden change
-        calm = settings.without_jerk()
-        found = minimise(problem(robot, state, u_before, target, sight, obstacles, horizon_s, calm))
+        found = minimise(problem(context, settings.without_jerk()))
     if not isinstance(found, Solution):
         if found.status == "not finite":
             return control_step.NOT_FINITE

@@ -32,9 +32,7 @@ def moved(flight: Flight, after: int = 0) -> bool:
 def test_it_echoes_then_approaches_then_follows_without_a_jump() -> None:
     flight = Flight().fly(12.0)
     first = flight.said()[0]
-    measured = flight.answers[0].row
-    assert measured is not None
-    assert_allclose(first.q, measured.q_measured, atol=1e-12)
+    assert_allclose(first.q, flight.answers[0].measured, atol=1e-12)
     assert_array_equal(first.dq, 0.0)
     assert flight.phases()[0] == "echo"
     assert flight.phases()[-2:] == ["approach", "following"]

@@ -95,11 +95,14 @@ def test_motions_are_those_of_the_session(run: Path, flight: Flight) -> None:
     table = pd.read_parquet(run / "motion.parquet")
     rows = [(answer, answer.row) for answer in flight.answers if answer.row is not None]
     assert len(table) == len(rows)
-    for column in ("q_measured", "q", "dq", "u"):
+    measured = [answer.measured for answer, _ in rows]
+    np.testing.assert_array_equal(table[[f"q_measured{i}" for i in range(1, 7)]], measured)
+    for column in ("q", "dq", "u"):
         wanted = np.array([getattr(row, column) for _, row in rows])
         np.testing.assert_array_equal(table[[f"{column}{i}" for i in range(1, 7)]], wanted)
     np.testing.assert_array_equal(table[["tcp_x", "tcp_y", "tcp_z"]], [row.tcp_m for _, row in rows])
     np.testing.assert_array_equal(table["distance_m"], [row.distance_m for _, row in rows])
+    np.testing.assert_array_equal(table["overlap_m"], [row.overlap_m for _, row in rows])
     assert table["phase"].tolist() == [PHASES[answer.phase] for answer, _ in rows]
     assert table["status"].tolist() == [STATUSES[answer.status] for answer, _ in rows]
     assert table["reason"].tolist() == [answer.reason for answer, _ in rows]

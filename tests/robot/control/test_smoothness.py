@@ -10,7 +10,7 @@ import pytest
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.control_step import PlanSettings, RobotState, observe, stop_axis_by_axis
 from hrcreplay.robot.control.minimiser import Solution, minimise
-from hrcreplay.robot.control.qp_controller import Target, propose
+from hrcreplay.robot.control.qp_controller import QpContext, Target, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from tests.robot.people import cloud, volumes
@@ -37,7 +37,7 @@ def next_velocity(
 ) -> Floats:
     """(6,) that is proposed [rad/s]."""
     sight = observe(robot, state, around, 0.0)
-    found = propose(robot, state, u_before, Target(*reference, HOME), sight, around, STOP_S, settings)
+    found = propose(QpContext(robot, state, u_before, Target(*reference, HOME), sight, around, STOP_S), settings)
     assert not isinstance(found, int)
     return found[0].stop.dq[0]
 

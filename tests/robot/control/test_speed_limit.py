@@ -18,7 +18,7 @@ from hrcreplay.robot.control.control_step import (
     stop_straight,
 )
 from hrcreplay.robot.control.minimiser import Solution, minimise
-from hrcreplay.robot.control.qp_controller import Target, problem, propose
+from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, propose
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.path import approach, smooth_recorded
@@ -68,7 +68,9 @@ def test_a_step_from_within_the_limit_ends_within_it(robot: RobotModel, changes:
         people = [cloud(rng, 20, np.full(3, 0.1)) + 0.7 * rng.normal(size=3) for _ in range(2)]
         around = NOBODY if rng.random() < 0.5 else obstacles(volumes(people), 0)
         sight = observe(robot, state, around, 0.0)
-        found = propose(robot, state, np.zeros(6), far_ahead(robot, state, rng, cap), sight, around, STOP_S, settings)
+        found = propose(
+            QpContext(robot, state, np.zeros(6), far_ahead(robot, state, rng, cap), sight, around, STOP_S), settings
+        )
         if isinstance(found, int):
             continue
         for stop, _ in found:
@@ -87,7 +89,7 @@ def test_a_robot_that_is_too_fast_slows_down_to_the_limit(robot: RobotModel) -> 
     speeds = [speed(state.q, state.dq)]
     for _ in range(120):
         sight = observe(robot, state, NOBODY, 0.0)
-        found = propose(robot, state, u, target, sight, NOBODY, STOP_S, SETTINGS)
+        found = propose(QpContext(robot, state, u, target, sight, NOBODY, STOP_S), SETTINGS)
         assert not isinstance(found, int)
         after = RobotState(found[0].stop.q[0], found[0].stop.dq[0])
         assert (np.abs(after.dq - state.dq) <= robot.ddq_max * DT_S * (1 + 1e-9)).all()
@@ -106,7 +108,9 @@ def test_the_limit_is_never_in_the_way_of_braking(robot: RobotModel) -> None:
         state = RobotState(state.q, np.clip(state.dq, -robot.dq_max, robot.dq_max))
         sight, target = observe(robot, state, NOBODY, 0.0), far_ahead(robot, state, rng, 1e-3)
         solved = [
-            isinstance(minimise(problem(robot, state, np.zeros(6), goal, sight, NOBODY, STOP_S, settings)), Solution)
+            isinstance(
+                minimise(problem(QpContext(robot, state, np.zeros(6), goal, sight, NOBODY, STOP_S), settings)), Solution
+            )
             for goal in (target, target._replace(tcp_speed_max=np.inf))
         ]
         assert solved[0] == solved[1]
@@ -118,7 +122,9 @@ def test_the_row_is_there_only_where_there_is_a_limit(robot: RobotModel) -> None
     state = RobotState(HOME, np.full(6, 0.1))
     sight, T = observe(robot, state, NOBODY, 0.0), robot.pose(HOME, np.zeros(6)).T_world_tcp
     free, bound = (
-        problem(robot, state, np.zeros(6), Target(T, np.zeros(6), HOME, cap), sight, NOBODY, STOP_S, SETTINGS).limits
+        problem(
+            QpContext(robot, state, np.zeros(6), Target(T, np.zeros(6), HOME, cap), sight, NOBODY, STOP_S), SETTINGS
+        ).limits
         for cap in (np.inf, 0.2)
     )
     assert (len(free.J), len(bound.J)) == (6, 7)
