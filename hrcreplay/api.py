@@ -228,11 +228,9 @@ class Volumes:
     def __getitem__(self, tick: int) -> dict[str, InflatedHull]:
         """Limb -> its volume at a tick. One that cannot be predicted has one vertex, of NaN: it may be anywhere."""
         found = {}
-        for i, limb in enumerate(self.volumes.limbs):
-            vertices, radius_m = self.volumes.vertices(tick, i), float(self.volumes.radius_m[tick, i])
-            known = bool(np.isfinite(vertices).all())
-            nothing = InflatedHull(vertices, np.zeros((0, 3), np.int64), radius_m)
-            found[limb] = InflatedHull.around(vertices, radius_m) if known else nothing
+        for limb, volume in self.volumes.at(tick).items():
+            nothing = InflatedHull(volume.vertices_m, np.zeros((0, 3), np.int64), volume.radius_m)
+            found[limb] = InflatedHull.around(*volume) if volume.known else nothing
         return found
 
     def to_pandas(self) -> pd.DataFrame:

@@ -195,6 +195,18 @@ class HumanStates(Table):
     nobody_else_s: Floats | None = None  #: the same without anybody but the person; inf before the first time [s]
 
 
+class SweptVolume(NamedTuple):
+    """Reachable space of one limb at one tick: the convex hull of its vertices + a ball."""
+
+    vertices_m: Floats  #: (m, 3) world [m]
+    radius_m: float  #: of the ball, Eq. (41) [m]
+
+    @property
+    def known(self) -> bool:
+        """Return whether all its numbers are finite, so that the limb could be predicted."""
+        return bool(np.isfinite(self.vertices_m).all() and np.isfinite(self.radius_m))
+
+
 @dataclass(frozen=True)
 class SweptVolumes:
     """Reachable space within the horizon: per tick and limb the convex hull of ``vertices`` + a ball.
@@ -220,6 +232,13 @@ class SweptVolumes:
         """(m, 3) vertices of one limb at one tick, world [m]."""
         first = tick * len(self.limbs) + limb
         return self.vertices_m[self.offsets[first] : self.offsets[first + 1]]
+
+    def at(self, tick: int) -> dict[str, SweptVolume]:
+        """Limb -> its volume at one tick, known or not."""
+        return {
+            limb: SweptVolume(self.vertices(tick, i), float(self.radius_m[tick, i]))
+            for i, limb in enumerate(self.limbs)
+        }
 
 
 #: What a tick of the plan was: free tracking, held by a safety constraint or a limit, a stop, or a way out of a volume.

@@ -28,7 +28,7 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
-from hrcreplay.pipeline.stages import NS, ProgressBar, tick_times
+from hrcreplay.pipeline.stages import NS, ProgressBar, span_ns, tick_times
 from hrcreplay.records import JOINTS, LIMBS, Floats
 from hrcreplay.version import __version__
 
@@ -200,13 +200,7 @@ def _horizon_s(run_configs: Sequence[RunConfig]) -> float:
 
 def _sample(run_config: RunConfig, horizon_s: float, held_back: float, limbs: bool) -> FitSample:
     log = open_log(run_config.log, run_config.settings.logs)
-    first_ns = log.header.start_ns
-    begin_ns = first_ns + round((run_config.start_s or 0.0) * NS)
-    end_ns = (
-        log.header.end_ns
-        if run_config.end_s is None
-        else min(log.header.end_ns, first_ns + round(run_config.end_s * NS))
-    )
+    begin_ns, end_ns = span_ns(run_config, log)
     cut_ns = end_ns - round(held_back * (end_ns - begin_ns))
     if min(cut_ns - begin_ns, end_ns - cut_ns) / NS <= horizon_s:
         raise LogError(

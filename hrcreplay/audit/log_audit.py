@@ -29,7 +29,7 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.pipeline.stages import NS, ProgressBar, tick_times
+from hrcreplay.pipeline.stages import NS, ProgressBar, span_ns, tick_times
 from hrcreplay.records import DOF, JOINTS, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.reporting.metrics.series import ANGLES, difference
 from hrcreplay.store.run_folder import Stopwatch
@@ -162,9 +162,7 @@ def audit_log(run_config: RunConfig, name: str, watch: Stopwatch) -> LogAudit:
     log = open_log(run_config.log, run_config.settings.logs)
     prediction_stage = assembly.prediction_stage(run_config)
     horizon_s = standstill_s(prediction_stage)
-    first_ns, last_ns = log.header.start_ns, log.header.end_ns
-    begin_ns = first_ns + round((run_config.start_s or 0.0) * NS)
-    end_ns = last_ns if run_config.end_s is None else min(last_ns, first_ns + round(run_config.end_s * NS))
+    begin_ns, end_ns = span_ns(run_config, log)
     if (end_ns - begin_ns) / NS <= horizon_s:
         raise LogError(
             f"{run_config.log}: found {max(0.0, (end_ns - begin_ns) / NS):.2f} s; an audit needs more than the horizon "

@@ -27,8 +27,7 @@ from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints
-from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolume
 from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter
@@ -46,7 +45,7 @@ VOLUME_OF = (
 _BODY_HZ = 25.0
 
 #: Limb -> vertices (m, 3) and radius of the volume around them [m].
-Volumes = Mapping[str, tuple[Floats, float]]
+Volumes = Mapping[str, SweptVolume]
 
 
 def read_recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> RecordedPeople:
@@ -302,16 +301,7 @@ class Predicted:
         if row < 0:
             return {}
         volumes = self.stage.volumes(self.all_states.rows(slice(row, row + 1)), horizon_s)
-        return solids(obstacles(volumes, 0), volumes.limbs)
-
-
-def solids(around: Obstacles, limbs: tuple[str, ...]) -> Volumes:
-    """Limb -> vertices and radius, of those of one tick that are known."""
-    found = {
-        limb: (around.vertices_m[around.offsets[i] : around.offsets[i + 1]], float(around.radius_m[i]))
-        for i, limb in enumerate(limbs)
-    }
-    return {limb: solid for limb, solid in found.items() if np.isfinite(solid[0]).all() and np.isfinite(solid[1])}
+        return {limb: volume for limb, volume in volumes.at(0).items() if volume.known}
 
 
 def by_volume(

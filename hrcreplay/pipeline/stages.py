@@ -115,13 +115,28 @@ def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
     return ticks[ticks <= end_ns]
 
 
+def span_ns(run_config: RunConfig, log: Log) -> tuple[int, int]:
+    """Begin and end of a run, as the command line and the log have them; the end may be before the begin [ns]."""
+    first, last = log.header.start_ns, log.header.end_ns
+    end_ns = last if run_config.end_s is None else min(last, first + round(run_config.end_s * NS))
+    return first + round((run_config.start_s or 0.0) * NS), end_ns
+
+
 def span_ticks(run_config: RunConfig, log: Log) -> Ints:
-    """(n,) ticks of a run [ns]."""
+    """(n,) ticks of a run [ns].
+
+    Args:
+        run_config: The run.
+        log: Its log.
+
+    Raises:
+        LogError: The log holds a single instant.
+        SettingsError: Nothing of the log is between begin and end.
+    """
     first, last = log.header.start_ns, log.header.end_ns
     if first == last:
         raise LogError(f"{run_config.log}: holds a single instant; would be right: two frames or more")
-    start_ns = first + round((run_config.start_s or 0.0) * NS)
-    end_ns = last if run_config.end_s is None else min(last, first + round(run_config.end_s * NS))
+    start_ns, end_ns = span_ns(run_config, log)
     if not first <= start_ns < end_ns:
         option = (
             f"--start {run_config.start_s:g}" if run_config.start_s is not None else f"--end {run_config.end_s or 0:g}"

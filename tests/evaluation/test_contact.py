@@ -16,7 +16,7 @@ from hrcreplay.evaluation.contact import VOLUME_OF, Volumes
 from hrcreplay.evaluation.recorded_person import BodyTrack, from_states
 from hrcreplay.human.model import PARTS
 from hrcreplay.logs import reader
-from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates
+from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, SweptVolume
 from hrcreplay.robot.model import RobotModel, from_urdf
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
@@ -154,7 +154,7 @@ class Known:
     """Volumes of any tick: a ball around one point."""
 
     def __init__(self, centre_m: Floats, radius_m: float) -> None:
-        self.solid = {"LRA": (centre_m + 1e-3 * np.vstack([np.zeros(3), np.eye(3)]), radius_m)}
+        self.solid = {"LRA": SweptVolume(centre_m + 1e-3 * np.vstack([np.zeros(3), np.eye(3)]), radius_m)}
         self.asked: list[tuple[int, float]] = []
 
     def volumes(self, t_ns: int, horizon_s: float) -> Volumes:

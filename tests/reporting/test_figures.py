@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from hrcreplay.commands.report import compute
+from hrcreplay.records import SweptVolume
 from hrcreplay.reporting.figures import catalogue, planning, prediction
 from hrcreplay.reporting.figures.catalogue import FIGURES, FigureData
 from hrcreplay.reporting.figures.prediction import Growth, Sweep, Walk
@@ -33,7 +34,10 @@ def data_of(run: Run, *, predicted: bool = True) -> FigureData:
         (
             int(k),
             {
-                m: {limb: (vertices, RADII_M[limb]) for limb, vertices in volumes_at((k - T0_NS) * 1e-9, s).items()}
+                m: {
+                    limb: SweptVolume(vertices, RADII_M[limb])
+                    for limb, vertices in volumes_at((k - T0_NS) * 1e-9, s).items()
+                }
                 for m, s in (("paper", 0.05), ("positions", 0.15))
             },
         )
@@ -86,8 +90,8 @@ def test_a_person_never_seen_and_a_robot_that_never_moved(tmp_path: Path) -> Non
 def test_volumes_show_every_method_and_limb_in_its_own_size() -> None:
     run = make_run(5.0)
     assert run.state is not None
-    limbs = {limb: (vertices, 0.1) for limb, vertices in volumes_at(2.0, 0.05).items()}
-    tall = limbs | {"LEGS": (np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), 0.5)}
+    limbs = {limb: SweptVolume(vertices, 0.1) for limb, vertices in volumes_at(2.0, 0.05).items()}
+    tall = limbs | {"LEGS": SweptVolume(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), 0.5)}
     k = T0_NS + 2_000_000_000
     plain = prediction.volumes([(k, {"paper": limbs})], run.state, T0_NS)
     assert "LEGS" not in {text.get_text() for text in plain.legends[0].get_texts()}

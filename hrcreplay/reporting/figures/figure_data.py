@@ -52,7 +52,7 @@ def volumes_by_method(run_config: RunConfig, run: Run, people: HumanStates) -> l
     methods = dict.fromkeys(("paper", "positions", stage.method))
     by_method = {method: stage.volumes(states, method=method) for method in methods}
     return [
-        (int(t), {method: _hulls(volumes, row) for method, volumes in by_method.items()})
+        (int(t), {method: volumes.at(row) for method, volumes in by_method.items()})
         for row, t in enumerate(states.t_ns)
     ]
 
@@ -135,7 +135,7 @@ def volume_growth(run_config: RunConfig, run: Run, people: HumanStates) -> Growt
 
 
 def _sum_m3(volumes: SweptVolumes) -> float:
-    hulls = _hulls(volumes, 0)
+    hulls = volumes.at(0)
     if not all(np.isfinite(hulls[limb][0]).all() for limb in LIMBS):
         return float("nan")
     return sum(InflatedHull.around(*hulls[limb]).volume_above_m3(FLOOR_Z_M) for limb in LIMBS)
@@ -194,14 +194,14 @@ def nearest_pose(run_config: RunConfig, run: Run, people: HumanStates) -> LinkPo
         return None
     states = _at(people, int(row["t_ns"]))
     horizon_s = float(row["horizon_s"]) if "horizon_s" in row else None
-    hulls = _hulls(assembly.prediction_stage(run_config).volumes(states, horizon_s), 0) if len(states) else {}
+    hulls = assembly.prediction_stage(run_config).volumes(states, horizon_s).at(0) if len(states) else {}
     return LinkPose(
         t_ns=int(row["t_ns"]),
         distance_m=float(row["distance_m"]),
         bodies=tuple(segment.body for segment in robot.segments),
         ends_m=robot.ends_m(q),
         radius_m=np.array([segment.radius_m for segment in robot.segments]),
-        volumes={limb: (points, radius) for limb, (points, radius) in hulls.items() if np.isfinite(points).all()},
+        volumes={limb: volume for limb, volume in hulls.items() if volume.known},
     )
 
 
@@ -246,7 +246,3 @@ def _states(run_config: RunConfig, run: Run) -> HumanStates | None:
 
 def _at(people: HumanStates, wanted_ns: Ints | int) -> HumanStates:
     return people.rows(np.isin(people.t_ns, wanted_ns))
-
-
-def _hulls(volumes: SweptVolumes, row: int) -> dict[str, tuple[Floats, float]]:
-    return {limb: (volumes.vertices(row, i), float(volumes.radius_m[row, i])) for i, limb in enumerate(volumes.limbs)}

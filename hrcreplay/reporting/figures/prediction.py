@@ -17,14 +17,14 @@ from matplotlib.ticker import LogLocator
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats
+from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats, SweptVolume
 from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.scene import ABOVE, View, bones, bounds_of, draw_solids, view_from, volume_solids
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import columns, times
 
-#: Limb -> (m, 3) vertices, world, and radius [m].
-Limbs = Mapping[str, tuple[Floats, float]]
+#: Limb -> its volume.
+Limbs = Mapping[str, SweptVolume]
 #: One instant of Fig. 17: t_ns, and the swept volumes of each method.
 Instant = tuple[int, Mapping[str, Limbs]]
 
@@ -175,7 +175,7 @@ def stored_at(occupancy: pd.DataFrame, t_ns: int) -> tuple[pd.DataFrame, Limbs]:
     at_ns = stored[max(0, int(np.searchsorted(stored, t_ns, side="right")) - 1)]
     rows = occupancy[times(occupancy) == at_ns]
     limbs = {
-        str(limb): (np.asarray(vertices, dtype=float).reshape(-1, 3), float(radius))
+        str(limb): SweptVolume(np.asarray(vertices, dtype=float).reshape(-1, 3), float(radius))
         for limb, vertices, radius in zip(rows["limb"], rows["vertices"], rows["radius_m"], strict=True)
     }
     return rows, limbs

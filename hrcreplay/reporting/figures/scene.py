@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.geometry.convex_hull import above, hull, visible_front
 from hrcreplay.geometry.small_matrices import apply, multiply
-from hrcreplay.records import FLOOR_Z_M, POINTS, Floats, Ints
+from hrcreplay.records import FLOOR_Z_M, POINTS, Floats, Ints, SweptVolume
 from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.drawing import figure_in
 from hrcreplay.reporting.metrics.series import thin_path
@@ -164,8 +164,8 @@ def draw_solids(
     ax.add_collection(polygons, autolim=False)
 
 
-def volume_solids(limbs: Mapping[str, tuple[Floats, float]], moved_m: Floats | None = None) -> list[RenderedHull]:
-    """Swept volumes in the colours of their limbs, above the floor: limb -> (m, 3) vertices, world, and radius [m].
+def volume_solids(limbs: Mapping[str, SweptVolume], moved_m: Floats | None = None) -> list[RenderedHull]:
+    """Swept volumes in the colours of their limbs, above the floor.
 
     Args:
         limbs: What to draw.
@@ -178,8 +178,8 @@ def volume_solids(limbs: Mapping[str, tuple[Floats, float]], moved_m: Floats | N
     ]
 
 
-def draw_outlines(ax: Axes, limbs: Mapping[str, tuple[Floats, float]], view: View) -> None:
-    """Swept volumes in pale colour behind all else: limb -> (m, 3) vertices, world, and radius [m]."""
+def draw_outlines(ax: Axes, limbs: Mapping[str, SweptVolume], view: View) -> None:
+    """Swept volumes in pale colour behind all else."""
     edges = [(solid.colour, solid.outline(view)) for solid in volume_solids(limbs)]
     colours = [colour for colour, edge in edges if len(edge)]
     for look in ({"facecolors": colours, "alpha": 0.15, "linewidths": 0.0}, {"edgecolors": colours, "alpha": 0.8}):
@@ -225,7 +225,7 @@ class LinkPose:
     bodies: tuple[str, ...]  #: link that each of the s capsules belongs to
     ends_m: Floats  #: (s, 2, 3) world [m]
     radius_m: Floats  #: (s,) [m]
-    volumes: Mapping[str, tuple[Floats, float]]  #: limb -> (m, 3) vertices, world, and radius [m]
+    volumes: Mapping[str, SweptVolume]  #: by limb
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ class StoryScene:
     ends_m: tuple[Floats, Floats]  #: (s, 2, 3) each: capsules of the links, world
     tcp_m: tuple[Floats, Floats]  #: (n, 3) each: way of the TCP until then, world
     points_m: Floats  #: (20, 3) the fused person
-    volumes: Mapping[str, tuple[Floats, float]]  #: limb -> (m, 3) vertices, world, and radius; of the person
+    volumes: Mapping[str, SweptVolume]  #: of the person, by limb
 
 
 @dataclass(frozen=True)

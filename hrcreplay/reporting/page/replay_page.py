@@ -25,7 +25,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
-from hrcreplay.records import Floats, Ints
+from hrcreplay.records import Floats, Ints, SweptVolume
 from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.drawing import BONES
 from hrcreplay.reporting.figures.scene import RenderedHull, render_hulls, view_from, volume_solids
@@ -341,14 +341,14 @@ def _words(track: MethodTrack, row: int) -> str:
     return ", ".join(words) + reason
 
 
-def _stored(scene: ReplayScene, row: int) -> dict[str, tuple[Floats, float]]:
-    """The volumes stored last before an instant, not more than a fifth of a second: limb -> vertices and radius [m]."""
+def _stored(scene: ReplayScene, row: int) -> dict[str, SweptVolume]:
+    """The volumes stored last before an instant, not more than a fifth of a second, by limb."""
     stored, now_ns = scene.volumes, int(scene.t_ns[row])
     before = stored.t_ns[(stored.t_ns <= now_ns) & (stored.t_ns >= now_ns - 200_000_000)]
     if not len(before):
         return {}
     return {
-        stored.limbs[stored.limb[k]]: (
+        stored.limbs[stored.limb[k]]: SweptVolume(
             stored.vertices_m[stored.offsets[k] : stored.offsets[k + 1]],
             float(stored.radius_m[k]),
         )
