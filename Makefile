@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: demo test bench soundness fuzz readme people deviations lock clean
+.PHONY: demo check test bench soundness fuzz readme people deviations lock clean
 
 demo: $(VENV)/made
 	@$(BIN)/hrcreplay demo
@@ -16,6 +16,13 @@ test: $(VENV)/made
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/pytest --numprocesses $(PROCESSES)
+
+# Format, lint, types and the quick tests, which tests/conftest.py lists.
+check: $(VENV)/made
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/pytest --quick --numprocesses $(PROCESSES)
 
 bench: $(VENV)/made
 	$(BIN)/pytest tests/benchmarks --benchmark-only

@@ -31,6 +31,11 @@ GROUPS = {
     "soundness": ("tests/tools/soundness/test_motion.py", "tests/tools/soundness/test_soundness.py"),
     "recordings": ("tests/test_recordings.py",),
 }
+#: Files and folders of the quick tests (``make check``): those that need no whole run and compile little.
+QUICK = (
+    *("tests/test_docs.py", "tests/test_docstrings.py", "tests/test_import_law.py", "tests/test_paper.py"),
+    *("tests/settings", "tests/limits", "tests/geometry", "tests/egm/test_codec.py", "tests/egm/test_protocol.py"),
+)
 WHOLE_RUNS = {"demo_folder", "printed"}
 
 
@@ -38,6 +43,11 @@ def group_of(nodeid: str) -> str:
     """Name of the group of a test: one of ``GROUPS``, else its file."""
     file = nodeid.partition("::")[0]
     return next((name for name, files in GROUPS.items() if file in files), file)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Adds ``--quick``."""
+    parser.addoption("--quick", action="store_true", help="only the quick tests, tests/conftest.py QUICK")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -74,8 +84,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return Scheduler(config, log)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Puts the long groups first where several processes share the tests."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leaves out what is not quick, where asked; puts the long groups first where several processes share the tests."""
+    if config.getoption("--quick"):
+        items[:] = [item for item in items if item.nodeid.startswith(QUICK)]
     for item in items:
         if WHOLE_RUNS & set(getattr(item, "fixturenames", ())) and group_of(item.nodeid) != "demo":
             raise pytest.UsageError(f"{item.nodeid} looks at a whole run of the demo: name its file in GROUPS")
