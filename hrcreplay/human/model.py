@@ -20,13 +20,18 @@ from typing import Any
 import numpy as np
 
 from hrcreplay.kernels import njit
-from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, POINTS, Floats
+from hrcreplay.records import BODY, DOF, JOINTS, LENGTHS, LIMBS, POINTS, Floats
 from hrcreplay.settings.sections import Prediction
 
 #: First of the four joints of each arm in JOINTS, and s of the kinematics: +1 on the left.
-RIGHT_ARM, LEFT_ARM = 4, 8
+RIGHT_ARM, LEFT_ARM = JOINTS.index("ar1"), JOINTS.index("al1")
 #: The pelvis's height in JOINTS.
 HEIGHT = JOINTS.index("z")
+THETA, RHO = JOINTS.index("theta"), JOINTS.index("rho")
+#: Joints alpha_2 and alpha_3 of both arms.
+ALPHA_2, ALPHA_3 = (RIGHT_ARM + 1, LEFT_ARM + 1), (RIGHT_ARM + 2, LEFT_ARM + 2)
+#: Limbs by their place in LIMBS and BODY.
+HD, THX, URA, LRA, ULA, LLA, LEGS = range(len(BODY))
 
 PELVIS, NECK, HEAD = (POINTS.index(name) for name in ("pelvis", "neck", "head"))
 #: Rows: right, left. Columns: shoulder, elbow, wrist.
@@ -141,9 +146,9 @@ def _skeleton_rows(p: Floats, lengths: Floats, points: Floats) -> None:
 @njit(cache=True)
 def skeleton_row(p: Floats, lengths: Floats, points: Floats) -> None:
     """Writes the model's points of one posture, p (13,) and lengths (7,), into points (20, 3) [m]."""
-    R = torso_rotation(p[2], p[3])
+    R = torso_rotation(p[THETA], p[RHO])
     for k in range(3):
-        base = p[k] if k < 2 else p[HEIGHT]
+        base = p[k] if k < THETA else p[HEIGHT]
         points[PELVIS, k] = base
         points[NECK, k] = base + R[k, 2] * lengths[0]
         points[HEAD, k] = points[NECK, k] + R[k, 2] * lengths[1]
@@ -249,11 +254,11 @@ def clamp_row(p: Floats, p_min: Floats, p_max: Floats, coupled: bool, low: Float
     """
     for j in range(DOF):
         low[j], high[j] = p_min[j], p_max[j]
-        if j == 2:  # Table 1's +-pi is a wrap, not a stop
+        if j == THETA:  # Table 1's +-pi is a wrap, not a stop
             low[j], high[j] = -np.inf, np.inf
-        elif coupled and j in (5, 9):
+        elif coupled and j in ALPHA_2:
             low[j], high[j] = alpha_2_bounds(p[j - 1], p[j - 1])
-        elif coupled and j in (6, 10):
+        elif coupled and j in ALPHA_3:
             low[j], high[j] = alpha_3_bounds(p[j - 2], p[j - 2], p[j - 1], p[j - 1])
         p[j] = max(low[j], min(p[j], high[j]))
 

@@ -17,7 +17,7 @@ from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Frames, Rules, Track
 from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
 from hrcreplay.human.fusion.reported_deviations import FIRST_SPREAD
-from hrcreplay.human.model import LimitSet, nearest
+from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, LimitSet, nearest
 from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
@@ -325,7 +325,7 @@ def _one_name(states: HumanStates, first: int) -> Floats:
     for k in range(1, len(mean)):
         p = nearest(mean[k : k + 1, :, 0], mean[k - 1 : k, :, 0])[0]
         mirrored = np.abs(np.sin(0.5 * (p - mean[k, :, 0]))) > 0.5  # alpha_1 moved by pi, not by a turn or not at all
-        for first_of_arm in (4, 8):
+        for first_of_arm in (RIGHT_ARM, LEFT_ARM):
             if mirrored[first_of_arm]:
                 mean[k, first_of_arm + 1] *= -1.0
         mean[k, :, 0] = p

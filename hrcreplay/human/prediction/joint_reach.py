@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.model import alpha_2_bounds, alpha_3_bounds
+from hrcreplay.human.model import ALPHA_2, ALPHA_3, LEFT_ARM, RIGHT_ARM, alpha_2_bounds, alpha_3_bounds
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 
@@ -91,10 +91,10 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
         low: (13,) lower ends of the joints' reachable intervals [m, m, rad..., m].
         high: (13,) their upper ends.
     """
-    if not coupled or j not in (5, 6, 9, 10):
+    if not coupled or not (j in ALPHA_2 or j in ALPHA_3):
         return bounds[0, j], bounds[0, j], bounds[1, j], bounds[1, j]
     least, inner_least, inner_most, most = np.inf, -np.inf, np.inf, -np.inf
-    first = 4 if j < 8 else 8
+    first = RIGHT_ARM if j < LEFT_ARM else LEFT_ARM
     for k in range(4):
         a1 = high[first] if k % 2 else low[first]
         if j == first + 1:

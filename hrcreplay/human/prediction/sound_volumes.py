@@ -33,7 +33,7 @@ import numpy as np
 
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
-from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, NECK, LimitSet, bounds_of, skeleton
+from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, NECK, ULA, URA, LimitSet, bounds_of, skeleton
 from hrcreplay.human.prediction.sound_reach import (
     SIDES,
     THIGH_M,
@@ -292,8 +292,8 @@ def _longest(limb: int, ends: Floats, off: Floats, hand: float) -> Floats:
             wide[i, 1] += off[2] if wide[i, 1] > 0.0 else -off[2]
             wide[i, 2] += off[0] if i > 2 else -off[0]
         return wide
-    left = limb >= 4
-    if limb in (2, 4):
+    left = limb >= ULA
+    if limb in (URA, ULA):
         ends[1, 2] -= off[3] if left else off[4]
     else:
         ends[1, 2] -= hand + (off[5] if left else off[6])

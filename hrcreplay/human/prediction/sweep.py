@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from hrcreplay.geometry.hull_reduction import NX, NY, POINT, A, B, C, Surface, is_inside
-from hrcreplay.human.model import HEIGHT
+from hrcreplay.human.model import HD, HEIGHT, LEFT_ARM, RHO, RIGHT_ARM, THX, ULA, URA
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 
@@ -35,17 +35,17 @@ def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tu
         lengths: (7,) LENGTHS [m].
     """
     torso, head, half_shoulder = lengths[0], lengths[1], lengths[2]
-    turn_rho = (_Y, low[3], high[3], 0.0, 0.0, low[HEIGHT])
-    if limb == 0:
+    turn_rho = (_Y, low[RHO], high[RHO], 0.0, 0.0, low[HEIGHT])
+    if limb == HD:
         points = np.array([[0.0, 0.0, torso], [0.0, 0.0, torso + head]])
         return points, np.array([turn_rho])
-    if limb == 1:
+    if limb == THX:
         points = np.array([[0.0, 0.0, 0.0], [0.0, -half_shoulder, torso], [0.0, half_shoulder, torso]])
         return points, np.array([turn_rho])
-    left = limb >= 4
+    left = limb >= ULA
     side = 1.0 if left else -1.0
     upper, forearm = (lengths[3], lengths[5]) if left else (lengths[4], lengths[6])
-    a1 = 8 if left else 4  # first joint of the arm
+    a1 = LEFT_ARM if left else RIGHT_ARM
     a2, a3, a4 = a1 + 1, a1 + 2, a1 + 3
     turn_2 = (_Y, -high[a2], -low[a2], 0.0, 0.0, 0.0)
     turn_1 = (
@@ -56,7 +56,7 @@ def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tu
         side * half_shoulder,
         torso,
     )
-    if limb in (2, 4):
+    if limb in (URA, ULA):
         points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -upper]])
         return points, np.array([turn_2, turn_1, turn_rho])
     turn_4 = (_Y, low[a4] - np.pi, high[a4] - np.pi, 0.0, 0.0, 0.0)

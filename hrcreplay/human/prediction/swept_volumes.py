@@ -12,7 +12,17 @@ import numpy as np
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
-from hrcreplay.human.model import HEIGHT, SHOWN_BY, LimitSet, alpha_2_bounds, alpha_3_bounds, bounds_of
+from hrcreplay.human.model import (
+    ALPHA_2,
+    ALPHA_3,
+    HEIGHT,
+    RHO,
+    SHOWN_BY,
+    LimitSet,
+    alpha_2_bounds,
+    alpha_3_bounds,
+    bounds_of,
+)
 from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, start_states
 from hrcreplay.human.prediction.sound_volumes import sweep_sound
 from hrcreplay.human.prediction.sweep import MOST_COPIES, append, box, kinematic_chain, sweep_rot, sweep_walk
@@ -117,15 +127,15 @@ def reach_row(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Flo
     bounds, coupled, horizon, method = within
     _walk(p, v, bounds, horizon, method, low, high)
     low[HEIGHT], high[HEIGHT] = p[HEIGHT], p[HEIGHT]  # a length in the paper: it stays
-    for j in range(3, HEIGHT):
+    for j in range(RHO, HEIGHT):
         if method == PAPER:
             low[j], high[j] = _joint(p[j], v[j], bounds[2:, j], horizon)
         else:
             low[j], high[j] = p[j] + bounds[2, j] * horizon, p[j] + bounds[3, j] * horizon
         least, most = bounds[0, j], bounds[1, j]
-        if coupled and j in (5, 9):
+        if coupled and j in ALPHA_2:
             least, most = alpha_2_bounds(low[j - 1], high[j - 1])
-        elif coupled and j in (6, 10):
+        elif coupled and j in ALPHA_3:
             least, most = alpha_3_bounds(low[j - 2], high[j - 2], low[j - 1], high[j - 1])
         if never[j]:
             low[j], high[j] = least, most

@@ -12,7 +12,7 @@ from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, clear
 from hrcreplay.robot.control.control_step import RobotState, Stop, at_rest, observe, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.control.separation import tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, irb140
-from tests.robot.control.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, random_step, run
+from tests.tools.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, random_step, run
 
 #: STOP.md's case: joint velocities at which the stop (67) was found to enter deepest [rad/s].
 FAST = np.radians([200.0, -34.0, -50.0, -360.0, -360.0, 450.0])

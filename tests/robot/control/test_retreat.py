@@ -16,16 +16,7 @@ from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task
 from hrcreplay.settings.sections import Plan
-from tests.robot.control.random_stops import (
-    DT_S,
-    RADII_M,
-    TOOL_M,
-    Box,
-    as_obstacles,
-    instants,
-    link_points,
-    random_turn,
-)
+from tests.tools.random_stops import DT_S, RADII_M, TOOL_M, Box, as_obstacles, instants, link_points, random_turn
 
 STATUS = dict(zip(STATUSES, range(len(STATUSES)), strict=True))
 

@@ -3,7 +3,7 @@
 The check shares nothing with the certificate: kinematics of its own from the axes of the data sheet, the motion within
 a tick as the parabola it is, 50 instants, 20 points a link, and the distance from a point to a box in closed form.
 
-    python -m tests.robot.control.random_stops --count 1000000 --seed 1
+    python -m tests.tools.random_stops --count 1000000 --seed 1
 """
 
 from __future__ import annotations
