@@ -129,7 +129,7 @@ def told(name: str, base: str, folder: Path) -> int:
 
 def main() -> int:
     """Runs the recordings."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.tools.bases", description=__doc__)
     parser.add_argument("names", nargs="*")
     parser.add_argument("--seconds", type=float, default=20.0)
     given = parser.parse_args()

@@ -5,6 +5,7 @@ Writes docs/deviations.md, and says what ``human.fusion.reported_deviations.FITT
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 from collections import Counter
@@ -154,6 +155,7 @@ def lines(samples: Sequence[Sample]) -> list[str]:
 
 def main() -> None:
     """Writes the tables; exit code 5 where the constants are not those that this fit finds."""
+    argparse.ArgumentParser(prog="python -m tests.tools.deviations", description=__doc__).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         samples = [sample(run) for run in fused(Path(folder))]
     OUT.write_text("\n".join(lines(samples)))

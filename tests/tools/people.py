@@ -78,7 +78,7 @@ def fused(folder: Path) -> list[Path]:
 
 def main() -> None:
     """Fits and tells what each left-out recording gave; exit code 5 where that is less than was asked for."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.tools.people", description=__doc__)
     parser.add_argument("--out", type=Path, default=PEOPLE)
     out = parser.parse_args().out
     with tempfile.TemporaryDirectory() as folder:

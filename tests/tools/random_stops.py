@@ -195,7 +195,7 @@ def run(count: int, seed: int) -> Outcome:
 
 def main() -> None:
     """Prints the outcome."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.tools.random_stops", description=__doc__)
     parser.add_argument("--count", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
