@@ -45,7 +45,7 @@ def shift(filter_: Filter, p: Floats, points: Floats) -> None:
     for k in _BESIDE:
         for i in range(3):
             for j in range(3):
-                points[k, i] += R[i, j] * filter_.offset[k, j]
+                points[k, i] += R[i, j] * filter_.model.offset[k, j]
     for i in range(3):
         points[NECK, i] = 0.5 * (points[_SHOULDERS[0], i] + points[_SHOULDERS[1], i])
 
@@ -70,17 +70,19 @@ def learn(
     for n, k in enumerate(_BESIDE):
         if not shown[_OF_LIMB[n]]:
             continue
-        age = min(now - filter_.offset_ns[k], rules.memory_ns) * 1e-9  # what is out of sight longer is lost anyway
-        weight = np.exp(-age / rules.offset_memory_s) * filter_.offset_weight[k] + 1.0
+        age = (
+            min(now - filter_.model.offset_ns[k], rules.memory_ns) * 1e-9
+        )  # what is out of sight longer is lost anyway
+        weight = np.exp(-age / rules.offset_memory_s) * filter_.model.offset_weight[k] + 1.0
         for j in range(3):
             beside = 0.0
             for i in range(3):
-                beside += R[i, j] * (filter_.points[c, k, i] - model[k, i])
-            filter_.offset[k, j] += (beside - filter_.offset[k, j]) / weight
-        filter_.offset_weight[k], filter_.offset_ns[k] = weight, now
+                beside += R[i, j] * (filter_.gate.points[c, k, i] - model[k, i])
+            filter_.model.offset[k, j] += (beside - filter_.model.offset[k, j]) / weight
+        filter_.model.offset_weight[k], filter_.model.offset_ns[k] = weight, now
     for n, k in enumerate(HANDS):
-        if shown[_LOWER_ARMS[n]] and _near(filter_, c, k, filter_.points[c, _WRISTS[n]], _HAND_M, rules):
-            _carry(filter_, c, k, filter_.points[c, k] - shifted[_WRISTS[n]])
+        if shown[_LOWER_ARMS[n]] and _near(filter_, c, k, filter_.gate.points[c, _WRISTS[n]], _HAND_M, rules):
+            _carry(filter_, c, k, filter_.gate.points[c, k] - shifted[_WRISTS[n]])
     if shown[_LEGS]:
         _learn_legs(filter_, c, model[PELVIS], p[2], rules)
 
@@ -90,26 +92,26 @@ def _learn_legs(filter_: Filter, c: int, pelvis: Floats, heading: float, rules: 
     """Takes in where a camera's frame shows the legs of a pelvis (3,) [m]."""
     for k in LEG_POINTS:
         if _near(filter_, c, k, pelvis, REACH_M, rules):
-            from_below = filter_.points[c, k].copy()
+            from_below = filter_.gate.points[c, k].copy()
             from_below[:2] -= pelvis[:2]
             _carry(filter_, c, k, from_below)
     for side in range(2):
         ankle, foot = _ANKLES[side], _FEET[side]
         if _near(filter_, c, ankle, pelvis, REACH_M, rules) and _near(filter_, c, foot, pelvis, REACH_M, rules):
-            filter_.foot[side] = _turned(filter_.points[c, foot] - filter_.points[c, ankle], -heading)
+            filter_.model.foot[side] = _turned(filter_.gate.points[c, foot] - filter_.gate.points[c, ankle], -heading)
 
 
 @njit(cache=True)
 def _near(filter_: Filter, c: int, k: int, place: Floats, most: float, rules: Rules) -> bool:
     """Return whether a camera shows a point with enough confidence within ``most`` [m] of a place."""
-    shown = filter_.confidence[c, k] >= rules.confidence_min
-    return bool(shown and distance(filter_.points[c, k], place) <= most)
+    shown = filter_.gate.confidence[c, k] >= rules.confidence_min
+    return bool(shown and distance(filter_.gate.points[c, k], place) <= most)
 
 
 @njit(cache=True)
 def _carry(filter_: Filter, c: int, k: int, relative: Floats) -> None:
-    if filter_.capture_ns[c] >= filter_.carried_ns[k]:
-        filter_.carried[k], filter_.carried_ns[k] = relative, filter_.capture_ns[c]
+    if filter_.gate.capture_ns[c] >= filter_.model.carried_ns[k]:
+        filter_.model.carried[k], filter_.model.carried_ns[k] = relative, filter_.gate.capture_ns[c]
 
 
 @njit(cache=True)
@@ -121,19 +123,19 @@ def place(filter_: Filter, p: Floats, points: Floats) -> None:
         p: (13,) the posture [m, m, rad..., m].
         points: (20, 3) receives the points, world [m].
     """
-    skeleton_row(p, filter_.lengths, points)
+    skeleton_row(p, filter_.estimate.lengths, points)
     shift(filter_, p, points)
-    now = filter_.tick_ns[0]
+    now = filter_.estimate.tick_ns[0]
     for n, k in enumerate(HANDS):
-        if now - filter_.carried_ns[k] <= _SHOWN_NS:
-            points[k] = points[_WRISTS[n]] + filter_.carried[k]
+        if now - filter_.model.carried_ns[k] <= _SHOWN_NS:
+            points[k] = points[_WRISTS[n]] + filter_.model.carried[k]
     for k in LEG_POINTS:
-        if now - filter_.carried_ns[k] <= _SHOWN_NS:
-            points[k] = filter_.carried[k]
+        if now - filter_.model.carried_ns[k] <= _SHOWN_NS:
+            points[k] = filter_.model.carried[k]
             points[k, :2] += points[PELVIS, :2]
     for side in range(2):
         if np.isnan(points[_FEET[side], 0]):
-            points[_FEET[side]] = points[_ANKLES[side]] + _turned(filter_.foot[side], p[2])
+            points[_FEET[side]] = points[_ANKLES[side]] + _turned(filter_.model.foot[side], p[2])
 
 
 @njit(cache=True)

@@ -13,7 +13,17 @@ import numpy as np
 
 from hrcreplay.human.fusion.body_points import FOOT_M
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
-from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Frames, Rules, Track, process_variance
+from hrcreplay.human.fusion.kalman import (
+    NEVER_NS,
+    Estimate,
+    Filter,
+    Frames,
+    Gate,
+    ModelResidual,
+    Rules,
+    Track,
+    process_variance,
+)
 from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
 from hrcreplay.human.fusion.reported_deviations import FIRST_SPREAD
@@ -62,46 +72,58 @@ def start(cameras: tuple[str, ...]) -> FusionState:
     for j in range(DOF):
         cov[j] = np.diag([_NEUTRAL_STD[j], *_REST_STD[j]]) ** 2
     return Filter(
-        tick_ns=np.full(1, NEVER_NS),
-        started=np.zeros(1, dtype=np.bool_),
-        mean=mean,
-        cov=cov,
-        lengths=np.array(MEDIAN_LENGTHS_M),
-        lengths_var=np.full(len(LENGTHS), _LENGTHS_STD_M**2),
-        row_ns=np.full(ROWS, NEVER_NS),
-        acquired_ns=np.full(ROWS, NEVER_NS),
-        point_ns=np.full(len(POINTS), NEVER_NS),
-        refused_ns=np.full((c, len(POINTS)), NEVER_NS),
-        refused_at=np.full((c, len(POINTS), 3), np.nan),
-        apart=np.zeros((c, len(LIMBS))),
-        bone_ns=np.full(len(LENGTHS), NEVER_NS),
-        capture_ns=np.full(c, NEVER_NS),
-        uses=np.full(c, -1),
-        newest_ns=np.full(1, NEVER_NS),
-        z=np.full((c, ROWS), np.nan),
-        z_var=np.full((c, ROWS), np.nan),
-        points=np.full((c, len(POINTS), 3), np.nan),
-        confidence=np.zeros((c, len(POINTS))),
-        valid=np.zeros((c, ROWS), dtype=np.bool_),
-        shows=np.zeros((c, len(LIMBS)), dtype=np.bool_),
-        residuals=np.zeros((len(BODY), BINS)),
-        weight=np.zeros(len(BODY)),
-        samples=np.zeros(len(BODY), dtype=np.int64),
-        sampled_ns=np.full(len(BODY), NEVER_NS),
-        residual=np.full(len(BODY), np.nan),
-        peak=np.zeros(len(BODY)),
-        peak_ns=np.full(len(BODY), NEVER_NS),
-        offset=np.zeros((len(POINTS), 3)),
-        offset_weight=np.zeros(len(POINTS)),
-        offset_ns=np.full(len(POINTS), NEVER_NS),
-        carried=np.full((len(POINTS), 3), np.nan),
-        carried_ns=np.full(len(POINTS), NEVER_NS),
-        foot=np.tile(FOOT_M, (2, 1)),
-        innovation=np.zeros((c, DOF)),
-        squares=np.zeros(DOF),
-        products=np.zeros(DOF),
-        spread=np.full(DOF, FIRST_SPREAD),
+        estimate=Estimate(
+            tick_ns=np.full(1, NEVER_NS),
+            started=np.zeros(1, dtype=np.bool_),
+            mean=mean,
+            cov=cov,
+            lengths=np.array(MEDIAN_LENGTHS_M),
+            lengths_var=np.full(len(LENGTHS), _LENGTHS_STD_M**2),
+            row_ns=np.full(ROWS, NEVER_NS),
+            acquired_ns=np.full(ROWS, NEVER_NS),
+            bone_ns=np.full(len(LENGTHS), NEVER_NS),
+            innovation=np.zeros((c, DOF)),
+            squares=np.zeros(DOF),
+            products=np.zeros(DOF),
+            spread=np.full(DOF, FIRST_SPREAD),
+        ),
+        gate=Gate(
+            point_ns=np.full(len(POINTS), NEVER_NS),
+            refused_ns=np.full((c, len(POINTS)), NEVER_NS),
+            refused_at=np.full((c, len(POINTS), 3), np.nan),
+            apart=np.zeros((c, len(LIMBS))),
+            capture_ns=np.full(c, NEVER_NS),
+            uses=np.full(c, -1),
+            newest_ns=np.full(1, NEVER_NS),
+            z=np.full((c, ROWS), np.nan),
+            z_var=np.full((c, ROWS), np.nan),
+            points=np.full((c, len(POINTS), 3), np.nan),
+            confidence=np.zeros((c, len(POINTS))),
+            valid=np.zeros((c, ROWS), dtype=np.bool_),
+            shows=np.zeros((c, len(LIMBS)), dtype=np.bool_),
+        ),
+        model=ModelResidual(
+            residuals=np.zeros((len(BODY), BINS)),
+            weight=np.zeros(len(BODY)),
+            samples=np.zeros(len(BODY), dtype=np.int64),
+            sampled_ns=np.full(len(BODY), NEVER_NS),
+            residual=np.full(len(BODY), np.nan),
+            peak=np.zeros(len(BODY)),
+            peak_ns=np.full(len(BODY), NEVER_NS),
+            offset=np.zeros((len(POINTS), 3)),
+            offset_weight=np.zeros(len(POINTS)),
+            offset_ns=np.full(len(POINTS), NEVER_NS),
+            carried=np.full((len(POINTS), 3), np.nan),
+            carried_ns=np.full(len(POINTS), NEVER_NS),
+            foot=np.tile(FOOT_M, (2, 1)),
+        ),
     )
+
+
+def _copy(state: FusionState) -> FusionState:
+    """The same numbers in arrays of their own."""
+    estimate, gate, model = ([array.copy() for array in part] for part in state)
+    return Filter(Estimate._make(estimate), Gate._make(gate), ModelResidual._make(model))
 
 
 def fuse(
@@ -138,7 +160,7 @@ def fuse(
         ``ticks_saturated``, and the trace of the n ticks, which has no rows unless ``traced``. The bits of the states
         do not depend on how ticks are cut into calls.
     """
-    after = Filter._make([array.copy() for array in state])
+    after = _copy(state)
     track = _track(len(ticks_ns), len(measurements.cameras), traced=traced)
     run(np.array(ticks_ns), _frames(measurements), after, _rules(settings, limits), track)
     p, v, a, j, p_std, v_std = track.motion

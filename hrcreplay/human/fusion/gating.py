@@ -64,43 +64,45 @@ def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track
         rules: Settings of the filter.
         track: Counts the points that do not agree with the filter.
     """
-    trusted = np.ones(len(filter_.point_ns), dtype=np.bool_)
-    believed = np.zeros(len(filter_.point_ns), dtype=np.bool_)
-    if filter_.started[0]:
+    trusted = np.ones(len(filter_.gate.point_ns), dtype=np.bool_)
+    believed = np.zeros(len(filter_.gate.point_ns), dtype=np.bool_)
+    if filter_.estimate.started[0]:
         whole = _whole(filter_, c, now, rules)
         agreeing, believed = _agreeing(filter_, c, now, whole, rules)
         trusted = (agreeing | believed) & whole
         track.outliers[c] += len(trusted) - np.sum(trusted)
     _validate_rows(filter_, c, trusted, rules)
-    for row in np.flatnonzero(filter_.valid[c]):
+    for row in np.flatnonzero(filter_.gate.valid[c]):
         if (DEPENDS[row] & believed).any():
-            filter_.row_ns[row] = min(filter_.row_ns[row], now - rules.memory_ns - 1)  # lost: it starts anew
-    confidence, points = filter_.confidence[c], filter_.points[c]
+            filter_.estimate.row_ns[row] = min(
+                filter_.estimate.row_ns[row], now - rules.memory_ns - 1
+            )  # lost: it starts anew
+    confidence, points = filter_.gate.confidence[c], filter_.gate.points[c]
     for point in _TESTED:
         if trusted[point] and confidence[point] >= rules.confidence_min and np.isfinite(points[point, 0]):
-            filter_.point_ns[point] = now
+            filter_.gate.point_ns[point] = now
     for limb in range(len(_PLACING)):
         product, agrees = 1.0, True
         for k in range(len(trusted)):
             if _PLACING[limb, k]:
                 product *= confidence[k]
                 agrees = agrees and trusted[k] and np.isfinite(points[k, 0])
-        filter_.shows[c, limb] = agrees and product >= rules.confidence_min
+        filter_.gate.shows[c, limb] = agrees and product >= rules.confidence_min
 
 
 @njit(cache=True)
 def _validate_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> None:
     """Select the valid rows, Eq. (58), given the points (20,) to be trusted."""
-    confidence, points = filter_.confidence[c], filter_.points[c]
+    confidence, points = filter_.gate.confidence[c], filter_.gate.points[c]
     for row in range(ROWS):
         product = 1.0
-        agrees = np.isfinite(filter_.z[c, row])
+        agrees = np.isfinite(filter_.gate.z[c, row])
         for k in range(len(trusted)):
             if DEPENDS[row, k]:
                 product *= confidence[k] if np.isfinite(points[k, 0]) else confidence[NECK]
                 agrees = agrees and trusted[k]
-        blind = 2 <= row < HEIGHT and filter_.z_var[c, row] > _BLIND_STD**2
-        filter_.valid[c, row] = agrees and not blind and product >= rules.confidence_min
+        blind = 2 <= row < HEIGHT and filter_.gate.z_var[c, row] > _BLIND_STD**2
+        filter_.gate.valid[c, row] = agrees and not blind and product >= rules.confidence_min
 
 
 @njit(cache=True)
@@ -110,14 +112,14 @@ def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> 
     A lost point agrees with anything. Since when each other one has been refused is kept. One that is not ``whole``
     (20,), while its bone begins where the filter has it, is refused anew in each frame: no limb is there.
     """
-    points = filter_.points[c]
+    points = filter_.gate.points[c]
     expected, gate = _gates(filter_, c, now, rules)
     agreeing, believed = np.ones(len(points), dtype=np.bool_), np.zeros(len(points), dtype=np.bool_)
     shown, there = np.zeros(len(points), dtype=np.bool_), np.zeros(len(points), dtype=np.bool_)
     for k in _TESTED:
-        lost = now - filter_.point_ns[k] > rules.memory_ns
+        lost = now - filter_.gate.point_ns[k] > rules.memory_ns
         agreeing[k] = lost or not distance(points[k], expected[k]) > gate[k]  # or missing
-        shown[k] = np.isfinite(points[k, 0]) and filter_.confidence[c, k] >= rules.confidence_min
+        shown[k] = np.isfinite(points[k, 0]) and filter_.gate.confidence[c, k] >= rules.confidence_min
         there[k] = shown[k] and distance(points[k], expected[k]) <= gate[k]
     for k in _TESTED:
         if not shown[k]:
@@ -125,14 +127,14 @@ def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> 
         other = _OTHER_SIDE[k]
         exchanged = other != k and distance(points[other], expected[k]) <= gate[k]
         if agreeing[k] or exchanged:
-            filter_.refused_ns[c, k] = NEVER_NS
+            filter_.gate.refused_ns[c, k] = NEVER_NS
             continue
         torn = not whole[k] and (there & _NEAR_ENDS[k]).any()
-        stays = not torn and distance(points[k], filter_.refused_at[c, k]) <= rules.outlier_m
-        if not stays or filter_.refused_ns[c, k] <= filter_.point_ns[k]:
-            filter_.refused_ns[c, k] = now
-        filter_.refused_at[c, k] = points[k]
-        believed[k] = now - filter_.refused_ns[c, k] >= rules.relearn_ns
+        stays = not torn and distance(points[k], filter_.gate.refused_at[c, k]) <= rules.outlier_m
+        if not stays or filter_.gate.refused_ns[c, k] <= filter_.gate.point_ns[k]:
+            filter_.gate.refused_ns[c, k] = now
+        filter_.gate.refused_at[c, k] = points[k]
+        believed[k] = now - filter_.gate.refused_ns[c, k] >= rules.relearn_ns
     return agreeing, believed
 
 
@@ -143,14 +145,14 @@ def _gates(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Floats, Flo
     That is ``outlier_m`` widened by three standard deviations of the prediction towards the point, each joint's carried
     through the forward kinematics. Those across say nothing: left and right exchanged would pass.
     """
-    p, lengths = extrapolate_back(filter_.mean, delay(filter_, c, now, rules)), filter_.lengths
-    expected, moved = np.empty_like(filter_.points[c]), np.empty_like(filter_.points[c])
+    p, lengths = extrapolate_back(filter_.estimate.mean, delay(filter_, c, now, rules)), filter_.estimate.lengths
+    expected, moved = np.empty_like(filter_.gate.points[c]), np.empty_like(filter_.gate.points[c])
     skeleton_row(p, lengths, expected)
     towards, variance = np.zeros_like(expected), np.zeros(len(expected))
     for k in _TESTED:
-        apart = distance(filter_.points[c, k], expected[k])
+        apart = distance(filter_.gate.points[c, k], expected[k])
         if apart > 0.0:
-            towards[k] = (filter_.points[c, k] - expected[k]) / apart
+            towards[k] = (filter_.gate.points[c, k] - expected[k]) / apart
     for j in range(DOF):
         p[j] += _STEP
         skeleton_row(p, lengths, moved)
@@ -159,11 +161,11 @@ def _gates(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Floats, Flo
             along = 0.0
             for axis in range(3):
                 along += (moved[k, axis] - expected[k, axis]) / _STEP * towards[k, axis]
-            variance[k] += along**2 * filter_.cov[j, 0, 0]
+            variance[k] += along**2 * filter_.estimate.cov[j, 0, 0]
     for k in _TESTED:
         if k != PELVIS:
-            variance[k] += filter_.lengths_var[0] + filter_.lengths_var[1 if k == HEAD else 2]
-            variance[k] += 0.0 if k == HEAD else filter_.lengths_var[3:].sum()
+            variance[k] += filter_.estimate.lengths_var[0] + filter_.estimate.lengths_var[1 if k == HEAD else 2]
+            variance[k] += 0.0 if k == HEAD else filter_.estimate.lengths_var[3:].sum()
     return expected, rules.outlier_m + 3.0 * np.sqrt(variance)
 
 
@@ -174,15 +176,15 @@ def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
     Bones do not change, so a marker that jumps is told from a limb that moves. A length that no camera has seen right
     for long was learnt wrong: it starts anew.
     """
-    whole = np.ones(len(filter_.point_ns), dtype=np.bool_)
-    for k in range(len(filter_.lengths)):
-        apart = abs(filter_.z[c, DOF + k] - filter_.lengths[k])
+    whole = np.ones(len(filter_.gate.point_ns), dtype=np.bool_)
+    for k in range(len(filter_.estimate.lengths)):
+        apart = abs(filter_.gate.z[c, DOF + k] - filter_.estimate.lengths[k])
         if not np.isfinite(apart):
             continue
-        if filter_.bone_ns[k] >= 0 and now - filter_.bone_ns[k] > rules.bone_memory_ns:
-            filter_.lengths_var[k] = _UNKNOWN_M**2
-        if apart <= rules.bone_m + 3.0 * np.sqrt(filter_.lengths_var[k]):
-            filter_.bone_ns[k] = now
+        if filter_.estimate.bone_ns[k] >= 0 and now - filter_.estimate.bone_ns[k] > rules.bone_memory_ns:
+            filter_.estimate.lengths_var[k] = _UNKNOWN_M**2
+        if apart <= rules.bone_m + 3.0 * np.sqrt(filter_.estimate.lengths_var[k]):
+            filter_.estimate.bone_ns[k] = now
         else:
             whole &= ~_ENDS[k]
     return whole

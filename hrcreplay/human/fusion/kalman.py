@@ -16,8 +16,8 @@ from hrcreplay.records import Bools, Floats, Ints
 NEVER_NS = -(2**62)
 
 
-class Filter(NamedTuple):
-    """All that one tick hands to the next."""
+class Estimate(NamedTuple):
+    """Estimate of the person: joints, lengths, and how well they fit their frames."""
 
     tick_ns: Ints  #: (1,) the last tick
     started: Bools  #: (1,) whether there is a person
@@ -27,11 +27,20 @@ class Filter(NamedTuple):
     lengths_var: Floats  #: (7,)
     row_ns: Ints  #: (20,) tick at which a row (JOINTS, then LENGTHS) was last valid
     acquired_ns: Ints  #: (20,) tick at which a row started anew
+    bone_ns: Ints  #: (7,) tick at which a camera last saw a length that agreed with the filter
+    innovation: Floats  #: (c, 13) each joint's last normalised innovation by a camera
+    squares: Floats  #: (13,) running sum of the squares of these
+    products: Floats  #: (13,) running sum of their products with the same camera's one before
+    spread: Floats  #: (13,) the highest square, decaying
+
+
+class Gate(NamedTuple):
+    """Frame held for each camera, and which of its rows and points are valid."""
+
     point_ns: Ints  #: (20,) tick at which a body point last agreed with the filter
     refused_ns: Ints  #: (c, 20) tick since when a camera has shown a point elsewhere, in one place
     refused_at: Floats  #: (c, 20, 3) where it last did
     apart: Floats  #: (c, 6) how far that is from the filter, the farthest point of each of LIMBS; 0 without one [m]
-    bone_ns: Ints  #: (7,) tick at which a camera last saw a length that agreed with the filter
     capture_ns: Ints  #: (c,) of the frame held for each camera
     uses: Ints  #: (c,) ticks that frame was used in; -1 without one
     newest_ns: Ints  #: (1,) capture of the newest frame of any camera that entered the filter
@@ -41,6 +50,11 @@ class Filter(NamedTuple):
     confidence: Floats  #: (c, 20)
     valid: Bools  #: (c, 20) which of its rows are used
     shows: Bools  #: (c, 6) which limbs it shows with all that carries them
+
+
+class ModelResidual(NamedTuple):
+    """Distances of the body from its model, and body points beside the model."""
+
     residuals: Floats  #: (7, BINS) weights of the residuals of each limb of BODY by their size
     weight: Floats  #: (7,) of all of them
     samples: Ints  #: (7,) residuals so far
@@ -54,10 +68,14 @@ class Filter(NamedTuple):
     carried: Floats  #: (20, 3) hands from the wrist, legs from below the pelvis, world [m]
     carried_ns: Ints  #: (20,) when a camera took that
     foot: Floats  #: (2, 3) right and left foot from its ankle, as last shown, in the body's heading [m]
-    innovation: Floats  #: (c, 13) each joint's last normalised innovation by a camera
-    squares: Floats  #: (13,) running sum of the squares of these
-    products: Floats  #: (13,) running sum of their products with the same camera's one before
-    spread: Floats  #: (13,) the highest square, decaying
+
+
+class Filter(NamedTuple):
+    """State of the fusion between two ticks."""
+
+    estimate: Estimate
+    gate: Gate
+    model: ModelResidual
 
 
 class Frames(NamedTuple):
@@ -136,7 +154,7 @@ def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
     """
     if not rules.compensate:
         return 0.0
-    return max(0.0, min((now - filter_.capture_ns[c]) * 1e-9, rules.delay_max_s))
+    return max(0.0, min((now - filter_.gate.capture_ns[c]) * 1e-9, rules.delay_max_s))
 
 
 @njit(cache=True)

@@ -38,24 +38,24 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
     seen = 0
     for k in range(len(ticks_ns)):
         now = ticks_ns[k]
-        dt = (now - filter_.tick_ns[0]) * 1e-9 if filter_.started[0] else 0.0
-        if filter_.started[0]:
+        dt = (now - filter_.estimate.tick_ns[0]) * 1e-9 if filter_.estimate.started[0] else 0.0
+        if filter_.estimate.started[0]:
             _predict(filter_, now, rules, damping)
         seen = _collect(frames, seen, now, filter_, track)
-        fresh = filter_.uses == 0
+        fresh = filter_.gate.uses == 0
         for c in range(len(fresh)):
             if fresh[c]:
                 validate_frame(filter_, c, now, rules, track)
-        if filter_.started[0]:
+        if filter_.estimate.started[0]:
             observe(filter_, fresh, now, rules)
         for c in range(len(fresh)):
-            again = rules.reuse and filter_.uses[c] > 0 and now - filter_.capture_ns[c] <= rules.memory_ns
+            again = rules.reuse and filter_.gate.uses[c] > 0 and now - filter_.gate.capture_ns[c] <= rules.memory_ns
             if fresh[c] or again:
                 track.valid[k, c] = _update(filter_, c, now, rules, track)
-        filter_.tick_ns[0] = now
-        if filter_.started[0]:
+        filter_.estimate.tick_ns[0] = now
+        if filter_.estimate.started[0]:
             _rename(filter_)
-            if saturate(filter_.mean, dt, rules):
+            if saturate(filter_.estimate.mean, dt, rules):
                 track.saturated[0] += 1
             _leave(filter_, k, rules, track, damping)
 
@@ -66,10 +66,10 @@ def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
 
     A joint unseen for longer than ``coast_ns`` comes to rest: no jerk can be followed far.
     """
-    dt = (now - filter_.tick_ns[0]) * 1e-9
+    dt = (now - filter_.estimate.tick_ns[0]) * 1e-9
     for j in range(DOF):
-        damping[j] = np.exp(-dt / rules.rest_s) if now - filter_.row_ns[j] > rules.coast_ns else 1.0
-        predict(filter_.mean[j], filter_.cov[j], dt, damping[j], rules.sigma[j], rules.rest_std[j])
+        damping[j] = np.exp(-dt / rules.rest_s) if now - filter_.estimate.row_ns[j] > rules.coast_ns else 1.0
+        predict(filter_.estimate.mean[j], filter_.estimate.cov[j], dt, damping[j], rules.sigma[j], rules.rest_std[j])
 
 
 @njit(cache=True)
@@ -77,17 +77,17 @@ def _collect(frames: Frames, seen: int, now: int, filter_: Filter, track: Track)
     """Holds the newest frame of each camera that has arrived; returns how many frames have been seen."""
     while seen < len(frames.arrival_ns) and frames.arrival_ns[seen] <= now:
         c = frames.camera[seen]
-        waiting = filter_.uses[c] == 0
-        late = filter_.uses[c] >= 0 and frames.capture_ns[seen] < filter_.capture_ns[c]
+        waiting = filter_.gate.uses[c] == 0
+        late = filter_.gate.uses[c] >= 0 and frames.capture_ns[seen] < filter_.gate.capture_ns[c]
         if waiting or late:
             track.superseded[c] += 1
         if not late:
-            filter_.capture_ns[c] = frames.capture_ns[seen]
-            filter_.uses[c] = 0
-            filter_.z[c] = frames.z[seen]
-            filter_.z_var[c] = frames.z_var[seen]
-            filter_.points[c] = frames.points[seen]
-            filter_.confidence[c] = frames.confidence[seen]
+            filter_.gate.capture_ns[c] = frames.capture_ns[seen]
+            filter_.gate.uses[c] = 0
+            filter_.gate.z[c] = frames.z[seen]
+            filter_.gate.z_var[c] = frames.z_var[seen]
+            filter_.gate.points[c] = frames.points[seen]
+            filter_.gate.confidence[c] = frames.confidence[seen]
         seen += 1
     return seen
 
@@ -100,49 +100,49 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
     n sigma_z^2 (4.1.1). A row of H of Eq. (45), (46) is ``h``: the identity's where d = 0, else Eq. (43) backwards.
     A row that is not valid is left out, which is Eq. (58), corrected: docs/paper.md.
     """
-    filter_.uses[c] += 1
-    if not filter_.valid[c].any():
+    filter_.gate.uses[c] += 1
+    if not filter_.gate.valid[c].any():
         return False
-    if not filter_.started[0]:
+    if not filter_.estimate.started[0]:
         _start(filter_, c)
     d = delay(filter_, c, now, rules)
     h = np.array([1.0, -d, d**2 / 2.0, -(d**3) / 6.0])
     z = _named(filter_, c, h)
     for row in range(ROWS):
-        if not filter_.valid[c, row]:
+        if not filter_.gate.valid[c, row]:
             continue
-        R = filter_.uses[c] * filter_.z_var[c, row]
+        R = filter_.gate.uses[c] * filter_.gate.z_var[c, row]
         if row >= DOF:
-            both = filter_.lengths_var[row - DOF] + R
+            both = filter_.estimate.lengths_var[row - DOF] + R
             if both > 0.0:  # else the length is known exactly, and so is the row
-                gain = filter_.lengths_var[row - DOF] / both
-                filter_.lengths[row - DOF] += gain * (z[row] - filter_.lengths[row - DOF])
-                filter_.lengths_var[row - DOF] *= 1.0 - gain
-        elif now - filter_.row_ns[row] > rules.memory_ns:
+                gain = filter_.estimate.lengths_var[row - DOF] / both
+                filter_.estimate.lengths[row - DOF] += gain * (z[row] - filter_.estimate.lengths[row - DOF])
+                filter_.estimate.lengths_var[row - DOF] *= 1.0 - gain
+        elif now - filter_.estimate.row_ns[row] > rules.memory_ns:
             _acquire(filter_, row, z[row], R, rules.rest_std[row])
-            filter_.acquired_ns[row] = now
-            track.reacquired[0] += filter_.row_ns[row] >= 0  # the first time is no loss
+            filter_.estimate.acquired_ns[row] = now
+            track.reacquired[0] += filter_.estimate.row_ns[row] >= 0  # the first time is no loss
         else:
-            innovation = correct(filter_.mean[row], filter_.cov[row], h, z[row], R)
+            innovation = correct(filter_.estimate.mean[row], filter_.estimate.cov[row], h, z[row], R)
             add_innovation(filter_, c, row, innovation, now, rules)
-        if filter_.uses[c] == 1:
-            filter_.row_ns[row] = now
-    filter_.newest_ns[0] = max(filter_.newest_ns[0], filter_.capture_ns[c])
+        if filter_.gate.uses[c] == 1:
+            filter_.estimate.row_ns[row] = now
+    filter_.gate.newest_ns[0] = max(filter_.gate.newest_ns[0], filter_.gate.capture_ns[c])
     return True
 
 
 @njit(cache=True)
 def _named(filter_: Filter, c: int, h: Floats) -> Floats:
     """The rows (20,) of a camera's frame by the names, and the turn of the heading, nearest to the estimate."""
-    z = filter_.z[c].copy()
+    z = filter_.gate.z[c].copy()
     expected, variance = np.empty(DOF), np.empty(DOF)
     for j in range(DOF):
-        if not filter_.valid[c, j]:
+        if not filter_.gate.valid[c, j]:
             z[j] = np.nan
-        expected[j] = dot(h, filter_.mean[j])
-        variance[j] = filter_.z_var[c, j]
+        expected[j] = dot(h, filter_.estimate.mean[j])
+        variance[j] = filter_.gate.z_var[c, j]
         for a in range(4):
-            variance[j] += h[a] * dot(filter_.cov[j, a], h)
+            variance[j] += h[a] * dot(filter_.estimate.cov[j, a], h)
     z[2] = expected[2] + wrap(z[2] - expected[2])
     for first in (RIGHT_ARM, LEFT_ARM):
         arm = slice(first, first + 4)
@@ -153,50 +153,50 @@ def _named(filter_: Filter, c: int, h: Floats) -> Floats:
 @njit(cache=True)
 def _start(filter_: Filter, c: int) -> None:
     """The person appears: the base under what is seen, until the pelvis is."""
-    filter_.started[0] = True
+    filter_.estimate.started[0] = True
     for axis in range(2):
-        filter_.mean[axis, 0] = np.nanmean(filter_.points[c, :, axis])
+        filter_.estimate.mean[axis, 0] = np.nanmean(filter_.gate.points[c, :, axis])
 
 
 @njit(cache=True)
 def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> None:
     """A joint seen for the first time, or for the first time after it was lost: nothing old is carried over."""
-    filter_.mean[j] = 0.0
-    filter_.mean[j, 0] = z
+    filter_.estimate.mean[j] = 0.0
+    filter_.estimate.mean[j, 0] = z
     reset(filter_, j)
-    filter_.cov[j] = 0.0
-    filter_.cov[j, 0, 0] = R
+    filter_.estimate.cov[j] = 0.0
+    filter_.estimate.cov[j, 0, 0] = R
     for k in range(3):
-        filter_.cov[j, k + 1, k + 1] = rest_std[k] ** 2
+        filter_.estimate.cov[j, k + 1, k + 1] = rest_std[k] ** 2
 
 
 @njit(cache=True)
 def _rename(filter_: Filter) -> None:
     """Keeps each arm near its canonical name. The same posture: alpha_2 is mirrored, P is what it was."""
     for first in (RIGHT_ARM, LEFT_ARM):
-        arm = filter_.mean[first : first + 4, 0].copy()
+        arm = filter_.estimate.mean[first : first + 4, 0].copy()
         if canonical_arm(arm, _NAME_MARGIN):
-            filter_.mean[first + 1] *= -1.0
-        filter_.mean[first : first + 4, 0] = arm
+            filter_.estimate.mean[first + 1] *= -1.0
+        filter_.estimate.mean[first : first + 4, 0] = arm
 
 
 @njit(cache=True)
 def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats) -> None:
     for j in range(DOF):
         for a in range(4):
-            track.motion[a, k, j] = filter_.mean[j, a]
+            track.motion[a, k, j] = filter_.estimate.mean[j, a]
         for a in range(2):
-            track.motion[4 + a, k, j] = np.sqrt(variance_factor(filter_, j, a, rules) * filter_.cov[j, a, a])
-    track.lengths[0, k] = filter_.lengths
-    track.lengths[1, k] = np.sqrt(filter_.lengths_var)
-    write_residual(filter_, filter_.tick_ns[0], rules, track.residual[k])
+            track.motion[4 + a, k, j] = np.sqrt(variance_factor(filter_, j, a, rules) * filter_.estimate.cov[j, a, a])
+    track.lengths[0, k] = filter_.estimate.lengths
+    track.lengths[1, k] = np.sqrt(filter_.estimate.lengths_var)
+    write_residual(filter_, filter_.estimate.tick_ns[0], rules, track.residual[k])
     write_unseen_times(filter_, track.unseen[k])
-    track.frame_age[k] = (filter_.tick_ns[0] - filter_.newest_ns[0]) * 1e-9
-    place(filter_, filter_.mean[:, 0].copy(), track.points[k])
+    track.frame_age[k] = (filter_.estimate.tick_ns[0] - filter_.gate.newest_ns[0]) * 1e-9
+    place(filter_, filter_.estimate.mean[:, 0].copy(), track.points[k])
     if len(track.cov) > 0:
-        track.cov[k] = filter_.cov
+        track.cov[k] = filter_.estimate.cov
         track.damping[k] = damping
-        track.spread[k] = filter_.spread
+        track.spread[k] = filter_.estimate.spread
         for j in range(DOF):
             track.autocorrelation[k, j] = autocorrelation(filter_, j)
 

@@ -61,20 +61,20 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
         rules: Settings of the filter.
     """
     for c in np.flatnonzero(fresh):
-        p = extrapolate_back(filter_.mean, delay(filter_, c, now, rules))
-        plain = np.full(filter_.points[0].shape, np.nan)
-        skeleton_row(p, filter_.lengths, plain)
+        p = extrapolate_back(filter_.estimate.mean, delay(filter_, c, now, rules))
+        plain = np.full(filter_.gate.points[0].shape, np.nan)
+        skeleton_row(p, filter_.estimate.lengths, plain)
         model = plain.copy()
         shift(filter_, p, model)
         _depart(filter_, c, model, now, rules)
         shown = np.zeros(len(BODY), np.bool_)
         for k in range(len(BODY)):
-            has = filter_.valid[c, :2].all() if k == _LEGS else filter_.shows[c, k]
+            has = filter_.gate.valid[c, :2].all() if k == _LEGS else filter_.gate.shows[c, k]
             shown[k] = has and _settled(filter_, k, now, rules)
         for limb in np.flatnonzero(shown[:_LEGS]):
             sample = 0.0
             for k in _ENDS[limb]:
-                sample = max(sample, distance(filter_.points[c, k], model[k]))
+                sample = max(sample, distance(filter_.gate.points[c, k], model[k]))
             _enter(filter_, limb, now, sample, rules)
         if shown[_LEGS]:
             below = _farthest(filter_, c, _BELOW, model[PELVIS], rules)
@@ -82,10 +82,10 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
                 sample = max(below, _farthest(filter_, c, _HIPS, model[PELVIS], rules))
                 _enter(filter_, _LEGS, now, sample, rules)
         learn(filter_, c, now, shown, p, plain, model, rules)
-    for limb in np.flatnonzero(filter_.sampled_ns == now):
-        if filter_.samples[limb] >= LEAST:
-            larger = (1.0 - rules.residual_quantile) * filter_.weight[limb]
-            filter_.residual[limb] = _exceeded_by(filter_.residuals[limb], larger)
+    for limb in np.flatnonzero(filter_.model.sampled_ns == now):
+        if filter_.model.samples[limb] >= LEAST:
+            larger = (1.0 - rules.residual_quantile) * filter_.model.weight[limb]
+            filter_.model.residual[limb] = _exceeded_by(filter_.model.residuals[limb], larger)
 
 
 @njit(cache=True)
@@ -94,18 +94,18 @@ def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> N
 
     Counts what it, or another camera, has shown there before, and no camera where the model has it.
     """
-    filter_.apart[c] = 0.0
+    filter_.gate.apart[c] = 0.0
     for limb in range(len(_ENDS)):
         for k in _ENDS[limb]:
-            since = filter_.refused_ns[c, k]
-            if since <= filter_.point_ns[k]:
+            since = filter_.gate.refused_ns[c, k]
+            if since <= filter_.gate.point_ns[k]:
                 continue
-            here, shown = filter_.refused_at[c, k], since < now
-            for other in range(len(filter_.apart)):
-                both = other != c and filter_.refused_ns[other, k] > filter_.point_ns[k]
-                shown = shown or (both and distance(filter_.refused_at[other, k], here) <= rules.outlier_m)
+            here, shown = filter_.gate.refused_at[c, k], since < now
+            for other in range(len(filter_.gate.apart)):
+                both = other != c and filter_.gate.refused_ns[other, k] > filter_.gate.point_ns[k]
+                shown = shown or (both and distance(filter_.gate.refused_at[other, k], here) <= rules.outlier_m)
             if shown:
-                filter_.apart[c, limb] = max(filter_.apart[c, limb], distance(here, model[k]))
+                filter_.gate.apart[c, limb] = max(filter_.gate.apart[c, limb], distance(here, model[k]))
 
 
 @njit(cache=True)
@@ -121,15 +121,15 @@ def write_residual(filter_: Filter, now: int, rules: Rules, residual: Floats) ->
         rules: Settings of the filter.
         residual: Receives the quantiles, or what is farther.
     """
-    residual[:] = filter_.residual
+    residual[:] = filter_.model.residual
     for limb in range(len(residual)):
-        if now - filter_.peak_ns[limb] < rules.residual_hold_ns and residual[limb] < filter_.peak[limb]:
-            residual[limb] = filter_.peak[limb]
-    for c in range(len(filter_.apart)):
-        if now - filter_.capture_ns[c] <= rules.memory_ns:
-            for limb in range(filter_.apart.shape[1]):
-                if filter_.apart[c, limb] > 0.0:
-                    residual[limb] = np.fmax(residual[limb], filter_.apart[c, limb])
+        if now - filter_.model.peak_ns[limb] < rules.residual_hold_ns and residual[limb] < filter_.model.peak[limb]:
+            residual[limb] = filter_.model.peak[limb]
+    for c in range(len(filter_.gate.apart)):
+        if now - filter_.gate.capture_ns[c] <= rules.memory_ns:
+            for limb in range(filter_.gate.apart.shape[1]):
+                if filter_.gate.apart[c, limb] > 0.0:
+                    residual[limb] = np.fmax(residual[limb], filter_.gate.apart[c, limb])
 
 
 @njit(cache=True)
@@ -137,8 +137,8 @@ def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rule
     """Largest distance of some points of the legs from the line below the pelvis (3,) [m]; -1 where none is shown."""
     farthest = -1.0
     for k in points:
-        point = filter_.points[c, k]
-        if filter_.confidence[c, k] >= rules.confidence_min and distance(point, pelvis) <= REACH_M:
+        point = filter_.gate.points[c, k]
+        if filter_.gate.confidence[c, k] >= rules.confidence_min and distance(point, pelvis) <= REACH_M:
             beyond = point[2] - max(0.0, min(point[2], pelvis[2]))
             off = np.sqrt((point[0] - pelvis[0]) ** 2 + (point[1] - pelvis[1]) ** 2 + beyond**2)
             farthest = max(farthest, off)
@@ -149,13 +149,13 @@ def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rule
 def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
     """Return whether no joint that carries the limb is lost or has restarted lately: the filter must find it first."""
     root = 2 if limb == _LEGS else 4
-    newest, last = filter_.acquired_ns[:root].max(), filter_.row_ns[:root].min()
-    newest, last = max(newest, filter_.acquired_ns[HEIGHT]), min(last, filter_.row_ns[HEIGHT])
+    newest, last = filter_.estimate.acquired_ns[:root].max(), filter_.estimate.row_ns[:root].min()
+    newest, last = max(newest, filter_.estimate.acquired_ns[HEIGHT]), min(last, filter_.estimate.row_ns[HEIGHT])
     if 2 <= limb < _LEGS:
         first = _FIRST[limb - 2]
-        newest = max(newest, filter_.acquired_ns[first - first % 4 : first + 2].max())
+        newest = max(newest, filter_.estimate.acquired_ns[first - first % 4 : first + 2].max())
         for pair in range(first - first % 4, first + 2, 2):  # one of the two is enough, see ``write_unseen_times``
-            last = min(last, filter_.row_ns[pair : pair + 2].max())
+            last = min(last, filter_.estimate.row_ns[pair : pair + 2].max())
     return now - newest > rules.memory_ns and now - last <= rules.memory_ns
 
 
@@ -166,11 +166,11 @@ def write_unseen_times(filter_: Filter, seconds: Floats) -> None:
     Head and thorax have been seen when all four joints of the torso have. Of the two joints of a part of an arm one is
     enough: the other goes blind where it does not matter (alpha_3 when the elbow is straight).
     """
-    now = filter_.tick_ns[0]
-    seconds[:2] = _since(now, filter_.row_ns[:4].min())
+    now = filter_.estimate.tick_ns[0]
+    seconds[:2] = _since(now, filter_.estimate.row_ns[:4].min())
     for i in range(len(_FIRST)):
-        seconds[2 + i] = _since(now, filter_.row_ns[_FIRST[i] : _FIRST[i] + 2].max())
-    seconds[_LEGS] = _since(now, filter_.carried_ns[BENDS].min())
+        seconds[2 + i] = _since(now, filter_.estimate.row_ns[_FIRST[i] : _FIRST[i] + 2].max())
+    seconds[_LEGS] = _since(now, filter_.model.carried_ns[BENDS].min())
 
 
 @njit(cache=True)
@@ -183,15 +183,15 @@ def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) ->
     """Lets the earlier samples of a limb age, and adds one of weight 1; one that is no distance is none."""
     if not sample >= 0.0:
         return
-    age = min(now - filter_.sampled_ns[limb], rules.memory_ns) * 1e-9
+    age = min(now - filter_.model.sampled_ns[limb], rules.memory_ns) * 1e-9
     kept = np.exp(-age / rules.residual_memory_s)
-    if sample >= filter_.peak[limb] or now - filter_.peak_ns[limb] >= rules.residual_hold_ns:
-        filter_.peak[limb], filter_.peak_ns[limb] = sample, now
-    filter_.residuals[limb] *= kept
-    filter_.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf is no whole number
-    filter_.weight[limb] = kept * filter_.weight[limb] + 1.0
-    filter_.samples[limb] += 1
-    filter_.sampled_ns[limb] = now
+    if sample >= filter_.model.peak[limb] or now - filter_.model.peak_ns[limb] >= rules.residual_hold_ns:
+        filter_.model.peak[limb], filter_.model.peak_ns[limb] = sample, now
+    filter_.model.residuals[limb] *= kept
+    filter_.model.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf is no whole number
+    filter_.model.weight[limb] = kept * filter_.model.weight[limb] + 1.0
+    filter_.model.samples[limb] += 1
+    filter_.model.sampled_ns[limb] = now
 
 
 @njit(cache=True)

@@ -45,8 +45,8 @@ FITTED = np.array(
 @njit(cache=True)
 def reset(filter_: Filter, j: int) -> None:
     """Joint j has been acquired: no innovation yet."""
-    filter_.innovation[:, j], filter_.squares[j], filter_.products[j] = 0.0, 0.0, 0.0
-    filter_.spread[j] = FIRST_SPREAD
+    filter_.estimate.innovation[:, j], filter_.estimate.squares[j], filter_.estimate.products[j] = 0.0, 0.0, 0.0
+    filter_.estimate.spread[j] = FIRST_SPREAD
 
 
 @njit(cache=True)
@@ -61,20 +61,20 @@ def add_innovation(filter_: Filter, c: int, j: int, innovation: float, now: int,
         now: The tick [ns].
         rules: Memory of the spread [s].
     """
-    age_s = (now - filter_.row_ns[j]) * 1e-9
+    age_s = (now - filter_.estimate.row_ns[j]) * 1e-9
     kept = np.exp(-age_s / _MEMORY_S)
-    filter_.squares[j] = kept * filter_.squares[j] + innovation**2
-    filter_.products[j] = kept * filter_.products[j] + innovation * filter_.innovation[c, j]
-    filter_.innovation[c, j] = innovation
-    filter_.spread[j] = max(np.exp(-age_s / rules.spread_memory_s) * filter_.spread[j], innovation**2)
+    filter_.estimate.squares[j] = kept * filter_.estimate.squares[j] + innovation**2
+    filter_.estimate.products[j] = kept * filter_.estimate.products[j] + innovation * filter_.estimate.innovation[c, j]
+    filter_.estimate.innovation[c, j] = innovation
+    filter_.estimate.spread[j] = max(np.exp(-age_s / rules.spread_memory_s) * filter_.estimate.spread[j], innovation**2)
 
 
 @njit(cache=True)
 def autocorrelation(filter_: Filter, j: int) -> float:
     """Of successive innovations of joint j by the same camera, at lag 1, in [-1, 1]; 0 before there are any."""
-    if not 0.0 < filter_.squares[j] < np.inf:
+    if not 0.0 < filter_.estimate.squares[j] < np.inf:
         return 0.0
-    return float(max(-1.0, min(filter_.products[j] / filter_.squares[j], 1.0)))
+    return float(max(-1.0, min(filter_.estimate.products[j] / filter_.estimate.squares[j], 1.0)))
 
 
 @njit(cache=True)
@@ -87,7 +87,7 @@ def variance_factor(filter_: Filter, j: int, a: int, rules: Rules) -> float:
         a: 0 for the variance of p, 1 for that of v.
         rules: Bounds on the factor.
     """
-    least = 1.0 if filter_.tick_ns[0] - filter_.row_ns[j] > rules.coast_ns else rules.spread_least
+    least = 1.0 if filter_.estimate.tick_ns[0] - filter_.estimate.row_ns[j] > rules.coast_ns else rules.spread_least
     offset, slope = FITTED[KIND[j], a]
-    scale = filter_.spread[j] * np.exp(offset + slope * autocorrelation(filter_, j))
+    scale = filter_.estimate.spread[j] * np.exp(offset + slope * autocorrelation(filter_, j))
     return float(max(least, min(scale, rules.spread_most)))

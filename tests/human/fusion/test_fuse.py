@@ -26,11 +26,11 @@ class Dense:
     def __init__(self, state: FusionState, settings: Fusion) -> None:
         self.settings = settings
         self.filter = KalmanFilter(STATES, 1)
-        self.filter.x = np.concatenate([state.mean.T.ravel(), state.lengths])[:, None]
+        self.filter.x = np.concatenate([state.estimate.mean.T.ravel(), state.estimate.lengths])[:, None]
         P = np.zeros((STATES, STATES))
         for j in range(DOF):
-            P[np.ix_(range(j, 4 * DOF, DOF), range(j, 4 * DOF, DOF))] = state.cov[j]
-        P[4 * DOF :, 4 * DOF :] = np.diag(state.lengths_var)
+            P[np.ix_(range(j, 4 * DOF, DOF), range(j, 4 * DOF, DOF))] = state.estimate.cov[j]
+        P[4 * DOF :, 4 * DOF :] = np.diag(state.estimate.lengths_var)
         self.filter.P = P
         self.held: dict[int, dict[str, Any]] = {}
 
@@ -104,7 +104,7 @@ def test_it_is_the_dense_filter_over_the_whole_state(stale: Any, delay: Any) -> 
     for frame in (f for f in frames if f["arrival_ns"] <= t[first - 1]):
         if frame["capture_ns"] >= newest.get(frame["camera"], frame)["capture_ns"]:
             newest[frame["camera"]] = frame
-    dense.held = {c: f | {"uses": int(state.uses[c])} for c, f in newest.items()}
+    dense.held = {c: f | {"uses": int(state.gate.uses[c])} for c, f in newest.items()}
     rest = m.rows(m.arrival_ns > t[first - 1])
     _, states, _, _ = fuse(state, t[first:], until(rest, int(t[-1])), settings, FREE)
     for k in range(first, len(t)):
@@ -254,7 +254,7 @@ def test_a_saturated_state_keeps_its_covariance() -> None:
 
 def test_the_given_state_is_not_changed() -> None:
     state, m, t = start(CAMERAS), standing(0.3), ticks(0.3)
-    before = [array.copy() for array in state]
+    before = [array.copy() for part in state for array in part]
     fuse(state, t, until(m, int(t[-1])), Fusion(), WIDE)
-    for array, kept in zip(state, before, strict=True):
+    for array, kept in zip((array for part in state for array in part), before, strict=True):
         np.testing.assert_array_equal(array, kept)
