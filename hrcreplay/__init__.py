@@ -1,7 +1,7 @@
 """Replays recorded human-robot sessions through a safety-aware trajectory generator.
 
-``import hrcreplay as hr`` gives the library: what the commands do, step by step (``hrcreplay.api``), loaded when it is
-first asked for.
+``import hrcreplay as hr`` gives the library (``hrcreplay.api``): the steps of the commands as functions. It is loaded
+at its first use.
 """
 
 from __future__ import annotations

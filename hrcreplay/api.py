@@ -1,7 +1,7 @@
-"""The library: what the commands do, step by step. ``import hrcreplay as hr`` offers all that stands in ``__all__``.
+"""The library: the steps of the commands as functions. ``import hrcreplay as hr`` gives all names in ``__all__``.
 
-Every result holds plain numpy records and gives a DataFrame by ``to_pandas()``, with the columns of the tables in a run
-folder (``store/columns.py``). Settings are those of a settings file, as a nested mapping:
+Every result holds numpy records; ``to_pandas()`` converts it to a DataFrame, with the columns of the tables in a run
+folder (``store/columns.py``). Settings are passed as a nested mapping with the keys of a settings file:
 ``settings={"fusion": {"rate_hz": 250.0}}``.
 """
 
@@ -63,7 +63,7 @@ __all__ = [
     "report",
 ]
 
-_BATCH = 250  # ticks; changes no result
+_BATCH = 250  # ticks; does not change the result
 Settings = Mapping[str, Mapping[str, Any]]
 
 
@@ -73,7 +73,7 @@ class Recording:
 
     log: Log
     run_config: RunConfig
-    _kept: Any = None  #: what must live as long as the log
+    _kept: Any = None  #: resources kept as long as the log is in use
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -82,20 +82,20 @@ class Recording:
 
     @property
     def T_world_base(self) -> Floats | None:
-        """(4, 4) pose of the robot's base in the world: of the cell file, else of the log; None: known to neither."""
+        """(4, 4) pose of the robot's base in the world: from the cell file, else from the log; None if both lack it."""
         return assembly.known_robot_base(self.run_config, self.log)
 
     @property
     def task(self) -> dict[str, Any] | None:
-        """The programmed task in the log, of the structure of a task file."""
+        """The programmed task in the log, structured like a task file."""
         return self.run_config.task or self.log.header.task
 
     def camera_frames(self) -> Iterator[CameraFrames]:
-        """The cleaned frames in order of arrival, in chunks of at most 1 s."""
+        """Yields the cleaned frames in order of arrival, in chunks of at most 1 s."""
         return self.log.frames()
 
     def to_pandas(self) -> pd.DataFrame:
-        """The cleaned frames as ``frames`` takes them, a row a body a frame."""
+        """Returns the cleaned frames in the form that ``frames`` takes, one row per body and frame."""
         return table_of_frames(list(self.log.frames()), self.cameras)
 
 
@@ -111,11 +111,11 @@ def open_log(
     Args:
         path: The log.
         cell: Cell file: poses of cameras and robot; None: those in the log.
-        config: Settings file (TOML), or the name of one that ships: ``paper``.
-        settings: Section -> key -> value; over those of the file.
+        config: Settings file (TOML), or the name of a shipped one: ``paper``.
+        settings: Section -> key -> value; they override the file.
 
     Raises:
-        LogError: There is no log that can be read.
+        LogError: The log is missing or cannot be read.
         SettingsError: A setting or the cell cannot be used.
     """
     run_config = resolve(
@@ -137,16 +137,16 @@ def frames(
     path: str | Path | None = None,
     **how: Any,
 ) -> Recording:
-    """A recording from a DataFrame, a row a body a frame.
+    """Makes a recording from a DataFrame with one row per body and frame.
 
     Args:
-        table: ``arrival_ns``, ``camera``, and of body points (``records.POINTS``) ``<point>_x``, ``_y``, ``_z`` in the
-            camera's frame [m]; NaN where a point was not seen. Also, where there is more than one, ``body``;
-            ``capture_ns`` where frames took time to arrive; ``<point>_confidence`` in [0, 1].
+        table: Columns ``arrival_ns``, ``camera``, and per body point (``records.POINTS``) ``<point>_x``, ``_y``, ``_z``
+            in the camera's frame [m]; NaN where a point was not observed. Optional: ``body``, needed with more than one
+            body; ``capture_ns``, for frames with a transport delay; ``<point>_confidence`` in [0, 1].
         cameras: Camera -> its pose (4, 4) in the world, z up, floor at z = 0 [m].
         T_world_base: (4, 4) robot base in the world [m].
-        task: The programmed task, of the structure of a task file.
-        path: MCAP file to keep the recording in; None: it goes with the recording.
+        task: The programmed task, structured like a task file.
+        path: MCAP file to write the recording to; None: a temporary file, deleted with the recording.
         **how: ``cell``, ``config`` and ``settings``, as for ``open_log``.
 
     Raises:
@@ -170,38 +170,38 @@ def frames(
 
 @dataclass(frozen=True)
 class People:
-    """The fused person, a row a tick."""
+    """The fused person, one row per tick."""
 
-    recording: Recording  #: with the span that was fused
+    recording: Recording  #: with the span of the fused part
     states: HumanStates
-    tables: dict[str, pa.Table] = field(default_factory=dict)  #: of a run folder: what stage 1 found
-    told: Told = field(default_factory=lambda: Told(Counter(), ()))  #: what it counted and noted
+    tables: dict[str, pa.Table] = field(default_factory=dict)  #: tables of a run folder with the results of stage 1
+    told: Told = field(default_factory=lambda: Told(Counter(), ()))  #: counts and notes of stage 1
 
     def __len__(self) -> int:
         return len(self.states)
 
     def rows(self, which: slice | Ints) -> People:
-        """Some ticks only."""
+        """Selects some ticks."""
         return People(self.recording, self.states.rows(which))
 
     def to_pandas(self) -> pd.DataFrame:
-        """The columns of state.parquet: angles, velocities, accelerations, jerks, lengths, and how sure they are."""
+        """Returns the columns of state.parquet: angles and their derivatives, lengths, standard deviations."""
         return arrow_table(state_columns(self.states)).to_pandas()
 
 
 def fuse(
     recording: Recording, *, start_s: float | None = None, end_s: float | None = None, smooth: bool | None = None
 ) -> People:
-    """Stage 1: skeletons of all cameras to joint angles, merged by a Kalman filter.
+    """Stage 1: computes joint angles from the skeletons of all cameras and merges them by a Kalman filter.
 
     Args:
         recording: A log.
         start_s: Start of the span, from the log's first message [s]; None: its beginning.
         end_s: End of the span [s]; None: its end.
-        smooth: Whether to smooth the person too; None: where a report needs it, of a log without ground truth.
+        smooth: True: also smooth the person; None: only if a report needs it, for a log without ground truth.
 
     Raises:
-        LogError: The log shows nobody, or a camera's pose is not known.
+        LogError: The log shows no person, or a camera's pose is unknown.
     """
     log = recording.log
     run_config = replace(recording.run_config, start_s=start_s, end_s=end_s)
@@ -226,7 +226,7 @@ class Volumes:
         return len(self.volumes)
 
     def __getitem__(self, tick: int) -> dict[str, InflatedHull]:
-        """Limb -> its volume at a tick. One that cannot be predicted has one vertex, of NaN: it may be anywhere."""
+        """Limb -> its volume at a tick. A limb that cannot be predicted has one NaN vertex: no bound."""
         found = {}
         for limb, volume in self.volumes.at(tick).items():
             nothing = InflatedHull(volume.vertices_m, np.zeros((0, 3), np.int64), volume.radius_m)
@@ -234,7 +234,7 @@ class Volumes:
         return found
 
     def to_pandas(self) -> pd.DataFrame:
-        """The columns of occupancy.parquet, a row a tick and limb that is known."""
+        """Returns the columns of occupancy.parquet, one row per tick and known limb."""
         found = _MemoryTables()
         found.table("occupancy", occupancy_columns(np.zeros(0, np.int64), [], self.volumes.method, [], [], [], []))
         stages.store_volumes(self.volumes, np.arange(len(self)), np.full(len(self), self.horizon_s), found)
@@ -242,12 +242,12 @@ class Volumes:
 
 
 def predict(people: People, horizon_s: float | None = None, *, method: str | None = None) -> Volumes:
-    """Stage 2: what the person can reach, as convex swept volumes per limb.
+    """Stage 2: computes the space that the person can reach, as one convex swept volume per limb.
 
     Args:
-        people: The fused person; a tick takes some 20 kB, so give ``people.rows(...)`` of a long one.
-        horizon_s: Until when after each tick they hold; None: the robot's braking time T_s [s].
-        method: ``sound``, ``paper`` or ``positions``; None: that of the settings.
+        people: The fused person; a tick takes about 20 kB, so pass ``people.rows(...)`` for a long recording.
+        horizon_s: Time after each tick until which the volumes hold; None: the robot's braking time T_s [s].
+        method: ``sound``, ``paper`` or ``positions``; None: as in the settings.
     """
     stage = assembly.prediction_stage(people.recording.run_config)
     until_s = stage.horizon_s if horizon_s is None else horizon_s
@@ -256,36 +256,36 @@ def predict(people: People, horizon_s: float | None = None, *, method: str | Non
 
 @dataclass(frozen=True)
 class Robot:
-    """A manipulator at its place."""
+    """A manipulator and the pose of its base."""
 
     settings: RobotSettings = field(default_factory=RobotSettings)
-    T_world_base: Floats | None = None  #: (4, 4); None: where cell file or log have it
+    T_world_base: Floats | None = None  #: (4, 4); None: from the cell file or the log
 
     @classmethod
     def from_urdf(cls, path: str | Path, T_world_base: Floats | None = None, **how: Any) -> Self:
-        """The robot of a URDF.
+        """Makes a robot from a URDF.
 
         Args:
             path: URDF; link capsules come from its collision shapes.
-            T_world_base: (4, 4) its base in the world [m].
+            T_world_base: (4, 4) pose of its base in the world [m].
             **how: Keys of the settings' section ``robot``, such as ``tcp_frame`` and ``tool_m``.
 
         Raises:
-            SettingsError: Such a key or its value is not known.
+            SettingsError: A key or its value is unknown.
         """
         return cls(load_settings(given={"robot": {"urdf": str(path), **how}}).robot, T_world_base)
 
     @classmethod
     def irb140(cls, T_world_base: Floats | None = None, **how: Any) -> Self:
-        """The ABB IRB 140, as ``from_urdf`` of others."""
+        """Makes the ABB IRB 140."""
         return cls(load_settings(given={"robot": how}).robot, T_world_base)
 
 
 def load_task(path: str | Path) -> dict[str, Any]:
-    """The programmed task of a task file (TOML).
+    """Reads the programmed task from a task file (TOML).
 
     Raises:
-        SettingsError: It cannot be read, or is no task.
+        SettingsError: The file cannot be read or holds no task.
     """
     table = read_toml(Path(path), "name a task file")
     parse_task(table, str(path))
@@ -294,14 +294,14 @@ def load_task(path: str | Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Plan:
-    """The robot's motion beside the person, by a method and its baselines."""
+    """The robot's motion near the person, by the chosen method and its baselines."""
 
     run_config: RunConfig
-    tables: dict[str, pa.Table]  #: of a run folder: motion, motion_<baseline>, occupancy
+    tables: dict[str, pa.Table]  #: tables of a run folder: motion, motion_<baseline>, occupancy
     told: Told
 
     def to_pandas(self, baseline: str | None = None) -> pd.DataFrame:
-        """The columns of motion.parquet, of the method or of a baseline: positions, velocities, status, distances."""
+        """Returns the columns of motion.parquet of a method: positions, velocities, status, distances."""
         return self.tables["motion" if baseline is None else f"motion_{baseline}"].to_pandas()
 
 
@@ -313,17 +313,17 @@ def plan(
     method: str | None = None,
     baselines: Sequence[str] | None = None,
 ) -> Plan:
-    """Stage 3: the robot's motion along its task, tick by tick, clear of all that the person can reach.
+    """Stage 3: plans the robot's motion along its task, tick by tick, outside the space that the person can reach.
 
     Args:
         people: The fused person.
-        robot: None: that of the settings.
-        task: From ``load_task``; None: that of the log, else its recorded joints.
-        method: ``qp``, ``scaling``, ``shield``, ``ssm`` or ``none``; None: that of the settings.
-        baselines: Methods beside it; None: those of the settings.
+        robot: None: as in the settings.
+        task: From ``load_task``; None: the task in the log, else its recorded joints.
+        method: ``qp``, ``scaling``, ``shield``, ``ssm`` or ``none``; None: as in the settings.
+        baselines: Methods to run for comparison; None: as in the settings.
 
     Raises:
-        SettingsError: The robot, its place or the task is not known, or cannot be used.
+        SettingsError: The robot, its base pose or the task is unknown or cannot be used.
     """
     run_config, log = _planned(people.recording.run_config, robot, task, method, baselines), people.recording.log
     found = _MemoryTables()
@@ -343,15 +343,15 @@ def report(recording: Recording, people: People, motion: Plan, out: str | Path) 
 
     Args:
         recording: The log.
-        people: From ``fuse``, whole.
+        people: From ``fuse``, all ticks.
         motion: From ``plan``.
-        out: Folder to make.
+        out: Folder to create.
 
     Raises:
-        SettingsError: The folder exists or cannot be made, or person or motion are not whole.
+        SettingsError: The folder exists or cannot be created, or the person or the motion lacks ticks.
     """
     if "state" not in people.tables or len(motion.tables["motion"]) != len(people):
-        raise SettingsError("report: some ticks only; would be right: all that fuse returned, and the plan beside it")
+        raise SettingsError("report: some ticks only; would be right: all ticks that fuse returned, and their plan")
     began = datetime.now(UTC)
     run_config, log = replace(motion.run_config, command="report"), recording.log
     with RunWriter(Path(out)) as writer:
@@ -365,10 +365,10 @@ def report(recording: Recording, people: People, motion: Plan, out: str | Path) 
 
 
 class Fusion:
-    """Stage 1 tick by tick, for frames as they come. The states are those of ``fuse``, bit for bit."""
+    """Stage 1 tick by tick, for frames as they arrive. The states equal those of ``fuse`` bit for bit."""
 
     def __init__(self, recording: Recording) -> None:
-        """Begin before the first frame, with the cameras, cell and settings of a recording."""
+        """Starts before the first frame, with the cameras, cell and settings of a recording."""
         self._cameras, run_config = recording.cameras, recording.run_config
         stage = assembly.fusion_stage(run_config, recording.log)
         self._fuser = PersonFuser(stage, self._cameras)
@@ -378,11 +378,12 @@ class Fusion:
         )
 
     def update(self, found: CameraFrames | pd.DataFrame | None, t_ns: int) -> HumanStates:
-        """The fused person at a tick, a table of one row.
+        """Computes the fused person at a tick, as a table of one row.
 
         Args:
-            found: All frames that arrived after the tick before and up to this one, in order; as ``frames`` takes them.
-            t_ns: The tick, after that of the last call [ns].
+            found: All frames that arrived after the previous tick and up to this one, in order and in the form that
+                ``frames`` takes.
+            t_ns: The tick, later than that of the last call [ns].
         """
         table = frames_of_table(found, self._cameras) if isinstance(found, pd.DataFrame) else found
         parts = [] if table is None else [part for part in self._clean(table) if part is not None]
@@ -400,7 +401,7 @@ class Fusion:
 
 
 class Controller:
-    """Stages 2 and 3 tick by tick: the next step of the robot beside a person. The steps are those of ``plan``."""
+    """Stages 2 and 3 tick by tick: the robot's next step near a person. The steps equal those of ``plan``."""
 
     def __init__(
         self,
@@ -410,13 +411,13 @@ class Controller:
         *,
         method: str | None = None,
     ) -> None:
-        """Begin at the start of the programme; the arguments are those of ``plan``."""
+        """Starts at the beginning of the programme; the arguments are those of ``plan``."""
         self._run_config = _planned(recording.run_config, robot, task, method, ())
         self._log = recording.log
         self._started: tuple[Planner, assembly.Surroundings] | None = None
 
     def step(self, person: HumanStates) -> Motion:
-        """The robot's motion at a tick, a table of one row; ``person`` is the row of ``Fusion.update``."""
+        """Computes the robot's motion at a tick, one row; ``person`` is the row from ``Fusion.update``."""
         if self._started is None:
             (planner,) = assembly.planners(self._run_config, self._log, int(person.t_ns[0])).values()
             self._started = planner, assembly.surroundings(self._run_config, planner.controller.robot)
@@ -425,12 +426,12 @@ class Controller:
 
     @staticmethod
     def to_pandas(steps: Sequence[Motion]) -> pd.DataFrame:
-        """The columns of motion.parquet of some steps."""
+        """Returns the columns of motion.parquet for some steps."""
         return arrow_table(motion_columns(Motion.join(list(steps)))).to_pandas()
 
 
 class _MemoryTables:
-    """Tables as a run folder takes them, kept."""
+    """Keeps in memory the tables that a run folder would store."""
 
     def __init__(self) -> None:
         self.tables: dict[str, pa.Table] = {}
@@ -441,7 +442,7 @@ class _MemoryTables:
         self.tables[name] = pa.concat_tables([self.tables[name], rows]) if name in self.tables else rows
 
     def sink(self) -> Sink:
-        """All output of a stage; no progress is shown."""
+        """Returns a sink that keeps all output of a stage and shows no progress."""
         return Sink(self, Stopwatch(time.perf_counter_ns), lambda _stage, _ticks: None)
 
 
@@ -452,7 +453,7 @@ def _planned(
     method: str | None,
     baselines: Sequence[str] | None,
 ) -> RunConfig:
-    """The run with another robot, task or method."""
+    """Returns the run with another robot, task or method."""
     chosen = {"method": method, "baselines": None if baselines is None else list(baselines)}
     given = {"plan": {name: value for name, value in chosen.items() if value is not None}}
     settings, cell = load_settings(base=run_config.settings.model_dump(mode="json"), given=given), run_config.cell

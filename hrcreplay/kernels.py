@@ -1,7 +1,7 @@
-"""Compiled code: which library is taken, and where our own functions stay compiled from one process to the next.
+"""Compiled code: choice of the library, and the folder that caches compiled functions between processes.
 
-numba compares a cached kernel with the file that it stands in, not with those of the functions it calls: after an
-update it would go on with old code inside new. So each state of all sources that hold kernels has a folder of its own.
+numba compares a cached kernel with its own source file, not with the files of the functions it calls: after an update,
+new kernels would contain old code. So each version of the sources has its own folder.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from typing import Any
 
 import numba
 
-#: The rooms that hold kernels.
+#: The packages that contain kernels.
 ROOMS = ("audit", "calibration", "geometry", "human", "robot")
 
 
 def njit(**options: Any) -> Callable[[Any], Any]:
-    """Numba's decorator; what it compiles is kept in ``folder()``, whatever folder others have for theirs."""
+    """Numba's decorator; caches the compiled functions in ``folder()``, independent of the folder of other packages."""
 
     def compiled(function: Callable[..., Any]) -> Any:
         others = numba.config.CACHE_DIR
-        numba.config.CACHE_DIR = str(folder())  # read while the function is decorated
+        numba.config.CACHE_DIR = str(folder())  # numba reads it while it decorates the function
         try:
             return numba.njit(**options)(function)
         finally:
@@ -37,9 +37,9 @@ def njit(**options: Any) -> Callable[[Any], Any]:
 
 @cache
 def folder() -> Path:
-    """Folder of this process's compiled kernels: NUMBA_CACHE_DIR where that is set, else by the digest of the sources.
+    """Folder of the compiled kernels: NUMBA_CACHE_DIR if that is set, else one named by the digest of the sources.
 
-    Beside the package, or in the user's cache where that cannot be written.
+    It lies beside the package, or in the user's cache if that place is not writable.
     """
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(chosen)
@@ -54,7 +54,7 @@ def folder() -> Path:
 
 
 def share(have: Path, lack: Path) -> None:
-    """Copies the compiled kernels of functions of which another folder has none: an index, and the files it names."""
+    """Copies compiled kernels to another folder, for functions it lacks: an index and the files that it names."""
     for index in have.glob("*/*.nbi"):
         copy = lack / index.relative_to(have)
         if not copy.exists():
@@ -65,5 +65,5 @@ def share(have: Path, lack: Path) -> None:
 
 
 def forgo(module: str) -> None:
-    """Has every import of a module fail from now on, if none has succeeded yet, so that importers take another."""
+    """Blocks later imports of a module that is not loaded yet, so that importers use their alternative."""
     sys.modules.setdefault(module, None)  # type: ignore[arg-type]

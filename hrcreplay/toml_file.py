@@ -1,4 +1,4 @@
-"""TOML that a user wrote, read within limits: of its size, of how deep it is nested, of how long its keys are."""
+"""Reads a user's TOML within limits on file size, nesting depth and key length."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Any, Final
 
 from hrcreplay.errors import SettingsError
 
-#: The longest file that is read; settings, cells, tasks and limit sets have some kB [bytes].
+#: Maximum size of a file; settings, cells, tasks and limit sets have a few kB [bytes].
 FILE_BYTES: Final = 2 << 20
-#: A key of so many parts joined by dots takes the parser very long.
+#: Maximum number of dotted parts of a key; the parser is very slow for more.
 _LONG_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){50}""")
 
 
 def parse_toml(text: str, where: str | Path) -> dict[str, Any]:
-    """The table that a text is.
+    """Parses a text into a table.
 
     Args:
         text: TOML.
-        where: Start of error messages, as the file.
+        where: Start of error messages, such as the file name.
 
     Raises:
-        SettingsError: It is not TOML, or beyond the limits.
+        SettingsError: The text is not TOML or exceeds the limits.
     """
     if _LONG_KEY.search(text):
         raise SettingsError(f"{where}: found a key of over 50 parts; at most 50 are read")
@@ -36,22 +36,20 @@ def parse_toml(text: str, where: str | Path) -> dict[str, Any]:
 
 
 def read_toml(path: Path, right: str) -> dict[str, Any]:
-    """The table that a file is.
+    """Reads a file into a table.
 
     Args:
         path: File.
-        right: What would be right where it cannot be read: "name a cell file".
+        right: End of the error message, such as "name a cell file".
 
     Raises:
-        SettingsError: It cannot be read, is not TOML, or is beyond the limits.
+        SettingsError: The file cannot be read, is not TOML or exceeds the limits.
     """
     try:
         with path.open("rb") as file:
             data = file.read(FILE_BYTES + 1)
         if len(data) > FILE_BYTES:
-            raise SettingsError(
-                f"{path}: has over {FILE_BYTES >> 20} MB, the most that is read of a TOML file; {right}"
-            )
+            raise SettingsError(f"{path}: is larger than {FILE_BYTES >> 20} MB, the maximum for a TOML file; {right}")
         return parse_toml(data.decode("utf-8").replace("\r\n", "\n"), path)
     except OSError as error:
         raise SettingsError(f"{path}: cannot be read ({error.strerror}); {right}") from error
