@@ -13,7 +13,8 @@ from hrcreplay.errors import SettingsError
 
 Source = Annotated[Path, typer.Argument(metavar="LOG_OR_RUN", help="A log, or the run folder of an earlier stage.")]
 Config = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings file; paper: the paper as printed.")
+    Path | None,
+    typer.Option("--config", metavar="FILE.toml", help="Settings file; paper: the settings of the printed paper."),
 ]
 Set = Annotated[
     list[str] | None,
@@ -53,14 +54,14 @@ Chunk = Annotated[
 def as_overrides(
     settings: list[str] | None, topics: list[str] | None = None, limits: str | None = None
 ) -> tuple[str, ...]:
-    """Options that stand for a setting, as settings."""
+    """Converts options that set a setting into settings."""
     short = [f"logs.topics={json.dumps(topics)}"] if topics else []
     short += [f"limits.prediction={json.dumps(limits)}"] if limits else []
     return (*(settings or ()), *short)
 
 
 def span(start: float | None, end: float | None) -> dict[str, Any]:
-    """The part of the log to use, as arguments. Raises SettingsError where nothing is between the two."""
+    """Returns the part of the log to use, as arguments. Raises SettingsError if that part is empty."""
     for option, seconds in (("--start", start), ("--end", end)):
         if seconds is not None and not math.isfinite(seconds):
             raise SettingsError(f"{option} {seconds:g}: would be right: seconds from the log's start, e.g. {option} 10")

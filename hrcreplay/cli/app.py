@@ -1,6 +1,6 @@
 """The command line: parses the arguments, calls the command, prints the run folder.
 
-Slow imports stand inside the commands, so that ``--help`` answers at once.
+Slow imports are inside the commands, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
@@ -81,12 +81,12 @@ def import_(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="azure, kinect2 or keraal.")],
     files: Annotated[
         list[str],
-        typer.Argument(metavar="[CAMERA=]FILE...", help="One file a camera; keraal: Kinect text, then optical text."),
+        typer.Argument(metavar="[CAMERA=]FILE...", help="One file per camera; keraal: Kinect text, then optical text."),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="LOG.mcap", help="Log to write.")],
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="keraal: rate of the Kinect, in Hz.")] = 30.0,
 ) -> None:
-    """Make our log from Azure Kinect CSV, Kinect v2 CSV or KERAAL text files."""
+    """Make a log from Azure Kinect CSV, Kinect v2 CSV or KERAAL text files."""
     from hrcreplay.commands import inputs
 
     for note in inputs.import_files(kind, files, out, rate):
@@ -103,20 +103,27 @@ def calibrate(
     topic: Topic = None,
     camera: Annotated[
         str | None,
-        typer.Option("--reference", metavar="CAMERA", help="Camera that defines the world; default the first."),
+        typer.Option("--reference", metavar="CAMERA", help="Camera that defines the world; default: the first."),
     ] = None,
     up: Annotated[
         str | None,
-        typer.Option("--up", metavar="X,Y,Z", help="Up in the reference camera's frame; default from the feet."),
+        typer.Option(
+            "--up",
+            metavar="X,Y,Z",
+            help="Upward direction in the reference camera's frame; default: found from the feet.",
+        ),
     ] = None,
     height: Annotated[
         float | None,
         typer.Option(
-            "--height", metavar="M", help="Reference camera above the floor, in metres; default from the feet."
+            "--height",
+            metavar="M",
+            help="Height of the reference camera above the floor, in metres; default: found from the feet.",
         ),
     ] = None,
     base: Annotated[
-        str | None, typer.Option("--base", metavar="X,Y,Z,YAW", help="Robot base in the world, in metres and degrees.")
+        str | None,
+        typer.Option("--base", metavar="X,Y,Z,YAW", help="Pose of the robot base in the world, in metres and degrees."),
     ] = None,
 ) -> None:
     """Find the poses and clock offsets of the cameras from the skeletons themselves."""
@@ -130,7 +137,7 @@ def calibrate(
 
 
 def _stage(command: str, text: str) -> None:
-    """Registers a command that runs the stages up to its own."""
+    """Registers a command that runs all stages up to the named one."""
 
     @app.command(name=command, help=text)
     def stage(
@@ -161,12 +168,12 @@ def _stage(command: str, text: str) -> None:
 
 
 def _run(command: str, source: Path, **options: Any) -> Path:
-    """Runs the stages up to a command's, and tells the main figures on standard error; the run folder."""
+    """Runs the stages up to that of a command, prints the main figures on standard error, returns the run folder."""
     from hrcreplay.commands import replay
     from hrcreplay.pipeline import stages
 
     folder = replay.run(command, source, **options)
-    from hrcreplay.commands import report  # slow, as it can draw: what ends in an error need not wait for it
+    from hrcreplay.commands import report  # slow to load, as it can draw; imported only after the run succeeded
 
     for line in report.summary(folder):
         stages.print_note(line)
@@ -198,7 +205,7 @@ def report(
         typer.Option(
             "--snapshot",
             metavar="SECONDS",
-            help="Of a run folder: only a still of its replay at that instant, PNG; --out names the file.",
+            help="With a run folder: only write a still of its replay at that instant, PNG; --out names the file.",
         ),
     ] = None,
     figure: Annotated[
@@ -206,11 +213,12 @@ def report(
         typer.Option(
             "--figure",
             metavar="NUMBER",
-            help="Of a run folder: only that figure again, PNG and SVG, as 14 or horizon; --out names their folder.",
+            help="With a run folder: only write that figure, such as 14 or horizon, as PNG and SVG; --out names their folder.",
         ),
     ] = None,
     list_figures: Annotated[
-        bool, typer.Option("--list-figures", help="Only list the figures, and what a run folder has for each.")
+        bool,
+        typer.Option("--list-figures", help="Only list the figures, and whether a run folder has the data for each."),
     ] = False,
 ) -> None:
     """All stages, then metrics.json, figures, report.html with the 3-D replay, and scene.mcap."""
@@ -234,7 +242,7 @@ def report(
 def _part_of_report(
     source: Path | None, figure: str | None, snapshot: float | None, out: Path | None, *, listed: bool
 ) -> None:
-    """Parts that ``report`` makes of a run folder without making another."""
+    """Writes single parts of a report from a run folder, without a new run folder."""
     from hrcreplay.commands.report import draw_figures, list_figures, take_still
 
     if listed:
@@ -258,7 +266,7 @@ def compare(
         typer.Option(
             "--methods",
             metavar="LIST",
-            help="METHOD[:OCCUPANCY[:HORIZON]],... as in none,qp,qp:paper:fixed; default: eight that matter.",
+            help="METHOD[:OCCUPANCY[:HORIZON]],... as in none,qp,qp:paper:fixed; default: eight common ones.",
         ),
     ] = None,
     config: Config = None,
@@ -271,7 +279,7 @@ def compare(
     end: End = None,
     chunk_ticks: Chunk = 250,
     processes: Annotated[
-        int, typer.Option("--processes", min=1, max=2, help="How many plan at once; changes no result.")
+        int, typer.Option("--processes", min=1, max=2, help="Number of parallel processes; changes no result.")
     ] = 2,
 ) -> None:
     """Compare methods side by side on the same recording: what if another controller had been running?"""
@@ -294,13 +302,14 @@ def compare(
 @app.command()
 def why(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of plan or report.")],
-    at: Annotated[float, typer.Option("--at", metavar="S", help="Instant, in seconds from the first tick.")],
+    at: Annotated[float, typer.Option("--at", metavar="S", help="Instant, in seconds after the first tick.")],
     method: Annotated[
-        str | None, typer.Option("--method", metavar="NAME", help="One of the run's baselines; default its own method.")
+        str | None,
+        typer.Option("--method", metavar="NAME", help="One of the run's baselines; default: the run's own method."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all facts as JSON.")] = False,
 ) -> None:
-    """Explain the robot's step at an instant of a run: limb, link, vertex and row that held it, or its refused stop."""
+    """Explain the robot's step at an instant: limb, link, vertex and row that limited it, or its rejected stop."""
     import json
 
     from hrcreplay.commands import explain as explaining
@@ -341,7 +350,9 @@ def fit_limits(
     ] = COVERAGE,
     held_back: Annotated[
         float,
-        typer.Option("--held-back", metavar="SHARE", help="Share of each log's time, its end, that is not fitted to."),
+        typer.Option(
+            "--held-back", metavar="SHARE", help="Share of each log, at its end, that is kept out of the fit."
+        ),
     ] = HELD_BACK,
     cover: Annotated[
         str, typer.Option("--cover", metavar="WHAT", help="joints in their intervals, or limbs in their volumes.")
@@ -353,7 +364,7 @@ def fit_limits(
     start: Start = None,
     end: End = None,
 ) -> None:
-    """The tightest velocity and acceleration bounds that cover what people did; for --limits."""
+    """Fit the tightest velocity and acceleration bounds that cover the recorded motion; for --limits."""
     from hrcreplay.audit import fit
 
     overrides = as_overrides(settings, topic)
@@ -379,7 +390,7 @@ def init(
 
 @app.command(name="settings")
 def settings_(
-    section: Annotated[str | None, typer.Argument(metavar="SECTION", help="Only this one, such as fusion.")] = None,
+    section: Annotated[str | None, typer.Argument(metavar="SECTION", help="Only this section, such as fusion.")] = None,
 ) -> None:
     """Print all settings with their defaults, units and meanings, as a settings file."""
     from hrcreplay.settings.listing import as_toml
@@ -416,7 +427,7 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """Writes a user's warning as one line; any other with its place in the code."""
+    """Writes a warning for the user as one line, any other warning with its place in the code."""
     if issubclass(category, SettingRenamed):
         sys.stderr.write(f"hrcreplay: {message}\n")
     else:
@@ -424,7 +435,7 @@ def _show_warning(
 
 
 def main() -> None:
-    """Runs the command line. A user's error is one line and an exit code, a bug keeps its traceback."""
+    """Runs the command line. A user error prints one line and sets the exit code; a bug keeps its traceback."""
     warnings.showwarning = _show_warning
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:

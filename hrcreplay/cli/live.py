@@ -1,6 +1,6 @@
 """The commands of a live session: live, twin and verify.
 
-Slow imports stand inside the functions, so that ``--help`` answers at once.
+Slow imports are inside the functions, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
@@ -38,7 +38,11 @@ def register(app: typer.Typer) -> None:
 def live(
     human: Human = None,
     send: Annotated[
-        bool, typer.Option("--send", help="Answer the robot. Without it all is computed and recorded, nothing is sent.")
+        bool,
+        typer.Option(
+            "--send",
+            help="Send answers to the robot. Without it, everything is computed and recorded but nothing is sent.",
+        ),
     ] = False,
     port: Port = None,
     duration: Duration = None,
@@ -79,26 +83,27 @@ def live(
 
 
 def twin(
-    host: Annotated[str, typer.Option("--host", help="Where the guide listens.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option("--host", help="Address at which the live session listens.")] = "127.0.0.1",
     port: Port = None,
     duration: Duration = None,
-    faults: Annotated[
-        Path | None, typer.Option("--faults", metavar="FILE.toml", help="Script of what goes wrong.")
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all that is random in the faults.")] = 0,
+    faults: Annotated[Path | None, typer.Option("--faults", metavar="FILE.toml", help="Script of the faults.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random faults.")] = 0,
     version: Annotated[str, typer.Option("--version", metavar="A|B|C", help="Edition of the messages.")] = "B",
-    radians: Annotated[bool, typer.Option("--radians", help="As RobotWare below 6.07: radians and no clock.")] = False,
+    radians: Annotated[
+        bool, typer.Option("--radians", help="Behave as RobotWare below 6.07: radians and no clock.")
+    ] = False,
     gain: Annotated[float, typer.Option("--gain", help="Proportional gain of the position loop, 0 to 20 1/s.")] = 5.0,
     filter_hz: Annotated[float, typer.Option("--filter", metavar="HZ", help="Low-pass filter; 0 is off.")] = 20.0,
     deviation: Annotated[
         float, typer.Option("--max-speed-deviation", metavar="DEG_PER_S", help="MaxSpeedDeviation.")
     ] = 450.0,
     cond_time: Annotated[
-        float, typer.Option("--cond-time", metavar="S", help="CondTime: end after this long converged; 0 disables.")
+        float,
+        typer.Option("--cond-time", metavar="S", help="CondTime: end after convergence for this long; 0 disables."),
     ] = 0.0,
     comm_timeout: Annotated[float, typer.Option("--comm-timeout", metavar="S", help="CommTimeout.")] = 1.0,
     start: Annotated[
-        str, typer.Option("--start", metavar="DEG,...", help="Joints at the beginning, one an axis, in degrees.")
+        str, typer.Option("--start", metavar="DEG,...", help="Initial joint positions, one per axis, in degrees.")
     ] = "0,0,0,0,30,0",
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the record.")] = None,
     config: Config = None,
@@ -106,7 +111,7 @@ def twin(
 ) -> None:
     """Play the robot of an EGM session: a UDP client with the controller's behaviour, and faults on demand.
 
-    It is the robot of the settings, as of live: --set robot.urdf=FILE, and live.joint_order.
+    Plays the robot of the settings, like live: --set robot.urdf=FILE, and live.joint_order.
     """
     from hrcreplay.egm.robot_double.faults import load_faults
     from hrcreplay.egm.robot_double.robot_simulator import SimulatorSettings
@@ -130,12 +135,12 @@ def twin(
 
 
 def _axes_of_double(config: Path | None, overrides: tuple[str, ...]) -> Axes:
-    """Range and speed of the robot of the settings, in the order of EGM."""
+    """Returns range and speed of the axes of the robot in the settings, in the order of EGM."""
     from hrcreplay.egm.robot_double.servo import IRB140, axes_of
     from hrcreplay.settings.load import load_settings
 
     found = load_settings(config, overrides)
-    if found.robot.urdf is None:  # and the double is there at once
+    if found.robot.urdf is None:  # and the double starts at once
         return IRB140
     import numpy as np
 
@@ -153,7 +158,7 @@ def verify(
         bool, typer.Option("--finish", help="First make the run folder of a killed session, RUN.partial, from its log.")
     ] = False,
 ) -> None:
-    """Compute a run again from its log and compare every bit.
+    """Compute a run again from its log and compare it bit by bit.
 
     Says 'identical' (exit code 0); 'same decisions, numbers within 1e-9' (exit code 6) where the run was recorded on
     another processor and nothing else differs; or what differs first (exit code 1).
