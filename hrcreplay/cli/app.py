@@ -213,7 +213,7 @@ def report(
         typer.Option(
             "--figure",
             metavar="NUMBER",
-            help="With a run folder: only write that figure, such as 14 or horizon, as PNG and SVG; --out names their folder.",
+            help="With a run folder: only write that figure, such as 14 or horizon; --out names the folder.",
         ),
     ] = None,
     list_figures: Annotated[

@@ -59,16 +59,16 @@ _ESCAPES = pa.schema(
         *((name, pa.int64()) for name in ("ticks", "deepest_t_ns")),
     ]
 )
-#: Of the bootstrap: any number, but always the same.
+#: Seed of the bootstrap: an arbitrary but fixed number.
 SEED = 3
 
 
 def run(sources: Sequence[Path], *, out: Path | None = None, **options: Unpack[RunOptions]) -> Path:
     """Audits logs, or the logs of earlier runs with the settings and cells of those runs.
 
-    The total counts every audited tick of every log once, so a long log weighs more than a short one: it is the share
-    of all the recorded time. Its intervals draw each log anew by itself, keeping its length: they say how well these
-    logs tell of more of the same people at the same work, and nothing of others.
+    The total counts every audited tick of every log once, so it is a share of the recorded time and a long log has more
+    weight. Its intervals resample each log separately and keep its length: they hold for more recordings of the same
+    people at the same work, not for other people.
 
     Args:
         sources: Logs, or run folders of earlier commands.
@@ -76,12 +76,12 @@ def run(sources: Sequence[Path], *, out: Path | None = None, **options: Unpack[R
         **options: Settings, cell and span, as ``run_config.resolve`` takes them.
 
     Returns:
-        The run folder: audit.json, audit.parquet (a row per tick, method and limb), escapes.parquet (a row per
-        escape), figures, report.html.
+        The run folder: audit.json, audit.parquet (a row per tick, method and limb), escapes.parquet (a row per escape),
+        figures, report.html.
 
     Raises:
         SettingsError: A setting, a cell or the output folder cannot be used.
-        LogError: A log cannot be read, is shorter than the horizon, or shows nobody.
+        LogError: A log cannot be read, is shorter than the horizon, or shows no person.
     """
     began = datetime.now(UTC)
     run_configs = [resolve("audit", source, **options) for source in sources]
@@ -110,7 +110,7 @@ def run(sources: Sequence[Path], *, out: Path | None = None, **options: Unpack[R
 
 
 def _write_report(found: dict[str, Any], meta: dict[str, Any], writer: RunWriter) -> None:
-    """audit.json, metrics.json, the figures, and the page that shows them."""
+    """Writes audit.json, metrics.json, the figures, and the page that shows them."""
     writer.text("audit.json", run_folder.to_json(found))
     folder = writer.partial / "figures"
     draw_all(found, folder)
@@ -120,7 +120,7 @@ def _write_report(found: dict[str, Any], meta: dict[str, Any], writer: RunWriter
 
 
 def _summary(found: dict[str, Any]) -> list[str]:
-    """The main figures, a line a log."""
+    """Returns the main figures, one line per log."""
     method, lines = found["method"], []
     for log in found["logs"]:
         whole = log["methods"][method]["all"]
@@ -134,7 +134,7 @@ def _summary(found: dict[str, Any]) -> list[str]:
 
 
 def _check_alike(run_configs: Sequence[RunConfig]) -> None:
-    """Refuses logs whose ticks cannot be counted together."""
+    """Raises SettingsError for logs whose ticks cannot be counted together."""
     stages = [assembly.prediction_stage(run_config) for run_config in run_configs]
     for what, values in (
         ("prediction.stop_s and latency_s", [standstill_s(one) for one in stages]),
@@ -151,7 +151,7 @@ def _check_alike(run_configs: Sequence[RunConfig]) -> None:
 
 
 def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
-    """The content of audit.json."""
+    """Returns the content of audit.json."""
     prediction_stage = assembly.prediction_stage(audits[0].run_config)
     horizon_s = standstill_s(prediction_stage)
     lengths = [len(audit.outcomes[methods()[0]]) for audit in audits]
@@ -206,7 +206,7 @@ def audit_results(audits: Sequence[LogAudit]) -> dict[str, Any]:
 
 
 def _margins(prediction_stage: PredictionStage) -> tuple[Any, ...]:
-    """Margins that ``sound`` adds to the model."""
+    """Returns the margins that ``sound`` adds to the model."""
     prediction = prediction_stage.settings
     names = ("sigmas", "latency_s", "hand_m", "legs_radius_m", "legs", "residual", "residual_unknown_m")
     return (*(getattr(prediction, name) for name in names), prediction_stage.memory_s)
@@ -238,7 +238,7 @@ def _curves(audits: Sequence[LogAudit]) -> dict[str, Any]:
 
 
 def _horizons(audits: Sequence[LogAudit]) -> list[dict[str, Any]]:
-    """Whole limbs at each horizon, the audit's own last."""
+    """Returns the coverage of whole limbs at each horizon; the last one is the horizon of the audit."""
     prediction_stage = assembly.prediction_stage(audits[0].run_config)
 
     def point(horizon_s: float, rate_hz: float, outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -258,7 +258,7 @@ def _horizons(audits: Sequence[LogAudit]) -> list[dict[str, Any]]:
 
 
 def _write_rows(audit: LogAudit, writer: RunWriter) -> None:
-    """A row per tick, limb and method."""
+    """Writes one row per tick, limb and method."""
     for method, outcome in audit.outcomes.items():
         ticks, limbs = len(outcome), len(outcome.limbs)
         escape = outcome.escape_m().ravel()
@@ -282,7 +282,7 @@ def _write_rows(audit: LogAudit, writer: RunWriter) -> None:
 
 
 def _write_escapes(found: dict[str, Any], writer: RunWriter) -> None:
-    """A row per escape: log, method, limb, when, for how many ticks, how far."""
+    """Writes one row per escape: log, method, limb, start, number of ticks, distance."""
     rows = [
         {"log": log["log"], "method": method, **escape}
         for log in found["logs"]
@@ -294,7 +294,7 @@ def _write_escapes(found: dict[str, Any], writer: RunWriter) -> None:
 
 
 def _cameras(audit: LogAudit) -> dict[str, dict[str, int | None]]:
-    """Per camera what it saw and what of it was not believed; None where nothing was held against it."""
+    """Returns, per camera, the counts of observed and disbelieved points; None if none was disbelieved."""
     counts = audit.recording.counts
     names = {
         "frames": "frames",
@@ -315,7 +315,7 @@ def _cameras(audit: LogAudit) -> dict[str, dict[str, int | None]]:
 
 
 def _names(run_configs: Sequence[RunConfig]) -> list[str]:
-    """A short name for each log; the same name twice gets numbers."""
+    """Returns a short name for each log; equal names get numbers."""
     stems = [run_config.log.stem for run_config in run_configs]
     return [s if stems.count(s) == 1 else f"{s} ({stems[:i].count(s) + 1})" for i, s in enumerate(stems)]
 

@@ -1,8 +1,8 @@
-"""The command ``compare``: one recording and one programme by several methods, beside the same recorded person.
+"""The command ``compare``: runs several methods on one recording and one programme, with the same recorded person.
 
-A variant is a method with an occupancy and a horizon. The person is fused once and recorded once; each variant then
-plans by itself, so two processes share them and the result does not depend on which took which. A motion that an
-earlier run made by the same settings is taken over; what is computed of it is computed again.
+A variant is a method with an occupancy and a horizon. The person is fused and stored once. Each variant then plans
+independently, so two processes share the variants and the result does not depend on their distribution. A motion from
+an earlier run with the same settings is reused; its metrics are computed again.
 """
 
 from __future__ import annotations
@@ -52,24 +52,25 @@ from hrcreplay.settings.sections import Plan, Prediction
 from hrcreplay.store.columns import motion_columns, read_states
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
-#: The eight that matter: the programme run blind, four methods with the sound volumes of each tick's own stop, the same
-#: to a fixed horizon, and the paper's two methods with its volumes and its horizon.
+#: The default variants: the programme without reaction; four methods with the sound volumes up to the end of each
+#: tick's own stop; qp with sound volumes up to a fixed horizon; and the two methods of the paper with its volumes and
+#: its horizon.
 PRESET = "none,ssm,shield,scaling,qp,qp:sound:fixed,qp:paper:fixed,scaling:paper:fixed"
 
-#: What a tick of a method costs beside that of another, about: long ones are begun first.
+#: Approximate relative cost of a tick by method; long tasks start first.
 _COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3}
 
 
 @dataclass(frozen=True)
 class PlacedProgramme:
-    """Programme and place of the robot; found once for all variants."""
+    """Programme and base pose of the robot; determined once for all variants."""
 
     T_world_base: Floats  #: (4, 4)
     path: Reference
     start_s: float  #: programmed time at the first tick [s]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Goes to another process without the robot, which is made again there."""
+        """Pickles the programme without the robot; the other process makes the robot again."""
         return PlacedProgramme, (self.T_world_base, replace(self.path, model=None), self.start_s)  # type: ignore[arg-type]
 
 
@@ -77,13 +78,13 @@ class PlacedProgramme:
 class VariantTask:
     """One variant on one log."""
 
-    run_config: RunConfig  #: its settings are those of the variant
+    run_config: RunConfig  #: with the settings of the variant
     variant: Variant
-    folder: Path  #: with state.parquet; gets motion and contact
+    folder: Path  #: contains state.parquet; motion and contact are written here
     people: RecordedPeople
-    full: Outcome | None  #: how its volumes hold until the braking time, the same for all with its occupancy
+    full: Outcome | None  #: coverage by its volumes until the braking time; depends only on the occupancy
     programme: PlacedProgramme
-    ready: bool  #: whether the motion is there already
+    ready: bool  #: True: the motion exists already
     size: int  #: ticks of a batch
 
 
@@ -100,14 +101,14 @@ def run(
 
     Args:
         sources: Logs, or run folders of earlier commands.
-        methods: ``METHOD[:OCCUPANCY[:HORIZON]]``, commas between; what is left out is as the settings say.
+        methods: ``METHOD[:OCCUPANCY[:HORIZON]]``, separated by commas; omitted parts are taken from the settings.
         out: Run folder to make; None: ``reports/<log>/<UTC>-compare``.
         chunk_ticks: Ticks of a batch; changes no result.
-        processes: How many plan at the same time, 1 or 2; changes no result.
+        processes: Number of parallel processes, 1 or 2; changes no result.
         **options: Settings, cell and span, as ``run_config.resolve`` takes them.
 
     Returns:
-        The run folder: compare.json, compare.csv, compare.md, figures, and a folder a log with the tables.
+        The run folder: compare.json, compare.csv, compare.md, figures, and one folder per log with the tables.
 
     Raises:
         SettingsError: A setting, a method, a cell, the task or the output folder cannot be used.
@@ -138,10 +139,10 @@ def run(
 
 
 def parse(text: str, settings: Settings) -> tuple[Variant, ...]:
-    """The variants that a list of methods names, each once.
+    """Returns the variants that a list of methods names, each once.
 
     Raises:
-        SettingsError: A part of one is not known.
+        SettingsError: A part of a variant is unknown.
     """
     known = {
         "method": get_args(Plan.model_fields["method"].annotation),
@@ -152,7 +153,7 @@ def parse(text: str, settings: Settings) -> tuple[Variant, ...]:
     for word in map(str.strip, text.split(",")):
         parts = word.split(":")
         if len(parts) > len(known) or (parts[0] == "none" and len(parts) > 1):
-            why = "none heeds nobody" if parts[0] == "none" else "too many parts"
+            why = "none uses no volumes" if parts[0] == "none" else "too many parts"
             raise SettingsError(
                 f"--methods {word}: {why}; would be right: METHOD[:OCCUPANCY[:HORIZON]], as in {PRESET}"
             )
@@ -165,13 +166,13 @@ def parse(text: str, settings: Settings) -> tuple[Variant, ...]:
 
 
 def _names(run_configs: Sequence[RunConfig]) -> list[str]:
-    """A short name for each log; the same name twice gets numbers."""
+    """Returns a short name for each log; equal names get numbers."""
     stems = [run_config.log.stem for run_config in run_configs]
     return [s if stems.count(s) == 1 else f"{s}-{stems[:i].count(s) + 1}" for i, s in enumerate(stems)]
 
 
 def variant_run_config(run_config: RunConfig, variant: Variant) -> RunConfig:
-    """The run that plans a variant and nothing else."""
+    """Returns the run that plans only this variant."""
     settings = run_config.settings
     plan = settings.plan.model_copy(update={"method": variant.method, "baselines": (), "horizon": variant.horizon})
     prediction = settings.prediction.model_copy(update={"method": variant.occupancy})
@@ -189,16 +190,16 @@ def _compare_log(
     size: int,
     processes: int,
 ) -> comparison.LogResult:
-    """All variants on one log; its tables are in the run folder's ``<name>``.
+    """Runs all variants on one log; the tables are in the subfolder ``<name>`` of the run folder.
 
     Args:
-        run_config: What was asked for.
-        name: Of the log.
-        variants: To run.
+        run_config: The run.
+        name: Name of the log.
+        variants: Variants to run.
         writer: The run folder.
-        watch: Takes the times.
+        watch: Records the times.
         size: Ticks of a batch.
-        processes: How many plan at the same time.
+        processes: Number of parallel processes.
     """
     part = RunWriter(writer.partial / name)
     part.partial.mkdir()
@@ -242,7 +243,7 @@ def _compare_log(
 def _full_coverages(
     run_config: RunConfig, variants: Sequence[Variant], people: RecordedPeople, folder: Path
 ) -> dict[str, Outcome | None]:
-    """Coverage of the person by the volumes of each occupancy until the braking time."""
+    """Computes the coverage of the person by the volumes of each occupancy until the braking time."""
     found: dict[str, Outcome | None] = {}
     for variant in sorted(variants, key=lambda variant: variant.method == "none"):
         if variant.occupancy not in found:
@@ -260,14 +261,14 @@ def _notes(
     programme: PlacedProgramme,
     found: Mapping[str, Any],
 ) -> tuple[str, ...]:
-    """Remarks on a log and its robot, as in a report, and on methods whose robot stands inside the person.
+    """Returns remarks on a log and its robot, as in a report, and on methods whose robot starts inside the person.
 
     Args:
-        run_config: What was asked for.
+        run_config: The run.
         folder: Tables of the log.
-        variants: That were run.
-        programme: Where the robot stands.
-        found: What the stages found in the log.
+        variants: Variants that were run.
+        programme: Base pose of the robot.
+        found: Findings of the stages in the log.
     """
     motions = {v.label: folder / f"motion_{v.slug}.parquet" for v in variants if v.method != "none"}
     robot = assembly.robot(run_config, programme.T_world_base)
@@ -286,7 +287,7 @@ def _silent(_stage: str, _ticks: int) -> None:
 
 
 def tables(folder: Path, variant: Variant) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Motion and contact of a variant."""
+    """Returns motion and contact of a variant."""
     return tuple(pq.read_table(folder / f"{what}_{variant.slug}.parquet").to_pandas() for what in ("motion", "contact"))
 
 
@@ -298,12 +299,12 @@ def _report_settings(run_config: RunConfig) -> comparison.Bounds:
 def _motions(
     run_config: RunConfig, log: Log, variants: Sequence[Variant], ticks_ns: Ints, part: RunWriter
 ) -> set[Variant]:
-    """Takes over the motions that an earlier run made by the same settings, and says which variants those are.
+    """Copies the motions of an earlier run with the same settings; returns the variants of these motions.
 
     Args:
-        run_config: What was asked for.
+        run_config: The run.
         log: Log of the run.
-        variants: To run.
+        variants: Variants to run.
         ticks_ns: (n,) ticks of the run [ns].
         part: Folder of the log.
     """
@@ -327,7 +328,7 @@ def _motions(
 
 
 def _parts(run_config: RunConfig, log: Log, ticks_ns: Ints) -> dict[str, str]:
-    """Digests of what the motion of a method depends on beside the method; which methods ran beside it is nothing."""
+    """Returns the digests of the inputs of a motion other than its method; the other methods of a run do not count."""
     plan = run_config.settings.plan.model_copy(update={"method": "qp", "baselines": ()})
     plain = replace(run_config, command="plan", settings=run_config.settings.model_copy(update={"plan": plan}))
     found = reuse.dependencies(plain, log, ticks_ns)
@@ -335,15 +336,15 @@ def _parts(run_config: RunConfig, log: Log, ticks_ns: Ints) -> dict[str, str]:
 
 
 def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[int], None]) -> dict[Variant, float]:
-    """Plans every task: a second process takes one after the other, the first takes those that are left.
+    """Plans all tasks: a second process and this one each take the next open task.
 
     Args:
-        tasks: To do.
+        tasks: Tasks to plan.
         processes: 1 or 2.
-        advance: Called with ticks done.
+        advance: Called with the number of ticks done.
 
     Returns:
-        How long each took [s].
+        Duration of each task [s].
     """
     order = sorted(tasks, key=lambda task: (task.ready, -_COST[task.variant.method]))
     if processes < 2 or len(order) < 2:
@@ -360,7 +361,7 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
                     ticks, took[task.variant] = future.result()
                     advance(ticks)
         except BaseException:
-            for process in multiprocessing.active_children():  # it would go on to the end of its task
+            for process in multiprocessing.active_children():  # otherwise it would continue to the end of its task
                 process.terminate()
             pool.shutdown(cancel_futures=True)
             raise
@@ -368,12 +369,12 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
 
 
 def _second_process() -> ProcessPoolExecutor:
-    """A process with compiled kernels of its own, since numba does not lock its files; it begins with all there are."""
+    """Starts a process with its own copy of the compiled kernels, as numba does not lock its files."""
     second = kernels.folder() / "second"
     kernels.share(kernels.folder(), second)
     pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
     mine = os.environ.get("NUMBA_CACHE_DIR")
-    os.environ["NUMBA_CACHE_DIR"] = str(second)  # read by the process as it begins
+    os.environ["NUMBA_CACHE_DIR"] = str(second)  # read by the process at its start
     try:
         pool.submit(os.getpid).result()
     finally:
@@ -384,11 +385,11 @@ def _second_process() -> ProcessPoolExecutor:
 
 
 def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tuple[int, float]:
-    """Motion and contact of a variant, into its folder; returns the number of ticks and the time that it took [s].
+    """Writes motion and contact of a variant to its folder; returns the number of ticks and the duration [s].
 
     Args:
-        task: What to do.
-        progress: Called with the ticks of each batch done; or None.
+        task: Task to plan.
+        progress: Called with the number of ticks of each finished batch; or None.
     """
     began_s, run_config, slug = time.perf_counter(), task.run_config, task.variant.slug
     robot = assembly.robot(run_config, task.programme.T_world_base)
@@ -416,7 +417,7 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
 
 
 def _planner(task: VariantTask, robot: RobotModel) -> Planner:
-    """The variant's method at the start of the programme."""
+    """Makes the controller of the variant at the start of the programme."""
     run_config, programme = task.run_config, task.programme
     settings = assembly.plan_settings(run_config, 1.0 / run_config.settings.fusion.rate_hz, task.variant.method)
     path = replace(programme.path, model=robot)
@@ -425,7 +426,7 @@ def _planner(task: VariantTask, robot: RobotModel) -> Planner:
 
 
 class _TablesOf(RunWriter):
-    """Tables in a folder that is there already."""
+    """Writes tables into an existing folder."""
 
     @property
     def partial(self) -> Path:

@@ -1,7 +1,7 @@
-"""The command ``why``: what held the robot at one tick of a run, computed again from the run's own tables.
+"""The command ``why``: finds the cause that limited the robot at one tick of a run, from the run's tables.
 
-The tick is made anew from the records of the ticks before it, with the same code and from the same numbers. Only where
-that gives the recorded step to the last bit is anything said about it.
+The tick is computed again from the recorded ticks before it, with the same code. A cause is given only if the result
+equals the recorded step bit by bit.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from hrcreplay.robot.control.control_step import (
 from hrcreplay.robot.control.controllers import Controller, Predict, QpController
 from hrcreplay.store.columns import read_states
 
-#: A TCP slower than this is said to stand [m/s].
+#: A TCP slower than this counts as stationary [m/s].
 _STANDS = 1e-3
-#: Ticks before the one asked for from which the run is made again, where one alone does not give the record.
+#: Numbers of ticks before the requested one at which the computation starts, if one tick does not reproduce the record.
 _BEFORE = (0, 25, 250)
 
 
 @dataclass
 class Record:
-    """A run folder whose ticks can be made again."""
+    """A run folder whose ticks can be computed again."""
 
     folder: Path
     method: str
@@ -70,21 +70,21 @@ class Record:
 
     @cached_property
     def surroundings(self) -> assembly.Surroundings:
-        """Obstacles of the robot."""
+        """Returns the obstacles of the robot."""
         return assembly.surroundings(self.run_config, self.controller.robot)
 
     @cached_property
     def controller(self) -> Controller:
-        """The method's robot, at the start of its programme."""
+        """Makes the method's controller, at the start of its programme."""
         (planner,) = assembly.planners(self.run_config, self.log, int(self.states.t_ns[0])).values()
         return planner.controller
 
     def predict(self, tick: int) -> Predict:
-        """Obstacles at a tick."""
+        """Predicts the obstacles at a tick."""
         return Forecast(self.surroundings, self.states.rows(slice(tick, tick + 1))).predict(0)
 
     def again(self, tick: int) -> TickContext | None:
-        """The tick made again; None where no attempt gives the recorded step to the last bit."""
+        """Computes the tick again; None if no attempt gives the recorded step bit by bit."""
         for first, current_stop in self._starts(tick):
             controller = self.controller
             controller.stop, controller.s_s = current_stop, float(self.motion["programme_s"].iloc[first])
@@ -109,7 +109,7 @@ class Record:
             return TickContext(controller.stop, controller.u, controller.s_s, controller.observe(self.predict(tick)))
 
     def _as_recorded(self, tick: int, step: control_step.Step) -> bool:
-        """Return whether a step is that of the record, bit for bit."""
+        """Returns True if a step equals the recorded one bit by bit."""
         row = self.motion.iloc[tick]
         same = STATUSES[step.status] == row["status"] and REASONS[step.reason] == (row["reason"] or "")
         same = same and np.array_equal(step.u, self._u[tick]) and step.certified == row["certified"]
@@ -120,7 +120,7 @@ class Record:
         return bool(same)
 
     def _starts(self, tick: int) -> Iterator[tuple[int, Stop]]:
-        """Ticks from which the run can be made again, nearest first, with the stop that was under way there."""
+        """Yields ticks at which the computation can start, nearest first, with the stop under way there."""
         if isinstance(self.controller, QpController):
             for before in _BEFORE:
                 first = max(0, tick - before)
@@ -135,7 +135,7 @@ class Record:
         yield 0, at_rest(self._q[0], np.array([first_s, 0.0]))
 
     def _stops(self, tick: int) -> Iterator[Stop]:
-        """The stops that may be under way at a tick of ``qp``: that after the last step that was taken."""
+        """Returns the stops that may be under way at a tick of ``qp``: the stop after the last step that was taken."""
         if not self._dq[tick].any():
             yield at_rest(self._q[tick])
             return
@@ -151,14 +151,14 @@ class Record:
 
 
 def open_record(folder: Path, method: str | None = None) -> Record:
-    """The record of a run, of its own method or of a baseline.
+    """Opens the record of a run, for its own method or a baseline.
 
     Args:
         folder: Run folder with a plan.
         method: None: the run's own.
 
     Raises:
-        SettingsError: Not such a run folder, or the method was not run.
+        SettingsError: The folder is not such a run folder, or the method was not run.
     """
     run_config = resolve("plan", folder)
     own = run_config.settings.plan.method
@@ -175,11 +175,11 @@ def explain(folder: Path, at_s: float, method: str | None = None) -> dict[str, A
 
     Args:
         folder: Run folder with a plan.
-        at_s: From the first tick on [s].
+        at_s: Time after the first tick [s].
         method: None: the run's own; else one of its baselines.
 
     Raises:
-        SettingsError: The run has no such instant or method, or the tick does not come out as recorded.
+        SettingsError: The run has no such instant or method, or the tick cannot be reproduced as recorded.
     """
     record = open_record(folder, method)
     t_ns = record.motion["t_ns"].to_numpy()
@@ -196,10 +196,10 @@ def explain(folder: Path, at_s: float, method: str | None = None) -> dict[str, A
 
 
 def facts(record: Record, tick: int) -> dict[str, Any] | None:
-    """All that is known of a tick; None where it does not come out as recorded.
+    """Collects all facts about a tick; None if it cannot be reproduced as recorded.
 
     Args:
-        record: Of the run.
+        record: Record of the run.
         tick: Row of its motion.
     """
     context = record.again(tick)
@@ -207,7 +207,7 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
         return None
     robot, settings, row = record.controller.robot, record.controller.settings, record.motion.iloc[tick]
     links, all_names = [segment.name for segment in robot.segments], record.surroundings.names
-    limbs = all_names[context.seen.obstacles.first :]  # of the hulls of this tick
+    limbs = all_names[context.seen.obstacles.first :]  # names of the hulls of this tick
     found: dict[str, Any] = {
         "at_s": float(row["t_ns"] - record.motion["t_ns"].iloc[0]) * 1e-9,
         "tick": tick,
@@ -246,7 +246,7 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
 
 
 def _cameras(record: Record, tick: int) -> dict[str, dict[str, float | None]]:
-    """Camera -> since its frames last entered the fused person, and the age of its newest frame by then [s]."""
+    """Camera -> time since its frames last entered the fused person, and the age of its newest frame then [s]."""
     t_ns = int(record.states.t_ns[tick])
     path = record.folder / "measurements.parquet"
     frames = pq.read_table(path, columns=["camera", "capture_ns", "arrival_ns"]).to_pandas() if path.exists() else None
@@ -263,13 +263,13 @@ def _cameras(record: Record, tick: int) -> dict[str, dict[str, float | None]]:
 
 
 def _unseen(record: Record, tick: int, limb: str) -> float | None:
-    """Time since a camera last saw the joints of a limb [s]; None for the lower body, and before the first time."""
+    """Time since a camera last saw the joints of a limb [s]; None for the lower body and for a limb not seen before."""
     since = record.states.unseen_s[tick, LIMBS.index(limb)] if limb in LIMBS else np.inf
     return float(since) if np.isfinite(since) else None
 
 
 def _named(found: dict[str, Any], links: Sequence[str], limbs: Sequence[str]) -> dict[str, Any]:
-    """The same with names of links and limbs in place of their numbers, at any depth."""
+    """Replaces the numbers of links and limbs by their names, at any depth."""
     named: dict[str, Any] = {}
     for key, value in found.items():
         if key in ("link", "limb"):
@@ -284,12 +284,12 @@ def _named(found: dict[str, Any], links: Sequence[str], limbs: Sequence[str]) ->
 
 
 def longest_stops(motion: pd.DataFrame, slow_m_per_s: float, most: int = 10) -> Ints:
-    """(k, 2) the longest stretches of ticks, [first, past the last), in which the robot stood though it should move.
+    """Returns (k, 2) the longest stretches of ticks, [first, past the last), of an unplanned standstill.
 
     Args:
         motion: A table of motion.
-        slow_m_per_s: A TCP slower than this stands [m/s].
-        most: How many.
+        slow_m_per_s: A TCP slower than this counts as stationary [m/s].
+        most: Maximum number of stretches.
     """
     _, standing = stationary(motion, np.inf, slow_m_per_s)
     runs = true_runs(standing)
@@ -297,10 +297,10 @@ def longest_stops(motion: pd.DataFrame, slow_m_per_s: float, most: int = 10) -> 
 
 
 def sentences(found: Mapping[str, Any]) -> list[str]:
-    """The facts of a tick in words, the cause first.
+    """Returns the facts of a tick in words, the cause first.
 
     Args:
-        found: What ``facts`` found.
+        found: Result of ``facts``.
     """
     lines = [f"{found['at_s']:.3f} s, tick {found['tick']}, {found['method']}: {_state(found)}."]
     lines += [f"Cause: {cause(found)}."]
@@ -344,7 +344,7 @@ def _state(found: Mapping[str, Any]) -> str:
 
 
 def cause(found: Mapping[str, Any]) -> str:
-    """Cause that held the robot, in a sentence without its full stop."""
+    """Returns the cause that limited the robot, as a sentence without its full stop."""
     if found.get("conflict"):
         return f"no velocity keeps all of these: {'; '.join(_row(row) for row in found['conflict'])}"
     if found.get("refused"):
@@ -363,7 +363,7 @@ def cause(found: Mapping[str, Any]) -> str:
 
 
 def _weighted(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The rows of people that hold, the heaviest first; of ``scaling`` the tightest."""
+    """Returns the active rows of people, the largest multiplier first; for ``scaling`` the tightest row."""
     return [{"multiplier": 1.0, **row} for row in found.get("binding", ())]
 
 
@@ -372,7 +372,7 @@ def _pair(of: Mapping[str, Any]) -> str:
 
 
 def _row(row: Mapping[str, Any]) -> str:
-    """A row in words."""
+    """Describes a row in words."""
     if row["kind"] == "axis":
         return f"axis {row['axis']}, {row['side']} bound on its next velocity"
     if row["kind"] == "tcp":
@@ -388,7 +388,7 @@ def _row(row: Mapping[str, Any]) -> str:
 
 
 def _failure(one: Mapping[str, Any]) -> str:
-    """Place at which a stop is not clear, in words."""
+    """Describes in words the place at which a stop is not clear."""
     if "link" not in one:
         return one["why"] + (f", axis {one['axis']}" if "axis" in one else "")
     when = f"{1e3 * one['failed_s']:.0f} ms after the tick"
@@ -399,11 +399,11 @@ def _failure(one: Mapping[str, Any]) -> str:
 
 
 def stop_table(record: Record, slow_m_per_s: float) -> tuple[PageTable, list[dict[str, Any]]]:
-    """The longest stops of a run, and the facts of the first tick of each.
+    """Returns the longest stops of a run, and the facts of the first tick of each.
 
     Args:
-        record: Of the run.
-        slow_m_per_s: A TCP slower than this stands [m/s].
+        record: Record of the run.
+        slow_m_per_s: A TCP slower than this counts as stationary [m/s].
     """
     rows, every, t_ns = [], [], record.motion["t_ns"].to_numpy()
     for first, past in longest_stops(record.motion, slow_m_per_s).tolist():

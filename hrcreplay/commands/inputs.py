@@ -21,13 +21,13 @@ KINDS = ("azure", "kinect2", "keraal")
 
 
 def describe(path: Path, config: Path | None, overrides: tuple[str, ...], cell_file: Path | None = None) -> list[str]:
-    """Content of a log, line by line.
+    """Describes the content of a log, line by line.
 
     Args:
         path: The log.
-        config: Settings file, or none.
-        overrides: ``section.key=value`` of the command line, which win over the file.
-        cell_file: Poses and clock offsets of the cameras, which win over the log's.
+        config: Settings file; may be None.
+        overrides: ``section.key=value`` of the command line; they override the file.
+        cell_file: Poses and clock offsets of the cameras; they override the log's.
 
     Raises:
         SettingsError: A setting cannot be used.
@@ -48,16 +48,16 @@ def describe(path: Path, config: Path | None, overrides: tuple[str, ...], cell_f
 
 
 def import_files(kind: str, files: list[str], out: Path, rate_hz: float) -> list[str]:
-    """Makes our log from text files; returns what the user should know of it.
+    """Makes a log from text files; returns notes for the user.
 
     Args:
         kind: azure, kinect2 or keraal.
-        files: ``[camera=]path``, one a camera; for keraal the Kinect's file and, if there is one, the optical one.
+        files: ``[camera=]path``, one per camera; for keraal the Kinect's file and, optionally, the optical one.
         out: Log to write.
         rate_hz: Frames a second of the Kinect, keraal only [Hz].
 
     Raises:
-        SettingsError: No such kind, too many files, a camera twice, or ``out`` exists.
+        SettingsError: The kind is unknown, there are too many files, a camera is given twice, or ``out`` exists.
         LogError: A file cannot be read.
     """
     if kind not in KINDS:
@@ -72,7 +72,7 @@ def import_files(kind: str, files: list[str], out: Path, rate_hz: float) -> list
 
 
 def _by_camera(files: list[str]) -> dict[str, Path]:
-    """Files by camera; a file without a camera's name gets its own, without endings."""
+    """Returns the files by camera; a file without a camera's name gets its file name without endings."""
     found: dict[str, Path] = {}
     for file in files:
         name, equals, path = file.partition("=")
@@ -96,21 +96,21 @@ def calibrate(
     height_m: float | None,
     base: str | None,
 ) -> list[str]:
-    """Writes the cell file of a log's cameras; returns the residuals and what is not sure, line by line.
+    """Writes the cell file of a log's cameras; returns the residuals and the uncertain results, line by line.
 
     Args:
         log: Log whose cameras saw one person.
         out: Cell file to write.
-        config: Settings file, or none.
-        overrides: ``section.key=value`` of the command line, which win over the file.
+        config: Settings file; may be None.
+        overrides: ``section.key=value`` of the command line; they override the file.
         reference: Camera that defines the world; None: the first.
         up: ``X,Y,Z``, up in the reference camera's frame; None: from the person's feet.
         height_m: Height of the reference camera above the floor [m]; None: from the person's feet.
-        base: ``X,Y,Z,YAW`` of the robot base in the world [m, m, m, deg]; None: not known.
+        base: ``X,Y,Z,YAW`` of the robot base in the world [m, m, m, deg]; None: unknown.
 
     Raises:
         SettingsError: An option cannot be used, or ``out`` exists.
-        LogError: The cameras did not see one person together, or floor and up cannot be told.
+        LogError: The cameras did not see one person together, or floor and upward direction cannot be determined.
     """
     if out.exists():
         raise SettingsError(f"{out}: exists already; name another file, or remove it")

@@ -1,4 +1,4 @@
-"""Remarks beside the results of a run: the same for ``report``, which has one motion, and ``compare``."""
+"""Remarks on the results of a run, the same for ``report``, which has one motion, and for ``compare``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hrcreplay.reporting.metrics import fusion as fusion_metrics
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.store.run_folder import Run
 
-_FIRST_S = 1.0  # with a person: a shorter time says nothing, for the volumes still hold what is not known yet
+_FIRST_S = 1.0  # with a person; earlier the volumes are large, as little is known yet
 
 
 def notes_of(
@@ -25,14 +25,14 @@ def notes_of(
     robot: RobotModel | None,
     rate_hz: float,
 ) -> list[str]:
-    """All notes of a run, each once.
+    """Returns all notes of a run, each once.
 
     Args:
         folder: Tables of the run.
-        meta: What is known of the run so far.
-        told: What the stages have noted.
-        motions: Method -> its table of motion; the programme run blind is not asked.
-        robot: None where the run has none.
+        meta: Entries of run.json so far.
+        told: Notes of the stages.
+        motions: Method -> its table of motion; ``none`` is left out.
+        robot: None for a run without a robot.
         rate_hz: Ticks a second [Hz].
     """
     notes = [*told, *_unmeasured(folder, meta, told), *_overlaps(folder, motions, rate_hz)]
@@ -40,7 +40,7 @@ def notes_of(
 
 
 def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str]:
-    """Remarks on limbs that were not measured, from the tables of the first stage."""
+    """Returns remarks on limbs that were not measured, from the tables of stage 1."""
 
     def table(name: str) -> Any:
         path = folder / f"{name}.parquet"
@@ -52,7 +52,7 @@ def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str
 
 
 def _overlaps(folder: Path, motions: Mapping[str, Path], rate_hz: float) -> list[str]:
-    """Remarks on robots that stand inside people from the start; which methods', where not all do."""
+    """Returns a remark on robots that start inside people; it names the methods if not all do."""
     found: dict[str, list[str]] = {}
     for method, path in motions.items():
         remark = initial_overlap(folder / "state.parquet", path, rate_hz)
@@ -62,7 +62,7 @@ def _overlaps(folder: Path, motions: Mapping[str, Path], rate_hz: float) -> list
 
 
 def initial_overlap(state: Path, motion: Path, rate_hz: float) -> str | None:
-    """Remark where robot and person overlap at every tick of the first second with a person in view, else None.
+    """Returns a remark if robot and person overlap at every tick of the first second with a person in view, else None.
 
     Args:
         state: Table of the fused person.

@@ -1,6 +1,6 @@
 """The offline driver: runs the stages of a command on a log and writes the run folder.
 
-Stages of an earlier run are reused where digests show that nothing has changed that their results depend on.
+Stages of an earlier run are reused if the digests of their inputs are unchanged.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def run(
         command: ``fuse``, ``predict``, ``plan`` or ``report``.
         source: A log, or the run folder of an earlier command.
         out: Run folder to make; None: ``reports/<log>/<UTC>-<command>``.
-        smooth: Whether to write the smoothed person too (smooth.parquet).
+        smooth: True: also write the smoothed person (smooth.parquet).
         chunk_ticks: Ticks of a batch; changes no result.
         **options: Settings, cell and span, as ``run_config.resolve`` takes them.
 
@@ -75,7 +75,7 @@ def run(
         last = [stage for stage in run_config.stages if stage not in reused][-1:]
         with ProgressBar(last[0] if last else "", len(ticks_ns)) as bar:
             sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
-            compared = command == "report" and not log.header.has_truth  # then with the smoothed person
+            compared = command == "report" and not log.header.has_truth  # this then includes the smoothed person
             told = run_stages(
                 run_config, log, ticks_ns, chunk_ticks, sink, reused, folder=writer.partial, smooth=smooth or compared
             )
@@ -91,13 +91,13 @@ def run(
 
 
 def describe_run(run_config: RunConfig, began: datetime, parts: Mapping[str, str], *, smooth: bool) -> dict[str, Any]:
-    """Entries of run.json on how a run came to be.
+    """Returns the entries of run.json on the origin of a run.
 
     Args:
-        run_config: What was asked for.
-        began: When.
-        parts: What ``dependencies`` found.
-        smooth: Whether the smoothed person was asked for.
+        run_config: The run.
+        began: Start time.
+        parts: Result of ``dependencies``.
+        smooth: True: the smoothed person was requested.
     """
     return {
         "arguments": run_config.arguments(smooth=smooth),
@@ -108,14 +108,14 @@ def describe_run(run_config: RunConfig, began: datetime, parts: Mapping[str, str
 
 
 def complete(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any]) -> None:
-    """Completes a run whose stages have written their tables; with the report where that was asked for.
+    """Completes a run whose stages have written their tables; also makes the report if requested.
 
     Args:
-        run_config: What was asked for.
+        run_config: The run.
         log: Log of the run.
         writer: Run folder.
-        watch: Times of the stages; takes those of the report.
-        meta: What run.json says so far.
+        watch: Times of the stages; the times of the report are added.
+        meta: Entries of run.json so far.
     """
     base = assembly.known_robot_base(run_config, log)
     writer.close_tables()
@@ -130,10 +130,10 @@ def complete(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatc
 
 
 def _report(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any]) -> None:
-    """The contact table and the report of a run whose other tables are written."""
+    """Writes the contact table and the report of a run whose other tables are written."""
     from hrcreplay.commands.report import write_report
     from hrcreplay.evaluation.contact import (
-        write_contact,  # both are slow to load, and the other commands ask for neither
+        write_contact,  # both are slow to load, and the other commands need neither
     )
 
     ticks = pq.read_metadata(writer.partial / "state.parquet").num_rows
@@ -154,20 +154,20 @@ def run_stages(
     folder: Path,
     smooth: bool,
 ) -> dict[str, Told]:
-    """All stages of the run in one pass, without those whose tables were taken over.
+    """Runs all stages in one pass, except those whose tables were reused.
 
     Args:
-        run_config: What was asked for.
+        run_config: The run.
         log: Log of the run.
         ticks_ns: (n,) ticks of the run, increasing [ns].
         size: Ticks of a batch.
-        sink: Where rows, counts and times go.
-        reused: Stages whose tables were taken over from an earlier run.
-        folder: Where those are.
-        smooth: Whether to write the smoothed person too.
+        sink: Receives rows, counts and times.
+        reused: Stages whose tables were copied from an earlier run.
+        folder: Folder of those tables.
+        smooth: True: also write the smoothed person.
 
     Returns:
-        What the stages that read the log found in it.
+        The findings of the stages that read the log.
     """
     todo = [stage for stage in run_config.stages if stage not in reused]
     states: Iterable[HumanStates]
@@ -196,17 +196,17 @@ def run_stages(
 def _describe_results(
     run_config: RunConfig, log: Log, folder: Path, meta: dict[str, Any], told: list[str]
 ) -> dict[str, Any]:
-    """Entries of run.json beside the findings of the stages: more remarks, and the robot where there is a plan.
+    """Returns further entries of run.json: more remarks and, for a run with a plan, the robot.
 
     Args:
-        run_config: What was asked for.
+        run_config: The run.
         log: Log of the run.
         folder: Tables of the run.
-        meta: What is known of the run so far.
+        meta: Entries of run.json so far.
         told: Remarks so far.
 
     Returns:
-        ``notes``, those told before among them, and ``robot``.
+        ``notes``, including the remarks so far, and ``robot``.
     """
     robot = assembly.robot(run_config, assembly.robot_base(run_config, log)) if "plan" in run_config.stages else None
     method = run_config.settings.plan.method
@@ -216,14 +216,14 @@ def _describe_results(
 
 
 def findings(run_config: RunConfig, told: Mapping[str, Told], reused: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Findings of the stages in the log; of a stage taken over, those of the earlier run.
+    """Returns the findings of the stages in the log; for a reused stage, those of the earlier run.
 
-    Damage to the files that only this run met is told all the same.
+    Damaged files that only this run found are included.
 
     Args:
-        run_config: What was asked for.
-        told: What ``run_stages`` returned.
-        reused: Stages whose tables were taken over from an earlier run.
+        run_config: The run.
+        told: Result of ``run_stages``.
+        reused: Stages whose tables were copied from an earlier run.
 
     Returns:
         ``counts`` and ``notes`` about the data, for run.json, and ``found_by``: those of each stage that reads the log.

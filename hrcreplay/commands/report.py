@@ -37,10 +37,10 @@ def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any],
     """Writes metrics.json, the figures, report.html and scene.mcap beside the tables that have just been written.
 
     Args:
-        run_config: What was asked for.
+        run_config: The run.
         writer: Run folder.
         meta: Content of run.json.
-        log: Of a replay, whose ticks can be computed again; None: a live session's are not.
+        log: Log of a replay, whose ticks can be computed again; None for a live session.
     """
     near = _bounds(run_config.settings.model_dump())
     run = run_folder.read(writer.partial, meta, shown=True)
@@ -67,7 +67,7 @@ def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any],
 
 
 def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:
-    """Scene of a run's 3-D replay; None where it moved no robot."""
+    """Returns the scene of a run's 3-D replay; None for a run without a robot."""
     if run.motion is None or run.T_world_base is None:
         return None
     radii_m = part_radii(run_config.settings.prediction, run_config.settings.report.leg_radius_m)
@@ -78,14 +78,14 @@ def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:
 def _stops(
     run_config: RunConfig, log: Log, run: Run, slow_m_per_s: float, found: dict[str, Metric]
 ) -> tuple[PageTable, ...]:
-    """The longest stops of the plan as a table, and among the metrics.
+    """Returns the longest stops of the plan as a table and adds them to the metrics.
 
     Args:
-        run_config: What was asked for.
-        log: That was replayed.
+        run_config: The run.
+        log: The replayed log.
         run: The run's tables.
-        slow_m_per_s: A TCP slower than this stands [m/s].
-        found: The metrics so far; gets those of the stops.
+        slow_m_per_s: A TCP slower than this counts as stationary [m/s].
+        found: The metrics so far; the metrics of the stops are added.
     """
     if run.motion is None or not len(run.motion):
         return ()
@@ -104,13 +104,13 @@ def _stops(
 
 
 def summary(folder: Path) -> list[str]:
-    """The main figures of a run, a line a stage."""
+    """Returns the main figures of a run, one line per stage."""
     run = run_folder.read(folder)
     return lines(run, compute(run, **_bounds(run.meta["settings"])))
 
 
 def _bounds(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings that the metrics need."""
+    """Returns the settings that the metrics need."""
     return {
         "near_m": settings["report"]["near_m"],
         "stationary_m_per_s": settings["report"]["stationary_m_per_s"],
@@ -119,12 +119,12 @@ def _bounds(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float = Logs().gap_s) -> dict[str, Metric]:
-    """Metrics of a run: name -> value, unit, meaning; null with a reason where one does not apply, never 0.
+    """Computes the metrics of a run: name -> value, unit, meaning; null with a reason if one does not apply, never 0.
 
     Args:
-        run: The run's tables; those of stages that were not run are None.
+        run: The run's tables; None for stages that were not run.
         near_m: The stationary share counts ticks with a separation of at most this [m].
-        stationary_m_per_s: A TCP slower than this stands [m/s].
+        stationary_m_per_s: A TCP slower than this counts as stationary [m/s].
         gap_s: A camera silent for longer has a gap [s].
 
     Returns:
@@ -151,15 +151,16 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
 
 
 def take_still(folder: Path, at_s: float, out: Path | None) -> Path:
-    """Draws a run at the instant of its replay that is nearest to ``at_s``.
+    """Draws the scene of a run at the instant of its replay that is nearest to ``at_s``.
 
     Args:
-        folder: A run folder whose run moved a robot.
-        at_s: By the report's clock [s].
-        out: PNG file to make; None: ``snapshot-<seconds>.png`` in the folder that one works in.
+        folder: Folder of a run with a robot.
+        at_s: Time on the report's clock [s].
+        out: PNG file to create; None: ``snapshot-<seconds>.png`` in the working directory.
 
     Raises:
-        SettingsError: No run folder, no such instant, or the file is there or cannot be written.
+        SettingsError: The folder is not a run folder, the instant is outside the run, or the file exists or cannot be
+            written.
     """
     if not run_folder.is_run(folder):
         raise SettingsError(f"--snapshot: {folder} is no run folder; make one with: hrcreplay report {folder}")
@@ -182,10 +183,10 @@ def take_still(folder: Path, at_s: float, out: Path | None) -> Path:
 def figure_data(
     run_config: RunConfig, run: Run, metrics: Mapping[str, Metric], kinds: Sequence[FigureKind]
 ) -> FigureData:
-    """All that some figures of a run are drawn from.
+    """Returns all data from which some figures of a run are drawn.
 
     Args:
-        run_config: That made the run.
+        run_config: Configuration of the run.
         run: The run's tables.
         metrics: The run's metrics.
         kinds: The figures.
@@ -195,18 +196,19 @@ def figure_data(
 
 
 def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
-    """Draws the figures of a number or a name from a run folder alone: the same bytes as a report of that run has.
+    """Draws the figures with a number or a name from a run folder; the files equal those of the report byte by byte.
 
     Args:
         folder: A run folder.
-        key: Number as the paper has it, or name of the file.
-        out: Folder for them; None: the one that one works in.
+        key: Number of the figure in the paper, or name of the file.
+        out: Folder for the files; None: the working directory.
 
     Returns:
         The files written: PNG and SVG of each figure.
 
     Raises:
-        SettingsError: No run folder, no such figure, the run lacks what it needs, or a file is there already.
+        SettingsError: The folder is not a run folder, there is no such figure, the run lacks its data, or a file exists
+            already.
     """
     kinds = catalogue.find(key)
     if not kinds:
@@ -215,7 +217,7 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
     run, metrics = _recorded(folder, "--figure")
     for kind in kinds:
         if why := catalogue.missing(kind, run, metrics):
-            raise SettingsError(f"--figure {key}: {folder} has not what it needs: {why}")
+            raise SettingsError(f"--figure {key}: {folder} lacks what it needs: {why}")
     to = out or Path()
     paths = [to / f"{kind.name}.{suffix}" for kind in kinds for suffix in ("png", "svg")]
     if taken := [path for path in paths if path.exists()]:
@@ -225,7 +227,7 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
         drawn = catalogue.draw_all(data, Path(made), kinds)
         if len(drawn) < len(kinds):
             raise SettingsError(
-                f"--figure {key}: {folder} has not what it needs: the person was not known well enough then"
+                f"--figure {key}: {folder} lacks what it needs: the person was not known well enough then"
             )
         try:
             to.mkdir(parents=True, exist_ok=True)
@@ -237,7 +239,7 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
 
 
 def list_figures(folder: Path | None) -> list[str]:
-    """A line for each figure: number or name, title and, of a run folder, whether the run has what it needs."""
+    """Lists the figures, one per line: number or name, title and, for a run folder, any missing data."""
     run = None if folder is None else _recorded(folder, "--list-figures")
     lines = []
     for kind in catalogue.FIGURES:
@@ -248,7 +250,7 @@ def list_figures(folder: Path | None) -> list[str]:
 
 
 def _recorded(folder: Path, option: str) -> tuple[Run, dict[str, Metric]]:
-    """The tables and metrics of a run folder; without metrics.json these are computed."""
+    """Returns the tables and metrics of a run folder; computes the metrics if metrics.json is missing."""
     if not run_folder.is_run(folder):
         raise SettingsError(f"{option}: {folder} is no run folder; make one with: hrcreplay report {folder}")
     run = run_folder.read(folder)

@@ -14,10 +14,10 @@ def write_templates(folder: Path) -> list[Path]:
     """Write commented files to begin with; returns their paths.
 
     Args:
-        folder: Where; made where it is missing.
+        folder: Folder for the files; created if missing.
 
     Raises:
-        SettingsError: One of them exists, or cannot be written.
+        SettingsError: One of the files exists or cannot be written.
     """
     shipped = resources.files("hrcreplay.commands")
     head = "# Settings: take the '# ' away from those to change. Use with --config settings.toml.\n\n"

@@ -1,6 +1,6 @@
 """The stages with their settings, and the robot, built from settings, cell and log.
 
-The rooms of the stages take sections of the settings as they are, and plain values of the rest; only drivers load them.
+The packages of the stages take whole sections of the settings and plain values for the rest; only drivers load them.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from hrcreplay.settings.sections import Fusion, Prediction, Robot
 class Sightings(NamedTuple):
     """Content of some frames."""
 
-    measured: Measurements  #: of the person
-    everybody: CameraFrames  #: all bodies, and frames that show nobody; points in the world [m]
-    mine: Bools  #: which of ``everybody`` are the person
-    counts: Counter[str]  #: of ``select_person``, and ``frames_late_<camera>``
+    measured: Measurements  #: measurements of the person
+    everybody: CameraFrames  #: all bodies, and frames without a body; points in the world [m]
+    mine: Bools  #: rows of ``everybody`` that are the person
+    counts: Counter[str]  #: counts of ``select_person``, and ``frames_late_<camera>``
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class FusionStage:
     limits: LimitSet
     person_jump_m: float
     person_memory_s: float
-    watched: WatchedArea | None = None  #: where nobody can be whom no camera shows
+    watched: WatchedArea | None = None  #: area in which every person is seen by a camera
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Sightings]:
-        """Measure frames by the clock of the reference camera; see ``clean.select_person``.
+        """Measures frames on the clock of the reference camera; see ``clean.select_person``.
 
-        A frame that was captured more than ``fresh_s`` before its arrival shows where the person was, not where they
-        are: it is left out, and counted as ``frames_late_<camera>``.
+        A frame that was captured more than ``fresh_s`` before its arrival is outdated: it is dropped and counted as
+        ``frames_late_<camera>``.
         """
         frames = self.on_one_clock(frames)
         late = np.asarray(frames.arrival_ns - frames.capture_ns > self.filter.fresh_s * 1e9)
@@ -77,7 +77,7 @@ class FusionStage:
         return memory, Sightings(measured, replace(frames, points_m=points_m), mine, found + counts)
 
     def on_one_clock(self, frames: CameraFrames) -> CameraFrames:
-        """Frames with captures by the clock of the reference camera, none of them after its arrival."""
+        """Converts the capture times to the clock of the reference camera, none later than its arrival."""
         capture_ns = frames.capture_ns - self.clock_offset_ns[frames.camera]
         return replace(frames, capture_ns=np.minimum(capture_ns, frames.arrival_ns))
 
@@ -88,7 +88,7 @@ class PredictionStage:
 
     limits: LimitSet
     settings: Prediction
-    memory_s: float  #: how long the filter goes on without a measurement [s]
+    memory_s: float  #: time for which the filter continues without a measurement [s]
 
     @property
     def horizon_s(self) -> float:
@@ -106,11 +106,11 @@ class PredictionStage:
         return swept_volumes.limbs_of(self.settings)
 
     def by(self, method: str) -> PredictionStage:
-        """The same by another method."""
+        """Returns the stage with another method."""
         return replace(self, settings=self.settings.model_copy(update={"method": method}))
 
     def reachable(self, states: HumanStates) -> swept_volumes.Reach:
-        """Reachable interval of every joint at every tick."""
+        """Computes the reachable interval of every joint at every tick."""
         return swept_volumes.reachable(
             states, self.limits, self.settings, horizon_s=self.horizon_s, memory_s=self.memory_s
         )
@@ -118,12 +118,12 @@ class PredictionStage:
     def volumes(
         self, states: HumanStates, horizon_s: float | None = None, *, method: str | None = None
     ) -> SweptVolumes:
-        """Swept volumes of every tick: the one call by which replay, live and audit ask for them.
+        """Computes the swept volumes of every tick, for replay, live and audit alike.
 
         Args:
             states: The fused person.
-            horizon_s: Until when after each tick they hold; None: the braking time T_s [s].
-            method: None: that of the settings.
+            horizon_s: Time after each tick until which they hold; None: the braking time T_s [s].
+            method: None: as in the settings.
         """
         if method is not None:
             return self.by(method).volumes(states, horizon_s)
@@ -133,26 +133,26 @@ class PredictionStage:
 
 @dataclass(frozen=True)
 class WatchedBorder:
-    """The border of a watched area around the robot, and how fast it comes in."""
+    """The border of a watched area around the robot, and the speed of people who enter."""
 
     area: WatchedArea
     border: Border
     latency_s: float  #: from the newest capture to the robot's reaction [s]
 
     def depth_m(self, since_s: float, horizon_s: float) -> float:
-        """Depth that somebody outside ``since_s`` [s] ago can reach within ``horizon_s`` [m]."""
+        """Depth that a person outside ``since_s`` [s] ago can reach within ``horizon_s`` [m]."""
         return float(self.area.reached_m(since_s + horizon_s + self.latency_s))
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Obstacles of a robot: the person's volumes, and the border behind which others may be.
+    """Obstacles of a robot: the person's volumes, and the border beyond which unseen people may be.
 
-    A person whose newest frame is too old is not known. Where nobody can be in the watched area, nobody needs to be.
+    A person whose newest frame is too old is unknown. No person is needed while the watched area is certainly empty.
     """
 
     prediction: PredictionStage
-    fresh_s: float  #: a person whose newest frame was captured longer ago is not known [s]
+    fresh_s: float  #: maximum age of the person's newest frame, since its capture; an older person is unknown [s]
     watched: WatchedBorder | None = None
 
     @property
@@ -162,7 +162,7 @@ class Surroundings:
         return (*self.prediction.limbs, *(BORDER,) * sides)
 
     def obstacles(self, states: HumanStates, tick: int, person: Obstacles) -> Obstacles:
-        """The volumes of a tick and the border, as far as they are known.
+        """Returns the volumes of a tick and the border, as far as they are known.
 
         Args:
             states: The fused person.
@@ -186,11 +186,11 @@ class Forecast:
 
     @cached_property
     def full(self) -> SweptVolumes:
-        """The volumes of all ticks that hold for the braking time T_s."""
+        """Volumes of all ticks for the braking time T_s."""
         return self.around.prediction.volumes(self.states)
 
     def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
-        """Those of one tick that hold for ``horizon_s`` [s]."""
+        """Obstacles of one tick up to ``horizon_s`` [s]."""
         stage, states = self.around.prediction, self.states
         if horizon_s == stage.horizon_s:
             person = obstacles(self.full, tick, horizon_s)
@@ -199,12 +199,12 @@ class Forecast:
         return self.around.obstacles(states, tick, person)
 
     def predict(self, tick: int) -> Predict:
-        """The same of one tick as a function of the horizon."""
+        """Obstacles of one tick as a function of the horizon."""
         return partial(self.obstacles, tick)
 
 
 class LogLike(Protocol):
-    """Part of a log that the stages need; in a live session a header without one."""
+    """The part of a log that the stages need; in a live session only a header."""
 
     @property
     def header(self) -> Header:
@@ -215,14 +215,14 @@ class LogLike(Protocol):
         """Remarks of the latest reading of the joints."""
 
     def joints(self, axes: Sequence[str], /) -> JointTrack | None:
-        """The recorded track of the robot's axes, where there is one."""
+        """The recorded track of the robot's axes, if there is one."""
 
 
 def fusion_stage(run_config: RunConfig, log: LogLike) -> FusionStage:
-    """Stage 1 of a run. A camera pose of the cell file has priority over the log's.
+    """Makes stage 1 of a run. A camera pose of the cell file has priority over the log's.
 
     Raises:
-        LogError: A camera's pose is known to neither.
+        LogError: A camera's pose is in neither of them.
     """
     cell = run_config.cell or Cell()
     poses = {**log.header.T_world_camera, **cell.T_world_camera}
@@ -251,7 +251,7 @@ def fusion_stage(run_config: RunConfig, log: LogLike) -> FusionStage:
 
 
 def watched_area(run_config: RunConfig) -> WatchedArea | None:
-    """Area that the cameras of a run see together, where its cell names one."""
+    """Area that the cameras of a run see together, if its cell gives one."""
     given = None if run_config.cell is None else run_config.cell.watched
     if given is None:
         return None
@@ -261,7 +261,7 @@ def watched_area(run_config: RunConfig) -> WatchedArea | None:
 
 
 def prediction_stage(run_config: RunConfig) -> PredictionStage:
-    """Stage 2 of a run. For a live robot the latency includes ``live.reaction_s``, so the volumes are larger."""
+    """Makes stage 2 of a run. For a live robot the latency includes ``live.reaction_s``, so the volumes are larger."""
     prediction = run_config.settings.prediction
     if run_config.command == "live":
         prediction = prediction.model_copy(
@@ -271,10 +271,10 @@ def prediction_stage(run_config: RunConfig) -> PredictionStage:
 
 
 def surroundings(run_config: RunConfig, model: RobotModel) -> Surroundings:
-    """Obstacles of a run's robot.
+    """Makes the obstacles of a run's robot.
 
     Raises:
-        SettingsError: The robot stands outside the area that its cell says is watched.
+        SettingsError: The robot's base lies outside the watched area of its cell.
     """
     stage, area = prediction_stage(run_config), watched_area(run_config)
     border = None
@@ -290,14 +290,14 @@ def surroundings(run_config: RunConfig, model: RobotModel) -> Surroundings:
 
 
 def known_robot_base(run_config: RunConfig, log: LogLike) -> Floats | None:
-    """(4, 4) pose of the robot's base in the world: of the cell file, else of the log; None where neither has it."""
+    """(4, 4) pose of the robot's base in the world: from the cell file, else from the log; None if both lack it."""
     if run_config.cell is not None and run_config.cell.T_world_base is not None:
         return run_config.cell.T_world_base
     return log.header.T_world_base
 
 
 def robot(run_config: RunConfig, T_world_base: Floats) -> RobotModel:
-    """The robot of a run at its place in the world.
+    """Makes the robot of a run at its base pose in the world.
 
     Raises:
         SettingsError: The URDF or a robot setting cannot be used.
@@ -306,7 +306,7 @@ def robot(run_config: RunConfig, T_world_base: Floats) -> RobotModel:
 
 
 def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base: Floats) -> RobotModel:
-    """The same from what of a run it depends on."""
+    """Makes the robot from the parts of a run that it depends on."""
     T_tool_tcp = np.eye(4)
     T_tool_tcp[:3, :3] = Rotation.from_euler("xyz", settings.tcp_offset.rpy_deg, degrees=True).as_matrix()
     T_tool_tcp[:3, 3] = settings.tcp_offset.position_m
@@ -337,10 +337,10 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
 
 
 def reference(run_config: RunConfig, log: LogLike, model: RobotModel) -> tuple[Reference, int | None]:
-    """The programmed path: of the task file, else of the log's task, else the log's joint track.
+    """Makes the programmed path: from the task file, else the log's task, else the log's joint track.
 
     Returns:
-        The path, and the instant at which it starts where the log says [ns].
+        The path, and the instant at which it starts, if the log gives one [ns].
 
     Raises:
         SettingsError: The task cannot be used, or there is none.
@@ -364,29 +364,29 @@ def reference(run_config: RunConfig, log: LogLike, model: RobotModel) -> tuple[R
 
 
 def programme_notes(run_config: RunConfig, log: LogLike, path: Reference) -> list[str]:
-    """Remarks on a recorded joint track that is the programme; none on a task.
+    """Returns remarks on a recorded joint track used as the programme; none for a task.
 
     Args:
-        run_config: What was asked for.
+        run_config: The run.
         log: Log of the run; its joints were read for the path.
-        path: What ``reference`` made.
+        path: Result of ``reference``.
     """
     if run_config.task or log.header.task:
         return []
     return [*log.joint_notes, *recorded_remarks(path)]
 
 
-@lru_cache(maxsize=4)  # a live session makes its controller twice: to compile the kernels, and to fly
+@lru_cache(maxsize=4)  # a live session makes its controller twice: to compile the kernels, and to run
 def _programme(
     task: Task, where: str, settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base: bytes
 ) -> Reference:
-    """The path of a task by the robot of the other arguments, which are those of ``_robot``."""
+    """Makes the path of a task for a robot; the other arguments are those of ``_robot``."""
     model = _robot(settings, files, stop_s, np.frombuffer(T_world_base).reshape(4, 4))
     return plan_programme(task, model, where)
 
 
 def planners(run_config: RunConfig, log: LogLike, start_ns: int) -> dict[str, Planner]:
-    """Stage 3: the chosen method and its baselines, each with a robot of its own."""
+    """Makes stage 3: the chosen method and its baselines, each with its own robot."""
     plan, model = run_config.settings.plan, robot(run_config, robot_base(run_config, log))
     path, begin_ns = reference(run_config, log, model)
     dt_s = 1.0 / run_config.settings.fusion.rate_hz
@@ -403,7 +403,7 @@ def robot_base(run_config: RunConfig, log: LogLike) -> Floats:
     """(4, 4) pose of the robot's base in the world, which must be known.
 
     Raises:
-        SettingsError: Neither the cell nor the log knows.
+        SettingsError: Both the cell and the log lack it.
     """
     T_world_base = known_robot_base(run_config, log)
     if T_world_base is None:
@@ -414,7 +414,7 @@ def robot_base(run_config: RunConfig, log: LogLike) -> Floats:
 
 
 def plan_settings(run_config: RunConfig, dt_s: float, method: str) -> PlanSettings:
-    """Section 5 for ticks of ``dt_s`` [s] by a method."""
+    """Returns the settings of Section 5 for ticks of ``dt_s`` [s] and a method."""
     plan, prediction = run_config.settings.plan, prediction_stage(run_config).settings
     return PlanSettings(
         plan,
@@ -428,11 +428,11 @@ def plan_settings(run_config: RunConfig, dt_s: float, method: str) -> PlanSettin
 
 
 def make_controller(method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float) -> Controller:
-    """A robot that follows a path by a method, from ``s_s`` seconds of programmed time on.
+    """Makes a controller that follows a path by a method, from ``s_s`` seconds of programmed time on.
 
     Args:
         method: One of ``plan.method``.
-        model: Robot that follows.
+        model: The robot.
         path: Programmed path.
         settings: Section 5 for the length of a tick.
         s_s: Programmed time at the start [s].

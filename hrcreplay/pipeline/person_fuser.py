@@ -1,4 +1,4 @@
-"""Stage 1 as it goes on: frames to the fused person, for replay, live, audit and the library alike."""
+"""Incremental stage 1: frames to the fused person, for replay, live, audit and the library."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ class FusedTicks(NamedTuple):
     """Result of stage 1 for some ticks."""
 
     states: HumanStates
-    counts: Counter[str]  #: of ``fuse`` and ``watch``
-    trace: Trace  #: what ``smooth`` needs; without rows unless traced
+    counts: Counter[str]  #: states from ``fuse`` and ``watch``
+    trace: Trace  #: input of ``smooth``; without rows unless traced
 
 
 @dataclass
 class PersonFuser:
-    """Selection of the person, filter, and vacancy of a watched area, from one update to the next.
+    """Selects the person, runs the filter and tracks the vacancy of a watched area, update by update.
 
-    The result does not depend on how ticks and frames are cut into updates, bit for bit.
+    The result does not depend on the division of ticks and frames into updates, bit for bit.
     """
 
     stage: FusionStage
     cameras: tuple[str, ...]
-    traced: bool = False  #: whether to keep what ``smooth`` needs, 1.5 kB a tick
+    traced: bool = False  #: True: keep the input of ``smooth``, 1.5 kB per tick
 
     def __post_init__(self) -> None:
         self._memory = PersonMemory()
@@ -41,18 +41,19 @@ class PersonFuser:
         self.nothing = no_sightings(self.cameras)
 
     def measure(self, frames: CameraFrames | None) -> Sightings:
-        """Joint angles of the person in the frames that arrived since the last call, in order of arrival."""
+        """Computes joint angles of the person in the frames that arrived since the last call, in order of arrival."""
         if frames is None:
             return self.nothing
         self._memory, seen = self.stage.measure(frames, self._memory)
         return seen
 
     def advance(self, ticks_ns: Ints, seen: Sightings) -> FusedTicks:
-        """The fused person at ticks (n,), increasing and after those of the last call [ns].
+        """Computes the fused person at ticks (n,), increasing and after those of the last call [ns].
 
         Args:
-            ticks_ns: When.
-            seen: From ``measure``: of all frames that arrived up to the last tick, and after that of the last call.
+            ticks_ns: The ticks.
+            seen: From ``measure``, for all frames that arrived after the last tick of the last call and up to the last
+                of these ticks.
         """
         self._filter, states, counts, trace = fuse.fuse(
             self._filter, ticks_ns, seen.measured, self.stage.filter, self.stage.limits, traced=self.traced
@@ -63,13 +64,13 @@ class PersonFuser:
         return FusedTicks(states, counts, trace)
 
     def update(self, ticks_ns: Ints, frames: CameraFrames | None) -> tuple[FusedTicks, Sightings]:
-        """Both of the above."""
+        """Calls ``measure`` and ``advance``."""
         seen = self.measure(frames)
         return self.advance(ticks_ns, seen), seen
 
 
 def no_sightings(cameras: tuple[str, ...]) -> Sightings:
-    """Sightings of no frame at all."""
+    """Returns the sightings of zero frames."""
     none, points, confidence = np.zeros(0, np.int64), np.zeros((0, 20, 3)), np.zeros((0, 20))
     rows = np.zeros((0, inverse_kinematics.ROWS))
     measured = Measurements(none, none, none, rows, rows, points, confidence, cameras)

@@ -19,13 +19,13 @@ from hrcreplay.store import run_folder
 from hrcreplay.store.columns import missing_columns
 from hrcreplay.store.run_folder import RunWriter
 
-#: What the fused person depends on, and the volumes; each stage works on what those before it hand on.
+#: Parts that the fused person and the volumes depend on; each stage also depends on the stages before it.
 _PERSON = ("versions", "log", "ticks", "cameras", "watched", "settings logs", "settings fusion", "limits.tracking")
 _VOLUMES = (*_PERSON, "settings prediction", "limits.prediction")
 _PROGRAMME = ("base", "programme", "settings robot", "settings plan")
 _JOINT_SETTINGS = tuple(key for key in Logs.model_fields if key.startswith("joint"))
-#: Stage -> the parts that its tables, counts and notes depend on. The plan takes the volumes of every tick: how many
-#: of them are stored changes nothing for it.
+#: Stage -> the parts that its tables, counts and notes depend on. The plan uses the volumes of every tick, so the
+#: storage rate is not one of its parts.
 PARTS = {
     "fuse": (*_PERSON, "logs.gap_s"),
     "predict": (*_VOLUMES, "prediction.store_hz"),
@@ -34,23 +34,23 @@ PARTS = {
 
 
 def parts_of(run_config: RunConfig, stage: str) -> tuple[str, ...]:
-    """The parts that a stage of a run depends on.
+    """Returns the parts that a stage of a run depends on.
 
-    Volumes that are stored beside a plan reach as far ahead as the chosen robot asked for, so they depend on it.
+    Volumes that are stored with a plan have the horizon that the chosen method requested, so they depend on it.
     """
     planned = "plan" in run_config.stages and run_config.settings.plan.horizon == "adaptive"
     return (*PARTS[stage], *_PROGRAMME) if planned and stage == "predict" else PARTS[stage]
 
 
 def dependencies(run_config: RunConfig, log: LogLike, ticks_ns: Ints) -> dict[str, str]:
-    """Digest of every part that a stage of the run depends on.
+    """Computes the digest of every part that a stage of the run depends on.
 
-    A section of the settings counts whole, so that a new setting cannot be forgotten, but for the keys that stand here
-    by themselves: a file counts by its content, what is set of the joints as the programme, for want of a task.
+    A section of the settings counts as a whole, so that a new setting cannot be forgotten. Some keys count separately:
+    a file by its content; the settings of the joints as part of the programme, if there is no task.
 
     Args:
-        run_config: What was asked for.
-        log: Where the run's cell and task say nothing, the log's own hold.
+        run_config: The run.
+        log: Log of the run; its cell and task are used where the run has none.
         ticks_ns: (n,) of the run [ns].
 
     Raises:
@@ -87,14 +87,14 @@ def dependencies(run_config: RunConfig, log: LogLike, ticks_ns: Ints) -> dict[st
 
 
 def stage_digests(run_config: RunConfig, found: Mapping[str, str]) -> dict[str, str]:
-    """Digest of all that the result of each stage of the run depends on, from those of ``dependencies``."""
+    """Computes one digest per stage over all inputs of its result, from those of ``dependencies``."""
     return {stage: _digest([found[name] for name in parts_of(run_config, stage)]) for stage in run_config.stages}
 
 
 def stale_stages(run_config: RunConfig, found: Mapping[str, str]) -> dict[str, str]:
-    """Stage -> why the earlier run's result is not the one that this run would make.
+    """Stage -> reason for which the earlier run's result differs from that of this run.
 
-    A table that is damaged or of an earlier version speaks against the stages after its own, too.
+    A table that is damaged or of an earlier version also invalidates the later stages.
     """
     if run_config.earlier is None:
         return {}
@@ -121,7 +121,7 @@ def _difference(parts: tuple[str, ...], found: Mapping[str, str], meta: Mapping[
 
 
 def _damage(folder: Path, stage: str, outputs: Mapping[str, str]) -> str | None:
-    """Reason not to take an earlier run's tables of a stage for ours."""
+    """Returns the reason for which an earlier run's tables of a stage cannot be reused."""
     for name in sorted(name for name in outputs if any(fnmatch(name, pattern) for pattern in TABLES[stage])):
         path = folder / name
         if not path.exists() or run_folder.sha256(path) != outputs[name]:
@@ -140,13 +140,13 @@ def _without(table: Mapping[str, Any], *keys: str) -> dict[str, Any]:
 
 
 def take_over(run_config: RunConfig, parts: Mapping[str, str], writer: RunWriter, *, smooth: bool) -> tuple[str, ...]:
-    """Copies the tables of the earlier run's stages that would come out the same, and says which those are.
+    """Copies the tables of the earlier run's stages that have the same result in this run; returns these stages.
 
     Args:
-        run_config: What was asked for.
-        parts: What ``dependencies`` found.
+        run_config: The run.
+        parts: Result of ``dependencies``.
         writer: Run folder.
-        smooth: Whether the smoothed person is asked for, too.
+        smooth: True: the smoothed person is requested too.
     """
     if run_config.earlier is None:
         return ()

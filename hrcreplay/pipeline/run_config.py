@@ -1,6 +1,6 @@
 """The configuration of a run: log, settings, cell, task and span, resolved from the command line or an earlier run.
 
-Also the files behind ``robot.urdf``: the URDF and the meshes of its links, which may be in several packages.
+It includes the files of ``robot.urdf``: the URDF and the meshes of its links, which may be in several packages.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from hrcreplay.version import __version__
 
 @dataclass(frozen=True)
 class UrdfFiles:
-    """A URDF's text, and where its meshes are."""
+    """A URDF's text, and the paths of its meshes."""
 
     text: str
-    meshes: tuple[tuple[str, str], ...]  #: file that a collision mesh names, and its path
+    meshes: tuple[tuple[str, str], ...]  #: file name of a collision mesh, and its path
     inputs: tuple[tuple[str, str], ...]  #: path and SHA-256 of each file that was read, the URDF first
-    capsules: tuple[LinkSettings, ...] = ()  #: of the links, where a run has recorded them: no mesh is read then
+    capsules: tuple[LinkSettings, ...] = ()  #: capsules of the links that a run has recorded: then no mesh is read
 
 
 def robot_axes(robot: Robot) -> tuple[str, ...]:
-    """The joints of the robot that the settings name, from the base on.
+    """Returns the joints of the robot in the settings, from the base on.
 
     Raises:
         SettingsError: The URDF cannot be used.
@@ -52,7 +52,7 @@ def robot_axes(robot: Robot) -> tuple[str, ...]:
 
 
 def robot_description(robot: Robot) -> Description:
-    """The chain of the robot that the settings name, with the limits of its axes.
+    """Returns the chain of the robot in the settings, with the limits of its axes.
 
     Raises:
         SettingsError: The URDF cannot be used.
@@ -63,12 +63,12 @@ def robot_description(robot: Robot) -> Description:
 
 
 def read_urdf(robot: Robot) -> UrdfFiles | None:
-    """The files of the robot that the settings name; none for the IRB 140.
+    """Reads the files of the robot in the settings; none for the IRB 140.
 
-    Meshes are looked for only where link capsules are derived from them.
+    Meshes are searched only if link capsules are derived from them.
 
     Raises:
-        SettingsError: The URDF or one of its meshes is not there or cannot be read.
+        SettingsError: The URDF or one of its meshes is missing or cannot be read.
     """
     path = robot.urdf
     if path is None:
@@ -92,7 +92,7 @@ def read_urdf(robot: Robot) -> UrdfFiles | None:
     return UrdfFiles(text, tuple(meshes.items()), tuple((str(file), run_folder.sha256(file)) for file in files))
 
 
-#: The longest URDF that is read, and the largest mesh: 400,000 triangles of a binary STL [bytes].
+#: Maximum size of a URDF, and of a mesh: 400,000 triangles of a binary STL [bytes].
 _URDF_BYTES, _MESH_BYTES = 8 << 20, 20 << 20
 
 
@@ -105,14 +105,14 @@ def _check_size(path: Path, most: int) -> None:
         )
 
 
-#: Endings of meshes that are read, in formats whose data are no larger in memory than some times the file.
+#: File endings of accepted meshes; in these formats the data in memory are at most a few times as large as the file.
 _MESHES = (".stl", ".dae", ".obj")
-#: How packed files begin: of zip, gzip, zstd.
+#: First bytes of packed files: zip, gzip, zstd.
 _PACKED = (b"PK", b"\x1f\x8b", ZSTD_MAGIC)
 
 
 def _check_kind(mesh: Path) -> None:
-    """Refuses a mesh that may be packed: the library unpacks it whole, however much that is."""
+    """Rejects a mesh that may be packed, as the library unpacks it without a size limit."""
     with mesh.open("rb") as file:
         packed = file.read(4).startswith(_PACKED)
     if packed or mesh.suffix.lower() not in _MESHES:
@@ -123,7 +123,7 @@ def _check_kind(mesh: Path) -> None:
 
 
 def _find(name: str, link: str, urdf: Path, packages: tuple[Path, ...]) -> Path:
-    """The file that a URDF calls ``package://PACKAGE/...``, or by its path."""
+    """Finds a file that a URDF names by ``package://PACKAGE/...`` or by its path."""
     scheme, _, rest = name.partition("://") if "://" in name else ("", "", name)
     if scheme in ("", "file"):
         path = urdf.parent / rest  # an absolute path stays one
@@ -144,7 +144,7 @@ def _find(name: str, link: str, urdf: Path, packages: tuple[Path, ...]) -> Path:
 
 
 def _ros_path() -> list[Path]:
-    """Directories in which ROS looks for packages."""
+    """Returns the directories in which ROS searches packages."""
     ros1 = os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)
     ros2 = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     return [Path(root) for root in ros1 if root] + [Path(root) / "share" for root in ros2 if root]
@@ -156,14 +156,14 @@ def _listed(roots: tuple[Path, ...] | list[Path]) -> str:
 
 STAGES = ("fuse", "predict", "plan")
 
-#: What each stage leaves behind.
+#: Tables that each stage writes.
 TABLES = {
     "fuse": ("measurements.parquet", "state.parquet", "truth.parquet", "bodies.parquet", "agreement.parquet"),
     "predict": ("occupancy.parquet",),
     "plan": ("motion.parquet", "motion_*.parquet"),
 }
 
-#: What a run must tell of itself, so that its log can be replayed as it was.
+#: Entries of run.json that are required to repeat a run.
 _NEEDED = ("inputs", "settings", "cell", "task", "span_s")
 
 #: Packages whose version can change a result.
@@ -188,14 +188,14 @@ class RunConfig:
     tracking_limits: LimitSet
     prediction_limits: LimitSet
     earlier: Path | None  #: run folder given instead of a log
-    recorded_urdf: UrdfFiles | None = None  #: of the run folder that the run is from; else the settings' own file
+    recorded_urdf: UrdfFiles | None = None  #: file of an earlier run; None: as in the settings
 
     @property
     def urdf(self) -> UrdfFiles | None:
         """The robot's files; none for the IRB 140.
 
         Raises:
-            SettingsError: As ``read_urdf``.
+            SettingsError: As for ``read_urdf``.
         """
         return self.recorded_urdf or read_urdf(self.settings.robot)
 
@@ -205,9 +205,9 @@ class RunConfig:
         return STAGES[: STAGES.index(self.command) + 1] if self.command in STAGES else STAGES
 
     def arguments(self, *, smooth: bool) -> list[str]:
-        """A command line that makes the same run again, wherever the settings came from: names without folders.
+        """Returns a command line that makes the same run again, from any source of settings; names without folders.
 
-        ``CELL.toml`` stands for the cell file, whose content is the run's ``cell``.
+        ``CELL.toml`` is a placeholder for the cell file; its content is the run's ``cell``.
         """
         span = (("--start", self.start_s), ("--end", self.end_s))
         return [
@@ -235,12 +235,12 @@ class RunConfig:
 
 
 def versions() -> dict[str, str]:
-    """Our version and those of PACKAGES."""
+    """Returns the version of hrcreplay and those of PACKAGES."""
     return {"hrcreplay": __version__, **{name: metadata.version(name) for name in PACKAGES}}
 
 
 class RunOptions(TypedDict, total=False):
-    """Arguments of ``resolve`` that the commands hand on to it."""
+    """Arguments of ``resolve`` that the commands pass on."""
 
     config: Path | None
     overrides: tuple[str, ...]
@@ -260,23 +260,23 @@ def resolve(
     end_s: float | None = None,
     given: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> RunConfig:
-    """Resolve what a command line asks for.
+    """Resolves the arguments of a command line.
 
     Settings of a run folder are those of the run unless a settings file or ``--set`` says otherwise.
 
     Args:
         command: Command of the run.
         source: A log, or the run folder of an earlier command.
-        config: Settings file, or none.
-        overrides: ``section.key=value`` of the command line, which win over the file.
+        config: Settings file; may be None.
+        overrides: ``section.key=value`` of the command line; they override the file.
         cell_file: Poses of cameras and robot; None: those of the earlier run, else of the log.
-        start_s: Start of the span, from the log's first message [s]; None: as the earlier run, else its beginning.
-        end_s: End of the span, from the log's first message [s]; None: as the earlier run, else its end.
-        given: Settings, section -> key -> value, over those of the file.
+        start_s: Start of the span, from the log's first message [s]; None: as in the earlier run, else its beginning.
+        end_s: End of the span, from the log's first message [s]; None: as in the earlier run, else its end.
+        given: Settings, section -> key -> value; they override the file.
 
     Raises:
         SettingsError: A setting, the cell, a limit set or the run folder cannot be used.
-        LogError: There is nothing at that path.
+        LogError: The path does not exist.
     """
     if not source.exists():
         raise LogError(f"{source}: nothing is there; give a log or a run folder")
@@ -291,7 +291,7 @@ def resolve(
         start_s = earlier["span_s"][0] if start_s is None else start_s
         end_s = earlier["span_s"][1] if end_s is None else end_s
     log = source
-    if earlier is not None:  # a live session's log lies in its folder, wherever that is by now
+    if earlier is not None:  # a live session's log lies in its folder, even if the folder was moved
         named = Path(earlier["inputs"][0]["path"])
         log = source / named if (source / named).exists() else named
     return RunConfig(
@@ -310,10 +310,10 @@ def resolve(
 
 
 def read_run_config(folder: Path) -> RunConfig:
-    """Read the configuration of a run from its run.json alone; neither log nor limits are opened.
+    """Reads the configuration of a run from its run.json only; neither log nor limits are opened.
 
     Raises:
-        SettingsError: No run folder, or one of another version.
+        SettingsError: The folder is not a run folder, or another version made it.
     """
     meta = run_folder.read_meta(folder)
     if missing := [key for key in (*_NEEDED, "limits") if key not in meta]:
@@ -335,25 +335,25 @@ def read_run_config(folder: Path) -> RunConfig:
 
 
 def recorded_limits(plain: dict[str, Any], where: str | Path) -> LimitSet:
-    """The limit set whose JSON form a run recorded.
+    """Returns the limit set that a run recorded as JSON.
 
     Raises:
         SettingsError: Another version recorded it.
     """
     try:
         return LimitSet.of(plain)
-    except TypeError as error:  # a bound too many or too few
+    except TypeError as error:  # too many or too few bounds
         raise SettingsError(f"{where}: its limit set {plain.get('name')} is of another version of hrcreplay") from error
 
 
 def resolve_without_log(command: str, where: Path, settings: Settings, cell_file: Path | None) -> RunConfig:
-    """Resolve a command that has no log yet.
+    """Resolves a command that has no log yet.
 
     Args:
         command: Command of the run.
-        where: What messages name in place of the log.
+        where: Name in messages in place of the log.
         settings: Settings of the run.
-        cell_file: Poses of cameras and robot, or none.
+        cell_file: Poses of cameras and robot; may be None.
 
     Raises:
         SettingsError: The cell, the task or a limit set cannot be used.
@@ -382,7 +382,7 @@ def _digest(log: Path, earlier: dict[str, Any] | None) -> str:
 
 
 def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The task of the task file, else of the earlier run; the log's own is read with the log."""
+    """Returns the task of the task file, else of the earlier run; the log's own task is read with the log."""
     path = settings.plan.task
     if path is None:
         return earlier["task"] if earlier is not None else None
@@ -390,7 +390,7 @@ def _task(settings: Settings, earlier: dict[str, Any] | None) -> dict[str, Any] 
 
 
 def urdf_digest(settings: Settings) -> str | None:
-    """Digest of the robot's URDF and of the meshes that its link capsules come from; None for the IRB 140."""
+    """Computes the digest of the robot's URDF and of the meshes of its link capsules; None for the IRB 140."""
     digests = [file["sha256"] for file in _urdf_inputs(settings)]
     return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else None
 
@@ -402,20 +402,20 @@ def _urdf_inputs(settings: Settings) -> list[dict[str, str]]:
 
 @lru_cache(maxsize=4)  # a run makes its robot several times; a file that changes has another digest
 def _derived_capsules(files: UrdfFiles, tcp_frame: str | None, base_frame: str | None) -> tuple[Segment, ...]:
-    """The link capsules that a URDF's collision shapes give."""
+    """Derives the link capsules from a URDF's collision shapes."""
     meshes = dict(files.meshes)
     model = from_urdf(files.text, np.eye(4), stop_s=1.0, tcp_frame=tcp_frame, base_frame=base_frame, meshes=meshes)
     return model.segments
 
 
 def link_capsules(robot: Robot, files: UrdfFiles) -> tuple[Segment, ...]:
-    """The links' capsules: those of the settings, else those that a run recorded, else what the shapes give."""
+    """Returns the links' capsules: from the settings, else as a run recorded them, else derived from the shapes."""
     given = tuple(Segment(**dict(link)) for link in robot.links or files.capsules)
     return given or _derived_capsules(files, robot.tcp_frame, robot.base_frame)
 
 
 def _urdf_record(run_config: RunConfig) -> dict[str, Any] | None:
-    """Record that makes the robot again without its files."""
+    """Returns a record from which the robot can be made again without its files."""
     files = run_config.urdf
     if files is None:
         return None

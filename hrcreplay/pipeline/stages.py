@@ -50,7 +50,7 @@ from hrcreplay.store.columns import (
 from hrcreplay.store.run_folder import Stopwatch
 
 NS = 1_000_000_000
-#: What can be wrong with points, and where bodies are lost: the beginnings of the names that count it.
+#: Prefixes of the names of counters for defective points and lost bodies.
 _LOST = (
     "points_",
     "person_frames_without",
@@ -60,12 +60,12 @@ _LOST = (
     "frames_out_of_order",
 )
 
-#: Of a session; a longer log has an arrival of another clock among its messages [s].
+#: Maximum length of a session; a longer log contains an arrival time from another clock [s].
 LONGEST_S = 24 * 3600
 
 
 class Tables(Protocol):
-    """Destination of the rows of tables: a run folder, or memory."""
+    """Destination of table rows: a run folder or memory."""
 
     def table(self, name: str, columns: Mapping[str, Any], /) -> None:
         """Appends rows to a table."""
@@ -86,24 +86,24 @@ class Sink:
     watch: Stopwatch
     progress: Callable[[str, int], None]  #: stage, ticks done
     counts: Counter[str] = field(default_factory=Counter)
-    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> what is odd
+    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> notes on it
 
 
 def collect_fusion_findings(log: Log, sink: Sink) -> Told:
-    """Findings of the latest pass over a log's frames and of stage 1, in files, frames and person."""
+    """Collects findings of the latest pass over a log's frames and of stage 1, in files, frames and person."""
     return Told(log.defects - log.joint_defects + sink.counts, (*log.notes, *sink.notes["fuse"]))
 
 
 def collect_plan_findings(log: Log, sink: Sink) -> Told:
-    """Findings of the latest reading of a log's joints and of stage 3."""
+    """Collects findings of the latest reading of a log's joints and of stage 3."""
     return Told(log.joint_defects, tuple(sink.notes["plan"]))
 
 
 def tick_times(start_ns: int, end_ns: int, rate_hz: float) -> Ints:
-    """(n,) tick times: from the first instant on, at the filter's rate, none after the last [ns].
+    """Returns (n,) tick times: from the first instant on, at the filter's rate, none after the last [ns].
 
     Raises:
-        LogError: So long a span is no session, but a message with an arrival that cannot be.
+        LogError: The span is longer than any session, so a message has a wrong arrival time.
     """
     if end_ns - start_ns > LONGEST_S * NS:
         raise LogError(
@@ -146,13 +146,13 @@ def span_ticks(run_config: RunConfig, log: Log) -> Ints:
 
 
 def store_every(run_config: RunConfig) -> float:
-    """Number of ticks for one whose volumes are stored."""
+    """Number of ticks per tick whose volumes are stored."""
     store_hz = run_config.settings.prediction.store_hz
     return 1.0 if store_hz == "all" else max(1.0, run_config.settings.fusion.rate_hz / store_hz)
 
 
 def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterator[tuple[Ints, CameraFrames | None]]:
-    """Ticks by the batch, each with the frames that arrived up to its last tick and not before."""
+    """Yields batches of ticks, each with the frames that arrived after the previous batch and up to its last tick."""
     waiting: list[CameraFrames] = []
     arrived_ns = -1
     for first in range(0, len(ticks_ns), size):
@@ -172,18 +172,18 @@ def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterat
 def fuse_batches(
     log: Log, ticks_ns: Ints, size: int, fusion_stage: FusionStage, sink: Sink, *, smooth: bool = False
 ) -> Iterator[HumanStates]:
-    """Stage 1: camera frames to the fused person; writes measurements and state, and ``smooth`` where asked.
+    """Stage 1: camera frames to the fused person; writes measurements and state and, if requested, ``smooth``.
 
     Args:
         log: Log to read.
         ticks_ns: (n,) ticks, increasing [ns].
         size: Ticks of a batch.
         fusion_stage: Cameras and settings of the stage.
-        sink: Where rows, counts and times go.
-        smooth: Whether to write the smoothed person at the end.
+        sink: Receives rows, counts and times.
+        smooth: True: write the smoothed person at the end.
 
     Raises:
-        LogError: At the end: what the log shows is certainly no person, or nobody was ever seen.
+        LogError: At the end: the log certainly shows no person, or no person was ever seen.
     """
     fuser = PersonFuser(fusion_stage, log.header.cameras, traced=smooth)
     watched = fusion_stage.watched is not None
@@ -228,7 +228,7 @@ def fuse_batches(
 
 
 def _describe_others(counts: Counter[str]) -> Iterator[str]:
-    """A note on bodies that are not the person."""
+    """Returns a note on bodies other than the person."""
     if others := counts["person_frames_beside_others"]:
         yield (
             f"{others} frames show at least one other body than the person: it counts for contact, but nothing is "
@@ -237,11 +237,11 @@ def _describe_others(counts: Counter[str]) -> Iterator[str]:
 
 
 def _describe_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -> Iterator[str]:
-    """Notes on a watched area: what was never known of it, and what contradicts it."""
+    """Returns notes on a watched area: missing observations and contradictions."""
     if refuting := counts["watched_frames_refuting"]:
         yield (
-            f"watched area: {refuting} frames show somebody further inside than anybody could have walked since all "
-            "cameras showed it without people: they do not see all of it, or people came faster; would be right: a "
+            f"watched area: {refuting} frames show a person deeper inside than people can walk since all cameras "
+            "showed it without people: the cameras do not see all of it, or people were faster; would be right: a "
             "smaller area, or a larger watched.margin_m, in the cell file"
         )
     if max(seen.vacant_ns) >= 0:
@@ -258,7 +258,7 @@ def _describe_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -
 
 
 def write_checks(checks: CameraChecks, sink: Sink) -> None:
-    """Writes how each camera's person stands and how far two cameras differ, and notes what is out of bounds."""
+    """Writes the checks of each camera's person and of each pair of cameras; adds notes on values out of bounds."""
     sink.notes["fuse"].extend(checks.remarks())
     for name, rows in zip(("bodies", "agreement"), checks.figures(), strict=True):
         if rows:
@@ -266,10 +266,10 @@ def write_checks(checks: CameraChecks, sink: Sink) -> None:
 
 
 class StretchSmoother:
-    """Smooths a run stretch by stretch: each tick given all measurements of its stretch and some of what came later.
+    """Smooths a run stretch by stretch: each tick uses all measurements of its stretch and some later ones.
 
-    A stretch knows 500 ticks of the next one, and what comes later tells no more. The result does not depend on the
-    batches in which the ticks come; a trace takes 1.5 kB a tick, so it holds two stretches at most.
+    A stretch uses 500 ticks of the next one; later ticks have no effect. The result does not depend on the batches of
+    the ticks. A trace takes 1.5 kB per tick, so at most two stretches are kept in memory.
     """
 
     TICKS, LATER = 15_000, 500
@@ -280,7 +280,7 @@ class StretchSmoother:
         self._count = 0
 
     def add(self, states: HumanStates, trace: fuse.Trace) -> list[HumanStates]:
-        """Takes the next ticks; returns the stretches that are complete with them, smoothed."""
+        """Adds the next ticks; returns the stretches that they complete, smoothed."""
         self._parts.append((states, trace))
         self._count += len(states)
         found = []
@@ -289,14 +289,14 @@ class StretchSmoother:
         return found
 
     def finish(self) -> list[HumanStates]:
-        """The smoothed ticks that are left."""
+        """Returns the remaining ticks, smoothed."""
         found = []
         while self._count:
             found.append(self._smooth(min(self._count, self.TICKS)))
         return found
 
     def _smooth(self, count: int) -> HumanStates:
-        """The next so many ticks, smoothed, and no longer held."""
+        """Smooths the next ``count`` ticks and removes them from memory."""
         states = HumanStates.join([part for part, _ in self._parts])
         trace = fuse.Trace.join([part for _, part in self._parts])
         known = slice(0, count + self.LATER)
@@ -307,7 +307,7 @@ class StretchSmoother:
 
 
 def _nobody(log: Log, found: Counter[str]) -> LogError:
-    """Error for a log in which nobody was ever seen: what there was, and what would be right."""
+    """Returns the error for a log without a person: what was found, and what would be right."""
     rows = sum(log.defects[f"frames_{camera}"] for camera in log.header.cameras)
     text = (
         f"{log.header.path}: nobody was ever seen: {rows} bodies in the frames of {', '.join(log.header.cameras)} hold "
@@ -327,7 +327,7 @@ def _nobody(log: Log, found: Counter[str]) -> LogError:
 
 
 def _describe_late_frames(log: Log, counts: Counter[str], offsets_ns: Ints) -> Iterator[str]:
-    """Notes on frames that came too late."""
+    """Returns notes on frames that arrived too late."""
     for camera, offset_ns in zip(log.header.cameras, offsets_ns.tolist(), strict=True):
         late = counts[f"frames_late_{camera}"]
         if late:
@@ -338,13 +338,13 @@ def _describe_late_frames(log: Log, counts: Counter[str], offsets_ns: Ints) -> I
 
 
 def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
-    """Writes the closed-form joints of the log's ground truth, where it has one.
+    """Writes the closed-form joints of the log's ground truth, if it has one.
 
     Args:
         log: Log to read.
         start_ns: First instant to write [ns].
         end_ns: Last instant to write [ns].
-        sink: Where the rows go.
+        sink: Receives the rows.
     """
     for truth in log.truth():
         within = truth.rows((truth.t_ns >= start_ns) & (truth.t_ns <= end_ns))
@@ -353,7 +353,7 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
 
 
 def select_stored_ticks(first: int, count: int, store_every: float) -> Ints:
-    """Select those of ``count`` ticks from the ``first`` on whose volumes are stored: one in ``store_every``."""
+    """Selects the ticks whose volumes are stored among ``count`` ticks from ``first`` on: one in ``store_every``."""
     if math.isinf(store_every):
         return np.zeros(0, np.int64)
     number = np.arange(first, first + count)
@@ -361,13 +361,13 @@ def select_stored_ticks(first: int, count: int, store_every: float) -> Ints:
 
 
 def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, tables: Tables) -> None:
-    """Writes hull vertices and size above the floor of some ticks' volumes; a tick without a person has none.
+    """Writes hull vertices and volume above the floor for some ticks; a tick without a person has none.
 
     Args:
         volumes: Of any ticks.
         ticks: Rows of ``volumes`` to write.
-        horizon_s: (n,) how long after its tick each row holds [s].
-        tables: Where they go.
+        horizon_s: (n,) time after its tick until which each row holds [s].
+        tables: Receives the rows.
     """
     t_ns: list[int] = []
     limbs: list[str] = []
@@ -396,13 +396,13 @@ def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, tables:
 def predict_batches(
     states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink
 ) -> Iterator[HumanStates]:
-    """Stage 2 alone: writes the volumes that hold for the braking time T_s, of one tick in ``store_every``.
+    """Stage 2 alone: writes the volumes for the braking time T_s, for one tick in ``store_every``.
 
     Args:
         states: Batches of the fused person.
         prediction_stage: Settings of the stage.
-        store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole.
-        sink: Where rows and times go.
+        store_every: Number of ticks per tick whose volumes are stored, 1 or more; need not be an integer.
+        sink: Receives rows and times.
     """
     done = 0
     for batch in states:
@@ -423,16 +423,16 @@ def plan_batches(
     store_every: float,
     sink: Sink,
 ) -> Iterator[None]:
-    """Stages 2 and 3: what the robot would have done by each method; each asks for the volumes that it needs.
+    """Stages 2 and 3: computes the robot's motion by each method; each method requests the volumes that it needs.
 
-    Writes a motion for each, and the volumes of the chosen method, of one tick in ``store_every``.
+    Writes a motion per method, and the volumes of the chosen method for one tick in ``store_every``.
 
     Args:
         states: Batches of the fused person.
-        surroundings: What is predicted around the robot.
+        surroundings: Obstacles of the robot.
         planners: Method -> its robot; the chosen one is first.
-        store_every: Number of ticks for one whose volumes are stored, 1 or more; need not be whole; inf: none are.
-        sink: Where rows and times go.
+        store_every: Number of ticks per tick whose volumes are stored, 1 or more; need not be an integer; inf: none.
+        sink: Receives rows and times.
     """
     done = 0
     for batch in states:
@@ -456,7 +456,7 @@ def plan_batches(
 
 
 def print_note(text: str) -> None:
-    """Prints a line for the user on standard error, where it does not mix with the result."""
+    """Prints a line for the user on standard error, separate from the result on standard output."""
     sys.stderr.write(f"hrcreplay: {text}\n")
 
 
@@ -475,7 +475,7 @@ class ProgressBar:
         return self
 
     def advance(self, stage: str, ticks: int) -> None:
-        """Adds ticks that a stage has done."""
+        """Adds the ticks that a stage has finished."""
         if stage == self._stage:
             self._bar.advance(self._task, ticks)
 

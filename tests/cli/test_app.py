@@ -70,7 +70,7 @@ def test_figures_are_listed_with_what_a_run_lacks_for_them(run: Run) -> None:
     assert state["17"] == "lacks: the person is not known for three seconds"
     code, out, err = run("report", "here", "--figure", 14)
     assert (code, out) == (2, "")
-    assert err.strip() == f"hrcreplay: --figure 14: here has not what it needs: {state['14'].removeprefix('lacks: ')}"
+    assert err.strip() == f"hrcreplay: --figure 14: here lacks what it needs: {state['14'].removeprefix('lacks: ')}"
     code, out, _ = run("report", "here", "--figure", 18, "--out", "drawn")
     assert (code, out) == (0, "drawn/fig18_coordinate.png\ndrawn/fig18_coordinate.svg\n")
     code, _, err = run("report", "here", "--figure", 18, "--out", "drawn")

@@ -369,7 +369,7 @@ def test_brakings_are_counted_where_they_begin() -> None:
         ("fast", r"--methods fast: 'fast' is no method; known are qp, scaling, shield, ssm, none"),
         ("qp:all", r"'all' is no occupancy; known are paper, positions, sound"),
         ("qp:sound:long", r"'long' is no horizon; known are adaptive, fixed"),
-        ("none:sound", r"none heeds nobody; would be right: METHOD"),
+        ("none:sound", r"none uses no volumes; would be right: METHOD"),
         ("qp:sound:fixed:4", r"too many parts"),
     ],
 )
