@@ -1,1 +1,1 @@
-"""All settings, each defined once with its unit and default. Defaults < file < command line."""
+"""All settings, each defined once with its unit and default. Priority: defaults < file < command line."""

@@ -1,4 +1,4 @@
-"""All settings with their defaults, units and meanings, as a settings file."""
+"""Prints all settings with their defaults, units and meanings, as a settings file."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _WIDTH = 100
 
 
 def as_toml(only: str | None = None, *, commented: bool = False) -> str:
-    """The default settings as a settings file, each with its meaning before it.
+    """Returns the default settings as a settings file, each preceded by its meaning.
 
     Args:
         only: Name of a section; None: all.
-        commented: Whether the values stand in comments, as in a file to be edited.
+        commented: True: the values are commented out, as in a file to be edited.
 
     Raises:
         SettingsError: There is no such section.
@@ -60,7 +60,7 @@ def _summary(section: Section) -> str:
 
 
 def _is_table(section: Section) -> bool:
-    """Return whether a section within another is large enough for a table of its own."""
+    """Returns True if a nested section is large enough for a separate table."""
     return len(type(section).model_fields) > 3
 
 
@@ -76,7 +76,7 @@ def _choices(annotation: Any) -> list[str]:
 
 
 def _value(value: Any) -> str:
-    """A value as TOML has it; "none" where there is none."""
+    """Returns a value as TOML; "none" for a missing one."""
     if value is None:
         return '"none"'
     if isinstance(value, BaseModel):

@@ -1,6 +1,6 @@
 """Loads the settings: defaults < settings file (TOML) < command line (``--set section.key=value``).
 
-Rooms that need settings take a section as it is (``sections``); none of them loads one.
+Packages that need settings take a whole section (``sections``); none of them loads it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from hrcreplay.toml_file import read_toml
 
 __all__ = ["SHIPPED", "Settings", "as_overrides", "load_settings"]
 
-#: Settings files that ship with the package: ``--config paper``.
+#: Shipped settings files: ``--config paper``.
 SHIPPED = {"paper": Path(__file__).with_name("paper.toml")}
 
-#: Words that TOML takes for something else than a text.
+#: Words that TOML does not read as text.
 _WORDS = frozenset({"true", "false", "inf", "nan"})
 
 
-#: Settings that name files; in a settings file a relative one is looked for beside that file first.
+#: Settings that name files; a relative path in a settings file is searched beside that file first.
 _PATHS = (
     ("robot", "urdf"),
     ("robot", "packages"),
@@ -46,16 +46,16 @@ def load_settings(
     base: dict[str, Any] | None = None,
     given: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Settings:
-    """Settings from a TOML file and ``section.key=value`` overrides, over those of an earlier run (``base``).
+    """Loads settings from a TOML file and ``section.key=value`` overrides, over those of an earlier run (``base``).
 
     Args:
-        path: A file, or the name of one of SHIPPED where no such file exists.
+        path: A file, or one of the names in SHIPPED if no such file exists.
         overrides: ``section.key=value``.
         base: The settings of an earlier run.
-        given: Section -> key -> value; over the file and under the overrides.
+        given: Section -> key -> value; they override the file and are overridden by ``overrides``.
 
     Raises:
-        SettingsError: The file cannot be read, or a key or value is not known.
+        SettingsError: The file cannot be read, or a key or value is unknown.
     """
     table, _ = with_new_names(base or {})
     where = "settings"
@@ -74,7 +74,7 @@ def load_settings(
 
 
 def _renamed(table: dict[str, Any], where: str) -> dict[str, Any]:
-    """The table by new names; warns of old ones."""
+    """Replaces old names by new ones; warns of old names."""
     found, replaced = with_new_names(table)
     for old, new in replaced.items():
         warnings.warn(
@@ -84,21 +84,21 @@ def _renamed(table: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _merge(table: dict[str, Any], layer: Mapping[str, Any]) -> None:
-    """Puts the sections of a layer over those of the table; what is no section stays, and is refused later."""
+    """Merges the sections of a layer into the table; an entry that is not a section is kept and rejected later."""
     for name, section in layer.items():
         below = table.get(name, {})
         table[name] = {**below, **section} if isinstance(section, Mapping) and isinstance(below, Mapping) else section
 
 
 def _beside(table: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The settings of a file, in which relative paths of files beside it become paths from here."""
+    """Replaces relative paths of files beside a settings file by paths from the working directory."""
     for path in _PATHS:
         table = _one_beside(table, path, folder)
     return table
 
 
 def _one_beside(table: dict[str, Any], path: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """The same of one setting, if it is there."""
+    """Does the same for one setting, if present."""
     name, rest = path[0], path[1:]
     given = table.get(name)
     if rest:
@@ -114,7 +114,7 @@ def _beside_or_same(given: Any, folder: Path) -> Any:
 
 
 def as_overrides(settings: Settings) -> tuple[str, ...]:
-    """The settings that are not the defaults, as ``section.key=value``; files by their names, without folders."""
+    """Returns the settings that differ from the defaults, as ``section.key=value``; files by name, without folders."""
     found = []
     for name in sorted(Settings.model_fields):
         section, usual = getattr(settings, name), getattr(Settings(), name)
@@ -126,7 +126,7 @@ def as_overrides(settings: Settings) -> tuple[str, ...]:
 
 
 def _toml(value: Any, *, inside: bool = False) -> str:
-    """A value as ``--set`` takes it: TOML, or a plain word."""
+    """Returns a value in the form that ``--set`` takes: TOML or a plain word."""
     if isinstance(value, BaseModel):
         usual = {name: field.default for name, field in type(value).model_fields.items()}
         value = {name: part for name in usual if (part := getattr(value, name)) != usual[name]}
@@ -143,7 +143,7 @@ def _toml(value: Any, *, inside: bool = False) -> str:
 
 
 def _override(text: str) -> dict[str, Any]:
-    """Section -> key -> value of ``section.key=value``."""
+    """Parses ``section.key=value`` into section -> key -> value."""
     key, equals, value = text.partition("=")
     parts = key.strip().split(".")
     if not equals or len(parts) != 2:

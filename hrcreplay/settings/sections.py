@@ -1,7 +1,7 @@
 """Every setting, with its unit and its default, in sections. Defaults are the paper's where it gives one.
 
-The stages take these sections as they are; only the drivers load them from files. Where an equation is called
-corrected, docs/paper.md says how.
+The stages take these sections unchanged; only the drivers load them from files. docs/paper.md lists the corrections of
+equations marked as corrected.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ Ipv4OrNone = Annotated[str, AfterValidator(lambda given: given and _ipv4(given))
 
 
 class Section(BaseModel):
-    """A group of settings: frozen, and an unknown key is an error."""
+    """A group of settings; it is frozen, and an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     @model_validator(mode="before")
     @classmethod
     def _none(cls, given: Any) -> Any:
-        """Takes the word "none" for no value where a setting may have none: TOML has no other way to say it."""
+        """Converts the word "none" to a missing value for optional settings, as TOML has no null."""
         if not isinstance(given, dict):
             return given
         fields = cls.model_fields
@@ -47,25 +47,25 @@ class Section(BaseModel):
 
 
 class Decoder(Section):
-    """Decoder of skeletons from a message type the package does not know."""
+    """Decoder of skeletons from an unknown message type."""
 
     topic: str
     """Topic of the messages."""
     camera: str
-    """Name that the sensor gets."""
+    """Name for the sensor."""
     points: str
-    """Path to the array of points inside the message, fields joined by dots; its elements have x, y, z."""
+    """Path to the array of points in the message, fields joined by dots; the elements have x, y, z."""
     index: dict[str, int]
-    """Which element is which body point: body point -> index."""
+    """Body point -> index of its element in the array."""
     unit: Literal["m", "mm"] = "m"
     """Unit of the points."""
     stamp: str | None = "header.stamp"
-    """Path to the capture time; "none": the arrival time is used."""
+    """Path to the capture time; "none": the arrival time."""
     confidence: str | None = None
-    """Path to an array of confidences in [0, 1], one a point; none: every finite point has confidence 1."""
+    """Path to an array of confidences in [0, 1], one per point; none: every finite point has confidence 1."""
 
     def model_post_init(self, _context: Any) -> None:
-        """Refuses body points that are not in POINTS."""
+        """Rejects body points that are not in POINTS."""
         unknown = sorted(set(self.index) - set(POINTS))
         if unknown:
             raise ValueError(f"unknown body point {unknown[0]!r}; known are {', '.join(POINTS)}")
@@ -75,31 +75,32 @@ class Logs(Section):
     """Reading logs."""
 
     topics: tuple[str, ...] = ()
-    """Skeleton topics to read; none: all that a decoder knows."""
+    """Skeleton topics to read; none: all with a decoder."""
     decoders: tuple[Decoder, ...] = ()
-    """Decoders for message types the package does not know."""
+    """Decoders for message types that the package cannot read itself."""
     unit: Literal["m", "mm"] = "m"
     """Unit of the positions in markers and transforms."""
     marker_ids_per_body: Annotated[int, Field(ge=1)] | None = None
-    """Ids of markers from one body to the next, of which the first are the joints; none: 100, or 33 or 32 where only
-    that fits the ids in the log."""
+    """Number of marker ids per body; the first ids of each body are the joints; none: 100, or 33 or 32 if only that
+    fits the ids in the log."""
     joints_topic: str | None = None
-    """Topic of the robot's joint states; none: all of sensor_msgs/JointState and our own, joined by joint."""
+    """Topic of the robot's joint states; none: all topics of sensor_msgs/JointState and of hrcreplay's own type, joined
+    by joint."""
     joint_names: tuple[str, ...] = ()
-    """The log's names of the robot's joints, in the order of the axes; none: those of the robot."""
+    """Names of the robot's joints in the log, in the order of the axes; none: as in the robot."""
     joints_unit: Literal["rad", "deg"] = "rad"
     """Unit of the joint positions."""
     joints_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] | None = None
-    """The robot's clock minus the log's; none: 0, or estimated where the stamps cannot be on the log's clock [s]."""
+    """The robot's clock minus the log's; none: 0, or estimated if the stamps are clearly from another clock [s]."""
     person_jump_m: Positive = 0.8
-    """A body further than this from where the person was last seen is somebody else [m]."""
+    """A body further than this from the person's last position is another person [m]."""
     person_memory_s: Positive = 2.0
-    """After this long without the person, the nearest body becomes the person [s]."""
+    """After this time without the person, the nearest body becomes the person [s]."""
     gap_s: Positive = 0.2
-    """A camera silent for longer has a gap [s]."""
+    """A longer time without frames counts as a gap of the camera [s]."""
 
     def model_post_init(self, _context: Any) -> None:
-        """Refuses a joint that is named for two axes."""
+        """Rejects a joint name that is given for two axes."""
         twice = [name for name in self.joint_names if self.joint_names.count(name) > 1]
         if twice:
             raise ValueError(f"logs.joint_names: {twice[0]!r} stands for two axes; name each joint once")
@@ -108,84 +109,84 @@ class Logs(Section):
 class Fusion(Section):
     """Section 4: the Kalman filter.
 
-    The sigmas and ``coast_s`` are those with the least error against ground truth over a sweep on a recording with
-    two cameras of 25 and 30 Hz, 1-3 cm of noise and occlusions: the velocity's sigma dominates, since people reach and
-    rest, and a polynomial with a lively jerk overshoots at both ends. Ignoring delays has the smaller error there
-    while people stand, compensating them while they move; what matters for safety is the latter.
+    The sigmas and ``coast_s`` minimise the error against ground truth in a sweep on a recording with two cameras of 25
+    and 30 Hz, 1-3 cm of noise and occlusions. The velocity's sigma dominates: people reach and rest, and a polynomial
+    with a large jerk overshoots at both ends. On that recording, ignoring delays gives the smaller error while people
+    stand, and compensating them while people move; the latter matters for safety.
     """
 
     rate_hz: Annotated[float, Field(gt=0, le=2000, allow_inf_nan=False)] = 250.0
     """Ticks a second of the filter and the controller [Hz]."""
     stale: Literal["skip", "reuse"] = "skip"
-    """Between two frames: skip the camera's rows, or re-use them with the sawtooth covariance of 4.1.1."""
+    """Between two frames of a camera: skip its rows, or reuse them with the sawtooth covariance of 4.1.1."""
     delay: Literal["compensate", "ignore"] = "compensate"
-    """Relate a frame to the state at its capture time, or take it for the state at the tick."""
+    """compensate: a frame measures the state at its capture time; ignore: the state at the tick."""
     confidence_min: Share = 0.2
     """An angle is used when the product of the confidences of its points is at least this."""
     outlier_m: Positive = 0.20
-    """A point further than this from the predicted skeleton is an outlier [m]."""
+    """A point further than this from the predicted skeleton counts as an outlier [m]."""
     relearn_s: Positive = 0.1
-    """Accept an outlier seen in one place this long, while no camera sees it where the filter has it [s]."""
+    """Accept an outlier seen in one place for this time, if no camera sees the point near the filter's estimate [s]."""
     bone_m: Positive = 0.10
-    """A point is an outlier too where its bone is longer or shorter than the person's by more than this [m]."""
+    """A point also counts as an outlier if its bone is longer or shorter than the person's by more than this [m]."""
     bone_memory_s: Positive = 5.0
-    """Accept such an outlier once no camera has seen that bone's right length for this long [s]."""
+    """Accept such an outlier after no camera has seen the expected bone length for this time [s]."""
     point_std_m: Positive = 0.02
     """Standard deviation of a skeleton point at full confidence [m]."""
     point_std_per_m: NotNegative = 0.0
-    """Its growth with the distance from the camera [m/m]."""
+    """Increase of that standard deviation with the distance from the camera [m/m]."""
     sigma_position: Sigmas = (300.0, 100.0, 5.0, 1.0)
     """Sigmas of Eq. (44) for x and y: p, v, a, j [m/s^2, m/s^2.5, m/s^3, m/s^3.5]."""
     sigma_height: Sigmas = (300.0, 200.0, 5.0, 1.0)
-    """The same for z: people get up faster than they walk about."""
+    """The same for z; larger, as people stand up faster than they walk."""
     sigma_angle: Sigmas = (1500.0, 600.0, 10.0, 1.0)
     """The same for the angles [rad]."""
     coast_s: Positive = 0.12
-    """A joint without a valid row for longer comes to rest [s]."""
+    """After this time without a valid row, a joint decelerates to rest in the estimate [s]."""
     delay_max_s: Positive = 0.25
-    """An older frame counts as this old [s]."""
+    """Maximum age of a frame in the delay compensation; an older frame gets this age [s]."""
     residual_quantile: Share = 0.9
-    """Tracked quantile of the distance of each limb's measured points from the model's."""
+    """Quantile of the distance between each limb's measured points and the model that is tracked."""
     residual_memory_s: Positive = 20.0
-    """Time constant with which a measured distance loses weight [s]."""
+    """Time constant of the weights of measured distances [s]."""
     residual_hold_s: NotNegative = 0.15
-    """Time for which a distance above the quantile counts, unless a larger one follows [s]."""
+    """Time for which a distance above the quantile is used, unless a larger one follows [s]."""
     offset_memory_s: Positive = 0.5
-    """Time constant of the mean offset of shoulders, head and arms from the model [s]."""
+    """Time constant of the running mean offset of shoulders, head and arms from the model [s]."""
     spread_memory_s: Positive = 1.0
-    """The reported variances are scaled by the highest normalised innovation squared; it decays to 1/e in this time
+    """The reported variances are scaled by the maximum normalised innovation squared, which decays to 1/e in this time
     [s]."""
     spread_least: Positive = 0.01
-    """Least factor by which the reported variances are scaled."""
+    """Minimum factor on the reported variances."""
     spread_most: Positive = 30.0
-    """Largest such factor."""
+    """Maximum factor on the reported variances."""
     memory_s: Positive = 0.5
-    """A joint without a valid row for longer is lost: it starts anew from the next one, and its limb may have moved as
-    far as the limits allow [s]."""
+    """After this time without a valid row, a joint is lost: it restarts from the next valid row, and until then its
+    limb may have moved as far as the limits allow [s]."""
     fresh_s: Positive = 0.3
-    """An older frame, by its capture, is not used, and a person whose newest frame is older is not known: the robot
-    brakes, in a live session too [s]."""
+    """Maximum age of a frame since its capture. An older frame is dropped; a person whose newest frame is older is
+    unknown, and the robot brakes, also in a live session [s]."""
 
 
 class LimitNames(Section):
     """Named limit sets (paper, human, people) or paths of TOML files."""
 
     tracking: str = "human"
-    """Bounds the filter's state, Eq. (62)-(65)."""
+    """Limit set for the filter's state, Eq. (62)-(65)."""
     prediction: str = "people"
-    """Bounds the reachable sets, Alg. 1. people: fitted on recordings; see docs/validation.md."""
+    """Limit set for the reachable sets, Alg. 1. people: fitted on recordings; see docs/validation.md."""
 
 
 class Prediction(Section):
-    """Section 3: what the person can reach."""
+    """Section 3: the space that the person can reach."""
 
     method: Literal["paper", "positions", "sound"] = "sound"
-    """sound: encloses every motion under the limits, of whole limbs where they bound departures, else of the joints;
-    paper: Eq. (20)-(30) and Alg. 1, 2 as printed; positions: from positions and velocity bounds alone [26]."""
+    """sound: encloses every motion within the limits, of whole limbs if the limits bound departures, else of the
+    joints; paper: Eq. (20)-(30) and Alg. 1, 2 as printed; positions: from positions and velocity bounds alone [26]."""
     stop_s: Positive = 0.377
     """Worst-case braking time T_s of the robot, Eq. (70) [s]."""
     store_hz: Positive | Literal["all"] = 25.0
-    """Ticks a second whose volumes are stored, or "all" [Hz]."""
+    """Rate of the ticks whose volumes are stored, or "all" [Hz]."""
     radius_head_m: NotNegative = 0.12
     """Table 2 [m]."""
     radius_thorax_m: NotNegative = 0.15
@@ -196,21 +197,21 @@ class Prediction(Section):
     """Table 2 [m]."""
 
     sigmas: NotNegative = 1.0
-    """sound: states within so many standard deviations of the estimate are enclosed, all joints off at once; not of
-    limbs whose departures are bounded, for these were measured from the estimate."""
+    """sound: number of standard deviations around the estimate that are enclosed, in all joints at once; not used for
+    limbs with bounded departures, which were measured from the estimate."""
     latency_s: NotNegative = 0.0
-    """sound: from the newest capture to the robot's reaction; the horizon is longer by it [s]."""
+    """sound: time from the newest capture to the robot's reaction; it is added to the horizon [s]."""
     hand_m: NotNegative = 0.19
     """sound: length of the hand beyond the wrist [m]."""
     legs_radius_m: Positive = 0.20
-    """sound: least radius of the lower body around the line from the floor to the pelvis; legs seen further off, as of
-    who sits or squats, make it larger [m]."""
+    """sound: minimum radius of the lower body around the line from the floor to the pelvis; it grows if legs are seen
+    further off, as while sitting or squatting [m]."""
     legs: bool = True
-    """sound: whether there is a lower body."""
+    """sound: include a volume for the lower body."""
     residual: bool = True
-    """sound: whether the measured body's distance from the model is added to the radii."""
+    """sound: add the distance between the measured body and the model to the radii."""
     residual_unknown_m: NotNegative = 0.10
-    """sound: that distance until enough of it has been seen [m]."""
+    """sound: value of that distance until enough measurements exist [m]."""
 
 
 class LinkSettings(Section):
@@ -219,7 +220,7 @@ class LinkSettings(Section):
     name: str
     """Name in outputs."""
     body: str
-    """Body (URDF link or joint frame) that both ends are fixed on."""
+    """Body (URDF link or joint frame) to which both ends are fixed."""
     start_m: tuple[float, float, float]
     """First end in that body's frame [m]."""
     end_m: tuple[float, float, float]
@@ -229,7 +230,7 @@ class LinkSettings(Section):
 
 
 class Offset(Section):
-    """A pose seen from another frame."""
+    """A pose in another frame."""
 
     position_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     """Its origin [m]."""
@@ -241,25 +242,24 @@ class Robot(Section):
     """The manipulator. Default: ABB IRB 140."""
 
     urdf: Path | None = None
-    """Another robot's URDF; none: the IRB 140. Joints that do not lie between base and tool are locked at zero. In a
-    settings file a relative path is looked for beside that file first, as are packages, plan.task and files of
-    limits."""
+    """URDF of another robot; none: the IRB 140. Joints that do not lie between base and tool are locked at zero. A
+    relative path in a settings file is searched beside that file first, like packages, plan.task and limit files."""
     packages: tuple[Path, ...] = ()
-    """Directories of the packages whose meshes that URDF names (package://); searched before the directories at and
-    above the URDF, and those of ROS_PACKAGE_PATH."""
+    """Directories of the packages of the meshes in that URDF (package://); searched before the directories at and above
+    the URDF and those of ROS_PACKAGE_PATH."""
     base_frame: str | None = None
-    """Frame of that URDF that stands on T_world_base; none: its root."""
+    """Frame of that URDF whose pose is T_world_base; none: its root."""
     tcp_frame: str | None = None
-    """Frame of that URDF that carries the tool; none: the last one that revolute joints move."""
+    """Frame of that URDF that carries the tool; none: the last one moved by revolute joints."""
     tool_m: NotNegative = 0.10
     """TCP beyond the flange, along its z axis [m]."""
     tcp_offset: Offset = Offset()
-    """TCP from there, for a tool that is not straight."""
+    """Pose of the TCP relative to that point, for a tool that is not straight."""
     links: tuple[LinkSettings, ...] = ()
-    """Link segments; none: the IRB 140's, or derived from the URDF's collision shapes, meshes (STL, Collada, OBJ) among
-    them."""
+    """Link segments; none: the IRB 140's, or derived from the URDF's collision shapes, including meshes (STL, Collada,
+    OBJ)."""
     tool_links: tuple[LinkSettings, ...] = ()
-    """Further link segments, of what is mounted at the tool; also beside the IRB 140's."""
+    """Additional link segments for parts mounted at the tool; also for the IRB 140."""
     acceleration: tuple[Positive, ...] = ()
     """Joint acceleration limits [rad/s^2]; none: top speed / T_s of every axis."""
 
@@ -268,53 +268,54 @@ class Plan(Section):
     """Section 5: the trajectory generator."""
 
     method: Literal["qp", "scaling", "shield", "ssm", "none"] = "qp"
-    """qp: Eq. (66); scaling: the largest factor on the programmed speed that meets the same constraints [24];
-    shield: the programmed speed while the next stop is certified; ssm: stop and go by the protective separation
-    distance of ISO/TS 15066; none: the programme, whoever is there."""
+    """qp: Eq. (66); scaling: the largest factor on the programmed speed under the same constraints [24]; shield: the
+    programmed speed while the next stop is certified; ssm: stop and go by the protective separation
+    distance of ISO/TS 15066; none: the programme without reaction to people."""
     baselines: tuple[Literal["qp", "scaling", "shield", "ssm", "none"], ...] = ("scaling", "none")
-    """Methods run beside it, for comparison."""
+    """Additional methods to run for comparison."""
     horizon: Literal["adaptive", "fixed"] = "adaptive"
-    """adaptive: the volumes reach to the end of the stop that would follow; fixed: always to prediction.stop_s."""
+    """Horizon of the volumes. adaptive: the end of the stop that would follow; fixed: always prediction.stop_s."""
     certify: bool = True
-    """Whether a step is taken only if it and the stop after it keep clear of every volume; else the stop that was found
-    clear before goes on. False: as printed, where Eq. (67) brakes when Eq. (66) has no solution."""
+    """true: a step is taken only if it and the stop after it are clear of every volume; otherwise the last certified
+    stop continues. false: as printed, Eq. (67) brakes if Eq. (66) has no solution."""
     rows: Literal["soft", "hard"] = "soft"
-    """qp: whether Eq. (66i) may be broken at a cost, so that there is always a solution, or not."""
+    """qp: soft: Eq. (66i) may be violated at a cost, so that a solution always exists; hard: it may not."""
     constraint_rhs: Literal["product", "square"] = "product"
     """Right-hand side of Eq. (14): distance (distance - clearance), or (distance - clearance)^2 as printed."""
     lead_s: NotNegative = 0.05
-    """The rows of Eq. (66i) look this much further ahead than the horizon, so that the robot slows down early [s]."""
+    """Time added to the horizon in the rows of Eq. (66i), so that the robot slows down early [s]."""
     give_way_m: NotNegative = 0.03
-    """qp: the robot moves away from a volume that is nearer than this [m]."""
+    """qp: distance to a volume below which the robot moves away [m]."""
     jerk_s: NotNegative = 0.03
-    """qp: time from no acceleration to the largest; 0: any change within a tick [s]."""
+    """qp: time from zero to maximum acceleration; 0: any change within a tick [s]."""
     smooth_s: NotNegative = 0.08
-    """qp: time constant with which the velocity approaches the best one that keeps the rows; 0: as fast as the limits
-    allow [s]."""
+    """qp: time constant of the approach to the best velocity under the constraints; 0: as fast as the limits allow
+    [s]."""
     retreat_m: NotNegative = 0.03
-    """qp: a robot that is inside a volume by no more than this moves out of it, at 0.25 m/s at most, if no point of it
-    comes nearer to any point of the volume; deeper inside, or with 0, it stands [m]."""
+    """qp: maximum penetration of a volume at which the robot moves out, at 0.25 m/s at most and only if no point of it
+    approaches any point of the volume; deeper inside, or with 0, it stops [m]."""
     posture: NotNegative = 0.01
-    """qp: weight of the way back to the programmed joint positions, relative to the cost as printed."""
+    """qp: weight of the return to the programmed joint positions, relative to the printed cost."""
     human_speed: Positive = 1.6
     """ssm: speed at which a person may approach, ISO 13855 [m/s]."""
     task: Path | None = None
-    """Task file (TOML); none: the one inside the log, else the joint track inside the log."""
+    """Task file (TOML); none: the task in the log, else the joint track in the log."""
     reference: Literal["time", "path"] = "path"
-    """time: the reference runs with the clock; path: only as far as the robot has followed."""
+    """time: the reference advances with the clock; path: only as far as the robot has followed."""
     max_reference_lead_m: Positive = 0.4
-    """path: the reference waits when the TCP is this far away, so no way round a person leads further off [m]."""
+    """path: the reference waits if the TCP is this far away; this limits the length of detours around people [m]."""
     catch_up_speed_m_per_s: NotNegative | Literal["free"] = 0.0
-    """qp: the TCP is never faster than the programme's speed limit where the reference is, not even to catch up; this
-    speed is allowed where that limit is lower; free: only tcp_speed_max bounds it [m/s]."""
+    """qp: the TCP speed is limited to the programme's limit at the reference or to this value, whichever is larger,
+    also while the robot catches up; free: only tcp_speed_max holds [m/s]."""
     waypoint_m: Positive = 0.02
-    """path: the reference leaves a waypoint when the TCP has come this close [m]."""
+    """path: the reference leaves a waypoint once the TCP is this close [m]."""
     q_p: tuple[NotNegative, NotNegative] = (0.10, 0.10)
     """Eq. (71): weights of the position error, translation and orientation."""
     q_v: tuple[NotNegative, NotNegative] = (1.0, 1.0)
     """Eq. (72): weights of the velocity error, translation and orientation."""
     path_gain_per_s: NotNegative = 5.0
-    """Position error fed into the reference velocity [1/s]; 0 as printed: no error decays, so use reference "time"."""
+    """Gain of the position error in the reference velocity [1/s]; 0 as printed: errors do not decay, so use reference
+    "time"."""
     clearance_m: NotNegative = 0.0
     """Clearance beyond limb radius + link radius [m]."""
     tcp_speed_max: Positive = 2.5
@@ -329,9 +330,9 @@ class Report(Section):
     near_m: Positive = 0.50
     """The stationary share counts ticks with a separation of at most this [m]."""
     stationary_m_per_s: Positive = 0.001
-    """A TCP slower than this stands [m/s]."""
+    """A TCP slower than this counts as stationary [m/s]."""
     leg_radius_m: NotNegative = 0.08
-    """Radius of thighs and shanks of the recorded person, of which Table 2 says nothing [m]."""
+    """Radius of thighs and shanks of the recorded person, which Table 2 does not give [m]."""
 
 
 class ZenohKey(Section):
@@ -340,15 +341,15 @@ class ZenohKey(Section):
     key: str
     """Key expression: 0/kinect/skeleton/** of rmw_zenoh, kinect/skeleton of the DDS bridge."""
     payload: Literal["hrcreplay", "cdr"] = "hrcreplay"
-    """Our own message, or the CDR of a ROS 2 system."""
+    """hrcreplay's own message, or the CDR of a ROS 2 system."""
     type: str | None = None
-    """cdr: message type; none: as the keys of rmw_zenoh tell."""
+    """cdr: message type; none: taken from the keys of rmw_zenoh."""
     definition: str = ""
-    """cdr: text of the type's .msg, where no release of ROS 2 has it."""
+    """cdr: text of the type's .msg, for a type that no release of ROS 2 contains."""
     points: str | None = None
-    """cdr: path to the points in a type without a decoder of its own, as in logs.decoders."""
+    """cdr: path to the points in a type without a built-in decoder, as in logs.decoders."""
     index: dict[str, int] = Field(default_factory=dict)
-    """cdr: which element is which body point."""
+    """cdr: body point -> index of its element."""
     unit: Literal["m", "mm"] = "m"
     """cdr: unit of the points, also of markers and transforms."""
     stamp: str | None = "header.stamp"
@@ -361,27 +362,28 @@ class Zenoh(Section):
     """Live skeletons over Zenoh."""
 
     mode: Literal["peer", "client"] = "peer"
-    """How we take part."""
+    """Mode of this Zenoh session."""
     connect: tuple[str, ...] = ()
     """Endpoints to connect to, as tcp/192.168.0.1:7447."""
     listen: tuple[str, ...] = ()
     """Endpoints to listen on."""
     scouting: bool = False
-    """Whether to look for others by multicast."""
+    """Search for other participants by multicast."""
     keys: dict[str, ZenohKey] = Field(default_factory=dict)
-    """Camera -> where its skeletons are."""
+    """Camera -> keys of its skeletons."""
     config: Path | None = None
-    """File of Zenoh's own configuration, with its authentication and encryption, in place of mode to scouting."""
+    """File with Zenoh's configuration, including authentication and encryption; replaces mode, connect, listen and
+    scouting."""
     secret: Path | None = None
-    """File of a secret shared with the cameras: then frames without a seal made with it are not used."""
+    """File with a secret shared with the cameras; frames without a seal from this secret are then rejected."""
     sources: tuple[str, ...] = ()
-    """secret: names of the sources that may seal frames; empty: whoever has the secret."""
+    """secret: names of the sources that may seal frames; empty: every source with the secret."""
     late_s: Positive = 0.3
-    """secret: a frame whose seal is older or newer by our clock is not used [s]."""
+    """secret: maximum difference between the time of a seal and the local clock; other frames are rejected [s]."""
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Zenoh:
-        """Refuses what a configuration of its own would silently leave out."""
+        """Rejects settings that the configuration file would override silently."""
         if self.config is not None and (self.connect or self.listen or self.scouting or self.mode != "peer"):
             raise ValueError("config has mode, connect, listen and scouting in it; would be right: one of both")
         return self
@@ -393,53 +395,55 @@ class Live(Section):
     port: Annotated[int, Field(ge=0, le=65535)] = 6510
     """UDP port at which the robot's packets arrive."""
     robot_address: Ipv4 = "127.0.0.1"
-    """The robot's address, the only one that is heard; as it is, that of a robot double on this machine."""
+    """The robot's address; other senders are ignored. Default: a robot double on this machine."""
     listen_address: Ipv4OrNone = ""
-    """Address of ours to listen on; empty: that from which the robot is reached."""
+    """Local address to listen on; empty: the one on the network of the robot."""
     joint_order: tuple[int, ...] = ()
-    """Axis of the robot, 1 next to its base, that each joint of EGM is, external ones last; empty: as they stand.
-    [1, 2, 4, 5, 6, 7, 3] for a YuMi, whose seventh joint is its third axis."""
+    """Axis of the robot for each joint of EGM, 1 next to the base, external joints last; empty: same order. [1, 2, 4,
+    5, 6, 7, 3] for a YuMi, whose seventh joint is its third axis."""
     cycle_s: Annotated[float, Field(ge=0.001, le=0.1)] = 0.004032
     """The robot's cycle: every answer moves the reference by this much time [s]."""
     reaction_s: NotNegative = 0.05
-    """Latency from perception to robot response: up to two cycles until a look is used, the delay of an answer, a cycle
-    and the robot's own lag. The swept volumes of method sound reach this much further than T_s [s]."""
+    """Latency from perception to robot response: up to two cycles until an update is used, the delay of an answer, one
+    cycle and the robot's own lag. It is added to the horizon T_s of method sound [s]."""
     perception_max_age_s: Positive = 0.016
-    """plan.certify: largest age of a perception update that a step may use; after it the certified stop goes on [s]."""
+    """plan.certify: maximum age of a perception update that a step may use; with an older one the certified stop
+    continues [s]."""
     approach_speed: Annotated[float, Field(gt=0, le=1)] = 0.1
-    """Share of the axes' top speeds on the way from where the robot stands to its programme."""
+    """Share of the axes' top speeds on the way from the initial position to the programme."""
     resume: bool = False
-    """Whether motion goes on by itself once the reason of a stop is gone."""
+    """Resume motion automatically once the reason for a stop has ended."""
     resume_s: Positive = 1.0
-    """How long it must be gone before that [s]."""
+    """Time without that reason before motion resumes [s]."""
     uncertain_m: Positive = 0.2
-    """A larger standard deviation of the person's position stops the robot [m]."""
+    """Maximum standard deviation of the person's position; a larger one stops the robot [m]."""
     uncertain_rad: Positive = 0.8
-    """The same for heading and bend of the trunk [rad]."""
+    """The same for heading and bending of the trunk [rad]."""
     person_late_s: Positive = 0.2
-    """The human side's process without a sign of life for longer stops the robot [s]."""
+    """Maximum time without a heartbeat of the perception process; a longer one stops the robot [s]."""
     overrun_s: Positive = 0.02
-    """An answer later than this stops the robot [s]."""
+    """Maximum delay of an answer; a longer one stops the robot [s]."""
     silent_s: Positive = 0.1
-    """A robot that sends nothing for longer counts as gone [s]."""
+    """After this time without a message, the robot counts as disconnected [s]."""
     tracking_rad: Positive = 0.2
-    """A robot further than this from its reference stops [rad]."""
+    """Maximum distance of the robot from its reference; a larger one stops it [rad]."""
     utilization_max: Positive = 100.0
-    """A robot above this cannot follow, and stops [%]."""
+    """Maximum utilisation of the robot; above it the robot cannot follow and is stopped [%]."""
     keep_recorder: bool = True
-    """Whether the robot stops when nobody records any more."""
+    """Stop the robot if recording fails."""
     disk_start_mb: NotNegative = 1000.0
-    """A session does not begin with less space on the disk of its record, which takes some 30 MB a minute [MB]."""
+    """Minimum free disk space to begin a session; its record takes about 30 MB per minute [MB]."""
     disk_low_mb: NotNegative = 200.0
-    """With less the robot stops, so that the record of its stop finds room [MB]."""
+    """Minimum free disk space during a session; below it the robot stops, so that its stop can still be recorded
+    [MB]."""
     real_time: bool = True
-    """Whether to ask the system to run the control loop before all else and to keep it in memory."""
+    """Request real-time priority and locked memory for the control loop."""
     zenoh: Zenoh = Zenoh()
-    """Where live skeletons come from when no recording is played."""
+    """Source of live skeletons if no recording is played."""
 
 
 class Settings(Section):
-    """Everything a run depends on beside the log and the cell."""
+    """All inputs of a run except the log and the cell."""
 
     logs: Logs = Logs()
     fusion: Fusion = Fusion()
@@ -452,7 +456,7 @@ class Settings(Section):
 
 
 def setting(recorded: Mapping[str, Any], section: str, key: str) -> Any:
-    """A setting as a run recorded it, or its default where the run did not.
+    """Returns a setting as a run recorded it, or its default if the run did not record it.
 
     Args:
         recorded: ``settings`` of run.json.
@@ -463,7 +467,7 @@ def setting(recorded: Mapping[str, Any], section: str, key: str) -> Any:
     return known.get(section, {}).get(key, getattr(getattr(Settings(), section), key))
 
 
-#: Names of sections and of settings before version 0.9; read for one version more.
+#: Names of sections and settings before version 0.9; accepted for one more version.
 RENAMED = {
     "occupancy": "prediction",
     "plan.leash_m": "plan.max_reference_lead_m",
@@ -473,14 +477,14 @@ RENAMED = {
 
 
 def with_new_names(table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Replace the old names of sections and settings by the new ones.
+    """Replaces the old names of sections and settings by the new ones.
 
     Args:
         table: Section -> key -> value.
 
     Returns:
-        The table by new names, and old name -> new name of those that it had. A name that is there in both forms
-        stays as it is, so that it is refused as unknown.
+        The table with new names, and old name -> new name of the replaced ones. If both forms of a name are present,
+        the old one is kept and later rejected as unknown.
     """
     found: dict[str, Any] = dict(table)
     replaced = {}
