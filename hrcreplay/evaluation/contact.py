@@ -1,10 +1,10 @@
-"""The robot against everybody recorded: a row a tick and method in contact.parquet.
+"""Contact between the robot and all recorded people: one row per tick and method in contact.parquet.
 
-The links' capsules at the commanded joint positions, and the capsules of every recorded body by every source: the
-ground truth, else the smoothed person and each camera's points; and every other body of every camera. None of them
-knows of predictions, and the worst counts. Where the moving robot touches the person, the row also says whether the
-part that is touched was inside the volume by which the motion had been certified: then the robot is at fault, else the
-prediction.
+It compares the links' capsules at the commanded joint positions with the capsules of every recorded body from every
+source: the ground truth, else the smoothed person and each camera's points; and every other body of every camera. These
+sources are independent of the predictions, and the smallest distance counts. If the moving robot touches the person,
+the row also says if the touched part was inside the volume used to certify the motion: then the fault lies with the
+controller, else with the prediction.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from hrcreplay.store.run_folder import RunWriter
 
 _BATCH = 4096
 
-#: Part of the body -> limb whose volume it has to be in.
+#: Part of the body -> limb whose volume must contain it.
 VOLUME_OF = (
     {part: part for part in PARTS}
     | dict.fromkeys((*LEG_PARTS, "FOOT_R", "FOOT_L"), "LEGS")
     | {"HAND_R": "LRA", "HAND_L": "LLA"}
 )
 
-#: Rows of body.parquet a second, for those who draw it.
+#: Rate of the rows of body.parquet, for drawing [Hz].
 _BODY_HZ = 25.0
 
 #: Limb -> vertices (m, 3) and radius of the volume around them [m].
@@ -49,12 +49,12 @@ Volumes = Mapping[str, SweptVolume]
 
 
 def read_recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> RecordedPeople:
-    """Everybody in the log of a run. Without ground truth and smooth.parquet the log is fused again, and that written.
+    """Reads all people in the log of a run; writes smooth.parquet if it and the ground truth are missing.
 
     Args:
-        run_config: What was asked for.
+        run_config: The run.
         log: Log of the run.
-        writer: Run folder, its tables complete.
+        writer: Run folder with complete tables.
     """
     ticks_ns = np.concatenate([states.t_ns for states in read_states(writer.partial / "state.parquet", _BATCH)])
     fusion_stage = assembly.fusion_stage(run_config, log)
@@ -71,7 +71,7 @@ def read_recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> 
 
 
 def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanStates]:
-    """The person fused and smoothed, where the stage was not run or was taken over."""
+    """Fuses and smooths the person, if the stage was not run or was reused."""
     fusion_stage, cameras = assembly.fusion_stage(run_config, log), log.header.cameras
     fuser = PersonFuser(replace(fusion_stage, watched=None), cameras, traced=True)
     smoother = stages.StretchSmoother(fusion_stage.filter)
@@ -82,12 +82,12 @@ def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanSt
 
 
 def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_base: Floats) -> None:
-    """Writes contact.parquet for every motion table of a run, and the recorded body for those who draw it.
+    """Writes contact.parquet for every motion table of a run, and the recorded body for drawing.
 
     Args:
-        run_config: What was asked for.
+        run_config: The run.
         log: Log of the run.
-        writer: Run folder, its tables complete.
+        writer: Run folder with complete tables.
         T_world_base: (4, 4) robot base in the world.
     """
     robot = assembly.robot(run_config, T_world_base)
@@ -111,7 +111,7 @@ def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_ba
 
 
 def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats:
-    """(m, 14, 2, 3) axes of the person's capsules, of each part by the first source that knows it [m]."""
+    """(m, 14, 2, 3) axes of the person's capsules; each part comes from the first source that has it [m]."""
     axes_m = person[0].axes_m(at_ns, hand_m)
     for track in person[1:]:
         axes_m = np.where(np.isnan(axes_m), track.axes_m(at_ns, hand_m), axes_m)
@@ -121,11 +121,11 @@ def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats
 def compute_own_coverage(
     run_config: RunConfig, people: RecordedPeople, predicted: Predicted, motion: pd.DataFrame
 ) -> Outcome | None:
-    """Coverage of every checked tick until the horizon that the motion's tick was decided with.
+    """Coverage of every checked tick until the horizon of the volumes that the controller used.
 
     Args:
-        run_config: What was asked for.
-        people: As recorded.
+        run_config: The run.
+        people: Recorded people.
         predicted: Volumes of any tick.
         motion: Rows of a motion table.
     """
@@ -155,17 +155,17 @@ def contact_table(
     own: Outcome | None,
     full: Outcome | None,
 ) -> Columns:
-    """The rows of contact.parquet for one motion.
+    """Computes the rows of contact.parquet for one motion.
 
     Args:
-        run_config: What was asked for.
-        robot: At its place in the world.
-        method: That made the motion.
+        run_config: The run.
+        robot: Robot at its base pose in the world.
+        method: Method of the motion.
         motion: Rows of a motion table.
-        people: As recorded.
+        people: Recorded people.
         predicted: Volumes of any tick.
-        own: What ``compute_own_coverage`` found; None where it was not asked.
-        full: What ``compute_full_coverage`` found; None likewise.
+        own: Result of ``compute_own_coverage``; None if not computed.
+        full: Result of ``compute_full_coverage``; None if not computed.
     """
     prediction, t_ns = run_config.settings.prediction, motion["t_ns"].to_numpy()
     radii_m = part_radii(prediction, run_config.settings.report.leg_radius_m)
@@ -194,17 +194,17 @@ def contact_table(
 
 @dataclass(frozen=True)
 class Nearest:
-    """Nearest pair of the robot and some bodies, a row a tick."""
+    """Nearest pair of a link and a body part, one row per tick."""
 
-    distance_m: Floats  #: (n,) surface to surface, negative in overlap; NaN where no body is known [m]
-    link: Ints  #: (n,) index into the robot's segments; -1 where no body is known
+    distance_m: Floats  #: (n,) distance between the surfaces, negative in overlap; NaN without a known body [m]
+    link: Ints  #: (n,) index into the robot's segments; -1 without a known body
     part: Ints  #: (n,) index into PARTS; -1 likewise
     track: Ints  #: (n,) index into the bodies' tracks; -1 likewise
-    speed: Floats  #: (n,) of the link's surface where it is nearest to the body [m/s]
+    speed: Floats  #: (n,) speed of the link's surface at its nearest point to the body [m/s]
 
 
 def choose_nearer(first: Nearest, second: Nearest) -> tuple[Nearest, Bools]:
-    """Of two at the same ticks the nearer one, tick by tick, and (n,) where that is the second."""
+    """Returns the nearer of two pairs, tick by tick, and (n,) True where it is the second."""
     is_second: Bools = np.asarray(~(first.distance_m <= second.distance_m) & np.isfinite(second.distance_m))
     pairs = ((getattr(first, name), getattr(second, name)) for name in first.__dataclass_fields__)
     return Nearest(*(np.where(is_second, b, a) for a, b in pairs)), is_second
@@ -213,12 +213,12 @@ def choose_nearer(first: Nearest, second: Nearest) -> tuple[Nearest, Bools]:
 def nearest(
     robot: RobotModel, motion: pd.DataFrame, groups: Sequence[Sequence[BodyTrack]], radii_m: Floats, hand_m: float
 ) -> tuple[Nearest, ...]:
-    """The nearest pair of link and body of each group of tracks, at every tick of a motion.
+    """Finds the nearest pair of link and body for each group of tracks, at every tick of a motion.
 
     Args:
         robot: The manipulator.
         motion: Rows of a motion table.
-        groups: Of bodies.
+        groups: Groups of bodies.
         radii_m: (14,) radii of PARTS [m].
         hand_m: Length of a hand beyond the wrist [m].
     """
@@ -234,7 +234,7 @@ def nearest(
 def _nearest(
     robot: RobotModel, links: LinkMotion, t_ns: Ints, tracks: Sequence[BodyTrack], radii_m: Floats, hand_m: float
 ) -> Nearest:
-    """The nearest pair among some tracks, at a batch of ticks."""
+    """Finds the nearest pair among some tracks, at a batch of ticks."""
     unknown, nothing = np.full(len(t_ns), np.nan), np.full(len(t_ns), -1)
     found = Nearest(unknown, nothing, nothing, nothing, unknown)
     link_radius_m = np.array([segment.radius_m for segment in robot.segments])
@@ -244,7 +244,7 @@ def _nearest(
         pair = nearest_pair(links.ends_m, link_radius_m, track.axes_m(t_ns, hand_m), radii_m)
         apart = pair.at_second_m - pair.at_first_m
         length = np.linalg.norm(apart, axis=1, keepdims=True)
-        towards = apart / np.where(length > 0.0, length, np.inf)  # on the axis itself where the axes cross
+        towards = apart / np.where(length > 0.0, length, np.inf)  # the point on the axis itself if the axes cross
         at_m = pair.at_first_m + link_radius_m[pair.first][:, None] * towards
         index = np.where(pair.first >= 0, k, -1)
         speed = links.speed(pair.first, at_m)
@@ -253,24 +253,24 @@ def _nearest(
 
 
 def _join(batches: Sequence[Nearest]) -> Nearest:
-    """Those of consecutive ticks as one."""
+    """Concatenates the pairs of consecutive ticks."""
     return Nearest(*(np.concatenate([getattr(b, name) for b in batches]) for name in Nearest.__dataclass_fields__))
 
 
 def _is_turning(motion: pd.DataFrame) -> Bools:
-    """(n,) whether any axis turns."""
+    """(n,) True if any axis turns."""
     joints = [name for name in motion.columns if name[:2] == "dq" and name[2:].isdigit()]
     return np.asarray((motion[joints].to_numpy(dtype=float) != 0.0).any(axis=1))
 
 
 def _at(from_ns: Ints, motion_ns: Ints, values: Floats) -> Floats:
-    """Values of a motion's ticks at other instants: those of the same instant, else NaN."""
+    """Returns the values of a motion's ticks at other instants; NaN for an instant without a tick."""
     row = np.clip(np.searchsorted(motion_ns, from_ns), 0, len(motion_ns) - 1)
     return np.where(motion_ns[row] == from_ns, values[row], np.nan)
 
 
 def _measure_left(outcome: Outcome | None, t_ns: Ints) -> tuple[Floats, Ints]:
-    """(n,) how far at most a limb left its volume, 0 where all were held, NaN where not asked [m]; (n,) that limb."""
+    """(n,) maximum distance by which a limb left its volume, 0 if none did, NaN if not checked [m]; (n,) that limb."""
     out_m, limb = np.full(len(t_ns), np.nan), np.full(len(t_ns), -1)
     if outcome is None:
         return out_m, limb
@@ -292,11 +292,11 @@ class Predicted:
 
     @cached_property
     def all_states(self) -> HumanStates:
-        """The fused person at every tick."""
+        """Reads the fused person at every tick."""
         return HumanStates.join(list(read_states(self.states, _BATCH)))
 
     def volumes(self, t_ns: int, horizon_s: float) -> Volumes:
-        """Those of the last state that is not later than ``t_ns``; none where the person was not known."""
+        """Volumes of the last state that is not later than ``t_ns``; none if the person was unknown."""
         row = int(np.searchsorted(self.all_states.t_ns, t_ns, side="right")) - 1
         if row < 0:
             return {}
@@ -312,15 +312,15 @@ def by_volume(
     hand_m: float,
     predicted: Predicted,
 ) -> Floats:
-    """(n,) how far the touched part was outside the volume by which the motion had been certified, negative inside [m].
+    """(n,) distance of the touched part outside the volume used to certify the motion, negative inside [m].
 
-    The volumes of the tick at which it was decided what moves the robot hold until the stop that was found clear of
-    them has ended. NaN where the robot touches nobody or stands, or nothing was predicted.
+    The volumes are those of the tick at which the present motion was decided; they hold until the end of the stop
+    certified with them. NaN if the robot touches no person or is stationary, or if there was no prediction.
 
     Args:
         motion: Rows of a motion table.
-        found: The nearest of the person's tracks at the same ticks.
-        tracks: Of the person.
+        found: Nearest pair with the person's tracks at the same ticks.
+        tracks: Tracks of the person.
         radii_m: (14,) radii of PARTS [m].
         hand_m: Length of a hand beyond the wrist [m].
         predicted: Volumes of any tick.
@@ -345,9 +345,9 @@ def by_volume(
 
 
 def deciding_rows(motion: pd.DataFrame) -> Ints:
-    """(n,) the row at which it was decided what moves the robot at each tick; -1 where none was.
+    """(n,) the row at which the motion of each tick was decided; -1 if none.
 
-    That is the last row before the tick that did not only go on braking.
+    That is the last row before the tick that did not just continue a stop.
     """
     going_on = motion["status"].astype(str).to_numpy() == "braking"
     last = np.maximum.accumulate(np.where(going_on, -1, np.arange(len(motion))))

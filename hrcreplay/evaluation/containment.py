@@ -1,7 +1,7 @@
-"""Coverage of the recorded person by the predicted volumes: one meaning of 'held' for report, compare and audit.
+"""Coverage of the recorded person by the predicted volumes: the same definition for report, compare and audit.
 
-A limb is held at a tick where all its recorded points, those of every camera and with the limb's radius about each,
-stay inside its volume until the horizon has passed.
+A limb is covered at a tick if all its recorded points, from every camera and each with the limb's radius around it,
+stay inside its volume until the end of the horizon.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
 from hrcreplay.settings.sections import Fusion
 
-#: Ticks a second that are asked [Hz].
+#: Rate of the checked ticks [Hz].
 AUDIT_HZ = 25.0
-#: The end of the horizon: its last quarter. A limb that was last seen before could have left later.
+#: Share of the horizon that counts as its end: the last quarter. A limb that was last seen earlier could have left
+#: later.
 _END = 0.75
-#: Points with which the union of a tick's volumes is counted out.
+#: Number of sample points for the volume of a tick's union.
 _COUNT = 1024
 #: Rounding of a distance [m].
 _ROUNDING_M = 1e-9
@@ -32,33 +33,33 @@ _SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
 
 @dataclass(frozen=True)
 class Outcome(Table):
-    """One method's volumes compared with the recorded motion, a row an audited tick."""
+    """One method's volumes compared with the recorded motion, one row per audited tick."""
 
     t_ns: Ints  #: (n,)
     beyond_m: (
-        Floats  #: (n, l) farthest that a recorded point of the limb got from the hull, before the ball; NaN: unseen
+        Floats  #: (n, l) maximum distance of the limb's recorded points from the hull, before the ball; NaN: unseen
     )
-    radius_m: Floats  #: (n, l) of the ball
-    volume_m3: Floats  #: (n, l) NaN where the limb could not be predicted
-    union_m3: Floats  #: (n,) of all limbs together; NaN where not computed
-    union_std_m3: Floats  #: (n,) standard error of the counting behind it
-    upper_m3: Floats  #: (n,) of the six LIMBS together, for which every method has volumes
+    radius_m: Floats  #: (n, l) radius of the ball
+    volume_m3: Floats  #: (n, l) volume; NaN if the limb could not be predicted
+    union_m3: Floats  #: (n,) volume of the union of all limbs; NaN if not computed
+    union_std_m3: Floats  #: (n,) standard error of that volume
+    upper_m3: Floats  #: (n,) volume of the union of the six LIMBS, which every method has
     upper_std_m3: Floats  #: (n,)
     limbs: tuple[str, ...]  #: LIMBS first
     limb_radius_m: tuple[float, ...]  #: radius of each limb itself, Table 2 and a thigh's [m]
 
     def escape_m(self, *, points_alone: bool = False) -> Floats:
-        """(n, l) how far the limb left its volume within the horizon; 0 inside, NaN where not audited [m].
+        """(n, l) distance by which the limb left its volume within the horizon; 0 inside, NaN if not audited [m].
 
-        The whole limb: a ball of the limb radius around each of its recorded points. Volumes are convex, so what is
-        between two points is no further out than the worse of them. With ``points_alone`` limb thickness is ignored.
+        The whole limb counts: a ball of the limb radius around each of its recorded points. Volumes are convex, so a
+        point between two others is never further out than the worse of them. ``points_alone`` ignores limb thickness.
         """
         radius = np.zeros(len(self.limbs)) if points_alone else np.array(self.limb_radius_m)
         depth = self.beyond_m + radius - self.radius_m
         return np.where(np.isnan(depth), np.nan, np.where(depth > _ROUNDING_M, depth, 0.0))
 
     def worst_m(self, limbs: int | None = None, *, points_alone: bool = False) -> Floats:
-        """(n,) largest escape of all limbs or the first so many, each from its own volume; NaN: none checked [m]."""
+        """(n,) largest escape of all limbs or of the first few, each from its own volume; NaN: none checked [m]."""
         escapes = self.escape_m(points_alone=points_alone)[:, :limbs]
         known = np.isfinite(escapes).any(axis=1)
         return np.where(known, np.where(np.isnan(escapes), -1.0, escapes).max(axis=1), np.nan)
@@ -69,22 +70,22 @@ class RecordedFuture:
     """The recorded future of some ticks."""
 
     states: HumanStates  #: (n,) the fused person at the ticks
-    limbs: dict[str, Floats]  #: limb -> (m, k, 3) its recorded points, world [m]
+    limbs: dict[str, Floats]  #: limb -> (m, k, 3) recorded points, world [m]
     first: Ints  #: (n,) row of the first recorded instant after the tick
     last: Ints  #: (n,) row past the last one within the horizon
-    seen: dict[str, Bools]  #: limb -> (n, k) whether a point was seen in the last quarter of the horizon
+    seen: dict[str, Bools]  #: limb -> (n, k) True: the point was seen in the last quarter of the horizon
 
     def rows(self, which: slice | Ints) -> RecordedFuture:
-        """The same for some of the ticks."""
+        """Selects some of the ticks."""
         seen = {limb: part[which] for limb, part in self.seen.items()}
         return RecordedFuture(self.states.rows(which), self.limbs, self.first[which], self.last[which], seen)
 
     def checked(self, limb: str) -> Bools:
-        """(n,) whether the limb can be checked: both its ends were seen near the horizon's end."""
+        """(n,) True if the limb can be checked: both its ends were seen near the horizon's end."""
         return np.asarray(self.seen[limb][:, :2].all(axis=1))
 
     def points(self) -> dict[str, dict[str, int]]:
-        """Limb -> each point beyond its ends -> at how many of the ticks that check the limb it was seen too."""
+        """Limb -> each point other than its ends -> number of the limb's checked ticks at which it was seen."""
         return {
             limb: {
                 point: int((self.seen[limb][:, 2 + k] & self.checked(limb)).sum()) for k, point in enumerate(names[2:])
@@ -94,16 +95,16 @@ class RecordedFuture:
 
 
 def recorded_future(t_ns: Ints, points_m: Floats, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
-    """The recorded future (t, t + T] of some ticks.
+    """Returns the recorded future (t, t + T] of some ticks.
 
     Args:
         t_ns: (m,) instants of the recorded points, increasing [ns].
-        points_m: (m, 20, 3) POINTS of the person, world [m]; NaN where not recorded or not believed.
+        points_m: (m, 20, 3) POINTS of the person, world [m]; NaN if not recorded or disbelieved.
         states: (n,) the fused person at the ticks.
-        horizon_s: T, the prediction's horizon and the latency, of each tick or of all [s].
+        horizon_s: T, the prediction's horizon plus the latency, one per tick or one for all [s].
     """
     points = points_m.copy()
-    # the model's neck is the middle of the shoulders, not the bone that cameras call so
+    # the model's neck is the middle of the shoulders, not the neck point of a camera
     points[:, POINTS.index("neck")] = 0.5 * (points[:, _SHOULDERS[0]] + points[:, _SHOULDERS[1]])
     limbs = {
         limb: np.ascontiguousarray(points[:, [POINTS.index(n) for n in names]]) for limb, names in LIMB_POINTS.items()
@@ -118,14 +119,14 @@ def recorded_future(t_ns: Ints, points_m: Floats, states: HumanStates, horizon_s
 
 
 def _find_seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
-    """(n, k) whether each of the points (m, k, 3) was recorded in any row from ``first`` (n,) up to ``last`` (n,)."""
+    """(n, k) True if a point of (m, k, 3) was recorded in any row from ``first`` (n,) up to ``last`` (n,)."""
     count = np.zeros((len(recorded) + 1, recorded.shape[1]), np.int64)
     np.cumsum(np.isfinite(recorded).all(axis=2), axis=0, out=count[1:])
     return np.asarray(count[last] > count[first])
 
 
 def body_radii_m(prediction_stage: PredictionStage) -> dict[str, float]:
-    """Limb -> its radius, Table 2; of the legs that of a thigh [m]."""
+    """Limb -> its radius, Table 2; for the legs the radius of a thigh [m]."""
     return dict(zip(BODY, (*limb_radii(prediction_stage.settings).tolist(), THIGH_M), strict=True))
 
 
@@ -141,12 +142,12 @@ def check_containment(
     """Compares one method's volumes with the recorded future.
 
     Args:
-        volumes: Of the n ticks.
-        future: Of the same ticks.
-        limb_radius: Limb -> its radius, as ``body_radii_m`` gives it [m].
+        volumes: Volumes of the n ticks.
+        future: Recorded future of the same ticks.
+        limb_radius: Limb -> its radius, from ``body_radii_m`` [m].
         counted: (n,) the ticks whose union volume is estimated.
-        first_sample: Number of ticks counted before, see ``union_volume_m3``.
-        sizes: Whether the volume of each limb is measured.
+        first_sample: Number of ticks estimated before, see ``union_volume_m3``.
+        sizes: True: compute the volume of each limb.
     """
     n, limbs = len(volumes), volumes.limbs
     beyond, size = np.full((n, len(limbs)), np.nan), np.full((n, len(limbs)), np.nan)
@@ -175,20 +176,20 @@ def check_containment(
 
 
 def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str) -> float:
-    """Largest distance of the recorded points of a limb, some of them seen, from a hull [m]."""
+    """Returns the maximum distance of a limb's recorded points from a hull; at least one was seen [m]."""
     points = future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
     return float(np.nanmax(solid.distances_m(points)))
 
 
 def select_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: float | Floats, fresh_s: float) -> Ints:
-    """Rows of the states that are asked: one in so many, with a known person, a whole horizon before the end.
+    """Selects the rows of the states to check: evenly spaced, with a known person, a whole horizon before the end.
 
     Args:
         states: (n,) every tick of a run.
         last_ns: The last instant of the recording [ns].
         rate_hz: Ticks a second of ``states`` [Hz].
-        horizon_s: Of all ticks or of each, with the latency [s].
-        fresh_s: A person whose newest frame is older is not known [s].
+        horizon_s: Horizon of all ticks or of each, with the latency [s].
+        fresh_s: Maximum age of the newest frame of a known person [s].
     """
     every = max(1.0, rate_hz / AUDIT_HZ)
     number = np.arange(len(states))
@@ -202,14 +203,14 @@ def select_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: fl
 def coverage(
     stage: PredictionStage, people: RecordedPeople, states: HumanStates, fusion: Fusion, horizon_s: Floats
 ) -> Outcome | None:
-    """Coverage of the recorded person by a run's volumes, at the checked ticks; None where none is.
+    """Computes the coverage of the recorded person by a run's volumes at the checked ticks; None without such ticks.
 
     Args:
-        stage: That predicts.
-        people: As recorded.
+        stage: Stage 2.
+        people: Recorded people.
         states: (n,) every tick of the run.
         fusion: Settings of stage 1.
-        horizon_s: (n,) for which each tick's volumes were predicted, without the latency; NaN: not asked [s].
+        horizon_s: (n,) horizon of each tick's volumes, without the latency; NaN: tick not checked [s].
     """
     until_s = horizon_s + stage.settings.latency_s
     last_ns = int(people.t_ns[-1]) if len(people.t_ns) else 0

@@ -1,7 +1,7 @@
-"""The people in a recording, as its ground truth or its cameras show them: what contact and coverage are asked of.
+"""The people in a recording, from its ground truth or its cameras: the reference for contact and coverage.
 
-The person is whom the robot plans for. Everybody else in a frame counts for contact, too, although nothing was
-predicted of them.
+The person is the one that the robot plans for. All other people in a frame also count for contact, although there is no
+prediction for them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LIMB_POINTS = {
     "LLA": ("elbow_l", "wrist_l", "hand_l"),
     "LEGS": tuple(f"{part}_{side}" for part in ("hip", "knee", "ankle", "foot") for side in "rl"),
 }
-#: Points that the model has no say about -> the point they hang from and the longest a body makes that bone [m].
+#: Points outside the model -> the point to which they are attached and the maximum length of that bone [m].
 _HANGING = {
     "hand": ("wrist", 0.30),
     "hip": ("pelvis", 0.30),
@@ -43,7 +43,7 @@ _HANGING = {
     "ankle": ("knee", 0.65),
     "foot": ("ankle", 0.40),
 }
-#: Points of the model from the root on, where their bone starts, and its length: so many times one of LENGTHS.
+#: Points of the model from the root on, the start of their bone, and its length as a multiple of one of LENGTHS.
 _BONES: tuple[tuple[str, str, str, float], ...] = (
     ("shoulder_r", "shoulder_l", "pi_half_shoulder", 2.0),
     ("shoulder_l", "shoulder_r", "pi_half_shoulder", 2.0),
@@ -52,29 +52,29 @@ _BONES: tuple[tuple[str, str, str, float], ...] = (
     *((f"elbow_{side}", f"shoulder_{side}", f"pi_upper_arm_{side}", 1.0) for side in "rl"),
     *((f"wrist_{side}", f"elbow_{side}", f"pi_forearm_{side}", 1.0) for side in "rl"),
 )
-#: A bone that is so near to the person's own length is that person's: people are not the model [m].
+#: Maximum difference between a bone and the person's bone length; people differ from the model [m].
 _BONE_M = 0.08
-#: Ticks fused at a time.
+#: Number of ticks fused per batch.
 _BATCH = 15_000
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A log as an audit needs it."""
+    """A log in the form that an audit needs."""
 
-    states: HumanStates  #: the fused person at every tick, knowing only what had arrived
+    states: HumanStates  #: the fused person at every tick, from the frames that had arrived
     t_ns: Ints  #: (m,) instants of the recorded points, increasing
-    points_m: Floats  #: (m, 20, 3) POINTS, world [m]; NaN where not recorded or not believed
+    points_m: Floats  #: (m, 20, 3) POINTS, world [m]; NaN if not recorded or disbelieved
     joints_t_ns: Ints  #: (k,) instants of the recorded joints, increasing
     joints: Floats  #: (k, 13) JOINTS [m, m, rad..., m]
     source: str  #: TRUTH, CAMERAS or SMOOTHED
     counts: dict[str, int]
 
 
-#: Between samples of a body further apart nothing is known [s].
+#: Maximum time between two samples of a body for interpolation [s].
 GAP_S = 0.1
-#: A camera's point counts for so long before and after its frame, where no neighbouring frame shows it: half a period
-#: of a slow camera [s].
+#: Time before and after a frame for which a camera's point counts if no neighbouring frame shows it: half a period of a
+#: slow camera [s].
 _HOLD_S = 0.02
 
 
@@ -82,51 +82,51 @@ _HOLD_S = 0.02
 class BodyTrack:
     """Points of one body over time, from one source."""
 
-    source: str  #: TRUTH, SMOOTHED, or a camera; of another body than the person, the camera and the tracker's id
+    source: str  #: TRUTH, SMOOTHED, or a camera; for another body, the camera and the tracker's id
     t_ns: Ints  #: (n,) increasing
-    points_m: Floats  #: (n, 20, 3) POINTS, world [m]; NaN where not known
-    hold_s: float = 0.0  #: a point counts for so long around its sample, where its neighbour lacks it [s]
+    points_m: Floats  #: (n, 20, 3) POINTS, world [m]; NaN if unknown
+    hold_s: float = 0.0  #: time around a sample for which a point counts if the neighbouring sample lacks it [s]
 
     def axes_m(self, at_ns: Ints, hand_m: float) -> Floats:
-        """(m, 14, 2, 3) axes of the capsules of ``PARTS`` at some instants; a part with one known end is a ball [m]."""
+        """(m, 14, 2, 3) axes of the capsules of ``PARTS`` at some instants; with one known end, a ball [m]."""
         axes = part_axes(at_instants(self.t_ns, self.points_m, at_ns, GAP_S, self.hold_s), hand_m)
         known: Bools = np.asarray(np.isfinite(axes).all(axis=3, keepdims=True))
         return np.where(known, axes, axes[:, :, ::-1])
 
     def is_near(self, first_ns: int, last_ns: int) -> bool:
-        """Return whether the track has a sample so near to a span of time that it may count in it."""
+        """Returns True if the track has a sample near enough to a time span to count in it."""
         margin_ns = round(GAP_S * 1e9)
         return bool(len(self.t_ns)) and self.t_ns[0] - margin_ns <= last_ns and first_ns <= self.t_ns[-1] + margin_ns
 
 
 @dataclass(frozen=True)
 class RecordedPeople:
-    """Everybody whom a log shows."""
+    """All people in a log."""
 
-    source: str  #: TRUTH, CAMERAS or SMOOTHED: where ``points_m`` is from
+    source: str  #: TRUTH, CAMERAS or SMOOTHED: source of ``points_m``
     t_ns: Ints  #: (m,) instants of the person's recorded points, increasing
-    points_m: Floats  #: (m, 20, 3) POINTS of the person, of all cameras in order of time, world [m]; NaN: not believed
-    person: tuple[BodyTrack, ...]  #: the truth alone; else the smoothed person and each camera's points
+    points_m: Floats  #: (m, 20, 3) POINTS of the person, of all cameras in order of time, world [m]; NaN: disbelieved
+    person: tuple[BodyTrack, ...]  #: only the truth; else the smoothed person and each camera's points
     others: tuple[BodyTrack, ...]  #: every other body of every camera
 
     @property
     def tracks(self) -> tuple[BodyTrack, ...]:
-        """The person's, then those of all others."""
+        """Tracks of the person, then those of all others."""
         return (*self.person, *self.others)
 
 
 def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float, hold_s: float = 0.0) -> Floats:
-    """Body points at some instants: linear between the two samples around each, or held for a moment.
+    """Interpolates body points at some instants: linear between two samples, or constant for a short time.
 
     Args:
         t_ns: (n,) instants of the samples, increasing [ns].
         points_m: (n, 20, 3) samples, world [m].
         at_ns: (m,) instants asked for [ns].
-        gap_s: Between samples further apart nothing is known [s].
-        hold_s: A point counts for so long before and after its sample where there is nothing to interpolate [s].
+        gap_s: Maximum time between two samples for interpolation [s].
+        hold_s: Time before and after a sample for which its points count without interpolation [s].
 
     Returns:
-        (m, 20, 3); NaN where not known. An instant that meets a sample gets that sample.
+        (m, 20, 3); NaN if unknown. An instant equal to that of a sample gets that sample.
     """
     if not len(t_ns):
         return np.full((len(at_ns), *points_m.shape[1:]), np.nan)
@@ -145,11 +145,11 @@ def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float, hold_s:
 
 
 def from_states(states: HumanStates, memory_s: float) -> BodyTrack:
-    """The smoothed person, but for where no camera saw them: there is nothing to smooth.
+    """Returns the smoothed person, without the times at which no camera saw the person.
 
     Args:
         states: The smoothed states.
-        memory_s: Between two ticks that used a camera further apart than this, nothing is known [s].
+        memory_s: Maximum time between two ticks that used a camera; the person is unknown in a longer gap [s].
     """
     points_m = skeleton(states.p, states.lengths_m)
     points_m[~_find_seen(states, memory_s)] = np.nan
@@ -157,7 +157,7 @@ def from_states(states: HumanStates, memory_s: float) -> BodyTrack:
 
 
 def _find_seen(states: HumanStates, memory_s: float) -> Bools:
-    """(n,) ticks that lie between two ticks with a camera not further apart than ``memory_s`` [s], both included."""
+    """(n,) True for ticks between two ticks with a camera at most ``memory_s`` [s] apart, both included."""
     used = np.flatnonzero(states.valid.any(axis=1))
     if not len(used):
         return np.zeros(len(states), dtype=np.bool_)
@@ -171,13 +171,13 @@ def _find_seen(states: HumanStates, memory_s: float) -> Bools:
 def read_people(
     log: Log, ticks_ns: Ints, fusion_stage: FusionStage, smoothed_states: Callable[[], HumanStates]
 ) -> RecordedPeople:
-    """Everybody whom a log shows within a span.
+    """Reads all people in a log within a span.
 
     Args:
         log: Log to read.
         ticks_ns: (n,) ticks of the span, increasing [ns].
         fusion_stage: Cameras, and settings of stage 1.
-        smoothed_states: Gives the smoothed states of these ticks; asked where the log has no ground truth.
+        smoothed_states: Returns the smoothed states of these ticks; called if the log has no ground truth.
     """
     memory, seen, others = PersonMemory(), [], []
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
@@ -208,7 +208,7 @@ def read_people(
 
 
 def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
-    """The ground truth within a span; None where the log has none there."""
+    """Reads the ground truth within a span; None if the log has none there."""
     if not log.header.has_truth:
         return None
     truth = [part.rows((part.t_ns >= ticks_ns[0]) & (part.t_ns <= ticks_ns[-1])) for part in log.truth()]
@@ -220,7 +220,7 @@ def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
 
 
 def _track(source: str, t_ns: Ints, points_m: Floats) -> BodyTrack:
-    """A camera's track, in order of capture; the neck is the model's, the middle of the shoulders, where they are."""
+    """Makes a camera's track, in order of capture; the neck is the middle of the shoulders, if they are known."""
     order = np.argsort(t_ns, kind="stable")
     t_ns, points_m = t_ns[order], points_m[order].copy()
     neck, right, left = (POINTS.index(name) for name in ("neck", "shoulder_r", "shoulder_l"))
@@ -230,7 +230,7 @@ def _track(source: str, t_ns: Ints, points_m: Floats) -> BodyTrack:
 
 
 def _tracks_of(bodies: CameraFrames, fusion_stage: FusionStage) -> Iterator[BodyTrack]:
-    """A track for each camera and body id; points that the camera trusts."""
+    """Makes a track for each camera and body id, with the points of sufficient confidence."""
     trusted = (bodies.confidence > 0.0) & (bodies.confidence >= fusion_stage.filter.confidence_min)
     points_m = np.where(trusted[..., None], bodies.points_m, np.nan)
     shown = np.isfinite(points_m).any(axis=(1, 2))
@@ -243,7 +243,7 @@ def _tracks_of(bodies: CameraFrames, fusion_stage: FusionStage) -> Iterator[Body
 def _people_off(
     truth: BodyTrack, seen: Sequence[Measurements], others: Sequence[CameraFrames], fusion_stage: FusionStage
 ) -> tuple[BodyTrack, ...]:
-    """Tracks of all bodies that are not where the ground truth is, chosen or not."""
+    """Makes the tracks of all bodies away from the ground truth, selected as the person or not."""
     tables = []
     for measured, rest in zip(seen, others, strict=True):
         chosen = CameraFrames(
@@ -268,18 +268,18 @@ def _people_off(
     return tuple(_tracks_of(bodies.rows(np.asarray(off)), fusion_stage))
 
 
-#: Body id of the person in each frame, whatever the tracker calls them.
+#: Body id of the person in each frame, independent of the tracker's ids.
 _CHOSEN = -1
 
 
 def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress: Callable[[int], None]) -> Recording:
-    """Reads the span of ``ticks_ns``.
+    """Reads the recording within the span of ``ticks_ns``.
 
-    The recorded future is the ground truth where the log has it. Else the points of the cameras, at their capture
-    times, that the cameras trust (confidence 0 is not seen) and that are either within the filter's outlier distance of
-    the smoothed person, who knows what came later, or at the end of a bone of the person's own length: who squats or
-    bends sideways leaves the model, not the room, and must not be thrown out for it; a marker that jumps away takes no
-    bone along. Else the smoothed person. Recorded joints are those of the truth, else of the smoothed person.
+    The recorded future is the ground truth if the log has it, else the points of the cameras at their capture times,
+    else the smoothed person. A camera point must have sufficient confidence (confidence 0: not seen). It must also be
+    within the filter's outlier distance of the smoothed person, which includes later frames, or at the end of a bone of
+    the person's length: the points of a person who squats or bends sideways leave the model but keep their bone
+    lengths, and a marker that jumps away does not. Recorded joints are those of the truth, else of the smoothed person.
 
     Args:
         log: Log to read.
@@ -288,7 +288,7 @@ def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress
         progress: Called with the number of ticks done since the last call.
 
     Raises:
-        LogError: No camera saw anybody.
+        LogError: No camera saw a person.
     """
     counts: Counter[str] = Counter()
     stretches = fuse_stretches(log, ticks_ns, fusion_stage, counts, progress)
@@ -310,21 +310,21 @@ def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress
 
 
 def _recorded_points(seen: Measurements, points: Floats, best: HumanStates) -> tuple[str, Ints, Floats]:
-    """Source, instants and points of the person: the believed points of all cameras, else the smoothed person."""
+    """Returns source, instants and points of the person: believed camera points, else the smoothed person."""
     if not np.isfinite(points).any():
         return SMOOTHED, best.t_ns, skeleton(best.p, best.lengths_m)
     order = np.argsort(seen.capture_ns, kind="stable")
     return CAMERAS, seen.capture_ns[order], points[order]
 
 
-#: What was measured, what was fused from it, and how.
+#: Measurements, fused states and trace.
 Stretch = tuple[Measurements, HumanStates, fuse.Trace]
 
 
 def fuse_stretches(
     log: Log, ticks_ns: Ints, fusion_stage: FusionStage, counts: Counter[str], progress: Callable[[int], None]
 ) -> Iterator[Stretch]:
-    """Stage 1, traced, from the first stretch on in which a camera saw somebody.
+    """Runs stage 1, traced, from the first stretch on in which a camera saw a person.
 
     Args:
         log: Log to read.
@@ -334,7 +334,7 @@ def fuse_stretches(
         progress: Called with the number of ticks done since the last call.
 
     Raises:
-        LogError: No camera saw anybody.
+        LogError: No camera saw a person.
     """
     fuser, ever = PersonFuser(replace(fusion_stage, watched=None), log.header.cameras, traced=True), False
     for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
@@ -351,11 +351,11 @@ def fuse_stretches(
 
 
 def _select_believed(seen: Measurements, best: HumanStates, fusion_stage: FusionStage) -> tuple[Floats, Counter[str]]:
-    """The measured points (m, 20, 3) that are believed, and how many per camera are not, by why.
+    """Returns the believed measured points (m, 20, 3), and the number of other points per camera and reason.
 
-    A missing point and one of confidence 0 were not seen. One that the camera trusts too little, that hangs from such a
-    point, or that was seen before the person was known, is doubted: nobody can say whether it is right. One that the
-    camera trusts and that fails a gate jumps off the person: it is rejected, with what hangs from it.
+    A missing point or one with confidence 0 counts as not seen. A point counts as doubted if its confidence is too low,
+    if it is attached to such a point, or if it was seen before the person was known. A point with sufficient confidence
+    that fails a gate counts as jumping: it is rejected together with the points attached to it.
     """
     tick = np.clip(np.searchsorted(best.t_ns, seen.capture_ns), 0, len(best) - 1)
     expected = skeleton(best.p[tick], best.lengths_m[tick])
@@ -364,7 +364,7 @@ def _select_believed(seen: Measurements, best: HumanStates, fusion_stage: Fusion
     good, jumped = trusted.copy(), np.zeros_like(trusted)
     points = seen.points_m.copy()
     neck, right, left = (POINTS.index(name) for name in ("neck", "shoulder_r", "shoulder_l"))
-    points[:, neck] = 0.5 * (points[:, left] + points[:, right])  # the model's: the middle of the shoulders
+    points[:, neck] = 0.5 * (points[:, left] + points[:, right])  # the neck of the model: the middle of the shoulders
     good[:, neck] = trusted[:, left] & trusted[:, right]
     off = np.linalg.norm(points - expected, axis=2)
     for name, start, length, part in _BONES:
@@ -386,7 +386,7 @@ def _select_believed(seen: Measurements, best: HumanStates, fusion_stage: Fusion
 
 
 def _count_disbelieved(seen: Measurements, measured: Bools, good: Bools, jumped: Bools) -> Counter[str]:
-    """Per camera the points that were not seen, were doubted, or jump; and the frames with one that jumps."""
+    """Counts, per camera, the points not seen, doubted and jumping, and the frames with a jumping point."""
     counts: Counter[str] = Counter()
     for c, camera in enumerate(seen.cameras):
         mine = seen.camera == c
