@@ -17,21 +17,21 @@ from hrcreplay.logs.reader import Log
 from hrcreplay.records import POINTS, Bools, CameraFrames, Floats, SkeletonTrack
 from hrcreplay.settings.sections import Logs
 
-_WINDOW_S = 10.0  # a long log is looked at in windows, long enough for clock offsets
-_WINDOWS = 60  # evenly spaced: ten minutes in all, so a log of any length fits in memory
-_TOGETHER_S = 0.1  # two cameras saw the person together when their frames are this close
-_FEW = 30  # frames together that are too few to register
-_TILTED_RAD = np.radians(4.0)  # up known less well than this is worth a remark
-#: How far two cameras are apart about one movement: 17 to 50 mm (median) between real sensors, 38 to 450 mm between
-#: recordings of different movements, which a rigid transform and an offset can bring that near to one another.
+_WINDOW_S = 10.0  # s, length of the windows into which a long log is divided, long enough for clock offsets
+_WINDOWS = 60  # number of evenly spaced windows: ten minutes in all, so a log of any length fits in memory
+_TOGETHER_S = 0.1  # s, maximum time between two frames that count as simultaneous
+_FEW = 30  # with fewer simultaneous frames there is no registration
+_TILTED_RAD = np.radians(4.0)  # a larger uncertainty of the upward direction gives a remark
+#: Maximum median distance between two cameras after registration. Real sensors of one movement differ by 17 to 50 mm;
+#: recordings of different movements, fitted by a rigid transform and an offset, by 38 to 450 mm.
 _APART_M, _DOUBTFUL_M = 0.15, 0.06
 
 
 class Survey(NamedTuple):
-    """A calibration, where in its world the person stood, and how well the cameras agree about that."""
+    """A calibration, the person's position in its world, and the agreement of the cameras."""
 
     cell: Cell
-    lines: tuple[str, ...]  #: main figures, and what --base needs: where the person stood, which way the axes point
+    lines: tuple[str, ...]  #: main figures, and for --base the person's position and the directions of the axes
 
 
 class Pair(NamedTuple):
@@ -42,7 +42,7 @@ class Pair(NamedTuple):
 
 
 def calibrate(log: Log, *given: Any, **options: Any) -> Cell:
-    """The cell that ``survey`` finds; takes and raises the same."""
+    """Returns the cell that ``survey`` finds; same arguments and errors."""
     return survey(log, *given, **options).cell
 
 
@@ -59,25 +59,25 @@ def survey(
     """Estimates the poses of a log's cameras and the offsets of their clocks.
 
     The world's origin is the floor under the reference camera, z is up and x the camera's viewing direction along the
-    floor. Each camera is tied to the reference through the pairs that saw the person together most often.
+    floor. Each camera is linked to the reference through the pairs with the most simultaneous frames.
 
     Args:
         log: A log whose cameras saw one person.
         reference: Camera that defines the world; None for the first.
         up: (3,) up in the reference camera's frame; None to find it from the person.
         height_m: Reference camera's origin above the floor [m]; None to find it from the feet.
-        jump_m: A body further than this from the person's last place is somebody else [m].
-        memory_s: After this long without the person, the nearest body becomes the person [s].
-        search_s: Clock offsets are searched within plus and minus this, and by so much further as the delays of two
-            cameras, from stamp to arrival, differ [s].
+        jump_m: A body further than this from the person's last position is another person [m].
+        memory_s: After this time without the person, the nearest body becomes the person [s].
+        search_s: Clock offsets are searched within plus and minus this, extended by the difference of the two cameras'
+            delays from stamp to arrival [s].
 
     Returns:
         Poses of all cameras, clock offsets, and residuals of every pair that saw the person together.
 
     Raises:
-        SettingsError: No such camera, ``up`` is no direction, or ``height_m`` no height.
-        LogError: The cameras did not see one person together, what they saw is no person, or floor and up cannot be
-            told.
+        SettingsError: The camera is unknown, ``up`` is not a direction, or ``height_m`` is not a height.
+        LogError: The cameras did not see one person together, what they saw is not a person, or the floor and the
+            upward direction cannot be determined.
     """
     cameras = log.header.cameras
     root = _root(cameras, reference, log)
@@ -112,7 +112,7 @@ def survey(
 
 
 def _checks(cell: Cell, tracks: list[SkeletonTrack]) -> CameraChecks:
-    """The tracks in the calibrated world, by one clock, checked as ``info`` and a run check them."""
+    """Checks the tracks in the calibrated world on one clock, as ``info`` and a run do."""
     checks = CameraChecks(tuple(cell.T_world_camera))
     there = [
         replace(track, t_ns=track.t_ns - round(1e9 * offset_s), points_m=transform(T, track.points_m))
@@ -124,7 +124,7 @@ def _checks(cell: Cell, tracks: list[SkeletonTrack]) -> CameraChecks:
 
 
 def person_positions(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tuple[str, ...]:
-    """Position and axes of the person in the cell's world, for placing a robot's base."""
+    """Describes the person's position and the axes of the cell's world, for placing a robot's base."""
     looks_along = abs(cell.T_world_camera[root][2, 2]) <= LEVEL_VIEW
     x = f"x points where {root} looks, along the floor" if looks_along else f"x points along {root}'s own x"
     there = [transform(T, track.points_m) for T, track in zip(cell.T_world_camera.values(), tracks, strict=True)]
@@ -146,9 +146,9 @@ def person_positions(cell: Cell, tracks: list[SkeletonTrack], root: str) -> tupl
 
 
 def collect_tracks(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTrack]:
-    """The track of the person in each camera's frame; of a long log, in evenly spaced windows."""
+    """Collects the track of the person in each camera's frame; for a long log, in evenly spaced windows."""
     cameras = log.header.cameras
-    alone = np.full((len(cameras), 4, 4), np.nan)  # poses are what is sought: continuity in each camera's own frame
+    alone = np.full((len(cameras), 4, 4), np.nan)  # poses are unknown: follow the person in each camera's frame
     memory = PersonMemory()
     kept: list[CameraFrames] = []
     for frames in log.frames():
@@ -165,16 +165,16 @@ def collect_tracks(log: Log, jump_m: float, memory_s: float) -> list[SkeletonTra
 
 
 def in_window(frames: CameraFrames, start_ns: int, end_ns: int) -> Bools:
-    """(n,) rows that arrived in one of the windows; all rows of a log that is short enough."""
+    """(n,) True for rows that arrived in one of the windows; all rows for a short log."""
     window_ns = round(_WINDOW_S * 1e9)
     every_ns = max(window_ns, (end_ns - start_ns) // _WINDOWS)
     return np.asarray((frames.arrival_ns - start_ns) % every_ns < window_ns)
 
 
 def track_of(table: CameraFrames, camera: int) -> SkeletonTrack:
-    """The frames of one camera, in its own frame, in order of capture; bodies are taken for one person."""
+    """Returns the frames of one camera, in its own frame, in order of capture; all bodies count as one person."""
     mine = table.rows(table.camera == camera)
-    _, first = np.unique(mine.capture_ns, return_index=True)  # in order of capture, a frame that came twice once
+    _, first = np.unique(mine.capture_ns, return_index=True)  # in order of capture, without duplicate frames
     mine = mine.rows(first.astype(np.int64))
     delay_s = float(np.median(mine.arrival_ns - mine.capture_ns)) / 1e9 if len(mine) else 0.0
     return SkeletonTrack(mine.capture_ns, mine.points_m, mine.confidence, delay_s)
@@ -200,7 +200,7 @@ def _direction(up: Sequence[float] | None) -> Floats | None:
 
 
 def _together(a: SkeletonTrack, b: SkeletonTrack) -> int:
-    """Frames of a that have one of b close by."""
+    """Returns the frames of a with a simultaneous frame of b."""
     if not len(a) or not len(b):
         return 0
     after = np.searchsorted(b.t_ns, a.t_ns).clip(1, max(1, len(b) - 1))
@@ -210,7 +210,7 @@ def _together(a: SkeletonTrack, b: SkeletonTrack) -> int:
 
 
 def _tree(tracks: list[SkeletonTrack], root: int) -> list[Pair]:
-    """Pairs that tie every camera to the root, those with most frames together first (Prim)."""
+    """Selects pairs that link every camera to the root, those with the most simultaneous frames first (Prim)."""
     tied: list[int] = [root]
     ties: list[Pair] = []
     while True:
@@ -223,7 +223,7 @@ def _tree(tracks: list[SkeletonTrack], root: int) -> list[Pair]:
 
 
 def _tie(tracks: list[SkeletonTrack], pair: Pair, known: Registration, search_s: float, log: Log) -> Registration:
-    """Pose of camera b relative to the root, by way of camera a."""
+    """Computes the pose of camera b relative to the root through camera a."""
     a, b = (tracks[i] for i in pair)
     search_s += round(abs(b.delay_s - a.delay_s), 1)
     names = " and ".join(log.header.cameras[i] for i in pair)
@@ -231,7 +231,7 @@ def _tie(tracks: list[SkeletonTrack], pair: Pair, known: Registration, search_s:
     rest = disagreement(a, b, found) if found is not None else None
     if found is None or rest is None:
         raise LogError(f"{log.header.path}: cameras {names} share too few points; would be right: 4 in each frame")
-    width_s = float(np.median(np.diff(a.t_ns))) / 1e9  # the offset is refined by as much
+    width_s = float(np.median(np.diff(a.t_ns))) / 1e9  # the refinement may change the offset by this much
     if rest.median_m > _APART_M or abs(found.offset_s) > search_s + width_s:
         raise LogError(
             f"{log.header.path}: cameras {names} do not fit each other: {rest.median_m * 1e3:.0f} mm apart (median) at "
@@ -281,7 +281,7 @@ def _floor(
     height_m: float | None,
     log: Log,
 ) -> Floor:
-    """The floor in the root's frame, from the root's own frames or else those of the camera nearest to it in order."""
+    """Finds the floor in the root's frame, from the root's own frames or else from the next camera in order."""
     order = [root, *(i for i in found if i != root)]
     for i in order:
         T = found[i].T_a_b

@@ -1,7 +1,6 @@
-"""The cell: poses of cameras and robot and clock offsets in a file, and the floor, found from a person who walks.
+"""The cell: a file of camera and robot poses and clock offsets, and the floor, found from a walking person.
 
-World frame: z up, floor at z = 0. Of the floor plane and the upward direction nothing is assumed about the directions
-of the sensor's axes.
+World frame: z up, floor at z = 0. The floor and the upward direction are found for any orientation of the sensor.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ def _check_area(corners: list[list[float]]) -> list[list[float]]:
 
 
 class Residual(BaseModel):
-    """Distance between two calibrated cameras about the same person, outliers included."""
+    """Distance between two calibrated cameras' views of the same person, outliers included."""
 
     model_config = _STRICT
 
@@ -49,24 +48,25 @@ class Residual(BaseModel):
     median_m: float
     p95_m: float
     points: int
-    """Point pairs it rests on."""
+    """Number of point pairs."""
     mirrored: float
-    """Share of frames in which the two see left and right exchanged."""
+    """Share of frames in which the two cameras disagree on left and right."""
 
 
 class Watched(BaseModel):
-    """Area that the cameras see together: one of them shows everybody who has any part of the body in it."""
+    """Area that the cameras see together: every person with a part of the body in it is seen by one of them."""
 
     model_config = _STRICT
 
     corners_m: Annotated[list[Annotated[list[_Number], Field(min_length=2, max_length=2)]], AfterValidator(_check_area)]
-    """Corners (x, y) of a convex area on the floor, one after another around it; it has any height [m]."""
+    """Corners (x, y) of a convex area on the floor, in order around it; its height is unlimited [m]."""
     margin_m: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
-    """How far inside somebody may be who is not shown yet, as by an arm stretched out: 0.85 m in ISO 13855 [m]."""
+    """Maximum depth inside the area of an unseen person, such as an extended arm: 0.85 m in ISO 13855 [m]."""
     clear_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 2.0
-    """How long somebody who was lost inside may be there, and all cameras must watch before they know [s]."""
+    """Time for which a person lost inside may still be there; all cameras must observe for this time before the area
+    counts as empty [s]."""
     speed_m_per_s: Annotated[float, Field(gt=0.0, le=100.0)] = 1.6
-    """Speed at which people walk in, ISO 13855 [m/s]."""
+    """Speed of people who walk in, ISO 13855 [m/s]."""
 
     @property
     def polygon(self) -> ConvexPolygon:
@@ -76,17 +76,17 @@ class Watched(BaseModel):
 
 @dataclass(frozen=True)
 class Cell:
-    """Poses and clocks of one cell, and what its cameras see."""
+    """Poses and clocks of one cell, and the area that its cameras watch."""
 
     T_world_camera: Mapping[str, Floats] = field(default_factory=dict)  #: camera -> (4, 4)
     clock_offset_s: Mapping[str, float] = field(default_factory=dict)  #: camera's clock minus the reference camera's
     T_world_base: Floats | None = None  #: (4, 4) robot base
-    watched: Watched | None = None  #: where nobody can be whom no camera shows
+    watched: Watched | None = None  #: area in which every person is seen by a camera
     residuals: tuple[Residual, ...] = ()
-    notes: tuple[str, ...] = ()  #: what calibrate was not sure of
+    notes: tuple[str, ...] = ()  #: uncertain results of calibrate
 
     def to_dict(self) -> dict[str, Any]:
-        """The cell as plain lists, numbers and strings, as a cell file has them."""
+        """Returns the cell as lists, numbers and strings, as in a cell file."""
         cell: dict[str, Any] = {
             "cameras": {
                 name: {"T_world_camera": T.tolist(), "clock_offset_s": float(self.clock_offset_s.get(name, 0.0))}
@@ -105,10 +105,10 @@ class Cell:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "cell") -> Self:
-        """The cell that ``to_dict`` gave, or a cell file holds.
+        """Makes a cell from the result of ``to_dict`` or the content of a cell file.
 
         Raises:
-            SettingsError: A key or value is not as it should be.
+            SettingsError: A key or value is invalid.
         """
         try:
             file = _CellFile.model_validate(dict(table))
@@ -131,13 +131,13 @@ def load_cell(path: Path) -> Cell:
     """Reads a cell file.
 
     Raises:
-        SettingsError: The file cannot be read, or a key or value is not as it should be.
+        SettingsError: The file cannot be read, or a key or value is invalid.
     """
     return Cell.from_dict(read_toml(path, "name a cell file"), str(path))
 
 
 def write_cell(cell: Cell, path: Path) -> None:
-    """Writes a cell file, whole or not at all.
+    """Writes a cell file, complete or not at all.
 
     Raises:
         SettingsError: The file exists, or its folder cannot be written.
@@ -146,9 +146,9 @@ def write_cell(cell: Cell, path: Path) -> None:
 
 
 def pose_from_position(position_m: Floats, yaw_rad: float) -> Floats:
-    """T_world_x (4, 4) of something at a place (3,) [m], turned about z by yaw [rad].
+    """Returns T_world_x (4, 4) for a position (3,) [m] and a rotation about z by yaw [rad].
 
-    scipy's ``Rotation`` goes by half the angle, and its last bits would reach the cell file.
+    scipy's ``Rotation`` uses half the angle; its rounding would change the last bits of the cell file.
     """
     T = np.eye(4)
     T[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
@@ -183,7 +183,7 @@ def _matrix(rows: list[list[float]]) -> str:
 
 
 def _check_rows(rows: Any) -> Any:
-    """Before the rows themselves, so that a matrix of another size is shown whole."""
+    """Checks the shape before the rows, so that a matrix of another size is shown completely."""
     if not isinstance(rows, list) or len(rows) != 4:
         raise ValueError(f"found {shown(rows)}; would be right: {_POSE}")
     return rows
@@ -212,7 +212,7 @@ class _Camera(BaseModel):
 
 
 class _Upright(BaseModel):
-    """A base whose z axis is the world's."""
+    """A base with a vertical z axis."""
 
     model_config = _STRICT
     position_m: Annotated[list[_Number], Field(min_length=3, max_length=3)]
@@ -234,7 +234,7 @@ class _CellFile(BaseModel):
     notes: list[str] = []
 
 
-#: What would be right, by the name of the key; for a number, a finite one.
+#: Description of a valid value by the name of the key; for a number, a finite one.
 _RIGHT = {
     "cameras": "a table",
     "T_world_camera": _POSE,
@@ -252,13 +252,13 @@ _RIGHT = {
 
 def _first_problem(error: ValidationError, table: Mapping[str, Any], where: str) -> str:
     problems = error.errors()
-    # An unknown key is told first: it may be a missing one with another name.
+    # An unknown key is reported first: it may be a misspelled missing one.
     problem = next((one for one in problems if one["type"] == "extra_forbidden"), problems[0])
     kind, loc, found = problem["type"], list(problem["loc"]), problem["input"]
     if loc[0] in ("residuals", "notes"):
         kind, loc, found = "value", loc[:1], table[str(loc[0])]
     elif loc[0] == "T_world_base":
-        del loc[1]  # the tag
+        del loc[1]  # the tag of the variant
     keys = [str(key) for key in loc if not isinstance(key, int)]
     at = f"{where}: {'.'.join(keys)}"
     right = "a table" if keys[0] == "cameras" and len(keys) == 2 else _RIGHT.get(keys[-1])
@@ -277,14 +277,15 @@ def _first_problem(error: ValidationError, table: Mapping[str, Any], where: str)
 
 
 _LEG = ("knee", "ankle", "foot")
-_UPRIGHT = 0.9  # neck to ankles, straight over along the bones: a chair gives 0.75 to 0.85
-_STANDING_STD = np.radians(3.0)  # sway, and errors of the trackers' feet
-_TORSO_STD = np.radians(8.0)  # how upright people sit
+_UPRIGHT = 0.9  # ratio of the straight distance from neck to ankles to that along the bones: 0.75 to 0.85 on a chair
+_STANDING_STD = np.radians(3.0)  # rad, from sway and errors of the trackers' feet
+_TORSO_STD = np.radians(8.0)  # rad, deviation of a sitting person's trunk from upright
 _FOOT_STD_M = 0.02
 _STEP_M = 0.1  # a tracker repeats its error while a foot rests: each place counts as one measurement
-_REST_S = 0.3  # a foot that is shorter at a place only passes there
-_MANY_S = 1.0  # rows worth this long are needed to tell anything
-#: A view whose z is less points along the floor enough to give it a direction: 60 degrees up or down.
+_REST_S = 0.3  # minimum time of a resting foot at a place
+_MANY_S = 1.0  # minimum duration of the rows for a result
+#: Maximum vertical component of the viewing direction that still gives a direction along the floor: 60 degrees up or
+#: down.
 LEVEL_VIEW = float(np.sin(np.radians(60)))
 
 
@@ -293,17 +294,17 @@ class Floor:
     """A point p of the sensor's frame is ``up @ p + height_m`` above the floor."""
 
     up: Floats  #: (3,) unit vector in the sensor's frame
-    height_m: float  #: of the sensor's origin above the floor [m]
-    tilt_std_rad: float  #: how well ``up`` is known, standard deviation [rad]
+    height_m: float  #: height of the sensor's origin above the floor [m]
+    tilt_std_rad: float  #: standard deviation of ``up`` [rad]
 
 
 def up_direction(track: SkeletonTrack) -> tuple[Floats, float] | None:
-    """The upward direction, from the direction of the person's body.
+    """Estimates the upward direction from the person's body.
 
     Returns:
-        Unit vector (3,) in the sensor's frame and its standard deviation [rad]. Who stands keeps the centre of mass
-        over the feet, however bent; who never stands upright sits, and the trunk from pelvis to neck must do. None
-        where neither was seen long enough.
+        Unit vector (3,) in the sensor's frame and its standard deviation [rad]. A standing person keeps the centre of
+        mass above the feet, even when bent. If the person never stands upright, the trunk from pelvis to neck is used
+        instead. None if neither was seen long enough.
     """
     neck, pelvis = _point(track, "neck"), _point(track, "pelvis")
     neck = np.where(np.isfinite(neck), neck, 0.5 * (_point(track, "shoulder_l") + _point(track, "shoulder_r")))
@@ -321,31 +322,31 @@ def up_direction(track: SkeletonTrack) -> tuple[Floats, float] | None:
 
 
 def find_floor(track: SkeletonTrack, up: Floats | None = None) -> Floor | None:
-    """The plane under the feet.
+    """Finds the plane under the feet.
 
-    Ankles and feet that rest lie on two planes of one direction; the posture says which direction is likely, the more
-    so the smaller the part of the floor that was walked on. Raised feet are left out by Tukey's weights.
+    Resting ankles and feet lie on two parallel planes. The posture gives a prior for their direction, with more weight
+    if the person walked on a small part of the floor. Tukey's weights remove raised feet.
 
     Args:
         track: The person in the sensor's frame [m].
         up: (3,) direction to keep, in the sensor's frame; None to find it.
 
     Returns:
-        The floor, or None where feet or trunk were not seen long enough.
+        The floor, or None if feet or trunk were not seen long enough.
     """
     guess = (up / np.linalg.norm(up), 1e-9) if up is not None else up_direction(track)
     feet_m, is_ankle = _feet(track)
     if guess is None or len(feet_m) < _rows_for(track, _MANY_S) or is_ankle.all():
         return None
     normal, std = guess
-    prior = (_FOOT_STD_M / std) ** 2  # on the tilt, in units of one place's residual
+    prior = (_FOOT_STD_M / std) ** 2  # prior on the tilt, in units of the residual of one place
     e1, e2 = _across(normal)
     tilt = np.zeros(2)
     heights = feet_m @ normal
     kinds = np.stack([~is_ankle, is_ankle], axis=1).astype(np.float64)
     level = np.array([_low(heights[~is_ankle]), _low(heights[is_ankle])])
     A = np.column_stack([feet_m @ e1, feet_m @ e2, -kinds])
-    A[:, :2] -= np.median(A[:, :2], axis=0)  # turning about where the person walks leaves the levels alone
+    A[:, :2] -= np.median(A[:, :2], axis=0)  # a rotation about the middle of the walked area does not change the levels
     share = _share(A[:, :2], is_ankle, _rows_for(track, _REST_S))
     for reach_m in np.concatenate([np.geomspace(0.3, 0.06, 12), np.full(20, 0.06)]):
         left = heights + A @ np.concatenate([tilt, level])
@@ -355,17 +356,17 @@ def find_floor(track: SkeletonTrack, up: Floats | None = None) -> Floor | None:
         tilt, level = solution[:2], solution[2:]
     found = _unit(normal + tilt[0] * e1 + tilt[1] * e2)
     middle = np.array([np.median(feet_m @ e1), np.median(feet_m @ e2)])
-    # Where the person walks, the feet's plane is `level` along the first guess.
+    # In the walked area, the plane of the feet is at `level` along the initial direction.
     on_plane = middle[0] * e1 + middle[1] * e2 + level[0] * normal
     tilt_std = _FOOT_STD_M * float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(H)[:2, :2])[-1]))
     return Floor(found, SOLE_M - float(found @ on_plane), tilt_std)
 
 
 def floor_frame(floor: Floor) -> Floats:
-    """T_world_sensor (4, 4) of the world that the sensor defines.
+    """Returns T_world_sensor (4, 4) of the world that the sensor defines.
 
     Its origin is the floor under the sensor, z is up, x is the viewing direction (the sensor's z) along the floor, or
-    the sensor's own x where it looks up or down by more than 60 degrees, as the frame of a motion capture system does.
+    the sensor's own x if its z axis points up or down by more than 60 degrees, as in a motion capture system.
     """
     view = np.array([0.0, 0.0, 1.0])
     if abs(floor.up @ view) > LEVEL_VIEW:
@@ -380,7 +381,7 @@ def _point(track: SkeletonTrack, name: str) -> Floats:
 
 
 def _unit(vectors: Floats) -> Floats:
-    """Directions (..., 3); NaN where a vector has no length."""
+    """Normalises vectors (..., 3); NaN for a zero vector."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.where(length > 0.0, length, np.nan))
 
@@ -390,12 +391,12 @@ def _length(vectors: Floats) -> Floats:
 
 
 def _rows_for(track: SkeletonTrack, seconds: float) -> float:
-    """Number of rows of this track that last so long."""
+    """Returns the number of rows of this track within a duration."""
     return max(1.0, seconds * 1e9 / float(np.median(np.diff(track.t_ns)))) if len(track) > 1 else np.inf
 
 
 def _middle(directions: Floats) -> Floats:
-    """Direction of the least sum of angles, so that bending now and then does not count."""
+    """Returns the direction with the minimum sum of angles, so that occasional bending has no influence."""
     middle = _unit(np.median(directions, axis=0))
     for _ in range(30):
         apart = np.linalg.norm(directions - middle, axis=1)
@@ -404,7 +405,7 @@ def _middle(directions: Floats) -> Floats:
 
 
 def _feet(track: SkeletonTrack) -> tuple[Floats, Bools]:
-    """(m, 3) ankles and feet that the sensor is sure of, and (m,) which are ankles."""
+    """Returns (m, 3) ankles and feet of full confidence, and (m,) True for ankles."""
     places, kinds = [], []
     for name in ("ankle_l", "ankle_r", "foot_l", "foot_r"):
         points = _point(track, name)
@@ -415,14 +416,14 @@ def _feet(track: SkeletonTrack) -> tuple[Floats, Bools]:
 
 
 def _share(places_m: Floats, is_ankle: Bools, rest: float) -> Floats:
-    """(m,) weights under which all points of one kind at one place of the floor count once."""
+    """Returns (m,) weights so that all points of one kind at one place of the floor count as one."""
     cells = np.column_stack([np.round(places_m / _STEP_M), is_ankle])
     _, which, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     return np.asarray(1.0 / np.maximum(count, rest)[which.ravel()])
 
 
 def _across(normal: Floats) -> tuple[Floats, Floats]:
-    """Two unit vectors at right angles to a direction and to one another."""
+    """Returns two unit vectors orthogonal to a direction and to each other."""
     e1 = _unit(np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))]))
     return e1, np.asarray(np.cross(normal, e1))
 

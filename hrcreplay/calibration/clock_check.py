@@ -1,4 +1,4 @@
-"""Comparison of the cameras' clocks by what the cameras see of one person, while a log is read."""
+"""Comparison of the cameras' clocks by their views of one person, while a log is read."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from hrcreplay.calibration.calibrate import in_window, track_of
 from hrcreplay.calibration.registration import ClockOffset, find_clock_offset, transform
 from hrcreplay.records import CameraFrames, Floats, SkeletonTrack
 
-#: Clocks that differ by more frames of the slower camera, and by more than this, are told [frames], [s].
+#: A clock difference above both is reported: in frames of the slower camera, and [s].
 _FRAMES, _LEAST_S = 3.0, 0.1
-#: With the offset the movements must be nearer to one another by this share, and by this.
+#: The offset must reduce the distance between the movements by this share, and by this distance.
 _NEARER, _NEARER_M = 0.85, 0.003
-#: Offsets are searched so far beyond those of the stamps from their arrivals [s].
+#: Search range of offsets beyond the difference between stamps and arrivals [s].
 _SEARCH_S = 1.0
 
 
 class ClockCheck:
-    """The frames of each camera with one body in them; of a long log, in evenly spaced windows.
+    """Collects the frames of each camera with one body in them; for a long log, in evenly spaced windows.
 
-    Frames with several bodies are left out: which of them two cameras have in common is not known yet.
+    Frames with several bodies are left out, as it is not known yet which of them both cameras see.
     """
 
     def __init__(self, cameras: tuple[str, ...], T_world_camera: Floats, start_ns: int, end_ns: int) -> None:
@@ -32,7 +32,7 @@ class ClockCheck:
         self._kept: list[CameraFrames] = []
 
     def add(self, frames: CameraFrames) -> None:
-        """Takes frames in order of arrival, with all bodies of a frame in one table."""
+        """Adds frames in order of arrival, with all bodies of a frame in one table."""
         rows = frames.rows(in_window(frames, *self._span_ns))
         key = np.stack([rows.camera, rows.capture_ns], axis=1)
         _, index, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
@@ -41,7 +41,7 @@ class ClockCheck:
             self._kept.append(alone)
 
     def remarks(self) -> Iterator[str]:
-        """Notes on cameras whose clocks differ from that of the camera with the least delay."""
+        """Returns notes on cameras whose clocks differ from that of the camera with the smallest delay."""
         tracks = self._tracks()
         first, *others = sorted(tracks, key=lambda name: abs(tracks[name].delay_s)) or [""]
         for name in others:
@@ -51,7 +51,7 @@ class ClockCheck:
                 yield _remark((first, a.delay_s), (name, b.delay_s), offset)
 
     def _tracks(self) -> dict[str, SkeletonTrack]:
-        """The world track of each camera."""
+        """Returns the world track of each camera."""
         table = CameraFrames.join(self._kept) if self._kept else None
         if table is None:
             return {}
@@ -71,7 +71,7 @@ def _disagrees(offset: ClockOffset) -> bool:
 
 
 def _remark(reference: tuple[str, float], other: tuple[str, float], offset: ClockOffset) -> str:
-    """The note on a camera; both by name and delay [s]."""
+    """Returns the note on a camera; both cameras are given by name and delay [s]."""
     behind = "behind" if offset.offset_s < 0.0 else "ahead of"
     without = "" if np.isnan(offset.without_m) else f", {100 * offset.without_m:.1f} cm without"
     return (

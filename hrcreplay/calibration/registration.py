@@ -1,7 +1,7 @@
 """Registration of two sensors, pose and clock offset, from the skeletons of one person that both saw.
 
 Recorded skeletons have gross errors at full confidence (left and right exchanged, jumps), the two clocks differ, and
-frames are taken at different instants. So both tracks are smoothed by the same kernel and compared at the instants of
+the frames have different capture times. So both tracks are smoothed by the same kernel and compared at the instants of
 one camera, and pose and clock offset are estimated together by a robust Gauss-Newton method.
 """
 
@@ -18,44 +18,45 @@ from hrcreplay.logs.camera_checks import find_mirrored, interpolate
 from hrcreplay.records import MIRROR, POINTS, Floats, Ints, SkeletonTrack
 
 _NS = 1e-9
-_SPEED_MAX = 4.0  # m/s: faster is a jump of the tracker, not the person
-_STARTS = 40  # frames whose own alignment is tried as the start
+_SPEED_MAX = 4.0  # m/s, maximum speed of a person; faster motion is a jump of the tracker
+_STARTS = 40  # number of frames whose alignment is tried as the initial one
 _ITERATIONS = 60
-_INSTANTS = 5000  # at most, evenly spaced, at which the tracks are compared
-_LIKE = 0.1  # correlation of speeds that is no chance
-_COARSE = 1200  # and of these at most, while offsets are only searched
-_ROUGH = 400  # and of these where an offset is wanted to a frame only
-_TOGETHER = 20  # frames of both in which a point must be seen
-_OVERLAP = 0.4  # of the most point pairs that any offset has
+_INSTANTS = 5000  # maximum number of instants, evenly spaced, at which the tracks are compared
+_LIKE = 0.1  # minimum significant correlation of speeds
+_COARSE = 1200  # maximum number of instants during the search for offsets
+_ROUGH = 400  # maximum number of instants for an offset accurate to a frame
+_TOGETHER = 20  # minimum number of frames of both with a point
+_OVERLAP = 0.4  # minimum share of the maximum number of point pairs over all offsets
 
 
 @dataclass(frozen=True)
 class Registration:
     """Pose and clock of sensor b relative to sensor a."""
 
-    T_a_b: Floats  #: (4, 4) takes points of b into the frame of a
+    T_a_b: Floats  #: (4, 4) transforms points of b into the frame of a
     offset_s: float  #: clock of b minus clock of a [s]
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Residual between two registered tracks, over every point that both saw, outliers included."""
+    """Residual between two registered tracks, over all points that both saw, including outliers."""
 
     median_m: float
     p95_m: float
-    points: int  #: point pairs it rests on
-    mirrored: float  #: share of the frames in which the two see left and right exchanged
+    points: int  #: number of point pairs
+    mirrored: float  #: share of the frames in which the two disagree on left and right
 
 
 def kabsch(source_m: Floats, target_m: Floats, weight: Floats) -> Floats:
-    """Rigid transform that takes the source points to the target points in weighted least squares.
+    """Computes the rigid transform from the source points to the target points by weighted least squares.
 
-    scipy's ``Rotation.align_vectors`` agrees to 1e-14 in 2.6 times the time, and its last bits reach the cell file.
+    scipy's ``Rotation.align_vectors`` agrees to 1e-14 but takes 2.6 times as long, and would change the last bits of
+    the cell file.
 
     Args:
         source_m: (m, 3) [m].
         target_m: (m, 3) [m].
-        weight: (m,) not negative.
+        weight: (m,) weights, not negative.
 
     Returns:
         T_target_source (4, 4).
@@ -68,19 +69,19 @@ def kabsch(source_m: Floats, target_m: Floats, weight: Floats) -> Floats:
 
 
 def rigid(rotation: Floats, translation_m: Floats) -> Floats:
-    """The (4, 4) transform of a rotation (3, 3) and a translation (3,) [m]."""
+    """Returns the (4, 4) transform of a rotation (3, 3) and a translation (3,) [m]."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, translation_m
     return T
 
 
 def transform(T: Floats, points_m: Floats) -> Floats:
-    """Points (..., 3) [m] taken through T (4, 4)."""
+    """Transforms points (..., 3) [m] by T (4, 4)."""
     return points_m @ T[:3, :3].T + T[:3, 3]
 
 
 def register(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float = 2.0) -> Registration | None:
-    """Pose of sensor b in the frame of sensor a, and b's clock offset.
+    """Estimates the pose of sensor b in the frame of sensor a, and b's clock offset.
 
     Args:
         a: The person as sensor a saw it, (n, 20, 3) [m].
@@ -88,7 +89,7 @@ def register(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float = 2.0) -> Re
         search_s: Clock offsets are searched within plus and minus this [s].
 
     Returns:
-        The registration, or None where the tracks share too few points to tell.
+        The registration, or None if the tracks share too few points.
     """
     if min(len(a), len(b)) < 3:
         return None
@@ -98,13 +99,13 @@ def register(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float = 2.0) -> Re
     points_a, velocity_a, weight_a = _smoothed(a, t_ns, width_s)
     few = slice(None, None, -(-len(t_ns) // _COARSE))
     offset_s, likeness = _coarse_offset(t_ns[few], velocity_a[few], b, width_s, search_s)
-    if likeness < _LIKE:  # nobody moved: the clocks cannot be compared, and a velocity of zero keeps them as they are
+    if likeness < _LIKE:  # no motion: the clocks cannot be compared, and a velocity of zero leaves the offset unchanged
         offset_s, velocity_a = 0.0, np.zeros_like(velocity_a)
     at_a = _AtA(t_ns, points_a, velocity_a, weight_a, width_s)
     found = _refine(at_a, b, offset_s)
     if found is None or likeness < _LIKE:
         return found
-    # Speeds may be alike by chance where the person moved little; places, once the pose is known about, are not.
+    # Speeds may agree by chance if the person moved little; positions do not, once the pose is roughly known.
     there = SkeletonTrack(b.t_ns, transform(found.T_a_b, b.points_m), b.confidence)
     better = find_clock_offset(a, there, search_s=search_s)
     if better is None or abs(better.offset_s - found.offset_s) <= width_s:
@@ -113,7 +114,7 @@ def register(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float = 2.0) -> Re
 
 
 class _AtA(NamedTuple):
-    """Sensor a's track at its own instants, smoothed."""
+    """Smoothed track of sensor a at its own instants."""
 
     t_ns: Ints
     points: Floats
@@ -123,7 +124,7 @@ class _AtA(NamedTuple):
 
 
 def _refine(a: _AtA, b: SkeletonTrack, offset_s: float) -> Registration | None:
-    """Pose and offset from a first offset on; None where the tracks share too few points to tell."""
+    """Refines pose and offset from an initial offset; None if the tracks share too few points."""
     points_b, _, weight_b = _smoothed(b, a.t_ns + round(offset_s / _NS), a.width_s)
     T = _start(a.points, points_b, np.sqrt(a.weight * weight_b))
     if T is None:
@@ -141,26 +142,26 @@ def _refine(a: _AtA, b: SkeletonTrack, offset_s: float) -> Registration | None:
 
 
 class ClockOffset(NamedTuple):
-    """The clock of a sensor b beside that of a sensor a, by what both saw."""
+    """Clock offset of a sensor b relative to a sensor a, from the person that both saw."""
 
-    offset_s: float  #: clock of b minus clock of a, to a frame [s]
-    apart_m: float  #: how far the two movements are from each other with this offset, median [m]
-    without_m: float  #: and with none; NaN where the two do not overlap then [m]
-    frame_s: float  #: time between two frames of the slower one [s]
+    offset_s: float  #: clock of b minus clock of a, accurate to a frame [s]
+    apart_m: float  #: median distance between the two movements with this offset [m]
+    without_m: float  #: the same without an offset; NaN if the two then do not overlap [m]
+    frame_s: float  #: time between two frames of the slower sensor [s]
 
 
 def find_clock_offset(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float) -> ClockOffset | None:
-    """The offset of two clocks at which two sensors see most nearly the same movement; to a frame, and fast.
+    """Finds the clock offset at which two sensors see the most similar movement; fast, accurate to a frame.
 
-    Places that differ by the same all the time, as by an error of a pose or of a tracker, make no difference.
+    A constant difference of positions, from an error of a pose or of a tracker, has no influence.
 
     Args:
-        a: The person as sensor a saw it, in a frame whose axes are those of b's.
+        a: The person as sensor a saw it, in a frame with the same axes as that of b.
         b: The same person as sensor b saw it.
         search_s: Offsets are searched within plus and minus this [s].
 
     Returns:
-        The offset; None where the two never saw the person together for long enough.
+        The offset; None if the two never saw the person together for long enough.
     """
     if min(len(a), len(b)) < _TOGETHER:
         return None
@@ -188,10 +189,10 @@ def find_clock_offset(a: SkeletonTrack, b: SkeletonTrack, *, search_s: float) ->
 
 
 def disagreement(a: SkeletonTrack, b: SkeletonTrack, found: Registration) -> Disagreement | None:
-    """Residual between the raw points of two registered tracks, b interpolated linearly to a's instants.
+    """Computes the residual between the raw points of two registered tracks, b interpolated linearly to a's instants.
 
     Returns:
-        Median and 95th percentile over all point pairs of positive confidence [m]; None where there is no pair.
+        Median and 95th percentile over all point pairs of positive confidence [m]; None without a pair.
     """
     there = transform(found.T_a_b, interpolate(b, a.t_ns + round(found.offset_s / _NS)))
     apart_m = np.linalg.norm(a.points_m - there, axis=2)
@@ -205,9 +206,9 @@ def disagreement(a: SkeletonTrack, b: SkeletonTrack, found: Registration) -> Dis
 
 
 def _without_jumps(track: SkeletonTrack) -> SkeletonTrack:
-    """Points that leave the median of their five nearest frames by more than a fast arm could: confidence 0.
+    """Sets confidence 0 for points further from the median of their five nearest frames than a fast arm can move.
 
-    Kept out before smoothing, which would smear them over their neighbours.
+    They are removed before smoothing, which would spread them over their neighbours.
     """
     n = len(track)
     around = np.clip(np.arange(n)[:, None] + np.arange(-2, 3), 0, n - 1)
@@ -220,7 +221,7 @@ def _without_jumps(track: SkeletonTrack) -> SkeletonTrack:
 
 
 def _smoothed(track: SkeletonTrack, t_ns: Ints, width_s: float) -> tuple[Floats, Floats, Floats]:
-    """Points (n, 20, 3) [m], velocities [m/s] and weights (n, 20) of a track at other instants."""
+    """Returns points (n, 20, 3) [m], velocities [m/s] and weights (n, 20) of a track at other instants."""
     return _smooth(track.t_ns, track.points_m, track.confidence, t_ns, width_s / _NS)
 
 
@@ -228,10 +229,10 @@ def _smoothed(track: SkeletonTrack, t_ns: Ints, width_s: float) -> tuple[Floats,
 def _smooth(
     t_track: Ints, points: Floats, confidence: Floats, t_ns: Ints, width_ns: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Local lines under a Gaussian kernel.
+    """Fits local lines with a Gaussian kernel.
 
-    Linear interpolation between two noisy frames has half the noise midway, which pulls any estimate of the offset
-    towards half a frame. Under a kernel as wide as a frame the noise is the same everywhere.
+    Linear interpolation between two noisy frames halves the noise midway, which biases the offset towards half a frame.
+    With a kernel as wide as a frame the noise is the same everywhere.
     """
     n, m = len(t_ns), points.shape[1]
     value, slope, weight = np.zeros((n, m, 3)), np.zeros((n, m, 3)), np.zeros((n, m))
@@ -268,7 +269,7 @@ def _smooth(
 def _coarse_offset(
     t_ns: Ints, velocity_a: Floats, b: SkeletonTrack, width_s: float, search_s: float
 ) -> tuple[float, float]:
-    """Offset [s] at which the points' speeds correlate best, and how well; no pose of a sensor changes them."""
+    """Returns the offset [s] with the highest correlation of the points' speeds, and that correlation."""
     speed_a = np.minimum(np.linalg.norm(velocity_a, axis=2), _SPEED_MAX)
     seen_a = speed_a > 0
     steps = int(np.ceil(search_s / width_s))
@@ -288,7 +289,7 @@ def _coarse_offset(
 
 
 def _start(points_a: Floats, points_b: Floats, weight: Floats) -> Floats | None:
-    """The best of the alignments that single frames give, judged by all: a trimmed start, without chance."""
+    """Returns the best alignment of single frames, judged by all frames: a trimmed, deterministic initial value."""
     rows = np.flatnonzero((weight > 0).sum(axis=1) >= 4)
     if not len(rows):
         return None
@@ -308,7 +309,8 @@ def _start(points_a: Floats, points_b: Floats, weight: Floats) -> Floats | None:
 def _gauss_newton(
     T: Floats, points_a: Floats, points_b: Floats, velocity_a: Floats, weight: Floats
 ) -> tuple[Floats, Floats]:
-    """One step on rotation, translation and offset under Cauchy weights: the new T and the step (7,) [rad, m, s]."""
+    """Takes a step on rotation, translation and offset with Cauchy weights; returns the new T, the step (7,) [rad, m,
+    s]."""
     there = transform(T, points_b)
     scale_m = max(float(np.median(np.linalg.norm(points_a - there, axis=2)[weight > 0])), 1e-6)
     flip = find_mirrored(points_a, there, weight, scale_m)
@@ -318,12 +320,12 @@ def _gauss_newton(
     p, w = there[use], weight[use]
     left = points_a[use] - p
     w = w / (1.0 + np.sum(left**2, axis=1) / (1.5 * scale_m) ** 2)
-    middle = w @ p / w.sum()  # turning about the middle decouples rotation from translation
+    middle = w @ p / w.sum()  # a rotation about the middle decouples rotation from translation
     x, y, z = (p - middle).T
     o = np.zeros_like(x)
     turn = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)  # columns e_k x p
     shift = np.broadcast_to(np.eye(3), turn.shape)
-    # A larger offset looks at a later b: the point moves on by its velocity.
+    # A larger offset takes a later instant of b: the point moves by its velocity.
     A = np.concatenate([turn, shift, velocity_a[use][:, :, None]], axis=2)
     AtW = (A * w[:, None, None]).reshape(-1, 7).T
     flat = A.reshape(-1, 7)
