@@ -1,4 +1,4 @@
-"""Conversion between records and the columns of a run folder's tables. Column names are a contract with readers."""
+"""Conversion between records and the columns of a run folder's tables. Other programs rely on the column names."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from hrcreplay.records import (
 
 Columns = dict[str, Any]
 
-#: The joint ``z`` by the name that it has among the lengths of the paper: readers know it by both.
+#: Name of the joint ``z`` among the lengths of the paper; the tables contain both names.
 _HEIGHT, _AS_LENGTH = JOINTS.index("z"), "pi_pelvis_height"
 _LENGTHS = (_AS_LENGTH, *LENGTHS)
 
 
 def measurement_columns(measurements: Measurements) -> Columns:
-    """A row a frame: what the closed-form inverse kinematics made of it."""
+    """Returns one row per frame: the result of the closed-form inverse kinematics."""
     return {
         "capture_ns": measurements.capture_ns,
         "arrival_ns": measurements.arrival_ns,
@@ -48,7 +48,7 @@ def measurement_columns(measurements: Measurements) -> Columns:
 
 
 def truth_columns(t_ns: Ints, angles: Floats, lengths_m: Floats) -> Columns:
-    """A row an instant of the ground truth: (n, 13) JOINTS and (n, 7) LENGTHS [m] of the noise-free skeleton."""
+    """Returns one row per instant of the ground truth: (n, 13) JOINTS, (n, 7) LENGTHS [m] of the exact skeleton."""
     heights = {_AS_LENGTH: angles[:, _HEIGHT]}
     return {"t_ns": t_ns, **_spread(angles, JOINTS), **heights, **_spread(lengths_m, LENGTHS)}
 
@@ -62,7 +62,7 @@ _SHOWN = tuple(f"point_{point}_{axis}" for point in POINTS for axis in "xyz")
 
 
 def state_columns(states: HumanStates) -> Columns:
-    """A row a tick: joints with derivatives and deviations, lengths, limbs, and which cameras entered."""
+    """Returns one row per tick: joints with derivatives and deviations, lengths, limbs, and the cameras used."""
     columns: Columns = {"t_ns": states.t_ns}
     for field, suffix in _STATE:
         columns |= _spread(getattr(states, field), JOINTS, suffix)
@@ -74,7 +74,7 @@ def state_columns(states: HumanStates) -> Columns:
     return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
 
 
-#: Columns that a table of a run folder has whatever the cameras and the robot; who reads one counts on them.
+#: Columns that every table of this name has, for any cameras and robot; readers rely on them.
 COLUMNS = {
     "measurements": ("capture_ns", "arrival_ns", "camera", *JOINTS, *(f"{joint}_std" for joint in JOINTS), *_LENGTHS),
     "bodies": ("camera", "frames", "floor_m", "floor_p95_m", "by_ankles", "head_m", "bones_m"),
@@ -92,7 +92,7 @@ COLUMNS = {
     "occupancy": ("t_ns", "limb", "method", "radius_m", "volume_m3", "vertices", "horizon_s"),
     "motion": (
         "t_ns",
-        *(name for field in MotionRow._fields for name in number_names(field, 0)),  # those of the axes aside
+        *(name for field in MotionRow._fields for name in number_names(field, 0)),  # without the columns of the axes
     ),
     "contact": (
         *("t_ns", "method", "person", "moving", "distance_m", "limb", "link", "tcp_speed", "contact_speed"),
@@ -102,13 +102,13 @@ COLUMNS = {
 
 
 def missing_columns(path: Path) -> tuple[str, ...]:
-    """The COLUMNS that a table lacks, as one of an earlier version may; ``motion_<baseline>`` has those of motion."""
+    """Returns the COLUMNS that a table of an earlier version lacks; ``motion_<baseline>`` has those of motion."""
     names = set(pq.read_schema(path).names)
     return tuple(name for name in COLUMNS[path.stem.split("_")[0]] if name not in names)
 
 
 def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
-    """state.parquet as records again, bit for bit, ``chunk_ticks`` rows at a time."""
+    """Reads state.parquet into records, bit for bit, ``chunk_ticks`` rows at a time."""
     with pq.ParquetFile(path) as file:
         cameras = tuple(n.removeprefix("valid_") for n in file.schema_arrow.names if n.startswith("valid_"))
         for batch in file.iter_batches(batch_size=chunk_ticks):
@@ -138,7 +138,7 @@ def occupancy_columns(
     hulls: list[Floats],
     horizon_s: list[float],
 ) -> Columns:
-    """A row per stored tick and limb; ``hulls`` are (m, 3) hull vertices in the world [m], before the radius.
+    """Returns one row per stored tick and limb; ``hulls`` are (m, 3) hull vertices in the world [m], before the radius.
 
     Args:
         t_ns: (n,) ticks [ns].
@@ -147,7 +147,7 @@ def occupancy_columns(
         radius_m: Radius of the ball around each hull [m].
         volume_m3: Volume of each hull with its ball, above the floor [m^3].
         hulls: (m, 3) hull vertices of each row, before the radius, world [m].
-        horizon_s: How long after the tick they hold, of each row [s].
+        horizon_s: Horizon of each row, after its tick [s].
     """
     return {
         "t_ns": t_ns,
@@ -161,7 +161,7 @@ def occupancy_columns(
 
 
 def motion_columns(motion: Motion) -> Columns:
-    """A row a tick: the commanded motion, and the distance from the person."""
+    """Returns one row per tick: the commanded motion, and the distance from the person."""
     names = {"limb": motion.limbs, "link": motion.links, "status": STATUSES, "reason": motion.reasons}
     columns: Columns = {"t_ns": motion.t_ns}
     for field in MotionRow._fields:
@@ -191,24 +191,24 @@ def contact_columns(
     left: tuple[Floats, Ints, tuple[str, ...]],
     left_full: tuple[Floats, Ints, tuple[str, ...]],
 ) -> Columns:
-    """A row a tick of a method: robot against everybody recorded. The worst of all bodies and sources counts.
+    """Returns one row per tick of a method: the smallest distance of the robot over all bodies and sources.
 
     Args:
         t_ns: (n,) [ns].
-        method: That moved the robot.
-        person: Where the recorded person is from.
-        moving: (n,) whether any axis turns.
-        distance_m: (n,) between the surfaces of robot and nearest body, negative in overlap; NaN: none is known [m].
+        method: Method of the robot.
+        person: Source of the recorded person.
+        moving: (n,) True if any axis turns.
+        distance_m: (n,) between the surfaces of robot and nearest body, negative in overlap; NaN: no known body [m].
         part: (n,) indices of the nearest part of the body, -1 without one, and the names of all parts.
         link: (n,) indices of the nearest link, -1 without one, and the names of all links.
         speeds: (n,) each: of the TCP, and of the link's surface where it is nearest to the body [m/s].
-        source: (n,) indices of what shows the nearest body, -1 without one, and the names of all sources.
-        apart: (n,) each: the distance of the person, and of the nearest other body; NaN: not known [m].
-        outside_m: (n,) how far the touched part of the person was outside the volume by which the motion had been
-            certified; NaN where nothing moving touched the person, or nothing was predicted [m].
-        left: (n,) how far at most a limb left the volume of the tick until its horizon, 0 where all were held, NaN
-            where not asked [m]; (n,) indices of that limb, -1 without one, and the names of all limbs.
-        left_full: The same until the braking time T_s, whatever the tick's horizon.
+        source: (n,) indices of the source of the nearest body, -1 without one, and the names of all sources.
+        apart: (n,) each: the distance of the person, and of the nearest other body; NaN: unknown [m].
+        outside_m: (n,) distance of the touched part outside the volume used to certify the motion; NaN if no moving
+            part touched the person, or without a prediction [m].
+        left: (n,) maximum distance by which a limb left the volume of the tick until its horizon, 0 if none did, NaN if
+            not checked [m]; (n,) indices of that limb, -1 without one, and the names of all limbs.
+        left_full: The same until the braking time T_s, independent of the tick's horizon.
     """
     return {
         "t_ns": t_ns,
@@ -232,13 +232,13 @@ def contact_columns(
 
 
 def record_columns(rows: Sequence[Any]) -> Columns:
-    """A row a record: flat dataclasses of one kind, a column a field."""
+    """Returns one row per record, for flat dataclasses of one type; one column per field."""
     columns = {spec.name: [getattr(row, spec.name) for row in rows] for spec in fields(rows[0])}
     return {name: _text(values) if isinstance(values[0], str) else np.array(values) for name, values in columns.items()}
 
 
 def body_columns(t_ns: Ints, axes_m: Floats, parts: tuple[str, ...]) -> Columns:
-    """A row an instant: (n, p, 2, 3) ends of the recorded body's capsules, world [m]; NaN where not known."""
+    """Returns one row per instant: (n, p, 2, 3) ends of the recorded body's capsules, world [m]; NaN if unknown."""
     names = [f"{part}_{end}_{axis}" for part in parts for end in (0, 1) for axis in "xyz"]
     return {"t_ns": t_ns, **_spread(axes_m.reshape(len(t_ns), -1), names)}
 

@@ -1,7 +1,7 @@
-"""Description of what last bits depend on beside versions: processor, code chosen for it, mathematical libraries.
+"""Describes what changes the last bits of results: processor, instruction set, mathematical libraries.
 
-BLAS, numpy's loops, the C library and numba each choose code by the processor at run time. So each run says where it
-was made, and who computes it again can tell another processor from another motion.
+BLAS, numpy's loops, the C library and numba each choose code by the processor at run time. So each run records its
+machine, and a repeated run can distinguish the effect of another processor from another motion.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from typing import Any
 
 import numpy as np
 
-#: Features of a processor by which one of those libraries chooses its code.
+#: Processor features by which these libraries choose their code.
 FEATURES = frozenset({"sse4_2", "avx", "avx2", "fma", "fma4", "avx512f", "avx512dq", "avx512bw", "avx512vl", "sve"})
 #: Variables that override the choice.
 VARIABLES = (
     *("GLIBC_TUNABLES", "NPY_DISABLE_CPU_FEATURES", "NPY_ENABLE_CPU_FEATURES"),
     *("NUMBA_CPU_FEATURES", "NUMBA_CPU_NAME", "OPENBLAS_CORETYPE"),
 )
-#: How OpenBLAS calls the function that names its kernels; numpy's and scipy's copies have names of their own.
+#: Names of the OpenBLAS function that returns the kernels' name; they differ between the copies of numpy and scipy.
 _CORE_NAMES = tuple(f"{before}openblas_get_corename{after}" for before in ("scipy_", "") for after in ("64_", "_", ""))
 
 
 def describe_machine() -> dict[str, Any]:
     """Processor, instructions, BLAS, C library and the target of numba, as run.json has them."""
-    from llvmlite import binding  # who only compares machines does not need it
+    from llvmlite import binding  # not needed to compare machines
 
     cpu, config = _cpu_information(), np.show_config(mode="dicts") or {}
     blas = config.get("Build Dependencies", {}).get("blas", {})
@@ -45,7 +45,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def name_machine(machine: dict[str, Any] | None) -> str:
-    """A machine in one line: processor, instructions, BLAS kernels, C library, and variables that override them."""
+    """Describes a machine in one line: processor, instructions, BLAS kernels, C library, and overriding variables."""
     if not machine:
         return "a processor that the record does not name"
     core, variables = machine.get("blas", {}).get("core"), machine.get("environment", {})
@@ -59,7 +59,7 @@ def name_machine(machine: dict[str, Any] | None) -> str:
 
 
 def _cpu_information() -> dict[str, str]:
-    """Description of the first processor by Linux; nothing elsewhere."""
+    """Linux's description of the first processor; empty on other systems."""
     try:
         text = Path("/proc/cpuinfo").read_text().partition("\n\n")[0]
     except OSError:
@@ -68,19 +68,19 @@ def _cpu_information() -> dict[str, str]:
 
 
 def _blas_core() -> str:
-    """Processor of numpy's OpenBLAS kernels; empty for another library, and where it cannot be asked."""
+    """Processor type of numpy's OpenBLAS kernels; empty for another library or if unavailable."""
     try:
         lines = Path("/proc/self/maps").read_text().splitlines()
     except OSError:
         return ""
     paths = sorted({line.split(maxsplit=5)[5] for line in lines if "openblas" in line.lower()})
-    numpys = [path for path in paths if "numpy" in path]  # scipy may have another, which is loaded when it is needed
+    numpys = [path for path in paths if "numpy" in path]  # scipy may have another copy, loaded on demand
     return next((core for path in numpys or paths if (core := _ask_core(path))), "")
 
 
 def _ask_core(path: str) -> str:
     try:
-        library = ctypes.CDLL(path)  # which is in this process already
+        library = ctypes.CDLL(path)  # already loaded in this process
     except OSError:
         return ""
     for name in _CORE_NAMES:

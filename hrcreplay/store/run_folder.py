@@ -1,8 +1,7 @@
 """Writing and reading of a run folder.
 
-A folder is written completely or not at all: everything goes to ``<folder>.partial`` first, which gets its final name
-with the last write. Tables are parquet without times or paths in them, so the same log and settings give the same
-bytes.
+A folder is written completely or not at all: all files go to ``<folder>.partial`` first, which is renamed after the
+last write. Tables are parquet without times or paths, so the same log and settings give the same bytes.
 """
 
 from __future__ import annotations
@@ -44,12 +43,12 @@ def sha256(path: Path) -> str:
 
 
 def to_json(value: Any) -> str:
-    """JSON text with sorted keys; a number that is not finite is a bug here and raises ValueError."""
+    """JSON text with sorted keys; a number that is not finite raises ValueError."""
     return json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
 
 
 class TableWriter:
-    """A parquet file written chunk by chunk in row groups of a fixed size, whatever the size of the chunks."""
+    """A parquet file written chunk by chunk, in row groups of a fixed size for any chunk size."""
 
     ROWS = 4096
 
@@ -72,7 +71,7 @@ class TableWriter:
         self._writer.write_table(table.combine_chunks())
 
     def close(self) -> None:
-        """Writes the remaining rows. A table that never got a row has no file."""
+        """Writes the remaining rows. A table without rows has no file."""
         rest = [table for table in self._waiting if len(table)]
         if rest or (self._waiting and self._writer is None):
             self._flush(pa.concat_tables(rest or self._waiting[:1]))
@@ -81,12 +80,12 @@ class TableWriter:
 
 
 def arrow_table(columns: Mapping[str, Any]) -> pa.Table:
-    """Columns as arrow has them: numpy arrays or arrow arrays."""
+    """Converts numpy or arrow arrays into an arrow table."""
     return pa.table({name: _one_nan(column) for name, column in columns.items()})
 
 
 def _one_nan(column: Any) -> Any:
-    """The column with one NaN for all: which of the many bit patterns arises depends on the machine."""
+    """Replaces every NaN by the same bit pattern, as the pattern depends on the machine."""
     if isinstance(column, np.ndarray) and column.dtype == np.float64:
         return np.where(np.isnan(column), np.nan, column)
     return column
@@ -94,10 +93,10 @@ def _one_nan(column: Any) -> Any:
 
 @dataclass
 class RunWriter:
-    """Makes a run folder. Use as a context manager: a failure removes all that was written.
+    """Creates a run folder. Use as a context manager: a failure removes all written files.
 
     Raises:
-        SettingsError: The folder exists, or cannot be made.
+        SettingsError: The folder exists or cannot be created.
     """
 
     folder: Path
@@ -136,7 +135,7 @@ class RunWriter:
         self.tables.clear()
 
     def copy(self, name: str, source: Path) -> None:
-        """Takes a file over from another run, byte for byte."""
+        """Copies a file from another run, byte for byte."""
         shutil.copyfile(source / name, self.partial / name)
 
     def text(self, name: str, text: str) -> None:
@@ -146,11 +145,11 @@ class RunWriter:
         path.write_text(text)
 
     def finish(self, meta: Mapping[str, Any], *, complete: bool = True) -> None:
-        """Writes run.json with the digest of every output and gives the folder its name.
+        """Writes run.json with the digest of every output and renames the folder.
 
         Args:
-            meta: All else that run.json has.
-            complete: No for a session that broke off, whatever could be made of its record.
+            meta: The other entries of run.json.
+            complete: False for a session that was interrupted, even if its record could be completed.
         """
         self.close_tables()
         self.text("timing.json", to_json(self.timing))
@@ -172,7 +171,7 @@ class RunWriter:
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder's tables; None where the stage was not run."""
+    """A run folder's tables; None if the stage was not run."""
 
     folder: Path
     meta: dict[str, Any]
@@ -191,25 +190,25 @@ class Run:
 
     @property
     def T_world_base(self) -> Floats | None:
-        """(4, 4) robot base in the world, where the run knew it."""
+        """(4, 4) robot base in the world; None if unknown."""
         found = self.meta.get("T_world_base")
         return None if found is None else np.asarray(found, dtype=float)
 
 
 def is_run(path: Path) -> bool:
-    """Return whether a folder was left by an earlier command."""
+    """Returns True if a folder was written by an earlier command."""
     return (path / "run.json").is_file()
 
 
 def read_meta(folder: Path, *, broken_off: bool = False) -> dict[str, Any]:
-    """run.json of a complete run.
+    """Reads run.json of a complete run.
 
     Args:
-        folder: Of the run.
-        broken_off: Whether a live session that crashed will do as well.
+        folder: Folder of the run.
+        broken_off: True: also accept a live session that crashed.
 
     Raises:
-        SettingsError: Not a run folder, or the run did not end.
+        SettingsError: The folder is not a run folder, or the run did not end.
     """
     try:
         meta: dict[str, Any] = json.loads((folder / "run.json").read_text())
@@ -226,12 +225,12 @@ def read_meta(folder: Path, *, broken_off: bool = False) -> dict[str, Any]:
     return meta
 
 
-#: Columns of the table of states that no page shows: two thirds of it.
+#: Columns of the table of states that no page shows: two thirds of the table.
 NOT_SHOWN = re.compile("^point_|_(acc|jerk|std)$")
 
 
 def read(folder: Path, meta: dict[str, Any] | None = None, *, shown: bool = False) -> Run:
-    """The tables of a run folder, or of a run under way when its ``meta`` is given; ``shown``: without NOT_SHOWN."""
+    """Reads the tables of a run folder, or of an open run if its ``meta`` is given; ``shown``: without NOT_SHOWN."""
     meta = read_meta(folder) if meta is None else meta
 
     def table(name: str, without: re.Pattern[str] | None = None) -> pd.DataFrame | None:
@@ -263,7 +262,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None, *, shown: bool = Fals
 
 
 class Stopwatch:
-    """Time spent per stage, for timing.json: per call, spread over the ticks that the call served."""
+    """Time spent per stage, for timing.json; the time of a call is divided among its ticks."""
 
     def __init__(self, clock_ns: Callable[[], int]) -> None:
         self._clock_ns = clock_ns
@@ -271,13 +270,13 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str, ticks: int) -> Iterator[None]:
-        """Adds the time that the block takes to a stage, for so many of its ticks."""
+        """Adds the duration of the block to a stage, for a number of its ticks."""
         start = self._clock_ns()
         yield
         self._calls.setdefault(name, []).append((ticks, self._clock_ns() - start))
 
     def summary(self, period_s: float) -> dict[str, Any]:
-        """Per stage: ticks; median, p99, p99.9 and max time a tick [us]; how much faster than real time."""
+        """Summarises each stage: ticks; median, p99, p99.9 and max time a tick [us]; speed relative to real time."""
         out = {}
         for stage, calls in self._calls.items():
             ticks = np.array([n for n, _ in calls if n])
@@ -298,7 +297,7 @@ class Stopwatch:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Writes a new file beside its place and gives it its name when it is complete.
+    """Writes a new file under a temporary name and renames it when it is complete.
 
     Raises:
         SettingsError: The file exists, or its folder cannot be written.
@@ -315,7 +314,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
             stream.write(content.encode() if isinstance(content, str) else content)
         umask = os.umask(0)
         os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # mkstemp's 0600 would hide the file from colleagues
+        temporary.chmod(0o666 & ~umask)  # mkstemp's mode 0600 would make the file unreadable for other users
         temporary.rename(path)
     finally:
         temporary.unlink(missing_ok=True)
