@@ -23,9 +23,9 @@ _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _PAIR = "[low, high] with low <= high"
 _ROW = f"a row with {', '.join(_QUANTITIES)}"
 _LIMB_ROW = "a row with beyond_m, residuals"
-#: Rows of departures that are not a limb's.
+#: Rows of departures that do not belong to a limb.
 _OF_BODY = ("horizon_s", "rise_m", "sink_m")
-#: What to write instead, by the key.
+#: Description of a valid value, by the key.
 _RIGHT = {
     "coupled": "true or false",
     "joints": "a table with a row for each joint",
@@ -37,21 +37,21 @@ _RIGHT = {
 
 
 def load_limits(name_or_path: str | Path) -> LimitSet:
-    """A limit set that ships with the package, by its name, or one of the user's, by the path of its TOML file.
+    """Loads a shipped limit set by its name, or one of the user's by the path of its TOML file.
 
     ``paper`` is Table 1.
 
     Args:
-        name_or_path: ``paper``, ``human``, ``people`` or a file like theirs: ``coupled`` and a table ``joints`` with
-            a row ``{ position = [low, high], velocity = [...], acceleration = [...] }`` for each of JOINTS
-            [m, m, rad..., m; per second; per second squared]. Where coupled, alpha_2 and alpha_3 have no position;
-            without a row ``z``, that of ``human`` holds. A table ``departure`` may bound how far limbs depart from
-            constant velocity: ``horizon_s = [...]``, ``rise_m = [...]``, ``sink_m = [...]`` and a row
-            ``{ beyond_m = [...], residuals = [...] }`` for each of BODY. A table ``provenance`` may say where the
-            bounds come from; it changes nothing.
+        name_or_path: ``paper``, ``human``, ``people`` or a file of the same form: ``coupled`` and a table ``joints``
+            with a row ``{ position = [low, high], velocity = [...], acceleration = [...] }`` for each of JOINTS [m, m,
+            rad..., m; per second; per second squared]. If coupled, alpha_2 and alpha_3 have no position; without a row
+            ``z``, that of ``human`` is used. A table ``departure`` may bound the departure of limbs from constant
+            velocity: ``horizon_s = [...]``, ``rise_m = [...]``, ``sink_m = [...]`` and a row ``{ beyond_m = [...],
+            residuals = [...] }`` for each of BODY. A table ``provenance`` may give the origin of the bounds; it has no
+            effect.
 
     Raises:
-        SettingsError: The file cannot be read, or a key or a bound is not what it should be.
+        SettingsError: The file cannot be read, or a key or a bound is invalid.
     """
     path = _HERE / f"{name_or_path}.toml" if name_or_path in NAMES else Path(name_or_path)
     known = f"name one of {', '.join(NAMES)} or a file"
@@ -90,12 +90,12 @@ def _departure(table: dict[str, Any] | None, where: str) -> Departure | None:
 
 
 def write_limits(limits: LimitSet, provenance: dict[str, Any], path: Path) -> None:
-    """Writes a limit set that ``load_limits`` reads, whole or not at all.
+    """Writes a limit set that ``load_limits`` reads, complete or not at all.
 
     Args:
         limits: Bounds; its name is that of the file.
-        provenance: Where they come from: texts, numbers, lists and tables.
-        path: File to make.
+        provenance: Origin of the bounds: texts, numbers, lists and tables.
+        path: File to create.
 
     Raises:
         SettingsError: The file exists, or its folder cannot be written.
@@ -128,7 +128,7 @@ def _toml(limits: LimitSet, provenance: dict[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    """TOML of a value; a table on one line."""
+    """Returns the TOML of a value; a table on one line."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {_value(part)}" for key, part in value.items()) + " }"
     if isinstance(value, list | tuple):
@@ -179,9 +179,9 @@ _LimitFile = create_model(
 
 def _first_problem(error: ValidationError, table: dict[str, Any], where: str) -> str:
     problems = error.errors()
-    # An unknown key is told first: it may be a missing one with another name.
+    # An unknown key is reported first: it may be a misspelled missing one.
     problem = next((one for one in problems if one["type"] == "extra_forbidden"), problems[0])
-    keys = [str(key) for key in problem["loc"][:3]]  # a bound inside a pair is shown with its pair
+    keys = [str(key) for key in problem["loc"][:3]]  # a bound in a pair is reported with its pair
     if problem["type"] == "extra_forbidden":
         of_limbs = ((*_OF_BODY, *BODY), tuple(_LimbRow.model_fields))
         rows = of_limbs if keys[0] == "departure" else (JOINTS, _QUANTITIES)
@@ -196,7 +196,7 @@ def _first_problem(error: ValidationError, table: dict[str, Any], where: str) ->
 
 
 def _bounds(row: dict[str, Any], joint: str, where: str, coupled: bool) -> list[list[float]]:
-    """The three pairs of bounds of one joint; a position that (34) gives is left for ``_enclose``."""
+    """Returns the three pairs of bounds of one joint; positions from Eq. (34) are set in ``_enclose``."""
     enclosed = coupled and joint in _COUPLED
     position = row["position"]
     if enclosed and position is not None:
@@ -216,7 +216,7 @@ def _bounds(row: dict[str, Any], joint: str, where: str, coupled: bool) -> list[
 
 
 def _enclose(bounds: Floats) -> None:
-    """Writes what Eq. (34b), (34c) allow at most as the position bounds of alpha_2 and alpha_3 into (13, 3, 2)."""
+    """Writes the widest bounds from Eq. (34b), (34c) as position bounds of alpha_2 and alpha_3 into (13, 3, 2)."""
     for first in (JOINTS.index("ar1"), JOINTS.index("al1")):
         bounds[first + 1, 0] = alpha_2_bounds(*bounds[first, 0])
         bounds[first + 2, 0] = alpha_3_bounds(*bounds[first, 0], *bounds[first + 1, 0])
