@@ -1,1 +1,1 @@
-"""Convex hulls, support polytopes, distances and rotations. Knows no person and no robot. Pure."""
+"""Convex hulls, support polytopes, distances and rotations. Pure functions, independent of person and robot."""

@@ -1,15 +1,15 @@
-"""Convex hulls, their volume with a ball around every point, their front to a viewer, and polytopes that enclose a set.
+"""Convex hulls, their volume with a ball around every point, their visible front, and polytopes that enclose a set.
 
-Hulls and volumes are defined for flat and thin sets too, because what a segment sweeps need not be a solid.
+Hulls and volumes are also defined for flat and thin sets, because the set swept by a segment may be flat.
 
-The polytope is for sets with too many points: given how far a set reaches along fixed directions, it always has the
-same number of corners. The directions are the corners of triangles around the unit sphere. For numbers that are nowhere
-below a set's support function, each triangle gives one corner: the point that is as far along its three directions as
-the numbers say. Any direction u lies over a triangle (a, b, c), so u = k a + l b + m c with weights >= 0, and no point
-of the set is further along u than k h(a) + l h(b) + m h(c): where the corner is. So the hull of the corners holds the
-set, whether or not every number is reached.
+The polytope replaces sets with too many points: it is computed from the extents of a set along fixed directions and
+always has the same number of corners. The directions are the corners of triangles around the unit sphere. Let h be at
+least the set's support function along each of them. Each triangle gives one corner: the point whose extents along its
+three directions equal h. Any direction u lies over a triangle (a, b, c), so u = k a + l b + m c with weights >= 0, and
+no point of the set has a larger extent along u than k h(a) + l h(b) + m h(c), the extent of the corner. So the hull of
+the corners contains the set, also if h is larger than the support function.
 
-How far a point gets along a direction while it turns about an axis is exact, so here no arc is widened to triangles.
+The extent of a turning point along a direction is exact, so arcs are not widened to triangles here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from hrcreplay.records import Floats, Ints
 
 #: A set thinner than this in a direction has no extent in it [m].
 _THIN_M = 1e-9
-#: Nor has one thinner than this times its largest coordinate: far from the origin that is how coarse coordinates are.
+#: Nor does a set thinner than this times its largest coordinate: the rounding of coordinates grows with the distance
+#: from the origin.
 _COARSE = 16.0 * float(np.finfo(np.float64).eps)
 
 
@@ -39,14 +40,14 @@ def hull(points_m: Floats) -> tuple[Floats, Ints]:
 
     Returns:
         ``vertices`` (m, 3) [m], the corners in the order of the points, and ``faces`` (f, 3), three rows of vertices
-        for each triangle, counterclockwise seen from outside. A flat set's triangles are there for both sides; a line
-        has its two ends and no triangles, a point itself.
+        for each triangle, counterclockwise seen from outside. A flat set has triangles on both sides; a line has its
+        two ends and no triangles, a point one vertex.
     """
     axes = _axes(points_m)
     while len(axes) > 1:
         try:
             return _solid(points_m) if len(axes) == 3 else _flat(points_m, axes)
-        except QhullError:  # too thin to be told from a flat set in floating point: then it is one
+        except QhullError:  # too thin to be distinguished from a flat set in floating point: treat it as flat
             axes = axes[:-1]
     if len(axes) == 1:
         along = apply(points_m - points_m[0], axes[0])
@@ -63,7 +64,7 @@ def _solid(points_m: Floats) -> tuple[Floats, Ints]:
 
 
 def _flat(points_m: Floats, axes: Floats) -> tuple[Floats, Ints]:
-    """The polygon in the plane of two axes (2, 3), with both sides."""
+    """Returns the polygon in the plane of two axes (2, 3), with both sides."""
     around = ConvexHull(multiply(points_m - points_m[0], axes.T)).vertices  # counterclockwise
     corners = np.sort(around)
     loop = np.searchsorted(corners, around)
@@ -72,12 +73,12 @@ def _flat(points_m: Floats, axes: Floats) -> tuple[Floats, Ints]:
 
 
 def above(points_m: Floats, triangles: Ints, height_m: float) -> tuple[Floats, Ints]:
-    """The part of a convex polytope above a height, as ``hull`` gives it; no corners where all of it is below.
+    """Returns the part of a convex polytope above a height, in the form of ``hull``; no corners if all of it is below.
 
     Args:
         points_m: (n, 3) points, its corners among them [m].
         triangles: (f, 3) of its surface, in any order.
-        height_m: Only what is not below is kept [m].
+        height_m: The part below this height is removed [m].
     """
     a, b = points_m[np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)), axis=0).T]
     low, high = a[:, 2:] - height_m, b[:, 2:] - height_m
@@ -92,10 +93,10 @@ def above(points_m: Floats, triangles: Ints, height_m: float) -> tuple[Floats, I
 
 @njit(cache=True)
 def _turn_outward(vertices: Floats, faces: Ints, neighbors: Ints) -> None:
-    """Makes all triangles counterclockwise from outside, in place; a sliver's own normal could not tell.
+    """Makes all triangles counterclockwise from outside, in place; the normal of a sliver is unreliable.
 
-    Neighbours run through the edge between them in opposite ways. That leaves one choice for all, and the hull's
-    volume is positive.
+    Neighbours traverse their common edge in opposite directions. This leaves one choice for all; the hull's volume must
+    be positive.
     """
     known = np.zeros(len(faces), np.bool_)
     known[0] = True
@@ -115,7 +116,7 @@ def _turn_outward(vertices: Floats, faces: Ints, neighbors: Ints) -> None:
 
 @njit(cache=True)
 def _runs_same_way(a: Ints, b: Ints) -> bool:
-    """Return whether two triangles have an edge in common, in the same direction."""
+    """Returns True if two triangles have a common edge in the same direction."""
     for i in range(3):
         for k in range(3):
             if a[i] == b[k] and a[(i + 1) % 3] == b[(k + 1) % 3]:
@@ -164,7 +165,7 @@ def _measures(vertices: Floats, faces: Ints) -> tuple[float, float, float]:
             i, j = faces[f, k], faces[f, (k + 1) % 3]
             beyond = normals[left[j, i]]
             angle = np.arctan2(norm(cross(normals[f], beyond)), dot(normals[f], beyond))
-            bend += 0.25 * norm(edge(vertices, i, j)) * angle  # half of it, and every edge is there twice
+            bend += 0.25 * norm(edge(vertices, i, j)) * angle  # half of it, and every edge occurs twice
     return volume, area, bend
 
 
@@ -179,7 +180,7 @@ def _axes(points_m: Floats) -> Floats:
 
 def _directions() -> Floats:
     """(92, 3) unit vectors: an icosahedron's corners, two of them up and down, thirds of its edges, its faces."""
-    around = [2.0 * math.pi * k / 5.0 for k in range(5)]  # numpy's own cosine is another one on another processor
+    around = [2.0 * math.pi * k / 5.0 for k in range(5)]  # numpy's own cosine depends on the processor
     ring = [np.array([(2.0 * math.cos(a + t), 2.0 * math.sin(a + t)) for a in around]) for t in (0.0, math.pi / 5.0)]
     upper, lower = (np.column_stack([ring[k], np.full(5, 1.0 - 2.0 * k)]) / np.sqrt(5.0) for k in range(2))
     corners = np.concatenate([[[0.0, 0.0, 1.0]], upper, lower, [[0.0, 0.0, -1.0]]])
@@ -205,27 +206,28 @@ def _inverses(A: Floats) -> Floats:
 DIRECTIONS = _directions()
 _TRIANGLES = ConvexHull(DIRECTIONS).simplices.astype(np.int64)
 _TRIANGLES = _TRIANGLES[np.lexsort(np.sort(_TRIANGLES).T)]
-#: (corners, 3, 3): from how far along its three directions a corner is to where it is.
+#: (corners, 3, 3): maps the extents along its three directions to a corner.
 _SOLUTIONS = _inverses(DIRECTIONS[_TRIANGLES])
 CORNERS = len(_TRIANGLES)
-#: The directions as (3, directions), and how far each is across each axis.
+#: The directions as (3, directions), and the length of each across each axis.
 _COLUMNS = np.ascontiguousarray(DIRECTIONS.T)
 _ACROSS = np.sqrt(1.0 - _COLUMNS**2)
 
 
 @njit(cache=True)
 def reach_turning(points: Floats, count: int, axis: int, low: float, high: float, far: Floats) -> None:
-    """Raises far (directions,) to how far points get that turn by low to high [rad] about a coordinate axis [m].
+    """Raises far (directions,) to the extents of points that turn by low to high [rad] about a coordinate axis [m].
 
-    Across the axis a point gets as far as its circle where it passes the direction, else as far as at the nearer end.
+    Across the axis the extent is the radius of the point's circle if it passes the direction, else that at the nearer
+    end.
 
     Args:
-        points: (m, 3), of which the first ``count`` are turned [m].
+        points: (m, 3), the first ``count`` are turned [m].
         count: Number of points.
         axis: 0, 1, 2 for x, y, z.
         low: Smallest angle [rad].
         high: Largest angle [rad].
-        far: (directions,) largest extent yet along each of DIRECTIONS, raised in place [m].
+        far: (directions,) largest extent so far along each of DIRECTIONS, raised in place [m].
     """
     i, j = (axis + 1) % 3, (axis + 2) % 3
     middle, half = 0.5 * (low + high), min(0.5 * (high - low), np.pi)
@@ -255,13 +257,14 @@ def around(far: Floats, points: Floats) -> int:
     return CORNERS
 
 
-#: A pixel so little outside a triangle, as a share of it, is on its edge: neighbours leave no gap between them.
+#: Maximum distance outside a triangle, as a share of it, at which a pixel counts as on its edge; avoids gaps between
+#: neighbours.
 _EDGE = 1e-9
 
 
 @njit(cache=True)
 def visible_front(triangles: Floats, light: Floats, u: Floats, v: Floats) -> tuple[Floats, Floats]:
-    """Depth of the front of a convex solid at pixels, and the light on the face there.
+    """Computes the depth of the front of a convex solid at pixels, and the light on the face there.
 
     Only triangles that face the viewer are drawn, each on the pixels that it covers.
 
@@ -281,7 +284,7 @@ def visible_front(triangles: Floats, light: Floats, u: Floats, v: Floats) -> tup
         a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
         bu, bv, cu, cv = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
         area = bu * cv - bv * cu
-        if area <= 0.0:  # it faces away, or is seen from its edge
+        if area <= 0.0:  # it faces away or is seen edge-on
             continue
         first, last = np.searchsorted(v, min(a[1], b[1], c[1])), np.searchsorted(v, max(a[1], b[1], c[1]))
         left, right = np.searchsorted(u, min(a[0], b[0], c[0])), np.searchsorted(u, max(a[0], b[0], c[0]))

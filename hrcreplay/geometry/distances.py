@@ -1,9 +1,9 @@
 """Distances between a segment and the convex hull of points, proven from both sides, and between capsules.
 
-From a hull it is the length of the shortest difference between a vertex and an end of the segment, mixed in any
-proportions: the least vector of a hull of differences, found by Wolfe's algorithm (Mathematical Programming 11, 1976).
-Each vector met is one of that hull, so the distance is no more; the plane across it bounds the distance from below.
-Capsules, segments with a radius, have a closed form, here over many instants at once.
+The distance from a hull is the length of the shortest vector in the convex hull of all differences between a vertex and
+an end of the segment, found by Wolfe's algorithm (Mathematical Programming 11, 1976). Each vector visited is in that
+hull, so its length is an upper bound; the plane orthogonal to it gives a lower bound. Capsules, segments with a radius,
+have a closed form, here over many instants at once.
 """
 
 from __future__ import annotations
@@ -19,41 +19,41 @@ from hrcreplay.records import Floats, Ints
 
 #: A distance is proven when its bounds are this close [m].
 EXACT_M = 1e-10
-#: Differences that can carry the shortest one.
+#: Maximum number of differences that span the shortest one.
 MOST = 4
-#: Steps after which rounding must be in the way.
+#: Maximum number of steps; only rounding can require more.
 _STEPS = 60
-#: An edge that leaves the plane of others by less than this share of its length is in it. Smaller shares are rounding;
-#: larger ones would take links that are nearly parallel to an edge of the hull for parallel.
+#: An edge that leaves the plane of others by less than this share of its length counts as inside the plane. Smaller
+#: shares are rounding; larger ones would take links that are nearly parallel to an edge of the hull for parallel.
 _FLAT = 1e-12
-#: A difference this short has lost digits that its direction needs [m].
+#: A shorter difference has too few exact digits for its direction [m].
 _SHORT_M = 1e-5
 
 
 class Carriers(NamedTuple):
-    """The differences whose mixture is the shortest yet, in the first rows; room for MOST."""
+    """The differences whose convex combination is the shortest so far, in the first rows; space for MOST."""
 
     points: Floats  #: (MOST, 3) [m]
     weights: Floats  #: (MOST,) positive, 1 in all
     wanted: Floats  #: (MOST,) weights of the shortest vector of their plane, of any sign
     basis: Floats  #: (MOST - 1, 3) orthonormal: the directions of their plane
-    triangle: Floats  #: (MOST - 1, MOST - 1) their edges in it
+    triangle: Floats  #: (MOST - 1, MOST - 1) their edges in this basis
     codes: Ints  #: (MOST,) twice the vertex, plus the end
 
 
 @njit(cache=True)
 def distances(ends: Floats, vertices: Floats, offsets: Ints) -> tuple[Floats, Floats, Ints]:
-    """Bounds of the distance between the axis of every link and the hull of every limb.
+    """Computes bounds of the distance between the axis of every link and the hull of every limb.
 
     Args:
         ends: (s, 2, 3) ends of the axes [m].
         vertices: (m, 3) of all limbs [m].
-        offsets: (l + 1,) where each limb's vertices begin; no limb is empty.
+        offsets: (l + 1,) first vertex of each limb; no limb is empty.
 
     Returns:
-        Lower and upper bound, (s, l) each [m]. The lower one is proven by a plane between link and limb, whether or not
-        the bounds meet: they end no further apart than EXACT_M but where rounding allows no more. 0 and at most EXACT_M
-        in penetration; (s, l, MOST) rows of ``vertices`` that carry the nearest point.
+        Lower and upper bound, (s, l) each [m]. The lower one is proven by a plane between link and limb, also if the
+        bounds differ: the difference is at most EXACT_M unless rounding prevents it. In penetration the bounds are 0
+        and at most EXACT_M. Also (s, l, MOST), the rows of ``vertices`` that span the nearest point.
     """
     links, limbs = len(ends), len(offsets) - 1
     low, high = np.empty((links, limbs)), np.empty((links, limbs))
@@ -64,7 +64,7 @@ def distances(ends: Floats, vertices: Floats, offsets: Ints) -> tuple[Floats, Fl
     )
     for s in range(links):
         for k in range(limbs):
-            start = near[s - 1, k, 0] if s else offsets[k]  # the link before is seldom far from this one
+            start = near[s - 1, k, 0] if s else offsets[k]  # the previous link is usually near this one
             low[s, k], high[s, k], count = _distance(ends[s], vertices, offsets[k], offsets[k + 1], start, work)
             for i in range(MOST):
                 near[s, k, i] = work.codes[i if i < count else 0] // 2
@@ -75,7 +75,7 @@ def distances(ends: Floats, vertices: Floats, offsets: Ints) -> tuple[Floats, Fl
 def _distance(
     ends: Floats, vertices: Floats, first: int, last: int, start: int, on: Carriers
 ) -> tuple[float, float, int]:
-    """Both bounds of one distance, and how many differences carry it."""
+    """Returns both bounds of one distance, and the number of differences that span it."""
     code, before, count = 2 * start, -1, 0
     low, high = 0.0, np.inf
     for _ in range(_STEPS):
@@ -89,7 +89,7 @@ def _distance(
         high = min(high, gap)
         if gap <= EXACT_M:
             return 0.0, high, count
-        if gap < _SHORT_M:  # across the plane of its carriers to the last digit
+        if gap < _SHORT_M:  # orthogonal to the plane of its carriers to the last digit
             for i in range(count - 1):
                 e = on.basis[i]
                 part = x0 * e[0] + x1 * e[1] + x2 * e[2]
@@ -113,7 +113,7 @@ def _distance(
 
 @njit(cache=True)
 def _join(on: Carriers, count: int, code: int, ends: Floats, vertices: Floats) -> int:
-    """Adds a difference without weight, but for the first; returns how many there are."""
+    """Adds a difference, with weight 0 unless it is the first; returns the number of carriers."""
     for c in range(3):
         on.points[count, c] = vertices[code // 2, c] - ends[code % 2, c]
     on.codes[count], on.weights[count] = code, 0.0 if count else 1.0
@@ -124,7 +124,7 @@ def _join(on: Carriers, count: int, code: int, ends: Floats, vertices: Floats) -
 def _shortest(on: Carriers, count: int) -> int:
     """Moves the weights to the shortest vector of a plane through carriers that lies between them.
 
-    Carriers that end without weight, or lie in the plane of those before, are dropped; returns how many are left.
+    Carriers with weight 0 at the end, or in the plane of earlier ones, are dropped; returns the number left.
     """
     while True:
         flat = _plane(on, count)
@@ -148,7 +148,7 @@ def _shortest(on: Carriers, count: int) -> int:
 
 @njit(cache=True)
 def _drop(on: Carriers, count: int, leaving: int) -> int:
-    """Takes a carrier out; returns how many are left."""
+    """Removes a carrier; returns the number left."""
     for i in range(leaving, count - 1):
         on.weights[i], on.codes[i] = on.weights[i + 1], on.codes[i + 1]
         for c in range(3):
@@ -158,7 +158,7 @@ def _drop(on: Carriers, count: int, leaving: int) -> int:
 
 @njit(cache=True)
 def _plane(on: Carriers, count: int) -> int:
-    """Computes the wanted weights; returns the first carrier in the plane of those before, -1 where there is none."""
+    """Computes the target weights; returns the first carrier in the plane of earlier ones, -1 if none."""
     for i in range(count - 1):
         if not _edge(on, i):
             return i + 1
@@ -174,14 +174,14 @@ def _plane(on: Carriers, count: int) -> int:
 
 @njit(cache=True)
 def _edge(on: Carriers, i: int) -> bool:
-    """Adds the direction from carrier 0 to carrier i + 1 to the basis, by Gram and Schmidt; False where it is in it."""
+    """Adds the direction from carrier 0 to i + 1 to the basis, by Gram-Schmidt; False if it lies in the plane."""
     e = on.basis[i]
     for c in range(3):
         e[c] = on.points[i + 1, c] - on.points[0, c]
     length = math.sqrt(dot3(e, e))
     for j in range(i):
         on.triangle[j, i] = 0.0
-    for _ in range(2):  # twice is enough
+    for _ in range(2):  # two passes suffice
         for j in range(i):
             part = dot3(on.basis[j], e)
             on.triangle[j, i] += part
@@ -196,7 +196,7 @@ def _edge(on: Carriers, i: int) -> bool:
 
 
 def protrusion_m(axes: Floats, radius_m: float, vertices: Floats, ball_m: float) -> Floats:
-    """Distance by which capsules stand out of a hull with a ball around each point; negative: inside the ball.
+    """Computes the protrusion of capsules from a hull with a ball around each point; negative: inside the ball.
 
     The distance from a convex set is convex, so no point of an axis is further away than one of its ends.
 
@@ -215,19 +215,19 @@ def protrusion_m(axes: Floats, radius_m: float, vertices: Floats, ball_m: float)
 
 
 class NearestPair(NamedTuple):
-    """The pair of capsules with the smallest distance between surfaces, a row an instant."""
+    """The pair of capsules with the smallest distance between surfaces, one row per instant."""
 
-    distance_m: Floats  #: (n,) negative where they overlap: the radii's sum is more than between the axes [m]
-    first: Ints  #: (n,) which capsule of the first set; -1 without a pair
-    second: Ints  #: (n,) which of the second
+    distance_m: Floats  #: (n,) distance between the surfaces, negative in overlap [m]
+    first: Ints  #: (n,) index of the capsule in the first set; -1 without a pair
+    second: Ints  #: (n,) index in the second set
     at_first_m: Floats  #: (n, 3) nearest point of the first one's axis [m]
-    at_second_m: Floats  #: (n, 3) and of the second one's [m]
+    at_second_m: Floats  #: (n, 3) nearest point of the second one's axis [m]
 
 
 def nearest_pair(first_m: Floats, first_radius_m: Floats, second_m: Floats, second_radius_m: Floats) -> NearestPair:
-    """The nearest pair of capsules of two sets at every instant.
+    """Finds the nearest pair of capsules of two sets at every instant.
 
-    A capsule with an end that is not finite counts as not there. Without a pair the distance is NaN.
+    A capsule with an end that is not finite is ignored. Without a pair the distance is NaN.
 
     Args:
         first_m: (n, a, 2, 3) ends of the axes [m].
@@ -281,11 +281,11 @@ def _at(ends: Floats, share: float, k: int) -> float:
 
 @njit(cache=True)
 def segment_distance(first: Floats, second: Floats) -> tuple[float, float, float]:
-    """The distance between two segments (2, 3) [m], and the shares of the way along each to the nearest points.
+    """Returns the distance between two segments (2, 3) [m], and the positions of the nearest points along each, 0 to 1.
 
-    It is least at an end of one of them, or between the feet of the common perpendicular where both lie inside.
+    The minimum is at an end of one of them, or at the feet of the common perpendicular if both lie inside.
     """
-    uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0  # products of both directions and of what is between starts
+    uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0  # products of both directions and of the vector between the starts
     for k in range(3):
         u, v, w = first[1, k] - first[0, k], second[1, k] - second[0, k], first[0, k] - second[0, k]
         uu, uv, vv = uu + u * u, uv + u * v, vv + v * v
@@ -299,7 +299,7 @@ def segment_distance(first: Floats, second: Floats) -> tuple[float, float, float
             t = float(k - 2)
             s = _clipped(t * uv - uw, uu)
         else:
-            across = uu * vv - uv * uv  # 0 for parallel ones, whose distance is found at an end
+            across = uu * vv - uv * uv  # 0 for parallel segments, whose minimum is at an end
             if across <= 0.0:
                 break
             s, t = (uv * vw - vv * uw) / across, (uu * vw - uv * uw) / across
@@ -315,5 +315,5 @@ def segment_distance(first: Floats, second: Floats) -> tuple[float, float, float
 
 @njit(cache=True)
 def _clipped(along: float, length2: float) -> float:
-    """Share of the way along a segment at which it is nearest to a point."""
+    """Returns the position along a segment, 0 to 1, at which it is nearest to a point."""
     return min(1.0, max(0.0, along / length2)) if length2 > 0.0 else 0.0

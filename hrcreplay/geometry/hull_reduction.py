@@ -1,8 +1,8 @@
 """Reduction of a point set to those points that may be corners of its convex hull, by an incremental hull.
 
 A point is dropped only when it is on the inner side of every triangle of a closed surface by more than the rounding
-error of that test. Such a point sees the whole closed surface from inside, so it is inside the hull of the surface's
-corners, however badly shaped or dented the surface may be. All others stay, corner or not, and all of a flat set.
+error of that test. Such a point is inside the hull of the surface's corners for any shape of the surface, even if it is
+not convex. All other points are kept, corners or not, and all points of a flat set.
 """
 
 from __future__ import annotations
@@ -18,41 +18,41 @@ from hrcreplay.records import Bools, Floats, Ints
 
 Int32s = NDArray[np.int32]
 
-#: Most points that the surface takes in; those beyond stay as they are.
+#: Maximum number of points in the surface; further points are kept without a test.
 MOST_SLOTS = 512
-#: Most triangles: no closed surface has more.
+#: Maximum number of triangles of a closed surface with that many points.
 MOST_FACES = 2 * MOST_SLOTS
 #: Rounding error of a side test over (product of the triangle's edges times largest coordinate), with a wide margin.
 _ROUNDING = 64 * np.finfo(np.float64).eps
-#: Points that stick out less are kept but not built into the surface: they would make slivers [m].
+#: Points that protrude by less are kept but not added to the surface, as they would make slivers [m].
 _THIN_M = 1e-10
 #: Rows of ``Surface.planes``: outward normal, not of unit length, its product with a corner, rounding error of the side
-#: test, and how far out a point must be to be built in; and of a slot: where its point is [m].
+#: test, and the protrusion at which a point is added; and per slot: the position of its point [m].
 NX, NY, NZ, OFFSET, ROUNDING, THIN, X, Y, Z = range(9)
-#: Rows of ``Surface.faces``: slots of the corners, counterclockwise from outside; for the next point to build in,
-#: whether it sees a triangle, the numbers of those, and the rim around them, from slots to slots.
+#: Rows of ``Surface.faces``: slots of the corners, counterclockwise from outside; for the next point to add, a mark for
+#: each triangle visible from it, the numbers of these triangles, and the rim around them, from slots to slots.
 A, B, C, SEEN, HIDDEN, START, END = range(7)
-#: And of a slot: the next one on the rim, and the index of its point.
+#: Per slot: the next slot on the rim, and the index of its point.
 FOLLOWS, POINT = 7, 8
 
 
 class Surface(NamedTuple):
-    """A closed surface of triangles, room for it included: few arrays, as each costs time in every call."""
+    """A closed surface of triangles with its memory; it has few arrays, as each costs time in every call."""
 
-    planes: Floats  #: (9, faces) a triangle or slot each column
+    planes: Floats  #: (9, faces) one triangle or slot per column
     faces: Int32s  #: (9, faces) a triangle, slot or edge each column
     owner: Int32s  #: (slots^2,) the face left of the edge from slot i to slot j, at i * width + j
 
 
 def surface() -> Surface:
-    """Room for a surface; one serves for any number of sets."""
+    """Allocates a surface; it can be reused for any number of sets."""
     most = 3 * MOST_FACES  # edges of as many triangles
     return Surface(np.empty((9, MOST_FACES)), np.empty((9, most), np.int32), np.empty(MOST_SLOTS**2, np.int32))
 
 
 @njit(cache=True)
 def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:  # noqa: D417
-    """Return whether a point is proven to be inside of all triangles.
+    """Returns True if a point is proven to be inside all triangles.
 
     Args:
         x, y, z: The point [m].
@@ -67,7 +67,7 @@ def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:
 
 @njit(cache=True)
 def _look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s) -> tuple[int, int]:  # noqa: D417
-    """For how many triangles a point is not proven to be inside, and how many it sees from clearly outside.
+    """Counts the triangles for which a point is not proven to be inside, and those for which it is clearly outside.
 
     Args:
         x, y, z: The point [m].
@@ -118,7 +118,7 @@ def _join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D4
 
 @njit(cache=True)
 def _hide(count: int, faces: Int32s) -> int:
-    """Lists the triangles that the last point looked at sees; returns how many."""
+    """Lists the triangles visible from the last tested point; returns their number."""
     hidden = 0
     for f in range(count):
         faces[HIDDEN, hidden] = f
@@ -128,10 +128,10 @@ def _hide(count: int, faces: Int32s) -> int:
 
 @njit(cache=True)
 def _outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
-    """Lists the edges between seen and unseen triangles; returns how many.
+    """Lists the edges between visible and hidden triangles; returns their number.
 
     Args:
-        hidden, width: Number of triangles seen, and of slots in a row of ``owner``.
+        hidden, width: Number of visible triangles, and of slots in a row of ``owner``.
         faces, owner: The surface; rows START and END of ``faces`` are written.
     """
     n = 0
@@ -149,10 +149,10 @@ def _outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:  # n
 
 @njit(cache=True)
 def is_loop(edges: int, faces: Int32s) -> bool:
-    """Return whether the edges are one simple loop, so that the surface stays closed when it is cut out and filled.
+    """Returns True if the edges are one simple loop, so that the surface stays closed when the inside is replaced.
 
-    They enter each slot as often as they leave it, so who follows them stays on them. Who is back at the start after as
-    many steps as there are edges, and not before, has been along each of them.
+    The edges enter each slot as often as they leave it, so a walk along them can always continue. A walk that returns
+    to the start after as many steps as there are edges, and not before, has used each of them.
     """
     for e in range(edges):
         faces[FOLLOWS, faces[START, e]] = faces[END, e]
@@ -166,7 +166,7 @@ def is_loop(edges: int, faces: Int32s) -> bool:
 
 @njit(cache=True)
 def _fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: Floats, faces: Int32s) -> bool:  # noqa: D417
-    """Adds triangles from the edges to the point in a slot, not joined yet; returns whether all face outward.
+    """Adds triangles from the edges to the point in a slot, not joined yet; returns True if all face outward.
 
     Args:
         inner, size: A point inside the surface, and the largest absolute coordinate of the points [m].
@@ -197,10 +197,10 @@ def _join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) ->
 
 @njit(cache=True)
 def _fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
-    """Moves the last triangles into the places of those no longer needed; returns the number of triangles.
+    """Moves the last triangles into the columns of removed ones; returns the number of triangles.
 
     Args:
-        hidden, end: Number of triangles no longer needed, and of all triangles, these included.
+        hidden, end: Number of removed triangles, and of all triangles including these.
         width, planes, faces, owner: Number of slots in a row of ``owner``, and the surface.
     """
     for h in range(hidden):
@@ -225,7 +225,7 @@ def _move(f: int, hole: int, planes: Floats, faces: Int32s) -> None:
 
 #: A set whose four most distant points are flatter than this has no surface [m].
 _FLAT_M = 1e-7
-#: Directions whose extreme points are built in first: the axes and the diagonals of faces and space.
+#: Directions whose extreme points are added first: the axes and the diagonals of faces and space.
 _SEEDS = np.array(
     [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)], dtype=np.float64
 )
@@ -237,16 +237,16 @@ def keep_corners(points: Floats, count: int, work: Surface) -> tuple[int, int]:
 
     Args:
         points: (m, 3), reordered in place [m].
-        count: Number of points to look at.
-        work: Left with the surface around the points.
+        count: Number of points to test.
+        work: Receives the surface around the points.
 
     Returns:
-        Number of points kept, and of triangles around them (0: the set is flat, or too small to have any to drop).
+        Number of points kept, and of triangles around them (0: the set is flat or too small for a reduction).
     """
     keep = np.ones(count, np.bool_)
     faces, slots = _grow(points, count, work, keep) if count > 4 else (0, 0)
     moved = np.full(count, -1)
-    marks = np.empty(count)  # the same for points that are the same
+    marks = np.empty(count)  # the same for equal points
     kept = 0
     for i in range(count):
         mark = points[i, 0] + 0.7 * points[i, 1] + 0.3 * points[i, 2]
@@ -263,7 +263,7 @@ def keep_corners(points: Floats, count: int, work: Surface) -> tuple[int, int]:
 
 @njit(cache=True)
 def _among(mark: float, marks: Floats, kept: int) -> bool:
-    """Return whether a mark is among the first."""
+    """Returns True if a mark is among the first ones."""
     alike = 0
     for k in range(kept):
         alike += marks[k] == mark
@@ -272,7 +272,7 @@ def _among(mark: float, marks: Floats, kept: int) -> bool:
 
 @njit(cache=True)
 def _same(points: Floats, kept: int, i: int) -> int:
-    """Index at which a point is already kept, or would be inserted."""
+    """Returns the index at which a point is kept already or would be inserted."""
     for k in range(kept):
         if points[k, 0] == points[i, 0] and points[k, 1] == points[i, 1] and points[k, 2] == points[i, 2]:
             return k
@@ -281,7 +281,7 @@ def _same(points: Floats, kept: int, i: int) -> int:
 
 @njit(cache=True)
 def _grow(points: Floats, count: int, work: Surface, keep: Bools) -> tuple[int, int]:
-    """Builds the surface and says which points must stay; returns the numbers of triangles and of slots."""
+    """Builds the surface and marks the points to keep; returns the numbers of triangles and of slots."""
     size = 0.0
     for i in range(count):
         for k in range(3):
@@ -318,7 +318,7 @@ def _grow(points: Floats, count: int, work: Surface, keep: Bools) -> tuple[int, 
 
 @njit(cache=True)
 def _drop_inner(points: Floats, count: int, faces: int, planes: Floats, triangles: Int32s, keep: Bools) -> None:
-    """Drops what was built in, or was near the surface, and is deep inside by now; its corners cannot be."""
+    """Drops points that were added, or were near the surface, and are now deep inside; corners of the surface stay."""
     corner = np.zeros(count, np.bool_)
     for f in range(faces):
         for k in (A, B, C):
@@ -335,7 +335,7 @@ def _mean(along: Floats) -> float:
 
 @njit(cache=True)
 def _seeds_first(points: Floats, count: int) -> Ints:
-    """Indices of the points, the extreme ones of some directions first: they make the surface big soon."""
+    """Returns the indices of the points, extreme ones first, so that the surface grows quickly."""
     first = np.zeros(count, np.bool_)
     order = np.empty(count, np.int64)
     n = 0
@@ -362,7 +362,7 @@ def _seeds_first(points: Floats, count: int) -> Ints:
 
 @njit(cache=True)
 def _simplex(points: Floats, order: Ints, size: float, width: int, work: Surface) -> int:
-    """Four points far from each other as the first surface; returns its 4 triangles, or 0 for a flat set."""
+    """Builds the first surface from four distant points; returns 4, its number of triangles, or 0 for a flat set."""
     a = order[0]
     b = _farthest(points, a, (0.0, 0.0, 0.0), 1, len(order))
     along = edge(points, a, b)
@@ -386,7 +386,7 @@ def _simplex(points: Floats, order: Ints, size: float, width: int, work: Surface
 
 @njit(cache=True)
 def _farthest(points: Floats, a: int, v: Vector, rank: int, count: int) -> int:
-    """The point farthest from point a (1), from the line through it along v (2), or from the plane across v (3)."""
+    """Finds the point farthest from a point a (1), from the line along v through a (2) or the plane normal to v (3)."""
     best, index = -1.0, a
     for i in range(count):
         w = edge(points, a, i)

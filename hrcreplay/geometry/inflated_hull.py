@@ -11,15 +11,15 @@ from hrcreplay.geometry.convex_hull import hull, sphere_swept_volume_m3
 from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
 
-#: A triangle counts as seen by a point that is not clearly behind it: in the plane of a flat set nothing is in front.
-#: How far behind is clear, and how far relative to the largest coordinate.
+#: A triangle counts as visible from a point that is not clearly behind it, as no point in the plane of a flat set is in
+#: front of it. Distance behind a triangle that is clear, and that distance relative to the largest coordinate.
 _BEHIND_M = 1e-9
 _COARSE = 16.0 * float(np.finfo(np.float64).eps)
 #: Largest root of g^4 = g + 1: powers of 1/g fill a cube evenly (a generalised golden ratio).
 _G = 1.2207440846057594759
 _STEPS = np.array([1.0 / _G, 1.0 / _G**2, 1.0 / _G**3])
 _PARTS = 4
-#: Points in the box of what lies below a height: they err by 0.2 % of that box.
+#: Number of sample points in the box of the part below a height: their error is 0.2 % of that box.
 _BELOW = 2048
 
 
@@ -33,7 +33,7 @@ class InflatedHull:
 
     @classmethod
     def around(cls, points_m: Floats, radius_m: float) -> InflatedHull:
-        """The solid of a set of points (n, 3), all finite [m]."""
+        """Makes the solid of a set of points (n, 3), all finite [m]."""
         vertices, faces = hull(points_m)
         return cls(np.ascontiguousarray(vertices), np.ascontiguousarray(faces), radius_m)
 
@@ -42,10 +42,10 @@ class InflatedHull:
         return sphere_swept_volume_m3(self.vertices_m, self.radius_m, self.faces)
 
     def volume_above_m3(self, height_m: float) -> float:
-        """Volume of its part above a height: all of it, less what is below by evenly spread points [m^3].
+        """Volume of the part above a height: the total minus that below, estimated from evenly spread points [m^3].
 
         Args:
-            height_m: Such as that of the floor [m].
+            height_m: Height, such as that of the floor [m].
         """
         low, high = self.vertices_m.min(axis=0) - self.radius_m, self.vertices_m.max(axis=0) + self.radius_m
         if low[2] >= height_m:
@@ -66,13 +66,13 @@ class InflatedHull:
 def union_volume_m3(solids: Sequence[InflatedHull], points: int, first: int = 0) -> tuple[float, float]:
     """Volume of a union of inflated hulls, from the share of evenly spread points of their common box.
 
-    The points are those of an additive recurrence with a generalised golden ratio, so the result is the same every
-    time. Its error is told from the spread between four stretches of the sequence, each of which fills the box.
+    The points are those of an additive recurrence with a generalised golden ratio, so the result is repeatable. Its
+    error is estimated from the spread between four parts of the sequence, each of which fills the box.
 
     Args:
         solids: At least one.
-        points: How many points, a multiple of 4.
-        first: Where in the sequence to start, so that errors of different calls do not add up.
+        points: Number of points, a multiple of 4.
+        first: Start in the sequence, so that errors of different calls do not add up.
 
     Returns:
         The volume and its standard error [m^3].
@@ -85,7 +85,7 @@ def union_volume_m3(solids: Sequence[InflatedHull], points: int, first: int = 0)
 
 
 def _inside(solids: Sequence[InflatedHull], low: Floats, high: Floats, points: int, first: int = 0) -> Bools:
-    """Mark the points, evenly spread in a box from ``low`` (3,) to ``high`` (3,) [m], that are in any of the solids."""
+    """Marks the points in any of the solids, for points spread evenly in a box from ``low`` to ``high`` (3,) [m]."""
     samples = (0.5 + np.arange(first, first + points)[:, None] * _STEPS) % 1.0 * (high - low) + low
     inside = np.zeros(points, dtype=np.bool_)
     for solid in solids:
@@ -183,7 +183,7 @@ def _triangle(p: Floats, a: Floats, b: Floats, c: Floats, normal: Floats, height
 
 @njit(cache=True)
 def _left(p: Floats, a: Floats, b: Floats, normal: Floats) -> bool:
-    """Return whether p is on the inner side of the edge from a to b of a triangle with that normal."""
+    """Returns True if p is on the inner side of the edge from a to b of a triangle with that normal."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     wx, wy, wz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
     x, y, z = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx

@@ -1,4 +1,4 @@
-"""A convex polygon on the floor, and how deep points of the world lie inside the prism above and below it."""
+"""A convex polygon on the floor, and the depth of points in the vertical prism over it."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class ConvexPolygon:
 
     @classmethod
     def of_corners(cls, corners_m: Floats) -> ConvexPolygon:
-        """The polygon with these corners, in either direction.
+        """Makes a polygon from its corners, in either direction.
 
         Args:
-            corners_m: (k, 2) one after another around it [m].
+            corners_m: (k, 2) corners in order around the polygon [m].
 
         Raises:
-            ValueError: They are fewer than three, or not the corners of a convex polygon.
+            ValueError: There are fewer than three corners, or the polygon is not convex.
         """
         corners = np.asarray(corners_m, dtype=float)
         if len(corners) < 3:
@@ -32,7 +32,7 @@ class ConvexPolygon:
         sides = np.roll(corners, -1, axis=0) - corners
         following = np.roll(sides, -1, axis=0)
         turns = sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
-        once_around = np.arctan2(turns, (sides * following).sum(axis=1)).sum()  # a star turns twice and also one way
+        once_around = np.arctan2(turns, (sides * following).sum(axis=1)).sum()  # a star turns one way, but twice
         same_way = (turns > 0.0).all() or (turns < 0.0).all()
         if not (np.isfinite(turns).all() and same_way and abs(abs(once_around) - 2.0 * np.pi) < 1e-6):
             raise ValueError("no convex polygon")
@@ -41,6 +41,6 @@ class ConvexPolygon:
         return cls(normals, (normals * corners).sum(axis=1))
 
     def depth_m(self, points_m: Floats) -> Floats:
-        """(...) how far inside points (..., 2 or more) are, at any height; negative outside, NaN where unknown [m]."""
+        """(...) depth of points (..., 2 or more) inside, at any height; negative outside, NaN if unknown [m]."""
         across = points_m[..., 0, None] * self.normals[:, 0] + points_m[..., 1, None] * self.normals[:, 1]
         return np.asarray((self.offsets_m - across).min(axis=-1))

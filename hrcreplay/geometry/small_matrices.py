@@ -1,8 +1,8 @@
-"""Products, solutions and singular values of small matrices, in an order of operations that no processor changes.
+"""Products, solutions and singular values of small matrices, in a fixed order of operations on every processor.
 
-BLAS and LAPACK choose their code by the processor, and with it the order in which they add up: the last bits differ
-from one machine to the next, and with them a robot's whole path. So what decides is computed in here. Kernels without
-fastmath neither reorder sums nor fuse a product with a sum.
+BLAS and LAPACK choose their code by the processor, and with it the order of sums: the last bits differ between
+machines, and so may the whole path of a robot. So all results that influence the motion are computed here. Kernels
+without fastmath neither reorder sums nor fuse a product with a sum.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 
 _EPS = float(np.finfo(np.float64).eps)
-_SWEEPS = 60  #: of Jacobi's rotations; some ten are enough
+_SWEEPS = 60  #: maximum number of sweeps of Jacobi's rotations; about ten suffice
 
 
 @njit(cache=True)
@@ -136,7 +136,7 @@ def singular_values(A: Floats) -> tuple[Floats, Floats, Floats]:
 
 @njit(cache=True)
 def _make_orthogonal(rows: Floats, turns: Floats, p: int, q: int) -> bool:
-    """Turns two rows in their plane until they are orthogonal, in place; says whether they were not."""
+    """Rotates two rows in their plane until they are orthogonal, in place; returns True if they were not."""
     a, b, c = dot_n(rows[p], rows[p]), dot_n(rows[q], rows[q]), dot_n(rows[p], rows[q])
     if not abs(c) > _EPS * math.sqrt(a * b):
         return False
@@ -153,7 +153,7 @@ def _make_orthogonal(rows: Floats, turns: Floats, p: int, q: int) -> bool:
 
 @njit(cache=True)
 def least_norm(A: Floats, b: Floats, smallest: float) -> Floats:
-    """(m,) shortest of the x with the least ``|A @ x - b|``, as by the pseudoinverse of A (n, m).
+    """(m,) shortest x that minimises ``|A @ x - b|``, as the pseudoinverse of A (n, m) gives it.
 
     Args:
         A: (n, m).
@@ -174,7 +174,7 @@ def least_norm(A: Floats, b: Floats, smallest: float) -> Floats:
 
 @njit(cache=True, error_model="numpy")
 def least_squares(A: Floats, b: Floats) -> Floats:
-    """(m,) with the least ``|A @ x - b|`` by Householder's reflections; not finite where columns of A (n, m) depend."""
+    """(m,) x that minimises ``|A @ x - b|``, by Householder's reflections; not finite if columns of A are dependent."""
     R, y, m = A.copy(), b.copy(), A.shape[1]
     v = np.zeros(len(b))
     for k in range(m):
@@ -201,15 +201,15 @@ def least_squares(A: Floats, b: Floats) -> Floats:
 
 @njit(cache=True)
 def nonnegative_least_squares(A: Floats, b: Floats, most: int) -> tuple[Floats, bool]:
-    """The x >= 0 (m,) with the least ``|A @ x - b|``, by Lawson and Hanson.
+    """Finds the x >= 0 (m,) that minimises ``|A @ x - b|``, by the algorithm of Lawson and Hanson.
 
     Args:
         A: (n, m).
         b: (n,).
-        most: How many columns may join in, one after the other.
+        most: Maximum number of columns that are added.
 
     Returns:
-        x, and whether it is the minimiser.
+        x, and True if it is the minimiser.
     """
     m = A.shape[1]
     x, chosen = np.zeros(m), np.zeros(0, np.int64)
@@ -229,7 +229,7 @@ def nonnegative_least_squares(A: Floats, b: Floats, most: int) -> tuple[Floats, 
 
 @njit(cache=True)
 def _join_steepest(A: Floats, b: Floats, x: Floats, chosen: Ints, enough: float) -> tuple[Ints, Floats]:
-    """The chosen columns with the steepest that does not depend on them, and their solution; without it if none is."""
+    """Adds the steepest independent column, if any; returns the chosen columns and their solution."""
     rest = b.copy()
     for k in chosen:
         rest -= A[:, k] * x[k]
@@ -248,7 +248,7 @@ def _join_steepest(A: Floats, b: Floats, x: Floats, chosen: Ints, enough: float)
 
 @njit(cache=True)
 def _leave_first(x: Floats, chosen: Ints, z: Floats) -> Ints:
-    """Goes from x towards z until the first column is not needed any more, in place; the columns that stay."""
+    """Moves x towards z until the first weight becomes 0, in place; returns the remaining columns."""
     share, leaves = 1.0, 0
     for i, k in enumerate(chosen):
         if z[i] <= 0.0 and x[k] <= share * (x[k] - z[i]):

@@ -14,7 +14,7 @@ Vector = tuple[float, float, float]
 
 @njit(cache=True)
 def edge(points: Floats, i: int, j: int) -> Vector:
-    """From point i to point j of (n, 3)."""
+    """Vector from point i to point j of (n, 3)."""
     return points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
 
 
@@ -47,7 +47,7 @@ def dot_n(a: Floats, b: Floats) -> float:
 
 @njit(cache=True)
 def dot3(a: Floats, b: Floats) -> float:
-    """Scalar product in space, in the same order, written out: it is what passes over vertices spend their time on."""
+    """Scalar product of 3-vectors in the same order, unrolled: loops over vertices spend most of their time here."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -61,10 +61,11 @@ def norm_n(v: Floats) -> float:
 def to_vector(R: Floats) -> Floats:
     """(3,) rotation vector of (3, 3), its length in [0, pi] [rad]; exact near both ends.
 
-    scipy's ``Rotation`` does the same in many times the time; this runs in every tick of the controller.
+    scipy's ``Rotation`` does the same but is many times slower; this runs in every tick of the controller.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
-    # four times the unit quaternion (w, x, y, z) times one of its elements: the row of the largest has no cancellation
+    # four times the unit quaternion (w, x, y, z) times one of its elements; the row of the largest is free of
+    # cancellation
     rows = (
         (1.0 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
         (zy - yz, 1.0 + xx - yy - zz, xy + yx, xz + zx),
