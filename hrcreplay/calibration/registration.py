@@ -309,8 +309,7 @@ def _start(points_a: Floats, points_b: Floats, weight: Floats) -> Floats | None:
 def _gauss_newton(
     T: Floats, points_a: Floats, points_b: Floats, velocity_a: Floats, weight: Floats
 ) -> tuple[Floats, Floats]:
-    """Takes a step on rotation, translation and offset with Cauchy weights; returns the new T, the step (7,) [rad, m,
-    s]."""
+    """Takes a step on T and the offset with Cauchy weights; returns the new T and the step (7,) [rad, m, s]."""
     there = transform(T, points_b)
     scale_m = max(float(np.median(np.linalg.norm(points_a - there, axis=2)[weight > 0])), 1e-6)
     flip = find_mirrored(points_a, there, weight, scale_m)
