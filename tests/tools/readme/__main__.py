@@ -22,12 +22,14 @@ from pathlib import Path
 from typing import Any
 
 from hrcreplay.settings.listing import as_toml
+from tests.tools.readme import reference
 from tests.tools.readme.blocks import fill
 from tests.tools.readme.measurements import ROOT, Measurement, load, measurements
 
 FACTS = ROOT / "docs" / "figures.json"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "validation.md")
 GUIDE = ROOT / "docs" / "guide.md"
+REFERENCE = ROOT / "docs" / "reference.md"
 PICTURE = ROOT / "reports" / "demo.png"
 CACHE = ROOT / ".readme"
 
@@ -58,6 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
     for page in PAGES:
         page.write_text(fill(page.read_text(), facts))
     GUIDE.write_text(with_settings(GUIDE.read_text()))
+    REFERENCE.write_text(reference.fill(REFERENCE.read_text()))
     missing = [name for name in known if name not in facts]
     if missing:
         print(f"never measured, so the pages keep what they had: {', '.join(missing)}")

@@ -196,10 +196,16 @@ def test_only_the_figures_asked_for_are_measured_and_nothing_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """And without the recordings of others their figures stay."""
-    for name, path in (("FACTS", "figures.json"), ("GUIDE", "guide.md"), ("CACHE", ".readme")):
+    for name, path in (
+        ("FACTS", "figures.json"),
+        ("GUIDE", "guide.md"),
+        ("REFERENCE", "reference.md"),
+        ("CACHE", ".readme"),
+    ):
         monkeypatch.setattr(readme, name, tmp_path / path)
     monkeypatch.setattr(readme, "PAGES", (tmp_path / "README.md",))
     (tmp_path / "guide.md").write_text("<!-- settings -->\n<!-- end of settings -->\n")
+    (tmp_path / "reference.md").write_text("")
     monkeypatch.delenv("HRCREPLAY_DATA", raising=False)
     (tmp_path / "README.md").write_text("<!-- figures: recordings -->\n<!-- end -->\n")
     old = _made_up()
