@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import hrcreplay
@@ -13,7 +14,7 @@ from hrcreplay.reporting.figures.catalogue import FIGURES, NEEDS, label
 PACKAGE = Path(hrcreplay.__file__).parent
 BLOCK = re.compile(r"(<!-- from the code: (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
-#: Group of error lines -> files and folders of the package that have them. Each file belongs to the first that names it.
+#: Group of error lines -> files and folders of the package that have them; a file belongs to the first that names it.
 ERRORS = {
     "settings": ("settings", "toml_file.py", "human"),
     "limits": ("limits",),
@@ -44,6 +45,7 @@ def fill(text: str) -> str:
     return BLOCK.sub(block, text)
 
 
+@cache
 def error_lines() -> dict[str, list[str]]:
     """Group of ERRORS -> its messages, in the order of their first words."""
     groups: dict[str, set[str]] = {name: set() for name in ERRORS}
