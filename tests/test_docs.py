@@ -127,7 +127,7 @@ def test_toml_is_accepted(page: Path, body: str, tmp_path: Path) -> None:
 
 def test_there_is_toml_of_each_kind() -> None:
     keys = {key for body in blocks(LIVE, "toml") for key in tomllib.loads(body)}
-    assert keys >= {"fault", "random", "cameras", "waypoints", "live", "occupancy"}
+    assert keys >= {"fault", "random", "cameras", "waypoints", "live", "prediction"}
 
 
 def test_python_compiles() -> None:
