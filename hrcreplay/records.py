@@ -319,7 +319,15 @@ class Motion(Table):
         links: tuple[str, ...],
         reasons: tuple[str, ...],
     ) -> Self:
-        """Collect the rows of the ticks ``t_ns``; ``reasons`` has the text of every row's reason."""
+        """Collect rows into a table.
+
+        Args:
+            t_ns: (n,) ticks of the rows [ns].
+            rows: n rows.
+            limbs: Names of all volumes, in the order of ``MotionRow.limb``.
+            links: Names of all links, in the order of ``MotionRow.link``.
+            reasons: All reasons that a row may have, the empty one first.
+        """
         columns = {
             name: np.array([getattr(row, name) for row in rows]) for name in MotionRow._fields if name != "reason"
         }

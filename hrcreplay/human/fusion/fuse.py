@@ -15,7 +15,7 @@ from hrcreplay.human.fusion.body_points import FOOT_M
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import (
     NEVER_NS,
-    Estimate,
+    StateEstimate,
     Filter,
     Frames,
     Gate,
@@ -72,7 +72,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
     for j in range(DOF):
         cov[j] = np.diag([_NEUTRAL_STD[j], *_REST_STD[j]]) ** 2
     return Filter(
-        estimate=Estimate(
+        estimate=StateEstimate(
             tick_ns=np.full(1, NEVER_NS),
             started=np.zeros(1, dtype=np.bool_),
             mean=mean,
@@ -123,7 +123,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
 def _copy(state: FusionState) -> FusionState:
     """The same numbers in arrays of their own."""
     estimate, gate, model = ([array.copy() for array in part] for part in state)
-    return Filter(Estimate._make(estimate), Gate._make(gate), ModelResidual._make(model))
+    return Filter(StateEstimate._make(estimate), Gate._make(gate), ModelResidual._make(model))
 
 
 def fuse(

@@ -16,8 +16,8 @@ from hrcreplay.records import Bools, Floats, Ints
 NEVER_NS = -(2**62)
 
 
-class Estimate(NamedTuple):
-    """Estimate of the person: joints, lengths, and how well they fit their frames."""
+class StateEstimate(NamedTuple):
+    """StateEstimate of the person: joints, lengths, and how well they fit their frames."""
 
     tick_ns: Ints  #: (1,) the last tick
     started: Bools  #: (1,) whether there is a person
@@ -73,7 +73,7 @@ class ModelResidual(NamedTuple):
 class Filter(NamedTuple):
     """State of the fusion between two ticks."""
 
-    estimate: Estimate
+    estimate: StateEstimate
     gate: Gate
     model: ModelResidual
 
