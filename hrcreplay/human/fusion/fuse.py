@@ -15,12 +15,12 @@ from hrcreplay.human.fusion.body_points import FOOT_M
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import (
     NEVER_NS,
-    StateEstimate,
     Filter,
     Frames,
     Gate,
     ModelResidual,
     Rules,
+    StateEstimate,
     Track,
     process_variance,
 )
