@@ -1,1 +1,1 @@
-"""The person: kinematics, inverse kinematics, fusion, reachable sets, swept volumes. Pure."""
+"""The person: kinematics, inverse kinematics, fusion, reachable sets, swept volumes. Pure functions."""

@@ -3,12 +3,13 @@
 World: z up, floor at z = 0. Human base: on the floor under the pelvis, x forward, y left.
 
 The shoulder's three axes are a spherical wrist, so (a1, a2, a3) and (a1 + pi, pi - a2, a3 + pi) are the same posture,
-here called two names of it. The *canonical* name has alpha_1 in the half-turn from -20 to 160 degrees, which holds all
-of (34a), and the other angles in the turn around the middle of what (34) allows. So every posture inside (34) has its
-own angles as canonical name. At the ends of the half-turn, an arm far across the back or steeply raised, the angles
-jump although the arm does not, and whoever follows angles through time takes the name ``nearest`` to where it was.
+here called two forms of it. The *canonical* form has alpha_1 in the half-turn from -20 to 160 degrees, which contains
+all of (34a), and the other angles within one turn around the middle of the range in (34). So every posture inside (34)
+is its own canonical form. At the ends of the half-turn, with an arm far across the back or steeply raised, the angles
+jump although the arm does not. To follow angles through time, use the form ``nearest`` to the previous one.
 
-The capsules around the lines between a body's points are what a robot would touch, not what a person can reach.
+The capsules around the lines between a body's points are the surface that a robot would touch, not the space that a
+person can reach.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ PELVIS, NECK, HEAD = (POINTS.index(name) for name in ("pelvis", "neck", "head"))
 #: Rows: right, left. Columns: shoulder, elbow, wrist.
 ARM_POINTS = tuple(tuple(POINTS.index(f"{name}_{side}") for name in ("shoulder", "elbow", "wrist")) for side in "rl")
 HANDS = np.array([POINTS.index(f"hand_{side}") for side in "rl"])
-#: Knees and ankles: without one of them nobody knows where a leg is.
+#: Knees and ankles: without one of them the position of a leg is unknown.
 BENDS = np.array([POINTS.index(f"{part}_{side}") for part in ("knee", "ankle") for side in "rl"])
 LEG_POINTS = np.array([POINTS.index(f"{part}_{side}") for part in ("hip", "knee", "ankle", "foot") for side in "rl"])
-#: Index into LIMBS of the limb whose points show each joint of JOINTS.
+#: Index into LIMBS of the limb whose points determine each joint of JOINTS.
 SHOWN_BY = np.array(
     [LIMBS.index(limb) for limb in ("THX",) * 4 + ("URA",) * 2 + ("LRA",) * 2 + ("ULA",) * 2 + ("LLA",) * 2 + ("THX",)]
 )
@@ -49,11 +50,12 @@ _DEGREE = np.pi / 180.0
 
 @dataclass(frozen=True)
 class Departure:
-    """Measured bounds on how far whole limbs depart from constant velocity.
+    """Measured bounds on the departure of whole limbs from constant velocity.
 
-    The body may be ``rise_m`` higher and ``sink_m`` lower than its velocity says. Until a horizon no point of a limb is
-    further from the hull of the limb at the tick and at all these places later (``human.prediction.velocity_tube``)
-    than ``beyond_m`` and ``residuals`` times the limb's residual, as far as that is noise; and at least the residual.
+    The body may be up to ``rise_m`` higher and ``sink_m`` lower than at constant velocity. Take the hull of the limb at
+    the tick and at all these later positions (``human.prediction.velocity_tube``). Up to a horizon, no point of the
+    limb is further from this hull than ``beyond_m`` plus ``residuals`` times the limb's residual, as far as that is
+    noise; the bound is at least the residual.
     """
 
     horizon_s: Floats  #: (h,) increasing [s]
@@ -68,8 +70,8 @@ class LimitSet:
     """Bounds on the joints of Eq. (37), as in Table 1, (13,) each, [m, m, rad..., m] and their derivatives.
 
     The velocity and acceleration bounds of x and y bound v (forward) and v_perp (to the left) in the body frame,
-    Eq. (18), (25), (26). Heading has no position bound (+-inf). Where ``coupled``, alpha_2 and alpha_3 obey
-    Eq. (34b), (34c) and their own entries in ``p_min``/``p_max`` only enclose them.
+    Eq. (18), (25), (26). Heading has no position bound (+-inf). If ``coupled``, alpha_2 and alpha_3 obey Eq. (34b),
+    (34c), and their entries in ``p_min``/``p_max`` only enclose these bounds.
     """
 
     name: str
@@ -80,10 +82,10 @@ class LimitSet:
     a_min: Floats
     a_max: Floats
     coupled: bool
-    departure: Departure | None = None  #: bounds the limbs under ``sound``; none: only the joints are bounded
+    departure: Departure | None = None  #: bounds on the limbs for ``sound``; None: only the joints are bounded
 
     def plain(self) -> dict[str, Any]:
-        """JSON form; no bound is null."""
+        """Returns the JSON form; an infinite bound is null."""
         found = {name: _plain(value) for name, value in vars(self).items() if name != "departure"}
         if self.departure is not None:
             found["departure"] = {name: value.tolist() for name, value in vars(self.departure).items()}
@@ -91,7 +93,7 @@ class LimitSet:
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> LimitSet:
-        """The limit set of which ``plain`` is the JSON form."""
+        """Makes a limit set from its JSON form, see ``plain``."""
         found = {name: _bound(name, value) for name, value in plain.items() if name != "departure"}
         if plain.get("departure") is not None:
             found["departure"] = Departure(**{name: np.array(value) for name, value in plain["departure"].items()})
@@ -112,23 +114,23 @@ def _bound(name: str, value: Any) -> Any:
 
 
 def bounds_of(limits: LimitSet) -> Floats:
-    """(6, 13): p_min, p_max, v_min, v_max, a_min, a_max, as the kernels take them."""
+    """Returns (6, 13): p_min, p_max, v_min, v_max, a_min, a_max, in the form that the kernels take."""
     return np.stack([limits.p_min, limits.p_max, limits.v_min, limits.v_max, limits.a_min, limits.a_max])
 
 
 def skeleton(p: Floats, lengths_m: Floats) -> Floats:
-    """Forward kinematics: where the model puts the body points.
+    """Forward kinematics: computes the body points of the model.
 
     Args:
         p: (n, 13) JOINTS [m, m, rad..., m].
         lengths_m: (n, 7) LENGTHS [m].
 
     Returns:
-        (n, 20, 3) POINTS, world [m]; NaN where the model has no say (hands, chest, legs). ``neck`` is the midpoint
-        of the shoulder line.
+        (n, 20, 3) POINTS, world [m]; NaN for points outside the model (hands, chest, legs). ``neck`` is the midpoint of
+        the shoulder line.
 
     Raises:
-        ValueError: The tables have other columns; the kernel would read beyond them.
+        ValueError: The tables have other numbers of columns; the kernel would read beyond them.
     """
     if p.shape[1:] != (DOF,) or lengths_m.shape[1:] != (len(LENGTHS),):
         raise ValueError(f"found {p.shape} joints and {lengths_m.shape} lengths; (n, {DOF}) and (n, {len(LENGTHS)})")
@@ -176,9 +178,9 @@ def torso_rotation(theta: float, rho: float) -> Floats:
 
 @njit(cache=True)
 def arm_directions(alpha_1: float, alpha_2: float, alpha_3: float, alpha_4: float) -> tuple[Floats, Floats]:
-    """Unit vectors shoulder to elbow and elbow to wrist in the torso's frame, of a left arm (s = +1).
+    """Computes unit vectors shoulder to elbow and elbow to wrist in the torso's frame, for a left arm (s = +1).
 
-    Those of a right arm are their mirror images in y, so the kernels of both arms are one.
+    Those of a right arm are their mirror images in y, so both arms share the kernels.
 
     Args:
         alpha_1: First angle of the shoulder [rad].
@@ -224,9 +226,9 @@ def alpha_3_bounds(low_1: float, high_1: float, low_2: float, high_2: float) -> 
 
 
 def clamp(p: Floats, limits: LimitSet) -> Floats:
-    """The postures inside the limits that Eq. (62) makes of ``p``, (n, 13) [m, m, rad..., m]; heading is left alone.
+    """Clamps postures ``p`` to the limits by Eq. (62), (n, 13) [m, m, rad..., m]; heading is unchanged.
 
-    Where the limits are coupled, alpha_2 is held in the bounds of the clamped alpha_1, and alpha_3 in those of both.
+    If the limits are coupled, alpha_2 is clamped to the bounds of the clamped alpha_1, and alpha_3 to those of both.
     """
     clamped = np.array(p, dtype=np.float64, order="C")
     _clamp_rows(clamped, limits.p_min, limits.p_max, limits.coupled)
@@ -242,13 +244,13 @@ def _clamp_rows(p: Floats, p_min: Floats, p_max: Floats, coupled: bool) -> None:
 
 @njit(cache=True)
 def clamp_row(p: Floats, p_min: Floats, p_max: Floats, coupled: bool, low: Floats, high: Floats) -> None:
-    """Eq. (62) for one posture (13,) in place; writes the bounds that held for it into low, high (13,).
+    """Applies Eq. (62) to one posture (13,) in place; writes the applied bounds into low, high (13,).
 
     Args:
         p: (13,) JOINTS [m, m, rad..., m].
         p_min: (13,) of ``LimitSet`` [m, m, rad..., m].
         p_max: (13,) of ``LimitSet`` [m, m, rad..., m].
-        coupled: Whether alpha_2 and alpha_3 obey Eq. (34b), (34c).
+        coupled: True: alpha_2 and alpha_3 obey Eq. (34b), (34c).
         low: (13,) receives the lower bounds [m, m, rad..., m].
         high: (13,) receives the upper bounds [m, m, rad..., m].
     """
@@ -269,17 +271,17 @@ _ROUNDING = 1e-9
 
 
 def canonical(p: Floats) -> Floats:
-    """The same postures with both arms by their canonical names, (n, 13) [m, m, rad..., m]."""
+    """Converts both arms of postures (n, 13) to their canonical forms [m, m, rad..., m]."""
     named = np.array(p, dtype=np.float64, order="C")
     _canonical_rows(named)
     return named
 
 
 def nearest(p: Floats, reference: Floats) -> Floats:
-    """The same postures, each by the name nearest to ``reference``, both (n, 13) [m, m, rad..., m].
+    """Converts each posture to the form nearest to ``reference``, both (n, 13) [m, m, rad..., m].
 
-    Heading goes to the nearest turn, each arm to the nearer of its two names. What is NaN in either stays as it is
-    in ``p``. Needed wherever angles of two sources are subtracted.
+    Heading takes the nearest turn, each arm the nearer of its two forms. A value that is NaN in either is copied from
+    ``p``. Use it before subtracting angles of two sources.
     """
     named = np.array(p, dtype=np.float64, order="C")
     _nearest_rows(named, np.ascontiguousarray(reference))
@@ -294,10 +296,10 @@ def wrap(angle: float) -> float:
 
 @njit(cache=True)
 def canonical_arm(arm: Floats, margin: float) -> bool:
-    """Renames one arm (4,) in place; True where alpha_2 was mirrored, so that its derivatives change sign.
+    """Converts one arm (4,) in place; returns True if alpha_2 was mirrored, so that its derivatives change sign.
 
-    A name is kept until an angle is out of its half-turn (or turn) by ``margin`` [rad], so that an arm resting where
-    the names meet does not flicker.
+    A form is kept until an angle is out of its half-turn (or turn) by ``margin`` [rad], so that a resting arm does not
+    alternate between both forms.
     """
     mirrored = False
     for j in range(3):
@@ -315,7 +317,7 @@ def canonical_arm(arm: Floats, margin: float) -> bool:
 
 @njit(cache=True)
 def nearest_arm(arm: Floats, reference: Floats, variance: Floats) -> None:
-    """Renames one arm (4,) in place to the name nearest to the reference (4,), each joint weighed by 1/variance."""
+    """Converts one arm (4,) in place to the form nearest to the reference (4,), with joints weighted by 1/variance."""
     for j in range(3):
         arm[j] = reference[j] + wrap(arm[j] - reference[j])
     other = (arm[0] + np.pi, np.pi - arm[1], arm[2] + np.pi)
@@ -331,7 +333,7 @@ def nearest_arm(arm: Floats, reference: Floats, variance: Floats) -> None:
 
 @njit(cache=True)
 def _into_turn(angle: float, j: int) -> float:
-    """The angle in the turn around the middle of what joint j of the arm can do [rad]."""
+    """Wraps the angle to the turn around the middle of the range of joint j of the arm [rad]."""
     return _MIDDLES[j] + wrap(angle - _MIDDLES[j])
 
 
@@ -357,9 +359,9 @@ def _nearest_rows(p: Floats, reference: Floats) -> None:
                     p[i, first + j] = arm[j]
 
 
-#: Thighs and shanks, of which the model of Eq. (37) knows nothing: there only where hip, knee and ankle were recorded.
+#: Thighs and shanks are not in the model of Eq. (37): they exist only if hip, knee and ankle were recorded.
 LEG_PARTS = ("THIGH_R", "SHANK_R", "THIGH_L", "SHANK_L")
-#: Hands and feet as a camera shows them; a forearm's capsule goes on beyond the wrist by itself.
+#: Hands and feet as observed by a camera; a forearm's capsule also extends beyond the wrist.
 END_PARTS = ("HAND_R", "HAND_L", "FOOT_R", "FOOT_L")
 #: Parts of a recorded body.
 PARTS = (*LIMBS, *LEG_PARTS, *END_PARTS)
@@ -384,15 +386,14 @@ _FOREARMS = np.array([PARTS.index("LRA"), PARTS.index("LLA")])
 
 
 def part_axes(points_m: Floats, hand_m: float) -> Floats:
-    """Axes of the capsules of a body's parts.
+    """Computes the axes of the capsules of a body's parts.
 
     Args:
         points_m: (n, 20, 3) POINTS, world [m].
-        hand_m: The forearm's capsule goes on beyond the wrist by so much, along the forearm [m].
+        hand_m: Extension of the forearm's capsule beyond the wrist, along the forearm [m].
 
     Returns:
-        (n, 14, 2, 3) ends of the axes of PARTS [m]; NaN where a point is missing.
-    """
+        (n, 14, 2, 3) ends of the axes of PARTS [m]; NaN if a point is missing."""
     axes = np.stack([points_m[:, _FROM], points_m[:, _TO]], axis=2)
     forearm = axes[:, _FOREARMS, 1] - axes[:, _FOREARMS, 0]
     length = np.linalg.norm(forearm, axis=2, keepdims=True)
@@ -401,7 +402,7 @@ def part_axes(points_m: Floats, hand_m: float) -> Floats:
 
 
 def part_radii(prediction: Prediction, leg_m: float) -> Floats:
-    """(14,) radii of PARTS: Table 2, a hand's that of the lower arm; ``leg_m`` for thighs, shanks and feet [m]."""
+    """(14,) radii of PARTS: Table 2, for hands that of the lower arm, for thighs, shanks and feet ``leg_m`` [m]."""
     upper, lower = prediction.radius_upper_arm_m, prediction.radius_lower_arm_m
     arms = (upper, lower, upper, lower)
     legs, ends = (leg_m,) * len(LEG_PARTS), (lower, lower, leg_m, leg_m)

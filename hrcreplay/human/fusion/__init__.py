@@ -1,1 +1,1 @@
-"""Skeletons of several cameras to one moving person: inverse kinematics, Kalman filter, gating, model residual."""
+"""Merges the skeletons of several cameras into one person: inverse kinematics, Kalman filter, gating, residual."""

@@ -1,9 +1,9 @@
 """Offsets of the body's points from the model, in the torso's frame, and attachment of hands and legs (docs/paper.md).
 
-People bend sideways, twist and lift their shoulders; thirteen joints do not. Where shoulders, head, elbows and wrists
-are beside the model is a running mean. Hands and legs have no joints: they are where a camera last showed them, carried
-along with the wrist, and with the pelvis over the floor. A foot that is hidden, its ankle being shown, is from there
-where it was shown last, or ahead, and turns with the body: no more than a foot's length can be wrong with that.
+People bend sideways, twist and lift their shoulders; the thirteen joints of the model do not. The offsets of shoulders,
+head, elbows and wrists from the model are running means. Hands and legs have no joints: they keep their last observed
+position relative to the wrist, or to the pelvis over the floor. A hidden foot with a visible ankle keeps its last
+observed offset from the ankle, or points ahead, and turns with the body: its error is at most a foot's length.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PEL
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats
 
-#: No point of a leg is further from the pelvis: toes of a tall man's straight leg. What is further is no leg [m].
+#: Maximum distance of a point of a leg from the pelvis: toes of a tall man's straight leg [m].
 REACH_M = 1.2
-#: Nor is a hand further from its wrist [m].
+#: Maximum distance of a hand from its wrist [m].
 _HAND_M = 0.3
-#: A foot's tip from its ankle until a camera has shown it, in the body's heading: about a man's [m].
+#: Distance of a foot's tip from its ankle, along the body's heading, until a camera has seen it: about a man's [m].
 FOOT_M = (0.2, 0.0, -0.06)
-#: A hand or a leg that a camera showed longer ago is anywhere by now: some frames of any camera [ns].
+#: Maximum age of the observation of a hand or a leg, a few frames of any camera; an older one is unknown [ns].
 _SHOWN_NS = 200_000_000
 
 (_SHOULDER_R, _ELBOW_R, _WRIST_R), (_SHOULDER_L, _ELBOW_L, _WRIST_L) = ARM_POINTS
 _LEGS = BODY.index("LEGS")
 _SHOULDERS = np.array([_SHOULDER_R, _SHOULDER_L])
-#: Points that are measured beside the model, and the limb of LIMBS that must be shown for each.
+#: Points with an offset from the model, and the limb of LIMBS that must be visible for each.
 _BESIDE = np.array([HEAD, _SHOULDER_R, _SHOULDER_L, _ELBOW_R, _WRIST_R, _ELBOW_L, _WRIST_L])
 _OF_LIMB = np.array([LIMBS.index(limb) for limb in ("HD", "THX", "THX", "URA", "LRA", "ULA", "LLA")])
-#: Wrists of HANDS, and the limbs that show them.
+#: Wrists of HANDS, and the limbs that contain them.
 _WRISTS = np.array([_WRIST_R, _WRIST_L])
 _LOWER_ARMS = np.array([LIMBS.index("LRA"), LIMBS.index("LLA")])
 #: Right, left.
@@ -40,7 +40,7 @@ _ANKLES, _FEET = (np.array([POINTS.index(f"{part}_{side}") for side in "rl"]) fo
 
 @njit(cache=True)
 def shift(filter_: Filter, p: Floats, points: Floats) -> None:
-    """Moves the model's points (20, 3) of a posture p (13,) to where they lately were beside it [m]."""
+    """Adds the recent offsets to the model's points (20, 3) of a posture p (13,) [m]."""
     R = torso_rotation(p[2], p[3])
     for k in _BESIDE:
         for i in range(3):
@@ -54,16 +54,16 @@ def shift(filter_: Filter, p: Floats, points: Floats) -> None:
 def learn(
     filter_: Filter, c: int, now: int, shown: Bools, p: Floats, model: Floats, shifted: Floats, rules: Rules
 ) -> None:
-    """Takes in where a camera's frame shows the points.
+    """Updates the offsets by the points in a camera's frame.
 
     Args:
-        filter_: Holds the frame; its offsets and what it carries are changed.
+        filter_: Contains the frame; its offsets and observed positions are changed.
         c: Index of the camera.
         now: The tick [ns].
-        shown: (7,) the limbs of BODY that the frame shows, of a person whom the filter has found.
+        shown: (7,) the limbs of BODY in the frame, for a person that the filter has found.
         p: (13,) the posture at the capture time.
         model: (20, 3) the model's points there [m].
-        shifted: (20, 3) the same where they lately were beside it [m].
+        shifted: (20, 3) the model's points with the recent offsets [m].
         rules: Settings of the filter.
     """
     R = torso_rotation(p[2], p[3])
@@ -89,7 +89,7 @@ def learn(
 
 @njit(cache=True)
 def _learn_legs(filter_: Filter, c: int, pelvis: Floats, heading: float, rules: Rules) -> None:
-    """Takes in where a camera's frame shows the legs of a pelvis (3,) [m]."""
+    """Updates the legs below a pelvis (3,) by a camera's frame [m]."""
     for k in LEG_POINTS:
         if _near(filter_, c, k, pelvis, REACH_M, rules):
             from_below = filter_.gate.points[c, k].copy()
@@ -116,7 +116,7 @@ def _carry(filter_: Filter, c: int, k: int, relative: Floats) -> None:
 
 @njit(cache=True)
 def place(filter_: Filter, p: Floats, points: Floats) -> None:
-    """Writes where the points are at the tick; NaN for hands and legs of which no camera tells.
+    """Writes the points at the tick; NaN for hands and legs that no camera has observed recently.
 
     Args:
         filter_: After the tick.
@@ -140,6 +140,6 @@ def place(filter_: Filter, p: Floats, points: Floats) -> None:
 
 @njit(cache=True)
 def _turned(vector: Floats, theta: float) -> Floats:
-    """A vector (3,) turned about the vertical."""
+    """Rotates a vector (3,) about the vertical."""
     c, s = np.cos(theta), np.sin(theta)
     return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], vector[2]])

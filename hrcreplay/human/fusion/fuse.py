@@ -1,6 +1,6 @@
 """Fusion of several cameras into one moving person, Alg. 3, and an offline smoother; corrections: docs/paper.md.
 
-The smoother (Rauch, Tung, Striebel) also uses the measurements after a tick: a reference for what was fused in time.
+The smoother (Rauch, Tung, Striebel) also uses the measurements after a tick, as a reference for the online estimate.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, LimitSet, nearest
 from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
-#: A person nobody has measured: upright, arms hanging; and how wrong that may be [m, m, rad..., m].
+#: Prior of an unmeasured person: upright with hanging arms, and its standard deviation [m, m, rad..., m].
 _NEUTRAL = (0.0, 0.0, 0.0, 0.1, 0.1, 0.3, 0.0, 2.6, 0.1, 0.3, 0.0, 2.6, 0.94)
 _NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2, 0.3)
-#: LENGTHS of the median man (upper arm 0.36 m, shoulders at 1.44 m), and how wrong that may be [m].
+#: LENGTHS of the median man (upper arm 0.36 m, shoulders at 1.44 m), and their standard deviation [m].
 MEDIAN_LENGTHS_M = (0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
 _LENGTHS_STD_M = 0.1
-#: How fast a joint may be moving that nobody sees: v, a, j of x, y and z [m/s...], of an angle [rad/s...].
+#: Standard deviations of v, a, j of an unseen joint: of x, y and z [m/s...], of an angle [rad/s...].
 _REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10 + [[0.3, 2.0, 20.0]])
-#: Whether a joint is x or y (0), an angle (1) or z (2).
+#: Type of a joint: x or y (0), an angle (1) or z (2).
 _KIND = np.repeat((0, 1, 2), (2, 10, 1))
 
 FusionState = Filter
@@ -47,25 +47,25 @@ FusionState = Filter
 
 @dataclass(frozen=True)
 class Trace:
-    """Input of the smoother beside the states: P of every tick, and how it was reached. No rows where not traced."""
+    """Further input of the smoother: P of every tick, and the factors of its prediction. No rows unless traced."""
 
     cov: Floats  #: (n, 13, 4, 4) covariance of p, v, a, j
-    damping: Floats  #: (n, 13) of the derivatives on the way to the tick; 1 unless the joint was unseen
+    damping: Floats  #: (n, 13) damping of the derivatives up to the tick; 1 unless the joint was unseen
     spread: Floats  #: (n, 13) highest normalised innovation squared, decaying
-    autocorrelation: Floats  #: (n, 13) of the innovations, at lag 1
+    autocorrelation: Floats  #: (n, 13) autocorrelation of the innovations, at lag 1
 
     def rows(self, which: slice) -> Trace:
-        """The trace of some of the ticks."""
+        """Selects the trace of some of the ticks."""
         return Trace(*(getattr(self, f.name)[which] for f in fields(Trace)))
 
     @staticmethod
     def join(parts: Sequence[Trace]) -> Trace:
-        """The traces of consecutive ticks as one."""
+        """Concatenates the traces of consecutive ticks."""
         return Trace(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Trace)))
 
 
 def start(cameras: tuple[str, ...]) -> FusionState:
-    """The filter before the first frame of any camera."""
+    """Makes the filter before the first frame of any camera."""
     c = len(cameras)
     mean, cov = np.zeros((DOF, 4)), np.zeros((DOF, 4, 4))
     mean[:, 0] = _NEUTRAL
@@ -140,11 +140,12 @@ def fuse(
     The filter is that of Eq. (42)-(57) with Eq. (44) corrected: per joint p, v, a, j under Eq. (43), per length a
     constant; rows that are not valid are switched off in H. After each tick the state is saturated by Eq. (62)-(65) and
     fed back; P is not changed by it. Where ``delay`` is compensated, a row measures p - d v + d^2/2 a - d^3/6 j, d the
-    age of the frame at the tick. Each arm is measured by the name nearest to the estimate (``human.model``), heading by
-    the nearest turn, so neither jumps. A joint unseen for ``coast_s`` has its derivatives damped and its covariance
-    growing; unseen for ``memory_s`` it is lost and starts anew from its next valid row. All is finite from the first
-    valid row on: joints not yet seen stand at a neutral posture with a large standard deviation. How far the body is
-    from its model, and for how long a limb has not been seen, is kept beside the filter and changes nothing in it.
+    age of the frame at the tick. The angles of each arm take the form nearest to the estimate (``human.model``),
+    heading takes the nearest turn, so neither jumps. A joint unseen for ``coast_s`` has its derivatives damped and its
+    covariance growing; unseen for ``memory_s`` it is lost and restarts from its next valid row. All values are finite
+    from the first valid row on: joints not seen yet have a neutral posture with a large standard deviation. The
+    distance of the body from its model and the time since each limb was seen are stored with the filter and do not
+    change it.
 
     Args:
         state: From ``start`` or the previous call. It is not changed.
@@ -152,13 +153,13 @@ def fuse(
         measurements: Rows in order of arrival, none after ``ticks_ns[-1]`` and none given before.
         settings: Of the filter.
         limits: Bounds for the saturation.
-        traced: Whether to keep what ``smooth`` needs, 1.5 kB a tick; changes no state.
+        traced: True: keep the input of ``smooth``, 1.5 kB per tick; changes no state.
 
     Returns:
         The filter after the last tick, the states (n ticks; NaN before the first valid row), counts of events:
         ``outlier_points_<camera>``, ``superseded_frames_<camera>`` (a newer frame had come), ``joints_reacquired``,
         ``ticks_saturated``, and the trace of the n ticks, which has no rows unless ``traced``. The bits of the states
-        do not depend on how ticks are cut into calls.
+        do not depend on the division of ticks into calls.
     """
     after = _copy(state)
     track = _track(len(ticks_ns), len(measurements.cameras), traced=traced)
@@ -190,7 +191,7 @@ def fuse(
 
 
 def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats:
-    """Diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds.
+    """Computes the diagonal (4,) of G of Eq. (44) for joint j and a step of dt seconds.
 
     Args:
         settings: Of the filter.
@@ -210,7 +211,7 @@ def _sigma(settings: Fusion) -> Floats:
 
 
 def _frames(measurements: Measurements) -> Frames:
-    """The measurements as the kernel takes them: in arrays of its own, for those of a record are read-only."""
+    """Copies the measurements into the kernel's form, as the arrays of a record are read-only."""
     return Frames(
         capture_ns=np.array(measurements.capture_ns),
         arrival_ns=np.array(measurements.arrival_ns),
@@ -275,21 +276,21 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
     )
 
 
-#: Derivatives are smoothed in units of this time, where the four states have about the same size [s].
+#: Unit of time in the smoother, in which the four states have similar magnitudes [s].
 _UNIT_S = 0.05
 
 
 def smooth(states: HumanStates, trace: Trace, settings: Fusion) -> HumanStates:
-    """Every tick given all measurements of the run, by filterpy's smoother joint by joint.
+    """Smooths every tick with all measurements of the run, by filterpy's smoother, joint by joint.
 
-    The arms are followed under one name through the run (``human.model``) and keep it: a smoothed angle does not jump.
-    Lengths are constants, so the last estimate is the best for all ticks. About 0.5 ms a tick; memory 1.5 kB a tick
-    for the trace and as much again for one joint at a time.
+    The angles of each arm keep one form through the run (``human.model``), so a smoothed angle does not jump. Lengths
+    are constants, so the last estimate is the best for all ticks. About 0.5 ms a tick; memory 1.5 kB a tick for the
+    trace and as much again for one joint at a time.
 
     Args:
-        states: Of one whole run.
-        trace: Of the same ticks, from ``fuse``.
-        settings: Those of the run.
+        states: States of one whole run.
+        trace: Trace of the same ticks, from ``fuse``.
+        settings: Settings of the run.
 
     Returns:
         The smoothed states; rows before the first measurement stay NaN.
@@ -319,8 +320,8 @@ def smooth(states: HumanStates, trace: Trace, settings: Fusion) -> HumanStates:
 def _smooth_joint(
     mean: Floats, cov: Floats, dt: Floats, damping: Floats, settings: Fusion, j: int
 ) -> tuple[Floats, Floats]:
-    """Smoothed mean (n, 4) and standard deviations of p and v (n, 2) of one joint."""
-    from filterpy.kalman import KalmanFilter  # takes half a second to import, and only smoothing needs it
+    """Returns the smoothed mean (n, 4) and standard deviations of p and v (n, 2) of one joint."""
+    from filterpy.kalman import KalmanFilter  # slow to import (0.5 s), and only used for smoothing
 
     scale = _UNIT_S ** np.arange(4.0)
     Fs, Qs = np.zeros_like(cov), np.zeros_like(cov)
@@ -342,7 +343,7 @@ def _transition(dt: float, damping: float) -> Floats:
 
 
 def _one_name(states: HumanStates, first: int) -> Floats:
-    """Means (n, 13, 4) with each posture by the name nearest to the one before."""
+    """Converts means (n, 13, 4) so that each posture has the form nearest to the previous one."""
     mean = np.stack([states.p, states.v, states.a, states.j], axis=2)[first:]
     for k in range(1, len(mean)):
         p = nearest(mean[k : k + 1, :, 0], mean[k - 1 : k, :, 0])[0]

@@ -1,9 +1,9 @@
 """Gating of camera frames, 4.1.2: by confidence, and by the predicted skeleton.
 
-Pure rejection prevents recovery of a filter that went wrong. So a point that a camera goes on showing in
-one place, while no camera shows it where the filter has it, is evidence: after ``relearn_s`` it is believed, and its
-rows start anew. Left and right exchanged are none, nor is a marker that jumps and leaves its bone behind; where two
-cameras show that, the residual holds it all the same (``model_residual``).
+Pure rejection prevents recovery of a filter that went wrong. So a point that a camera keeps showing in one place, while
+no camera shows it near the filter's estimate, is accepted after ``relearn_s``, and its rows restart. Exchanged left and
+right sides are not accepted, nor is a marker that jumps away from its bone; if two cameras show it, the residual
+includes it (``model_residual``).
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, NECK, PELV
 from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, LENGTHS, POINTS, Bools, Floats
 
-#: An angle known no better than this is not observed: a circle cannot tell [rad].
+#: An angle with a larger standard deviation is not observed; on a circle it contains no information [rad].
 _BLIND_STD = 1.0
-#: The points that the model predicts and a camera may get wrong.
+#: Points that the model predicts and that are checked in a camera's frame.
 _TESTED = np.flatnonzero(DEPENDS.any(axis=0))
 _FAR_ENDS = (
     (PELVIS,),
@@ -29,40 +29,40 @@ _FAR_ENDS = (
     (ARM_POINTS[1][2],),
     (ARM_POINTS[0][2],),
 )
-#: (6, 20) the body points that place a limb of LIMBS: what its rows are computed from, however it is turned.
+#: (6, 20) the body points that determine a limb of LIMBS: the inputs of its rows, for any orientation.
 _PLACING = DEPENDS[[3, 3, RIGHT_ARM, RIGHT_ARM + 2, LEFT_ARM, LEFT_ARM + 2]]
 _PLACING[0, HEAD] = True
-#: (7, 20) the points that may be wrong where a length is: the far end of its bone, both shoulders of their line.
+#: (7, 20) points whose error changes a length: the far end of its bone, both shoulders for their line.
 _ENDS = np.zeros((len(LENGTHS), len(POINTS)), dtype=np.bool_)
 for _length, _point in enumerate(_FAR_ENDS):
     _ENDS[_length, list(_point)] = True
-#: (20, 20) the points at which the bone to a point begins, or those that stand for the neck.
+#: (20, 20) points at which the bone to a point begins; both shoulders for the neck.
 _NEAR_ENDS = np.zeros((len(POINTS), len(POINTS)), dtype=np.bool_)
 for _shoulder, _elbow, _wrist in ARM_POINTS:
     _NEAR_ENDS[_elbow, _shoulder] = _NEAR_ENDS[_wrist, _elbow] = True
     _NEAR_ENDS[[PELVIS, HEAD], _shoulder] = True
     _NEAR_ENDS[_shoulder, [points[0] for points in ARM_POINTS]] = True
     _NEAR_ENDS[_shoulder, [_shoulder, PELVIS]] = False, True
-#: (20,) the same point on the other side of the body; itself where there is none.
+#: (20,) the same point on the other side of the body; a point without a counterpart maps to itself.
 _OTHER_SIDE = np.array(
     [POINTS.index(p[:-1] + {"l": "r", "r": "l"}[p[-1]] if p[-2] == "_" else p) for p in POINTS], dtype=np.int64
 )
 _STEP = 1e-5
-#: How wrong a length is that starts anew, standard deviation [m].
+#: Standard deviation of a length that restarts [m].
 _UNKNOWN_M = 0.1
 
 
 @njit(cache=True)
 def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
-    """Select the valid rows of a new frame, 4.1.2 and Eq. (58), and the limbs that it shows whole.
+    """Selects the valid rows of a new frame, 4.1.2 and Eq. (58), and the limbs that it shows completely.
 
     Args:
-        filter_: Holds the frame. ``valid`` and ``shows`` of the camera are written, and the ticks at which points and
-            lengths last agreed; the variance of a length that starts anew is set.
+        filter_: Contains the frame. Receives ``valid`` and ``shows`` of the camera, the ticks at which points and
+            lengths last agreed, and the variance of a length that restarts.
         c: Index of the camera.
         now: The tick [ns].
         rules: Settings of the filter.
-        track: Counts the points that do not agree with the filter.
+        track: Receives the number of points that disagree with the filter.
     """
     trusted = np.ones(len(filter_.gate.point_ns), dtype=np.bool_)
     believed = np.zeros(len(filter_.gate.point_ns), dtype=np.bool_)
@@ -107,10 +107,11 @@ def _validate_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> Non
 
 @njit(cache=True)
 def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> tuple[Bools, Bools]:
-    """The points of a frame (20,) near enough to the a-priori skeleton, and those believed although they are not.
+    """Returns the points of a frame (20,) near the a-priori skeleton, and those accepted in spite of their distance.
 
-    A lost point agrees with anything. Since when each other one has been refused is kept. One that is not ``whole``
-    (20,), while its bone begins where the filter has it, is refused anew in each frame: no limb is there.
+    A lost point agrees with any position. For each other point the start of its rejection is stored. A point that is
+    not ``whole`` (20,), although its bone begins near the filter's estimate, is rejected again in each frame: it is not
+    on the limb.
     """
     points = filter_.gate.points[c]
     expected, gate = _gates(filter_, c, now, rules)
@@ -140,10 +141,11 @@ def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> 
 
 @njit(cache=True)
 def _gates(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Floats, Floats]:
-    """Expected points in a camera's frame, (20, 3) [m], and their allowed errors, (20,) [m].
+    """Returns the expected points in a camera's frame, (20, 3) [m], and their allowed errors, (20,) [m].
 
-    That is ``outlier_m`` widened by three standard deviations of the prediction towards the point, each joint's carried
-    through the forward kinematics. Those across say nothing: left and right exchanged would pass.
+    The allowed error is ``outlier_m`` plus three standard deviations of the prediction towards the point, propagated
+    from each joint by the forward kinematics. Deviations across this direction are not added, as exchanged left and
+    right sides would pass.
     """
     p, lengths = extrapolate_back(filter_.estimate.mean, delay(filter_, c, now, rules)), filter_.estimate.lengths
     expected, moved = np.empty_like(filter_.gate.points[c]), np.empty_like(filter_.gate.points[c])
@@ -171,10 +173,10 @@ def _gates(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Floats, Flo
 
 @njit(cache=True)
 def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
-    """The points of a frame (20,) that are not at the far end of a bone of another length than the person's.
+    """Returns the points of a frame (20,) except those at the far end of a bone of wrong length.
 
-    Bones do not change, so a marker that jumps is told from a limb that moves. A length that no camera has seen right
-    for long was learnt wrong: it starts anew.
+    Bone lengths are constant, which distinguishes a jumping marker from a moving limb. A length that no camera has
+    confirmed for a long time was learnt wrong: it restarts.
     """
     whole = np.ones(len(filter_.gate.point_ns), dtype=np.bool_)
     for k in range(len(filter_.estimate.lengths)):
@@ -192,5 +194,5 @@ def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
 
 @njit(cache=True)
 def distance(a: Floats, b: Floats) -> float:
-    """Between two points (3,) [m]."""
+    """Distance between two points (3,) [m]."""
     return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)

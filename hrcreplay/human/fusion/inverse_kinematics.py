@@ -1,8 +1,8 @@
-"""From skeleton points to the joints of Eq. (37): closed-form inverse kinematics and what it can observe.
+"""From skeleton points to the joints of Eq. (37): closed-form inverse kinematics and its variances.
 
-Real people are not the model: they bend sideways, lift shoulders, twist. The angles are those of the frames that the
-points themselves span: heading from the shoulder line's projection on the floor, rho from the line pelvis to neck
-seen from the side, each arm from its own two bones in the torso's frame. Lengths are distances between points.
+Real people differ from the model: they bend sideways, lift shoulders, twist. The angles are computed from frames that
+the points span: heading from the shoulder line's projection on the floor, rho from the line pelvis to neck seen from
+the side, each arm from its own two bones in the torso's frame. Lengths are distances between points.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ ROWS = DOF + len(LENGTHS)
 _SHOULDER_R, _SHOULDER_L = ARM_POINTS[0][0], ARM_POINTS[1][0]
 _USED = (PELVIS, NECK, HEAD, *ARM_POINTS[0], *ARM_POINTS[1])
 _STEP_M = 1e-6
-#: Two points nearer than this are one place: no bone lies between them, so it has neither length nor direction [m].
+#: Two points nearer than this coincide: the bone between them has neither length nor direction [m].
 LEAST_BONE_M = 1e-3
-#: A variance that leaves a filter untouched [rad^2, m^2].
+#: A variance so large that a filter ignores the row [rad^2, m^2].
 _UNOBSERVED = 1e6
-#: No variance is less: a sum of squares that rounds to 0 would count as a certainty [rad^2, m^2].
+#: Minimum variance: a sum of squares that rounds to 0 would count as exact [rad^2, m^2].
 _LEAST_VARIANCE = 1e-18
 _LEAST_CONFIDENCE = 0.05
 
 
 def _points_of_rows() -> tuple[tuple[int, ...], ...]:
-    """The body points that each joint and each length is computed from."""
+    """Returns the body points from which each joint and each length is computed."""
     shoulders = (_SHOULDER_R, _SHOULDER_L)
     torso = (PELVIS, *shoulders)
     rows = [(PELVIS,), (PELVIS,), shoulders, torso]
@@ -53,23 +53,23 @@ def _points_of_rows() -> tuple[tuple[int, ...], ...]:
     return tuple(rows)
 
 
-#: (20, 20) whether a row (JOINTS, then LENGTHS) is computed from a body point.
+#: (20, 20) True if a row (JOINTS, then LENGTHS) is computed from a body point.
 DEPENDS = np.zeros((ROWS, len(POINTS)), dtype=np.bool_)
 for _row, _points in enumerate(_points_of_rows()):
     DEPENDS[_row, list(_points)] = True
 
 
 def inverse(points_m: Floats) -> tuple[Floats, Floats]:
-    """Joint angles and limb lengths of skeletons, the inverse of ``model.skeleton``.
+    """Computes joint angles and limb lengths of skeletons, the inverse of ``model.skeleton``.
 
     Args:
-        points_m: (n, 20, 3) POINTS, world [m]; NaN where missing. The neck is the middle of the shoulders; the
-            measured neck stands in for it only where one shoulder is missing, and then no length rests on it.
+        points_m: (n, 20, 3) POINTS, world [m]; NaN where missing. The neck is the middle of the shoulders; the measured
+            neck replaces it only if one shoulder is missing, and then no length is computed from it.
 
     Returns:
-        Angles (n, 13) JOINTS [m, m, rad..., m], arms by their canonical names (``human.model``), and lengths (n, 7)
-        LENGTHS [m]. NaN where a point is missing, or where the two ends of a bone are in one place. At a singular
-        posture the angle that cannot be observed is 0.
+        Angles (n, 13) JOINTS [m, m, rad..., m], arms in canonical form (``human.model``), and lengths (n, 7) LENGTHS
+        [m]. NaN if a point is missing or the two ends of a bone coincide. At a singular posture the angle that cannot
+        be observed is 0.
     """
     rows = np.full((len(points_m), ROWS), np.nan)
     _inverse_rows(np.ascontiguousarray(points_m, dtype=np.float64), rows)
@@ -77,15 +77,15 @@ def inverse(points_m: Floats) -> tuple[Floats, Floats]:
 
 
 def measure(frames: CameraFrames, T_world_camera: Floats, settings: Fusion) -> Measurements:
-    """Joint angles and limb lengths of camera frames, by closed-form inverse kinematics.
+    """Computes joint angles and limb lengths of camera frames, by closed-form inverse kinematics.
 
     Args:
         frames: Skeletons in their camera's frame, one body each.
         T_world_camera: (c, 4, 4) pose of each camera in the world.
         settings: Noise of a skeleton point, the same in all directions: (``point_std_m`` + ``point_std_per_m`` * range)
             / confidence, which is carried through the inverse kinematics by its Jacobian, diagonal only,
-            Eq. (47). Towards a singular posture it grows without bound (a straight elbow says nothing of alpha_3,
-            an arm pointing forward nothing of alpha_1, a vertical shoulder line nothing of heading).
+            Eq. (47). Towards a singular posture it grows without bound (alpha_3 is unobservable for a straight elbow,
+            alpha_1 for an arm pointing forward, heading for a vertical shoulder line).
     """
     n = len(frames)
     points = np.empty((n, len(POINTS), 3))
@@ -143,7 +143,7 @@ def _measure_rows(
 
 @njit(cache=True)
 def _variances_row(points: Floats, point_variance: Floats, variances: Floats) -> None:
-    """Eq. (47), variance of every row by the Jacobian's squares; second order: it outgrows what a circle can tell."""
+    """Eq. (47), variance of every row from the squared Jacobian; to second order it exceeds the range of an angle."""
     J = inverse_jacobian(points)
     for row in range(ROWS):
         variance = 0.0
@@ -151,7 +151,7 @@ def _variances_row(points: Floats, point_variance: Floats, variances: Floats) ->
             squares = J[row, k, 0] ** 2 + J[row, k, 1] ** 2 + J[row, k, 2] ** 2
             if squares > 0.0:
                 variance += squares * point_variance[k]
-            elif np.isnan(squares):  # a step more and there is no bone
+            elif np.isnan(squares):  # with one more step the bone vanishes
                 variance = _UNOBSERVED
         if 2 <= row < HEIGHT:
             variance *= 1.0 + 4.0 * variance
@@ -162,7 +162,7 @@ def _variances_row(points: Floats, point_variance: Floats, variances: Floats) ->
 def inverse_jacobian(points: Floats) -> Floats:
     """(20, 20, 3) derivative of the joints and lengths by the points (20, 3), central differences.
 
-    [rad/m, m/m]. In the arms' direct names, whose derivatives are those of any other name up to sign.
+    [rad/m, m/m]. The arms are in direct form; the derivatives of the other form differ only in sign.
     """
     J = np.zeros((ROWS, len(POINTS), 3))
     moved, above, below = points.copy(), np.empty(ROWS), np.empty(ROWS)
@@ -190,7 +190,7 @@ def _name_arms(rows: Floats) -> None:
 
 @njit(cache=True)
 def _direct_row(points: Floats, rows: Floats) -> None:
-    """The joints and lengths of one skeleton (20, 3), arms by the name with |alpha_2| <= 90 degrees."""
+    """Computes the joints and lengths of one skeleton (20, 3), arms in the form with |alpha_2| <= 90 degrees."""
     pelvis, right, left = _point(points, PELVIS), _point(points, _SHOULDER_R), _point(points, _SHOULDER_L)
     neck, line = _middle(right, left), _from_to(right, left)
     (_, elbow_r, wrist_r), (_, elbow_l, wrist_l) = ARM_POINTS
@@ -218,13 +218,13 @@ def _direct_row(points: Floats, rows: Floats) -> None:
         upper, fore = _bone(edge(points, shoulder, elbow)), _bone(edge(points, elbow, wrist))
         first = RIGHT_ARM + 4 * arm
         _arm_row(_in_torso(R, s, upper), _in_torso(R, s, fore), rows[first : first + 4])
-        # free of the torso's frame, so it holds where heading does not
+        # independent of the torso's frame, so it holds also without a heading
         rows[first + 3] = _elbow_angle((-upper[0], -upper[1], -upper[2]), fore)
 
 
 @njit(cache=True)
 def _bone(ends: Vector) -> Vector:
-    """The same, or NaN where both ends are in one place: that bone cannot be observed."""
+    """Returns the bone, or NaN if both ends coincide: that bone cannot be observed."""
     if norm(ends) < LEAST_BONE_M:
         return np.nan, np.nan, np.nan
     return ends
@@ -232,7 +232,7 @@ def _bone(ends: Vector) -> Vector:
 
 @njit(cache=True)
 def _in_torso(R: Floats, s: float, bone: Vector) -> Vector:
-    """A bone in the torso's frame, mirrored in y for a right arm (s = -1)."""
+    """Transforms a bone into the torso's frame, mirrored in y for a right arm (s = -1)."""
     x, y, z = bone
     return (
         R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
@@ -243,7 +243,7 @@ def _in_torso(R: Floats, s: float, bone: Vector) -> Vector:
 
 @njit(cache=True)
 def _arm_row(upper: Vector, fore: Vector, arm: Floats) -> None:
-    """alpha_1 to alpha_3 of a left arm whose bones point along upper and fore in the torso's frame."""
+    """Computes alpha_1 to alpha_3 of a left arm whose bones point along upper and fore in the torso's frame."""
     across = np.hypot(upper[1], upper[2])
     arm[0] = np.arctan2(upper[1], -upper[2])
     arm[1] = np.arctan2(upper[0], across)
@@ -254,7 +254,7 @@ def _arm_row(upper: Vector, fore: Vector, arm: Floats) -> None:
 
 @njit(cache=True)
 def _elbow_angle(a: Vector, b: Vector) -> float:
-    """The angle between both bones seen from the elbow, pi when straight; unlike an arc cosine exact near both ends."""
+    """Computes the angle at the elbow, pi when straight; unlike an arc cosine, it is exact near both ends."""
     return np.arctan2(norm(cross(a, b)), dot(a, b))
 
 

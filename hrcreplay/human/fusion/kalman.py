@@ -12,7 +12,7 @@ import numpy as np
 from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
 
-#: Before every tick: what has not happened yet [ns].
+#: Time before every tick, for events that have not occurred yet [ns].
 NEVER_NS = -(2**62)
 
 
@@ -20,7 +20,7 @@ class StateEstimate(NamedTuple):
     """StateEstimate of the person: joints, lengths, and how well they fit their frames."""
 
     tick_ns: Ints  #: (1,) the last tick
-    started: Bools  #: (1,) whether there is a person
+    started: Bools  #: (1,) True if there is a person
     mean: Floats  #: (13, 4) p, v, a, j
     cov: Floats  #: (13, 4, 4)
     lengths: Floats  #: (7,)
@@ -60,11 +60,11 @@ class ModelResidual(NamedTuple):
     samples: Ints  #: (7,) residuals so far
     sampled_ns: Ints  #: (7,) tick of the last
     residual: Floats  #: (7,) their quantile [m]
-    peak: Floats  #: (7,) largest of the last few [m]
-    peak_ns: Ints  #: (7,) tick of it
-    offset: Floats  #: (20, 3) running mean of where points are beside the model, in the torso's frame [m]
-    offset_weight: Floats  #: (20,) of all that it is the mean of
-    offset_ns: Ints  #: (20,) tick of the last
+    peak: Floats  #: (7,) maximum of the recent residuals [m]
+    peak_ns: Ints  #: (7,) tick of this maximum
+    offset: Floats  #: (20, 3) running mean of the points' offsets from the model, in the torso's frame [m]
+    offset_weight: Floats  #: (20,) sum of the weights in that mean
+    offset_ns: Ints  #: (20,) tick of the last sample
     carried: Floats  #: (20, 3) hands from the wrist, legs from below the pelvis, world [m]
     carried_ns: Ints  #: (20,) when a camera took that
     foot: Floats  #: (2, 3) right and left foot from its ankle, as last shown, in the body's heading [m]
@@ -112,7 +112,7 @@ class Rules(NamedTuple):
     spread_least: float
     spread_most: float
     rest_s: float
-    rest_std: Floats  #: (13, 3) of v, a, j of a joint nobody has seen for long
+    rest_std: Floats  #: (13, 3) standard deviations of v, a, j of a joint unseen for a long time
     p_min: Floats
     p_max: Floats
     v_min: Floats
@@ -123,7 +123,7 @@ class Rules(NamedTuple):
 
 
 class Track(NamedTuple):
-    """Output of the ticks; rows before the start stay as they are."""
+    """Output of the ticks; rows before the start are not changed."""
 
     motion: Floats  #: (6, n, 13) p, v, a, j, and the reported deviations of p and v
     lengths: Floats  #: (2, n, 7) and their deviations
@@ -144,13 +144,13 @@ class Track(NamedTuple):
 
 @njit(cache=True)
 def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
-    """Age of the frame held for a camera [s]; 0 where delays are ignored.
+    """Age of the stored frame of a camera [s]; 0 if delays are ignored.
 
     Args:
-        filter_: Holds the frame.
+        filter_: Contains the frame.
         c: Index of the camera.
         now: The tick [ns].
-        rules: Whether delays are compensated, and the largest [s].
+        rules: Compensation of delays, and the maximum delay [s].
     """
     if not rules.compensate:
         return 0.0
@@ -161,9 +161,9 @@ def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
 def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> None:
     """Eq. (42), (48), (49) over dt seconds, mean (4,) and P (4, 4) in place.
 
-    x, y and heading are joints like the others, with world velocities of their own: the linear model of Eq. (31).
-    F is upper triangular, so that each row is done before the rows it needs change. With a damping below 1 the
-    derivatives also forget: towards rest, give or take ``rest_std`` (3,).
+    x, y and heading are joints like the others, with independent world velocities: the linear model of Eq. (31). F is
+    upper triangular, so each row is computed before the rows it needs change. With a damping below 1 the derivatives
+    also decay towards rest, with standard deviations ``rest_std`` (3,).
 
     Args:
         mean: (4,) p, v, a, j [m or rad, and these per s, s^2, s^3].
@@ -200,7 +200,7 @@ def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> floa
 def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
     """Eq. (52)-(57) for one joint and one scalar row; returns the normalised innovation, over its standard deviation.
 
-    A row whose innovation has no variance, or none that a number can hold, tells nothing: it changes nothing.
+    A row whose innovation has zero variance, or one that overflows, is ignored.
 
     Args:
         mean: (4,) p, v, a, j [m or rad, and these per s, s^2, s^3], changed in place.
@@ -225,7 +225,7 @@ def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
 
 @njit(cache=True)
 def process_variance(a: int, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> float:
-    """Entry a of the diagonal of G of Eq. (44), corrected; with a damping, also of what is forgotten.
+    """Entry a of the diagonal of G of Eq. (44), corrected; with a damping, also the variance of the decay.
 
     Args:
         a: 0, 1, 2, 3 for p, v, a, j.
@@ -241,7 +241,7 @@ def process_variance(a: int, dt: float, damping: float, sigma: Floats, rest_std:
 
 @njit(cache=True)
 def extrapolate_back(mean: Floats, d: float) -> Floats:
-    """Joint positions (13,) d seconds before, by the Taylor polynomial of Eq. (43)."""
+    """Extrapolates joint positions (13,) d seconds back, by the Taylor polynomial of Eq. (43)."""
     return mean[:, 0] - d * mean[:, 1] + d**2 / 2.0 * mean[:, 2] - d**3 / 6.0 * mean[:, 3]
 
 

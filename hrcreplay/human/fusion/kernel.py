@@ -1,6 +1,6 @@
 """One tick of Alg. 3 on plain arrays, with the bounds on the fused state, Eq. (62)-(65).
 
-The filter of Eq. (42)-(57) is 13 filters of four states, one a joint, and 7 of one state, one a length.
+The filter of Eq. (42)-(57) consists of 13 filters of four states, one per joint, and 7 of one state, one per length.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row,
 from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, Floats, Ints
 
-#: A name of an arm is kept until the other is better by this [rad].
+#: Hysteresis between the two forms of an arm's angles [rad].
 _NAME_MARGIN = np.radians(20.0)
 
 
 @njit(cache=True)
 def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Track) -> None:
-    """Alg. 3 over the ticks, changing the filter in place. Frames must have arrived by the last tick.
+    """Runs Alg. 3 over the ticks, changing the filter in place. Frames must have arrived by the last tick.
 
     Without a valid row the a-priori estimate stays as it is, Eq. (50), (51).
 
@@ -32,7 +32,7 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
         frames: In order of arrival.
         filter_: The filter before the first tick; after the call, that after the last.
         rules: Settings and limits.
-        track: Room for n ticks; receives the states and the counts of events.
+        track: Arrays for n ticks; receive the states and the counts of events.
     """
     damping = np.ones(DOF)
     seen = 0
@@ -62,9 +62,9 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
 
 @njit(cache=True)
 def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
-    """The a-priori estimate, Eq. (48), (49).
+    """Computes the a-priori estimate, Eq. (48), (49).
 
-    A joint unseen for longer than ``coast_ns`` comes to rest: no jerk can be followed far.
+    A joint unseen for longer than ``coast_ns`` decelerates to rest, as a polynomial with jerk diverges.
     """
     dt = (now - filter_.estimate.tick_ns[0]) * 1e-9
     for j in range(DOF):
@@ -74,7 +74,7 @@ def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
 
 @njit(cache=True)
 def _collect(frames: Frames, seen: int, now: int, filter_: Filter, track: Track) -> int:
-    """Holds the newest frame of each camera that has arrived; returns how many frames have been seen."""
+    """Stores the newest arrived frame of each camera; returns the number of frames processed."""
     while seen < len(frames.arrival_ns) and frames.arrival_ns[seen] <= now:
         c = frames.camera[seen]
         waiting = filter_.gate.uses[c] == 0
@@ -94,7 +94,7 @@ def _collect(frames: Frames, seen: int, now: int, filter_: Filter, track: Track)
 
 @njit(cache=True)
 def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bool:
-    """Eq. (52)-(57) with the valid rows of one camera's frame, row after row; whether there was one.
+    """Applies Eq. (52)-(57) with the valid rows of one camera's frame, row by row; returns True if there was one.
 
     One scalar row at a time is exact because R of Eq. (47) is diagonal. R of a frame used for the n-th time is
     n sigma_z^2 (4.1.1). A row of H of Eq. (45), (46) is ``h``: the identity's where d = 0, else Eq. (43) backwards.
@@ -172,7 +172,7 @@ def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> N
 
 @njit(cache=True)
 def _rename(filter_: Filter) -> None:
-    """Keeps each arm near its canonical name. The same posture: alpha_2 is mirrored, P is what it was."""
+    """Keeps the angles of each arm near the canonical form. The posture is unchanged: alpha_2 is mirrored, P stays."""
     for first in (RIGHT_ARM, LEFT_ARM):
         arm = filter_.estimate.mean[first : first + 4, 0].copy()
         if canonical_arm(arm, _NAME_MARGIN):
@@ -211,7 +211,7 @@ def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
     its acceleration not over its velocity bound; without a dt yet (0) only the plain bounds hold.
 
     Returns:
-        Whether anything had to give.
+        True if anything was changed.
     """
     low, high = np.empty(DOF), np.empty(DOF)
     before = mean[:, :3].copy()
@@ -232,7 +232,7 @@ def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
 def _clip(
     rate: Floats, value: Floats, low: Floats, high: Floats, rate_low: Floats, rate_high: Floats, dt: float
 ) -> Floats:
-    """Eq. (63)-(65): the rates (13,) within their bounds and those that keep the value within its own for dt."""
+    """Eq. (63)-(65): the rates (13,) within their bounds and within those that keep the value in its bounds for dt."""
     clipped = np.empty(DOF)
     for j in range(DOF):
         least, most = rate_low[j], rate_high[j]
@@ -245,7 +245,7 @@ def _clip(
 
 @njit(cache=True)
 def _into_body(world: Floats, theta: float) -> Floats:
-    """Eq. (33): the first two of (13,) forward and to the left."""
+    """Eq. (33): returns the first two of (13,) as forward and to the left."""
     body = world.copy()
     c, s = np.cos(theta), np.sin(theta)
     body[0], body[1] = c * world[0] + s * world[1], -s * world[0] + c * world[1]

@@ -1,16 +1,17 @@
 """Distance of the body's points from the model and ``body_points``, and time since a camera saw them.
 
-A sample of a limb's residual is the largest distance of its measured points from those, of the predicted model at the
-frame's capture time, where the delay is compensated. It is taken before the frame is used, so it also holds how far the
-filter lags who sets off, from frames that show the limb and all that carries it with enough confidence and without an
-outlier. That of the legs is the largest distance from the line between the floor and the fused pelvis of the
-hips, knees, ankles and feet that the frame shows, if it shows the pelvis and at least one point below the hips. The
-distance from a convex set is convex, so a bone between two points is no further off than the worse of them.
+A sample of a limb's residual is the maximum distance of its measured points from the predicted points, at the frame's
+capture time if the delay is compensated. It is taken before the frame is used, so it includes the lag of the filter
+behind a person who starts to move. It is taken from frames that show the limb and all limbs that carry it, with enough
+confidence and without an outlier. The sample of the legs is the maximum distance of the visible hips, knees, ankles and
+feet from the line between the floor and the fused pelvis, if the frame shows the pelvis and at least one point below
+the hips. The distance from a convex set is convex, so a bone between two points is never further off than the worse of
+them.
 
-The running quantile is that of all samples so far, each with the weight exp(-age / memory); a limb out of sight does
-not age for longer than it takes to be lost, so that what is known of a person outlives an occlusion. Samples are kept
-by the millimetre and rounded up. A larger one counts for ``residual_hold_s``, or until one larger still: a movement of
-its kind has not been seen before.
+The running quantile is that of all samples so far, each with the weight exp(-age / memory); the samples of an unseen
+limb stop ageing when the limb is lost, so the quantile survives an occlusion. Samples are rounded up to a millimetre. A
+sample above the quantile is used for ``residual_hold_s``, or until a larger one, as no such movement has been seen
+before.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
 
 _BIN_M = 0.001
-#: Bins of a limb's samples; the last takes all that are larger, far beyond what passes for the same person's arm.
+#: Bins of a limb's samples; the last one contains all larger samples, far beyond those of the same person's arm.
 BINS = round(REACH_M / _BIN_M)
-#: Fewer samples say nothing of a quantile.
+#: Minimum number of samples for a quantile.
 LEAST = 20
 
 (_SHOULDER_R, _ELBOW_R, _WRIST_R), (_SHOULDER_L, _ELBOW_L, _WRIST_L) = ARM_POINTS
-#: Points of each of LIMBS, the first repeated where there are fewer. The neck, the middle of the shoulders, is never
-#: further off than the worse of them.
+#: Points of each of LIMBS, the first repeated where there are fewer. The neck is the middle of the shoulders, so its
+#: distance is at most that of the worse shoulder.
 _ENDS = np.array(
     [
         [HEAD, HEAD, HEAD],
@@ -52,11 +53,11 @@ _BELOW = np.array([POINTS.index(f"{part}_{side}") for part in ("knee", "ankle", 
 
 @njit(cache=True)
 def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
-    """Takes the samples of the cameras' new frames in, and the quantiles of those limbs anew.
+    """Adds the samples of the cameras' new frames and recomputes the quantiles of those limbs.
 
     Args:
         filter_: After the tick's prediction, before its update; the residuals' samples and quantiles are changed.
-        fresh: (c,) whether the frame held for a camera is new.
+        fresh: (c,) True if the stored frame of a camera is new.
         now: The tick [ns].
         rules: Settings of the filter.
     """
@@ -90,9 +91,9 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
 
 @njit(cache=True)
 def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> None:
-    """Writes how far a camera shows each limb from the model (20, 3) [m], by points that the gates refuse.
+    """Writes the distance of each limb's rejected points in a camera's frame from the model (20, 3) [m].
 
-    Counts what it, or another camera, has shown there before, and no camera where the model has it.
+    A point counts if this or another camera has shown it there before, and no camera shows it near the model.
     """
     filter_.gate.apart[c] = 0.0
     for limb in range(len(_ENDS)):
@@ -110,16 +111,16 @@ def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> N
 
 @njit(cache=True)
 def write_residual(filter_: Filter, now: int, rules: Rules, residual: Floats) -> None:
-    """Writes the residual of each limb of BODY that counts at a tick, (7,) [m]; NaN until known.
+    """Writes the residual of each limb of BODY used at a tick, (7,) [m]; NaN until known.
 
-    It holds what cameras show that the gates still refuse, so that volumes hold both, what the filter has and what the
-    cameras saw.
+    It includes points that the gates still reject, so that volumes contain both the filter's estimate and the camera's
+    points.
 
     Args:
         filter_: After ``observe``.
         now: The tick [ns].
         rules: Settings of the filter.
-        residual: Receives the quantiles, or what is farther.
+        residual: Receives the quantiles, or larger distances of rejected points.
     """
     residual[:] = filter_.model.residual
     for limb in range(len(residual)):
@@ -134,7 +135,7 @@ def write_residual(filter_: Filter, now: int, rules: Rules, residual: Floats) ->
 
 @njit(cache=True)
 def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rules) -> float:
-    """Largest distance of some points of the legs from the line below the pelvis (3,) [m]; -1 where none is shown."""
+    """Returns the maximum distance of leg points from the line below the pelvis (3,) [m]; -1 if none is seen."""
     farthest = -1.0
     for k in points:
         point = filter_.gate.points[c, k]
@@ -147,7 +148,7 @@ def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rule
 
 @njit(cache=True)
 def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
-    """Return whether no joint that carries the limb is lost or has restarted lately: the filter must find it first."""
+    """Returns True if no joint that carries the limb is lost or has restarted recently."""
     root = 2 if limb == _LEGS else 4
     newest, last = filter_.estimate.acquired_ns[:root].max(), filter_.estimate.row_ns[:root].min()
     newest, last = max(newest, filter_.estimate.acquired_ns[HEIGHT]), min(last, filter_.estimate.row_ns[HEIGHT])
@@ -161,10 +162,10 @@ def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
 
 @njit(cache=True)
 def write_unseen_times(filter_: Filter, seconds: Floats) -> None:
-    """Writes how long ago the last valid row of each limb's own joints came, (7,) [s]; of the legs, knees and ankles.
+    """Writes the time since the last valid row of each limb's own joints, (7,) [s]; for the legs, knees and ankles.
 
-    Head and thorax have been seen when all four joints of the torso have. Of the two joints of a part of an arm one is
-    enough: the other goes blind where it does not matter (alpha_3 when the elbow is straight).
+    Head and thorax count as seen if all four joints of the torso are seen. For the two joints of a part of an arm one
+    is enough: the other may be unobservable where it has no effect (alpha_3 with a straight elbow).
     """
     now = filter_.estimate.tick_ns[0]
     seconds[:2] = _since(now, filter_.estimate.row_ns[:4].min())
@@ -180,7 +181,7 @@ def _since(now: int, then: int) -> float:
 
 @njit(cache=True)
 def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) -> None:
-    """Lets the earlier samples of a limb age, and adds one of weight 1; one that is no distance is none."""
+    """Reduces the weights of a limb's earlier samples and adds one of weight 1; ignores a sample that is not finite."""
     if not sample >= 0.0:
         return
     age = min(now - filter_.model.sampled_ns[limb], rules.memory_ns) * 1e-9
@@ -196,7 +197,7 @@ def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) ->
 
 @njit(cache=True)
 def _exceeded_by(weights: Floats, larger: float) -> float:
-    """The least upper end of a bin with samples of at most this weight above it [m]."""
+    """Returns the smallest upper end of a bin such that the samples above it have at most this weight [m]."""
     above = 0.0
     bin_ = BINS
     while bin_ > 1 and above + weights[bin_ - 1] <= larger:

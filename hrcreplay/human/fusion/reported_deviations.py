@@ -1,16 +1,16 @@
 """Scales the reported variances by the filter's normalised innovations and their autocorrelation.
 
-P of Eq. (49) follows from the sigmas alone, which must do for the liveliest motion and the worst camera. To multiply R
-and G by one number leaves every gain, and so the estimate, as it is, and multiplies P: the variance of unit weight of
-the calculus of observations. Each joint has its own: the highest normalised innovation squared (innovation squared over
-its variance), which decays exponentially. At rest it is small; when a joint sets off, the first innovation raises it at
-once, and it outlasts the motion.
+P of Eq. (49) depends only on the sigmas, which must suit the fastest motion and the worst camera. Multiplying R and G
+by one factor multiplies P and leaves every gain, and so the estimate, unchanged: the variance of unit weight in
+adjustment theory. Each joint has its own factor: the maximum normalised innovation squared (innovation squared over its
+variance), which decays exponentially. At rest it is small; when a joint starts to move, the first innovation raises it
+at once, and it stays high beyond the end of the motion.
 
 The innovations of a filter whose model is right are white (Mehra, IEEE Trans. Automatic Control 15(2), 1970). Where the
 filter lags, a camera is calibrated wrongly or its noise is coloured, successive innovations by the same camera are
-correlated, and the estimate is further off than their size tells: white noise is averaged out, coloured noise is not.
-So the variances also grow exponentially with the autocorrelation at lag 1. By how much is fitted on recordings
-(docs/deviations.md).
+correlated, and the error of the estimate is larger than their size indicates: white noise is averaged out, coloured
+noise is not. So the variances also grow exponentially with the autocorrelation at lag 1. The growth rate is fitted on
+recordings (docs/deviations.md).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 from hrcreplay.human.fusion.kalman import Filter, Rules
 from hrcreplay.kernels import njit
 
-#: Highest square before the first innovation: the reported variances are then about the filter's own.
+#: Maximum square before the first innovation; the reported variances are then about those of the filter.
 FIRST_SPREAD = 4.0
-#: An innovation this long ago counts 1/e in the autocorrelation [s].
+#: Age at which an innovation has weight 1/e in the autocorrelation [s].
 _MEMORY_S = 2.0
-#: Of JOINTS, the row of FITTED: both arms share theirs.
+#: Row of FITTED for each of JOINTS; both arms share their rows.
 KIND = np.array([0, 0, 1, 2, 3, 4, 5, 6, 3, 4, 5, 6, 7])
 #: For the variances of p and of v: logarithm of the factor without autocorrelation, and its slope over the
 #: autocorrelation. Fitted by ``python -m tests.tools.deviations``.
@@ -51,13 +51,13 @@ def reset(filter_: Filter, j: int) -> None:
 
 @njit(cache=True)
 def add_innovation(filter_: Filter, c: int, j: int, innovation: float, now: int, rules: Rules) -> None:
-    """Adds a normalised innovation of joint j; ``row_ns`` is still the tick of the one before.
+    """Adds a normalised innovation of joint j; ``row_ns`` is still the tick of the previous one.
 
     Args:
         filter_: Sums, last innovation and spread of the joint are changed.
         c: Index of the camera.
         j: Index into JOINTS.
-        innovation: Over its standard deviation.
+        innovation: Innovation over its standard deviation.
         now: The tick [ns].
         rules: Memory of the spread [s].
     """
@@ -79,7 +79,7 @@ def autocorrelation(filter_: Filter, j: int) -> float:
 
 @njit(cache=True)
 def variance_factor(filter_: Filter, j: int, a: int, rules: Rules) -> float:
-    """By which the variance of a joint is scaled; at least 1 while it coasts, for then no innovation tells of it.
+    """Factor on the variance of a joint; at least 1 while it coasts, as there are then no innovations.
 
     Args:
         filter_: After the tick.

@@ -1,10 +1,10 @@
-"""Time since nobody can have been in an area that the cameras watch.
+"""Time since an area that the cameras watch was certainly empty.
 
-The area is vacant at an instant to which all cameras have given frames, for long enough and without a gap, when every
-body that one of them showed inside was shown outside afterwards. A body that was lost inside may still be there, but
-not for ever: trackers lose people, and they invent some. From the instant on nobody can be further inside than they
-walked since. A body counts wherever a camera shows one of its points, whether it is the person that the filter follows
-or somebody else; a body without any point may be anywhere.
+The area is vacant at an instant if all cameras have sent frames up to it, for long enough and without a gap, and every
+body seen inside was later seen outside. A body that was lost inside may still be there, but only for a limited time:
+trackers lose people and report false ones. After the instant, no person can be deeper inside than people walk in the
+time since. A body counts at every place where a camera shows one of its points, for the person that the filter follows
+and for others; a body without points may be anywhere.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, HumanStates
 
 @dataclass(frozen=True)
 class WatchedArea:
-    """Area that the cameras see together: one of them shows everybody who has any point of the body in it."""
+    """Area that the cameras see together: every person with a point of the body in it is seen by one of them."""
 
-    polygon: ConvexPolygon  #: on the floor; the area has any height
-    margin_m: float  #: how far inside the border somebody may be who is not shown yet [m]
-    clear_s: float  #: how long a body that was lost inside is believed to be there [s]
-    gap_s: float  #: a camera whose frames are further apart did not watch between them [s]
-    speed_m_per_s: float  #: at which people walk in, ISO 13855
+    polygon: ConvexPolygon  #: on the floor; the height is unlimited
+    margin_m: float  #: maximum depth inside the border of a person not seen yet [m]
+    clear_s: float  #: time for which a body lost inside is assumed to be there [s]
+    gap_s: float  #: maximum time between two frames of a camera without a gap [s]
+    speed_m_per_s: float  #: speed of people who walk in, ISO 13855
 
     def reached_m(self, since_s: float | Floats) -> float | Floats:
-        """Depth inside the border that somebody outside ``since_s`` [s] ago can have reached; inf for inf [m]."""
+        """Depth inside the border that a person outside ``since_s`` [s] ago can have reached; inf for inf [m]."""
         return self.margin_m + self.speed_m_per_s * since_s
 
 
@@ -39,39 +39,39 @@ class Sighting(NamedTuple):
 
     capture_ns: int
     inside: bool
-    other: bool  #: whether it was not the person
+    other: bool  #: True: not the person
 
 
 class VacancyState(NamedTuple):
     """State between two tables of frames; instants are captures [ns]."""
 
     newest_ns: tuple[int, ...]  #: camera -> its newest frame; -1 before the first
-    begin_ns: tuple[int, ...]  #: camera -> since when its frames have come without a gap
-    bodies: tuple[tuple[tuple[int, int], Sighting], ...]  #: camera and body id -> its last sighting, while it matters
-    vacant_ns: tuple[int, int]  #: when the area was last without anybody, and without others; -1 before the first time
+    begin_ns: tuple[int, ...]  #: camera -> start of its frames without a gap
+    bodies: tuple[tuple[tuple[int, int], Sighting], ...]  #: camera and body id -> its last sighting, while relevant
+    vacant_ns: tuple[int, int]  #: when the area was last empty, and last without other people; -1 before the first time
 
 
 def start(cameras: int) -> VacancyState:
-    """Before the first frame of so many cameras."""
+    """Makes the state before the first frame of ``cameras`` cameras."""
     return VacancyState((-1,) * cameras, (-1,) * cameras, (), (-1, -1))
 
 
 def watch(
     state: VacancyState, states: HumanStates, frames: CameraFrames, mine: Bools, area: WatchedArea
 ) -> tuple[VacancyState, HumanStates, Counter[str]]:
-    """Adds to each tick since when nobody, and nobody but the person, can be in the area.
+    """Adds to each tick the time since the area was certainly empty, and since it was so except for the person.
 
     Args:
-        state: From the table before; ``start`` at the beginning.
+        state: From the previous table; ``start`` at the beginning.
         states: The fused person at the ticks, increasing.
-        frames: All bodies that arrived since the tick before the first, up to the last, in order of arrival, and the
-            frames that show nobody; points in the world [m].
-        mine: (n,) which of them are the person.
-        area: What is watched.
+        frames: All bodies that arrived after the tick before the first and up to the last, in order of arrival, and the
+            frames without a body; points in the world [m].
+        mine: (n,) True for the person.
+        area: The watched area.
 
     Returns:
         The new state; ``states`` with ``nobody_s`` and ``nobody_else_s``; and the count ``watched_frames_refuting``,
-        of frames that show somebody further inside than anybody could have walked since the area was vacant.
+        of frames that show a person deeper inside than people can walk since the area was vacant.
     """
     depth_m = _depths(frames, area)
     counts: Counter[str] = Counter()
@@ -92,7 +92,7 @@ def watch(
 
 
 def _depths(frames: CameraFrames, area: WatchedArea) -> Floats:
-    """(n,) of each body's deepest point [m]; -inf for a frame of nobody, inf for a body without a point."""
+    """(n,) depth of each body's deepest point [m]; -inf for a frame without a body, inf for a body without a point."""
     shown = np.isfinite(frames.points_m).all(axis=2) & (frames.confidence > 0.0)
     depth_m = np.where(shown, area.polygon.depth_m(frames.points_m), -np.inf).max(axis=1, initial=-np.inf)
     depth_m = np.where(shown.any(axis=1), depth_m, np.inf)
@@ -100,13 +100,13 @@ def _depths(frames: CameraFrames, area: WatchedArea) -> Floats:
 
 
 def _refutes(vacant_ns: int, capture_ns: int, depth_m: float, area: WatchedArea) -> bool:
-    """Return whether a body is where nobody can have come since the area was vacant."""
+    """Returns True if a body is deeper inside than people can walk since the area was vacant."""
     since_s = (capture_ns - vacant_ns) / 1e9
     return vacant_ns >= 0 and since_s >= 0.0 and np.isfinite(depth_m) and bool(depth_m > area.reached_m(since_s))
 
 
 def _met(state: VacancyState, who: tuple[int, int], seen: Sighting, gap_ns: int) -> VacancyState:
-    """The state after a body, or a frame without one."""
+    """Returns the state after a body, or after a frame without one."""
     newest, begin, bodies = list(state.newest_ns), list(state.begin_ns), dict(state.bodies)
     camera, body = who
     if newest[camera] < 0 or seen.capture_ns - newest[camera] > gap_ns:
@@ -118,7 +118,7 @@ def _met(state: VacancyState, who: tuple[int, int], seen: Sighting, gap_ns: int)
 
 
 def _decide_vacancy(state: VacancyState, clear_ns: int) -> VacancyState:
-    """The state after all frames of a tick: whether the area is vacant at the newest capture that all cameras have."""
+    """Updates the state after all frames of a tick: vacancy at the newest capture that all cameras have reached."""
     watched_ns = min(state.newest_ns)
     if watched_ns < 0:
         return state

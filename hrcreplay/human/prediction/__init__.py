@@ -1,1 +1,1 @@
-"""Prediction of the person within a horizon: reachable sets of the joints, and the volumes that the limbs sweep."""
+"""Prediction of the person within a horizon: reachable sets of the joints, and swept volumes of the limbs."""

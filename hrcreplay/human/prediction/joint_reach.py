@@ -1,8 +1,9 @@
-"""Reach of one joint: bang-bang motions between bounds, with what stops do to them.
+"""Reach of one joint: bang-bang motions between bounds, including the effect of joint stops.
 
-A joint obeys v_min <= v <= v_max and a_min <= a <= a_max. A state beyond a velocity bound comes back as fast as the
-acceleration bounds allow. So with v_hi the largest initial velocity, no velocity is ever above the profile that starts
-there and goes to v_max at a_max (from above: at a_min), and no displacement above that profile's integral.
+A joint obeys v_min <= v <= v_max and a_min <= a <= a_max. A state beyond a velocity bound returns as fast as the
+acceleration bounds allow. Let v_hi be the largest initial velocity. Then the velocity is never above the profile that
+starts at v_hi and approaches v_max with a_max (from above: with a_min), and the displacement is never above that
+profile's integral.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ from hrcreplay.human.model import ALPHA_2, ALPHA_3, LEFT_ARM, RIGHT_ARM, alpha_2
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 
-#: Largest and smallest value of a joint's stops over a reachable box: (least, inner least, inner most, most).
+#: Range of a joint's lower and upper stops over a reachable box: (lowest lower, highest lower, lowest upper, highest
+#: upper).
 Stops = tuple[float, float, float, float]
 
 
 @njit(cache=True)
 def saturation_s(v: float, top: float, gain: float, brake: float) -> float:
-    """Time at which the fastest velocity profile reaches its bound [s]; inf where it never does.
+    """Time at which the fastest velocity profile reaches its bound [s]; inf if it never does.
 
     Args:
         v: Largest initial velocity [m/s or rad/s].
@@ -51,8 +53,8 @@ def fastest(v: float, top: float, gain: float, brake: float, t: float) -> float:
 def rise(v: float, top: float, gain: float, brake: float, horizon: float) -> float:
     """The largest displacement at any time in [0, horizon] of motions that start with at most v.
 
-    The fastest profile's integral. Rising, the profile makes a convex integral: its largest value is at an end.
-    Falling, the integral may peak before: where the profile passes zero, if it does.
+    It is the integral of the fastest profile. For a rising profile the integral is convex and its maximum is at an end.
+    For a falling profile the maximum may be at the zero of the profile.
 
     Args:
         v: Largest initial velocity.
@@ -73,21 +75,21 @@ def rise(v: float, top: float, gain: float, brake: float, horizon: float) -> flo
 
 @njit(cache=True)
 def braking(v: float, brake: float, horizon: float) -> float:
-    """Distance that a joint travels while it brakes as hard as it can."""
+    """Distance that a joint travels during maximum braking."""
     return rise(v, 0.0, 0.0, brake, horizon) if v > 0.0 else 0.0
 
 
 @njit(cache=True)
 def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> Stops:
-    """Range of the stops of joint j while the joints that they depend on are in [low, high].
+    """Computes the range of the stops of joint j while the joints that they depend on are in [low, high].
 
-    A stop outside of all of them holds always; one inside of all may be where the joint is stopped. The coupled ones,
-    Eq. (34b), (34c), are monotonic or bilinear: their extremes are at the corners.
+    The outermost stop is never exceeded; the joint may be stopped anywhere in the range. The coupled stops, Eq. (34b),
+    (34c), are monotonic or bilinear: their extremes are at the corners.
 
     Args:
         j: Index into JOINTS.
         bounds: (6, 13) of ``human.model.bounds_of``.
-        coupled: Whether Eq. (34b), (34c) hold.
+        coupled: True: Eq. (34b), (34c) hold.
         low: (13,) lower ends of the joints' reachable intervals [m, m, rad..., m].
         high: (13,) their upper ends.
     """
@@ -111,23 +113,23 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
 def interval(
     p: tuple[float, float], v: tuple[float, float], speed: Floats, limit: Stops, horizon: float
 ) -> tuple[float, float]:
-    """Reachable interval of a joint between stops at any time in [0, horizon]; replaces Alg. 1 under ``sound``.
+    """Computes the reachable interval of a joint at any time in [0, horizon]; replaces Alg. 1 in ``sound``.
 
-    A stop takes the velocity into it away at once: from there the joint starts again from rest. A state that may be
-    beyond a stop brakes outward and then stays; a stop takes nothing away from what the state itself encloses.
+    At a stop the velocity becomes zero at once, and the joint starts again from rest. A state that may be beyond a stop
+    brakes outward and then stays; a stop never removes a part of the initial state interval.
 
     Args:
         p: Smallest and largest initial position.
         v: Smallest and largest initial velocity.
         speed: (4,) v_min, v_max, a_min, a_max.
-        limit: Where its stops can be.
+        limit: Range of its stops.
         horizon: [s].
     """
     least, inner_least, inner_most, most = limit
     v_min, v_max, a_min, a_max = speed[0], speed[1], speed[2], speed[3]
     up = p[1] + rise(v[1], v_max, a_max, a_min, horizon)
     down = p[0] - rise(-v[0], -v_min, -a_min, -a_max, horizon)
-    for _ in range(2):  # what leaves one stop may meet the other
+    for _ in range(2):  # a motion away from one stop may reach the other
         if down < inner_least:
             up = max(up, inner_least + rise(0.0, v_max, a_max, a_min, horizon))
         if up > inner_most:

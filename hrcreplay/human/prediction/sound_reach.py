@@ -1,19 +1,19 @@
-"""Reachable sets under ``sound``: intervals of all joints, where the pelvis can walk, and the legs below it.
+"""Reachable sets of ``sound``: intervals of all joints, the area that the pelvis can reach, and the legs below it.
 
-They start from a box of likely states, not from the estimate alone, and a joint that has not been seen for long may
-have moved since: so real people stay inside, whose states are never known exactly.
+They start from a box of likely states instead of the estimate, and a joint unseen for a long time may have moved since:
+the true state of a person is never known exactly and must stay inside.
 
 A polygon encloses all displacements, over all headings, velocities and times.
 
 The displacement at time t along u(phi) is the integral of u . Rz(theta) (v, v_perp). At every instant theta, v and
-v_perp are in intervals of their own, so the integral is at most that of
+v_perp are in separate intervals, so the integral is at most that of
 
     F(tau) = max over theta, v, v_perp in their intervals at tau of u . Rz(theta) (v, v_perp).
 
-Time is cut where a velocity profile bends and in between. In a piece theta is taken from its interval at the piece's
-end, which holds all earlier ones; the ends of the velocity intervals are then linear in tau, and F, the largest of
-linear functions of them, is convex: the trapezoid is never below its integral. So is that of max(0, F), which bounds
-what an instant inside the piece can gain.
+Time is divided into pieces, at the corners of the velocity profiles and in between. In a piece theta is taken from its
+interval at the end of the piece, which contains all earlier ones. The ends of the velocity intervals are then linear in
+tau, and F, the maximum of linear functions of them, is convex: the trapezoidal rule is never below its integral. The
+same holds for max(0, F), which bounds the displacement at instants inside the piece.
 
 Neighbouring sides of the polygon meet in its corners. A direction between theirs is a sum of both with weights >= 0,
 so no displacement is further along it than the corner: the hull of the corners encloses them, whatever the sides.
@@ -35,26 +35,26 @@ Range = tuple[float, float]
 
 
 class Likely(NamedTuple):
-    """Possible states of people at the tick, a row each: a box around the estimate, and what is long unseen."""
+    """Possible states of people at the tick, one per row: a box around the estimate, and times without observation."""
 
     p: Floats  #: (n, 13)
     v: Floats  #: (n, 13)
     p_off: Floats  #: (n, 13) largest error of p
     v_off: Floats  #: (n, 13) largest error of v
-    unseen_s: Floats  #: (n, 13) for how long a joint has not been seen, 0 within its memory [s]
+    unseen_s: Floats  #: (n, 13) time since a joint was seen, 0 within its memory [s]
 
 
 class SoundMotionLimits(NamedTuple):
     """Bounds on the motions that ``sound`` encloses."""
 
     bounds: Floats  #: (6, 13) of ``human.model.bounds_of``
-    coupled: bool  #: whether Eq. (34b), (34c) hold
+    coupled: bool  #: True: Eq. (34b), (34c) hold
     horizon: float  #: horizon and latency [s]
-    memory: float  #: how long the filter goes on without a measurement [s]
+    memory: float  #: time for which the filter continues without a measurement [s]
 
 
 def start_states(states: HumanStates, prediction: Prediction, memory_s: float) -> Likely:
-    """The states that ``sound`` starts from; a limb unseen for longer than ``memory_s`` [s] may have moved since."""
+    """Returns the initial states of ``sound``; a limb unseen for longer than ``memory_s`` [s] may have moved since."""
     unseen = np.where(states.unseen_s > memory_s, states.unseen_s, 0.0)[:, SHOWN_BY]
     off = (prediction.sigmas * states.p_std, prediction.sigmas * states.v_std)
     return Likely(*(np.ascontiguousarray(a) for a in (states.p, states.v, *off, unseen)))
@@ -69,11 +69,11 @@ def enclose_row(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high
 
     Args:
         i: Row of ``at``.
-        at: Where people may be.
-        within: What bounds their motions.
-        low: (13,) receives the lower ends [m, m, rad..., m]; NaN where the state is.
+        at: Possible states of the people.
+        within: Bounds on their motions.
+        low: (13,) receives the lower ends [m, m, rad..., m]; NaN if the state is NaN.
         high: (13,) receives the upper ends.
-        corners: (SIDES, 2) receives the corners, world [m]; NaN where the state is.
+        corners: (SIDES, 2) receives the corners, world [m]; NaN if the state is NaN.
     """
     _walk(i, at, within, low, high, corners)
     for j in range(3, DOF):
@@ -129,7 +129,7 @@ def _walk(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high: Floa
 
 
 def enclose(at: Likely, within: SoundMotionLimits) -> tuple[Floats, Floats]:
-    """Reachable intervals of all rows: lower and upper ends, (n, 13) each [m, m, rad..., m]."""
+    """Computes the reachable intervals of all rows: lower and upper ends, (n, 13) each [m, m, rad..., m]."""
     low, high = np.empty_like(at.p), np.empty_like(at.p)
     _enclose_rows(at, within, low, high)
     return low, high
@@ -142,9 +142,9 @@ def _enclose_rows(at: Likely, within: SoundMotionLimits, low: Floats, high: Floa
         enclose_row(i, at, within, low[i], high[i], corners)
 
 
-#: Sides of the polygon; the first looks ahead.
+#: Number of sides of the polygon; the first one faces ahead.
 SIDES = 8
-#: Equal pieces of the horizon, beside the cuts where profiles bend.
+#: Number of equal pieces of the horizon, in addition to the corners of the profiles.
 _PIECES = 4
 
 
@@ -170,7 +170,7 @@ def rotate_range(x: float, y: float, low: float, high: float) -> Range:
 
 @njit(cache=True)
 def body_velocity(v: Floats, spread: Floats, heading: Range) -> tuple[Range, Range]:
-    """Ranges of v and v_perp, Eq. (33), for a velocity in v +- spread (2,), world, and any heading in the range."""
+    """Computes ranges of v and v_perp, Eq. (33), for world velocities in v +- spread (2,) and a range of headings."""
     forward = rotate_range(v[0], v[1], heading[0], heading[1])
     left = rotate_range(v[1], -v[0], heading[0], heading[1])
     cosine = rotate_range(1.0, 0.0, heading[0], heading[1])
@@ -182,9 +182,9 @@ def body_velocity(v: Floats, spread: Floats, heading: Range) -> tuple[Range, Ran
 
 @njit(cache=True)
 def walked(heading: Range, velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float, far: Floats) -> None:
-    """Adds to far (SIDES,) how far the pelvis gets along each side's direction at any time in [0, horizon] [m].
+    """Adds to far (SIDES,) the maximum displacement of the pelvis along each side's direction in [0, horizon] [m].
 
-    Stands for Eq. (20)-(30), whose box does not hold all motions of Eq. (25): docs/paper.md.
+    Replaces Eq. (20)-(30), whose box does not contain all motions of Eq. (25): docs/paper.md.
 
     Args:
         heading: Initial headings [rad].
@@ -221,7 +221,7 @@ def _turn(omega: Range, bounds: Floats, t: float) -> Range:
 
 @njit(cache=True)
 def turn_heading(heading: Range, omega: Range, bounds: Floats, horizon: float) -> Range:
-    """All headings at any time in [0, horizon] [rad].
+    """Interval of all headings at any time in [0, horizon] [rad].
 
     Args:
         heading: Initial headings [rad].
@@ -262,7 +262,7 @@ def _speeds(v: Range, bounds: Floats, k: int, t: float) -> Range:
 
 @njit(cache=True)
 def _farthest(box: tuple[Range, Range], low: float, high: float) -> float:
-    """F: largest v cos(psi) + v_perp sin(psi) over the box and psi in [low, high]; at a corner, for it is convex."""
+    """F: maximum of v cos(psi) + v_perp sin(psi) over the box and psi in [low, high]; at a corner, as it is convex."""
     largest = -np.inf
     for v in box[0]:
         for v_perp in box[1]:
@@ -272,7 +272,7 @@ def _farthest(box: tuple[Range, Range], low: float, high: float) -> float:
 
 @njit(cache=True)
 def corners_of(far: Floats, ahead: float, corners: Floats) -> None:
-    """Writes into corners (SIDES, 2) where the polygon's neighbouring sides meet; ``ahead``: its first direction."""
+    """Writes the corners of the polygon into corners (SIDES, 2); ``ahead``: direction of its first side."""
     step = 2.0 * np.pi / SIDES
     for i in range(SIDES):
         after = (i + 1) % SIDES
@@ -281,33 +281,33 @@ def corners_of(far: Floats, ahead: float, corners: Floats) -> None:
         corners[i, 1] = (far[after] * np.cos(a) - far[i] * np.cos(b)) / np.sin(step)
 
 
-#: From the middle of a leg, where cameras put its points, to the skin: a thigh 0.5 m around [m].
+#: Distance from the middle of a leg, the place of a camera's points, to the skin: a thigh of 0.5 m girth [m].
 THIGH_M = 0.08
-#: Length of thigh and of shank with foot: two of them are the pelvis's height of the median man [m].
+#: Length of the thigh, and of the shank with foot: half the pelvis's height of the median man [m].
 BONE_M = 0.47
-#: How high a knee gets whose foot carries a person: with a shank upright on the toes [m].
+#: Maximum height of the knee of a leg that carries the person: shank upright, on the toes [m].
 KNEE_M = 0.55
 
 
 @njit(cache=True)
 def knees_out(pelvis_m: float) -> float:
-    """Distance of the knees from the line below a pelvis of that height, whose foot is under it [m]."""
-    return np.sqrt(max(0.0, BONE_M**2 - (0.5 * pelvis_m) ** 2))  # thigh and shank of one length
+    """Distance of the knees from the line below a pelvis at a height, with the foot below it [m]."""
+    return np.sqrt(max(0.0, BONE_M**2 - (0.5 * pelvis_m) ** 2))  # thigh and shank have the same length
 
 
 @njit(cache=True)
 def legs_around(corners: Floats, ahead: float, lowest: float, highest: float, radius: float) -> tuple[Floats, int]:
-    """From the floor to the highest pelvis, wherever it walks; below, as far out as the lowest pelvis puts the knees.
+    """Encloses the legs: from the floor to the highest pelvis over its area, out to the knees of the lowest pelvis.
 
     Args:
-        corners: (SIDES, 2) where the pelvis walks [m].
+        corners: (SIDES, 2) corners of the area of the pelvis [m].
         ahead: Direction of its first side [rad].
-        lowest: Pelvis's height [m].
-        highest: The same [m].
-        radius: Of the ball around the result; it holds knees of people who stand [m].
+        lowest: Minimum height of the pelvis [m].
+        highest: Maximum height of the pelvis [m].
+        radius: Radius of the ball around the result; it contains the knees of standing people [m].
 
     Returns:
-        (m, 3) points whose hull is that, and m; one NaN where the state is.
+        (m, 3) points whose hull encloses the legs, and m; one NaN point if the state is NaN.
     """
     if not np.isfinite(corners.sum() + lowest + highest):
         return np.full((1, 3), np.nan), 1

@@ -1,30 +1,29 @@
-"""Swept volumes that enclose every motion of Eq. (25) under the limits, from every likely state: the method ``sound``.
+"""Swept volumes that enclose every motion of Eq. (25) within the limits, from every likely state: the method ``sound``.
 
-Where the limit set bounds how far limbs depart from constant velocity, a limb that was seen lately has the tube of
-``velocity_tube``. Every other limb is enclosed joint by joint. Why no motion with the stops of Eq. (34) leaves that, at
-any time and from any likely state:
+If the limit set bounds the departure of limbs from constant velocity, a recently seen limb has the tube of
+``velocity_tube``. Every other limb is enclosed joint by joint. Proof that no motion with the stops of Eq. (34) leaves
+this volume, at any time and from any likely state:
 
-1. States. Each joint's position and velocity are within ``sigmas`` deviations of the estimate, whatever their
+1. States. Each joint's position and velocity are within ``sigmas`` standard deviations of the estimate, for any
    correlation: a box around it. World velocities are turned into the body's frame over all headings of the box.
 2. Joints. Heading, torso and arm joints and the pelvis's height stay in the intervals of ``joint_reach`` at all times;
    stops that depend on other joints are taken over the intervals of those.
 3. Walking. The pelvis stays in the convex polygon of ``sound_reach`` at all times, at a height of its interval.
-4. Limbs. A limb at any instant is a chain of rotations, each by an angle of its interval, then a displacement of the
-   polygon and the height. Sweeping a convex set by all angles of a joint and by all displacements, each regardless of
-   the others, holds all combinations, among them those that occur. A swept set is kept as points whose hull holds it:
-   rotations are linear, so the hull of the swept points holds the swept hull. Arcs are in triangles with their apexes
-   outside, and points are only dropped where they are proven to be inside the rest (``sweep``, ``hull_reduction``).
-   Where that leaves too many, the polytope of ``convex_hull`` takes their place, which holds them all. It may be cut
-   back to the ball that no point of the limb can leave, because a direction's number may be any that is not below the
-   truth.
-5. Lengths. A limb is drawn as long as it may be: its far end goes out along a line through the near one. An unknown
-   length further up the chain displaces the limb by no more than its error, which is added to the radius.
-6. Rounding. The steps are exact in real numbers; in floating point they are off by less than 1e-12 m for people within
-   a kilometre of the origin. Radii are larger by ``ROUNDING_M``. That is no tolerance for motions outside.
+4. Limbs. A limb at any instant is a chain of rotations, each by an angle of its interval, then a displacement within
+the polygon and the height interval. Sweeping a convex set by all angles of a joint and by all displacements
+independently covers all combinations, including the real ones. A swept set is stored as points whose hull contains it:
+rotations are linear, so the hull of the swept points contains the swept hull. Arcs lie in triangles with their apexes
+outside, and points are only dropped if they are proven to be inside the rest (``sweep``, ``hull_reduction``). If too
+many remain, the polytope of ``convex_hull`` replaces them, which contains them all. It may be cut to the ball that no
+point of the limb can leave, because the extent along a direction may be any upper bound. 5. Lengths. A limb has its
+maximum length: its far end moves outwards along the line through the near one. An error of a length further up the
+chain displaces the limb by at most this error, which is added to the radius. 6. Rounding. The steps are exact in real
+numbers; in floating point they are off by less than 1e-12 m for people within
+   a kilometre of the origin. ``ROUNDING_M`` is added to the radii. It covers rounding only, not motions outside.
 
-The lower body is the line from the floor to the pelvis with its own radius, walking along: that of people who stand, or
-as far out as cameras have seen hips, knees and feet lately (``model_residual``). A low pelvis folds the legs, so the
-knees are further out.
+The lower body is the line from the floor to the pelvis with its own radius, moving with the pelvis. The radius is that
+of standing people, or the recent distance of observed hips, knees and feet (``model_residual``). With a low pelvis the
+legs are folded and the knees are further out.
 """
 
 from __future__ import annotations
@@ -68,34 +67,34 @@ from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, LIMBS, POINTS, Floats, HumanStates, Ints
 from hrcreplay.settings.sections import Prediction
 
-#: Added to every radius: more than all rounding on the way [m].
+#: Added to every radius: more than the sum of all rounding errors [m].
 ROUNDING_M = 1e-9
-#: More points than a rotation or walking may make: the polytope around them is made instead.
+#: Maximum number of points after a rotation or walking; above it the polytope around them is used.
 MOST_COPIED = 2000
-#: Beyond this many, walking makes triangles of 60 degrees.
+#: Number of points above which walking uses triangles of 60 degrees.
 MOST_FINE = 700
-#: Only smaller sets are reduced to their corners: the time goes with the square.
+#: Maximum size of a set that is reduced to its corners, as the time grows with the square.
 MOST_REDUCED = 256
 #: Largest angle of a triangle around an arc: its apex is then at most 3.6 % of the radius off [rad].
 FINE_RAD = np.pi / 6.0
-#: More corners than this at the end are replaced by the polytope around them.
+#: Maximum number of corners of the result; above it the polytope around them is used.
 MOST_CORNERS = 256
-#: A larger set is reduced before the next rotation.
+#: Size above which a set is reduced before the next rotation.
 _MANY_CORNERS = 40
 
 
 def sweep_sound(
     states: HumanStates, limits: LimitSet, prediction: Prediction, limbs_m: Floats, span_s: float, memory_s: float
 ) -> tuple[Floats, Ints, Floats]:
-    """Swept volumes of all ticks and limbs.
+    """Computes the swept volumes of all ticks and limbs.
 
     Args:
         states: The fused person.
-        limits: Bounds on the joints, and on the limbs where it has them.
-        prediction: What is added to the model.
+        limits: Bounds on the joints and, if given, on the limbs.
+        prediction: Margins added to the model.
         limbs_m: (6,) radii of LIMBS, Table 2 [m].
         span_s: Horizon and latency [s].
-        memory_s: How long the filter goes on without a measurement [s].
+        memory_s: Time for which the filter continues without a measurement [s].
 
     Returns:
         Vertices (m, 3) [m] and the offsets of ``SweptVolumes``, and (n, limbs) radii [m].
@@ -118,13 +117,13 @@ def sweep_sound(
 
 
 def sound_radii(states: HumanStates, limbs_m: Floats, prediction: Prediction) -> Floats:
-    """(n, limbs) radii of volumes from the joints: of the limb (6,) [m], and what the model may be off by.
+    """(n, limbs) radii of volumes from the joints: those of the limbs (6,) [m] plus the errors of the model.
 
-    That is what an unknown length up the chain displaces, the residual, and how far the points are beside the model
-    that the residual is from. A residual that is not known yet (NaN) is taken to be ``residual_unknown_m``. The lower
-    body has the thorax's. The legs' is how far their middles were from the line below the pelvis; where it and a thigh
-    are more, they are the radius. Legs that were close when they were last seen make it no smaller: a table may hide
-    that they are not now.
+    These errors are the displacement by an error of a length up the chain, the residual, and the offset of the points
+    from the model that the residual refers to. An unknown residual (NaN) is replaced by ``residual_unknown_m``. The
+    lower body uses the thorax's. The residual of the legs is the distance of their middles from the line below the
+    pelvis; if its sum with a thigh's radius is larger, that sum is the radius. It is never reduced for legs last seen
+    close to the line, as a table may hide a later change.
     """
     found = np.empty((len(states), len(LIMBS) + prediction.legs))
     unknown_m = prediction.residual_unknown_m if prediction.residual else np.nan
@@ -133,7 +132,7 @@ def sound_radii(states: HumanStates, limbs_m: Floats, prediction: Prediction) ->
     return found
 
 
-#: The points of each of LIMBS that may be beside the model.
+#: Points of each of LIMBS that may have an offset from the model.
 _POINTS = (
     (NECK, HEAD),
     (ARM_POINTS[0][0], ARM_POINTS[1][0]),
@@ -142,7 +141,7 @@ _POINTS = (
 
 
 def _beside_m(states: HumanStates) -> Floats:
-    """(n, 6) how far each limb's points are beside the model [m]."""
+    """(n, 6) offset of each limb's points from the model [m]."""
     off = np.linalg.norm(states.points_m - skeleton(states.p, states.lengths_m), axis=2)
     return np.column_stack([off[:, list(points)].max(axis=1) for points in _POINTS])
 
@@ -151,7 +150,7 @@ def _beside_m(states: HumanStates) -> Floats:
 def _radii_rows(
     off: Floats, residual: Floats, beside: Floats, limbs: Floats, legs: float, unknown: float, found: Floats
 ) -> None:
-    """Writes the radii; without the residual where ``unknown``, what stands for one not known yet, is NaN."""
+    """Writes the radii; if ``unknown``, the value for an unknown residual, is NaN, without the residual."""
     for i in range(len(off)):
         shoulder = np.hypot(off[i, 0], off[i, 2])
         displaced = (0.0, 0.0, shoulder, shoulder + off[i, 4], shoulder, shoulder + off[i, 3])
@@ -160,7 +159,7 @@ def _radii_rows(
             of = THORAX if limb == LEGS else limb
             further = beside[i, of] + (unknown if np.isnan(residual[i, of]) else residual[i, of])
             found[i, limb] = base if np.isnan(unknown) else base + further
-        if len(found[i]) > LEGS and not np.isnan(unknown):  # no less than where they were seen
+        if len(found[i]) > LEGS and not np.isnan(unknown):  # at least their observed distance
             found[i, LEGS] = np.fmax(found[i, LEGS], residual[i, LEGS] + (THIGH_M + ROUNDING_M))
 
 
@@ -177,7 +176,7 @@ def _sweep_rows(
     radii: Floats,
     work: Surface,
 ) -> tuple[Floats, Ints]:
-    """Vertices and offsets; writes the radii of limbs that have tubes into ``radii``, their own (7,) in them."""
+    """Returns vertices and offsets; writes the radii of tubes, including the limb radii (7,), into ``radii``."""
     limbs = radii.shape[1]
     offsets = np.zeros(len(at.p) * limbs + 1, np.int64)
     vertices = np.empty((len(at.p) * limbs * 80 + 80, 3))
@@ -215,7 +214,7 @@ def _sweep_rows(
 def _limb(
     limb: int, low: Floats, high: Floats, corners: Floats, lengths: Floats, off: Floats, hand: float, work: Surface
 ) -> tuple[Floats, int]:
-    """Points around all that a limb reaches, in place of Alg. 2; a NaN vertex where state or lengths are NaN."""
+    """Returns points around the reachable space of a limb, in place of Alg. 2; a NaN vertex for NaN states."""
     ends, chain = kinematic_chain(limb, low, high, lengths)
     ends = _longest(limb, ends, off, hand)
     if not np.isfinite(ends.sum() + chain.sum() + corners.sum() + low[2] + high[2] + high[HEIGHT]):
@@ -239,10 +238,10 @@ def _turn_all(ends: Floats, chain: Floats, rise: float, work: Surface) -> tuple[
     """Points around what a chain's rotations and a rise of the pelvis make of a limb's ends [m].
 
     Returns:
-        The points, how many they are, and triangles around them.
+        The points, their number, and triangles around them.
     """
     points, count, faces = ends, len(ends), 0
-    radius = 0.0  # of the ball around the frame's origin that holds the limb
+    radius = 0.0  # radius of the ball around the frame's origin that contains the limb
     for end in ends:
         radius = max(radius, np.sqrt(end[0] ** 2 + end[1] ** 2 + end[2] ** 2))
     for k, step in enumerate(chain):
@@ -270,7 +269,7 @@ def _turn_all(ends: Floats, chain: Floats, rise: float, work: Surface) -> tuple[
 
 @njit(cache=True)
 def _raised(points: Floats, count: int, rise: float) -> Floats:
-    """The first ``count`` points, and the same higher by ``rise`` [m]: their hull holds all heights between."""
+    """Returns the first ``count`` points and copies raised by ``rise`` [m]: their hull contains all heights between."""
     both = np.empty((2 * count, 3))
     both[:count], both[count:] = points[:count], points[:count]
     both[count:, 2] += rise
@@ -279,7 +278,7 @@ def _raised(points: Floats, count: int, rise: float) -> Floats:
 
 @njit(cache=True)
 def _longest(limb: int, ends: Floats, off: Floats, hand: float) -> Floats:
-    """The limb's end points, drawn out to where lengths up to ``off`` (7,) longer or shorter may put them [m]."""
+    """Returns the limb's end points, moved outwards for lengths with an error of up to ``off`` (7,) [m]."""
     if limb == HEAD_LIMB:
         ends[0, 2] -= off[0]
         ends[1, 2] += off[0] + off[1]

@@ -1,12 +1,12 @@
 """Swept volumes of point sets, one degree of freedom at a time, and the rotations that carry each limb: Alg. 2.
 
-Every sweep maps the whole set by a few fixed linear maps. So the hull of a swept set is the swept hull: points that
-are not corners of the hull may be dropped before any sweep without changing what comes out at the end.
+Every sweep maps the whole set by a few fixed linear maps. So the hull of a swept set is the swept hull: points that are
+not corners of the hull may be dropped before any sweep without changing the result.
 
-The last sweeps, heading and place, are done in one, and only copies that can be corners of the result are written. All
-copies of a point are at its height. A copy is no corner of the result when it lies between another copy and a point of
-its own set, that is: when the point can take a small step away from where the other copy is, and stay inside. The
-steps are proven on the surface around the set, so nothing is dropped that is not inside the hull of the rest.
+The last sweeps, heading and position, are done in one step, and only copies that can be corners of the result are
+written. All copies of a point have the same height. A copy is not a corner of the result if it lies between another
+copy and a point of its own set, that is, if a small step from the point away from the other copy stays inside the set.
+These steps are proven with the surface around the set, so only points inside the hull of the rest are dropped.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _X, _Y, _Z = 0, 1, 2
 
 @njit(cache=True)
 def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tuple[Floats, Floats]:
-    """A limb's end points in the frame of its first rotation, and the rotations from there to the human base, Alg. 2.
+    """Returns a limb's end points in the frame of its first rotation, and the rotations up to the human base, Alg. 2.
 
-    A row of the chain is: axis, smallest and largest angle [rad], then the origin of its frame in the next (3,) [m].
-    What follows is walking. The thorax also spans the shoulder line, whose midpoint is the neck.
+    A row of the chain contains axis, smallest and largest angle [rad], and the origin of its frame in the next (3,)
+    [m]. Walking follows the chain. The thorax also spans the shoulder line, whose midpoint is the neck.
 
     Args:
         limb: Index into LIMBS.
@@ -68,7 +68,7 @@ def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tu
 #: Largest angle that one triangle spans [rad], Alg. 2, corrected (docs/paper.md): its apex is then at most 15.5 % of
 #: the radius off the arc.
 TRIANGLE_RAD = np.pi / 3.0
-#: Most points that a rotation makes of one: both ends and an apex for each of six triangles.
+#: Maximum number of copies of a point in a rotation: both ends and an apex for each of six triangles.
 MOST_COPIES = 8
 
 
@@ -78,12 +78,12 @@ def sweep_rot(
 ) -> int:
     """Rotational sweep about a coordinate axis through the origin, Fig. 8 and Alg. 2: arcs inside triangles.
 
-    An arc is cut into equal pieces of at most ``widest``; each lies in the triangle of its ends and the point where
-    their tangents meet. A cut lies on the tangent that its two triangles share, between their apexes, so only the
-    arc's ends and the apexes are corners. A whole turn is the polygon around the circle.
+    An arc is divided into equal pieces of at most ``widest``; each lies in the triangle of its ends and the
+    intersection of their tangents. A division point lies on the common tangent of its two triangles, between their
+    apexes, so only the arc's ends and the apexes are corners. A whole turn gives the polygon around the circle.
 
     Args:
-        points: (m, 3), of which the first ``count`` are swept [m].
+        points: (m, 3), the first ``count`` are swept [m].
         count: Number of points.
         axis: 0, 1, 2 for x, y, z.
         low: Smallest angle [rad].
@@ -111,21 +111,21 @@ def sweep_rot(
 
 @njit(cache=True)
 def copies(low: float, high: float, widest: float = TRIANGLE_RAD) -> int:
-    """Most points that a rotation makes of one."""
+    """Maximum number of copies of a point in a rotation."""
     return 1 if low == high else 2 + int(np.ceil(min(high - low, 2.0 * np.pi) / widest))
 
 
 @njit(cache=True)
 def turns(low: float, high: float, cosines: Floats, sines: Floats, widest: float = TRIANGLE_RAD) -> int:
-    """The maps of a rotational sweep: rotations, for an apex stretched by 1 / cos(half the piece).
+    """Computes the maps of a rotational sweep: rotations, for an apex scaled by 1 / cos(half the piece).
 
-    Writes the first columns (cos, sin) of their matrices, and returns how many there are.
+    Writes the first columns (cos, sin) of their matrices, and returns their number.
 
     Args:
         low: Smallest angle [rad].
         high: Largest angle [rad].
         cosines: (>= copies(low, high, widest),) receives the first elements.
-        sines: Of the same shape, receives the second elements.
+        sines: Array of the same shape, receives the second elements.
         widest: Largest angle of a triangle [rad].
     """
     if low == high:
@@ -145,13 +145,13 @@ def turns(low: float, high: float, cosines: Floats, sines: Floats, widest: float
 
 
 #: Directions in the plane: EMPTY, POINTED (within less than half a turn) or ALL_ROUND (they can cancel), and the
-#: clockwise most and counterclockwise most of pointed ones as unit vectors.
+#: outermost clockwise and counterclockwise unit vectors of pointed ones.
 Cone = tuple[int, float, float, float, float]
 EMPTY, POINTED, ALL_ROUND = 0, 1, 2
 
-#: How far a step goes [m], and how far it keeps off the edge of the directions that lead inside [rad].
+#: Length of a step [m], and its margin to the boundary of the directions that lead inside [rad].
 _STEP_M, _OFF_EDGE = 1e-6, 1e-3
-#: Directions that differ by less are the same [rad].
+#: Directions that differ by less count as equal [rad].
 _SAME = 1e-12
 
 
@@ -169,13 +169,13 @@ def sweep_walk(
     """Rotational sweep about the z axis, then a translational one over a polygon, Fig. 7: the end of Alg. 2.
 
     Args:
-        points: (m, 3), of which the first ``count`` are what ``keep_corners`` kept, in the human base frame [m].
+        points: (m, 3), the first ``count`` are those kept by ``keep_corners``, in the human base frame [m].
         count: Number of points.
-        faces: Number of triangles around them; with none, only copies inside the others of a point are left out.
-        work: The surface, as ``keep_corners`` left it.
+        faces: Number of triangles around them; if 0, only copies inside the hull of a point's other copies are dropped.
+        work: The surface from ``keep_corners``.
         heading: Smallest and largest heading [rad].
-        floor: (k, 6) places of the human base: x, y, and the vectors there from the two neighbouring corners of the
-            polygon, zero where there is none [m].
+        floor: (k, 6) positions of the human base: x, y, and the vectors from the two neighbouring corners of the
+            polygon, zero if there is none [m].
         swept: (>= copies(*heading, widest) k count, 3) receives the points, world [m].
         widest: Largest angle of a triangle [rad].
 
@@ -207,7 +207,7 @@ def sweep_walk(
 
 @njit(cache=True)
 def _directions(floor: Floats) -> Floats:
-    """(k, 4) the two vectors of each place as unit vectors; zero ones stay."""
+    """(k, 4) the two vectors of each place as unit vectors; zero vectors are kept."""
     sides = np.zeros((len(floor), 4))
     for k in range(len(floor)):
         for j in (0, 2):
@@ -220,7 +220,7 @@ def _directions(floor: Floats) -> Floats:
 
 @njit(cache=True)
 def _is_between(away: Cone, k: int, sides: Floats) -> bool:
-    """Return whether a copy is no corner at a place, by the directions to it from its set and its turned copies."""
+    """Returns True if a copy is not a corner at a position, by the directions from its set and its turned copies."""
     if away[0] == ALL_ROUND:
         return True
     for j in (0, 2):
@@ -232,7 +232,7 @@ def _is_between(away: Cone, k: int, sides: Floats) -> bool:
 
 @njit(cache=True)
 def box(low: Floats, high: Floats) -> Floats:
-    """The floor of ``sweep_walk`` for x and y in intervals of their own; an empty interval has one end."""
+    """Makes ``floor`` of ``sweep_walk`` for x and y in separate intervals; an interval of length 0 has one end."""
     wide, deep = 1 + (low[0] < high[0]), 1 + (low[1] < high[1])
     floor = np.zeros((wide * deep, 6))
     for right in range(wide):
@@ -246,7 +246,7 @@ def box(low: Floats, high: Floats) -> Floats:
 
 @njit(cache=True)
 def polygon(corners: Floats) -> Floats:
-    """The floor of ``sweep_walk`` for the hull of corners (k, 2) in order around it [m]."""
+    """Makes ``floor`` of ``sweep_walk`` for the hull of corners (k, 2) in order around it [m]."""
     floor = np.empty((len(corners), 6))
     for i in range(len(corners)):
         before, after = corners[i - 1], corners[(i + 1) % len(corners)]
@@ -271,7 +271,7 @@ def _away_from_turned(x: float, y: float, copy: int, made: int, cosines: Floats,
 
 @njit(cache=True)
 def _widen(cone: Cone, x: float, y: float) -> Cone:
-    """The cone with another direction in it; a zero vector is none."""
+    """Adds a direction to the cone; a zero vector is ignored."""
     length = np.sqrt(x * x + y * y)
     if cone[0] == ALL_ROUND or length == 0.0:
         return cone
@@ -280,7 +280,7 @@ def _widen(cone: Cone, x: float, y: float) -> Cone:
 
 @njit(cache=True)
 def _widen_to(cone: Cone, x: float, y: float) -> Cone:
-    """The cone with a unit vector in it."""
+    """Adds a unit vector to the cone."""
     kind, ax, ay, bx, by = cone
     if kind == ALL_ROUND:
         return cone
@@ -298,9 +298,9 @@ def _widen_to(cone: Cone, x: float, y: float) -> Cone:
 
 @njit(cache=True)
 def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floats:
-    """(count, 4) two level directions (x, y, x, y), from which on and between which a small step leads inside.
+    """(count, 4) two horizontal directions (x, y, x, y); a small step along them, or between them, leads inside.
 
-    They are next to the edges of what the triangles at a corner allow, and zero where they allow or prove none.
+    They are near the limits set by the triangles at a corner, and zero if no direction is allowed or proven.
     """
     normals = [(EMPTY, 0.0, 0.0, 0.0, 0.0) for _ in range(count)]
     for f in range(faces):
@@ -312,7 +312,7 @@ def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floa
         kind, ax, ay, bx, by = normals[i]
         if kind != POINTED:
             continue
-        for k, x, y in ((0, -by, bx), (2, ay, -ax)):  # at right angles to the outermost normals
+        for k, x, y in ((0, -by, bx), (2, ay, -ax)):  # orthogonal to the outermost normals
             x, y = x - _OFF_EDGE * (ax + bx), y - _OFF_EDGE * (ay + by)
             px, py = points[i, 0] + _STEP_M * x, points[i, 1] + _STEP_M * y
             if is_inside(px, py, points[i, 2], faces, work.planes):
@@ -322,13 +322,13 @@ def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floa
 
 @njit(cache=True)
 def append(vertices: Floats, n: int, swept: Floats, count: int) -> Floats:
-    """Vertices with more of them behind their first rows, in a larger array if need be.
+    """Appends vertices behind the first ``n`` rows, in a larger array if needed.
 
     Args:
-        vertices: (m, 3) of which the first n count [m].
-        n: How many count.
-        swept: (k, 3) what to put behind them [m].
-        count: How many of these.
+        vertices: (m, 3), the first n are valid [m].
+        n: Number of valid vertices.
+        swept: (k, 3) vertices to append [m].
+        count: Number of vertices to append.
     """
     if n + count > len(vertices):
         roomier = np.empty((2 * (n + count), 3))

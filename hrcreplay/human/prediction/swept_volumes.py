@@ -1,6 +1,6 @@
 """Reachable intervals of the joints within the horizon, and swept volumes of the limbs: Eq. (18)-(30), Alg. 1, Alg. 2.
 
-Corrections: docs/paper.md. Under ``sound`` both enclose every motion of Eq. (25), see ``sound_volumes``.
+Corrections: docs/paper.md. With ``sound``, both enclose every motion of Eq. (25), see ``sound_volumes``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
 from hrcreplay.settings.sections import Prediction
 
-#: Ways to predict, in the order of their codes in the kernels: the two of the literature, and what encloses.
+#: Methods of prediction, in the order of their codes in the kernels: two from the literature, and ``sound``.
 PRINTED = ("paper", "positions")
 METHODS = (*PRINTED, "sound")
 PAPER, SOUND = METHODS.index("paper"), METHODS.index("sound")
@@ -38,18 +38,18 @@ PAPER, SOUND = METHODS.index("paper"), METHODS.index("sound")
 
 @dataclass(frozen=True)
 class Reach(Table):
-    """Reachable interval of every joint, a row a tick, Eq. (36), (38), (39). The current posture is in it, Eq. (40)."""
+    """Reachable interval of every joint, one row per tick, Eq. (36), (38), (39), with the current posture, Eq. (40)."""
 
     t_ns: Ints  #: (n,)
-    low: Floats  #: (n, 13) JOINTS [m, m, rad..., m]; NaN where the state is
+    low: Floats  #: (n, 13) JOINTS [m, m, rad..., m]; NaN if the state is NaN
     high: Floats  #: (n, 13)
 
 
 class MotionLimits(NamedTuple):
-    """Bounds on the motions that a printed method predicts from."""
+    """Bounds on the motions in a printed method."""
 
     bounds: Floats  #: (6, 13) of ``bounds_of``
-    coupled: bool  #: whether Eq. (34b), (34c) hold
+    coupled: bool  #: True: Eq. (34b), (34c) hold
     horizon: float  #: braking time T_s of the robot [s]
     method: int  #: index into METHODS of one of PRINTED
 
@@ -60,21 +60,21 @@ def reachable(
     """Reachable sets within the horizon, Eq. (36), (38), (39), joint by joint.
 
     ``paper``: Eq. (20)-(30), corrected, for walking and Alg. 1 for the other joints: from positions, velocities and
-    bounds on velocity and acceleration. ``positions``: the older way of [26], from positions and velocity bounds.
-    Both hold the angles within their limits, with Eq. (34b), (34c) taken over the reachable interval of what they
-    depend on; a posture that is itself outside stays included. An arm joint that nobody ever measured may be
-    anywhere within its limits, whatever the method. ``sound``: every motion under the limits from every likely state,
-    at all times until the horizon and the latency are over; x and y are those of a polygon, see ``sound_reach``.
+    bounds on velocity and acceleration. ``positions``: the older method of [26], from positions and velocity bounds.
+    Both keep the angles within their limits, with Eq. (34b), (34c) evaluated over the reachable intervals of the joints
+    they depend on; a posture outside the limits stays included. In every method, an arm joint that was never measured
+    may be anywhere within its limits. ``sound``: every motion within the limits from every likely state, at all times
+    until the end of horizon and latency; x and y lie in a polygon, see ``sound_reach``.
 
     Args:
         states: The fused person.
         limits: Bounds.
-        prediction: Method, one of METHODS, and what ``sound`` adds; the printed methods add nothing.
+        prediction: Method, one of METHODS, and the margins of ``sound``; the printed methods add nothing.
         horizon_s: Braking time T_s of the robot [s].
-        memory_s: How long the filter goes on without a measurement [s].
+        memory_s: Time for which the filter continues without a measurement [s].
 
     Raises:
-        SettingsError: There is no such method.
+        SettingsError: The method is unknown.
     """
     code = code_of(prediction.method)
     if code == SOUND:
@@ -89,15 +89,15 @@ def reachable(
 
 
 def find_never_measured(states: HumanStates) -> Bools:
-    """(n, 13) joints of which no camera has shown anything yet: the filter only has a guess of them."""
+    """(n, 13) True for joints that no camera has observed yet: the filter only has their prior."""
     return np.ascontiguousarray(np.isinf(states.unseen_s)[:, SHOWN_BY])
 
 
 def code_of(method: str) -> int:
-    """The number by which the kernels know a method of METHODS.
+    """Returns the code of a method of METHODS in the kernels.
 
     Raises:
-        SettingsError: There is no such method.
+        SettingsError: The method is unknown.
     """
     if method not in METHODS:
         raise SettingsError(f"prediction.method: found {method!r}; choose one of {', '.join(METHODS)}")
@@ -112,15 +112,15 @@ def _reach_rows(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: F
 
 @njit(cache=True)
 def reach_row(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Floats, high: Floats) -> None:
-    """Writes the reachable interval of every joint from p, v (13,) into low, high (13,); ``never`` was it measured.
+    """Writes the reachable interval of every joint from p, v (13,) into low, high (13,).
 
     Alg. 1 and its clipping to Eq. (34), (35); walking is Eq. (18)-(30).
 
     Args:
         p: (13,) JOINTS [m, m, rad..., m].
         v: (13,) their velocities [m/s, m/s, rad/s...].
-        never: (13,) whether no camera has ever shown the joint.
-        within: What bounds the motions.
+        never: (13,) True if no camera has ever observed the joint.
+        within: Bounds on the motions.
         low: (13,) receives the lower ends [m, m, rad..., m].
         high: (13,) receives the upper ends [m, m, rad..., m].
     """
@@ -183,7 +183,7 @@ def _walk(p: Floats, v: Floats, bounds: Floats, horizon: float, method: int, low
         for k in range(3):
             gain = bounds[5, k] * horizon  # Eq. (27), (28), corrected: k = 1 is the lateral acceleration
             most[k] = min(body[k] + gain, most[k])
-            if k > 0:  # the print lets a walker stop at once: its v^min is the bound, whatever the acceleration
+            if k > 0:  # as printed, a walker can stop at once: v^min is the bound, independent of the acceleration
                 least[k] = max(body[k] + bounds[4, k] * horizon, least[k])
     ahead = (least[0] * horizon, most[0] * horizon)
     left = (least[1] * horizon, most[1] * horizon)
@@ -202,14 +202,15 @@ def _sum(start: float, f: float, a: tuple[float, float], g: float, b: tuple[floa
     return low, high
 
 
-#: A larger set is reduced before the next rotation: below, it costs less to carry all points along.
+#: Size above which a set is reduced before the next rotation; for smaller sets it is faster to keep all points.
 _WORTH_REDUCING = 50
-#: A larger result is reduced once more: walking leaves few points too many unless the person can turn far.
+#: Size above which the result is reduced once more; walking adds few redundant points unless the heading range is
+#: large.
 _TOO_MANY = 256
 
 
 def limb_radii(prediction: Prediction) -> Floats:
-    """(6,) radii of the balls that give the limbs their thickness, Eq. (41), Table 2, in the order of LIMBS [m]."""
+    """(6,) radii of the limbs, Eq. (41), Table 2, in the order of LIMBS [m]."""
     upper, lower = prediction.radius_upper_arm_m, prediction.radius_lower_arm_m
     return np.array([prediction.radius_head_m, prediction.radius_thorax_m, upper, lower, upper, lower])
 
@@ -227,22 +228,22 @@ def predict(
     horizon_s: float,
     memory_s: float,
 ) -> SweptVolumes:
-    """Swept volumes of all limbs from the reachable sets of the joints: Alg. 2, or what encloses them all (``sound``).
+    """Computes swept volumes of all limbs from the reachable sets of the joints: Alg. 2, or ``sound``.
 
     Args:
-        states: The fused person; a row gives the same bits alone and among others.
+        states: The fused person; the result of a row does not depend on the other rows.
         limits: Bounds on the joints.
-        prediction: Method, radii of Table 2, and what ``sound`` adds; the printed methods add nothing.
+        prediction: Method, radii of Table 2, and the margins of ``sound``; the printed methods add nothing.
         horizon_s: Braking time T_s of the robot [s].
-        memory_s: How long the filter goes on without a measurement [s].
+        memory_s: Time for which the filter continues without a measurement [s].
 
     Returns:
-        Points whose convex hulls are those of Alg. 2: every corner of a hull is among them, and few others. For
+        Points whose convex hulls are those of Alg. 2; they include every corner of a hull and few other points. For
         ``sound``, points whose hulls enclose all motions; with ``prediction.legs`` the last limb is ``LEGS``. A limb
         whose state or lengths are NaN has one NaN vertex.
 
     Raises:
-        SettingsError: There is no such method.
+        SettingsError: The method is unknown.
     """
     code, radius = code_of(prediction.method), limb_radii(prediction)
     if code == SOUND:
@@ -282,7 +283,7 @@ def _predict_rows(
 
 @njit(cache=True)
 def _sweep_limb(limb: int, low: Floats, high: Floats, lengths: Floats, work: Surface) -> tuple[Floats, int]:
-    """Alg. 2 for one limb, given the reachable intervals (13,) and the lengths (7,)."""
+    """Applies Alg. 2 to one limb, given the reachable intervals (13,) and the lengths (7,)."""
     points, chain = kinematic_chain(limb, low, high, lengths)
     if not np.isfinite(points.sum() + chain.sum() + low[:3].sum() + high[:3].sum()):
         return np.full((1, 3), np.nan), 1

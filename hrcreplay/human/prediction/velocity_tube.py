@@ -1,9 +1,10 @@
-"""Tubes around where the fused velocity takes the limbs: as wide as recorded people were found to depart from it.
+"""Tubes around the motion of the limbs at constant fused velocity, as wide as the departures of recorded people.
 
-Bounds on thirteen joints, each at its worst, enclose two to three times what people do. So a limit set may also bound
-how far whole limbs depart from constant velocity (``Departure``), fitted on recordings. The tube of a limb is the hull
-of its ends at the tick and after the horizon, raised and lowered as people get up and sit down, with a ball around it:
-who stops or slows down stays in that hull. No motion that keeps to the bound leaves the tube, whatever the joints do.
+Worst-case bounds on thirteen joints enclose two to three times the volume that people use. So a limit set may also
+bound the departure of whole limbs from constant velocity (``Departure``), fitted on recordings. The tube of a limb is
+the hull of its ends at the tick and after the horizon, raised and lowered as people stand up and sit down, with a ball
+around it; a person who stops or slows down stays in that hull. No motion within the bound leaves the tube, for any
+motion of the joints.
 """
 
 from __future__ import annotations
@@ -18,33 +19,33 @@ from hrcreplay.records import BODY, Bools, Floats, HumanStates
 
 #: Time step of the difference that gives the velocities of the points [s].
 _STEP_S = 1e-4
-#: A limb seen longer ago has had so much more time to depart: recorded limbs were as old as this [s].
+#: Age of the recorded limbs in the fit; a limb seen longer ago gets the additional time to depart [s].
 _FRESH_S = 0.1
-#: A larger residual is no noise of one place but another place, which the filter does not believe yet [m].
+#: Maximum residual from noise; a larger one is another position that the filter has not accepted yet [m].
 NOISE_M = 0.2
 #: Longest extrapolation at constant velocity, of trunk and legs, and of arms [s].
 _CARRIES_S, _CARRIES_ARMS_S = 0.25, 0.15
-#: A swinging leg is so many times as fast as the body: it stands for about half of the time.
+#: Speed of a swinging leg relative to the body: each foot rests about half of the time.
 _STRIDE = 2.0
-#: No direction can be told of a hand that is nearer to its wrist [m].
+#: Minimum distance of a hand from its wrist that gives a direction [m].
 _SHORT_M = 0.02
 HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
-#: For each limb of BODY, itself and those of LIMBS that carry it: an arm on a torso that nobody sees is anywhere.
+#: For each limb of BODY, itself and those of LIMBS that carry it: an arm on an unseen torso is unknown.
 _CARRIED_BY = ((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))
-#: Most points of a tube.
+#: Maximum number of points of a tube.
 MOST_POINTS = 2 * (len(LEG_POINTS) + 2)
 _ARMS = np.array(ARM_POINTS)
 
 
 class Tubes(NamedTuple):
-    """Data of the tubes, a row a tick."""
+    """Data of the tubes, one row per tick."""
 
     points: Floats  #: (n, 20, 3) of ``HumanStates.points_m``
-    residual: Floats  #: (n, 7) what is added for each limb of BODY times ``residuals`` [m]
-    usable: Bools  #: (n, 7) whether the limb has a tube
-    legs_shown: Bools  #: (n,) whether it is known where both knees and ankles are
-    legs_m: Floats  #: (n,) how far from the line below the pelvis they were [m]; NaN: not known, or does not count
-    reach_s: Floats  #: (n, 7) until when it may depart [s]
+    residual: Floats  #: (n, 7) residual of each limb of BODY, multiplied by ``residuals`` [m]
+    usable: Bools  #: (n, 7) True: the limb has a tube
+    legs_shown: Bools  #: (n,) True: the positions of both knees and ankles are known
+    legs_m: Floats  #: (n,) their distance from the line below the pelvis [m]; NaN: unknown or not used
+    reach_s: Floats  #: (n, 7) time for which it may depart [s]
     horizon_s: Floats  #: (h,) of ``Departure``
     beyond_m: Floats  #: (7, h)
     residuals: Floats  #: (7, h)
@@ -55,13 +56,13 @@ class Tubes(NamedTuple):
 def tubes(
     states: HumanStates, limits: LimitSet, residual: bool, unknown_m: float, span_s: float, memory_s: float
 ) -> Tubes:
-    """The limbs that have tubes: those seen within the filter's memory, if the limit set bounds departures.
+    """Makes the tubes of the limbs seen within the filter's memory, if the limit set bounds departures.
 
     Args:
         states: The fused person.
         limits: Bounds.
-        residual: Whether the distance from the model counts.
-        unknown_m: That distance until it is known [m].
+        residual: True: use the distance from the model.
+        unknown_m: Value of that distance until it is known [m].
         span_s: Horizon and latency [s].
         memory_s: How long the filter goes on without a measurement [s].
     """
@@ -69,7 +70,7 @@ def tubes(
     unseen = np.column_stack([states.unseen_s[:, list(carrying)].max(axis=1) for carrying in _CARRIED_BY])
     usable, legs_shown = unseen <= memory_s, np.isfinite(states.points_m[:, BENDS].sum(axis=(1, 2)))
     unseen[legs_shown, LEGS] = np.maximum(unseen, states.unseen_s)[legs_shown, LEGS]
-    of = states.residual_m[:, [0, 1, 2, 3, 4, 5, 1]]  # legs have none of their own that tells of departures
+    of = states.residual_m[:, [0, 1, 2, 3, 4, 5, 1]]  # the residual of the legs is not related to departures
     empty = np.zeros((len(BODY), 1))
     return Tubes(
         points=np.ascontiguousarray(states.points_m),
@@ -90,13 +91,13 @@ def tubes(
 def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
     """Largest departure of a limb until ``reach_s`` [m].
 
-    Never less than the residual: the limb may be there already.
+    At least the residual, as the limb may already be there.
 
     Args:
         limb: Index into BODY.
-        reach_s: Since the tick [s].
+        reach_s: Time since the tick [s].
         residual_m: The limb's residual [m]
-        at: Holds the table.
+        at: Contains the table.
     """
     beyond = _until(reach_s, at.horizon_s, at.beyond_m[limb])
     times = np.interp(reach_s, at.horizon_s, at.residuals[limb])
@@ -107,8 +108,8 @@ def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
 def _until(reach_s: float, horizon_s: Floats, most_m: Floats) -> float:
     """A row (h,) of the table at ``reach_s`` [m].
 
-    Between the horizons that were measured linear, for it grows faster than the horizon; before the first as at it;
-    after the last as fast as before it, for people's speeds are bounded.
+    Linear between the measured horizons, as it grows faster than the horizon; constant before the first; after the last
+    with the same slope as before it, as people's speeds are bounded.
     """
     found, last = np.interp(reach_s, horizon_s, most_m), len(horizon_s) - 1
     if reach_s > horizon_s[last] and last > 0:
@@ -119,7 +120,7 @@ def _until(reach_s: float, horizon_s: Floats, most_m: Floats) -> float:
 
 @njit(cache=True)
 def velocities(p: Floats, v: Floats, lengths: Floats, found: Floats) -> None:
-    """Writes the velocities (20, 3) of the model's points [m/s]; NaN where it has none.
+    """Writes the velocities (20, 3) of the model's points [m/s]; NaN for points outside the model.
 
     Args:
         p: (13,) posture.
@@ -137,22 +138,22 @@ def velocities(p: Floats, v: Floats, lengths: Floats, found: Floats) -> None:
 def tube(
     limb: int, points: Floats, velocity: Floats, span_s: float, reach_s: float, hand_m: float, at: Tubes, swept: Floats
 ) -> int:
-    """Writes the points whose hull is a limb's tube before the ball, in place of Alg. 2; returns how many.
+    """Writes the points whose hull is a limb's tube before the ball, in place of Alg. 2; returns their number.
 
-    The hand lies along the forearm, and where a camera shows it. Of the lower body the pelvis rises and sinks.
+    The hand lies along the forearm and at its observed position. Of the lower body the pelvis rises and sinks.
 
     Args:
         limb: Index into BODY.
         points: (20, 3) where the body's points are [m].
         velocity: (20, 3) of the model's points [m/s].
         span_s: Horizon and latency [s].
-        reach_s: Until when the limb may depart, since the tick [s].
+        reach_s: Time after the tick until which the limb may depart [s].
         hand_m: Length of the hand beyond the wrist [m].
-        at: Holds the table.
+        at: Contains the table.
         swept: (MOST_POINTS, 3) receives the points.
     """
     carries_s = _CARRIES_S if limb in (HEAD_LIMB, THORAX, LEGS) else _CARRIES_ARMS_S
-    unmeasured_s = max(0.0, span_s - at.horizon_s[-1])  # of that nothing is known but the velocity
+    unmeasured_s = max(0.0, span_s - at.horizon_s[-1])  # for these points only the velocity is known
     n = _ends(limb, points, velocity, min(span_s, carries_s + unmeasured_s), hand_m, swept)
     rising = 2 if limb == LEGS else n
     for i in range(rising):
@@ -164,7 +165,7 @@ def tube(
 
 @njit(cache=True)
 def _ends(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats) -> int:
-    """Writes where a limb's ends are at the tick and after ``span_s``; returns how many points, the pelvis's first."""
+    """Writes a limb's ends at the tick and after ``span_s``; returns the number of points; the pelvis's come first."""
     n = 0
     if limb == HEAD_LIMB:
         n = _add(points[NECK], velocity[NECK], span_s, swept, n)
@@ -180,7 +181,7 @@ def _ends(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: fl
         for k in LEG_POINTS:
             if np.isfinite(points[k].sum()):
                 n = _add(points[k], along, span_s, swept, n)
-        if not np.isfinite(points[BENDS].sum()):  # somewhere about the line from the floor to the pelvis
+        if not np.isfinite(points[BENDS].sum()):  # around the line from the floor to the pelvis
             below = points[PELVIS].copy()
             below[2] = 0.0
             n = _add(below, along, span_s, swept, n)
