@@ -393,7 +393,8 @@ def part_axes(points_m: Floats, hand_m: float) -> Floats:
         hand_m: Extension of the forearm's capsule beyond the wrist, along the forearm [m].
 
     Returns:
-        (n, 14, 2, 3) ends of the axes of PARTS [m]; NaN if a point is missing."""
+        (n, 14, 2, 3) ends of the axes of PARTS [m]; NaN if a point is missing.
+    """
     axes = np.stack([points_m[:, _FROM], points_m[:, _TO]], axis=2)
     forearm = axes[:, _FOREARMS, 1] - axes[:, _FOREARMS, 0]
     length = np.linalg.norm(forearm, axis=2, keepdims=True)
