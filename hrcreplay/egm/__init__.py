@@ -1,1 +1,1 @@
-"""The EGM link: message codec, our side of the protocol, UDP server, and a robot double for tests."""
+"""The EGM link: message codec, client side of the protocol, UDP server, and a robot double for tests."""

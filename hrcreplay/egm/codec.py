@@ -1,7 +1,7 @@
-"""Encoding and decoding of EGM datagrams, and the pose of the flange that a controller reports beside the joints.
+"""Encoding and decoding of EGM datagrams, and the pose of the flange that a controller reports with the joints.
 
-Degrees and millimetres are used only in here. Each call makes a new protobuf message: one that is used again never
-gives its memory back (0.5 kB a packet).
+Degrees and millimetres are used only in this module. Each call makes a new protobuf message, as a reused message never
+frees its memory (0.5 kB per packet).
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from hrcreplay.egm import motion_link_pb2 as messages
 from hrcreplay.records import Floats
 from hrcreplay.robot import irb140
 
-#: The flange's z points out of it, along the last axis: a quarter turn about y.
+#: The flange's z axis points outwards along the last axis: a quarter turn about y.
 _FLANGE = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 
 
 def flange_pose(q: Floats) -> Floats:
-    """Pose of the flange of an IRB 140 in the robot's base.
+    """Computes the pose of the flange of an IRB 140 in the robot's base.
 
     Args:
-        q: (6,) joints by the controller's zero and signs [rad].
+        q: (6,) joints with the controller's zero positions and signs [rad].
 
     Returns:
         (7,) position [m], then quaternion w, x, y, z with w >= 0.
@@ -46,7 +46,7 @@ def flange_pose(q: Floats) -> Floats:
 
 
 def _product(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, ...]:
-    """Of two quaternions."""
+    """Product of two quaternions."""
     (aw, ax, ay, az), (bw, bx, by, bz) = a, b
     return (
         aw * bw - ax * bx - ay * by - az * bz,
@@ -57,27 +57,28 @@ def _product(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _turned(turn: tuple[float, ...], vector: tuple[float, float, float]) -> tuple[float, ...]:
-    """A vector, turned by a quaternion."""
+    """Rotates a vector by a quaternion."""
     w, x, y, z = turn
     return _product(_product(turn, (0.0, *vector)), (w, -x, -y, -z))[1:]
 
 
-#: Joints that go as those of the arm; those beyond, a seventh axis or external ones, go as external joints.
+#: Number of joints sent as joints of the arm; further ones, a seventh axis or external axes, are sent as external
+#: joints.
 ARM_JOINTS: Final = 6
-#: The most joints that a message may hold in all.
+#: Maximum number of joints in a message.
 MOST_JOINTS: Final = 14
-#: Counters of the link, ``seqno`` and ``tm``, go round here.
+#: The counters of the link, ``seqno`` and ``tm``, wrap at this value.
 WRAP: Final = 2**32
 
 _RAD_PER_DEG: Final = pi / 180.0
 _DEG_PER_RAD: Final = 180.0 / pi
 _MM_PER_M: Final = 1000.0
 _NS_PER_S: Final = 1_000_000_000
-_LATEST_NS: Final = 2**63  # what a record of int64 holds
+_LATEST_NS: Final = 2**63  # range of int64 in a record
 
 
 class BadPacket(ValueError):
-    """A datagram that is no message of the link; the text says why."""
+    """A datagram that is not a message of the link; the text gives the reason."""
 
 
 class Motors(IntEnum):
@@ -110,16 +111,16 @@ class RobotPacket:
     """The feedback of the robot in one cycle.
 
     Attributes:
-        seqno: The robot's counter, None where it sent none.
-        tm_ms: The robot's own stamp [ms], goes round at 2**32.
-        clock_ns: Instant of the feedback by the robot's clock; None below RobotWare 6.07, which sends radians.
-        q: (n,) measured joints, the arm's and then the external ones, as many as it says [rad].
-        q_planned: (n,) where the controller itself wants to be [rad].
+        seqno: The robot's counter; None if not sent.
+        tm_ms: The robot's own stamp [ms], wraps at 2**32.
+        clock_ns: Time of the feedback on the robot's clock; None below RobotWare 6.07, which sends radians.
+        q: (n,) measured joints, those of the arm and then the external ones, as many as were sent [rad].
+        q_planned: (n,) joints planned by the controller [rad].
         motors: One of ``Motors``.
         mci: One of ``Mci``.
         rapid: One of ``Rapid``.
-        converged: The controller holds the target for reached, which is how a session ends.
-        utilization: Share of what the robot can follow [%]; NaN where it does not say.
+        converged: True: the controller considers the target reached; this ends a session.
+        utilization: Utilisation of the robot's limits [%]; NaN if not sent.
     """
 
     seqno: int | None
@@ -136,7 +137,7 @@ class RobotPacket:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """Our reply to the robot: ``q`` (n,) [rad] and the speed reference ``dq`` (n,) [rad/s], external joints last."""
+    """Reply to the robot: ``q`` (n,) [rad] and the speed reference ``dq`` (n,) [rad/s], external joints last."""
 
     seqno: int
     tm_ms: int
@@ -145,7 +146,7 @@ class Correction:
 
 
 def _parsed(kind: Any, data: bytes) -> Any:
-    """The message of that kind. Raises BadPacket."""
+    """Parses a message of a given type. Raises BadPacket."""
     if not data:
         raise BadPacket("empty datagram")
     try:
@@ -155,12 +156,12 @@ def _parsed(kind: Any, data: bytes) -> Any:
 
 
 def decode_robot(data: bytes) -> RobotPacket:
-    """Read one datagram of the robot, of any edition.
+    """Decodes one datagram of the robot, of any edition.
 
-    Without ``feedBack.time`` the joints are taken for radians, because RobotWare below 6.07 sends those.
+    Without ``feedBack.time`` the joints are read as radians, because RobotWare below 6.07 sends radians.
 
     Raises:
-        BadPacket: Empty, garbage, another kind of message, no joints, or a joint that is no finite number.
+        BadPacket: The datagram is empty, garbage or of another type, or has no joints or a joint that is not finite.
     """
     message = _parsed(messages.RobotMessage, data)
     header, feedback, planned = message.header, message.feed_back, message.planned
@@ -188,10 +189,10 @@ def decode_robot(data: bytes) -> RobotPacket:
 
 
 def encode_correction(correction: Correction) -> bytes:
-    """The datagram that answers the robot: joints [deg] and speed reference [deg/s].
+    """Encodes the answer to the robot: joints [deg] and speed reference [deg/s].
 
     Raises:
-        ValueError: Not 6 to 14 joints, or one that is no finite number: nothing of the kind may leave.
+        ValueError: There are not 6 to 14 joints, or one is not finite; such an answer must not be sent.
     """
     q, dq = (correction.q * _DEG_PER_RAD).tolist(), (correction.dq * _DEG_PER_RAD).tolist()
     if not ARM_JOINTS <= len(q) <= MOST_JOINTS or len(dq) != len(q) or not all(map(isfinite, q + dq)):
@@ -210,11 +211,11 @@ def encode_correction(correction: Correction) -> bytes:
 
 
 def decode_correction(data: bytes) -> Correction:
-    """Read a reply to the robot; without a speed reference the speed is 0.
+    """Decodes a reply to the robot; without a speed reference the speed is 0.
 
     Raises:
-        BadPacket: Empty, garbage, a robot's own message, not 6 to 14 joints, other speeds than joints, or one that is
-            no finite number.
+        BadPacket: The datagram is empty, garbage or a robot's own message, has not 6 to 14 joints or another number of
+            speeds, or a value is not finite.
     """
     message = _parsed(messages.SensorMessage, data)
     header, speed = message.header, message.speed_reference
@@ -239,11 +240,11 @@ def encode_robot(
     radians: bool = False,
     q_cartesian: Floats | None = None,
 ) -> bytes:
-    """The datagram of a robot, as editions A, B and C fill it. Checks nothing: a double also has to send nonsense.
+    """Encodes a robot's datagram as in editions A, B and C, without checks, as a double must also send invalid values.
 
     Args:
-        packet: What to say. None is left out.
-        version: A says no utilisation, collision or RAPID data; C adds the second stamp and the torques.
+        packet: Values to send; None is left out.
+        version: A has no utilisation, collision or RAPID data; C adds the second stamp and the torques.
         radians: As RobotWare below 6.07: joints in radians, no clock.
         q_cartesian: (7,) pose of the tool: position [m], then quaternion w, x, y, z.
     """
@@ -269,13 +270,13 @@ def encode_robot(
 
 
 def _all_joints(place: Any) -> list[float]:
-    """Joints of the arm, then external ones, of one part of a message."""
+    """Returns joints of the arm, then external ones, of one part of a message."""
     arm = place.joints.joints[:]
     return arm + place.external_joints.joints[:] if place.HasField("external_joints") else arm
 
 
 def _joints(place: Any, what: str) -> list[float]:
-    """The same of a guide's message: all of the arm, and external ones or none."""
+    """Returns the same for a guide's message: all joints of the arm, and optional external ones."""
     values, arm = _all_joints(place), len(place.joints.joints)
     if arm != ARM_JOINTS or len(values) > MOST_JOINTS:
         raise BadPacket(
@@ -286,14 +287,14 @@ def _joints(place: Any, what: str) -> list[float]:
 
 
 def _fill_joints(place: Any, values: list[float]) -> None:
-    """Joints of one part of a message: those beyond the arm's as external ones."""
+    """Fills the joints of one part of a message; those beyond the arm are external ones."""
     place.joints.joints.extend(values[:ARM_JOINTS])
     if values[ARM_JOINTS:]:
         place.external_joints.joints.extend(values[ARM_JOINTS:])
 
 
 def _scaled(values: list[float], scale: float, what: str) -> Floats:
-    """Joints in SI, read-only."""
+    """Returns joints in SI units, read-only."""
     if not all(map(isfinite, values)):
         raise BadPacket(f"{what}: joints {values}; finite numbers are right")
     scaled = np.array(values) * scale
@@ -302,7 +303,7 @@ def _scaled(values: list[float], scale: float, what: str) -> Floats:
 
 
 def _clock(clock: Any) -> int:
-    """Nanoseconds of the robot's clock."""
+    """Returns the time of the robot's clock in nanoseconds."""
     clock_ns: int = clock.sec * _NS_PER_S + clock.usec * 1000
     if clock_ns >= _LATEST_NS:
         raise BadPacket(f"feedBack: time {clock.sec} s + {clock.usec} us; seconds since 1970 are right")
@@ -310,7 +311,7 @@ def _clock(clock: Any) -> int:
 
 
 def _fill_place(place: Any, q: Floats, scale: float, cartesian: Floats | None) -> None:
-    """Joints and pose of the measured or of the planned place."""
+    """Fills joints and pose of the measured or planned state."""
     _fill_joints(place, (q * scale).tolist())
     if cartesian is not None:
         pos, orient = place.cartesian.pos, place.cartesian.orient
@@ -319,7 +320,7 @@ def _fill_place(place: Any, q: Floats, scale: float, cartesian: Floats | None) -
 
 
 def _fill_clock(place: Any, clock_ns: int, *, stamp: bool) -> None:
-    """The clock, and the second stamp of edition C."""
+    """Fills the clock, and the second stamp of edition C."""
     place.time.sec, remainder_ns = divmod(clock_ns, _NS_PER_S)
     place.time.usec = remainder_ns // 1000
     if stamp:
@@ -327,13 +328,13 @@ def _fill_clock(place: Any, clock_ns: int, *, stamp: bool) -> None:
 
 
 def _fill_edition(message: Any, packet: RobotPacket, version: str) -> None:
-    """Fills the fields that only some editions have; at rest where this robot has nothing to say."""
+    """Fills the fields that only some editions have; with rest values if this robot has none."""
     still = [0.0] * ARM_JOINTS
     if version == "A":
         message.measured_force = messages.MeasuredForceA(force=still).SerializeToString()
         return
     message.measured_force = messages.MeasuredForceB(fc_active=False, force=still).SerializeToString()
-    if packet.utilization == packet.utilization:  # NaN is silence
+    if packet.utilization == packet.utilization:  # NaN is not sent
         message.utilization_rate = packet.utilization
     message.move_index = 1
     message.collision.triggered = False

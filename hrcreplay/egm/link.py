@@ -1,21 +1,22 @@
-"""Our side of the EGM link: the state machine of its protocol, which has no clock and no socket, and the UDP server.
+"""The client side of the EGM link: the state machine of its protocol, without clock and socket, and the UDP server.
 
-The robot numbers its packets. How a packet is treated follows from its number, ``ahead`` of the last:
+The robot numbers its packets. The treatment of a packet depends on how far its number is ahead of the last one:
 
-- older by the robot's clock, and not 0: overtaken on the way, however long ago. Not answered.
-- 1 to ``LEAP`` ahead, modulo 2**32: the next one; those between are lost.
-- the same number, clock and stamp: a duplicate. Not answered, for a second answer waits in the robot's queue and adds
-  delay.
+- older by the robot's clock, and not 0: overtaken on the way, at any age. Not answered.
+- 1 to ``LEAP`` ahead, modulo 2**32: the next packet; those in between are lost.
+- the same number, clock and stamp: a duplicate. Not answered, as a second answer would wait in the robot's queue and
+add delay.
 - any packet after a pause: a new session.
-- anything else, as 0: perhaps a robot that was started again, perhaps somebody else who uses its address. It raises an
-  alarm, and is a new session only once packets that follow it come alone.
+- anything else, such as 0: either a restarted robot or another sender with its address. It raises an alarm, and becomes
+a new session only after packets that follow it arrive without others.
 
-Joints from which the axes cannot have come since the last packet raise an alarm, too, and are never believed. What
-raises an alarm is answered by the motion that goes on, which is a stop, and never by an echo.
+Joints that the axes cannot have reached since the last packet also raise an alarm and are never used. A packet with an
+alarm is answered by the motion under way, which is a stop, and never by an echo.
 
-A session after a pause begins with an echo: the first answer is what the robot measured, at speed 0, whatever is asked
-for. So is every answer while the robot may not move, since the last target is valid again as soon as it may. No echo
-leads further from the answer before than the axes can go in the time between: the rest follows with the next ones.
+A session after a pause begins with an echo: the first answer contains the measured joints at speed 0, for any requested
+motion. Every answer while the robot may not move is also an echo, since its last target becomes valid again once it may
+move. The step from one echo to the next is limited to the motion that the axes can make in the time between; the rest
+follows with the next echoes.
 
 The server is a blocking socket without a thread, because that has the shortest latency.
 """
@@ -38,30 +39,31 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
 from hrcreplay.settings.sections import Live
 
-#: Lost packets that a session survives: 4 s of them, far more than a silence allows.
+#: Maximum number of lost packets within a session: 4 s, far more than the allowed silence.
 LEAP: Final = 1000
 
-#: Why a datagram is not answered. The first two refuse the robot, the others the datagram.
+#: Reasons not to answer a datagram. The first two concern the robot, the others the datagram.
 REFUSALS: Final = ("radians", "axes", "no packet", "stale", "duplicate")
-#: Why an answered robot must not be moved.
+#: Reasons not to move a robot that is answered.
 STOPS: Final = ("motors off", "EGM error", "converged", "program stopped", "not answered yet", "utilization")
-#: What may be somebody else who uses the robot's address.
+#: Signs of another sender with the robot's address.
 RESTARTED: Final = "robot restarted"
 JUMPED: Final = "joints jump"
 OTHER: Final = "another robot"
 ALARMS: Final = (RESTARTED, JUMPED, OTHER)
-#: Every reason that ``classify`` gives.
+#: All reasons that ``classify`` returns.
 REASONS: Final = (*REFUSALS, *STOPS, *ALARMS)
 
-#: What a robot may measure beyond its limits: this share of speed, and noise [rad].
+#: Tolerance of measured joints beyond the limits: this share of the speed, and noise [rad].
 _FASTER, _NOISE_RAD = 1.1, 0.01
-#: A robot further outside the range of its axes than this is none [rad].
+#: Maximum distance of measured joints outside the range of the axes; larger ones are invalid [rad].
 _OUTSIDE_RAD = 1.0
-#: Lost packets, at most, in which the axes may have gone on.
+#: Maximum number of lost packets during which the axes may have moved.
 _MISSED = 25
-#: What raises an alarm is answered this many cycles after the last answer: not beside that of the robot itself.
+#: Number of cycles after the last answer at which a packet with an alarm is answered, so that it does not add to the
+#: answer to the robot itself.
 _APART = 0.75
-#: A new session without a pause is one once its packets come alone for so many cycles.
+#: Number of cycles without other packets after which a new session without a pause is accepted.
 _ALONE = 1.5
 
 
@@ -70,12 +72,12 @@ class PacketStatus:
     """Classification of a received packet.
 
     Attributes:
-        answer: It is to be answered, at once.
-        fresh: The answer will be an echo of the measured joints; blend from there. True from the first packet of a
-            session, or from the first on which the robot may move again, until that echo is given.
-        allowed: Motors on, EGM running, program not stopped. Of a datagram that is refused: what held before.
+        answer: True: answer it, at once.
+        fresh: True: the answer will be an echo of the measured joints; blend from there. True from the first packet of
+            a session, or from the first packet with which the robot may move again, until that echo is sent.
+        allowed: Motors on, EGM running, program not stopped. For a rejected datagram: the last value.
         reason: Empty, or one of ``REASONS``.
-        ended: The robot has converged or left EGM: the session is over or about to be. To report, no failure.
+        ended: The robot has converged or left EGM: the session ends. Reported, but not an error.
         lost: Packets missing before this one.
     """
 
@@ -88,9 +90,9 @@ class PacketStatus:
 
 
 class EgmSession:
-    """State of our side of the link with one robot, over any number of EGM sessions.
+    """State of the client side of the link with one robot, over any number of EGM sessions.
 
-    ``counts`` has the packets and sessions received, those lost, and each refusal by its reason.
+    ``counts`` contains the numbers of received packets and sessions, lost packets, and rejections by reason.
     """
 
     def __init__(
@@ -104,15 +106,16 @@ class EgmSession:
         silence_s: float = Live().silent_s,
         cycle_s: float = Live().cycle_s,
     ) -> None:
-        """Begin before the first packet.
+        """Starts before the first packet.
 
         Args:
-            q_min: (n,) smallest joints that are ever commanded [rad].
-            q_max: (n,) largest ones [rad].
-            dq_max: (n,) largest speed reference, and what the axes can do [rad/s].
+            q_min: (n,) lower limits of commanded joints [rad].
+            q_max: (n,) upper limits [rad].
+            dq_max: (n,) limit of the speed reference, and top speed of the axes [rad/s].
             utilization_max: The robot cannot follow above this [%].
-            utilization_packets: It must say so this often in a row, because a lost packet lets it flare up.
-            silence_s: After a longer pause of the robot the session is a new one [s].
+            utilization_packets: Number of consecutive packets above that limit, because a lost packet causes a short
+                peak.
+            silence_s: After a longer pause of the robot a new session begins [s].
             cycle_s: The robot's cycle [s].
         """
         self.counts: Counter[str] = Counter()
@@ -120,11 +123,11 @@ class EgmSession:
         self._utilization = (utilization_max, utilization_packets)
         self._silence_ns = round(silence_s * 1e9)
         self._cycle_s = cycle_s
-        self._last: RobotPacket | None = None  # that was believed
-        self._last_ns = self._heard_ns = 0  # when it came, and any that was answered
-        self._rival: RobotPacket | None = None  # that may be of a new session
-        self._rival_ns = 0  # when its first one came
-        self._alarm = ""  # of a packet since the last answer
+        self._last: RobotPacket | None = None  # last accepted packet
+        self._last_ns = self._heard_ns = 0  # arrival of that packet, and of the last answered one
+        self._rival: RobotPacket | None = None  # packet of a possible new session
+        self._rival_ns = 0  # arrival of its first packet
+        self._alarm = ""  # reason of an alarm since the last answer
         self._seqno = -1
         self._told: Floats | None = None
         self._told_ns = 0
@@ -133,7 +136,7 @@ class EgmSession:
         self._strained = 0
 
     def classify(self, packet: RobotPacket | None, t_ns: int) -> PacketStatus:
-        """Take one datagram in order of arrival; None stands for one that is no packet."""
+        """Takes one datagram in order of arrival; None for an invalid one."""
         if packet is None:
             return self._refuse("no packet")
         other = "radians" if packet.clock_ns is None else "axes" if packet.q.shape != self._q_min.shape else ""
@@ -156,9 +159,9 @@ class EgmSession:
         return self._judge(packet, lost)
 
     def classify_all(self, packets: Iterable[RobotPacket | None], t_ns: int) -> tuple[PacketStatus, RobotPacket | None]:
-        """Take a queue that built up, in order of arrival: one decision, and the packet to answer if there is one.
+        """Takes all datagrams of the queue, in order of arrival; returns one decision, and the packet to answer if any.
 
-        The last datagram need not be that packet: it may be garbage, or overtaken by one before it.
+        That packet is not always the last datagram, which may be garbage or older than the one before it.
         """
         newest, answered, lost, ended = None, None, 0, False
         heard = PacketStatus(answer=False, fresh=False, allowed=self._allowed, reason="no packet", ended=False, lost=0)
@@ -174,16 +177,16 @@ class EgmSession:
         return found, newest
 
     def reply(self, q: Floats, dq: Floats, t_ns: int) -> Correction:
-        """Answer the packet just classified. Returns what the robot is told, which may be less than what was asked for.
+        """Answers the packet just classified. Returns the sent joints, which may be limited.
 
         Args:
-            q: (n,) joints to be at [rad]. Held inside the limits, and a speed that leads out of them with it; where
-                the echo itself was outside, the limits reach as far as it.
-            dq: (n,) derivative of q [rad/s]. Held inside dq_max.
+            q: (n,) target joints [rad]. They are clamped to the limits, and so is a speed that leads out of them; if
+                the echo itself was outside, the limits are extended to it.
+            dq: (n,) derivative of q [rad/s], clamped to dq_max.
             t_ns: Now.
 
         Raises:
-            ValueError: Nothing is due, or a joint is no finite number.
+            ValueError: No packet waits for an answer, or a joint is not finite.
         """
         if not self._due or self._last is None:
             raise ValueError("reply: no packet is waiting for one; one answer each is right")
@@ -216,10 +219,11 @@ class EgmSession:
         )
 
     def _place(self, packet: RobotPacket, t_ns: int) -> tuple[str, int]:
-        """Relation of the packet to the conversation, and how many packets are missing before it.
+        """Returns the relation of the packet to the session, and the number of packets missing before it.
 
         Returns:
-            "new" after a pause, "next", "again" where it makes its predecessor a new session, a refusal or an alarm.
+            "new" after a pause, "next", "again" if it confirms its predecessor as a new session, a rejection or an
+            alarm.
         """
         if self._last is None:
             outside = np.maximum(self._q_min - packet.q, packet.q - self._q_max)
@@ -235,15 +239,15 @@ class EgmSession:
         return kind, lost
 
     def _live(self, t_ns: int) -> bool:
-        """Return whether a robot is being answered."""
+        """Returns True if a robot is being answered."""
         return self._answered and t_ns - self._heard_ns <= self._silence_ns
 
     def _follows_rival(self, packet: RobotPacket) -> bool:
-        """Return whether the packet continues a possible new session."""
+        """Returns True if the packet continues a possible new session."""
         return self._rival is not None and _follows(packet, self._rival)[0] == "next"
 
     def _passed_s(self, lost: int, t_ns: int) -> float:
-        """The longest time that can have passed for the robot since the last packet that was believed [s]."""
+        """Returns the maximum time on the robot's side since the last accepted packet [s]."""
         cycles = 2 + min(lost, _MISSED)  # packets of a queue arrive at once, and arrivals vary
         return (t_ns - self._last_ns) * 1e-9 + cycles * self._cycle_s
 
@@ -255,13 +259,13 @@ class EgmSession:
         return all(abs(now - before) <= most * passed_s + _NOISE_RAD for now, before, most in moves)
 
     def _hurries(self, packet: RobotPacket, lost: int, t_ns: int) -> bool:
-        """Return whether its clock runs ahead: believed, it would make those of the robot itself look stale."""
+        """Returns True if its clock runs ahead; if it were accepted, packets of the robot itself would look old."""
         if packet.clock_ns is None or self._last is None or self._last.clock_ns is None:
             return False
         return (packet.clock_ns - self._last.clock_ns) * 1e-9 > self._passed_s(lost, t_ns)
 
     def _towards(self, q: Floats, t_ns: int) -> Floats:
-        """Joints q (n,) [rad], or as far as the axes can go to them since the last answer."""
+        """Returns joints q (n,) [rad], limited to the motion that the axes can make since the last answer."""
         if self._told is None:
             return q
         reach = self._dq_max * max(self._cycle_s, (t_ns - self._told_ns) * 1e-9)
@@ -269,7 +273,7 @@ class EgmSession:
         return np.where(np.abs(way) <= reach, q, self._told + np.clip(way, -reach, reach))
 
     def _doubt(self, alarm: str, packet: RobotPacket, t_ns: int) -> PacketStatus:
-        """Take a packet that is not believed: it is answered as if the robot had said nothing new."""
+        """Handles a packet that is not accepted: it is answered as if it contained nothing new."""
         self.counts[alarm] += 1
         self._alarm = alarm
         if alarm == RESTARTED:
@@ -282,19 +286,19 @@ class EgmSession:
         return PacketStatus(True, fresh=False, allowed=self._allowed, reason=alarm, ended=False, lost=0)
 
     def _begin(self, *, echo: bool) -> None:
-        """Forget the last session. Our own counter goes on: the robot sees no gap that is none."""
+        """Resets the session. The counter of the answers continues, so that the robot sees no gap."""
         self.counts["sessions"] += 1
         self._fresh = echo
         self._answered = self._ran = False
         self._strained = 0
 
     def _refuse(self, reason: str) -> PacketStatus:
-        """Count a datagram that is not answered."""
+        """Counts a datagram that is not answered."""
         self.counts[reason] += 1
         return PacketStatus(answer=False, fresh=False, allowed=self._allowed, reason=reason, ended=False, lost=0)
 
     def _judge(self, packet: RobotPacket, lost: int) -> PacketStatus:
-        """Return whether the robot may be moved."""
+        """Returns True if the robot may be moved."""
         allowed = packet.motors == Motors.ON and packet.mci == Mci.RUNNING and packet.rapid != Rapid.STOPPED
         self._fresh = self._fresh or (allowed and not self._allowed)
         self._allowed = allowed
@@ -308,7 +312,7 @@ class EgmSession:
         return PacketStatus(answer=True, fresh=self._fresh, allowed=allowed, reason=reason, ended=ended, lost=lost)
 
     def _standing(self, packet: RobotPacket) -> str:
-        """Reason why the robot may not move. EGM does not run before the first answer: that is no stop."""
+        """Returns the reason not to move the robot. EGM does not run before the first answer; this is not a stop."""
         if packet.motors != Motors.ON:
             return "motors off"
         if packet.mci == Mci.ERROR:
@@ -321,7 +325,7 @@ class EgmSession:
 
 
 def _follows(packet: RobotPacket, last: RobotPacket) -> tuple[str, int]:
-    """Relation of a packet to one before it: "next", a refusal or a restart, and how many are missing between them."""
+    """Returns the relation of a packet to an earlier one: "next", a rejection or a restart, and the packets missing."""
     if packet.seqno is None or last.seqno is None:
         return "next", 0
     if (packet.clock_ns or 0) < (last.clock_ns or 0) and packet.seqno != 0:
@@ -337,9 +341,9 @@ def _follows(packet: RobotPacket, last: RobotPacket) -> tuple[str, int]:
 
 Address = tuple[str, int]
 
-#: A robot's message has half a kilobyte and may grow; UDP carries no longer one than this.
+#: Maximum size of a UDP datagram; a robot's message has 0.5 kB and may grow.
 _LONGEST: Final = 65536
-#: A flood may fill the queue faster than it drains: no more of it than this at once.
+#: Maximum number of datagrams read at once, as a flood may fill the queue faster than it is emptied.
 _DRAIN: Final = 1024
 
 
@@ -349,11 +353,11 @@ class Received:
 
     Attributes:
         data: The newest datagram.
-        older: Those of the same sender that arrived before it, in order; none of them is answered.
-        sender: Where both came from.
-        t_ns: Monotonic clock right after the first of them was taken.
-        count: How many datagrams those are.
-        waited: Whether they were there already when they were asked for: we are late.
+        older: Earlier ones of the same sender, in order; none of them is answered.
+        sender: Address of the sender.
+        t_ns: Monotonic clock right after the first of them was read.
+        count: Number of these datagrams.
+        waited: True: they were in the queue before the call, so the caller is late.
     """
 
     data: bytes
@@ -364,28 +368,28 @@ class Received:
     waited: bool
 
 
-#: Senders beside the robot that are kept to be told of.
+#: Maximum number of other senders that are stored for reports.
 _STRANGERS: Final = 4
 
 
 class EgmServer:
-    """The server's socket, used from one thread. It hears one address, and within a session one port of it.
+    """The server's socket, used from one thread. It accepts one address and, within a session, one port.
 
-    A robot that has been silent for so long that its session is over may call from another port.
+    A robot whose session has ended by a silence may use another port.
 
     Attributes:
-        port: The port in use, also where 0 was asked for.
-        robot: The only address that is heard.
+        port: The port in use, also if 0 was requested.
+        robot: The only accepted address.
         strangers: Datagrams of other senders, dropped.
-        vanished: Answers that could not be sent, because the peer or the network was gone.
+        vanished: Number of answers that could not be sent, because the peer or the network was unavailable.
     """
 
     def __init__(self, host: str, port: int, timeout_s: float, *, robot: str, silence_s: float) -> None:
-        """Open the port.
+        """Opens the port.
 
         Args:
-            host: Address of ours to listen on; "" for that from which the robot is reached.
-            port: UDP port the robot calls; 0 takes any free one.
+            host: Local address to listen on; "" for the one on the network of the robot.
+            port: UDP port that the robot uses; 0 takes any free one.
             timeout_s: Longest wait of ``newest`` [s].
             robot: IPv4 address of the robot.
             silence_s: After a longer pause of the robot its session is over [s].
@@ -411,11 +415,11 @@ class EgmServer:
         self.port: int = self._socket.getsockname()[1]
 
     def strangers_seen(self) -> list[Address]:
-        """The first senders that were not heard, in order."""
+        """The first ignored senders, in order."""
         return self._seen
 
     def newest(self) -> Received | None:
-        """Wait for a datagram, then empty the queue. None when nothing came within the time-out."""
+        """Waits for a datagram, then empties the queue; None if nothing arrives within the time-out."""
         deadline_ns = monotonic_ns() + self._timeout_ns
         first = self._receive(socket.MSG_DONTWAIT)
         waited = first is not None
@@ -431,36 +435,36 @@ class EgmServer:
         return None
 
     def answer(self, data: bytes, to: Address) -> None:
-        """Send, and go on whatever becomes of it: the robot's silence shows what went wrong."""
+        """Sends an answer and ignores errors; a failure shows as silence of the robot."""
         try:
             self._socket.sendto(data, socket.MSG_DONTWAIT, to)
         except OSError:
             self.vanished += 1
 
     def clear(self) -> None:
-        """Discard the datagrams that are in the queue."""
+        """Discards the datagrams in the queue."""
         while self._drain():
             pass
 
     def close(self) -> None:
-        """Close the socket."""
+        """Closes the socket."""
         self._socket.close()
 
     def _take(self, wait_ns: int) -> tuple[bytes, Address] | None:
-        """The next datagram within ``wait_ns``, if there is one. The kernel waits."""
+        """Returns the next datagram within ``wait_ns``, if any. The wait is in the operating system."""
         wait = struct.pack("ll", wait_ns // 1_000_000_000, max(1, wait_ns % 1_000_000_000 // 1000))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, wait)
         return self._receive(0)
 
     def _drain(self) -> list[tuple[bytes, Address]]:
-        """All that is in the queue."""
+        """Returns all datagrams in the queue."""
         lot: list[tuple[bytes, Address]] = []
         while len(lot) < _DRAIN and (datagram := self._receive(socket.MSG_DONTWAIT)) is not None:
             lot.append(datagram)
         return lot
 
     def _receive(self, flags: int) -> tuple[bytes, Address] | None:
-        """One datagram; None where there is none. An earlier answer's failure may be reported here: it is counted."""
+        """Returns one datagram, or None. The failure of an earlier answer may be reported here; it is counted."""
         while True:
             try:
                 return self._socket.recvfrom(_LONGEST, flags)
@@ -470,7 +474,7 @@ class EgmServer:
                 self.vanished += 1
 
     def _choose(self, lot: list[tuple[bytes, Address]], t_ns: int, *, waited: bool) -> Received | None:
-        """Those of the robot we talk to, or of its last call while we talk to none."""
+        """Selects the datagrams of the robot of the session, or of the last caller without a session."""
         calls = [address for _, address in lot if address[0] == self.robot]
         if t_ns - self._heard_ns > self._silence_ns and self._peer not in calls:
             self._peer = None
@@ -490,14 +494,14 @@ class EgmServer:
 
 
 def _own_address(robot: str) -> str:
-    """Our address on the network that leads to the robot.
+    """Returns the local address on the network of the robot.
 
     Raises:
-        SettingsError: None does.
+        SettingsError: No network leads to the robot.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect((robot, 9))  # sends nothing
+            probe.connect((robot, 9))  # connect sends nothing over UDP
         except OSError as error:
             raise SettingsError(
                 f"live.robot_address: no network leads to {robot} ({error.strerror}); would be right: the address of "

@@ -1,7 +1,7 @@
-"""The last gate before the socket: nothing is sent that leads further from the last command than the axes can go.
+"""The last check before the socket: blocks every command that is further from the last one than the axes can move.
 
-It reads what is about to leave, byte for byte, and knows nothing of how it came about: neither of controller and
-session, nor of the fallback that brakes after a crash. It has no clock.
+It decodes the datagram to be sent and is independent of its source: of controller and session, and of the fallback that
+brakes after a crash. It has no clock.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from hrcreplay.records import Floats
 
 
 class UnsafeCommandError(Exception):
-    """A command that must not be sent; the text says how far it leads, and how far it may."""
+    """A command that must not be sent; the text gives its step and the allowed one."""
 
 
-#: Rounding of a position that goes over the link in degrees [rad], and of a duration.
+#: Rounding of a position in degrees on the link [rad], and of a duration.
 _ROUNDING_RAD: Final = 1e-9
 _ROUNDING: Final = 1e-6
 
 
 class StepGate:
-    """Commands go at most as far as the axes can, each from the last one, and all of them over time.
+    """Limits commands to the motion of the axes, both from one to the next and over time.
 
-    A command may use the time since the last one, and at least a cycle. As packets may come close to each other, many
-    of them could still hurry the robot; so each also takes the time that its step needs from a store, which time fills
-    and which holds no more than ``STORE`` cycles.
+    A command may use the time since the last one, and at least a cycle. With packets in quick succession this alone
+    would allow too high a speed. So the time that a step needs is also taken from a store, which is refilled by the
+    elapsed time and holds at most ``STORE`` cycles.
     """
 
-    #: Cycles that a robot whose packets came late may catch up with.
+    #: Number of cycles that a robot may catch up after late packets.
     STORE: Final = 25
 
     def __init__(self, dq_max: Floats, cycle_s: float) -> None:
-        """Begin before the first command.
+        """Starts before the first command.
 
         Args:
-            dq_max: (n,) what the axes can do [rad/s].
+            dq_max: (n,) top speeds of the axes [rad/s].
             cycle_s: The robot's cycle [s].
         """
         self._dq_max, self._cycle_s = dq_max.tolist(), cycle_s
@@ -45,20 +45,20 @@ class StepGate:
         self._store_s = self.STORE * cycle_s
 
     def check(self, datagram: bytes, measured: Floats | None, t_ns: int) -> None:
-        """Lets a command pass that is about to be sent.
+        """Checks a command before it is sent.
 
         Args:
             datagram: The command.
-            measured: (n,) where the robot says it is [rad]: the first command may lead no further than a cycle from
-                there. None: it does not say.
+            measured: (n,) measured joints [rad]; the first command must be within the motion of a cycle from there.
+                None: not known.
             t_ns: Now.
 
         Raises:
-            UnsafeCommandError: It must not be sent. It then counts as not sent.
-            BadPacket: It is no command.
+            UnsafeCommandError: The command must not be sent. It then counts as not sent.
+            BadPacket: The datagram is not a command.
         """
         told = decode_correction(datagram)
-        q, axes = told.q.tolist(), len(self._dq_max)  # plain floats: arrays of six cost the robot 0.1 ms a tick
+        q, axes = told.q.tolist(), len(self._dq_max)  # plain floats: arrays of six elements take 0.1 ms per tick
         last, last_ns = self._last or (None if measured is None else measured.tolist(), t_ns)
         if last is None:
             raise UnsafeCommandError("the first command; where the robot is is not known, so none may be sent")

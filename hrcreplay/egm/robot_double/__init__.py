@@ -1,1 +1,1 @@
-"""A simulated robot controller for EGM sessions, with injected faults and a report of what it received."""
+"""A simulated robot controller for EGM sessions, with injected faults and a report of the received messages."""

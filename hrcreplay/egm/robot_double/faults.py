@@ -1,6 +1,7 @@
-"""Faults injected into the link and the robot, from a script or at random from a seed, and what came after each.
+"""Faults injected into the link and the robot, from a script or random with a seed, and the outcome of each.
 
-``FaultyChannel`` applies those of one direction of the link: which datagrams arrive, when, and in what order.
+``FaultyChannel`` applies those of one direction of the link: it decides which datagrams arrive, when, and in what
+order.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from hrcreplay.toml_file import read_toml
 
 
 class Datagram(NamedTuple):
-    """A datagram and when it departs, or has arrived [ns]."""
+    """A datagram and the time of its departure or arrival [ns]."""
 
     t_ns: int
     data: bytes
 
 
 class FaultyChannel:
-    """Faults of one direction, in the order in which they were given. Draws from its own generator alone."""
+    """Faults of one direction, in the given order, with a separate random generator."""
 
     def __init__(self, faults: Iterable[Fault], seed: Sequence[int]) -> None:
         self._faults = tuple(faults)
@@ -37,14 +38,14 @@ class FaultyChannel:
         self._held: Datagram | None = None
 
     def transmit(self, datagram: Datagram, since_s: float) -> list[Datagram]:
-        """The datagrams that arrive in place of one, after the faults of this direction.
+        """Applies the faults of this direction to a datagram; returns the datagrams that arrive in its place.
 
         Args:
-            datagram: The one to carry.
+            datagram: The datagram to transmit.
             since_s: Time since the first cycle, that of the script [s].
 
         Returns:
-            What departs, each with its own time, not before the datagram's.
+            The departing datagrams, each with a time not before that of ``datagram``.
         """
         if not self._faults:
             return [datagram]
@@ -64,7 +65,7 @@ class FaultyChannel:
     def _touch(
         self, fault: Fault, out: list[Datagram], beside: list[Datagram], t_ns: int, since_s: float
     ) -> list[Datagram]:
-        """The datagrams after one fault; garbage and empty ones go to ``beside``."""
+        """Applies one fault; garbage and empty datagrams go to ``beside``."""
         match fault.kind:
             case "loss":
                 return []
@@ -91,7 +92,7 @@ class FaultyChannel:
 
 
 def is_active(fault: Fault, since_s: float) -> bool:
-    """Return whether a fault is on; one without duration is on for less than a cycle."""
+    """Returns True if a fault is active; without a duration it is active for less than a cycle."""
     return fault.at_s <= since_s < fault.at_s + max(fault.duration_s, 0.004032)
 
 
@@ -102,7 +103,7 @@ def _later(datagrams: list[Datagram], by_ns: int) -> list[Datagram]:
 Direction = Literal["out", "in", "both"]
 _DIRECTIONS = ("out", "in", "both")
 
-#: What each fault of the link does to datagrams -> its keys beside kind, at_s, duration_s, probability, direction.
+#: Faults of the link -> their keys in addition to kind, at_s, duration_s, probability, direction.
 LINK_FAULTS: Mapping[str, tuple[str, ...]] = {
     "loss": (),
     "burst": ("count",),
@@ -114,7 +115,7 @@ LINK_FAULTS: Mapping[str, tuple[str, ...]] = {
     "garbage": (),
     "empty": (),
 }
-#: What happens to the robot -> the keys of that fault beside kind, at_s, duration_s.
+#: Faults of the robot -> their keys in addition to kind, at_s, duration_s.
 ROBOT_FAULTS: Mapping[str, tuple[str, ...]] = {
     "nan": ("axis",),
     "teleport": ("axis", "angle_deg"),
@@ -132,34 +133,34 @@ KINDS = (*LINK_FAULTS, *ROBOT_FAULTS)
 class Fault:
     """One fault.
 
-    ``loss`` drops datagrams, ``burst`` that many in a row; ``duplicate`` sends twice; ``reorder`` lets the next one
-    overtake; ``delay`` adds a fixed time, ``jitter`` a random one up to it; ``stall`` holds all back and then delivers
-    them at once; ``garbage`` and ``empty`` send such a datagram beside each. ``nan`` and ``teleport`` falsify the
-    measured joint of an axis. ``silence`` keeps the robot from sending while it moves on; ``egm_error`` and
-    ``new_session`` happen once, at their onset.
+    ``loss`` drops datagrams, ``burst`` that many in a row; ``duplicate`` sends twice; ``reorder`` sends the next one
+    first; ``delay`` adds a fixed time, ``jitter`` a random one up to it; ``stall`` delays all and then delivers them at
+    once; ``garbage`` and ``empty`` add such a datagram to each one. ``nan`` and ``teleport`` falsify the measured joint
+    of an axis. ``silence`` stops the robot's messages while it continues to move; ``egm_error`` and ``new_session``
+    happen once, at their onset.
     """
 
     kind: str
     at_s: float
     """Onset, since the first cycle [s]."""
     duration_s: float = 0.0
-    """How long it lasts [s]; 0: one cycle."""
+    """Duration [s]; 0: one cycle."""
     probability: float = 1.0
-    """Of touching a datagram, or for ``burst`` of beginning at one."""
+    """Probability of changing a datagram, or for ``burst`` of beginning at one."""
     direction: Direction = "out"
-    """Which way the datagrams go: out of the robot, in to it, or both."""
+    """Direction of the datagrams: out of the robot, in to it, or both."""
     delay_s: float = 0.02
-    """Of delay and jitter [s]."""
+    """Time of delay and jitter [s]."""
     count: int = 5
-    """Datagrams in a burst."""
+    """Number of datagrams in a burst."""
     axis: int = 1
     """Axis that is falsified, from 1."""
     angle_deg: float = 10.0
-    """How far a teleported axis seems to be off [deg]."""
+    """Apparent offset of a teleported axis [deg]."""
 
     @property
     def of_link(self) -> bool:
-        """Return whether it touches datagrams, not the robot."""
+        """Returns True for a fault of the link, False for one of the robot."""
         return self.kind in LINK_FAULTS
 
 
@@ -168,14 +169,14 @@ def load_faults(path: Path, *, seed: int, duration_s: float) -> tuple[Fault, ...
 
     Args:
         path: A TOML file.
-        seed: Of the random ones.
+        seed: Seed of the random ones.
         duration_s: Length of the session, for the random ones [s].
 
     Returns:
-        In the order of their onset.
+        The faults in order of their onset.
 
     Raises:
-        SettingsError: It cannot be read, or something in it is not right.
+        SettingsError: The file cannot be read or has an invalid entry.
     """
     script = read_toml(path, "name a script of faults, with [[fault]] tables")
     unknown = sorted(set(script) - {"fault", "random"})
@@ -195,17 +196,17 @@ def load_faults(path: Path, *, seed: int, duration_s: float) -> tuple[Fault, ...
 def random_faults(
     seed: int, *, duration_s: float, count: int = 3, after_s: float = 1.0, kinds: Sequence[str] = KINDS
 ) -> tuple[Fault, ...]:
-    """Faults of random kind, time, length and strength; the same for the same seed.
+    """Draws faults of random kind, time, duration and strength; repeatable for a seed.
 
     Args:
-        seed: Of the draw.
-        duration_s: They begin before this [s].
-        count: How many.
-        after_s: They begin after this [s].
-        kinds: To draw from.
+        seed: Seed of the generator.
+        duration_s: Latest onset [s].
+        count: Number of faults.
+        after_s: Earliest onset [s].
+        kinds: Kinds to draw from.
 
     Returns:
-        In the order of their onset.
+        The faults in order of their onset.
     """
     rng = np.random.default_rng(seed)
     faults = []
@@ -229,10 +230,10 @@ def random_faults(
 
 
 def fault_of(row: Mapping[str, Any], where: str) -> Fault:
-    """One fault from a table of a script.
+    """Makes one fault from a table of a script.
 
     Raises:
-        SettingsError: A key, a type or a value that is not right.
+        SettingsError: A key, a type or a value is invalid.
     """
     kind = row.get("kind")
     if kind not in KINDS:
@@ -274,7 +275,7 @@ def _check_number(value: object, low: float, high: float, where: str, *, whole: 
 
 
 def _chance_of(table: object, where: str) -> dict[str, Any]:
-    """Arguments of `random_faults` from a script."""
+    """Reads the arguments of `random_faults` from a script."""
     if not isinstance(table, dict):
         raise SettingsError(f"{where} is {table!r}; a table [random] would be right")
     unknown = sorted(set(table) - {"count", "after_s", "kinds"})
@@ -290,23 +291,23 @@ def _chance_of(table: object, where: str) -> dict[str, Any]:
     return dict(table)
 
 
-#: Slower than this on every axis is standstill [rad/s] ...
+#: Maximum speed of every axis at standstill [rad/s] ...
 _REST_RAD_PER_S = 0.01
-#: ... once it has lasted for so many cycles.
+#: ... for at least this number of cycles.
 _REST_CYCLES = 25
 
 
 @dataclass(frozen=True)
 class FaultOutcome:
-    """A fault and what came after its onset. None: not within the run."""
+    """A fault and its outcome. None: not within the run."""
 
     fault: Fault
     told_rest_s: float | None
-    """Until the references stood still, or no longer counted [s]."""
+    """Time until the references stood still or became invalid [s]."""
     robot_rest_s: float | None
-    """Until the robot stood still [s]."""
+    """Time until the robot stood still [s]."""
     coast_s: float | None
-    """Of it after the last reference that moved [s]."""
+    """Part of that time after the last moving reference [s]."""
 
     def line(self) -> str:
         """The fault as text."""
@@ -316,7 +317,7 @@ class FaultOutcome:
 
 
 def fault_outcome(fault: Fault, cycles: NDArray[Any]) -> FaultOutcome:
-    """Time from the onset of a fault until everything stood still."""
+    """Computes the time from the onset of a fault until everything stood still."""
     since_s = (cycles["t_ns"] - cycles["t_ns"][:1]) * 1e-9
     told = _told_still(cycles)
     robot_s = _rest_s(fault, since_s, np.all(np.abs(cycles["planned_rad_per_s"]) < _REST_RAD_PER_S, axis=1))
@@ -329,7 +330,7 @@ def fault_outcome(fault: Fault, cycles: NDArray[Any]) -> FaultOutcome:
 
 
 def _told_still(cycles: NDArray[Any]) -> Bools:
-    """Cycles whose reference neither moves nor says so (n,); without a reference there is nothing that moves."""
+    """(n,) True for cycles whose reference neither moves nor has a speed, or without a reference."""
     reference = cycles["ref_rad"]
     step = np.diff(reference, axis=0, prepend=reference[:1]) / (PERIOD_NS * 1e-9)
     moves = (np.abs(step) >= _REST_RAD_PER_S) | (np.abs(cycles["ref_rad_per_s"]) >= _REST_RAD_PER_S)
@@ -337,7 +338,7 @@ def _told_still(cycles: NDArray[Any]) -> Bools:
 
 
 def _rest_s(fault: Fault, since_s: Floats, still: Bools) -> float | None:
-    """Time from the onset of a fault to the first cycle of a standstill that lasts; None without one."""
+    """Returns the time from the onset of a fault to the first cycle of a lasting standstill; None without one."""
     if len(still) < _REST_CYCLES:
         return None
     lasting = np.convolve(still, np.ones(_REST_CYCLES), mode="valid") > _REST_CYCLES - 0.5

@@ -1,4 +1,4 @@
-"""The simulated controller of one session, computed one cycle at a time without clock or socket, and its record."""
+"""The simulated controller of one session, computed cycle by cycle without clock or socket, and its record."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ _BLOCK = 4096
 
 
 def _cycle_row(axes: int) -> np.dtype[Any]:
-    """A row a cycle.
+    """One row per cycle.
 
-    Its start; session from 1; seqno sent, -1 none; seqno of the message read, -1 none; messages still queued; states as
-    sent; joints measured; joints and speed planned; reference and its speed, NaN without; utilization.
+    Fields: start; session from 1; sent seqno, -1 none; seqno of the message read, -1 none; number of queued messages;
+    states as sent; measured joints; planned joints and speed; reference and its speed, NaN if none; utilization.
     """
     counts = ("t_ns", "session", "seqno", "told_seqno", "queued", "motors", "mci", "rapid")
     joints = ("q_rad", "planned_rad", "planned_rad_per_s", "ref_rad", "ref_rad_per_s")
@@ -52,7 +52,7 @@ def _cycle_row(axes: int) -> np.dtype[Any]:
 
 
 def _arrival_row(axes: int) -> np.dtype[Any]:
-    """A row a message that arrived, before any fault of the way in."""
+    """One row per arrived message, before the faults of the incoming direction."""
     counts, joints = ("t_ns", "session", "seqno"), ("ref_rad", "ref_rad_per_s")
     return np.dtype([*((name, np.int64) for name in counts), *((name, np.float64, axes) for name in joints)])
 
@@ -61,8 +61,8 @@ class SimulatorRecord:
     """Record of one run of the robot double.
 
     Attributes:
-        departed_ns: When the packets left that are owed an answer: duplicates and lost ones are not [ns].
-        garbage: Datagrams that were no message.
+        departed_ns: Departure times of the packets that require an answer, without duplicates and lost ones [ns].
+        garbage: Number of invalid datagrams.
     """
 
     def __init__(self, axes: int) -> None:
@@ -98,10 +98,10 @@ class SimulatorRecord:
         Args:
             t_ns: Start of the cycle [ns].
             session: Number of the session, from 1.
-            packet: What was sent; None where nothing was.
+            packet: The sent packet; None if nothing was sent.
             servo: State of the controller after the step.
-            told: Message that was read in this cycle; None without one.
-            queued: Messages that still wait in the queue.
+            told: Message read in this cycle; None without one.
+            queued: Number of messages left in the queue.
         """
         seqno = -1 if packet is None else packet.seqno
         states = (0, 0, 0) if packet is None else (packet.motors, packet.mci, packet.rapid)
@@ -112,15 +112,15 @@ class SimulatorRecord:
         self._cycles.append((t_ns, session, seqno, -1 if told is None else told.seqno, queued, *states, *motion))
 
     def cycles(self) -> NDArray[Any]:
-        """A structured row a cycle: t_ns, session, seqno, told_seqno, queued, motors, mci, rapid, q_rad..."""
+        """One structured row per cycle: t_ns, session, seqno, told_seqno, queued, motors, mci, rapid, q_rad..."""
         return self._cycles.table()
 
     def arrivals(self) -> NDArray[Any]:
-        """A structured row a message: t_ns, session, seqno, ref_rad, ref_rad_per_s."""
+        """One structured row per message: t_ns, session, seqno, ref_rad, ref_rad_per_s."""
         return self._arrivals.table()
 
     def departures(self) -> Ints:
-        """Instants of the packets that are owed an answer, ascending; not of those that a later one overtook [ns]."""
+        """Departure times of the packets that require an answer, ascending, without overtaken ones [ns]."""
         departed_ns = np.array(self.departed_ns, dtype=np.int64)
         next_ns = np.minimum.accumulate(departed_ns[::-1])[::-1][1:]
         return departed_ns[np.append(departed_ns[:-1] <= next_ns, np.ones(len(departed_ns[-1:]), bool))]
@@ -138,7 +138,7 @@ def columns(table: NDArray[Any]) -> tuple[list[str], Floats]:
 
 
 class _Rows:
-    """Structured rows in blocks, so that a long session never copies what it has."""
+    """Structured rows in blocks, so that a long session never copies its rows."""
 
     def __init__(self, dtype: np.dtype[Any]) -> None:
         self._full: list[NDArray[Any]] = []
@@ -156,7 +156,7 @@ class _Rows:
         return np.concatenate([*self._full, self._block[: self._used]])
 
 
-#: Messages that the controller's socket holds; what comes on top is lost.
+#: Capacity of the controller's socket in messages; further ones are lost.
 _QUEUE = 1024
 
 
@@ -171,9 +171,9 @@ class SimulatorSettings:
     version: Literal["A", "B", "C"] = "B"
     """Edition of the messages."""
     radians: bool = False
-    """As RobotWare below 6.07: joints in radians, no clock."""
+    """Behave as RobotWare below 6.07: joints in radians, no clock."""
     restart_s: float = 1.5
-    """This long after a session has ended the program begins another; 0 is never [s]."""
+    """Time after the end of a session at which the program starts another; 0: never [s]."""
     epoch_ns: int = 1_700_000_000_000_000_000
     """The controller's clock at the first cycle [ns]."""
 
@@ -193,13 +193,13 @@ class SimulatorSettings:
 
 
 class SimulatedRobot:
-    """The simulated controller and robot: the same instants, datagrams and seed give the same answers.
+    """The simulated controller and robot; the same instants, datagrams and seed give the same answers.
 
     Attributes:
-        servo: The controller that moves.
-        record: What it was told and what it did.
+        servo: The motion controller.
+        record: Received messages and cycles.
         session: Number of the session, from 1.
-        ends: How each session ended, empty for one that is cut off or goes on.
+        ends: Reason for the end of each session; empty for one that was cut off or still runs.
     """
 
     def __init__(self, settings: SimulatorSettings, faults: Sequence[Fault] = (), seed: int = 0) -> None:
@@ -221,14 +221,14 @@ class SimulatedRobot:
         self._last_ns = 0
 
     def cycle(self, t_ns: int, arrived: Sequence[Datagram]) -> list[Datagram]:
-        """One cycle: read the feedback, send it, read one queued message, move.
+        """Runs one cycle: read the feedback, send it, read one queued message, move.
 
         Args:
-            t_ns: Start of the cycle [ns]. Where whole periods have passed since the last, the robot has moved on.
-            arrived: What has come in since the last cycle, with instants of arrival.
+            t_ns: Start of the cycle [ns]. After skipped periods, the robot has moved on.
+            arrived: Datagrams since the last cycle, with arrival times.
 
         Returns:
-            What departs, each at its own time: now, or later by a fault.
+            The departing datagrams with their times: now, or later by a fault.
         """
         self._catch_up(t_ns)
         since_s = (t_ns - (self._first_ns or 0)) * 1e-9
@@ -243,12 +243,12 @@ class SimulatedRobot:
         return departing
 
     def sent_at(self, t_ns: int) -> None:
-        """Sets when the packet of this cycle was really sent; without it the start of the cycle counts [ns]."""
+        """Sets the actual sending time of this cycle's packet; default: the start of the cycle [ns]."""
         if self.record.departed_ns and self.record.departed_ns[-1] == self._last_ns:
             self.record.departed_ns[-1] = t_ns
 
     def _catch_up(self, t_ns: int) -> None:
-        """Moves through cycles that never were, with the last reference."""
+        """Moves through skipped cycles, with the last reference."""
         if self._first_ns is None:
             self._first_ns = t_ns
         else:
@@ -257,7 +257,7 @@ class SimulatedRobot:
         self._last_ns = t_ns
 
     def _apply_faults(self, t_ns: int, since_s: float) -> dict[str, Fault]:
-        """Applies the faults of the robot. Returns those that are on, by kind."""
+        """Applies the faults of the robot. Returns the active ones, by kind."""
         active = {}
         for number, fault in enumerate(self._robot_faults):
             if not is_active(fault, since_s):
@@ -278,7 +278,7 @@ class SimulatedRobot:
         return active
 
     def _begin(self) -> None:
-        """A new session: counts from 0 and forgets what was queued."""
+        """Starts a new session: counts from 0 and clears the queue."""
         self.servo.begin()
         self._queue.clear()
         self._coming.clear()
@@ -287,7 +287,7 @@ class SimulatedRobot:
         self.ends.append("")
 
     def _take_in(self, t_ns: int, since_s: float, arrived: Sequence[Datagram]) -> None:
-        """Queues what is there by now, after the faults of the way in."""
+        """Queues the arrived datagrams, after the faults of the incoming direction."""
         for datagram in arrived:
             self.record.add_arrival(datagram, self.session)
             for late in self._in.transmit(datagram, since_s):
@@ -299,12 +299,12 @@ class SimulatedRobot:
                 self._queue.append(data)
 
     def _silent(self, t_ns: int, active: dict[str, Fault]) -> bool:
-        """Return whether nothing is sent: by a fault, or since the session is over and its last states are told."""
+        """Returns True if nothing is sent: by a fault, or after the end of a session whose last states were sent."""
         ended_ns = self.servo.ended_ns
         return "silence" in active or (ended_ns is not None and t_ns - ended_ns > self._settings.servo.ramp_s * 1e9)
 
     def _packet(self, t_ns: int, active: dict[str, Fault]) -> RobotPacket:
-        """State of the robot in this cycle."""
+        """Returns the state of the robot in this cycle."""
         servo, since_ns = self.servo, t_ns - (self._first_ns or 0)
         q = servo.measured
         if teleport := active.get("teleport"):
@@ -329,17 +329,17 @@ class SimulatedRobot:
         return packet
 
     def _send(self, t_ns: int, since_s: float, packet: RobotPacket) -> list[Datagram]:
-        """The packet's datagram after the faults of the way out."""
+        """Returns the packet's datagrams after the faults of the outgoing direction."""
         pose = flange_pose(self.servo.measured) if self._settings.servo.axes == IRB140 else None
         data = encode_robot(packet, version=self._settings.version, radians=self._settings.radians, q_cartesian=pose)
         departing = self._out.transmit(Datagram(t_ns, data), since_s)
         owed_ns = [datagram.t_ns for datagram in departing if datagram.data is data]
-        if owed_ns and np.isfinite(packet.q).all():  # nobody has to answer nonsense
+        if owed_ns and np.isfinite(packet.q).all():  # invalid packets require no answer
             self.record.departed_ns.append(min(owed_ns))
         return departing
 
     def _read(self) -> Correction | None:
-        """The one message of this cycle; what is none is read and ignored."""
+        """Reads the one message of this cycle; an invalid one is ignored."""
         try:
             told = decode_correction(self._queue.popleft()) if self._queue else None
         except BadPacket:

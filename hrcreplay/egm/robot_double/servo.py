@@ -1,4 +1,4 @@
-"""The controller's response to position references: a state machine stepped once a cycle, without clock and socket.
+"""The controller's response to position references: a state machine stepped once per cycle, without clock and socket.
 
 Settings have the controller's names and units (degrees); positions, speeds and accelerations are in radians.
 """
@@ -19,7 +19,7 @@ from hrcreplay.robot import irb140
 #: Time between two packets of a real controller [ns].
 PERIOD_NS = 4_032_000
 _PERIOD_S = PERIOD_NS * 1e-9
-#: A reference may be this far out of range by the rounding of degrees [rad].
+#: Maximum excess of a reference over the range, from the rounding of degrees [rad].
 _ROUNDING_RAD = 1e-9
 
 
@@ -37,7 +37,8 @@ class Axes:
     """Top acceleration, either way [deg/s^2]."""
 
 
-#: Range and speed of the product specification. No acceleration is published: full speed to rest in 0.15 s is ours.
+#: Range and speed of the product specification. The acceleration is not published; assumed: full speed to rest in 0.15
+#: s.
 IRB140 = Axes(
     low_deg=tuple(float(axis.range_deg[0]) for axis in irb140.AXES),
     high_deg=tuple(float(axis.range_deg[1]) for axis in irb140.AXES),
@@ -47,33 +48,33 @@ IRB140 = Axes(
 
 
 def axes_of(q_min: Floats, q_max: Floats, dq_max: Floats) -> Axes:
-    """The axes of any robot, (n,) each [rad, rad/s]: full speed to rest in 0.15 s."""
+    """Makes the axes of any robot, (n,) each [rad, rad/s]; assumed: full speed to rest in 0.15 s."""
     low, high, speed = (tuple(np.degrees(bound).tolist()) for bound in (q_min, q_max, dq_max))
     return Axes(low, high, speed, tuple(of / 0.15 for of in speed))
 
 
 @dataclass(frozen=True, slots=True)
 class ServoSettings:
-    """The session as RAPID sets it up. As delivered: ``max_speed_deviation_deg_per_s`` 1 and ``cond_time_s`` 1."""
+    """The session settings of RAPID. As delivered: ``max_speed_deviation_deg_per_s`` 1 and ``cond_time_s`` 1."""
 
     gain: float = 5.0
     """Proportional gain of the position loop, 0 to 20 [1/s]."""
     pos_corr_gain: float = 1.0
-    """PosCorrGain, 0 to 1: 0 follows the speed reference alone."""
+    """PosCorrGain, 0 to 1; 0: only the speed reference is followed."""
     filter_hz: float = 20.0
-    """Low-pass filter of the speed; 0 is off [Hz]."""
+    """Low-pass filter of the speed; 0: off [Hz]."""
     max_speed_deviation_deg_per_s: float = 450.0
     """MaxSpeedDeviation: above it all axes are slowed together [deg/s]."""
     convergence_deg: float = 0.5
-    """An axis this close to its reference has converged [deg]."""
+    """Distance to its reference at which an axis has converged [deg]."""
     cond_time_s: float = 0.0
-    """CondTime: converged for this long, the session ends; 0 is never [s]."""
+    """CondTime: after convergence for this time the session ends; 0: never [s]."""
     comm_timeout_s: float = 1.0
-    """CommTimeout: without a message for longer, once there was one, the session ends in an error [s]."""
+    """CommTimeout: after the first message, a longer silence ends the session with an error [s]."""
     ramp_s: float = 0.5
-    """A program stop or the end of the session takes the robot to rest in this time [s]."""
+    """Time in which a program stop or the end of the session brings the robot to rest [s]."""
     lag_cycles: int = 3
-    """Cycles by which the measured joints trail the planned ones."""
+    """Delay of the measured joints behind the planned ones, in cycles."""
     axes: Axes = IRB140
     """Range, speed and acceleration of each axis."""
 
@@ -92,18 +93,19 @@ class ServoSettings:
 
 
 class ServoController:
-    """The controller in a session: takes at most one reference a cycle and moves the robot by one cycle.
+    """The controller in a session: takes at most one reference per cycle and moves the robot by one cycle.
 
     Attributes:
-        motors_on: Set from outside. Off, the brakes stop the robot; back on, the last reference is live again.
-        program_running: Set from outside. Stopped, the robot ramps to rest; running, the last reference is live again.
-        error: Why the session ended in an error; empty without one.
-        converged: The session ended by convergence.
-        ended_ns: When it ended; None while it lasts.
+        motors_on: Set from outside. False: the brakes stop the robot. True again: the last reference is valid again.
+        program_running: Set from outside. False: the robot ramps to rest. True again: the last reference is valid
+            again.
+        error: Error that ended the session; empty without one.
+        converged: True: the session ended by convergence.
+        ended_ns: Time of the end; None during the session.
         q: Planned joints (nv,) [rad].
         dq: Planned speed (nv,) [rad/s].
-        utilization: Speed or acceleration asked for, of what is allowed; above 100 the robot cannot follow [%].
-        reference: The reference that is followed; None before the first of the session.
+        utilization: Requested speed or acceleration relative to the limit; above 100 the robot cannot follow [%].
+        reference: The current reference; None before the first of the session.
     """
 
     def __init__(self, settings: ServoSettings, q: Floats) -> None:
@@ -125,7 +127,7 @@ class ServoController:
         self.begin()
 
     def begin(self) -> None:
-        """Starts a session; the state of the one before is discarded."""
+        """Starts a session; discards the state of the previous one."""
         self.error = ""
         self.converged = False
         self.ended_ns: int | None = None
@@ -138,12 +140,12 @@ class ServoController:
 
     @property
     def measured(self) -> Floats:
-        """Measured joints (nv,) [rad]: the planned ones some cycles ago."""
+        """Measured joints (nv,) [rad]: the planned ones of some cycles ago."""
         return self._trail[0]
 
     @property
     def moves(self) -> bool:
-        """Return whether references are followed: the session lasts, motors are on and the program runs."""
+        """Returns True if references are followed: the session lasts, motors are on and the program runs."""
         return self.ended_ns is None and self.motors_on and self.program_running
 
     def step(self, t_ns: int, told: Correction | None) -> None:
@@ -183,7 +185,7 @@ class ServoController:
             self.converged, self.ended_ns = True, t_ns
 
     def _follow(self) -> Floats:
-        """Speed (nv,) [rad/s] of the control law: k (pos_ref - pos) + speed_ref, filtered, then limited."""
+        """Returns the speed (nv,) [rad/s] of the control law: k (pos_ref - pos) + speed_ref, filtered, then limited."""
         self._halted = None
         raw = np.zeros_like(self.q)
         if self.reference is not None:
@@ -196,7 +198,7 @@ class ServoController:
         return self.dq + np.clip(change, -step, step)
 
     def _halt(self, t_ns: int) -> Floats:
-        """Speed (nv,) [rad/s] on the way to rest: by brakes without motors, by the ramp otherwise."""
+        """Returns the speed (nv,) [rad/s] on the way to rest: by brakes if the motors are off, else by the ramp."""
         if self._halted is None:
             self._halted = (t_ns, self.dq)
         self.utilization = 0.0
@@ -208,11 +210,11 @@ class ServoController:
         return self._filtered
 
     def _keep_range(self, dq: Floats) -> Floats:
-        """The speed from which full braking still ends within the range of each axis (nv,) [rad/s]."""
+        """Limits the speed so that full braking ends within the range of each axis (nv,) [rad/s]."""
         return np.clip(dq, -self._fastest(self.q - self.low), self._fastest(self.high - self.q))
 
     def _fastest(self, room: Floats) -> Floats:
-        """Largest speed that can be braked within some room, cycle by cycle (nv,) [rad/s]."""
-        step = self.acceleration_max * _PERIOD_S  # v T + (v - step) T + ... over n cycles is the room
+        """Returns the maximum speed from which the axes stop within a distance, cycle by cycle (nv,) [rad/s]."""
+        step = self.acceleration_max * _PERIOD_S  # v T + (v - step) T + ... over n cycles is the distance
         n = np.maximum(1.0, np.ceil(np.sqrt(0.25 + 2 * np.maximum(room, 0.0) / (step * _PERIOD_S)) - 0.5))
         return np.maximum(room, 0.0) / (n * _PERIOD_S) + step * (n - 1) / 2

@@ -1,6 +1,6 @@
-"""The robot double as a UDP client that keeps its cycle time by absolute deadlines, and the summary of a run of it.
+"""The robot double as a UDP client that keeps its cycle time by absolute deadlines, and the summary of its run.
 
-The summary has reply times, what was commanded, and how the double came to rest after faults.
+The summary contains reply times, the commands, and the standstill after faults.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats, Ints
 
-#: A packet with another so close behind may go unanswered: a guide that drains its socket answers the newest [ns].
+#: Time to the next packet within which a packet may stay unanswered: a guide that empties its socket answers the newest
+#: [ns].
 DRAINED_NS = 500_000
 
 
@@ -41,12 +42,12 @@ class Answers:
 
     packets: int
     before_first: int
-    """Packets that left before the guide said anything at all."""
+    """Packets sent before the first message of the guide."""
     answered: int
     missed: int
-    """Of the others."""
+    """Answered ones of the other packets."""
     doubled: int
-    """Messages for which no packet was waiting."""
+    """Messages without a waiting packet."""
     garbage: int
     seqno_steps: int
     """Steps of the guide's counter other than 1 within a session."""
@@ -59,9 +60,9 @@ class Commanded:
     """Largest commanded jumps, speeds and accelerations, for each axis."""
 
     start_jump_rad: list[float]
-    """From the measured joints to a session's first reference [rad]."""
+    """Jump from the measured joints to a session's first reference [rad]."""
     jump_rad: list[float]
-    """From one reference to the next [rad]."""
+    """Jump from one reference to the next [rad]."""
     speed_rad_per_s: list[float]
     """That jump over the cycles between their arrivals [rad/s]."""
     speed_ref_rad_per_s: list[float]
@@ -79,16 +80,16 @@ class SimulatorReport:
     duration_s: float
     cycles: int
     overruns: int
-    """Cycles that the machine kept from happening in time."""
+    """Cycles that were late on this machine."""
     sessions: list[str]
-    """How each session ended; empty for one that was cut off."""
+    """Reason for the end of each session; empty for one that was cut off."""
     answers: Answers
     commanded: Commanded
     faults: list[FaultOutcome]
     record: SimulatorRecord
 
     def as_json(self) -> dict[str, Any]:
-        """All but the record, ready for JSON."""
+        """Returns all except the record, in JSON form."""
         names = ("duration_s", "cycles", "overruns", "sessions")
         parts = {"answers": asdict(self.answers), "commanded": asdict(self.commanded)}
         return (
@@ -96,7 +97,7 @@ class SimulatorReport:
         )
 
     def lines(self) -> list[str]:
-        """The report as text."""
+        """Returns the report as text."""
         answers, told = self.answers, self.commanded
         ends = ", ".join(end or "cut off" for end in self.sessions)
         latency = ", ".join(f"{name} {value:.0f}" for name, value in answers.latency_us.items()) or "none"
@@ -136,7 +137,7 @@ class SimulatorReport:
 
 
 def report_of(core: SimulatedRobot, faults: Sequence[Fault], *, overruns: int = 0) -> SimulatorReport:
-    """The report of a run of the robot double."""
+    """Makes the report of a run of the robot double."""
     cycles, arrivals = core.record.cycles(), core.record.arrivals()
     return SimulatorReport(
         duration_s=len(cycles) and float(cycles["t_ns"][-1] - cycles["t_ns"][0] + PERIOD_NS) * 1e-9,
@@ -153,8 +154,9 @@ def report_of(core: SimulatedRobot, faults: Sequence[Fault], *, overruns: int = 
 def _answers(departed_ns: Ints, arrivals: NDArray[Any], garbage: int) -> Answers:
     """Pairs packets and answers.
 
-    Between two departures come as many answers as packets wait: then each has its own. Fewer: the newest were
-    answered, as a guide does that has fallen behind. More: those were doubled.
+    If as many answers as waiting packets arrive between two departures, each packet has one. If fewer arrive, the
+    newest packets were answered, as by a guide that has fallen behind. If more arrive, the additional ones are
+    duplicates.
     """
     arrived_ns = arrivals["t_ns"]
     windows = np.split(arrived_ns, np.searchsorted(arrived_ns, departed_ns))
@@ -187,7 +189,7 @@ def _answers(departed_ns: Ints, arrivals: NDArray[Any], garbage: int) -> Answers
 
 
 def _commanded(cycles: NDArray[Any], arrivals: NDArray[Any], speed_max: Floats, acceleration_max: Floats) -> Commanded:
-    """Largest jumps, speeds and accelerations of what arrived, within sessions."""
+    """Computes the maximum jumps, speeds and accelerations of the arrived references, within sessions."""
     session = arrivals["session"]
     same = np.diff(session) == 0
     count = np.maximum(1, np.rint(np.diff(arrivals["t_ns"])[same] / PERIOD_NS))[:, None]
@@ -214,8 +216,8 @@ def _largest(values: Floats) -> list[float]:
 
 _SO_TIMESTAMPNS = 35  # Linux; the socket module has no name for it
 _BUFFER = 65536
-_LAST_ANSWERS_NS = 50_000_000  # so long the end waits for answers that are under way
-_RANK = 10  # lowest of what matters: never ahead of the guide on its own machine
+_LAST_ANSWERS_NS = 50_000_000  # maximum wait for outstanding answers at the end
+_RANK = 10  # lowest real-time priority: never above the guide on the same machine
 
 
 def run_simulator(
@@ -231,16 +233,16 @@ def run_simulator(
     """Plays the robot against a server at ``host:port`` until the time is up, or SIGINT or SIGTERM.
 
     Args:
-        host: Where the robot's guide listens.
-        port: Its port.
-        settings: Which controller; its clock begins at the present time.
-        faults: What goes wrong.
-        seed: Of all that is random in the faults.
-        duration_s: How long; None is until it is interrupted [s].
-        out: Folder for the report and the record, made if need be; None writes nothing.
+        host: Address of the robot's guide.
+        port: Port of the guide.
+        settings: Settings of the controller; its clock begins at the present time.
+        faults: Faults to inject.
+        seed: Seed of the random faults.
+        duration_s: Duration; None: until it is interrupted [s].
+        out: Folder for the report and the record, created if needed; None writes nothing.
 
     Returns:
-        What it was told and what it did.
+        The report of the run.
 
     Raises:
         SettingsError: The host has no address, or the folder cannot be written.
@@ -261,7 +263,7 @@ def run_simulator(
 
 
 def _run(core: SimulatedRobot, client: socket.socket, duration_s: float | None) -> int:
-    """Cycles until the end. Returns the cycles that the machine has kept from happening in time."""
+    """Runs cycles until the end. Returns the number of late cycles."""
     overruns = 0
     late: list[tuple[int, int, bytes]] = []
     number = itertools.count()
@@ -283,14 +285,14 @@ def _run(core: SimulatedRobot, client: socket.socket, duration_s: float | None) 
             due_ns += PERIOD_NS
         _wait(due_ns + _LAST_ANSWERS_NS, late, client)
     except KeyboardInterrupt:
-        pass  # the report is what remains to be done
+        pass  # only the report remains
     for datagram in _arrived(client):
         core.record.add_arrival(datagram, core.session)
     return overruns
 
 
 def _wait(until_ns: int, late: list[tuple[int, int, bytes]], client: socket.socket) -> None:
-    """Sleeps until the deadline, sending what is due on the way."""
+    """Sleeps until the deadline and sends due datagrams meanwhile."""
     while late and late[0][0] < until_ns:
         due_ns, _number, data = heapq.heappop(late)
         time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
@@ -299,7 +301,7 @@ def _wait(until_ns: int, late: list[tuple[int, int, bytes]], client: socket.sock
 
 
 def _arrived(client: socket.socket) -> list[Datagram]:
-    """Received packets, with the instants at which the kernel had them, which no sleep of ours delays."""
+    """Returns received packets with the kernel's arrival times, which are independent of the process's sleep."""
     datagrams: list[Datagram] = []
     to_monotonic_ns = time.monotonic_ns() - time.time_ns()
     while True:
@@ -308,19 +310,19 @@ def _arrived(client: socket.socket) -> list[Datagram]:
         except BlockingIOError:
             return datagrams
         except ConnectionError:
-            continue  # nobody listens yet
+            continue  # no listener yet
         seconds, nanoseconds = struct.unpack("qq", notes[0][2])
         datagrams.append(Datagram(seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns, data))
 
 
 def _send(client: socket.socket, data: bytes) -> None:
-    with suppress(ConnectionError, BlockingIOError):  # nobody listens, or the buffer is full: a lost packet
+    with suppress(ConnectionError, BlockingIOError):  # no listener, or the buffer is full: a lost packet
         client.send(data)
 
 
 @contextmanager
 def _client(host: str, port: int) -> Iterator[socket.socket]:
-    """A non-blocking UDP socket towards the guide, with time stamps of the kernel."""
+    """Opens a non-blocking UDP socket to the guide, with time stamps of the kernel."""
     try:
         family, kind, protocol, _name, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
     except (OSError, UnicodeError) as error:
@@ -337,7 +339,7 @@ def _client(host: str, port: int) -> Iterator[socket.socket]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """No garbage collection in between, and ahead of other processes where that is allowed, as a controller would be.
+    """Disables garbage collection and raises the priority if allowed, as for a real controller.
 
     SIGTERM ends the session as Ctrl-C does.
     """
