@@ -1,4 +1,4 @@
-"""Swept volumes by three methods from the literature, written from their definitions, for comparison with ours.
+"""Swept volumes by three methods from the literature, implemented from their definitions, for comparison.
 
 All methods get the same input, the fused posture and its velocity, and give the limbs the same thickness.
 """
@@ -15,34 +15,34 @@ BASELINES = ("constant_velocity", "v2_a50", "iso_13855")
 
 #: Bounds of ``v2_a50`` on a point of the body [m/s], [m/s^2].
 _SPEED, _ACCELERATION = 2.0, 50.0
-#: Approach speeds of ISO 13855 per limb: walking for the body, the upper limbs' own for the arms [m/s].
+#: Approach speeds of ISO 13855 per limb: of walking for the body, of the upper limbs for the arms [m/s].
 _APPROACH = np.array([1.6, 1.6, 2.0, 2.0, 2.0, 2.0])
 #: Time step of the difference that gives the ends' velocities [s].
 _STEP_S = 1e-4
 
 
 def predict(states: HumanStates, *, horizon_s: float, radii_m: Floats, hand_m: float, method: str) -> SweptVolumes:
-    """Swept volumes of a baseline: the hull of what each limb's ends can reach, as the limb lies between them.
+    """Computes the swept volumes of a baseline: the hull of the points that each limb's ends can reach.
 
-    ``constant_velocity``: the limb now and after the horizon, its ends moving on as they do.
-    ``v2_a50``: every motion of the ends with speeds up to 2 m/s and accelerations up to 50 m/s^2 from their present
-    velocity, as in capsule-based reachability analysis: the velocity is in a ball of radius a t around the present
-    one, and in a ball of radius v around 0; up to t' = v/a the first is the smaller, then the second. So an end is
-    within a t'^2 / 2 + v (T_s - t') of where its velocity takes it by t'. A faster present velocity counts as 2 m/s.
-    ``iso_13855``: a ball of 1.6 m/s times the horizon around head and thorax, of 2.0 m/s around the arms.
+    ``constant_velocity``: the limb now and after the horizon, with its ends at constant velocity. ``v2_a50``: every
+    motion of the ends with speeds up to 2 m/s and accelerations up to 50 m/s^2 from their present velocity, as in
+    capsule-based reachability analysis: the velocity is in a ball of radius a t around the present one, and in a ball
+    of radius v around 0; up to t' = v/a the first is the smaller, then the second. So an end is within a t'^2 / 2 + v
+    (T_s - t') of its position at constant velocity at t'. A faster present velocity counts as 2 m/s. ``iso_13855``: a
+    ball of 1.6 m/s times the horizon around head and thorax, of 2.0 m/s around the arms.
 
     Args:
         states: The fused person.
         horizon_s: Braking time T_s of the robot [s].
         radii_m: (6,) radii of LIMBS, Table 2 [m].
-        hand_m: The lower arm reaches this far beyond the wrist [m].
+        hand_m: Length of the lower arm beyond the wrist [m].
         method: One of PEERS.
 
     Returns:
-        Volumes of LIMBS; a limb of a person not known yet has NaN vertices.
+        Volumes of LIMBS; a limb of a person who is not known yet has NaN vertices.
 
     Raises:
-        SettingsError: There is no such method.
+        SettingsError: The method is unknown.
     """
     if method not in BASELINES:
         raise SettingsError(f"peer: found {method!r}; choose one of {', '.join(BASELINES)}")
@@ -66,14 +66,14 @@ def predict(states: HumanStates, *, horizon_s: float, radii_m: Floats, hand_m: f
 
 
 def ends(p: Floats, lengths_m: Floats, hand_m: float) -> list[Floats]:
-    """Per limb of LIMBS the points (n, 2 or 3, 3) whose hull is its axis, world [m].
+    """Returns, per limb of LIMBS, the points (n, 2 or 3, 3) whose hull is its axis, world [m].
 
     Head: neck, head. Thorax: pelvis, shoulders. Upper arm: shoulder, elbow. Lower arm: elbow, tip of the hand.
 
     Args:
         p: (n, 13) JOINTS [m, m, rad..., m].
         lengths_m: (n, 7) LENGTHS [m].
-        hand_m: The hand goes on in the forearm's direction for so long [m].
+        hand_m: Length of the hand in the forearm's direction [m].
     """
     points = skeleton(p, lengths_m)
     found = [points[:, (NECK, HEAD)], points[:, (PELVIS, ARM_POINTS[0][0], ARM_POINTS[1][0])]]
@@ -86,17 +86,17 @@ def ends(p: Floats, lengths_m: Floats, hand_m: float) -> list[Floats]:
 
 
 def _velocities(states: HumanStates, hand_m: float) -> list[Floats]:
-    """Velocities of the ``ends`` [m/s]."""
+    """Computes the velocities of the ``ends`` [m/s]."""
     later = ends(states.p + _STEP_S * states.v, states.lengths_m, hand_m)
     earlier = ends(states.p - _STEP_S * states.v, states.lengths_m, hand_m)
     return [(b - a) / (2.0 * _STEP_S) for a, b in zip(earlier, later, strict=True)]
 
 
 def _accelerated(now: list[Floats], velocities: list[Floats], horizon_s: float) -> tuple[list[Floats], float]:
-    """Centres and radius of the balls that hold all the ends can reach, at every time up to the horizon.
+    """Returns centres and radius of the balls that contain all points that the ends can reach up to the horizon.
 
-    The ball of the horizon holds those of all earlier times, unless the horizon is so short that the present place
-    itself is outside; then both are centres.
+    The ball at the horizon contains those of all earlier times, unless the horizon is so short that the present
+    position is outside; then both are centres.
     """
     turn_s = min(horizon_s, _SPEED / _ACCELERATION)
     reach_m = 0.5 * _ACCELERATION * turn_s**2 + _SPEED * (horizon_s - turn_s)

@@ -1,11 +1,11 @@
-"""The fit of ``human.model.Departure`` to how far whole limbs departed from constant velocity on recordings.
+"""The fit of ``human.model.Departure`` to the departures of whole limbs from constant velocity on recordings.
 
-First rise and sink are fitted: a quantile, for the whole body moves with the pelvis. Then each pair of limbs and
-horizon gets a line over the limb's residual, by quantile regression: of all lines above the wanted share of the
-departures, the one that is least above them. The lines are then raised by one factor a horizon, until whole people are
-inside, not limbs one by one, in the wanted share of the ticks of every log. Last, people whose truth is known are all
-but wholly taken in, by raising what costs the least volume: of them no miss is a camera's. Simulated people, of whom
-there are as many ticks as one likes, do not count where ticks of all logs are counted together.
+First rise and sink are fitted by a quantile, as the whole body moves with the pelvis. Then quantile regression gives
+each pair of limbs and horizon a line over the limb's residual: the lowest line above the required share of the
+departures. The lines are then raised by one factor per horizon, until whole people, not single limbs, are inside in the
+required share of the ticks of every log. Last, people with ground truth are included almost completely, by raising the
+lines that cost the least volume, as their misses are not camera errors. Simulated people, with an unlimited number of
+ticks, do not count in totals over the ticks of all logs.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from hrcreplay.records import BODY, Floats
 
 #: Limbs that share a line: both sides of the body.
 _PAIRS = ((0,), (1,), (2, 4), (3, 5), (6,))
-#: Share of a pair's departures below its line before it is raised.
+#: Share of a pair's departures below its line before the line is raised.
 _BELOW = 0.995
-#: No line is steeper: what is steeper rests on the few logs of much noise.
+#: Maximum slope of a line; a larger slope comes from the few logs with much noise.
 _STEEPEST = 1.25
-#: The largest factor of all lines, how often its interval is halved, and the largest of one line after that.
+#: Maximum common factor of all lines, number of bisection steps, and maximum factor of one line after that.
 _MOST, _HALVINGS, _MOST_AGAIN = 1.5, 12, 1.5
-#: How many times as many ticks may miss as are asked for: of one log that was left out; and where it is fitted to, of
-#: one log, of one that holds the truth, and of all logs together, for people who are not known miss more.
+#: Allowed misses relative to the requested share: of one log that was left out; and in the fit, of one log, of one with
+#: ground truth, and of all logs together. The last is below 1, as unknown people miss more.
 EACH, _FITTED, _TRUE, _TOGETHER = 3.0, 2.25, 0.3, 0.6
-#: Departures, their growth, and rise and sink are rounded up to these [m], [1], [m]: with steps that coarse most folds
-#: have the same rise and sink, beside which departures need to be measured once.
+#: Departures, their slopes, and rise and sink are rounded up to multiples of these [m], [1], [m]. With steps this
+#: coarse most folds have the same rise and sink, so that departures are measured only once.
 _MM, _HUNDREDTH, _CM = 1e-3, 1e-2, 1e-2
 
 
 def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
-    """The departures that hold whole people of some logs.
+    """Fits the departures that contain whole people of some logs.
 
     Args:
-        samples: One a log, with the same horizons.
-        share: Of the ticks of other logs at each horizon, in (0, 1). Of all ticks fitted to, 0.6 times as many may
-            miss, of one log's 2.25 times as many, of those of one with the truth 0.3 times as many.
+        samples: One per log, with the same horizons.
+        share: Required share of the ticks of other logs at each horizon, in (0, 1). Allowed misses in the fit, relative
+            to its complement: 0.6 times over all ticks, 2.25 times in one log, 0.3 times in one with ground truth.
     """
     horizon_s = samples[0].horizon_s
     rise_m, sink_m = (_rise(horizon_s, [s.height_m[way] for s in samples]) for way in range(2))
@@ -67,20 +67,21 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
 
 
 def counted(samples: Sequence[LimbDepartures]) -> list[bool]:
-    """Mark the logs that count where ticks of all are counted together: those without the truth, else all."""
+    """Marks the logs that count in totals over all ticks: those without ground truth, else all."""
     all_true = all(sample.true for sample in samples)
     return [all_true or not sample.true for sample in samples]
 
 
 def _times(departure: Departure, factor: Floats) -> Departure:
-    """Lines raised by factors that broadcast to (7, h)."""
+    """Returns the lines raised by factors that broadcast to (7, h)."""
     return replace(departure, beyond_m=factor * departure.beyond_m, residuals=factor * departure.residuals)
 
 
 def _rise(horizon_s: Floats, logs: Sequence[Floats]) -> Floats:
-    """(h,) how far the pelvis rises, or sinks, at most in nearly all ticks; of each log (h, n) how far it did [m].
+    """(h,) maximum rise, or sink, of the pelvis in nearly all ticks; input: (h, n) of each log [m].
 
-    Before the last horizon no more than who accelerates evenly until then: the rest is noise, which the ball holds.
+    Before the last horizon, at most that of a constant acceleration until then; the rest is noise, which the ball
+    covers.
     """
     last = _often([log[-1] for log in logs])
     evenly = last * (horizon_s / horizon_s[-1]) ** 2
@@ -88,7 +89,7 @@ def _rise(horizon_s: Floats, logs: Sequence[Floats]) -> Floats:
 
 
 def _often(logs: Sequence[Floats]) -> float:
-    """The height [m] that the share _BELOW of all ticks is not above; every log weighs as the root of its ticks."""
+    """Returns the quantile _BELOW of all heights [m]; a log's weight is the root of its number of ticks."""
     known = [log[np.isfinite(log)] for log in logs]
     height = np.concatenate(known)
     if not len(height):
@@ -100,9 +101,9 @@ def _often(logs: Sequence[Floats]) -> float:
 
 
 def _line(logs: Sequence[tuple[Floats, Floats]]) -> Floats:
-    """(2,) offset >= 0 and slope, up to _STEEPEST, of the line with the least quantile loss.
+    """(2,) offset >= 0 and slope, up to _STEEPEST, of the line with the minimum quantile loss.
 
-    Every log weighs as the root of its ticks.
+    The weight of a log is the root of its number of ticks.
     """
     far, near, weight = [], [], []
     for beyond, residual in logs:
@@ -127,9 +128,9 @@ def _line(logs: Sequence[tuple[Floats, Floats]]) -> Floats:
 
 
 def _factor(samples: Sequence[LimbDepartures], plain: Departure, k: int, share: float) -> float:
-    """The least factor on the lines at a horizon that holds the people of all logs together and of each.
+    """Returns the smallest factor on the lines at a horizon that contains the people of all logs together and of each.
 
-    A log whose people not even the largest factor holds, as of a camera that loses the legs, asks for none.
+    A log whose people exceed even the largest factor, as with a camera that loses the legs, is ignored.
     """
     needed = [of.max(axis=1) for of in _needed(samples, plain, k)]
     if not any(len(of) for of in needed):
@@ -157,16 +158,16 @@ def _factor(samples: Sequence[LimbDepartures], plain: Departure, k: int, share: 
 
 
 def _needed(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> list[Floats]:
-    """(n, 7) a log: ``factors`` at the ticks at which any limb was recorded, 0 for those that were not."""
+    """(n, 7) per log: ``factors`` at the ticks at which any limb was recorded, 0 for unrecorded limbs."""
     factors = [s.factors(departure, k) for s in samples]
     return [np.nan_to_num(of[np.isfinite(of).any(axis=1)]) for of in factors]
 
 
 def _raise(samples: Sequence[LimbDepartures], departure: Departure, k: int, share: float) -> Floats:
-    """(7,) factors on the lines at a horizon that hold the people of each of the logs, whose truth is known.
+    """(7,) factors on the lines at a horizon that contain the people of each of the logs with ground truth.
 
-    The limbs of a pair have one. Of the ticks that are outside the one is taken in that costs the least volume, until
-    enough are inside, or only some that not even the largest factors hold.
+    The limbs of a pair share a factor. The ticks outside are included one after the other, the one that costs the least
+    volume first, until enough are inside or only ticks beyond the largest factors remain.
     """
     needed = _needed(samples, departure, k)
     log = np.repeat(np.arange(len(samples)), [len(of) for of in needed])
@@ -188,11 +189,11 @@ def _raise(samples: Sequence[LimbDepartures], departure: Departure, k: int, shar
 
 
 def _weights(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> Floats:
-    """(pairs,) what the tubes of a pair cost: their cross-sections, which grow with the square of the radius."""
+    """(pairs,) costs of the tubes of a pair: their cross-sections, which grow with the square of the radius."""
     noise = np.minimum(np.concatenate([s.residual_m for s in samples]), NOISE_M)
     radius_m = departure.beyond_m[:, k] + departure.residuals[:, k] * noise.mean(axis=0)
     return np.array([(radius_m[list(pair)] ** 2).sum() for pair in _PAIRS])
 
 
 def _up(values: Floats, step: float) -> Floats:
-    return np.round(np.ceil(values / step - 1e-9) * step, 6) + 0.0  # no -0.0
+    return np.round(np.ceil(values / step - 1e-9) * step, 6) + 0.0  # avoids -0.0

@@ -1,8 +1,8 @@
 """Departure of whole limbs from constant velocity on recordings, for the bounds that ``departure_fit`` fits.
 
-At a tick the pelvis departs until a horizon by how far it rises above, and sinks below, its heights at the tick and
-where its velocity takes it, and a limb by how far its recorded points get from its tube (``velocity_tube``) without the
-ball, at worst.
+The departure of the pelvis at a tick and horizon is its rise above, and sink below, its heights at the tick and at
+constant velocity. The departure of a limb is the maximum distance of its recorded points from its tube
+(``velocity_tube``) without the ball.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, tube
 from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolumes
 
-#: Robots beside people stop within some 10 to 100 ms; nothing is known before the first horizon that is measured [s].
+#: Measured horizons; robots near people stop within about 10 to 100 ms, and below the first horizon nothing is known
+#: [s].
 _FIRST_S = 0.02
-#: Smaller than any number that counts.
+#: Smaller than any relevant number.
 EXACT = 1e-12
 
 
@@ -36,15 +37,15 @@ class LimbDepartures:
 
     states: HumanStates  #: (n,) the fused person at the ticks
     horizon_s: Floats  #: (h,) [s]
-    height_m: Floats  #: (2, h, n) how far the pelvis rises and sinks; NaN where it was not recorded [m]
-    #: Of a horizon's index, rise and sink [m]: (n, 7) how far limbs of BODY depart beside those [m]; NaN where a limb
-    #: was not recorded near the horizon's end, or not seen lately.
+    height_m: Floats  #: (2, h, n) rise and sink of the pelvis; NaN if not recorded [m]
+    #: Function of a horizon's index, rise and sink [m]: (n, 7) departures of the limbs of BODY in addition to these
+    #: [m]; NaN if a limb was not recorded near the horizon's end, or not seen recently.
     beyond_m: Callable[[int, float, float], Floats]
     residual_m: Floats  #: (n, 7)
-    true: bool  #: whether the log holds the ground truth
+    true: bool  #: True: the log contains the ground truth
 
     def rows(self, which: Ints) -> LimbDepartures:
-        """The same at some of the ticks."""
+        """Selects some of the ticks."""
         return replace(
             self,
             states=self.states.rows(which),
@@ -54,18 +55,18 @@ class LimbDepartures:
         )
 
     def inside(self, departure: Departure, k: int) -> Floats:
-        """(n,) whether all limbs that were recorded stayed within their departures at a horizon.
+        """(n,) 1 if all recorded limbs stayed within their departures at a horizon, else 0.
 
-        1, 0, or NaN where none was recorded.
+        NaN if none was recorded.
         """
         factors = self.factors(departure, k)
         held = ~(factors > 1.0 + EXACT).any(axis=1)
         return np.where(np.isfinite(factors).any(axis=1), held, np.nan)
 
     def factors(self, departure: Departure, k: int) -> Floats:
-        """(n, 7) by how much the lines at a horizon would have to be raised to hold each limb; 0 within the residual.
+        """(n, 7) factors by which the lines at a horizon must be raised to contain each limb; 0 within the residual.
 
-        NaN where a limb was not recorded.
+        NaN if a limb was not recorded.
         """
         beyond = self.beyond_m(k, float(departure.rise_m[k]), float(departure.sink_m[k]))
         noise = np.minimum(self.residual_m, NOISE_M)
@@ -80,7 +81,7 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
     Args:
         stage: Radii, braking time and margins.
         recording: The log.
-        ticks: (n,) rows of ``recording.states``, of a person whom the filter has found.
+        ticks: (n,) rows of ``recording.states`` with a person that the filter has found.
     """
     horizon_s = np.array([*(h for h in (_FIRST_S, *SHORTER_S) if h < stage.horizon_s), stage.horizon_s])
     states, nothing = recording.states.rows(ticks), np.zeros(len(ticks), dtype=bool)
@@ -89,7 +90,7 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
     unknown_m = bare.settings.residual_unknown_m
     at = [tubes(states, bare.limits, True, unknown_m, h, stage.memory_s) for h in horizon_s.tolist()]
 
-    # seen so lately that a limb has departed for no longer
+    # seen recently enough for the time of a departure
     asked = [tubed.usable & (tubed.reach_s <= h) for tubed, h in zip(at, horizon_s, strict=True)]
 
     @cache
@@ -113,13 +114,13 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
 
 
 def _bare(horizon_s: Floats, rise_m: float, sink_m: float) -> Departure:
-    """Tubes without a ball."""
+    """Makes tubes without a ball."""
     rows, same = (len(BODY), len(horizon_s)), np.ones(len(horizon_s))
     return Departure(horizon_s, np.zeros(rows), np.ones(rows), rise_m * same, sink_m * same)
 
 
 def _heights(volumes: SweptVolumes, future: RecordedFuture) -> Floats:
-    """(2, n) how far the pelvis gets above and below where the thorax's tube starts, the pelvis now and later [m]."""
+    """(2, n) rise and sink of the pelvis beyond the start of the thorax's tube, the pelvis now and later [m]."""
     found = np.full((2, len(volumes)), np.nan)
     for i in range(len(volumes)):
         pelvis = volumes.vertices(i, THORAX)[:2, 2]
@@ -133,13 +134,13 @@ def _heights(volumes: SweptVolumes, future: RecordedFuture) -> Floats:
 def tube_stage(
     stage: PredictionStage, departure: Departure, *, residual: bool = True, legs: bool = True
 ) -> PredictionStage:
-    """The stage by ``sound`` with some departures, from the tick on.
+    """Makes a ``sound`` stage with some departures, which start at the tick.
 
     Args:
         stage: Radii, braking time and margins.
         departure: The departures.
-        residual: Whether the distance from the model counts.
-        legs: Whether there is a lower body.
+        residual: True: use the distance from the model.
+        legs: True: include the lower body.
     """
     changed = {"method": "sound", "legs": legs, "latency_s": 0.0, "residual": residual}
     limits = replace(stage.limits, departure=departure)
@@ -147,27 +148,27 @@ def tube_stage(
 
 
 def find_unrecorded_limbs(samples: Sequence[LimbDepartures]) -> list[str]:
-    """Limbs of BODY that no log shows near a horizon's end, so that nothing is said of them."""
+    """Returns the limbs of BODY that no log shows near a horizon's end, so that there is no result for them."""
     return [limb for k, limb in enumerate(BODY) if not any(_find_recorded(s)[k] for s in samples)]
 
 
 def _find_recorded(sample: LimbDepartures) -> Bools:
-    """(7,) whether a limb was recorded near any horizon's end."""
+    """(7,) True if a limb was recorded near any horizon's end."""
     return np.any([np.isfinite(sample.beyond_m(k, 0.0, 0.0)).any(axis=0) for k in range(len(sample.horizon_s))], axis=0)
 
 
-#: Ticks of a log whose volumes are counted out, and points for each.
+#: Number of ticks of a log whose volumes are estimated, and number of points for each.
 _COUNTED, _POINTS = 24, 1024
 
 
 def union_m3(stage: PredictionStage, sample: LimbDepartures, departure: Departure, *, legs: bool = True) -> list[float]:
-    """Mean volume of all limbs at each horizon [m^3].
+    """Computes the mean volume of all limbs at each horizon [m^3].
 
     Args:
         stage: Radii, braking time and margins.
         sample: The person.
         departure: The departures.
-        legs: Whether there is a lower body.
+        legs: True: include the lower body.
     """
     with_departures = tube_stage(stage, departure, legs=legs)
     states = _some(sample.states)
@@ -175,7 +176,7 @@ def union_m3(stage: PredictionStage, sample: LimbDepartures, departure: Departur
 
 
 def capsules_m3(stage: PredictionStage, sample: LimbDepartures) -> list[float]:
-    """The same of capsules that grow by 2 m/s and 50 m/s^2, which have no lower body [m^3]."""
+    """Computes the same for capsules that grow by 2 m/s and 50 m/s^2, without a lower body [m^3]."""
     radii, hand = limb_radii(stage.settings), stage.settings.hand_m
     states = _some(sample.states)
     return [

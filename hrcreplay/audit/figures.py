@@ -15,7 +15,7 @@ from hrcreplay.records import JOINTS, LIMBS, Floats
 from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.fusion import LABELS
 
-#: Method -> how the page calls it.
+#: Method -> its name on the page.
 METHODS = {
     "paper": "paper",
     "sound": "sound",
@@ -34,7 +34,7 @@ COLOURS = {
 }
 NAMES = ("audit_coverage", "audit_limbs", "audit_joints")
 
-#: Coverage is drawn so that 99 % and 99.9 % are apart: by the share that is missed, and 0.1 % more.
+#: Coverage is drawn on a logarithmic axis of the missed share plus 0.1 %, so that 99 % and 99.9 % are distinct.
 _SPARE = 0.001
 _TICKS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999, 1.0)
 
@@ -48,12 +48,12 @@ def draw_all(found: Mapping[str, Any], folder: Path) -> None:
 
 
 def in_order(methods: Mapping[str, Any]) -> list[str]:
-    """Methods as the figures list them."""
+    """Returns the methods in the order of the figures."""
     return [method for method in METHODS if method in methods] + sorted(set(methods) - set(METHODS))
 
 
 def trade_off(found: Mapping[str, Any]) -> Figure:
-    """Coverage against volume: all methods, and our own as their limits' rates are scaled."""
+    """Draws coverage against volume: all methods, and hrcreplay's methods with scaled rates of their limits."""
     figure = drawing.new_figure(4.3)
     ax = drawing.panels(figure, 1, top_in=0.62, left_in=0.8, bottom_in=0.5)[0][0]
     total = found["total"]
@@ -75,12 +75,12 @@ def trade_off(found: Mapping[str, Any]) -> Figure:
 
 
 def _drawn(figures: Mapping[str, Any]) -> bool:
-    """Return whether a method has a place in the figure: a volume of 0 has none on an axis of powers."""
+    """Returns True if a method can be drawn; a volume of 0 has no place on a logarithmic axis."""
     return bool(figures["union_m3"]["value"]) and figures["covered_share"]["value"] is not None
 
 
 def _volume_axis(ax: Axes, which: str) -> None:
-    """An axis of powers of ten, also where nothing was drawn on it."""
+    """Makes a logarithmic axis, also if nothing was drawn on it."""
     axis = ax.yaxis if which == "y" else ax.xaxis
     high = (ax.dataLim.intervaly if which == "y" else ax.dataLim.intervalx)[1]
     if not 0.0 < high < np.inf:
@@ -90,7 +90,7 @@ def _volume_axis(ax: Axes, which: str) -> None:
 
 
 def _scatter(ax: Axes, each: Sequence[Mapping[str, Any]], colour: str) -> None:
-    """One faint dot a log."""
+    """Draws one faint dot per log."""
     pairs = [(p["union_m3"]["value"], p["covered_share"]["value"]) for p in each if _drawn(p)]
     known = np.array(pairs, dtype=float).reshape(-1, 2)
     ax.plot(known[:, 0], known[:, 1], ".", ms=5, color=colour, alpha=0.35, mew=0, clip_on=False)
@@ -116,7 +116,7 @@ def _curve(ax: Axes, curve: Sequence[Mapping[str, Any]], colour: str) -> None:
 
 
 def _cross(ax: Axes, figures: Mapping[str, Any], colour: str, label: str, ours: bool) -> None:
-    """A method with both intervals."""
+    """Draws a method with both intervals."""
     x, y = figures["union_m3"], figures["covered_share"]
     if not _drawn(figures):
         return
@@ -166,7 +166,7 @@ def _unique(ax: Axes) -> tuple[list[Any], list[str]]:
 
 
 def limbs(found: Mapping[str, Any]) -> Figure:
-    """Coverage and volume of each limb, by method."""
+    """Draws coverage and volume of each limb, by method."""
     figure = drawing.new_figure(4.6)
     rows = drawing.panels(figure, 2, top_in=0.66, left_in=0.8, share_x=True, gap_in=(0.36, 0.0))
     methods = found["total"]["methods"]
@@ -204,7 +204,7 @@ def limbs(found: Mapping[str, Any]) -> Figure:
 
 
 def joints(found: Mapping[str, Any]) -> Figure:
-    """Per joint: how often the recorded future stayed inside the reachable interval."""
+    """Draws, per joint, the share of ticks with the recorded future inside the reachable interval."""
     figure = drawing.new_figure(2.6)
     ax = drawing.panels(figure, 1, top_in=0.5, left_in=0.8, bottom_in=0.34)[0][0]
     tables = found["total"]["joints"]

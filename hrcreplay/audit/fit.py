@@ -1,7 +1,7 @@
 """The command ``fit-limits``: velocity and acceleration bounds fitted to logs, written as a limit set.
 
-With ``cover = "limbs"`` it also bounds how far whole limbs depart from constant velocity (``departures``), so that the
-swept volumes, not only the joint intervals, contain the people of the logs in the wanted share of the ticks.
+With ``cover = "limbs"`` it also bounds the departure of whole limbs from constant velocity (``departures``), so that
+the swept volumes, not only the joint intervals, contain the people of the logs in the required share of the ticks.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from hrcreplay.version import __version__
 
 
 def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) -> list[str]:
-    """Lines on a fit for the user.
+    """Returns the lines on a fit for the user.
 
     Args:
         found: The fit.
         limits: The limit set made of it.
         facts: Its provenance.
-        standard: Limit set whose positions are taken where nobody was outside of them.
+        standard: Limit set whose positions are used if no recorded posture is outside of them.
     """
     told = [
         f"{joint}: velocity {limits.v_min[j]:g} to {limits.v_max[j]:g}, acceleration {limits.a_min[j]:g} to "
@@ -96,15 +96,15 @@ def _by_horizon(found: dict[str, Any], shares: Sequence[dict[str, Any]]) -> str:
 class FitReport(NamedTuple):
     """Report of a fit."""
 
-    lines: list[str]  #: what the user should know
-    missed: str  #: where whole limbs are inside less often than asked for in recordings not fitted to; empty: nowhere
+    lines: list[str]  #: notes for the user
+    missed: str  #: cases in which whole limbs in held-out recordings are covered less than requested; empty: none
 
 
-#: Ticks a second that are fitted to [Hz]; what no camera has seen for longer is no evidence [s]; of the bootstrap.
+#: Rate of the fitted ticks [Hz]; maximum time since a camera saw a fitted joint [s]; seed of the bootstrap.
 FIT_HZ, SEEN_S, SEED = 25.0, 0.25, 3
-#: The limit sets that joints keep which cannot be fitted, and whose positions hold more than those.
+#: Limit set with the standard positions, one with wider positions, and one for joints that cannot be fitted.
 STANDARD, WIDE, KEPT = "paper", "human", "human"
-#: What the coverage is of: joints in their intervals, or limbs in their volumes.
+#: Kinds of coverage: joints in their intervals, or limbs in their volumes.
 COVERS = ("joints", "limbs")
 
 
@@ -117,14 +117,14 @@ class FitSample:
     source: str
     training: Futures
     held_back: Futures
-    outside: bool  #: whether a training posture is outside the standard positions
+    outside: bool  #: True: a training posture is outside the standard positions
     prediction_stage: PredictionStage
-    limbs: LimbDepartures  #: of all of it; empty where they are not asked for
+    limbs: LimbDepartures  #: departures of the whole log; empty if not requested
     cut_ns: int  #: end of the first part
 
 
-#: Ticks a second whose departures are measured [Hz]: out of step with cameras of 25, 30 and 50 Hz, so that ticks of all
-#: ages of their last frame are among them.
+#: Rate of the ticks whose departures are measured [Hz]; not a multiple of camera rates of 25, 30 and 50 Hz, so that all
+#: ages of the last frame occur.
 DEPARTURES_HZ = 27.8
 
 
@@ -139,20 +139,20 @@ def run(
 ) -> FitReport:
     """Fits velocity and acceleration bounds to logs and writes them as a limit set.
 
-    The last part of every log is held back: nothing is fitted to it. With several logs each is also left out as a
-    whole once, to tell how far bounds fitted to the others hold the person of this one.
+    The last part of every log is held back from the fit. With several logs, each is also left out once as a whole, to
+    measure the coverage of its person by bounds fitted to the others.
 
     Args:
         logs: Logs, or run folders whose logs, settings and cells are taken.
         out: Limit set to write (TOML), with provenance.
-        coverage: Share of the ticks in which all fitted joints shall stay inside their intervals.
-        held_back: Share of every log's time, its end.
-        cover: ``joints``: bounds on the joints, whose intervals of Alg. 1 hold that share. ``limbs``: also how far
-            whole limbs, the lower body too, depart from constant velocity in that share of the ticks.
+        coverage: Required share of the ticks in which all fitted joints stay inside their intervals.
+        held_back: Share of every log's time that is held back, at its end.
+        cover: ``joints``: bounds on the joints, whose intervals of Alg. 1 cover that share. ``limbs``: also bounds on
+            the departure of whole limbs, including the lower body, from constant velocity in that share of the ticks.
         **options: Settings, cell and span, as ``run_config.resolve`` takes them.
 
     Returns:
-        What the user should know, and whether the share was missed.
+        Notes for the user, and the cases in which the share was missed.
 
     Raises:
         SettingsError: A setting cannot be used, or ``out`` exists.
@@ -174,7 +174,7 @@ def run(
 
 
 def _refuse(logs: Sequence[Path], out: Path, coverage: float, held_back: float, cover: str) -> None:
-    """Raises SettingsError for what cannot be used."""
+    """Raises SettingsError for invalid arguments."""
     if not 0.0 < coverage < 1.0:
         raise SettingsError(f"--coverage {coverage:g}: would be right: a share above 0 and below 1, e.g. 0.99")
     if held_back == 0.0:
@@ -236,7 +236,7 @@ def _sample(run_config: RunConfig, horizon_s: float, held_back: float, limbs: bo
 
 
 def _limbs(run_config: RunConfig, recording: Recording, wanted: bool) -> LimbDepartures:
-    """The departures in a recording; of no tick where they are not wanted."""
+    """Measures the departures in a recording; at no tick if not requested."""
     stage, states = assembly.prediction_stage(run_config), recording.states
     horizon_ns = round(stage.horizon_s * NS)
     ticks = np.arange(0, len(states), max(1, round(run_config.settings.fusion.rate_hz / DEPARTURES_HZ)))
@@ -246,14 +246,14 @@ def _limbs(run_config: RunConfig, recording: Recording, wanted: bool) -> LimbDep
 
 
 def _parts(sample: FitSample) -> tuple[LimbDepartures, LimbDepartures]:
-    """Those of the first part of a log, horizon included, and of the last."""
+    """Returns the ticks of the first part of a log, horizon included, and of the last part."""
     whole, t_ns = sample.limbs, sample.limbs.states.t_ns
     first = t_ns + round(sample.prediction_stage.horizon_s * NS) <= sample.cut_ns
     return whole.rows(np.flatnonzero(first)), whole.rows(np.flatnonzero(t_ns > sample.cut_ns))
 
 
 def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departure, dict[str, Any], str]:
-    """The departures fitted to all logs, what they and those fitted without each log hold, and where that misses."""
+    """Returns the departures fitted to all logs, the coverage by them and by leave-one-out fits, and the misses."""
     if len(samples) > 1:
         fitted = known = [sample.limbs for sample in samples]
         folds = [fit_departures([*known[:i], *known[i + 1 :]], coverage) for i in range(len(known))]
@@ -294,7 +294,7 @@ def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departur
 
 
 def _sizes(stage: PredictionStage, one: LimbDepartures, fold: Departure, coverage: float) -> dict[str, list[float]]:
-    """Volumes [m^3]: of a log's people by the fold; beside it without the lower body, as capsules are; fitted to it."""
+    """Volumes [m^3] of a log's people: by the fold; without the lower body, like the capsules; by its own fit."""
     found = {
         "union_m3": union_m3(stage, one, fold),
         "union_without_legs_m3": union_m3(stage, one, fold, legs=False),
@@ -305,7 +305,7 @@ def _sizes(stage: PredictionStage, one: LimbDepartures, fold: Departure, coverag
 
 
 def _missed(facts: dict[str, Any], coverage: float) -> str:
-    """Whole limbs that were not fitted to and are inside less often than required."""
+    """Returns the cases of held-out whole limbs with less than the required coverage."""
     wanted = [(facts["pooled_are"], facts["unknown"], coverage)]
     wanted += [(log["name"], log["shares"], 1.0 - EACH * (1.0 - coverage)) for log in facts["logs"]]
     return "; ".join(
@@ -325,7 +325,7 @@ def _fit(samples: Sequence[FitSample], coverage: float, horizon_s: float) -> Fit
 
 
 def _limits(found: Fit, samples: Sequence[FitSample], name: str) -> LimitSet:
-    """Positions are the standard ones, or where somebody was outside of these, the outer of both sets."""
+    """Returns the limits, with the standard positions or, if a posture exceeds them, the outer of both sets."""
     standard, wide = load_limits(STANDARD), load_limits(WIDE)
     if any(sample.outside for sample in samples):
         p_min, p_max = np.minimum(standard.p_min, wide.p_min), np.maximum(standard.p_max, wide.p_max)
@@ -334,7 +334,7 @@ def _limits(found: Fit, samples: Sequence[FitSample], name: str) -> LimitSet:
 
 
 def _share(within: Sequence[Floats], horizon_s: float, rate_hz: float = FIT_HZ) -> Estimate:
-    """Share of the ticks of some logs in which all joints stayed inside, with its interval."""
+    """Returns the share of the ticks of some logs in which all joints stayed inside, with its interval."""
     hits = [fit_limits.are_all_inside(part) for part in within]
     lengths = [len(part) for part in hits]
     drawn = resample(lengths, block_ticks(horizon_s, rate_hz, max(lengths)), horizon_s * rate_hz, SEED)
@@ -344,7 +344,7 @@ def _share(within: Sequence[Floats], horizon_s: float, rate_hz: float = FIT_HZ) 
 def _facts(
     samples: Sequence[FitSample], found: Fit, limits: LimitSet, coverage: float, horizon_s: float, held_back: float
 ) -> dict[str, Any]:
-    """The limit set's provenance."""
+    """Returns the limit set's provenance."""
     fitted = ~found.kept
     trained = [fit_limits.inside_intervals(sample.training, found, horizon_s) for sample in samples]
     held = [fit_limits.inside_intervals(sample.held_back, found, horizon_s) for sample in samples]
@@ -402,6 +402,6 @@ def _facts(
 
 
 def _plain(share: Estimate) -> dict[str, Any]:
-    """A share with its interval and its ticks; without what is not known."""
+    """Returns a share with its interval and its number of ticks; without unknown values."""
     numbers = {"share": share.value, "low": share.low, "high": share.high}
     return {key: round(value, 4) for key, value in numbers.items() if np.isfinite(value)} | {"ticks": share.samples}

@@ -1,9 +1,9 @@
 """The smallest velocity and acceleration bounds under which Alg. 1 contains the recorded motion of the joints.
 
-A joint's recorded future lies in its interval where its highest and its lowest position do, so each tick is reduced to
-three numbers: the velocity, and the largest displacement up and down within the horizon. For a given velocity bound
-the acceleration bound that a tick needs has a closed form, and the number of ticks that may be missed selects one of
-these bounds. Of all pairs that miss no more ticks, the fit takes the pair with the shortest mean interval.
+A joint's recorded future lies in its interval if its highest and its lowest position do, so each tick is reduced to
+three numbers: the velocity, and the largest displacement up and down within the horizon. For a given velocity bound the
+acceleration bound that a tick needs has a closed form, and the number of ticks that may be missed selects one of these
+bounds. Of all pairs that miss no more ticks, the fit takes the pair with the shortest mean interval.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from hrcreplay.records import DOF, Bools, Floats, HumanStates, Ints, Table
 
 #: A joint that moves less than this within a horizon is at rest [m, m, rad..., m].
 STIR = np.array([0.03] * 2 + [np.radians(5.0)] * 10 + [0.03])
-#: A joint needs so many horizons with motion, none overlapping; with fewer its bounds cannot be told.
+#: Minimum number of non-overlapping horizons with motion for the bounds of a joint.
 EXCURSIONS = 10
-#: Bounds are at least this [per second; per second squared], and are rounded up to so many digits.
+#: Minimum bounds [per second; per second squared], and number of digits to which they are rounded up.
 LEAST, _DIGITS = 0.01, 3
-#: Velocity bounds tried; and how much longer than the shortest mean reach one with less acceleration may be.
+#: Number of velocity bounds tried; and relative excess over the shortest mean reach at which one with less acceleration
+#: is preferred.
 _TRIED, _HARDLY = 48, 1.05
-#: The ticks that may be missed are given up in about so many steps, or in steps doubled up to so many times.
+#: Approximate number of steps in which the allowed misses are distributed, and number of doublings of a step.
 _STEPS, _DOUBLINGS = 40, 6
-#: About how far a joint is from what it moves: makes reaches of different joints comparable [m/m, m/rad].
+#: Approximate lever arm of a joint: makes reaches of different joints comparable [m/m, m/rad].
 _LEVER_M = np.array([1.0, 1.0, 0.5, 0.5] + 2 * [0.6, 0.6, 0.4, 0.4] + [1.0])
-#: A posture further outside its limits than this is outside [m, m, rad..., m].
+#: Tolerance for a posture outside its limits [m, m, rad..., m].
 _OUTSIDE = np.radians(0.1)
 _ROUNDING = 1e-9
 #: Joints of both arms in JOINTS.
@@ -39,7 +40,7 @@ ARMS = slice(4, 12)
 class Futures(Table):
     """Motion of each joint within the horizon of a tick, relative to the fused state. (n, 13) each.
 
-    x and y are those of the body frame at the tick: forward, to the left. NaN where not recorded to the end.
+    x and y are in the body frame at the tick: forward, to the left. NaN if not recorded to the end.
     """
 
     t_ns: Ints  #: (n,)
@@ -55,24 +56,24 @@ class Futures(Table):
 
 @dataclass(frozen=True)
 class Fit:
-    """Fitted bounds (13,), and how much motion they rest on."""
+    """Fitted bounds (13,), and the amount of motion behind them."""
 
     v_min: Floats
     v_max: Floats
     a_min: Floats
     a_max: Floats
-    kept: Bools  #: too little motion to say, so the standard bounds stayed
-    excursions: Ints  #: horizons with motion
+    kept: Bools  #: True: too little motion, so the standard bounds are kept
+    excursions: Ints  #: number of horizons with motion
 
     def onto(self, limits: LimitSet, name: str) -> LimitSet:
-        """A limit set with these bounds and the positions of ``limits``."""
+        """Makes a limit set with these bounds and the positions of ``limits``."""
         return replace(limits, name=name, v_min=self.v_min, v_max=self.v_max, a_min=self.a_min, a_max=self.a_max)
 
 
 def futures(
     states: HumanStates, ticks: Ints, t_ns: Ints, joints: Floats, *, horizon_s: float, memory_s: float
 ) -> Futures:
-    """The recorded futures (t, t + T_s] of some ticks.
+    """Returns the recorded futures (t, t + T_s] of some ticks.
 
     Args:
         states: The fused person.
@@ -80,7 +81,7 @@ def futures(
         t_ns: (m,) instants of the recorded joints, increasing.
         joints: (m, 13) recorded JOINTS [m, m, rad..., m].
         horizon_s: T_s [s].
-        memory_s: What no camera had seen for longer at the tick says nothing [s].
+        memory_s: Maximum time since a camera saw a joint at the tick [s].
     """
     at = states.rows(ticks)
     end_ns = at.t_ns + round(horizon_s * 1e9)
@@ -97,31 +98,31 @@ def futures(
 
 
 def recently_seen(joints: Floats, unseen_s: Floats, memory_s: float) -> Floats:
-    """Rows of JOINTS (n, 13), NaN where no camera had seen a joint's limb for longer; ``unseen_s`` (n, 6) by LIMBS."""
+    """Sets rows of JOINTS (n, 13) to NaN for limbs that no camera saw recently; ``unseen_s`` (n, 6) by LIMBS."""
     return np.where((unseen_s <= memory_s)[:, SHOWN_BY], joints, np.nan)
 
 
 def outside_positions(p: Floats, limits: LimitSet) -> Bools:
-    """(n,) whether a posture (n, 13) is outside of the position limits; False where it is unknown."""
+    """(n,) True if a posture (n, 13) is outside the position limits; False if unknown."""
     named = canonical(p)
     return np.asarray((np.abs(clamp(named, limits) - named) > _OUTSIDE).any(axis=1))
 
 
 def arms_move(some: Futures) -> Bools:
-    """(n,) whether a joint of an arm moves within the horizon."""
+    """(n,) True if a joint of an arm moves within the horizon."""
     return np.asarray((some.moved > STIR)[:, ARMS].any(axis=1))
 
 
 def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -> Fit:
-    """The tightest bounds under which a share of the ticks has all fitted joints inside their intervals.
+    """Fits the tightest bounds with which a share of the ticks has all fitted joints inside their intervals.
 
-    Starts from bounds that miss no tick, then lets the sides of the joints miss a few more ticks one after the other,
-    always the one whose interval becomes shorter by most for each tick that is given up, while the share allows.
+    Starts from bounds that miss no tick. Then the sides of the joints may miss a few more ticks one after the other,
+    always the side whose interval shrinks most per missed tick, until the share is used up.
 
     Args:
         training: Ticks to fit on.
-        standard: Bounds that joints keep whose motion is too little to say.
-        share: Of the ticks, in (0, 1).
+        standard: Bounds for joints with too little motion.
+        share: Share of the ticks, in (0, 1).
         horizon_s: T_s [s].
 
     Raises:
@@ -148,7 +149,7 @@ def fit(training: Futures, standard: LimitSet, share: float, horizon_s: float) -
 
 
 def inside_intervals(some: Futures, bounds: Fit | LimitSet, horizon_s: float) -> Floats:
-    """(n, 13) whether each joint stayed in its interval, stops aside: 1, 0, or NaN where not recorded."""
+    """(n, 13) 1 if the joint stayed in its interval without stops, else 0; NaN if not recorded."""
     high = largest_displacement(some.v, bounds.v_max, bounds.a_max, horizon_s)
     low = -largest_displacement(-some.v, -bounds.v_min, -bounds.a_min, horizon_s)
     within = (some.up <= high) & (some.down >= low)
@@ -156,7 +157,7 @@ def inside_intervals(some: Futures, bounds: Fit | LimitSet, horizon_s: float) ->
 
 
 def are_all_inside(within: Floats) -> Floats:
-    """(n,) whether all joints (n, k) that were recorded stayed inside: 1, 0, or NaN where none was."""
+    """(n,) 1 if all recorded joints of (n, k) stayed inside, else 0; NaN if none was recorded."""
     return np.where(np.isfinite(within).any(axis=1), (within != 0.0).all(axis=1).astype(float), np.nan)
 
 
@@ -179,12 +180,12 @@ class _Pair:
 
     v_bound: float
     a_bound: float
-    length: float  #: shortest mean reach over the ticks with so many misses [m] or [rad]
-    missed: Ints  #: (n,) 1 where the joint got further
+    length: float  #: shortest mean reach over the ticks, with this number of misses [m] or [rad]
+    missed: Ints  #: (n,) 1 if the joint moved further
 
 
 class _Side:
-    """One joint's motion upward, or downward with the signs changed, and how many ticks it may miss."""
+    """One joint's motion upward, or downward with the signs changed, and its allowed number of misses."""
 
     def __init__(self, some: Futures, joint: int, upward: bool, horizon_s: float) -> None:
         self.joint, self.upward = joint, upward
@@ -195,17 +196,17 @@ class _Side:
 
     @property
     def now(self) -> _Pair:
-        """The bounds with as many misses as it has."""
+        """The bounds with the present number of misses."""
         return self.with_misses(self.misses)
 
     def with_misses(self, misses: int) -> _Pair:
-        """The bounds with so many misses."""
+        """Returns the bounds with a number of misses."""
         if misses not in self._known:
             self._known[misses] = self._tightest(misses)
         return self._known[misses]
 
     def _tightest(self, misses: int) -> _Pair:
-        """The pair with the shortest mean reach; of those hardly longer, the one with the least acceleration."""
+        """Returns the pair with the shortest mean reach; among similar ones, that with the least acceleration."""
         known = np.isfinite(self._gone)
         v, gone, horizon_s = self._v[known], self._gone[known], self._horizon_s
         rank = max(0, len(v) - 1 - misses)
@@ -221,9 +222,9 @@ class _Side:
 
 
 def _give_up(sides: list[_Side], budget: int) -> None:
-    """Moves sides on while at most ``budget`` ticks are missed by any.
+    """Tightens sides while at most ``budget`` ticks are missed in total.
 
-    Steps of several sizes are tried, for to give up one tick of a fast motion and not the next gains nothing.
+    Steps of several sizes are tried, as missing a single tick of a fast motion gains nothing.
     """
     missed = np.sum([side.now.missed for side in sides], axis=0)
     smallest = max(1, budget // _STEPS)
@@ -247,10 +248,10 @@ def _give_up(sides: list[_Side], budget: int) -> None:
 
 
 def least_acceleration(v: Floats, gone: Floats, bound: float, horizon_s: float) -> Floats:
-    """(n,) the least acceleration bound under which Alg. 1 reaches ``gone``; inf where none does.
+    """(n,) smallest acceleration bound with which Alg. 1 reaches ``gone``; inf if none does.
 
-    Either the whole horizon is spent speeding up, gone = v T + a T^2 / 2, or the velocity bound V is reached, and
-    the area that the profile lacks below V is a triangle: V T - gone = (V - v)^2 / (2 a).
+    Either the joint accelerates during the whole horizon, gone = v T + a T^2 / 2, or it reaches the velocity bound V,
+    and the area between V and the profile is a triangle: V T - gone = (V - v)^2 / (2 a).
 
     Args:
         v: (n,) velocities at the tick [m/s] or [rad/s].
@@ -268,7 +269,7 @@ def least_acceleration(v: Floats, gone: Floats, bound: float, horizon_s: float) 
 
 
 def rounded_up(values: Floats) -> Floats:
-    """Positive values rounded up to few digits, as the shortest decimals that say so."""
+    """Rounds positive values up to a few digits, as the shortest decimals."""
     digits = _DIGITS - 1 - np.floor(np.log10(values)).astype(int)
     return np.array(
         [np.round(np.ceil(x * 10.0**n - _ROUNDING) / 10.0**n, n) for x, n in zip(values, digits.tolist(), strict=True)]
@@ -276,7 +277,7 @@ def rounded_up(values: Floats) -> Floats:
 
 
 def count_excursions(t_ns: Ints, moving: Bools, horizon_s: float) -> int:
-    """Number of moving ticks that fit behind each other without a common future."""
+    """Counts moving ticks with non-overlapping futures."""
     count, free_ns = 0, -1
     for t in t_ns[moving].tolist():
         if t >= free_ns:
@@ -285,7 +286,7 @@ def count_excursions(t_ns: Ints, moving: Bools, horizon_s: float) -> int:
 
 
 def _turned(rows: Floats, c: Floats, s: Floats) -> Floats:
-    """Rows (n, 13) of JOINTS or their rates with x and y along the body's axes, Eq. (33)."""
+    """Returns rows (n, 13) of JOINTS or their rates with x and y along the body's axes, Eq. (33)."""
     turned = rows.copy()
     turned[:, 0], turned[:, 1] = c * rows[:, 0] + s * rows[:, 1], c * rows[:, 1] - s * rows[:, 0]
     return turned

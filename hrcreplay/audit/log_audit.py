@@ -36,18 +36,18 @@ from hrcreplay.store.run_folder import Stopwatch
 
 
 def standstill_s(prediction_stage: PredictionStage) -> float:
-    """Time for which the person must stay in the prediction: until the robot has reacted and braked [s]."""
+    """Time for which the prediction must contain the person: the robot's reaction and braking [s]."""
     return prediction_stage.horizon_s + prediction_stage.settings.latency_s
 
 
 def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horizon_s: float) -> Floats:
-    """(n, 13) whether each joint's recorded future stayed in its reachable interval: 1, 0, or NaN where not recorded.
+    """(n, 13) 1 if the joint's recorded future stayed in its reachable interval, else 0; NaN if not recorded.
 
     Args:
         recording: The log.
         states: (n,) the fused person at the ticks.
-        reach: Of the same ticks.
-        horizon_s: T, T_s and the latency [s].
+        reach: Reachable intervals at the same ticks.
+        horizon_s: T, the sum of T_s and the latency [s].
     """
     t_ns = recording.joints_t_ns
     first = np.searchsorted(t_ns, states.t_ns, side="right")
@@ -66,7 +66,7 @@ def joints_inside(recording: Recording, states: HumanStates, reach: Reach, horiz
 
 
 def joint_travel(joints: Floats) -> Floats:
-    """(13,) how far each joint went, between the 5th and the 95th percentile of its values [m, m, rad..., m]."""
+    """(13,) range of each joint, between the 5th and the 95th percentile of its values [m, m, rad..., m]."""
     known = joints[np.isfinite(joints).all(axis=1)]
     if len(known) < 2:
         return np.full(joints.shape[1], np.nan)
@@ -76,19 +76,19 @@ def joint_travel(joints: Floats) -> Floats:
     return found
 
 
-#: The union is counted out at, and the curve rests on, one in so many audited ticks. Shorter
-#: horizons rest on one in so many: out of step with cameras of 30 Hz, which else might never have a frame near the end.
+#: One in this number of audited ticks is used for the union and the curve. One in the second number is used for shorter
+#: horizons; it is not in step with 30 Hz cameras, which might otherwise never have a frame near the end.
 EVERY, EVERY_SHORTER = 5, 4
 #: Factors on the limit set's velocities and accelerations along the curve; ``positions`` grows with their cube.
 _FACTORS = {"positions": (0.25, 0.5, 1.0, 2.0)}
 _STANDARD_FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
-#: A joint that went less than this says little about its bounds [m, m, rad..., m].
+#: Minimum range of a joint for a statement on its bounds [m, m, rad..., m].
 LITTLE = np.array([0.05] * 2 + [np.radians(10.0)] * 10 + [0.05])
 _BATCH = 100
 
 
-#: Shorter horizons than the braking time, at which a robot beside people stops [s]; and who is compared there, beside
-#: the audited method.
+#: Horizons shorter than the braking time, at which a robot near people stops [s]; and methods compared there in
+#: addition to the audited one.
 SHORTER_S = (0.05, 0.1, 0.2)
 _PEERS = ("v2_a50", "iso_13855")
 
@@ -100,27 +100,27 @@ class LogAudit:
     run_config: RunConfig
     name: str
     recording: Recording
-    outcomes: dict[str, Outcome]  #: by method, our own first
-    joints: dict[str, Floats]  #: by method of ours: (n, 13) of ``joints_inside``
-    curve: dict[str, dict[float, Outcome]]  #: by method of ours and factor
+    outcomes: dict[str, Outcome]  #: by method, hrcreplay's own first
+    joints: dict[str, Floats]  #: by own method: (n, 13) of ``joints_inside``
+    curve: dict[str, dict[float, Outcome]]  #: by own method and factor
     horizons: dict[float, dict[str, Outcome]]  #: by shorter horizon [s] and method, at fewer ticks
     errors: Floats  #: (2, n, 13) of ``errors_in_deviations``
-    points: dict[str, dict[str, int]]  #: limb -> each point beyond its ends -> at how many ticks it was checked
+    points: dict[str, dict[str, int]]  #: limb -> each point other than its ends -> number of its checked ticks
     notes: tuple[str, ...]
 
 
 def methods() -> tuple[str, ...]:
-    """Our own methods, then the baselines."""
+    """Hrcreplay's own methods, then the baselines."""
     return (*swept_volumes.METHODS, *baselines.BASELINES)
 
 
 def factors(method: str) -> tuple[float, ...]:
-    """Factors on the limit set's rates along a method's curve, growing, 1 among them."""
+    """Factors on the limit set's rates along a method's curve, increasing, including 1."""
     return _FACTORS.get(method, _STANDARD_FACTORS)
 
 
 def volumes(prediction_stage: PredictionStage, window: RecordedFuture, method: str) -> SweptVolumes:
-    """Swept volumes by any method, ours or a baseline's."""
+    """Computes swept volumes by any method, own or baseline."""
     if method in baselines.BASELINES:
         return baselines.predict(
             window.states,
@@ -133,7 +133,7 @@ def volumes(prediction_stage: PredictionStage, window: RecordedFuture, method: s
 
 
 def scale_rates(limits: LimitSet, factor: float) -> LimitSet:
-    """A limit set whose velocities, accelerations and departures are ``factor`` times as large."""
+    """Returns a limit set with velocities, accelerations and departures scaled by ``factor``."""
     grown = {name: factor * getattr(limits, name) for name in ("v_min", "v_max", "a_min", "a_max")}
     known = limits.departure
     if known is not None:
@@ -143,7 +143,7 @@ def scale_rates(limits: LimitSet, factor: float) -> LimitSet:
 
 
 def compared_methods(prediction_stage: PredictionStage) -> tuple[str, ...]:
-    """Methods that are asked at shorter horizons, too."""
+    """Methods that are also compared at shorter horizons."""
     return (prediction_stage.method, *_PEERS)
 
 
@@ -157,7 +157,7 @@ def audit_log(run_config: RunConfig, name: str, watch: Stopwatch) -> LogAudit:
 
     Raises:
         SettingsError: The cell does not fit the log.
-        LogError: The log cannot be read, is shorter than the horizon, or shows nobody.
+        LogError: The log cannot be read, is shorter than the horizon, or shows no person.
     """
     log = open_log(run_config.log, run_config.settings.logs)
     prediction_stage = assembly.prediction_stage(run_config)
@@ -232,7 +232,7 @@ def _curve(
     standard: Outcome,
     progress: Callable[[int], None],
 ) -> dict[float, Outcome]:
-    """The method under scaled limits, at fewer ticks; factor 1 is its ``standard`` outcome with all ticks."""
+    """Evaluates the method with scaled limits, at fewer ticks; factor 1 is its ``standard`` outcome with all ticks."""
     some = future.rows(np.arange(0, len(future.states), EVERY))
     found = {1.0: standard}
     for factor in factors(method):
@@ -245,7 +245,7 @@ def _curve(
 def _shorter(
     prediction_stage: PredictionStage, recording: Recording, rows: Ints, progress: Callable[[int], None]
 ) -> dict[float, dict[str, Outcome]]:
-    """The same question at shorter horizons: latency and all, from tick to standstill."""
+    """Computes the coverage at shorter horizons: total time from tick to standstill, including the latency."""
     found: dict[float, dict[str, Outcome]] = {}
     for horizon_s in shorter(prediction_stage):
         stop_s = horizon_s - prediction_stage.settings.latency_s
@@ -257,7 +257,7 @@ def _shorter(
 
 
 def _remarks(recording: Recording, audited_s: float, horizon_s: float) -> tuple[str, ...]:
-    """Remarks on one log's figures."""
+    """Returns remarks on one log's figures."""
     notes = [f"the recorded future is the {recording.source}"]
     if others := recording.counts.get("person_frames_beside_others"):
         notes.append(f"{others} frames show at least one other body: nothing was predicted of it, and nothing audited")

@@ -7,7 +7,7 @@ the quantity is estimated on each resampled log, and the interval holds the midd
 not cross from one log to another, and each log keeps its length.
 
 With few escapes, or none, resampling shows little variation. So the interval of a share also holds the exact binomial
-interval for as many independent samples as there are horizons in the logs: an excursion shows in the ticks of the one
+interval for as many independent samples as there are horizons in the logs: an excursion affects only the ticks of one
 horizon before it.
 """
 
@@ -29,33 +29,33 @@ _CHUNK = 50
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with its interval; NaN where there is nothing to estimate it from."""
+    """A figure with its interval; NaN without data."""
 
     value: float
     low: float
     high: float
-    samples: int  #: ticks behind it
+    samples: int  #: number of ticks behind it
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON form; what is not known is null."""
+        """Returns the JSON form; unknown values are null."""
         numbers = {"value": self.value, "low": self.low, "high": self.high}
         return {k: float(v) if np.isfinite(v) else None for k, v in numbers.items()} | {"samples": self.samples}
 
 
 @dataclass(frozen=True)
 class Resampling:
-    """Weight of each tick in each resampled log: how often it occurs there."""
+    """Weight of each tick in each resampled log: the number of its occurrences."""
 
-    weights: Floats  #: (draws, n) whole numbers
-    block: int  #: ticks a stretch
-    sample_ticks: float  #: ticks for one independent sample of a share: those of a horizon
+    weights: Floats  #: (draws, n) integers
+    block: int  #: number of ticks of a block
+    sample_ticks: float  #: number of ticks for one independent sample of a share: those of a horizon
 
     def of(self, which: slice) -> Resampling:
-        """The same for some of the ticks."""
+        """Selects some of the ticks."""
         return Resampling(self.weights[:, which], self.block, self.sample_ticks)
 
     def share(self, hits: Floats) -> Estimate:
-        """Share of ticks with 1 among those with 0 or 1, (n,); NaN is no sample."""
+        """Estimates the share of ticks with 1 among those with 0 or 1, (n,); NaN is ignored."""
         found = self.mean(hits)
         if found.samples == 0:
             return found
@@ -64,7 +64,7 @@ class Resampling:
         return Estimate(found.value, min(found.low, low), max(found.high, high), found.samples)
 
     def mean(self, values: Floats) -> Estimate:
-        """Mean of (n,); NaN is no sample."""
+        """Estimates the mean of (n,); NaN is ignored."""
         known = np.isfinite(values)
         if not known.any():
             return Estimate(np.nan, np.nan, np.nan, 0)
@@ -74,7 +74,7 @@ class Resampling:
         return _estimate(float(values[known].mean()), means, int(known.sum()))
 
     def quantile(self, values: Floats, q: float) -> Estimate:
-        """The smallest value of (n,) that at least a share ``q`` does not exceed; NaN is no sample."""
+        """Estimates the smallest value of (n,) that at least a share ``q`` does not exceed; NaN is ignored."""
         known = np.isfinite(values)
         if not known.any():
             return Estimate(np.nan, np.nan, np.nan, 0)
@@ -99,7 +99,7 @@ def _estimate(value: float, resampled: Floats, samples: int) -> Estimate:
 
 
 def _binomial(hits: float, trials: float) -> tuple[float, float]:
-    """Clopper and Pearson's interval of a share; the counts need not be whole."""
+    """Computes the Clopper-Pearson interval of a share; the counts need not be integers."""
     tail = 0.5 * (1.0 - LEVEL)
     misses = trials - hits
     low = betaincinv(hits, misses + 1.0, tail) if hits > 0.0 else 0.0
@@ -108,18 +108,18 @@ def _binomial(hits: float, trials: float) -> tuple[float, float]:
 
 
 def block_ticks(horizon_s: float, rate_hz: float, ticks: int) -> int:
-    """Length of a block: three horizons, or the cube root of the ticks of the longest log where that is more."""
+    """Computes the length of a block: three horizons, or the cube root of the ticks of the longest log if larger."""
     return max(1, int(np.ceil(3.0 * horizon_s * rate_hz)), int(np.ceil(ticks ** (1.0 / 3.0))))
 
 
 def resample(lengths: Sequence[int], block: int, sample_ticks: float, seed: int, draws: int = DRAWS) -> Resampling:
-    """Weights of the ticks in logs resampled block by block.
+    """Computes weights of the ticks in logs resampled block by block.
 
     Args:
-        lengths: Ticks of each log, in the order in which the values will come.
-        block: Ticks a stretch; cut to a log that is shorter.
-        sample_ticks: Ticks for one independent sample of a share.
-        seed: Of the random numbers: the same seed and lengths give the same weights.
+        lengths: Number of ticks of each log, in the order of the values.
+        block: Number of ticks of a block; limited to the length of a log.
+        sample_ticks: Number of ticks for one independent sample of a share.
+        seed: Seed of the random numbers; the same seed and lengths give the same weights.
         draws: Number of resampled logs.
     """
     random = np.random.default_rng(seed)
@@ -132,7 +132,7 @@ def resample(lengths: Sequence[int], block: int, sample_ticks: float, seed: int,
         starts = random.integers(0, n, size=(draws, pieces))
         weights = np.zeros((draws, n))
         for row, first in zip(weights, starts, strict=True):
-            ticks = (first[:, None] + np.arange(size)).ravel()[:n]  # the last stretch is cut: a log keeps its length
+            ticks = (first[:, None] + np.arange(size)).ravel()[:n]  # the last block is cut: a log keeps its length
             row[:] = np.bincount(ticks % n, minlength=n)
         parts.append(weights)
     return Resampling(np.concatenate(parts, axis=1) if parts else np.zeros((draws, 0)), block, sample_ticks)

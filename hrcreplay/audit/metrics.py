@@ -1,6 +1,6 @@
 """Metrics of an audit with their intervals, by method, limb and joint, for one log or for several together.
 
-They also say which limbs and points could not be checked, since a coverage holds only for those that were.
+They also list the limbs and points that could not be checked, since a coverage applies only to the checked ones.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from hrcreplay.reporting.tables import PageTable
 
 
 def never_checked(part: Mapping[str, Any], method: str) -> list[str]:
-    """Limbs that a method was not checked for at any tick, and points of other limbs that were never seen.
+    """Lists the limbs for which a method was not checked at any tick, and points of other limbs that were never seen.
 
     Args:
         part: One log of audit.json, or its total.
-        method: Whose volumes.
+        method: Method of the volumes.
     """
     limbs = [limb for limb in BODY if not ticks_of(part, method, limb)]
     points = [
@@ -36,7 +36,7 @@ def never_checked(part: Mapping[str, Any], method: str) -> list[str]:
 
 
 def partly_checked(part: Mapping[str, Any], method: str) -> list[str]:
-    """Limbs and points that were checked at some ticks only, each with the number of those at which it was not."""
+    """Lists limbs and points that were checked only at some ticks, each with the number of unchecked ticks."""
     found = []
     for limb, counts in part["points"].items():
         limb_ticks = ticks_of(part, method, limb)
@@ -47,13 +47,13 @@ def partly_checked(part: Mapping[str, Any], method: str) -> list[str]:
 
 
 def ticks_of(part: Mapping[str, Any], method: str, limb: str) -> int:
-    """At how many ticks a limb was compared with its volume: it was seen to the horizon's end and has a volume."""
+    """Counts the ticks at which a limb was checked: it was seen to the horizon's end and has a volume."""
     figures = part["methods"][method].get(limb)
     return 0 if figures is None else int(figures["covered_share"]["samples"])
 
 
 def unchecked_notes(part: Mapping[str, Any], method: str) -> list[str]:
-    """Remarks on what a log's figures did not check."""
+    """Returns remarks on limbs and points that were not checked."""
     told = []
     if gaps := never_checked(part, method):
         told.append(f"not checked at all, so nothing is said of it: {', '.join(gaps)}")
@@ -63,13 +63,13 @@ def unchecked_notes(part: Mapping[str, Any], method: str) -> list[str]:
 
 
 def checked_scope(part: Mapping[str, Any], method: str) -> str:
-    """The limbs that a headline holds for, in a few words."""
+    """Describes in a few words the limbs to which a headline applies."""
     missing = [limb for limb in BODY if not ticks_of(part, method, limb)]
     return f"not {', '.join(missing)}" if missing else "LEGS included"
 
 
 def checked_table(total: Mapping[str, Any], method: str) -> PageTable:
-    """A row a limb, and one for each point beyond its two ends: at how many ticks it was checked."""
+    """Makes one row per limb and per point other than its two ends, with the number of checked ticks."""
     rows = []
     for limb in BODY:
         ticks = ticks_of(total, method, limb)
@@ -103,27 +103,27 @@ def checked_cameras(log: Mapping[str, Any]) -> PageTable:
     )
 
 
-#: Several limbs together -> what their share is of.
+#: Group of limbs -> description of its share.
 WHAT = {
     "all": "every limb that was checked, limb radius included, in its own volume",
     "upper": "every limb that was checked, limb radius included, the lower body left out, in its own volume",
 }
 UNCHECKED = "not checked: not seen to the end of a horizon"
-#: Ticks of one escape may have so many ticks without one between them.
+#: Maximum number of ticks without an escape within one escape.
 _BREAK = 2
 
 
 def method_figures(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:
-    """Coverage, escapes and volumes of one method.
+    """Computes coverage, escapes and volumes of one method.
 
     Args:
-        outcomes: One a log, in the order of the resampling.
-        resampling: Of all their ticks.
+        outcomes: One per log, in the order of the resampling.
+        resampling: Resampling of all their ticks.
 
     Returns:
-        Of whole limbs, and beside them ``points_share`` of their points alone: ``all`` (all limbs that the method has
-        volumes for, each in its own), ``upper`` (the six LIMBS, for which all methods have them) and each limb -> name
-        -> figure.
+        Figures of whole limbs, and ``points_share`` for their points only: ``all`` (all limbs with volumes by the
+        method, each in its own), ``upper`` (the six LIMBS, which have volumes by all methods) and each limb -> name ->
+        figure.
     """
     whole = Outcome.join(outcomes)
     escapes, points = whole.escape_m(), whole.escape_m(points_alone=True)
@@ -156,22 +156,22 @@ def _escape_figures(escape_m: Floats, points_escape_m: Floats, resampling: Resam
 
 
 def _ratio(part: Floats, whole: Floats) -> Floats:
-    """Shares; NaN where there is no whole."""
+    """Computes shares; NaN if the total is 0."""
     return np.asarray(part / np.where(whole > 0.0, whole, np.nan))
 
 
 def _hits(values: Floats, most: Floats) -> Floats:
-    """1 where a value is at most ``most``, else 0; NaN stays."""
+    """Returns 1 for a value of at most ``most``, else 0; NaN is kept."""
     return np.where(np.isnan(values), np.nan, (values <= most).astype(float))
 
 
 def joint_figures(inside: Floats, travel: Floats, resampling: Resampling) -> dict[str, Any]:
-    """Per joint: share of ticks whose recorded future stayed inside the reachable interval, and how much it moved.
+    """Computes, per joint, the share of ticks with the recorded future inside the reachable interval, and its motion.
 
     Args:
-        inside: (n, 13) 1 or 0; NaN where the joint was not recorded.
-        travel: (13,) how far the joint went in the recording, 5th to 95th percentile [m, m, rad..., m].
-        resampling: Of the n ticks.
+        inside: (n, 13) 1 or 0; NaN if the joint was not recorded.
+        travel: (13,) range of the joint in the recording, 5th to 95th percentile [m, m, rad..., m].
+        resampling: Resampling of the n ticks.
     """
     return {
         joint: {"inside_share": resampling.share(inside[:, j]).to_dict(), "travel": _number(travel[j])}
@@ -180,10 +180,10 @@ def joint_figures(inside: Floats, travel: Floats, resampling: Resampling) -> dic
 
 
 def deviation_figures(errors: Floats) -> dict[str, Any]:
-    """Per joint, of positions and of velocities: root mean square of the errors, and how many are within 1, 2, 3.
+    """Computes, per joint, for positions and velocities: root mean square of the errors, and shares within 1, 2, 3.
 
     Args:
-        errors: (2, n, 13) in standard deviations; NaN where not known.
+        errors: (2, n, 13) in standard deviations; NaN if unknown.
     """
     found: dict[str, Any] = {joint: {} for joint in JOINTS}
     for name, part in zip(("position", "velocity"), errors, strict=True):
@@ -196,7 +196,7 @@ def deviation_figures(errors: Floats) -> dict[str, Any]:
 
 
 def curve_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:
-    """Coverage of the six LIMBS and volume of their union, of one method under one limit set."""
+    """Computes coverage of the six LIMBS and volume of their union, for one method and one limit set."""
     whole = Outcome.join(outcomes)
     worst = whole.worst_m(len(LIMBS))
     return {
@@ -206,7 +206,7 @@ def curve_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str
 
 
 def horizon_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[str, Any]:
-    """Coverage of every whole limb that was checked, and volume of their union, of one method at one horizon."""
+    """Computes coverage of all checked whole limbs and volume of their union, for one method at one horizon."""
     whole = Outcome.join(outcomes)
     worst = whole.worst_m()
     return {
@@ -216,7 +216,7 @@ def horizon_point(outcomes: Sequence[Outcome], resampling: Resampling) -> dict[s
 
 
 def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
-    """Every escape: the ticks in a row whose prediction one limb left, when, and how far.
+    """Lists all escapes: consecutive ticks whose prediction one limb left, their time and the distance.
 
     Times are those of the predictions; seconds count from ``start_ns``.
     """
@@ -244,15 +244,15 @@ def escapes(outcome: Outcome, start_ns: int) -> list[dict[str, Any]]:
 def first_movements(
     outcome: Outcome, moved_ns: Mapping[str, int | None], horizon_s: float, start_ns: int
 ) -> list[dict[str, Any]]:
-    """For each limb that moved: when it first did, and whether the volumes held it then.
+    """Finds, for each limb that moved, its first movement and its coverage at that time.
 
-    Asked are the volumes predicted up to a horizon before and after. Times count from ``start_ns``.
+    The volumes predicted up to a horizon before and after are checked. Times count from ``start_ns``.
 
     Args:
-        outcome: Of a method.
-        moved_ns: Limb -> when it first moved [ns].
-        horizon_s: Of the volumes [s].
-        start_ns: Of the log [ns].
+        outcome: Outcome of a method.
+        moved_ns: Limb -> time of its first movement [ns].
+        horizon_s: Horizon of the volumes [s].
+        start_ns: Start of the log [ns].
     """
     depth, found = outcome.escape_m(), []
     for i, limb in enumerate(outcome.limbs):
@@ -274,7 +274,7 @@ def first_movements(
 
 
 def _joined(escaped: Bools) -> list[tuple[int, int]]:
-    """Runs of true, those joined that lie close together."""
+    """Returns runs of True; runs close together are merged."""
     runs: list[tuple[int, int]] = []
     for first, last in true_runs(escaped).tolist():
         if runs and first - runs[-1][1] <= _BREAK:
@@ -285,11 +285,11 @@ def _joined(escaped: Bools) -> list[tuple[int, int]]:
 
 
 def volume_at(curve: Sequence[Mapping[str, Any]], share: float) -> float | None:
-    """Union volume at which a method's curve first has a coverage, between its points; None where it never has [m^3].
+    """Returns the union volume at which a method's curve first reaches a coverage, interpolated; None if never [m^3].
 
     Args:
-        curve: Points of one method, by growing factor.
-        share: The coverage asked for.
+        curve: Points of one method, by increasing factor.
+        share: The required coverage.
     """
     before: tuple[float, float] | None = None
     for point in curve:
@@ -306,7 +306,7 @@ def volume_at(curve: Sequence[Mapping[str, Any]], share: float) -> float | None:
 
 
 def headline_metrics(found: Mapping[str, Any]) -> dict[str, Metric]:
-    """The headline figures of all logs together, as metrics.json has them.
+    """Returns the headline figures of all logs together, in the form of metrics.json.
 
     Args:
         found: The content of audit.json.
@@ -351,7 +351,7 @@ def _number(value: float) -> float | None:
 
 
 def text_with_interval(figure: Mapping[str, Any] | Estimate, scale: float = 1.0, decimals: int = 1) -> str:
-    """A figure with its interval, as tables show it; a dash where there is none."""
+    """Formats a figure with its interval for a table; a dash if missing."""
     plain = figure.to_dict() if isinstance(figure, Estimate) else figure
     if plain["value"] is None:
         return "\u2013"

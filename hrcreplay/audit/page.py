@@ -29,7 +29,7 @@ from hrcreplay.reporting.tables import PageTable, text_of
 CAPTIONS = {
     "audit_coverage": (
         "Share of the ticks at which every limb that was checked, the lower body left out, stayed in its own volume "
-        "for the whole horizon, against the room that these volumes take: not all methods have a lower body. "
+        "for the whole horizon, against the size of these volumes: not all methods have a lower body. "
         "Diamonds: our methods with the limit set as given; lines: its velocities, accelerations and departures times "
         "the factors written beside them. Squares: peers. Bars: 95 % intervals. Faint: each log."
     ),
@@ -41,7 +41,7 @@ CAPTIONS = {
 }
 _CLAIMS = (
     "A limb or a point that was not checked may have been anywhere.",
-    "Coverage on these logs says nothing of other people, other tasks or faster days than those recorded.",
+    "Coverage on these logs is not valid for other people, other tasks or faster motion than those recorded.",
     "Recorded points are points of a skeleton. The share with the limb's own thickness is given per limb.",
     "Intervals rest on the ticks of these logs alone; where a log is short or the person still, they are wide.",
     "hrcreplay is a research tool. It is not certified, and no page of it makes a robot cell safe or compliant.",
@@ -50,13 +50,13 @@ _MOST_ESCAPES = 25
 
 
 def render(found: Mapping[str, Any], metrics: Mapping[str, Metric], meta: Mapping[str, Any], figures_dir: Path) -> str:
-    """The page of an audit.
+    """Renders the page of an audit.
 
     Args:
         found: The content of audit.json.
-        metrics: That of metrics.json.
-        meta: That of run.json.
-        figures_dir: Where ``figures.draw_all`` drew.
+        metrics: The content of metrics.json.
+        meta: The content of run.json.
+        figures_dir: Folder of the figures from ``figures.draw_all``.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(
@@ -67,7 +67,7 @@ def render(found: Mapping[str, Any], metrics: Mapping[str, Metric], meta: Mappin
     return template.render(
         title="Audit: " + ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else ""),
         subtitle=f"{total['ticks']} ticks at {found['audit_hz']:g} Hz, horizon {found['horizon_s']:g} s",
-        verdict=None,  # there is no robot
+        verdict=None,  # an audit has no robot
         answers=(_answer(found),),
         cards=_cards(found),
         parts=(_coverage(found, figures_dir), _limbs(found, figures_dir), _joints(found, figures_dir), _data(found)),
@@ -75,7 +75,7 @@ def render(found: Mapping[str, Any], metrics: Mapping[str, Metric], meta: Mappin
         inputs=[{"name": PurePath(str(i["path"])).name, "sha256": i["sha256"]} for i in meta.get("inputs", [])],
         versions=sorted(meta.get("versions", {}).items()),
         stages=[],
-        flaws=(),  # of each log, in the section on the data
+        flaws=(),  # notes of each log are in the section on the data
         command=str(meta.get("command", "")),
         not_claimed=_CLAIMS,
         metrics=[
@@ -94,7 +94,7 @@ def _answer(found: Mapping[str, Any]) -> Answer:
     sources = sorted({log["recorded_future"] for log in found["logs"]})
     limits = sorted({log["limits"] for log in found["logs"]})
     words = (
-        f"Method {METHODS.get(method, method)}, limits {', '.join(limits)}: at so many of {share['samples']} ticks, "
+        f"Method {METHODS.get(method, method)}, limits {', '.join(limits)}: at this share of {share['samples']} ticks "
         f"every limb that was checked ({checked_scope(found['total'], method)}) stayed, limb radius included, around "
         f"its recorded points ({', '.join(sources)}) in its own volume for all of the next {found['horizon_s']:g} s. "
         f"95 % interval {100 * share['low']:.1f} to {100 * share['high']:.1f} %. For skeleton points only, "
@@ -122,7 +122,7 @@ def _cards(found: Mapping[str, Any]) -> tuple[Card, ...]:
 
 
 def _figure(folder: Path, name: str) -> PageFigure:
-    """An SVG as an image of its own, on white: what it says is in its caption."""
+    """Embeds an SVG as an image on white; its caption describes it."""
     data = base64.b64encode((folder / f"{name}.svg").read_bytes()).decode()
     look = "display: block; width: 100%; background: #fff; border-radius: 6px"
     label = Markup.escape(CAPTIONS[name])
@@ -161,7 +161,7 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> PageSection:
     return PageSection(
         "coverage",
         "Coverage",
-        "Did the recorded person stay in what was predicted, and how much room did the prediction take?",
+        "Did the recorded person stay in the predicted volumes, and how large were these volumes?",
         (_figure(folder, "audit_coverage"),),
         (
             table(f"{every} covered [%]", "covered_share", 100.0, 1, f"{_lower(found)} {way}"),
@@ -177,7 +177,7 @@ def _coverage(found: Mapping[str, Any], folder: Path) -> PageSection:
 
 
 def _by_horizon(found: Mapping[str, Any], every: str) -> tuple[PageTable, ...]:
-    """Coverage and volume at horizons up to the audit's own, of all logs together."""
+    """Makes the table of coverage and volume at horizons up to that of the audit, for all logs together."""
     points = found["total"]["horizons"]
     compared = tuple(points[0]["methods"])
     head = ("until after the tick", *_named(compared))
@@ -204,7 +204,7 @@ def _counted(error: float) -> str:
 
 
 def _lower(found: Mapping[str, Any]) -> str:
-    """Methods with a lower body that can leave its volume."""
+    """Returns a sentence on the methods with a volume for the lower body."""
     methods = found["total"]["methods"]
     have = [METHODS.get(m, m) for m in in_order(methods) if "LEGS" in methods[m]]
     if not have:
@@ -213,7 +213,7 @@ def _lower(found: Mapping[str, Any]) -> str:
 
 
 def _equal(found: Mapping[str, Any]) -> str:
-    """Volumes of our methods where their curves reach a baseline's coverage less half a percent."""
+    """Returns volumes of hrcreplay's methods where their curves reach a baseline's coverage less half a percent."""
     peer = found["total"]["methods"].get("v2_a50")
     if peer is None or peer["upper"]["covered_share"]["value"] is None or not peer["upper"]["union_m3"]["value"]:
         return ""
@@ -292,8 +292,8 @@ def _deviations(total: Mapping[str, Any]) -> PageTable:
             cells += ["\u2013" if one["rms"] is None else f"{one['rms']:.2f}", within]
         rows.append((joint, *cells))
     note = (
-        "How well the filter knows how wrong it is. Of normal errors with the right deviations the root mean square is "
-        "1, and 68, 95 and 99.7 % are within 1, 2 and 3 of them; a smaller root mean square: the filter is too careful."
+        "Consistency of the filter. For normal errors with the right deviations the root mean square is 1, and 68, 95 and "
+        "99.7 % are within 1, 2 and 3 of them; a smaller root mean square: the reported deviations are too large."
     )
     head = ("joint", "position, rms", "within 1 / 2 / 3 [%]", "velocity, rms", "within 1 / 2 / 3 [%]")
     return PageTable("Errors of the fused person, in their standard deviations", head, tuple(rows), note)
@@ -361,7 +361,7 @@ def _escapes(log: Mapping[str, Any], method: str) -> PageTable:
 
 
 def _settings(settings: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """The sections that an audit rests on."""
+    """Returns the settings that an audit depends on."""
     return [
         (section, [(key, str(value)) for key, value in sorted(settings[section].items())])
         for section in ("fusion", "limits", "occupancy")

@@ -1,4 +1,4 @@
-"""Audit of the recorded motion alone: when limbs first moved, and how far the filter's state was off."""
+"""Audit of the recorded motion alone: the first movements of limbs, and the errors of the filter's state."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from hrcreplay.human.model import SHOWN_BY
 from hrcreplay.records import POINTS, Floats, Ints
 from hrcreplay.reporting.metrics.series import difference
 
-#: A limb has moved once one of its ends is so far from where it was first, the middle of so many sightings [m].
+#: Distance of a limb's end from its first position that counts as a movement [m], and number of sightings whose median
+#: is the first position.
 _MOVED_M, _FIRST = 0.1, 10
 
 
 def first_movements_ns(recording: Recording) -> dict[str, int | None]:
-    """Limb -> when it first moved [ns]; None where it never did: a filter has seen no movement of its kind before."""
+    """Limb -> time of its first movement [ns]; None if it never moved. The filter has seen no such movement before."""
     found: dict[str, int | None] = {}
     for limb, names in LIMB_POINTS.items():
         moved = np.zeros(len(recording.t_ns), dtype=bool)
@@ -27,20 +28,20 @@ def first_movements_ns(recording: Recording) -> dict[str, int | None]:
     return found
 
 
-#: Recorded velocities are differences over so long, of joints recorded without a longer gap; a limb that no camera has
-#: seen for longer is where nobody knows [ns], [s].
+#: Time difference for recorded velocities [ns], maximum gap between their recorded joints [ns], and maximum time since
+#: a camera saw the limb [s].
 _ACROSS_NS, _GAP_NS, _SEEN_S = 40_000_000, 100_000_000, 0.25
 
 
 def errors_in_deviations(recording: Recording, ticks: Ints) -> Floats:
-    """Errors of the fused positions and velocities, in their standard deviations.
+    """Computes the errors of the fused positions and velocities, in their standard deviations.
 
     Args:
         recording: The log.
         ticks: (n,) rows of ``recording.states``.
 
     Returns:
-        (2, n, 13), positions before velocities; NaN where the joint was not recorded, or not seen lately.
+        (2, n, 13), positions before velocities; NaN if the joint was not recorded or not seen recently.
     """
     t_ns, joints, states = recording.joints_t_ns, recording.joints, recording.states.rows(ticks)
 
