@@ -24,9 +24,9 @@ from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, DOF, JOINTS, LENGTHS, LIMBS, POINTS, Floats
 from hrcreplay.settings.sections import Prediction
 
-#: First of the four joints of each arm in JOINTS, and s of the kinematics: +1 on the left.
+#: First of the four joints of each arm in JOINTS, and the sign s of the kinematics: +1 on the left.
 RIGHT_ARM, LEFT_ARM = JOINTS.index("ar1"), JOINTS.index("al1")
-#: The pelvis's height in JOINTS.
+#: Index of the pelvis's height in JOINTS.
 HEIGHT = JOINTS.index("z")
 THETA, RHO = JOINTS.index("theta"), JOINTS.index("rho")
 #: Joints alpha_2 and alpha_3 of both arms.
@@ -256,7 +256,7 @@ def clamp_row(p: Floats, p_min: Floats, p_max: Floats, coupled: bool, low: Float
     """
     for j in range(DOF):
         low[j], high[j] = p_min[j], p_max[j]
-        if j == THETA:  # Table 1's +-pi is a wrap, not a stop
+        if j == THETA:  # Table 1's +-pi is the wrap of an angle, not a joint limit
             low[j], high[j] = -np.inf, np.inf
         elif coupled and j in ALPHA_2:
             low[j], high[j] = alpha_2_bounds(p[j - 1], p[j - 1])

@@ -70,9 +70,7 @@ def learn(
     for n, k in enumerate(_BESIDE):
         if not shown[_OF_LIMB[n]]:
             continue
-        age = (
-            min(now - filter_.model.offset_ns[k], rules.memory_ns) * 1e-9
-        )  # what is out of sight longer is lost anyway
+        age = min(now - filter_.model.offset_ns[k], rules.memory_ns) * 1e-9  # a point unseen for longer is lost anyway
         weight = np.exp(-age / rules.offset_memory_s) * filter_.model.offset_weight[k] + 1.0
         for j in range(3):
             beside = 0.0
@@ -103,7 +101,7 @@ def _learn_legs(filter_: Filter, c: int, pelvis: Floats, heading: float, rules: 
 
 @njit(cache=True)
 def _near(filter_: Filter, c: int, k: int, place: Floats, most: float, rules: Rules) -> bool:
-    """Return whether a camera shows a point with enough confidence within ``most`` [m] of a place."""
+    """Returns True if a camera shows a point with enough confidence within ``most`` [m] of a place."""
     shown = filter_.gate.confidence[c, k] >= rules.confidence_min
     return bool(shown and distance(filter_.gate.points[c, k], place) <= most)
 

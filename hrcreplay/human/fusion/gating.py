@@ -76,7 +76,7 @@ def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track
         if (DEPENDS[row] & believed).any():
             filter_.estimate.row_ns[row] = min(
                 filter_.estimate.row_ns[row], now - rules.memory_ns - 1
-            )  # lost: it starts anew
+            )  # lost: it restarts
     confidence, points = filter_.gate.confidence[c], filter_.gate.points[c]
     for point in _TESTED:
         if trusted[point] and confidence[point] >= rules.confidence_min and np.isfinite(points[point, 0]):
@@ -92,7 +92,7 @@ def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track
 
 @njit(cache=True)
 def _validate_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> None:
-    """Select the valid rows, Eq. (58), given the points (20,) to be trusted."""
+    """Selects the valid rows, Eq. (58), from the trusted points (20,)."""
     confidence, points = filter_.gate.confidence[c], filter_.gate.points[c]
     for row in range(ROWS):
         product = 1.0

@@ -17,7 +17,7 @@ NEVER_NS = -(2**62)
 
 
 class StateEstimate(NamedTuple):
-    """StateEstimate of the person: joints, lengths, and how well they fit their frames."""
+    """Estimate of the person: joints, lengths, and how well they fit their frames."""
 
     tick_ns: Ints  #: (1,) the last tick
     started: Bools  #: (1,) True if there is a person
@@ -26,39 +26,39 @@ class StateEstimate(NamedTuple):
     lengths: Floats  #: (7,)
     lengths_var: Floats  #: (7,)
     row_ns: Ints  #: (20,) tick at which a row (JOINTS, then LENGTHS) was last valid
-    acquired_ns: Ints  #: (20,) tick at which a row started anew
+    acquired_ns: Ints  #: (20,) tick at which a row restarted
     bone_ns: Ints  #: (7,) tick at which a camera last saw a length that agreed with the filter
     innovation: Floats  #: (c, 13) each joint's last normalised innovation by a camera
     squares: Floats  #: (13,) running sum of the squares of these
     products: Floats  #: (13,) running sum of their products with the same camera's one before
-    spread: Floats  #: (13,) the highest square, decaying
+    spread: Floats  #: (13,) maximum square, decaying
 
 
 class Gate(NamedTuple):
     """Frame held for each camera, and which of its rows and points are valid."""
 
     point_ns: Ints  #: (20,) tick at which a body point last agreed with the filter
-    refused_ns: Ints  #: (c, 20) tick since when a camera has shown a point elsewhere, in one place
-    refused_at: Floats  #: (c, 20, 3) where it last did
-    apart: Floats  #: (c, 6) how far that is from the filter, the farthest point of each of LIMBS; 0 without one [m]
-    capture_ns: Ints  #: (c,) of the frame held for each camera
-    uses: Ints  #: (c,) ticks that frame was used in; -1 without one
+    refused_ns: Ints  #: (c, 20) tick since which a camera has shown a point at another place
+    refused_at: Floats  #: (c, 20, 3) last such place
+    apart: Floats  #: (c, 6) maximum distance of these places from the filter's estimate, per limb; 0 without one [m]
+    capture_ns: Ints  #: (c,) capture of the stored frame of each camera
+    uses: Ints  #: (c,) number of ticks that used this frame; -1 without one
     newest_ns: Ints  #: (1,) capture of the newest frame of any camera that entered the filter
     z: Floats  #: (c, 20) its rows
     z_var: Floats  #: (c, 20) sigma_z^2
     points: Floats  #: (c, 20, 3)
     confidence: Floats  #: (c, 20)
-    valid: Bools  #: (c, 20) which of its rows are used
-    shows: Bools  #: (c, 6) which limbs it shows with all that carries them
+    valid: Bools  #: (c, 20) True for its used rows
+    shows: Bools  #: (c, 6) True for limbs that it shows, together with all limbs that carry them
 
 
 class ModelResidual(NamedTuple):
     """Distances of the body from its model, and body points beside the model."""
 
-    residuals: Floats  #: (7, BINS) weights of the residuals of each limb of BODY by their size
-    weight: Floats  #: (7,) of all of them
-    samples: Ints  #: (7,) residuals so far
-    sampled_ns: Ints  #: (7,) tick of the last
+    residuals: Floats  #: (7, BINS) weights of the residuals of each limb of BODY, by their size
+    weight: Floats  #: (7,) sum of these weights
+    samples: Ints  #: (7,) number of residuals so far
+    sampled_ns: Ints  #: (7,) tick of the last residual
     residual: Floats  #: (7,) their quantile [m]
     peak: Floats  #: (7,) maximum of the recent residuals [m]
     peak_ns: Ints  #: (7,) tick of this maximum
@@ -66,8 +66,8 @@ class ModelResidual(NamedTuple):
     offset_weight: Floats  #: (20,) sum of the weights in that mean
     offset_ns: Ints  #: (20,) tick of the last sample
     carried: Floats  #: (20, 3) hands from the wrist, legs from below the pelvis, world [m]
-    carried_ns: Ints  #: (20,) when a camera took that
-    foot: Floats  #: (2, 3) right and left foot from its ankle, as last shown, in the body's heading [m]
+    carried_ns: Ints  #: (20,) capture of that observation
+    foot: Floats  #: (2, 3) last observed offset of the right and left foot from the ankle, in the body's heading [m]
 
 
 class Filter(NamedTuple):

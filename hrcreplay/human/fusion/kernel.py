@@ -121,7 +121,7 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
         elif now - filter_.estimate.row_ns[row] > rules.memory_ns:
             _acquire(filter_, row, z[row], R, rules.rest_std[row])
             filter_.estimate.acquired_ns[row] = now
-            track.reacquired[0] += filter_.estimate.row_ns[row] >= 0  # the first time is no loss
+            track.reacquired[0] += filter_.estimate.row_ns[row] >= 0  # the first time is not a reacquisition
         else:
             innovation = correct(filter_.estimate.mean[row], filter_.estimate.cov[row], h, z[row], R)
             add_innovation(filter_, c, row, innovation, now, rules)
@@ -133,7 +133,7 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
 
 @njit(cache=True)
 def _named(filter_: Filter, c: int, h: Floats) -> Floats:
-    """The rows (20,) of a camera's frame by the names, and the turn of the heading, nearest to the estimate."""
+    """Returns the rows (20,) of a camera's frame, arms in the form and heading in the turn nearest to the estimate."""
     z = filter_.gate.z[c].copy()
     expected, variance = np.empty(DOF), np.empty(DOF)
     for j in range(DOF):
@@ -152,7 +152,7 @@ def _named(filter_: Filter, c: int, h: Floats) -> Floats:
 
 @njit(cache=True)
 def _start(filter_: Filter, c: int) -> None:
-    """The person appears: the base under what is seen, until the pelvis is."""
+    """Starts the person, with the base under the seen points until the pelvis is seen."""
     filter_.estimate.started[0] = True
     for axis in range(2):
         filter_.estimate.mean[axis, 0] = np.nanmean(filter_.gate.points[c, :, axis])
@@ -160,7 +160,7 @@ def _start(filter_: Filter, c: int) -> None:
 
 @njit(cache=True)
 def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> None:
-    """A joint seen for the first time, or for the first time after it was lost: nothing old is carried over."""
+    """Starts a joint seen for the first time or after a loss; no earlier state is kept."""
     filter_.estimate.mean[j] = 0.0
     filter_.estimate.mean[j, 0] = z
     reset(filter_, j)

@@ -189,7 +189,7 @@ def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) ->
     if sample >= filter_.model.peak[limb] or now - filter_.model.peak_ns[limb] >= rules.residual_hold_ns:
         filter_.model.peak[limb], filter_.model.peak_ns[limb] = sample, now
     filter_.model.residuals[limb] *= kept
-    filter_.model.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf is no whole number
+    filter_.model.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf cannot be converted to an integer
     filter_.model.weight[limb] = kept * filter_.model.weight[limb] + 1.0
     filter_.model.samples[limb] += 1
     filter_.model.sampled_ns[limb] = now

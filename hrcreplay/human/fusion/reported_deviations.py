@@ -44,7 +44,7 @@ FITTED = np.array(
 
 @njit(cache=True)
 def reset(filter_: Filter, j: int) -> None:
-    """Joint j has been acquired: no innovation yet."""
+    """Resets joint j after its acquisition, without an innovation."""
     filter_.estimate.innovation[:, j], filter_.estimate.squares[j], filter_.estimate.products[j] = 0.0, 0.0, 0.0
     filter_.estimate.spread[j] = FIRST_SPREAD
 
@@ -71,7 +71,7 @@ def add_innovation(filter_: Filter, c: int, j: int, innovation: float, now: int,
 
 @njit(cache=True)
 def autocorrelation(filter_: Filter, j: int) -> float:
-    """Of successive innovations of joint j by the same camera, at lag 1, in [-1, 1]; 0 before there are any."""
+    """Autocorrelation of joint j's innovations by the same camera, at lag 1, in [-1, 1]; 0 without innovations."""
     if not 0.0 < filter_.estimate.squares[j] < np.inf:
         return 0.0
     return float(max(-1.0, min(filter_.estimate.products[j] / filter_.estimate.squares[j], 1.0)))

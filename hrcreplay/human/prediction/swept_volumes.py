@@ -126,7 +126,7 @@ def reach_row(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Flo
     """
     bounds, coupled, horizon, method = within
     _walk(p, v, bounds, horizon, method, low, high)
-    low[HEIGHT], high[HEIGHT] = p[HEIGHT], p[HEIGHT]  # a length in the paper: it stays
+    low[HEIGHT], high[HEIGHT] = p[HEIGHT], p[HEIGHT]  # a constant length in the paper
     for j in range(RHO, HEIGHT):
         if method == PAPER:
             low[j], high[j] = _joint(p[j], v[j], bounds[2:, j], horizon)
