@@ -292,8 +292,8 @@ def _deviations(total: Mapping[str, Any]) -> PageTable:
             cells += ["\u2013" if one["rms"] is None else f"{one['rms']:.2f}", within]
         rows.append((joint, *cells))
     note = (
-        "Consistency of the filter. For normal errors with the right deviations the root mean square is 1, and 68, 95 and "
-        "99.7 % are within 1, 2 and 3 of them; a smaller root mean square: the reported deviations are too large."
+        "Consistency of the filter. For normal errors with the right deviations the root mean square is 1, and 68, 95 "
+        "and 99.7 % are within 1, 2 and 3 of them; a smaller root mean square: the reported deviations are too large."
     )
     head = ("joint", "position, rms", "within 1 / 2 / 3 [%]", "velocity, rms", "within 1 / 2 / 3 [%]")
     return PageTable("Errors of the fused person, in their standard deviations", head, tuple(rows), note)
