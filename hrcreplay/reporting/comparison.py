@@ -1,6 +1,7 @@
-"""Methods side by side: figures of each, the sum over several logs, tables, and one picture of safety and pace.
+"""Comparison of methods: figures of each, totals over several logs, tables, and one plot of safety and pace.
 
-Terminal, CSV, Markdown and JSON show the same numbers. Those of a motion alone are the metrics of a report.
+Terminal, CSV, Markdown and JSON show the same numbers. Numbers that depend only on a motion are the metrics of a
+report.
 """
 
 from __future__ import annotations
@@ -27,16 +28,16 @@ from hrcreplay.reporting.tables import PageTable
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
 
-#: A smaller pace is shown as 0.0 %: the robot made no way.
+#: A smaller pace is shown as 0.0 %: the robot made no progress.
 NO_WAY = 0.0005
 
-#: Name of the row over several logs.
+#: Name of the row with the total over several logs.
 ALL = "all"
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A method, and how and how far ahead the person is predicted for it."""
+    """A method with its prediction of the person: occupancy and horizon."""
 
     method: str
     occupancy: str
@@ -44,7 +45,7 @@ class Variant:
 
     @property
     def label(self) -> str:
-        """As ``--methods`` takes it; the programme run blind has no volumes."""
+        """Label in the form that ``--methods`` takes; ``none`` has no volumes."""
         return self.method if self.method == "none" else f"{self.method}:{self.occupancy}:{self.horizon}"
 
     @property
@@ -68,7 +69,7 @@ class LogResult:
 
     name: str
     sha256: str
-    person: str  #: where the recorded person is from, as contact.parquet has it
+    person: str  #: source of the recorded person, as in contact.parquet
     seconds: float
     notes: tuple[str, ...]
     figures: Mapping[Variant, Mapping[str, Any]]
@@ -76,7 +77,7 @@ class LogResult:
 
 @dataclass(frozen=True)
 class Field:
-    """A figure: how those of several logs make one, its unit and its meaning."""
+    """A figure: its total over several logs, its unit and its meaning."""
 
     name: str
     how: str  #: sum, min, max; or "a / b" of two others; or "mean", "rms" by ticks
@@ -89,17 +90,17 @@ FIELDS = (
     Field("known_ticks", "sum", "1", "ticks at which the person is known"),
     Field("touch_ticks", "sum", "1", "ticks with a moving link in contact with anybody recorded"),
     Field("touch_person_ticks", "sum", "1", "of these, with the person"),
-    Field("touch_other_ticks", "sum", "1", "of these, with another body, which the robot did not heed"),
+    Field("touch_other_ticks", "sum", "1", "of these, with another body, which the robot did not consider"),
     Field("touch_s", "sum", "s", "the time of these"),
-    Field("touch_inside_ticks", "sum", "1", "with the person inside the volumes: the robot is at fault"),
-    Field("touch_retreating_ticks", "sum", "1", "with the robot moving out of the volumes: the person came"),
+    Field("touch_inside_ticks", "sum", "1", "with the person inside the volumes: the fault lies with the controller"),
+    Field("touch_retreating_ticks", "sum", "1", "with the robot moving out of the volumes: the person approached"),
     Field(
         "touch_outside_ticks",
         "sum",
         "1",
-        "with the person outside the volumes: the prediction is at fault",
+        "with the person outside the volumes: the fault lies with the prediction",
     ),
-    Field("touch_unpredicted_ticks", "sum", "1", "with the person, where the motion rested on no volume of that limb"),
+    Field("touch_unpredicted_ticks", "sum", "1", "with the person, without a volume of that limb for the motion"),
     Field("touch_rest_ticks", "sum", "1", "ticks with a link at rest in contact with anybody recorded"),
     Field("touch_speed_m_per_s", "max", "m/s", "largest speed of the touching surface while moving"),
     Field("nearest_moving_m", "min", "m", "smallest distance, surface to surface, while moving; negative in overlap"),
@@ -110,20 +111,20 @@ FIELDS = (
         "still_logs",
         "sum",
         "1",
-        "logs on which the robot never moved, or made no way: without contact there is no success",
+        "logs on which the robot never moved, or made no progress: no contact is then not a success",
     ),
     Field("tcp_speed_max_m_per_s", "max", "m/s", "greatest speed of the TCP"),
     Field("tcp_speed_near_body_m_per_s", "max", "m/s", "the same within report.near_m of the recorded body"),
     Field("programme_speed_max_m_per_s", "max", "m/s", "greatest programmed speed of the TCP, where the reference was"),
     Field("retreating_ticks", "sum", "1", "ticks in retreat: they begin inside a volume"),
     Field("retreating_share", "retreating_ticks / ticks", "1", "retreating ticks / ticks"),
-    Field("retreating_overlap_m", "max", "m", "how deep, at most, a link was inside a volume then"),
+    Field("retreating_overlap_m", "max", "m", "maximum depth of a link inside a volume at these ticks"),
     Field("near_ticks", "sum", "1", "ticks with at most report.near_m between robot and volumes"),
-    Field("standing_ticks", "sum", "1", "of these, the robot stands though its programme moves or waits for it"),
+    Field("standing_ticks", "sum", "1", "of these, the robot stands although its programme moves or waits for it"),
     Field("standing_share", "standing_ticks / near_ticks", "1", "standing ticks / near ticks"),
     Field("null_speed_ticks", "sum", "1", "near ticks with a TCP that stands, programmed dwells included"),
     Field("null_speed_share", "null_speed_ticks / near_ticks", "1", "null velocity when near, as the paper defines it"),
-    Field("made_s", "sum", "s", "programmed time of the way that the robot made"),
+    Field("made_s", "sum", "s", "programmed time of the robot's progress"),
     Field("given_s", "sum", "s", "time that it had"),
     Field("pace", "made_s / given_s", "1", "pace kept, of the programmed"),
     Field("cycles", "sum", "1", "times the reference came back to its first point"),
@@ -145,7 +146,7 @@ FIELDS = (
     Field("full_held_ticks", "sum", "1", "of these, every limb that was seen stayed whole inside its volume"),
     Field("full_coverage", "full_held_ticks / full_checked_ticks", "1", "as audit counts it until T_s"),
 )
-#: Where a figure is a metric of the report: its name there, after ``plan_`` but for those of the volumes.
+#: Figures that are metrics of the report -> their names there, after ``plan_`` except for those of the volumes.
 _METRICS = {
     "ticks": "plan_ticks",
     "known_ticks": "plan_body_known_ticks",
@@ -180,13 +181,13 @@ _METRICS = {
 
 
 def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Any]:
-    """The figures of a variant on one log: FIELDS, and ``braking_events_by_cause``; None where one does not apply.
+    """Computes the figures of a variant on one log: FIELDS, and ``braking_events_by_cause``; None if inapplicable.
 
     Args:
-        variant: Which.
+        variant: The variant.
         motion: Its table of motion.
         contact: Its rows of contact.
-        bounds: What the settings say.
+        bounds: Bounds from the settings.
     """
     metrics = _metrics(variant, motion, contact, bounds)
     found = {name: metrics[key]["value"] for name, key in _METRICS.items()}
@@ -207,7 +208,7 @@ def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bound
 
 
 def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Metric]:
-    """Metrics of this motion as a report has them, with nothing beside it."""
+    """Computes the metrics of this motion as in a report, without other methods."""
     table = MetricTable()
     settings = {"plan": {"method": variant.method}}
     add_plan(
@@ -226,7 +227,7 @@ def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, boun
 
 
 def braking_events(motion: pd.DataFrame, slow_m_per_s: float) -> dict[str, int]:
-    """Number of times a moving robot began to brake, by the reason that its record gives at that tick."""
+    """Counts how often a moving robot began to brake, by the recorded reason at that tick."""
     runs = true_runs((motion["status"].astype(str) == "braking").to_numpy())
     moving, reasons = is_moving(motion, slow_m_per_s), motion["reason"].fillna("").astype(str).to_numpy()
     found: dict[str, int] = {}
@@ -244,7 +245,7 @@ def _jerk(motion: pd.DataFrame) -> Floats:
 
 
 def _add_ratios(found: dict[str, Any]) -> dict[str, Any]:
-    """The figures in the order of FIELDS, with those that are one over another."""
+    """Returns the figures in the order of FIELDS, including the ratios."""
     for field in FIELDS:
         if "/" in field.how:
             above, below = (found[part.strip()] for part in field.how.split("/"))
@@ -253,7 +254,7 @@ def _add_ratios(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def total(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The figures of a variant over several logs: counts and times add up, extremes are those of the worst log."""
+    """Computes the totals of a variant over several logs: sums of counts and times, and the worst extremes."""
     found: dict[str, Any] = {}
     for field in FIELDS:
         known = [row for row in each if row[field.name] is not None]
@@ -276,7 +277,7 @@ def total(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str, Any]:
-    """The content of compare.json."""
+    """Returns the content of compare.json."""
     return {
         "methods": {
             variant.label: {"method": variant.method}
@@ -307,7 +308,7 @@ def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str,
 
 
 def _select_told(row: Mapping[str, Any], logs: int) -> dict[str, Any]:
-    """The figures of a variant with what they say of its motion, in words; None where it made its way."""
+    """Returns the figures of a variant with a remark on its standstill; None for a variant that made progress."""
     return {**row, "stillness": stillness(row, logs) or None}
 
 
@@ -336,31 +337,31 @@ _COLUMNS = (
 
 
 def _cell(value: float | None, factor: int, decimals: int) -> str:
-    """A figure as a reader wants it."""
+    """Formats a figure for readers."""
     return "\u2013" if value is None else f"{factor * value:,.{decimals}f}".replace("-", "\u2212")
 
 
 def stillness(row: Mapping[str, Any], logs: int) -> str:
-    """That a method never moved, or made no way, on one log or on how many of several; empty where it did.
+    """Returns a remark on a method that never moved, or made no progress, with the number of logs; empty if it did.
 
     Args:
         row: Its figures.
-        logs: How many logs they are of.
+        logs: Number of logs.
     """
     if not row["still_logs"]:
         return ""
     if row["still_logs"] < logs:
-        return f"no way on {row['still_logs']} of {logs} logs"
-    return "made no way" if row["moving_ticks"] else "never moved"
+        return f"no progress on {row['still_logs']} of {logs} logs"
+    return "made no progress" if row["moving_ticks"] else "never moved"
 
 
 def notes(found: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The notes of all logs, each with the log's name."""
+    """Returns the notes of all logs, each with the log's name."""
     return [(log["log"], note) for log in found["logs"] for note in log["notes"]]
 
 
 def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
-    """Tables of terminal and Markdown: the methods side by side, and why they braked."""
+    """Returns the tables for terminal and Markdown: the methods side by side, and the reasons for braking."""
     logs = [(log["log"], log["methods"]) for log in found["logs"]]
     if len(logs) > 1:
         logs.append((ALL, found["total"]))
@@ -371,7 +372,7 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
         for label, row in methods.items():
             head = (log, label) if len(logs) > 1 else (label,)
             cells = [_cell(row[name], *how) for _, name, *how in _COLUMNS]
-            if row["stillness"]:  # lest it be taken for a success
+            if row["stillness"]:  # so that it is not read as a success
                 cells[0] += f"\n({row['stillness']})"
             rows.append((*head, *cells))
             by_cause = row["braking_events_by_cause"]
@@ -385,7 +386,7 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
 
 
 def _note(found: Mapping[str, Any]) -> str:
-    """Note on the numbers, and the paper's own beside them."""
+    """Returns a note on the numbers and those of the paper."""
     persons = sorted({PERSONS.get(log["person"], log["person"]) for log in found["logs"]})
     known, ticks = (
         sum(next(iter(log["methods"].values()))[name] for log in found["logs"]) for name in ("known_ticks", "ticks")
@@ -414,7 +415,7 @@ def _note(found: Mapping[str, Any]) -> str:
 
 
 def print_tables(found: Mapping[str, Any]) -> None:
-    """The tables on standard error, where they do not mix with the result."""
+    """Prints the tables on standard error, separate from the result on standard output."""
     console = Console(stderr=True, markup=False, emoji=False, highlight=False)
     if not console.is_terminal:
         console.width = 190
@@ -429,7 +430,7 @@ def print_tables(found: Mapping[str, Any]) -> None:
 
 
 def write(found: Mapping[str, Any], writer: RunWriter) -> None:
-    """compare.json, compare.csv, compare.md and the figure."""
+    """Writes compare.json, compare.csv, compare.md and the figure."""
     writer.text("compare.json", run_folder.to_json(found))
     writer.text("compare.csv", as_csv(found))
     writer.text("compare.md", as_markdown(found))
@@ -440,7 +441,7 @@ def write(found: Mapping[str, Any], writer: RunWriter) -> None:
 
 
 def as_csv(found: Mapping[str, Any]) -> str:
-    """A row a log and method, and the sums over all logs; an empty cell where a figure does not apply."""
+    """Returns one row per log and method, and the totals over all logs; an empty cell if a figure does not apply."""
     causes = sorted({cause for row in found["total"].values() for cause in row["braking_events_by_cause"]})
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -458,7 +459,7 @@ def as_csv(found: Mapping[str, Any]) -> str:
 
 
 def as_markdown(found: Mapping[str, Any]) -> str:
-    """The tables and the notes of the terminal."""
+    """Returns the tables and the notes of the terminal."""
     parts = []
     for table in page_tables(found):
         head = [

@@ -20,13 +20,13 @@ from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
 
-#: Instants of the replay a second.
+#: Rate of the replay [Hz].
 RATE_HZ = 25.0
-#: Volumes of the replay a second at most.
+#: Maximum rate of volumes in the replay [Hz].
 VOLUME_HZ = 12.5
-#: A row of a table that is older than this says nothing of an instant [s].
+#: Maximum age of a row of a table at an instant [s].
 _STALE_S = 0.2
-#: Body points of the fused person that are shown.
+#: Shown body points of the fused person.
 SHOWN_POINTS = tuple(dict.fromkeys(name for bone in BONES for name in bone))
 
 
@@ -34,39 +34,39 @@ SHOWN_POINTS = tuple(dict.fromkeys(name for bone in BONES for name in bone))
 class LinkMesh:
     """The surface of a link in the world, with all axes at zero."""
 
-    link: int  #: which of the robot's links
+    link: int  #: index of the robot's link
     vertices_m: Floats  #: (k, 3)
-    triangles: Ints  #: (t, 3) which vertices
+    triangles: Ints  #: (t, 3) indices of vertices
 
 
 @dataclass(frozen=True)
 class RobotGeometry:
-    """A serial robot for drawing: with all axes at zero in the world, and the screws that move it from there."""
+    """A serial robot for drawing: its geometry with all axes at zero in the world, and the screws of its axes."""
 
     links: tuple[str, ...]  #: (s,) names
-    radius_m: Floats  #: (s,) of the links' capsules
+    radius_m: Floats  #: (s,) radii of the links' capsules
     ends_m: Floats  #: (s, 2, 3) ends of their axes
-    moved_by: Ints  #: (s,) so many axes, counted from the base, move the link
-    screws: Floats  #: (nv, 6) of a unit turn: velocity of the point at the world's origin, angular velocity
+    moved_by: Ints  #: (s,) number of axes, counted from the base, that move the link
+    screws: Floats  #: (nv, 6) screws of unit rates: velocity of the point at the world's origin, angular velocity
     tcp_m: Floats  #: (3,)
     base_m: Floats  #: (3,)
-    meshes: tuple[LinkMesh, ...]  #: of the links that have one
+    meshes: tuple[LinkMesh, ...]  #: meshes of the links that have one
 
 
 @dataclass(frozen=True)
 class MethodTrack:
-    """Motion of one method, a row an instant; NaN and -1 where its table says nothing."""
+    """Motion of one method, one row per instant; NaN and -1 if its table has no value."""
 
     q: Floats  #: (n, nv) [rad]
-    stop_q: Floats  #: (n, nv) where the stop ends that it would go on with [rad]
+    stop_q: Floats  #: (n, nv) end of the stop that would follow [rad]
     ref_m: Floats  #: (n, 3) programmed TCP, world
     tcp_m: Floats  #: (n, 3) driven TCP, world
     ref_speed: Floats  #: (n,) [m/s]
     tcp_speed: Floats  #: (n,) [m/s]
-    distance_m: Floats  #: (n,) to all that the person can reach until the horizon
-    body_m: Floats  #: (n,) to the recorded body
+    distance_m: Floats  #: (n,) distance from the space that the person can reach until the horizon
+    body_m: Floats  #: (n,) distance from the recorded body
     horizon_s: Floats  #: (n,)
-    certified: Ints  #: (n,) 1, 0, or -1 where the table does not say
+    certified: Ints  #: (n,) 1, 0, or -1 if the table has no value
     names: dict[str, tuple[tuple[str, ...], Ints]]  #: status, reason, limb, link: all names, and (n,) indices or -1
     events: tuple[StopEvent, ...]
 
@@ -77,14 +77,14 @@ class VolumeTrack:
 
     t_ns: Ints  #: (k,)
     limb: Ints  #: (k,) index into ``limbs``
-    radius_m: Floats  #: (k,) of the ball around the hull
+    radius_m: Floats  #: (k,) radius of the ball around the hull
     offsets: Ints  #: (k + 1,) hull ``i`` is ``vertices_m[offsets[i] : offsets[i + 1]]``
     vertices_m: Floats  #: (m, 3) world
-    horizon_s: Floats  #: (k,) how long after the instant it holds; NaN where the table does not say
+    horizon_s: Floats  #: (k,) horizon after the instant; NaN if the table has no value
     limbs: tuple[str, ...]
 
     def rows(self, which: Ints) -> VolumeTrack:
-        """Only some rows."""
+        """Selects some rows."""
         counts = np.diff(self.offsets)[which]
         parts = [self.vertices_m[self.offsets[i] : self.offsets[i + 1]] for i in which.tolist()]
         return VolumeTrack(
@@ -100,7 +100,7 @@ class VolumeTrack:
 
 @dataclass(frozen=True)
 class ReplayScene:
-    """Everything that moves in the 3-D replay, at ``RATE_HZ``."""
+    """All moving parts of the 3-D replay, at ``RATE_HZ``."""
 
     t0_ns: int  #: instant of time zero of the report
     t_ns: Ints  #: (n,)
@@ -111,16 +111,16 @@ class ReplayScene:
     volumes: VolumeTrack
     robot: RobotGeometry
     methods: dict[str, MethodTrack]  #: the run's own first
-    watched_m: Floats  #: (k, 2) corners of what the cameras watch, on the floor; k is 0 where the cell does not say
+    watched_m: Floats  #: (k, 2) corners of the watched area, on the floor; k is 0 if the cell gives none
 
     @property
     def seconds(self) -> Floats:
-        """(n,) the instants by the report's clock [s]."""
+        """(n,) instants on the report's clock [s]."""
         return seconds_from(self.t_ns, self.t0_ns)
 
 
 def robot_geometry(robot: RobotModel) -> RobotGeometry:
-    """A robot with all axes at zero. A link's twist at a unit velocity of one axis is that axis' screw, or zero."""
+    """Makes a robot with all axes at zero. A link's twist at unit velocity of an axis is the axis' screw, or zero."""
     zero = np.zeros((robot.nv, robot.nv))
     motion = robot.link_motion(zero, np.eye(robot.nv))
     moves = np.abs(motion.twist[:, :, 3:]).sum(axis=2) > 0.0  # (nv, s)
@@ -137,12 +137,12 @@ def robot_geometry(robot: RobotModel) -> RobotGeometry:
     )
 
 
-#: A mesh of more triangles is drawn coarser.
+#: Maximum number of triangles of a drawn mesh; larger meshes are simplified.
 _TRIANGLES = 8000
 
 
 def _meshes(robot: RobotModel, start_m: Floats, q: Floats) -> Iterator[LinkMesh]:
-    """The links' meshes in the world at joint positions (nv,) [rad], where the links begin at (s, 3) [m]."""
+    """Returns the links' meshes in the world at joint positions (nv,) [rad]; links begin at (s, 3) [m]."""
     for link, (segment, turn) in enumerate(zip(robot.segments, robot.R_bodies(q), strict=True)):
         if segment.surface is not None and len(segment.surface.triangles):
             vertices_m, triangles = coarser(segment.surface.vertices_m, segment.surface.triangles, _TRIANGLES)
@@ -150,12 +150,12 @@ def _meshes(robot: RobotModel, start_m: Floats, q: Floats) -> Iterator[LinkMesh]
 
 
 def coarser(vertices_m: Floats, triangles: Ints, most: int) -> tuple[Floats, Ints]:
-    """A mesh of so many triangles at most: what lies in one cell of a grid becomes one vertex, their mean.
+    """Simplifies a mesh to a maximum number of triangles: merges the vertices in each cell of a grid to their mean.
 
     Args:
         vertices_m: (k, 3) [m].
-        triangles: (t, 3) which vertices.
-        most: As few triangles are left.
+        triangles: (t, 3) indices of vertices.
+        most: Maximum number of triangles.
 
     Returns:
         (k, 3) vertices [m] and (t, 3) triangles.
@@ -174,7 +174,7 @@ def coarser(vertices_m: Floats, triangles: Ints, most: int) -> tuple[Floats, Int
 
 
 def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floats]]:
-    """Pose of each link relative to the pose with all axes at zero: products of exponentials.
+    """Computes the pose of each link relative to that with all axes at zero: products of exponentials.
 
     Args:
         robot: Its screws.
@@ -185,7 +185,7 @@ def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floa
     """
     turned, at_m = Rotation.identity(len(q)), np.zeros((len(q), 3))
     for angle, screw in zip(q.T, robot.screws, strict=True):
-        foot = np.cross(screw[3:], screw[:3])  # the axis' point nearest to the world's origin
+        foot = np.cross(screw[3:], screw[:3])  # the point of the axis nearest to the world's origin
         turn = Rotation.from_rotvec(angle[:, None] * screw[3:])
         at_m = at_m + turned.apply(foot - turn.apply(foot))
         turned = turned * turn
@@ -193,7 +193,7 @@ def placements(robot: RobotGeometry, q: Floats) -> Iterator[tuple[Rotation, Floa
 
 
 def pose_links(robot: RobotGeometry, q: Floats) -> Floats:
-    """(n, s, 2, 3) ends of the links' axes in the world at joint positions (n, nv) [rad]; NaN where these are [m]."""
+    """Returns (n, s, 2, 3) ends of the links' axes in the world [m] at joint positions (n, nv) [rad]; keeps NaN."""
     known = np.asarray(np.isfinite(q).all(axis=1))
     ends = np.repeat(robot.ends_m[None], len(q), axis=0)
     for axis, (turned, at_m) in enumerate(placements(robot, np.where(known[:, None], q, 0.0)), start=1):
@@ -205,11 +205,11 @@ def pose_links(robot: RobotGeometry, q: Floats) -> Floats:
 
 
 def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, float]) -> ReplayScene | None:
-    """The replay of a run that moved a robot; None of any other.
+    """Makes the replay of a run with a robot; None for other runs.
 
     Args:
         run: The run's tables.
-        robot: The robot of the run at its place.
+        robot: The robot of the run at its base pose.
         t0_ns: Instant of time zero of the report [ns].
         radii_m: Part of the recorded body -> radius of its capsule [m].
     """
@@ -239,7 +239,7 @@ def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, 
 
 
 def _rows(table: pd.DataFrame, at_ns: Ints) -> tuple[Ints, Bools]:
-    """The last row of a table at each instant, and whether it says anything of it."""
+    """Returns the last row of a table at each instant, and True if it is recent enough."""
     t_ns = times(table)
     row = np.searchsorted(t_ns, at_ns, side="right") - 1
     known = (row >= 0) & (at_ns - t_ns[np.maximum(row, 0)] <= _STALE_S * 1e9)
@@ -247,7 +247,7 @@ def _rows(table: pd.DataFrame, at_ns: Ints) -> tuple[Ints, Bools]:
 
 
 def _pick(table: pd.DataFrame, names: list[str], at_ns: Ints) -> Floats:
-    """(n, len(names)) numbers of a table at some instants; NaN where it says nothing."""
+    """Returns (n, len(names)) numbers of a table at some instants; NaN without a recent row."""
     if not len(table) or not set(names) <= set(table.columns):
         return np.full((len(at_ns), len(names)), np.nan)
     row, known = _rows(table, at_ns)
@@ -271,7 +271,7 @@ def _body(body: pd.DataFrame | None, parts: tuple[str, ...], at_ns: Ints) -> Flo
 
 
 def at_rate(t_ns: Ints, rate_hz: float) -> Ints:
-    """Rows of the first stored instant in each period."""
+    """Returns the rows of the first stored instant in each period."""
     if not len(t_ns):
         return np.zeros(0, np.int64)
     instants = np.unique(t_ns)
@@ -281,7 +281,7 @@ def at_rate(t_ns: Ints, rate_hz: float) -> Ints:
 
 
 def volume_track(occupancy: pd.DataFrame | None) -> VolumeTrack:
-    """The stored volumes, in order of time, at most ``VOLUME_HZ`` of them a second."""
+    """Returns the stored volumes in order of time, at a rate of at most ``VOLUME_HZ``."""
     if occupancy is None or not len(occupancy):
         nothing, none = np.zeros(0), np.zeros(0, np.int64)
         return VolumeTrack(none, none, nothing, np.zeros(1, np.int64), np.zeros((0, 3)), nothing, ())
@@ -304,7 +304,7 @@ def volume_track(occupancy: pd.DataFrame | None) -> VolumeTrack:
 def _track(
     run: Run, method: str, motion: pd.DataFrame, robot: RobotModel, t_ns: Ints, t0_ns: int, slow: float
 ) -> MethodTrack:
-    """Motion of one method.
+    """Returns the motion of one method.
 
     Args:
         run: The run's tables.
@@ -313,7 +313,7 @@ def _track(
         robot: The robot of the run.
         t_ns: (n,) instants of the replay [ns].
         t0_ns: Instant of time zero [ns].
-        slow: A TCP slower than this stands [m/s].
+        slow: A TCP slower than this counts as stationary [m/s].
     """
     contact = None if run.contact is None else run.contact[run.contact["method"] == method]
     axes = range(1, robot.nv + 1)
@@ -337,17 +337,17 @@ def _track(
     )
 
 
-#: The method whose stops leave the path; those of all others end where the path is at rest again.
+#: The method whose stops leave the path; those of all others end on the path.
 _LEAVES_PATH = "qp"
 
 
 def _stops(
     run: Run, method: str, motion: pd.DataFrame, robot: RobotModel, t_ns: Ints, q: Floats, dq: Floats, tau_s: Floats
 ) -> Floats:
-    """(n, nv) where the stop ends that the method would go on with; NaN where the table does not say [rad].
+    """Returns (n, nv) end of the stop that would follow; NaN if the table has no value [rad].
 
-    A straight stop loses its velocity evenly, so it goes on for half its time at the velocity of the instant. One
-    along the path does so in programmed time, and a path's joint positions are those that were driven there.
+    A straight stop has a constant deceleration, so its length is half its time times the present velocity. A stop along
+    the path does the same in programmed time, with the joint positions driven there.
 
     Args:
         run: The run's tables.
@@ -357,7 +357,7 @@ def _stops(
         t_ns: (n,) instants [ns].
         q: (n, nv) there [rad].
         dq: (n, nv) there [rad/s].
-        tau_s: (n,) how long the stop takes [s].
+        tau_s: (n,) duration of the stop [s].
     """
     straight = q + dq * (0.5 * tau_s)[:, None]
     if method == _LEAVES_PATH:
@@ -378,7 +378,7 @@ def _stops(
 
 
 def _names(motion: pd.DataFrame, column: str, at_ns: Ints) -> tuple[tuple[str, ...], Ints]:
-    """The texts of a column, in order of appearance, and which of them holds at each instant; -1: none."""
+    """Returns the texts of a column, in order of appearance, and the index of the text at each instant; -1: none."""
     if column not in motion:
         return (), np.full(len(at_ns), -1)
     texts = motion[column].fillna("").astype(str)

@@ -1,6 +1,6 @@
 """scene.mcap: a run's 3-D scene with Foxglove's well-known messages, for Foxglove and Rerun.
 
-The links hang on the frames of the axes that move them, so that each method's robot is drawn once and moved by /tf.
+The links are attached to the frames of the axes that move them, so each method's robot is drawn once and moved by /tf.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hrcreplay.reporting.metrics.series import times
 from hrcreplay.reporting.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, at_rate, placements, pose_links
 from hrcreplay.reporting.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
 
-#: Volumes a second at most.
+#: Maximum rate of volumes [Hz].
 _VOLUME_HZ = 5.0
 _CHUNK_BYTES = 1024 * 1024
 _STOP: Rgba = (0.80, 0.20, 0.15, 0.35)
@@ -36,7 +36,7 @@ _BODY: Rgba = (0.40, 0.63, 0.82, 1.0)
 _CAMERA: Rgba = (0.35, 0.60, 0.30, 0.8)
 _DISTANCE: Rgba = (0.48, 0.12, 0.64, 1.0)
 _BONE_M = 0.02
-#: A message: topic, instant [ns], and what to write.
+#: A message: topic, instant [ns], and content.
 Message = tuple[str, int, Any]
 #: Numbers of a method over time, for plots.
 _SERIES = ("tcp_speed", "ref_speed", "distance_m", "body_m", "horizon_s")
@@ -54,17 +54,17 @@ def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | Non
     """Writes the scene of a run.
 
     Args:
-        path: File to make.
-        scene: What moves.
+        path: File to create.
+        scene: The scene.
         measurements: Rows of measurements.parquet: the skeletons of the cameras; None without them.
     """
     streams = [_robots(scene), _watched(scene), _transforms(scene), _person(scene), _volumes(scene), _distances(scene)]
     streams += [_series(scene, name, track) for name, track in scene.methods.items()]
     streams += _cameras(measurements)
-    found = heapq.merge(*streams, key=lambda message: message[1])  # of one instant in the order of the streams
+    found = heapq.merge(*streams, key=lambda message: message[1])  # one instant: in the order of the streams
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        writer.start(profile="", library="hrcreplay")  # the library's version would change the bytes
+        writer.start(profile="", library="hrcreplay")  # the version of the library would change the bytes
         channels: dict[str, int] = {}
         for topic, t_ns, message in found:
             if topic not in channels:
@@ -85,12 +85,12 @@ def _channel(writer: Writer, topic: str, message: Any) -> int:
 
 
 def _base(scene: ReplayScene, name: str) -> str:
-    """Topic of a method: the run's own is the plan."""
+    """Returns the topic of a method; the run's own method has that of the plan."""
     return "/plan" if name == next(iter(scene.methods)) else f"/baseline/{name}"
 
 
 def _robots(scene: ReplayScene) -> Iterator[Message]:
-    """The links of each method's robot, and where the plan's would stop, each in the frame of its last axis."""
+    """Yields the links of each method's robot, and the end of the plan's stop, each in the frame of its last axis."""
     t_ns = int(scene.t_ns[0])
     for name in scene.methods:
         topic = _base(scene, name)
@@ -116,7 +116,7 @@ def _frame(method: str, axis: int, suffix: str) -> str:
 
 
 def _watched(scene: ReplayScene) -> Iterator[Message]:
-    """The border of what the cameras watch, on the floor."""
+    """Yields the border of the watched area on the floor."""
     if len(scene.watched_m):
         t_ns = int(scene.t_ns[0])
         corners = np.column_stack((scene.watched_m, np.zeros(len(scene.watched_m))))
@@ -126,7 +126,7 @@ def _watched(scene: ReplayScene) -> Iterator[Message]:
 
 
 def _transforms(scene: ReplayScene) -> Iterator[Message]:
-    """The frames of all axes of all methods, an update an instant."""
+    """Yields the frames of all axes of all methods, one update per instant."""
     frames: list[str] = []
     numbers: list[Floats] = []
     plan = next(iter(scene.methods))
@@ -161,7 +161,7 @@ def _transforms(scene: ReplayScene) -> Iterator[Message]:
 
 
 def _person(scene: ReplayScene) -> Iterator[Message]:
-    """The fused skeleton, its points, and the recorded body as lines as thick as its parts."""
+    """Yields the fused skeleton, its points, and the recorded body as lines as thick as its parts."""
     fields = [
         messages.PackedElementField(name=axis, offset=4 * i, type=messages.PackedElementFieldNumericType.Float32)
         for i, axis in enumerate("xyz")
@@ -184,7 +184,7 @@ def _person(scene: ReplayScene) -> Iterator[Message]:
 
 
 def _volumes(scene: ReplayScene) -> Iterator[Message]:
-    """The stored volumes, and none of a limb that is not predicted."""
+    """Yields the stored volumes; without limbs that are not predicted."""
     stored = scene.volumes.rows(at_rate(scene.volumes.t_ns, _VOLUME_HZ))
     for t_ns in np.unique(stored.t_ns).tolist():
         entities = []
@@ -196,7 +196,7 @@ def _volumes(scene: ReplayScene) -> Iterator[Message]:
 
 
 def _distances(scene: ReplayScene) -> Iterator[Message]:
-    """From the surface of the plan's robot to the nearest part of the recorded body."""
+    """Yields lines from the surface of the plan's robot to the nearest part of the recorded body."""
     if not len(scene.body_parts):
         return
     robot, track = scene.robot, next(iter(scene.methods.values()))
@@ -212,7 +212,7 @@ def _distances(scene: ReplayScene) -> Iterator[Message]:
 
 
 def _series(scene: ReplayScene, name: str, track: MethodTrack) -> Iterator[Message]:
-    """The numbers of a method as JSON, null where not known."""
+    """Yields the numbers of a method as JSON, null if unknown."""
     topic = f"{_base(scene, name)}/series"
     table = {key: np.round(getattr(track, key), 4).tolist() for key in _SERIES}
     texts = {kind: [known[i] if i >= 0 else "" for i in index.tolist()] for kind, (known, index) in track.names.items()}
@@ -225,7 +225,7 @@ def _series(scene: ReplayScene, name: str, track: MethodTrack) -> Iterator[Messa
 
 
 def _cameras(measurements: pd.DataFrame | None) -> list[Iterator[Message]]:
-    """The skeletons that each camera's frames gave, by arrival, a stream a camera."""
+    """Yields the skeletons in each camera's frames, by arrival, one stream per camera."""
     if measurements is None or not set(LENGTHS) <= set(measurements.columns):
         return []
     return [_camera(str(camera), rows) for camera, rows in measurements.groupby("camera", sort=True)]

@@ -1,4 +1,4 @@
-"""Parts of Foxglove's well-known messages, for the recorded scene and the live one alike."""
+"""Parts of Foxglove's well-known messages, for the recorded scene and the live one."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from hrcreplay.reporting.figures.drawing import BONES
 
 Rgba = tuple[float, float, float, float]
 
-#: Frame that everything is in.
+#: Frame of all entities.
 WORLD = "world"
 PERSON: Rgba = (0.10, 0.35, 0.85, 1.0)
 VOLUME: Rgba = (0.95, 0.55, 0.10, 0.30)
 ROBOT: Rgba = (0.95, 0.45, 0.05, 1.0)
 _NS = 10**9
-_BALL = 162  # directions in which a volume's surface is looked for
+_BALL = 162  # number of directions in which a volume's surface is sampled
 
 
 def colour(rgba: Rgba) -> Any:
-    """A colour."""
+    """Makes a colour."""
     r, g, b, a = rgba
     return messages.Color(r=r, g=g, b=b, a=a)
 
 
 def points(points_m: Floats) -> list[Any]:
-    """(n, 3) points."""
+    """Makes (n, 3) points."""
     return [messages.Point3(x=x, y=y, z=z) for x, y, z in points_m.tolist()]
 
 
 def pose(position_m: Floats, quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)) -> Any:
-    """A pose from position (3,) and quaternion (x, y, z, w)."""
+    """Makes a pose from position (3,) and quaternion (x, y, z, w)."""
     x, y, z = position_m.tolist()
     qx, qy, qz, qw = quaternion
     return messages.Pose(
@@ -45,17 +45,17 @@ def pose(position_m: Floats, quaternion: tuple[float, float, float, float] = (0.
 
 
 def timestamp(t_ns: int) -> Any:
-    """An instant."""
+    """Makes a time stamp."""
     return messages.Timestamp(t_ns // _NS, t_ns % _NS)
 
 
 def entity(t_ns: int, name: str, *, frame: str = WORLD, **shapes: Any) -> Any:
-    """An entity of a scene that holds until its next update.
+    """Makes an entity of a scene, valid until its next update.
 
     Args:
         t_ns: Instant [ns].
-        name: Of the entity.
-        frame: That its shapes are given in, and that it moves with.
+        name: Name of the entity.
+        frame: Frame of its shapes, with which it moves.
         **shapes: Lists of primitives.
     """
     return messages.SceneEntity(
@@ -64,7 +64,7 @@ def entity(t_ns: int, name: str, *, frame: str = WORLD, **shapes: Any) -> Any:
 
 
 def lines(ends_m: Floats, thickness_m: float, rgba: Rgba) -> Any:
-    """(n, 2, 3) separate lines; those with an unknown end are left out."""
+    """Makes (n, 2, 3) separate lines; those with an unknown end are left out."""
     known = ends_m[np.isfinite(ends_m).all(axis=(1, 2))]
     return messages.LinePrimitive(
         type=messages.LinePrimitiveLineType.LineList,
@@ -75,13 +75,13 @@ def lines(ends_m: Floats, thickness_m: float, rgba: Rgba) -> Any:
 
 
 def bones(points_m: Floats, rgba: Rgba = PERSON) -> Any:
-    """The skeleton of (20, 3) POINTS."""
+    """Makes the skeleton of (20, 3) POINTS."""
     pairs = [[POINTS.index(a), POINTS.index(b)] for a, b in BONES]
     return lines(points_m[pairs], 0.02, rgba)
 
 
 def capsule(ends_m: Floats, radius_m: float, rgba: Rgba) -> dict[str, Any]:
-    """The primitives of a capsule between two points, (2, 3) [m]."""
+    """Makes the primitives of a capsule between two points, (2, 3) [m]."""
     a, b = ends_m
     size = 2.0 * radius_m
     ball = messages.Vector3(x=size, y=size, z=size)
@@ -97,7 +97,7 @@ def capsule(ends_m: Floats, radius_m: float, rgba: Rgba) -> dict[str, Any]:
 
 
 def surface(vertices_m: Floats, radius_m: float, rgba: Rgba = VOLUME) -> Any:
-    """The surface of hull + ball above the floor, (m, 3) vertices [m]; empty where there is no volume."""
+    """Makes the surface of hull + ball above the floor, (m, 3) vertices [m]; empty without a volume."""
     corners, triangles = surface_mesh(vertices_m, radius_m)
     return messages.TriangleListPrimitive(
         points=points(np.round(corners, 3)), indices=triangles.ravel().tolist(), color=colour(rgba)
@@ -105,10 +105,10 @@ def surface(vertices_m: Floats, radius_m: float, rgba: Rgba = VOLUME) -> Any:
 
 
 def surface_mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, Ints]:
-    """Corners (k, 3) [m] and triangles (f, 3) of the surface of hull + ball, (m, 3) vertices [m], above the floor.
+    """Returns corners (k, 3) [m] and triangles (f, 3) of the surface of hull + ball above the floor.
 
-    For each direction the vertex that is furthest along it, and from there the ball's radius: the corners lie on the
-    surface, so that between them the picture may be smaller than the volume, by millimetres.
+    Each corner is the vertex with the largest extent along a direction, plus the ball's radius along it. The corners
+    lie on the surface, so between them the drawing may be smaller than the volume, by millimetres.
     """
     if not len(vertices_m) or not np.isfinite(vertices_m).all():
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
@@ -119,7 +119,7 @@ def surface_mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, Ints]:
 
 @cache
 def _around_a_ball() -> tuple[Floats, Ints]:
-    """(162, 3) unit directions, spread evenly by the golden angle, and (f, 3) triangles between them, outward."""
+    """Returns (162, 3) unit directions, spread by the golden angle, and (f, 3) triangles between them, outward."""
     k = np.arange(_BALL) + 0.5
     polar, around = np.arccos(1.0 - 2.0 * k / _BALL), np.pi * (1.0 + np.sqrt(5.0)) * k
     unit = np.column_stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)])
@@ -132,7 +132,7 @@ def _around_a_ball() -> tuple[Floats, Ints]:
 
 
 def upright_to(direction: Floats) -> tuple[float, float, float, float]:
-    """The quaternion (x, y, z, w) that turns the z axis into a direction; none at all where that is zero."""
+    """Returns the quaternion (x, y, z, w) that turns the z axis into a direction; the identity for a zero direction."""
     length = float(np.linalg.norm(direction))
     if length == 0.0:
         return 0.0, 0.0, 0.0, 1.0

@@ -1,6 +1,6 @@
-"""Results of a run in words: answers, headline numbers, defects of the log, and a line for each stage.
+"""Results of a run in words: answers, headline numbers, defects of the log, and one line per stage.
 
-They state what the replay shows, and no more than that.
+They state only results of the replay.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from hrcreplay.reporting.verdict import unmeasured
 from hrcreplay.settings.sections import setting, with_new_names
 from hrcreplay.store.run_folder import Run
 
-#: Between groups of digits.
+#: Separator between groups of digits.
 NARROW = "\u202f"
 _CAMERA = "_<camera>"
-#: How ``DEFECTS`` begins what is none, and what is no count.
+#: Prefixes in ``DEFECTS`` of entries that are not a defect, and not a count.
 _NONE, _INSTANT = "no defect", "an instant"
 
 
 def defect_notes(counts: Mapping[str, int], notes: Sequence[str]) -> tuple[str, ...]:
-    """The notes of a run, then what was counted of each defect of its log; nothing of a clean log.
+    """Returns the notes of a run, then the count of each defect of its log; nothing for a clean log.
 
     Args:
-        counts: ``counts`` of run.json; what is no defect of the log is left out.
+        counts: ``counts`` of run.json; entries that are not defects of the log are left out.
         notes: ``notes`` of run.json.
     """
     found = [(_text(name), count) for name, count in sorted(counts.items()) if count]
@@ -37,7 +37,7 @@ def defect_notes(counts: Mapping[str, int], notes: Sequence[str]) -> tuple[str, 
 
 
 def _text(name: str) -> str:
-    """Text of ``DEFECTS`` for a counter; empty where it counts no defect. A note tells of the instant."""
+    """Returns the text of ``DEFECTS`` for a counter; empty if it counts no defect. The instant is in a note."""
     for known, text in DEFECTS.items():
         stem = known.removesuffix(_CAMERA)
         of_camera = stem != known and name.startswith(f"{stem}_")
@@ -57,7 +57,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Answer:
-    """One of two questions, the answer in a few words, and what stands behind it: a paragraph a line."""
+    """One of two questions, the answer in a few words, and its explanation: one paragraph per line."""
 
     question: str
     short: str
@@ -69,7 +69,7 @@ COST = "What would it have cost the task?"
 
 
 def answers(run: Run, metrics: Mapping[str, Metric]) -> tuple[Answer, ...]:
-    """Both questions of the page."""
+    """Answers both questions of the page."""
     if run.motion is None:
         stage = "predicted what the person could reach" if run.occupancy is not None else "fused the cameras"
         words = f"This run {stage} and moved no robot. Run plan or report on the same log to have it answered."
@@ -78,7 +78,7 @@ def answers(run: Run, metrics: Mapping[str, Metric]) -> tuple[Answer, ...]:
 
 
 def _with_unmeasured(safe: Answer, metrics: Mapping[str, Metric]) -> Answer:
-    """The answer with what was not measured of the person before it: a limb that nobody saw is not safe."""
+    """Adds the unmeasured limbs of the person before the answer, as an unseen limb is not safe."""
     never, mostly = unmeasured(metrics)
     if not never and not mostly:
         return safe
@@ -89,8 +89,8 @@ def _with_unmeasured(safe: Answer, metrics: Mapping[str, Metric]) -> Answer:
     ]
     short = f"Not known of {'; '.join(parts)}."
     words = (
-        "Where no camera measured a limb, the prediction has only the joints' limits to go by, and nothing of this "
-        f"recording can show that it was right.\nOf what was measured: {safe.short[0].lower()}{safe.short[1:]} "
+        "For a limb that no camera measured, the prediction uses only the joints' limits, and this recording cannot "
+        f"confirm it.\nFor the measured limbs: {safe.short[0].lower()}{safe.short[1:]} "
     )
     return Answer(safe.question, short, words + safe.words)
 
@@ -105,13 +105,13 @@ def _safety(run: Run, metrics: Mapping[str, Metric]) -> Answer:
 
 
 def _certifies(run: Run) -> bool:
-    """Return whether the plan took certified steps only."""
+    """Returns True if the plan took only certified steps."""
     plan = run.meta.get("settings", {}).get("plan", {})
     return bool(plan.get("certify")) and plan.get("method") != "none"
 
 
 def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
-    """The answer in short and in words, where every step had to be certified."""
+    """Returns the short and the long answer for a plan with certified steps."""
     ticks, moving = text_of(metrics["plan_ticks"]), text_of(metrics["plan_moving_ticks"])
     if not metrics["plan_moving_ticks"]["value"]:
         return "The robot never moved.", f"It stood at all {ticks} ticks."
@@ -157,7 +157,7 @@ def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
 
 
 def _by_inequality(metrics: Mapping[str, Metric]) -> tuple[str, str]:
-    """The answer in short and in words, where inequality (2) is all that there is."""
+    """Returns the short and the long answer for a plan with inequality (2) only."""
     ticks, moving = text_of(metrics["plan_ticks"]), text_of(metrics["plan_moving_ticks"])
     late = metrics["plan_braking_moving_ticks"]["value"]
     kept = (
@@ -183,7 +183,7 @@ def _by_inequality(metrics: Mapping[str, Metric]) -> tuple[str, str]:
 
 
 def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
-    """The smallest distance, and which distance that is."""
+    """Returns the smallest distance, with its definition."""
     nearest, late = metrics["plan_separation_min_moving_m"], metrics["plan_braking_moving_separation_min_m"]
     if nearest["value"] is None:
         return ""
@@ -201,7 +201,7 @@ def _nearest(run: Run, metrics: Mapping[str, Metric]) -> str:
 
 
 def _horizon(run: Run, metrics: Mapping[str, Metric]) -> str:
-    """Horizon of the prediction, in words."""
+    """Describes the horizon of the prediction in words."""
     settings, _ = with_new_names(run.meta.get("settings", {}))
     median, most = metrics["plan_horizon_median_s"], metrics["plan_horizon_max_s"]
     if settings.get("plan", {}).get("horizon") == "adaptive" and median["value"] is not None:
@@ -211,7 +211,7 @@ def _horizon(run: Run, metrics: Mapping[str, Metric]) -> str:
 
 
 def _braked(metrics: Mapping[str, Metric]) -> str:
-    """Reasons for which it braked, and for which it stood held; the most frequent first."""
+    """Returns the reasons for braking and for standing, the most frequent first."""
     mark, stood = "plan_braking_ticks_", "plan_standing_share_"
     held = [(m["value"], name.removeprefix(stood)) for name, m in metrics.items() if name.startswith(stood)]
     why = [
@@ -257,7 +257,7 @@ def _standing(metrics: Mapping[str, Metric], prefix: str, who: str) -> str:
 
 
 def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
-    """The four headline numbers of a run, whatever stages it has."""
+    """Returns the four headline numbers of a run with any stages."""
     if run.motion is None:
         return _human_cards(run, metrics)
     late, ticks = metrics["plan_braking_moving_ticks"]["value"], metrics["plan_ticks"]["value"]
@@ -282,7 +282,7 @@ def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
         ),
         Card(
             text_of(metrics["plan_separation_min_moving_m"]),
-            "smallest distance from a link's surface to that of what the person could reach within "
+            "smallest distance from a link's surface to the space that the person could reach within "
             f"{'the horizon' if metrics['plan_horizon_max_s']['value'] else 'T_s'}, while it moved",
             "not to the body"
             + (f"; at all: {text_of(metrics['plan_separation_min_m'])}, {pair[0]} \u2013 {pair[1]}" if pair[0] else ""),
@@ -301,7 +301,7 @@ def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
 
 
 def _floor_percent(share: float) -> str:
-    """Rounded down, so that 100 % means all."""
+    """Formats a share rounded down, so that 100 % means all."""
     return f"{int(share * 10000) / 100:.2f} %" if share < 1 else "100 %"
 
 
@@ -335,7 +335,7 @@ Metrics = Mapping[str, Metric]
 
 
 def lines(run: Run, metrics: Metrics) -> list[str]:
-    """The main figures of each stage that the run holds; of a report also its answers.
+    """Returns the main figures of each stage of the run; for a report also its answers.
 
     Args:
         run: The run's tables.
@@ -355,7 +355,7 @@ def lines(run: Run, metrics: Metrics) -> list[str]:
         found.append(
             "report: " + " ".join([*([touched] if touched else []), *(a.short for a in answers(run, metrics))])
         )
-    return [line.replace("\u202f", ",") for line in found]  # the page's separator is not in every terminal's font
+    return [line.replace("\u202f", ",") for line in found]  # some terminal fonts lack the page's separator
 
 
 def _fuse(run: Run, metrics: Metrics) -> str:

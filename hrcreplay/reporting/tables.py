@@ -76,41 +76,40 @@ FUSION = (
     ("RMSE of y", "rmse_y"),
 )
 
-#: What happened at the ticks at which the robot braked, or stood where it was, by the reason that its record gives
-#: (``control_step.REASONS``).
+#: Explanation of braking or standing, by the recorded reason (``control_step.REASONS``).
 REASONS = {
     "no human state": (
-        "it was not known where people are: the person's newest frame was older than fusion.fresh_s, or none had come "
-        "yet, and no watched area was known to be without people"
+        "the positions of people were unknown: the person's newest frame was older than fusion.fresh_s, or none had "
+        "arrived yet, and no watched area was known to be without people"
     ),
     "no solution": "no motion satisfied all constraints",
     "separation failed": (
-        "the distance from the robot to what the person could reach could not be computed as surely as the constraint "
-        "needs it; where the person is was known"
+        "the distance from the robot to the space that the person could reach could not be computed as accurately as "
+        "the constraint requires; the person's position was known"
     ),
-    "not finite": "the robot's own state, its reference or the constraints held a number that is none",
+    "not finite": "the robot's own state, its reference or the constraints contained a number that is not finite",
     "not certified": (
-        "the step that the method proposed could not be certified: with the stop after it, it came too near to what "
-        "the person could reach"
+        "the proposed step could not be certified: the step and the stop after it came too near to the space that the "
+        "person could reach"
     ),
     "inside a volume": (
-        "a link was already where the person could reach, and from there no motion begins but a slow retreat"
+        "a link was already in the space that the person could reach, and only a slow retreat may start there"
     ),
     "too near": "the person was nearer than the protective separation distance of ISO/TS 15066",
 }
 
 
 def reason_text(reason: str) -> str:
-    """Text of a reason to brake or stand; of a reason without words, the record's own."""
+    """Returns the text of a reason to brake or stand; for an unknown reason, the recorded one."""
     return REASONS.get(reason, f"the record says '{reason}'")
 
 
-#: The limits of what a page can say.
+#: Limits of validity of a page.
 NOT_CLAIMED = (
     "hrcreplay is a research tool. It is not certified, and no page of it makes a robot cell safe or compliant.",
     (
-        "Only ticks were checked, for contact with the body too, with the recorded person's actual motion as the log "
-        "has it. A person who sees a robot move differently may move differently too."
+        "Distances and contact were checked only at the ticks, with the recorded motion of the person. A person who "
+        "sees a robot move differently may also move differently."
     ),
     (
         "The swept volumes follow from a model of thirteen joints and assumed bounds. Real people bend sideways, lift "
@@ -135,7 +134,7 @@ class PageTable:
     note: str = ""
 
 
-#: How a joint of Eq. (37) is written in Table 1.
+#: Symbol of a joint of Eq. (37) in Table 1.
 SYMBOLS = {
     "x": "x",
     "y": "y",
@@ -147,11 +146,11 @@ SYMBOLS = {
 
 
 def limit_table(limits: LimitSet, *, use: str) -> PageTable:
-    """Table 1 as used: position, velocity and acceleration bounds of every joint.
+    """Makes Table 1 as used: position, velocity and acceleration bounds of every joint.
 
     Args:
         limits: The limit set.
-        use: What it bounds, e.g. "prediction".
+        use: Its use, e.g. "prediction".
     """
     rows = []
     for i, joint in enumerate(JOINTS):
@@ -174,7 +173,7 @@ def limit_table(limits: LimitSet, *, use: str) -> PageTable:
 
 
 def _bound(value: float, kind: str) -> str:
-    """A bound as Table 1 writes it: multiples of pi where it is one."""
+    """Formats a bound as in Table 1: as a multiple of pi if it is one."""
     if np.isinf(value):
         return "\u221e" if value > 0 else "\u2212\u221e"
     sign = "\u2212" if value < 0 else ""
@@ -186,13 +185,13 @@ def _bound(value: float, kind: str) -> str:
 
 
 def radius_table(radii_m: Mapping[str, float]) -> PageTable:
-    """Table 2 as used: the radius of every body part [m]."""
+    """Makes Table 2 as used: the radius of every body part [m]."""
     rows = tuple((part, f"{radius:.2f}") for part, radius in radii_m.items())
     return PageTable("Table 2 as used: radii of the sphere-swept volumes", ("body part", "radius [m]"), rows)
 
 
 def text_of(metric: Metric | None) -> str:
-    """A metric's value as a reader wants it; a dash where it does not apply."""
+    """Formats a metric's value for readers; a dash if it does not apply."""
     if metric is None or metric["value"] is None:
         return "\u2013"
     value, unit = metric["value"], metric["unit"]
@@ -209,7 +208,7 @@ def text_of(metric: Metric | None) -> str:
 
 
 def percent(metric: Metric | None, decimals: int = 1) -> str:
-    """A share as percent; a dash where it does not apply."""
+    """Formats a share as percent; a dash if it does not apply."""
     if metric is None or metric["value"] is None:
         return "\u2013"
     return f"{100 * metric['value']:.{decimals}f} %"
@@ -222,14 +221,14 @@ def compare(
     rows: Sequence[tuple[str, str]],
     note: str = "",
 ) -> PageTable:
-    """Metrics side by side.
+    """Makes a table of metrics side by side.
 
     Args:
-        title: Of the table.
+        title: Title of the table.
         metrics: Name -> metric.
         columns: Heading of each column -> prefix of its metrics' names.
         rows: Label and suffix of each row's metrics; shares are written in percent.
-        note: Below the table.
+        note: Note below the table.
     """
     body = []
     for label, suffix in rows:
@@ -241,7 +240,7 @@ def compare(
 
 
 def agreement_table(agreement: pd.DataFrame | None) -> tuple[PageTable, ...]:
-    """Distance between two cameras' views of each limb; nothing where there are no two."""
+    """Makes the table of distances between two cameras' views of each limb; none without two cameras."""
     if agreement is None:
         return ()
     pairs = list(dict.fromkeys(zip(agreement["a"], agreement["b"], strict=True)))
@@ -265,11 +264,11 @@ def agreement_table(agreement: pd.DataFrame | None) -> tuple[PageTable, ...]:
     )
 
 
-_LITRES = 1000.0  # a cubic metre
+_LITRES = 1000.0  # litres in a cubic metre
 
 
 def summary(robot: RobotModel) -> dict[str, Any]:
-    """JSON form of the robot for run.json; volumes [m^3], null where a capsule was given and not derived."""
+    """Returns the robot as JSON for run.json; volumes [m^3], null if a capsule was given and not derived."""
     return {
         "name": robot.name,
         "base_frame": robot.base_frame,
@@ -292,7 +291,7 @@ def summary(robot: RobotModel) -> dict[str, Any]:
 
 
 def remarks(robot: RobotModel) -> tuple[str, ...]:
-    """Remarks on a robot from a URDF: its chain, its capsules, what is locked, what is not guarded."""
+    """Returns remarks on a robot from a URDF: its chain, its capsules, locked joints, unguarded parts."""
     found = []
     derived = [segment for segment in robot.segments if segment.shape_m3 > 0]
     if derived:
@@ -313,10 +312,10 @@ def remarks(robot: RobotModel) -> tuple[str, ...]:
 
 
 def robot_table(robot: Mapping[str, Any]) -> PageTable:
-    """The capsules that stand for the links, and how much each adds to the hull of the shape inside it.
+    """Makes the table of the links' capsules, with the volume that each adds to the hull of its shape.
 
     Args:
-        robot: What :func:`summary` made.
+        robot: Result of :func:`summary`.
     """
     rows = []
     for link in robot["links"]:
@@ -342,10 +341,10 @@ def robot_table(robot: Mapping[str, Any]) -> PageTable:
     )
 
 
-#: What people call BODY.
+#: Names of BODY for readers.
 LIMB_NAMES = camera_checks.LIMB_NAMES
 
-#: What people call the parts of a recorded body that are no LIMBS.
+#: Names for readers of the parts of a recorded body that are not in LIMBS.
 _PART_NAMES = {
     "THIGH_R": "right thigh",
     "SHANK_R": "right shank",
@@ -361,16 +360,16 @@ _PART_NAMES = {
 
 
 def part_name_text(part: str) -> str:
-    """A part of a recorded body as a reader calls it."""
+    """Returns the name for readers of a part of a recorded body."""
     return LIMB_NAMES.get(part) or _PART_NAMES.get(part, part)
 
 
 def neighbour_text(part: str) -> str:
-    """Neighbour of a link in words: a part of the person, or the border behind which others may be."""
+    """Describes the neighbour of a link: a part of the person, or the border beyond which others may be."""
     return f"the {part_name_text(part)}" if part == BORDER else f"the person's {part_name_text(part)}"
 
 
 def limb_names_text(limbs: list[str]) -> str:
-    """Limbs as a reader calls them, with their abbreviations: "left lower arm (LLA) and head (HD)"."""
+    """Returns the names of limbs for readers, with their abbreviations: "left lower arm (LLA) and head (HD)"."""
     names = [f"{LIMB_NAMES[limb]} ({limb})" for limb in limbs]
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -1,6 +1,6 @@
-"""Verdict at the top of the page: would the robot have touched the recorded person, and at what cost; a row a method.
+"""Verdict at the top of the page: contact of the robot with the recorded person, and its cost; one row per method.
 
-Beside it what a reader must know of limbs that were not measured.
+It includes remarks on limbs that were not measured.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from hrcreplay.settings.sections import setting, with_new_names
 from hrcreplay.store.run_folder import Run
 
 Metrics = Mapping[str, Metric]
-#: How contact.parquet calls a person from the log's ground truth.
+#: Name in contact.parquet of a person from the log's ground truth.
 TRUTH = "ground truth"
-#: A limb that is known for so long counts as seen throughout.
+#: Minimum share of the time at which a limb counts as always seen.
 _WHOLE = 0.995
 _HAD = "Had this controller been running, "
 _COLUMNS = (
@@ -37,18 +37,18 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class ContactSummary:
-    """The chosen method in a few sentences, and all methods beside each other."""
+    """The chosen method in a few sentences, and a table of all methods."""
 
     sentences: tuple[str, ...]  #: contact, then cost
-    speeds: str  #: greatest speeds, and what standing means
-    scope: tuple[str, ...]  #: what was considered, and what was not
-    held: str  #: how far the prediction they rest on can be trusted; empty: not known
-    details: tuple[str, ...]  #: the same with places, instants and causes
+    speeds: str  #: maximum speeds, and the definition of standing
+    scope: tuple[str, ...]  #: scope: considered and ignored parts
+    held: str  #: coverage of the prediction behind them; empty: unknown
+    details: tuple[str, ...]  #: the same with positions, instants and causes
     table: PageTable
 
 
 def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
-    """Result of the comparison with everybody recorded; None where there is none."""
+    """Returns the result of the comparison with all recorded people; None without one."""
     if run.motion is None or metrics["contact_person"]["value"] is None:
         return None
     return ContactSummary(
@@ -62,7 +62,7 @@ def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
 
 
 def _contact_in_short(metrics: Metrics) -> str:
-    """State whether the robot would have touched anybody, at the ticks at which somebody is known."""
+    """States if the robot would have touched a person, at the ticks at which one is known."""
     touch, near = metrics["plan_touch_moving_ticks"]["value"], metrics["plan_body_distance_min_moving_m"]["value"]
     if touch is None:
         return "Whether the robot would have touched anybody is not known: the recording shows nobody."
@@ -81,12 +81,12 @@ def _contact_in_short(metrics: Metrics) -> str:
 
 
 def _as_far_as(metrics: Metrics) -> str:
-    """Qualification before 'touched nobody' where a limb was not seen."""
+    """Returns the qualification of "touched nobody" if a limb was not seen."""
     return ", as far as the person was seen," if unseen_limbs(metrics) else ""
 
 
 def _whom(metrics: Metrics, prefix: str = "plan") -> str:
-    """People touched by the moving robot."""
+    """Describes the people touched by the moving robot."""
     person, other = (metrics[f"{prefix}_touch_{who}_ticks"]["value"] for who in ("person", "other"))
     if person and other:
         return f"the person ({_count(person)}) and another body ({_count(other)})"
@@ -98,7 +98,7 @@ def _count(ticks: int) -> str:
 
 
 def _at_known_ticks(metrics: Metrics) -> str:
-    """At which ticks, and judged by what."""
+    """Describes the ticks of the comparison, and the source of the person."""
     known, ticks = metrics["plan_body_known_ticks"], metrics["plan_ticks"]
     which = f"at the {text_of(known)} of {text_of(ticks)} ticks" if known["value"] != ticks["value"] else "at any tick"
     where = " at which the person is known" if known["value"] != ticks["value"] else ""
@@ -106,7 +106,7 @@ def _at_known_ticks(metrics: Metrics) -> str:
 
 
 def _at_rest(metrics: Metrics) -> str:
-    """Contacts of a robot at rest."""
+    """Describes contacts of a robot at rest."""
     rest, deep = metrics["plan_touch_rest_ticks"]["value"], metrics["plan_body_distance_min_rest_m"]["value"]
     if not rest:
         return ""
@@ -114,7 +114,7 @@ def _at_rest(metrics: Metrics) -> str:
 
 
 def _speeds(run: Run, metrics: Metrics) -> str:
-    """The greatest speeds beside the programme's, and how often the robot stood, by two counts."""
+    """Describes the maximum speeds, with the programme's, and the share of standstill by two definitions."""
     fastest, near, programmed = (
         metrics[f"plan_{name}_max_m_per_s"] for name in ("tcp_speed", "tcp_speed_near_body", "ref_speed")
     )
@@ -131,7 +131,7 @@ def _speeds(run: Run, metrics: Metrics) -> str:
     return f"{words}."
 
 
-#: What no run looks at.
+#: Not considered in any run.
 NOT_CONSIDERED = (
     "objects, table and fixtures",
     "the robot's own links",
@@ -141,7 +141,7 @@ NOT_CONSIDERED = (
 
 
 def scope(metrics: Metrics) -> tuple[str, ...]:
-    """Scope of the verdict: what it considers, and what it does not."""
+    """Describes the scope of the verdict: considered and ignored parts."""
     others = metrics["others_frames"]["value"]
     people = "One person is planned for"
     if others:
@@ -161,27 +161,27 @@ def scope(metrics: Metrics) -> tuple[str, ...]:
 
 
 def _watched(metrics: Metrics) -> list[str]:
-    """Claims that rest on the cell's word that its cameras see everybody in an area."""
+    """Describes the results that rely on the cell's claim that its cameras see all people in an area."""
     share, refuting = metrics["watched_vacant_share"]["value"], metrics["watched_frames_refuting"]["value"]
     if share is None:
         return []
     words = (
-        "Whoever else comes in is taken to walk over the border of the watched area at up to "
-        f"{text_of(metrics['watched_speed_m_per_s'])}, as the cell says that its cameras see everybody within; nothing "
-        f"but that word stood for people at {percent(metrics['watched_vacant_share'])} of the ticks, when no camera "
-        "showed anybody there"
+        "Other people are assumed to enter over the border of the watched area at up to "
+        f"{text_of(metrics['watched_speed_m_per_s'])}, because the cell states that its cameras see everybody within; "
+        f"at {percent(metrics['watched_vacant_share'])} of the ticks no camera showed anybody there and safety relied "
+        "only on this statement"
     )
     if refuting:
         frames = f"{refuting:,} frame{'' if refuting == 1 else 's'}".replace(",", "\u202f")
         words += (
-            f". The recording contradicts it: {frames} show somebody further inside than anybody could have walked "
-            "since all cameras showed the area without people"
+            f". The recording contradicts it: {frames} show a person deeper inside than people can walk since all "
+            "cameras showed the area without people"
         )
     return [f"{words}."]
 
 
 def unseen_limbs(metrics: Metrics) -> list[str]:
-    """Limbs of the recorded person that were not seen, or only part of the time, each in words."""
+    """Lists limbs of the recorded person that were not seen, or only part of the time, each in words."""
     shares = {f"the {limb}": metrics[f"contact_{limb}_known_share"]["value"] for limb in SHOWN_PARTS}
     found = {limb: share for limb, share in shares.items() if share is not None and share < _WHOLE}
     if metrics["contact_person"]["value"] != TRUTH:
@@ -195,7 +195,7 @@ def unseen_limbs(metrics: Metrics) -> list[str]:
 
 
 def _cost_in_short(run: Run, metrics: Metrics) -> str:
-    """Cost to the task, and contacts without a controller."""
+    """Describes the cost to the task, and contacts without a controller."""
     pace = metrics["plan_progress_share"]["value"]
     cost = "What it would have cost the task is not known"
     if pace is not None:
@@ -211,7 +211,7 @@ def _cost_in_short(run: Run, metrics: Metrics) -> str:
 
 
 def _held(metrics: Metrics) -> str:
-    """Share of the recorded person that the prediction held, as ``audit`` counts it."""
+    """Describes the coverage of the recorded person by the prediction, as in ``audit``."""
     parts = []
     for prefix, until in (("volumes", "their horizon"), ("volumes_full", "the braking time")):
         checked, left = metrics[f"{prefix}_checked_ticks"]["value"], metrics[f"{prefix}_left_ticks"]["value"]
@@ -225,17 +225,17 @@ def _held(metrics: Metrics) -> str:
 
 
 def _floor_percent(share: float) -> str:
-    """Rounded down, so that nothing but all is 100 %."""
+    """Formats a share rounded down, so that only a complete one is 100 %."""
     return f"{int(1000 * share) / 10:.1f} %"
 
 
 def _centimetres(metres: float) -> str:
-    """Rounded down: a distance is never made larger than it was."""
+    """Formats a distance rounded down, so that it is never too large."""
     return f"{int(100 * metres)} cm"
 
 
 def _touched(metrics: Metrics) -> str:
-    """The first sentence: whether the moving robot would have touched anybody."""
+    """Returns the first sentence: contact of the moving robot with people."""
     touch = metrics["plan_touch_moving_ticks"]["value"]
     if touch is None:
         return f"{_HAD}it is not known whether the robot would have touched anybody: nobody is known."
@@ -271,15 +271,15 @@ def _when(metrics: Metrics) -> str:
 
 
 def _fault(metrics: Metrics) -> str:
-    """Whose fault the contacts were."""
+    """Describes the faults behind the contacts."""
     inside, retreating, outside, unknown = (
         metrics[f"plan_touch_{name}_ticks"]["value"] for name in ("inside", "retreating", "outside", "unpredicted")
     )
     if inside is None:
-        return "; it heeds nobody"
+        return "; it does not react to people"
     parts = []
     if other := metrics["plan_touch_other_ticks"]["value"]:
-        parts.append(f"at {other} it touched a body that it did not heed")
+        parts.append(f"at {other} it touched a body that it did not consider")
     if inside:
         parts.append(f"at {inside} of these ticks the person was where the prediction said, so the robot is at fault")
     if retreating:
@@ -292,7 +292,7 @@ def _fault(metrics: Metrics) -> str:
 
 
 def _cost(run: Run, metrics: Metrics) -> str:
-    """The second sentence: what it would have cost, and what the programme run blind would have done."""
+    """Returns the second sentence: the cost, and the contacts of the programme without reaction."""
     words = []
     if metrics["plan_progress_share"]["value"] is not None:
         words.append(f"kept {percent(metrics['plan_progress_share'])} of the programmed pace")
@@ -311,7 +311,7 @@ def _cost(run: Run, metrics: Metrics) -> str:
 
 
 def _table(run: Run, metrics: Metrics) -> PageTable:
-    """A row a method."""
+    """Makes one row per method."""
     rows = []
     for method, prefix in method_prefixes(run).items():
         near = f"{prefix}_body_distance_min_moving"
@@ -333,7 +333,7 @@ def _table(run: Run, metrics: Metrics) -> PageTable:
 
 
 def _signed(metric: Metric) -> str:
-    """A number with the minus that is as wide as a digit."""
+    """Formats a number with a minus as wide as a digit."""
     return text_of(metric).replace("-", "\u2212")
 
 
@@ -342,7 +342,7 @@ def _ticks(metric: Metric) -> str:
 
 
 def _note(run: Run, metrics: Metrics) -> str:
-    """Person and body that were judged."""
+    """Describes the person and the body in the comparison."""
     settings, _ = with_new_names(run.meta.get("settings", {}))
     hand_m, leg_m = settings.get("prediction", {}).get("hand_m"), settings.get("report", {}).get("leg_radius_m")
     person = str(metrics["contact_person"]["value"])
@@ -364,7 +364,7 @@ def _note(run: Run, metrics: Metrics) -> str:
 
 
 def _left(metrics: Metrics) -> str:
-    """Number of times the person left the volumes."""
+    """Describes how often the person left the volumes."""
     checked, left = metrics["volumes_checked_ticks"]["value"], metrics["volumes_left_ticks"]["value"]
     if checked is None or left is None:
         return ""
@@ -377,7 +377,7 @@ def _left(metrics: Metrics) -> str:
 
 
 def line(run: Run, metrics: Metrics) -> str:
-    """The same in a line for the terminal; empty where there is no comparison."""
+    """Returns the verdict in one line for the terminal; empty without a comparison."""
     if run.motion is None or metrics["contact_person"]["value"] is None:
         return ""
     parts = []
@@ -395,23 +395,23 @@ def line(run: Run, metrics: Metrics) -> str:
     return f"{judged}: {'; '.join(parts)}. {' '.join(scope(metrics))}"
 
 
-#: A limb unmeasured at more than this share of the time has to be spoken of.
+#: Share of the time without measurement above which a limb gets a remark.
 _MOST = 0.5
 
 
 def unmeasured(metrics: Metrics) -> tuple[list[str], dict[str, float]]:
-    """Limbs that were never measured, and those unmeasured most of the time with that share."""
+    """Returns limbs that were never measured, and limbs unmeasured most of the time with that share."""
     shares = {limb: metrics[f"limb_{limb}_unmeasured_share"]["value"] for limb in LIMBS}
     never = [limb for limb, share in shares.items() if share == 1.0]
     return never, {limb: share for limb, share in shares.items() if share is not None and _MOST < share < 1.0}
 
 
 def limb_remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
-    """Remarks on limbs that were not measured, or not whole; a line each.
+    """Returns remarks on limbs that were not measured, or only in part; one line each.
 
     Args:
-        run: Its tables of the first stage.
-        told: Notes on the log, which may already say of a limb that no camera gave its points.
+        run: Tables of stage 1.
+        told: Notes on the log, which may already name limbs without points from any camera.
     """
     table = MetricTable()
     add_limbs(table, run)
@@ -431,6 +431,6 @@ def limb_remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
     ]
     for limb in LIMBS:
         joints = metrics[f"limb_{limb}_joints_unmeasured"]["value"]
-        if joints is not None and limb not in never and limb != "HD":  # the head hangs on the trunk's joints
+        if joints is not None and limb not in never and limb != "HD":  # the head depends on the trunk's joints
             lines.append(f"the {limb_names_text([limb])} was measured only in part: never its {joints}")
     return lines

@@ -348,10 +348,10 @@ def test_a_method_that_never_moved_is_not_taken_for_a_success(
 
 def test_on_how_many_logs_a_method_made_no_way() -> None:
     row = {"still_logs": 1, "moving_ticks": 7}
-    assert comparison.stillness(row, 1) == "made no way"
+    assert comparison.stillness(row, 1) == "made no progress"
     assert comparison.stillness({**row, "moving_ticks": 0}, 1) == "never moved"
-    assert comparison.stillness(row, 3) == "no way on 1 of 3 logs"
-    assert comparison.stillness({**row, "still_logs": 3}, 3) == "made no way"
+    assert comparison.stillness(row, 3) == "no progress on 1 of 3 logs"
+    assert comparison.stillness({**row, "still_logs": 3}, 3) == "made no progress"
     assert not comparison.stillness({"still_logs": 0, "moving_ticks": 900}, 3)
 
 

@@ -107,7 +107,7 @@ def test_somebody_who_walks_in_is_met_by_a_robot_that_stands(tmp_path: Path) -> 
     assert metrics["watched_vacant_share"]["value"] == pytest.approx(unseen.mean())
     assert metrics["watched_frames_refuting"]["value"] == 0
     page = (folder / "report.html").read_text()
-    assert "as the cell says that its cameras see everybody within" in page
+    assert "because the cell states that its cameras see everybody within" in page
     assert "nobody in the watched area in another" in " ".join(report.summary(folder))
 
 
@@ -216,7 +216,7 @@ def test_why_names_the_border(tmp_path: Path) -> None:
     text = "\n".join(sentences(found))
     assert "the border of the watched area" in text
     assert "The watched area was last known to be without anybody" in text
-    assert "Cause: it was not known where people are" in "\n".join(sentences(explain(folder, 1.0)))
+    assert "Cause: the positions of people were unknown" in "\n".join(sentences(explain(folder, 1.0)))
 
 
 def test_a_run_of_another_area_is_not_taken_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

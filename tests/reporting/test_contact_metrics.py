@@ -118,7 +118,7 @@ def test_a_reason_to_stand_is_told(run: Run, tmp_path: Path) -> None:
     standing = dataclasses.replace(run, motion=motion)
     assert metrics_of(standing)["plan_standing_share_inside_a_volume"]["value"] == pytest.approx(0.05)
     text = " ".join(read(rendered(standing, tmp_path)).text)
-    assert "at 5.0 % of the ticks a link was already where the person could reach" in text
+    assert "at 5.0 % of the ticks a link was already in the space that the person could reach" in text
     assert "standing: inside a volume" in text
 
 

@@ -70,7 +70,7 @@ def test_the_verdict_says_first_which_limb_nobody_measured() -> None:
     assert answered(seen(run)).short.startswith("By the paper's criterion at every moving tick")
     safe = answered(seen(run, LLA=np.inf, LRA=np.inf))
     assert safe.short == "Not known of the right lower arm (LRA) and left lower arm (LLA): never measured."
-    assert "Of what was measured: by the paper's criterion at every moving tick" in safe.words
+    assert "For the measured limbs: by the paper's criterion at every moving tick" in safe.words
     card = summary_text.cards(
         seen(run, LLA=np.inf), compute(seen(run, LLA=np.inf), near_m=0.5, stationary_m_per_s=0.001)
     )[0]

@@ -193,7 +193,7 @@ def test_the_smallest_distance_says_which_it_is() -> None:
     assert "At 0 the constraint lets a link move along that space or away from it, but not into it." in safe.words
     card = summary_text.cards(touching, metrics)[1]
     assert card.value == "0.000 m"
-    assert "from a link's surface to that of what the person could reach within T_s" in card.label
+    assert "from a link's surface to the space that the person could reach within T_s" in card.label
     assert card.detail.startswith("not to the body")
 
 

@@ -1,4 +1,4 @@
-"""The figures of a run: one table of what there is and what each needs, and the drawing of what the data allow."""
+"""The figures of a run: a table of all figures with the data that each needs, and their drawing."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class FigureData:
     run: Run
     metrics: Mapping[str, Metric]
     near_m: float  #: the stationary share counts ticks with a separation of at most this
-    stationary_m_per_s: float  #: a TCP slower than this stands
-    gap_s: float = Logs().gap_s  #: a camera silent for longer has a gap
+    stationary_m_per_s: float  #: a TCP slower than this counts as stationary
+    gap_s: float = Logs().gap_s  #: a longer time without frames counts as a gap of a camera
     instants: Sequence[Instant] = ()  #: the swept volumes by several methods at the ticks that ``instants`` names
     walk: Walk | None = None
     sweep: Sweep | None = None
@@ -62,9 +62,9 @@ class FigureData:
 
 
 def require(value: _T | None) -> _T:
-    """A value that is there: a figure without what it needs is not drawn."""
+    """Returns a value that must not be None; figures without their data are not drawn."""
     if value is None:
-        raise ValueError("a figure is drawn without what it needs")
+        raise ValueError("a figure is drawn without its data")
     return value
 
 
@@ -72,17 +72,17 @@ def require(value: _T | None) -> _T:
 class FigureKind:
     """A figure that a run may have."""
 
-    name: str  #: of its files
-    numbers: tuple[str, ...]  #: the paper's; none for our own
+    name: str  #: name of its files
+    numbers: tuple[str, ...]  #: number in the paper; None for other figures
     title: str
-    section: str  #: of the page
-    needs: tuple[str, ...]  #: of NEEDS
+    section: str  #: section of the page
+    needs: tuple[str, ...]  #: keys of NEEDS
     draw: Callable[[FigureData], Figure]
     caption: str
-    predicted: str = ""  #: the field of FigureData that has to be computed for it
+    predicted: str = ""  #: field of FigureData that must be computed for it
 
 
-#: What a run may lack: how to tell whether it is there, and what to say when it is not.
+#: Data that a run may lack: a test for their presence, and a message if they are missing.
 NEEDS: dict[str, tuple[Callable[[Run, Mapping[str, Metric]], bool], str]] = {
     "motion": (
         lambda run, _: run.motion is not None and len(run.motion) > 1,
@@ -90,7 +90,7 @@ NEEDS: dict[str, tuple[Callable[[Run, Mapping[str, Metric]], bool], str]] = {
     ),
     "path": (
         lambda _, metrics: metrics["plan_deviation_max_m"]["value"] is not None,
-        "the way of the TCP is not known",
+        "the path of the TCP is unknown",
     ),
     "deviation": (
         lambda _, metrics: metrics["plan_deviation_max_m"]["value"] >= SHORTEST_M,
@@ -100,16 +100,16 @@ NEEDS: dict[str, tuple[Callable[[Run, Mapping[str, Metric]], bool], str]] = {
         lambda run, _: run.motion is not None and "horizon_s" in run.motion,
         "its motion.parquet has no horizon_s; make it anew from its log",
     ),
-    "base": (lambda run, _: run.T_world_base is not None, "where the robot stands is not known"),
+    "base": (lambda run, _: run.T_world_base is not None, "the pose of the robot's base is unknown"),
     "joints": (
         lambda run, _: run.motion is not None and "q1" in run.motion and bool(run.motion["q1"].notna().any()),
-        "the joint positions of the robot are not known",
+        "the joint positions of the robot are unknown",
     ),
     "alone": (
         lambda run, _: "none" in run.baselines,
-        'no robot without regard to the person beside it; run it with "none" among plan.baselines',
+        'no robot that ignores the person; run it with "none" among plan.baselines',
     ),
-    "person": (lambda run, _: len(find_known_ticks(run)) > 0, "nobody was seen in it"),
+    "person": (lambda run, _: len(find_known_ticks(run)) > 0, "no person was seen in it"),
     "seconds": (lambda run, _: len(instants(run)) > 0, "the person is not known for three seconds"),
     "occupancy": (
         lambda run, _: run.occupancy is not None and len(run.occupancy) > 0,
@@ -130,12 +130,12 @@ FIGURES = (
     FigureKind(
         "fig05_walking",
         ("5",),
-        "what of the floor a person can reach, at the fastest step",
+        "floor area that a person can reach, at the fastest step",
         "prediction",
         ("person",),
         lambda data: prediction.walking(require(data.walk), data.t0_ns),
         "As the paper's Fig. 5, at the instant of the fastest walking. Dashed: the circular sectors that a unicycle "
-        "reaches within the stopping time, as the paper has them. Orange: their convex approximation, Eq. (22)-(30), "
+        "reaches within the stopping time, as in the paper. Orange: their convex approximation, Eq. (22)-(30), "
         "corrected. Blue: every walk under the joints' bounds, of every likely state. Red: where the person walked.",
         "walk",
     ),
@@ -146,9 +146,9 @@ FIGURES = (
         "prediction",
         ("person",),
         lambda data: prediction.sweeps(require(data.sweep), data.t0_ns),
-        "As the paper's Fig. 7 and 8, on the forearm of this run's person. On the right the elbow turns it through all "
-        "angles that the paper's method says it can reach: arcs in triangles, and their hull. On the left that set is "
-        "displaced to all places that walking can reach, seen from above.",
+        "As the paper's Fig. 7 and 8, on the forearm of this run's person. On the right the elbow turns it through "
+        "all angles that it can reach by the paper's method: arcs in triangles, and their hull. On the left that set "
+        "is displaced to all positions that walking can reach, seen from above.",
         "sweep",
     ),
     FigureKind(
@@ -199,8 +199,8 @@ FIGURES = (
         "cost",
         ("motion", "joints", "base", "alone", "occupancy", "person"),
         lambda data: scene.storyboard(require(data.story), data.t0_ns),
-        "As the paper's Fig. 15 and 16. Each row is the same instant of the programme: on the left as the robot passes "
-        "it with nobody to mind (the baseline none), on the right beside the person, when it got there.",
+        "As the paper's Fig. 15 and 16. Each row is the same instant of the programme: on the left as the robot "
+        "passes it without reaction to people (the baseline none), on the right near the person.",
         "story",
     ),
     FigureKind(
@@ -210,9 +210,9 @@ FIGURES = (
         "prediction",
         ("seconds",),
         lambda data: prediction.volumes(data.instants, data.state, data.t0_ns),
-        "As the paper's Fig. 17. What the person could reach within the stopping time at four instants, limb radii "
-        "included: from positions and velocities (paper); by the older method, from positions alone; and as this run "
-        "did it, where that is neither.",
+        "As the paper's Fig. 17. The space that the person could reach within the stopping time at four instants, "
+        "limb radii included: from positions and velocities (paper); by the older method, from positions only; and by "
+        "this run's method, if different.",
         "instants",
     ),
     FigureKind(
@@ -222,8 +222,8 @@ FIGURES = (
         "fusion",
         ("measurements",),
         lambda data: fusion.coordinate(data.run, data.t0_ns, data.gap_s),
-        "As the paper's Fig. 18. One coordinate of the person as each camera saw it and as fused, and where the log "
-        "has ground truth, the errors.",
+        "As the paper's Fig. 18. One coordinate of the person as each camera saw it and as fused and, if the log has "
+        "ground truth, the errors.",
     ),
     FigureKind(
         "horizon",
@@ -232,8 +232,8 @@ FIGURES = (
         "safety",
         ("motion", "horizon"),
         lambda data: planning.horizon(data.motion, data.t0_ns, _stop_s(data.run)),
-        "Until when the swept volumes hold by which each tick was decided, and how long the stop takes that the robot "
-        "would make from there; T\u209b is the stop from full speed. Braking is shaded.",
+        "Horizon of the swept volumes used at each tick, and duration of the stop that the robot would make from "
+        "there; T\u209b is the stop from full speed. Braking is shaded.",
     ),
     FigureKind(
         "volume_horizon",
@@ -260,9 +260,9 @@ FIGURES = (
             near_m=data.near_m,
             slow_m_per_s=data.stationary_m_per_s,
         ),
-        "What the robot did over time. Limited: held by a safety constraint or a limit. Above each bar, in grey, when "
-        "it was near the person; solid, when it then stood although its programme moves. Where stretches are narrower "
-        "than a line, the gravest status is drawn.",
+        "Status of the robot over time. Limited: slowed by a safety constraint or a limit. Above each bar, grey: the "
+        "robot is near the person; solid: it stands there although its programme moves. Where periods are narrower "
+        "than a line, the most severe status is drawn.",
     ),
     FigureKind(
         "stationary_share",
@@ -281,8 +281,8 @@ FIGURES = (
         "robot",
         ("motion", "joints", "base"),
         lambda data: scene.links(require(data.pose), data.t0_ns, require(data.run.T_world_base)),
-        "The robot as its distances see it: a capsule around each collision shape of its links, at the tick of the "
-        "smallest separation, beside the swept volumes of the person. The square is the robot's base.",
+        "The robot as used for distances: a capsule around each collision shape of its links, at the tick of the "
+        "smallest separation, with the swept volumes of the person. The square is the robot's base.",
         "pose",
     ),
     FigureKind(
@@ -306,34 +306,35 @@ FIGURES = (
     FigureKind(
         "data_quality",
         (),
-        "when each camera saw the person",
+        "times at which each camera saw the person",
         "data",
         ("measurements",),
         lambda data: fusion.data_quality(data.run, data.t0_ns, data.gap_s),
-        "When each camera's frames held the person (pale), when the filter used them (solid), and when it had none.",
+        "Times at which each camera's frames contain the person (pale), at which the filter used them (solid), and at "
+        "which it had none.",
     ),
 )
 
 
 def label(kind: FigureKind) -> str:
-    """Name that a user types for it: its number, or where the paper has none its name."""
+    """Key for users: its number, or its name if it is not in the paper."""
     return ", ".join(kind.numbers) or kind.name
 
 
 def find(key: str) -> tuple[FigureKind, ...]:
-    """The figures of a number or a name; ``13`` stands for 13a and 13b. Empty for one that there is not."""
+    """Finds the figures with a number or a name; ``13`` means 13a and 13b. Empty if there is none."""
     wanted = re.sub(r"^fig\.?\s*", "", key.strip().lower())
     found = [kind for kind in FIGURES if wanted in (*kind.numbers, kind.name) or key == kind.name]
     return tuple(found or (kind for kind in FIGURES if wanted and wanted in [n.rstrip("ab") for n in kind.numbers]))
 
 
 def missing(kind: FigureKind, run: Run, metrics: Mapping[str, Metric]) -> str:
-    """Reason why a run lacks data for a figure; empty where it has them."""
+    """Returns the data that a run lacks for a figure, in words; empty if it has all."""
     return next((why for there, why in map(NEEDS.__getitem__, kind.needs) if not there(run, metrics)), "")
 
 
 def select_figures(run: Run, metrics: Mapping[str, Metric]) -> tuple[FigureKind, ...]:
-    """The figures that a run has all for."""
+    """Returns the figures for which a run has all data."""
     return tuple(kind for kind in FIGURES if not missing(kind, run, metrics))
 
 
@@ -341,9 +342,10 @@ def draw_all(data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None 
     """Draws figures into ``folder`` as ``<name>.png`` and ``<name>.svg``.
 
     Args:
-        data: What to draw from.
-        folder: Made if need be.
-        kinds: Which; None: all that the run has all for. One without what had to be computed for it is left out.
+        data: Input of the figures.
+        folder: Folder for the files; created if needed.
+        kinds: Figures to draw; None: all for which the run has the data. A figure without its computed data is left
+            out.
 
     Returns:
         The names drawn.

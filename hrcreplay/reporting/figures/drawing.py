@@ -1,6 +1,6 @@
 """Shared drawing functions: figure style, panels and export.
 
-The colours can be told apart by readers with colour vision deficiency.
+The colours are distinguishable for readers with colour vision deficiency.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hrcreplay.records import Floats
 ORANGE, SKY, GREEN, YELLOW = "#E69F00", "#56B4E9", "#009E73", "#F0E442"
 BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 
-#: Text and axes; the page replaces these two by its own ink where it is dark.
+#: Colours of text and axes; the page replaces both in its dark mode.
 INK, FAINT = "#25313c", "#8b98a5"
 GRID = "#dfe5ea"
 
@@ -80,7 +80,7 @@ STYLE: dict[str, Any] = {
     "svg.image_inline": True,
 }
 
-#: What differs in one column of a two-column paper.
+#: Settings that differ in one column of a two-column paper.
 COLUMN_STYLE: dict[str, Any] = STYLE | {
     "font.size": 7.0,
     "axes.titlesize": 7.0,
@@ -107,23 +107,23 @@ COLUMN_STYLE: dict[str, Any] = STYLE | {
 
 DPI = 150
 WIDTH_IN = 8.4
-#: One column of a two-column paper, and its dots an inch.
+#: Width of one column of a two-column paper, and its resolution [dpi].
 COLUMN_IN = 3.5
 COLUMN_DPI = 300
 
 
 def style(*, column: bool = False) -> Any:
-    """Context in which figures are made and saved, of the page's width or of a paper's column."""
+    """Returns a context in which figures are made and saved, for the page's width or a paper's column."""
     return mpl.rc_context(cast("Any", COLUMN_STYLE if column else STYLE))
 
 
 def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
-    """An empty figure of the page's width."""
+    """Makes an empty figure of the page's width."""
     return Figure(figsize=(width_in, height_in))
 
 
 def column_figure(height_in: float) -> Figure:
-    """An empty figure of one column of a two-column paper."""
+    """Makes an empty figure of one column of a two-column paper."""
     return Figure(figsize=(COLUMN_IN, height_in))
 
 
@@ -141,10 +141,10 @@ def panels(
     widths: Sequence[float] | None = None,
     share_x: bool = False,
 ) -> list[list[Axes]]:
-    """A grid of axes with margins in inches, which unlike a layout engine costs no second drawing.
+    """Makes a grid of axes with margins in inches; unlike with a layout engine, no second drawing is needed.
 
     Args:
-        figure: To draw on.
+        figure: Figure to draw on.
         rows: Rows of axes.
         columns: Columns of axes.
         left_in: Margin for the labels of the first column [in].
@@ -179,7 +179,7 @@ def panels(
 
 
 def set_window(ax: Axes, low: Sequence[float], high: Sequence[float]) -> None:
-    """Limits that show at least the box from ``low`` to ``high`` with one scale for both axes."""
+    """Sets limits that show at least the box from ``low`` to ``high`` with one scale for both axes."""
     size = figure_in(ax)
     box = ax.get_position()
     size_in = (box.width * size[0], box.height * size[1])
@@ -198,10 +198,10 @@ def column_panels(figure: Figure, rows: int = 1, columns: int = 1, **margins: An
     """``panels`` with the margins of a column.
 
     Args:
-        figure: To draw on.
+        figure: Figure to draw on.
         rows: Rows of axes.
         columns: Columns of axes.
-        margins: What else ``panels`` takes; has priority.
+        margins: Other arguments of ``panels``; they have priority.
     """
     usual: dict[str, Any] = {
         "left_in": 0.48,
@@ -217,33 +217,33 @@ def column_panels(figure: Figure, rows: int = 1, columns: int = 1, **margins: An
 
 
 def no_axes(ax: Axes) -> None:
-    """Takes ticks, grid and frame away."""
+    """Removes ticks, grid and frame."""
     ax.set(xticks=[], yticks=[])
     ax.grid(visible=False)
     ax.spines[:].set_visible(False)
 
 
 def legend_above(axes: Axes, columns: int = 6, handles: Sequence[Any] | None = None) -> None:
-    """A legend in one row at the upper right, outside the data."""
+    """Adds a legend in one row at the upper right, outside the data."""
     given = {} if handles is None else {"handles": list(handles)}
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.015), ncols=columns, **given)
 
 
 def png_bytes(figure: Figure, dpi: int = DPI) -> bytes:
-    """The figure as PNG on white; the same figure gives the same bytes."""
+    """Returns the figure as PNG on white; the same figure gives the same bytes."""
     figure.set_dpi(dpi)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     stream = io.BytesIO()
-    image.save(stream, "png", dpi=(dpi, dpi), compress_level=4)  # a palette costs more time, and pale colours
+    image.save(stream, "png", dpi=(dpi, dpi), compress_level=4)  # a palette takes more time and loses pale colours
     return stream.getvalue()
 
 
 def svg_bytes(figure: Figure, dpi: int = DPI) -> bytes:
-    """The figure as SVG without a background; the same figure gives the same bytes."""
+    """Returns the figure as SVG without a background; the same figure gives the same bytes."""
     stream = io.BytesIO()
-    figure.set_dpi(dpi)  # of what is drawn as pixels inside the SVG
+    figure.set_dpi(dpi)  # resolution of bitmaps inside the SVG
     canvas: Any = FigureCanvasSVG(figure)
     canvas.print_svg(stream, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     return stream.getvalue()
@@ -253,10 +253,10 @@ def save(figure: Figure, folder: Path, name: str, dpi: int = DPI) -> None:
     """Writes ``name.svg`` and ``name.png``.
 
     Args:
-        figure: To write.
-        folder: Where to.
-        name: Of the files.
-        dpi: Dots an inch of the PNG, and of what is pixels in the SVG.
+        figure: Figure to write.
+        folder: Folder for the files.
+        name: Name of the files.
+        dpi: Resolution of the PNG, and of bitmaps in the SVG.
     """
     (folder / f"{name}.svg").write_bytes(svg_bytes(figure, dpi))
     figure.set_facecolor("white")

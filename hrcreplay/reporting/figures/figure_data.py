@@ -25,11 +25,11 @@ from hrcreplay.reporting.metrics.series import find_known_ticks, instants, momen
 from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run
 
-#: Programmed time between the pictures of the storyboard, and how many there are [s].
+#: Programmed time between the pictures of the storyboard [s], and their number.
 _STORY_STEP_S, _STORY_COUNT = 0.8, 4
-#: A smaller deviation is nothing to tell a story of [m].
+#: Minimum deviation for a storyboard [m].
 _STORY_M = 0.01
-#: Stored volumes older than this are not those of an instant [s].
+#: Maximum age of stored volumes at an instant [s].
 _STALE_S = 0.2
 #: Horizons at which volumes are compared.
 _HORIZONS = 7
@@ -37,14 +37,14 @@ X, Y, THETA = (JOINTS.index(name) for name in ("x", "y", "theta"))
 
 
 def compute_fields(run_config: RunConfig, run: Run, fields: Iterable[str]) -> dict[str, Any]:
-    """Those fields of ``FigureData`` that are not in the tables; None or empty where the run has nothing for one."""
+    """Computes the fields of ``FigureData`` that are not in the tables; None or empty if the run lacks the data."""
     wanted = [name for name in dict.fromkeys(fields) if name]
     people = _states(run_config, run) if wanted else None
     return {name: _FIELDS[name](run_config, run, people) for name in wanted} if people is not None else {}
 
 
 def volumes_by_method(run_config: RunConfig, run: Run, people: HumanStates) -> list[Instant]:
-    """The swept volumes by the paper's two methods and the run's own at the instants that Fig. 17 shows."""
+    """Computes the swept volumes by the paper's two methods and the run's own at the instants of Fig. 17."""
     wanted_ns = instants(run)
     if not len(wanted_ns):
         return []
@@ -58,7 +58,7 @@ def volumes_by_method(run_config: RunConfig, run: Run, people: HumanStates) -> l
 
 
 def fastest_walk(run_config: RunConfig, run: Run, people: HumanStates) -> Walk | None:
-    """Reachable places from the tick of the fastest walking, Eq. (18)-(30), corrected, and by ``sound``."""
+    """Computes the reachable area from the tick of the fastest walking, Eq. (18)-(30), corrected, and by ``sound``."""
     t_ns = _fastest_ns(run, run_config.settings.prediction.stop_s)
     if run.state is None or t_ns is None:
         return None
@@ -84,7 +84,7 @@ def fastest_walk(run_config: RunConfig, run: Run, people: HumanStates) -> Walk |
 
 
 def forearm_sweep(run_config: RunConfig, run: Run, people: HumanStates) -> Sweep | None:
-    """Sweep by elbow and walking of the forearm nearest to the robot, or the right one, Alg. 2 and Fig. 7, 8."""
+    """Computes the sweep by elbow and walking of the forearm nearest to the robot, or the right one, Fig. 7, 8."""
     moment = moment_ns(run)
     if moment is None:
         return None
@@ -103,7 +103,7 @@ def forearm_sweep(run_config: RunConfig, run: Run, people: HumanStates) -> Sweep
     postures[:, joint] = angles
     points = skeleton(postures, np.tile(states.lengths_m, (len(angles), 1)))
     elbow, wrist = (points[:, POINTS.index(f"{name}_{side}")] for name in ("elbow", "wrist"))
-    if not np.isfinite(wrist).all():  # a length that nobody measured
+    if not np.isfinite(wrist).all():  # an unmeasured length
         return None
     apexes = elbow[0] + (wrist[-1 - pieces : -1] - elbow[0]) / np.cos(0.5 * (high - low) / pieces)
     return Sweep(
@@ -118,7 +118,7 @@ def forearm_sweep(run_config: RunConfig, run: Run, people: HumanStates) -> Sweep
 
 
 def volume_growth(run_config: RunConfig, run: Run, people: HumanStates) -> Growth | None:
-    """The six limbs' volumes at the moment that figures show, for horizons up to the braking time, by each method."""
+    """Computes the six limbs' volumes at one instant, for horizons up to the braking time, by each method."""
     moment = moment_ns(run)
     if moment is None:
         return None
@@ -142,7 +142,7 @@ def _sum_m3(volumes: SweptVolumes) -> float:
 
 
 def story(run_config: RunConfig, run: Run, _people: HumanStates) -> Storyboard | None:
-    """The stretch of the programme around the largest deviation, or else the nearest tick, alone and with people."""
+    """Returns the part of the programme around the largest deviation, or else the nearest tick."""
     motion, alone, occupancy = run.motion, run.baselines.get("none"), run.occupancy
     if motion is None or alone is None or occupancy is None or run.state is None or run.T_world_base is None:
         return None
@@ -184,7 +184,7 @@ def story(run_config: RunConfig, run: Run, _people: HumanStates) -> Storyboard |
 
 
 def nearest_pose(run_config: RunConfig, run: Run, people: HumanStates) -> LinkPose | None:
-    """The robot's capsules and the swept volumes at the tick of the smallest separation."""
+    """Returns the robot's capsules and the swept volumes at the tick of the smallest separation."""
     if run.motion is None or not len(run.motion) or run.T_world_base is None:
         return None
     robot = assembly.robot(run_config, run.T_world_base)
@@ -220,7 +220,7 @@ def _joints(motion: pd.DataFrame, row: int, axes: int) -> Floats:
 
 
 def _fastest_ns(run: Run, span_s: float) -> int | None:
-    """The tick from which the person walks furthest within ``span_s`` [s], as fused [ns]; else the last known."""
+    """Finds the tick [ns] from which the fused person walks furthest within ``span_s`` [s]; else the last known."""
     known_ns = find_known_ticks(run)
     if run.state is None or not len(known_ns):
         return None
@@ -233,7 +233,7 @@ def _fastest_ns(run: Run, span_s: float) -> int | None:
 
 
 def _states(run_config: RunConfig, run: Run) -> HumanStates | None:
-    """The fused person at the ticks that any figure asks for, read once; None without a person."""
+    """Reads the fused person at all ticks that the figures need, once; None without a person."""
     if run.state is None:
         return None
     wanted_ns = [*instants(run).tolist(), moment_ns(run), _fastest_ns(run, run_config.settings.prediction.stop_s)]

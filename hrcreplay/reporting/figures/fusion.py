@@ -35,17 +35,17 @@ LABELS = {
     "rho": "torso \u03c1",
     **{f"a{side}{i}": f"{name} \u03b1{i}" for side, name in (("r", "right"), ("l", "left")) for i in range(1, 5)},
 }
-#: As many panels beside each other show all joints.
+#: Number of panels per row in the figure of all joints.
 _PANELS = 3
 
 
 def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
-    """Fig. 18: one coordinate as each camera saw it, as fused and, where the log has it, as it was; and the errors.
+    """Fig. 18: draws one coordinate as each camera saw it, as fused and, if the log has it, the truth; and the errors.
 
     Args:
         run: Tables of the run.
         t0_ns: Instant of time zero [ns].
-        gap_s: A line is broken where a camera was silent for longer [s].
+        gap_s: Time without frames at which a camera's line is interrupted [s].
         joint: Coordinate to draw, one of JOINTS.
     """
     found = errors(run, gap_s)
@@ -90,7 +90,7 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
 
 
 def _frames(run: Run) -> dict[str, pd.DataFrame]:
-    """The frames of each camera, in order of capture."""
+    """Returns the frames of each camera, in order of capture."""
     table = run.measurements
     if table is None:
         return {}
@@ -100,7 +100,7 @@ def _frames(run: Run) -> dict[str, pd.DataFrame]:
 
 
 def _seen(run: Run, frames: pd.DataFrame, joint: str, t0_ns: int, gap_s: float) -> tuple[Floats, Floats]:
-    """A camera's raw values over time [s], broken where it was silent for longer than ``gap_s``."""
+    """Draws a camera's raw values over time [s], interrupted after ``gap_s`` without frames."""
     t_ns = times(frames, "capture_ns")
     values = _beside_fused(run, joint, t_ns, frames[joint].to_numpy(dtype=float))
     return break_at_gaps(seconds_from(t_ns, t0_ns), values, gap_s)
@@ -112,7 +112,7 @@ def _span(ax: Axes, run: Run, t0_ns: int) -> None:
 
 
 def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
-    """All joints: what the cameras saw (dots), the fused state and the truth."""
+    """Draws all joints: raw camera values (dots), the fused state and the truth."""
     count = -(-len(JOINTS) // _PANELS)
     figure = drawing.column_figure(0.7 + 0.95 * count)
     grid = drawing.column_panels(
@@ -157,7 +157,7 @@ def joint_angles(run: Run, t0_ns: int, gap_s: float) -> Figure:
 
 
 def _beside_fused(run: Run, joint: str, t_ns: Ints, values: Floats) -> Floats:
-    """An angle in the turn of the fused one, which is unwrapped; a length as it is."""
+    """Moves an angle to the turn of the fused one, which is unwrapped; a length is unchanged."""
     if run.state is None or joint not in ANGLES:
         return values
     fused_ns, fused = times(run.state), run.state[joint].to_numpy(dtype=float)
@@ -169,7 +169,7 @@ def _beside_fused(run: Run, joint: str, t_ns: Ints, values: Floats) -> Floats:
 
 
 def _limits_of(ax: Axes, values: Floats) -> None:
-    """The fused line with room around it; a camera's outliers may leave the picture."""
+    """Returns limits around the fused line with a margin; a camera's outliers may lie outside."""
     finite = values[np.isfinite(values)]
     if len(finite):
         room = 0.25 * max(float(np.ptp(finite)), 1e-2)
@@ -177,7 +177,7 @@ def _limits_of(ax: Axes, values: Floats) -> None:
 
 
 def fusion_error(metrics: Mapping[str, Metric], names: Sequence[str]) -> Figure:
-    """RMSE per angle and pooled, of each camera's raw angles and of the fused state; velocities likewise."""
+    """Draws the RMSE per angle and pooled, for each camera's raw angles and the fused state; velocities likewise."""
     figure = drawing.column_figure(2.7)
     rows = drawing.column_panels(figure, 2, bottom_in=0.22, share_x=True)
     sources = [*names, "fused"]
@@ -206,7 +206,7 @@ def fusion_error(metrics: Mapping[str, Metric], names: Sequence[str]) -> Figure:
 
 
 def data_quality(run: Run, t0_ns: int, gap_s: float) -> Figure:
-    """Per camera: when its frames held the person, when the filter used them, and its gaps."""
+    """Draws, per camera, the times of frames with the person, of frames used by the filter, and of gaps."""
     names = cameras(run)
     figure = drawing.column_figure(0.72 + 0.24 * (len(names) + 1))
     ((ax,),) = drawing.column_panels(figure, left_in=0.62, top_in=0.34)
@@ -249,7 +249,7 @@ def data_quality(run: Run, t0_ns: int, gap_s: float) -> Figure:
 
 
 def _frame_bars(seconds: Floats, gap_s: float) -> list[tuple[float, float]]:
-    """Stretches of frames no further apart than ``gap_s`` as (start, width) [s]."""
+    """Returns runs of frames at most ``gap_s`` apart as (start, width) [s]."""
     if not len(seconds):
         return []
     breaks = np.flatnonzero(np.diff(seconds) > gap_s)

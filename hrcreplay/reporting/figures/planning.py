@@ -21,9 +21,9 @@ from hrcreplay.reporting.metrics.planning import numeric_column, position_column
 from hrcreplay.reporting.metrics.series import Metric, envelope, path_feet, seconds_from, thin_path, times, true_runs
 
 SIDE = view_from(-0.5 * np.pi, 0.0)
-#: The path this long before and after the largest deviation is drawn boldly [s].
+#: Time before and after the largest deviation in which the path is drawn in bold [s].
 _PASS_S = 2.0
-#: A deviation below this is none [m].
+#: Minimum deviation [m].
 SHORTEST_M = 0.5e-3
 
 
@@ -31,18 +31,18 @@ SHORTEST_M = 0.5e-3
 class Deviation:
     """Largest deviation of the TCP from the programmed path."""
 
-    row: int  #: of motion.parquet
+    row: int  #: row of motion.parquet
     at_m: Floats  #: (3,) the TCP, world
     foot_m: Floats  #: (3,) the nearest point of the programmed path, world
 
     @property
     def length_m(self) -> float:
-        """Its length."""
+        """Length of the deviation."""
         return float(np.linalg.norm(self.at_m - self.foot_m))
 
 
 def largest_deviation(motion: pd.DataFrame) -> Deviation:
-    """The largest distance between the TCP and the programmed path."""
+    """Finds the largest distance between the TCP and the programmed path."""
     reference, tcp = position_columns(motion, "ref"), position_columns(motion, "tcp")
     feet = path_feet(tcp, reference)
     far = np.linalg.norm(tcp - feet, axis=1)
@@ -57,16 +57,16 @@ def path(
     T_world_base: Floats | None = None,
     worst: Deviation | None = None,
 ) -> Figure:
-    """Fig. 13a: programmed and actual TCP path from above and from the side; dots: the largest deviation.
+    """Fig. 13a: draws the programmed and the actual TCP path from above and from the side; dots: the largest deviation.
 
-    The swept volumes are those stored last before that tick, in outline.
+    Also draws the outlines of the swept volumes stored last before that tick.
 
     Args:
         motion: Rows of motion.parquet.
         occupancy: Rows of occupancy.parquet; None without stored volumes.
         t0_ns: Instant of time zero [ns].
         T_world_base: (4, 4) pose of the robot's base, drawn as a square; None: not drawn.
-        worst: The largest deviation, where it is known already.
+        worst: The largest deviation, if already known.
     """
     worst = worst or largest_deviation(motion)
     limbs = _limbs_at(occupancy, motion, worst)
@@ -91,13 +91,13 @@ def path(
 def deviation(
     motion: pd.DataFrame, occupancy: pd.DataFrame | None, t0_ns: int, worst: Deviation | None = None
 ) -> Figure:
-    """Fig. 13b: the largest deviation, in the vertical plane that holds it, so that its length is not distorted.
+    """Fig. 13b: draws the largest deviation in its vertical plane, so that its length is not distorted.
 
     Args:
         motion: Rows of motion.parquet.
         occupancy: Rows of occupancy.parquet; None without stored volumes.
         t0_ns: Instant of time zero [ns].
-        worst: The largest deviation, where it is known already.
+        worst: The largest deviation, if already known.
     """
     worst = worst or largest_deviation(motion)
     limbs = _limbs_at(occupancy, motion, worst)
@@ -120,7 +120,7 @@ def deviation(
 
 
 def _label_length(ax: Axes, ends: Floats, text: str, crowd: Floats) -> None:
-    """Writes beside the middle of a line, away from most of a crowd of points (n, 2)."""
+    """Writes a label near the middle of a line, on the side away from most points (n, 2)."""
     along, middle = ends[1] - ends[0], ends.mean(axis=0)
     beside = np.array([along[1], -along[0]]) / max(float(np.linalg.norm(along)), 1e-12)
     if np.nanmean(np.sign((crowd - middle) @ beside)) > 0.0:
@@ -151,7 +151,7 @@ def _path_legend(figure: Figure, *, with_limbs: bool, with_base: bool) -> None:
 
 
 def _limbs_at(occupancy: pd.DataFrame | None, motion: pd.DataFrame, worst: Deviation) -> Limbs:
-    """The volumes stored last before the deviation; none before the first."""
+    """Returns the volumes stored last before the deviation; none before the first."""
     t_ns = int(times(motion)[worst.row])
     if occupancy is None or not (times(occupancy) <= t_ns).any():
         return {}
@@ -173,7 +173,7 @@ def _draw_path(ax: Axes, view: View, motion: pd.DataFrame, limbs: Limbs, worst: 
 
 
 def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
-    """Fig. 14: programmed speed; actual speed with braking shaded; separation from the swept volumes."""
+    """Fig. 14: draws programmed speed; actual speed with braking shaded; separation from the swept volumes."""
     seconds = seconds_from(times(motion), t0_ns)
     figure = drawing.column_figure(3.3)
     rows = drawing.column_panels(figure, 3, share_x=True)
@@ -199,7 +199,7 @@ def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
 
 
 def horizon(motion: pd.DataFrame, t0_ns: int, stop_s: float) -> Figure:
-    """Horizon of the volumes used at each tick, and duration of the stop from its velocity.
+    """Draws the horizon of the volumes used at each tick, and the duration of the stop from its velocity.
 
     Args:
         motion: Rows of motion.parquet.
@@ -219,7 +219,7 @@ def horizon(motion: pd.DataFrame, t0_ns: int, stop_s: float) -> Figure:
     return figure
 
 
-#: Of the shading that ``_shade`` makes.
+#: Legend entry of the shading by ``_shade``.
 _BRAKING = Patch(color=drawing.STATUS["braking"], alpha=0.25, lw=0, label="braking")
 
 
@@ -237,7 +237,7 @@ def _shade(ax: Axes, seconds: Floats, motion: pd.DataFrame, status: str) -> None
 
 
 def _bars(seconds: Floats, mask: Bools) -> list[tuple[float, float]]:
-    """Stretches as (start, width) [s]; neighbours closer than a line's width on paper are one bar."""
+    """Returns runs as (start, width) [s]; runs closer than a line's width on paper are merged."""
     bars: list[tuple[float, float]] = []
     resolution = (seconds[-1] - seconds[0]) / 1000.0 if len(seconds) else 0.0
     for first, last in true_runs(mask):
@@ -258,7 +258,7 @@ def status(
     near_m: float,
     slow_m_per_s: float,
 ) -> Figure:
-    """Status of the plan and each baseline over time, and when each stood near the person though it should move.
+    """Draws the status of the plan and each baseline over time, and its standstills near the person.
 
     Args:
         motion: Rows of motion.parquet.
@@ -266,7 +266,7 @@ def status(
         method: Method of the plan.
         t0_ns: Instant of time zero [ns].
         near_m: The person is near at a separation of at most this [m].
-        slow_m_per_s: The robot stands where its TCP is slower than this [m/s].
+        slow_m_per_s: A TCP slower than this counts as stationary [m/s].
     """
     tables = {f"plan: {method}": motion, **baselines}
     figure = drawing.column_figure(0.8 + 0.32 * len(tables))
@@ -274,7 +274,7 @@ def status(
     for row, table in enumerate(tables.values()):
         seconds = seconds_from(times(table), t0_ns)
         kind = table["status"].to_numpy()
-        for value in STATUSES:  # the gravest is drawn last and stays visible
+        for value in STATUSES:  # the most severe status is drawn last and stays visible
             bars = _bars(seconds, kind == value)
             ax.broken_barh(bars, (row - 0.12, 0.44), facecolors=drawing.STATUS[value], lw=0)
         near, stands = stationary(table, near_m, slow_m_per_s)
@@ -295,7 +295,7 @@ def status(
 
 
 def stationary_share(metrics: Mapping[str, Metric]) -> Figure:
-    """Stationary share of the plan and its baselines on this log, with the paper's two figures beside them."""
+    """Draws the stationary share of the plan and its baselines on this log, with the paper's two figures."""
     method = metrics["plan_method"]["value"]
     rows = [(f"this log: {method}", "plan", drawing.BLUE)]
     rows += [
@@ -341,7 +341,7 @@ _MARKERS = {"sound": "o", "paper": "s", "positions": "D"}
 
 
 def methods(found: Mapping[str, Any]) -> Figure:
-    """Safety against productivity: the smallest distance while moving over the pace kept, a point a method.
+    """Draws safety against productivity: the smallest distance while moving over the pace kept, one point per method.
 
     Args:
         found: The content of compare.json.
@@ -356,7 +356,7 @@ def methods(found: Mapping[str, Any]) -> Figure:
             ax.plot(*_place(other), ".", ms=5, color=colour, alpha=0.45)
         words = label.replace(":", ", ") + (f": {row['stillness']}" if row["stillness"] else "")
         if row["pace"] is None or row["nearest_moving_m"] is None:
-            if row["stillness"]:  # it has no place, but is not left out
+            if row["stillness"]:  # it has no position in the plot but is listed
                 ax.plot([], [], "x", ms=8, color=colour, label=words)
             continue
         if row["touch_ticks"]:
@@ -384,11 +384,11 @@ def methods(found: Mapping[str, Any]) -> Figure:
 
 
 def log_rows(found: Mapping[str, Any], label: str) -> list[Mapping[str, Any]]:
-    """The figures of a method on each log that can be placed."""
+    """Returns the figures of a method on each log that can be plotted."""
     rows = [log["methods"][label] for log in found["logs"]]
     return [row for row in rows if row["pace"] is not None and row["nearest_moving_m"] is not None]
 
 
 def _place(row: Mapping[str, Any]) -> tuple[float, float]:
-    """Pace [%] and smallest distance [cm]."""
+    """Returns pace [%] and smallest distance [cm]."""
     return 100.0 * row["pace"], 100.0 * row["nearest_moving_m"]

@@ -1,4 +1,4 @@
-"""Figures of what the person could reach: Fig. 5, 7, 8, 9 and 17, and the volume against the horizon."""
+"""Figures of the space that the person could reach: Fig. 5, 7, 8, 9 and 17, and the volume against the horizon."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ COLOURS = {"paper": drawing.ORANGE, "positions": drawing.GREEN, "sound": drawing
 
 @dataclass(frozen=True)
 class Walk:
-    """Floor area that the person can reach from one instant on."""
+    """Floor area that the person can reach after an instant."""
 
     t_ns: int
     horizon_s: float  #: braking time T_s
-    place_m: Floats  #: (2,) of the pelvis, world
+    place_m: Floats  #: (2,) position of the pelvis, world
     heading_rad: float
-    radius_m: float  #: R, how far at the highest speed
+    radius_m: float  #: R, distance at the highest speed
     turn_rad: tuple[float, float]  #: beta^min and beta^max from the heading
     box_m: Floats  #: (2, 2) lower and upper corner of the paper's convex approximation, world
-    polygon_m: Floats  #: (k, 2) corners of what ``sound`` encloses, in order
-    walked_m: Floats  #: (n, 2) where the fused person was from the instant until the horizon
+    polygon_m: Floats  #: (k, 2) corners of the area enclosed by ``sound``, in order
+    walked_m: Floats  #: (n, 2) positions of the fused person from the instant until the horizon
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A forearm swept by its elbow and then by walking, as the paper has both."""
+    """A forearm swept by its elbow and then by walking, as in the paper."""
 
     t_ns: int
     limb: str
     elbow_m: Floats  #: (3,) world
     wrist_m: Floats  #: (3,) where it is
-    arc_m: Floats  #: (n, 3) where elbow angles in the reachable interval bring the wrist, from end to end
-    apexes_m: Floats  #: (k, 3) of the triangles around that arc
+    arc_m: Floats  #: (n, 3) positions of the wrist over the reachable interval of the elbow angle
+    apexes_m: Floats  #: (k, 3) corners of the triangles around that arc
     box_m: Floats  #: (2, 2) lower and upper displacement in x and y
 
 
@@ -70,7 +70,7 @@ class Growth:
 
 
 def walking(walk: Walk, t0_ns: int) -> Figure:
-    """Fig. 5: the circular sectors that a unicycle reaches (dashed), and the convex sets in their place (solid)."""
+    """Fig. 5: draws the circular sectors that a unicycle reaches (dashed), and the convex sets used (solid)."""
     figure = drawing.column_figure(2.7)
     ((ax,),) = drawing.column_panels(figure, bottom_in=0.64)
     beta = np.linspace(*walk.turn_rad, 60) + walk.heading_rad
@@ -106,7 +106,7 @@ def walking(walk: Walk, t0_ns: int) -> Figure:
 
 
 def sweeps(sweep: Sweep, t0_ns: int) -> Figure:
-    """Fig. 7, Fig. 8: a forearm displaced by walking, from above; and turned by the elbow, in its plane."""
+    """Fig. 7, Fig. 8: draws a forearm displaced by walking, from above, and turned by the elbow, in its plane."""
     figure = drawing.column_figure(2.35)
     (ax, turn), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.62, gap_in=(0.0, 0.5))
     swept = np.vstack([sweep.elbow_m, sweep.arc_m[[0, -1]], sweep.apexes_m])
@@ -138,7 +138,7 @@ def sweeps(sweep: Sweep, t0_ns: int) -> Figure:
 
 
 def _draw_turn(ax: Axes, sweep: Sweep) -> None:
-    """Fig. 8: the forearm at angles of the elbow's interval, their arc, its triangles and the hull of all corners."""
+    """Fig. 8: draws the forearm over the elbow's interval, the arc, its triangles and the hull of all corners."""
     wrists = sweep.arc_m - sweep.elbow_m
     along = wrists[len(wrists) // 2]
     along = along / np.linalg.norm(along)
@@ -162,7 +162,7 @@ def _draw_turn(ax: Axes, sweep: Sweep) -> None:
 
 
 def hull_of(points: Floats) -> Floats:
-    """(k, 2) corners of a flat hull in order; the points themselves where they have none."""
+    """Returns (k, 2) corners of a flat hull in order; the points themselves if they have no hull."""
     try:
         return np.asarray(points[ConvexHull(points).vertices])
     except (QhullError, ValueError):
@@ -170,7 +170,7 @@ def hull_of(points: Floats) -> Floats:
 
 
 def stored_at(occupancy: pd.DataFrame, t_ns: int) -> tuple[pd.DataFrame, Limbs]:
-    """The volumes that were stored last at or before an instant, else the first; their rows, and the same as Limbs."""
+    """Returns the volumes stored last at or before an instant, else the first: their rows, and the same as Limbs."""
     stored = np.unique(times(occupancy))
     at_ns = stored[max(0, int(np.searchsorted(stored, t_ns, side="right")) - 1)]
     rows = occupancy[times(occupancy) == at_ns]
@@ -182,12 +182,12 @@ def stored_at(occupancy: pd.DataFrame, t_ns: int) -> tuple[pd.DataFrame, Limbs]:
 
 
 def volumes_at(occupancy: pd.DataFrame, state: pd.DataFrame, moment_ns: int, t0_ns: int) -> Figure:
-    """Fig. 9: the swept volumes as the run used them, at one instant, from before the person and from above.
+    """Fig. 9: draws the swept volumes that the run used at one instant, from the front of the person and from above.
 
     Args:
         occupancy: Rows of occupancy.parquet.
         state: The fused person.
-        moment_ns: About when; the volumes stored last before are drawn [ns].
+        moment_ns: Approximate instant; the volumes stored last before it are drawn [ns].
         t0_ns: Start of the run [ns].
     """
     rows, limbs = stored_at(occupancy, moment_ns)
@@ -209,10 +209,10 @@ def volumes_at(occupancy: pd.DataFrame, state: pd.DataFrame, moment_ns: int, t0_
 
 
 def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Figure:
-    """Fig. 17: the person's swept volumes, a row a method, a column an instant, all to one scale.
+    """Fig. 17: draws the person's swept volumes, one row per method, one column per instant, with one scale.
 
     Args:
-        instants: What to draw, in order of time.
+        instants: Instants to draw, in order of time.
         state: The fused person, for the skeleton and the viewpoint.
         t0_ns: Start of the run [ns].
     """
@@ -229,7 +229,7 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
         ]
         for method in methods
     }
-    boxes = [bounds_of(edges, 0.04) for edges in outlines.values()]  # one scale, but no row taller than it need be
+    boxes = [bounds_of(edges, 0.04) for edges in outlines.values()]  # one scale, and the minimum height of each row
     left, right = min(low[0] for low, _ in boxes), max(high[0] for _, high in boxes)
     wide_in = (drawing.COLUMN_IN - 0.22) / len(instants)
     tall_in = [max(0.5, float(high[1] - low[1]) * wide_in / float(right - left)) for low, high in boxes]
@@ -261,14 +261,14 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
 
 
 def skeleton_at(state: pd.DataFrame, t_ns: int) -> tuple[Floats, float]:
-    """(20, 3) points of the fused person at the tick nearest to an instant, world [m], and the heading [rad]."""
+    """Returns (20, 3) points of the fused person at the tick nearest to an instant [m], and the heading [rad]."""
     row = state.iloc[[int(np.argmin(np.abs(times(state) - t_ns)))]]
     p = columns(row)
     return skeleton(p, row[list(LENGTHS)].to_numpy(dtype=float))[0], float(p[0, JOINTS.index("theta")])
 
 
 def _draw_person(ax: Axes, limbs: Limbs, points: Floats, view: View, centre: Floats) -> None:
-    """Volumes, half transparent, with the skeleton in them; ``centre`` is where the axes' origin is in the view."""
+    """Draws half-transparent volumes with the skeleton; ``centre`` is the position of the axes' origin in the view."""
     moved = centre @ np.stack([view.right, view.up])
     draw_solids(ax, volume_solids(limbs, moved), view, opacity=0.8, line=0.45)
     _draw_bones(ax, points, view, centre)
@@ -292,7 +292,7 @@ def _limb_legend(figure: Figure, drawn: Mapping[str, object] | set[str]) -> None
 
 
 def _scale_bar(ax: Axes, right: float, low: float) -> None:
-    """Half a metre at the lower edge of axes, its words below."""
+    """Draws a scale bar of half a metre at the lower edge of axes, with its label below."""
     ax.plot([right - 0.5, right], [low, low], color=drawing.INK, lw=1.2, solid_capstyle="butt", clip_on=False)
     words: dict[str, Any] = {
         "xytext": (0, -2),
@@ -309,10 +309,10 @@ def _at(t_ns: int, t0_ns: int) -> str:
 
 
 def growth(found: Growth, occupancy: pd.DataFrame | None, t0_ns: int) -> Figure:
-    """The six limbs' volumes against the horizon: by each method at one instant, and as the run used them (dots).
+    """Draws the six limbs' volumes against the horizon: by each method at one instant, and as used (dots).
 
     Args:
-        found: What to draw.
+        found: Data to draw.
         occupancy: Rows of occupancy.parquet; None: no dots.
         t0_ns: Start of the run [ns].
     """
@@ -342,7 +342,7 @@ def growth(found: Growth, occupancy: pd.DataFrame | None, t0_ns: int) -> Figure:
 
 
 def stored_sums(occupancy: pd.DataFrame) -> tuple[Floats, Floats]:
-    """(n,) horizon [s] and (n,) volume of the six limbs added up [m^3] of every stored instant that has all six."""
+    """Returns (n,) horizon [s] and (n,) total volume of the six limbs [m^3] at every stored instant with all six."""
     six = occupancy[occupancy["limb"].isin(LIMBS)]
     by_tick = six.groupby("t_ns", sort=True)
     count = by_tick["volume_m3"].count().to_numpy()

@@ -26,34 +26,34 @@ from hrcreplay.reporting.metrics.series import thin_path
 
 @dataclass(frozen=True)
 class RenderedHull:
-    """A convex hull grown by a ball, and the colour to paint it in."""
+    """A convex hull extended by a ball, and its colour."""
 
     vertices_m: Floats  #: (m, 3) world [m]
     radius_m: float
     colour: tuple[float, float, float]
-    floor_m: float = -math.inf  #: what is below this height is not there [m]
+    floor_m: float = -math.inf  #: the part below this height is removed [m]
 
     @cached_property
     def surface(self) -> tuple[Floats, Ints]:
-        """The hull with balls of few corners, as ``hull`` gives it; empty where it is not known."""
-        return self._grown(_sphere(64 if len(self.vertices_m) <= _FEW else 32))  # a polytope hides most of each ball
+        """The hull with coarse balls, in the form of ``hull``; empty if unknown."""
+        return self._grown(_sphere(64 if len(self.vertices_m) <= _FEW else 32))  # mostly hidden inside the polytope
 
     def outline(self, view: View) -> Floats:
-        """(k, 2) its outline in a view, exact but for the circle's 36 corners [m]; empty without a hull."""
+        """(k, 2) outline in a view, exact except for the 36 corners of circles [m]; empty without a hull."""
         if not np.isfinite(self.vertices_m).all():
             return np.zeros((0, 2))
         angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
         circle = np.column_stack([np.cos(angle), np.sin(angle)])
         cloud = (view.flat(self.vertices_m)[:, None, :] + self.radius_m * circle).reshape(-1, 2)
-        if self.vertices_m[:, 2].min() - self.radius_m < self.floor_m:  # its edge on the floor may be outermost
+        if self.vertices_m[:, 2].min() - self.radius_m < self.floor_m:  # the edge on the floor may be the outermost one
             cloud = view.flat(self._grown(np.concatenate([circle @ [view.right, view.up], _sphere(64)]))[0])
         try:
             return np.asarray(cloud[ConvexHull(cloud).vertices])
-        except (QhullError, ValueError):  # flat, or nothing
+        except (QhullError, ValueError):  # flat or empty
             return np.zeros((0, 2))
 
     def _grown(self, ball: Floats) -> tuple[Floats, Ints]:
-        """The hull of the vertices with points of the unit ball (k, 3) around each, above the floor."""
+        """Returns the hull of the vertices with points of the unit ball (k, 3) around each, above the floor."""
         if not np.isfinite(self.vertices_m).all():
             return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
         corners, faces = hull((self.vertices_m[:, None, :] + self.radius_m * ball).reshape(-1, 3))
@@ -69,12 +69,12 @@ class View:
     toward: Floats
 
     def flat(self, points_m: Floats) -> Floats:
-        """(n, 2) of (n, 3) world points [m]."""
+        """Projects (n, 3) world points to (n, 2) [m]."""
         return multiply(np.asarray(points_m, dtype=float).reshape(-1, 3), np.column_stack([self.right, self.up]))
 
 
 def view_from(azimuth_rad: float, elevation_rad: float) -> View:
-    """The view of someone who looks at the origin from there; z stays up on the page."""
+    """Returns the view of the origin from a direction; z points up on the page."""
     ca, sa, ce, se = (turn(angle) for angle in (azimuth_rad, elevation_rad) for turn in (math.cos, math.sin))
     return View(
         right=np.array([-sa, ca, 0.0]), up=np.array([-se * ca, -se * sa, ce]), toward=np.array([ce * ca, ce * sa, se])
@@ -84,9 +84,9 @@ def view_from(azimuth_rad: float, elevation_rad: float) -> View:
 #: From above, x to the right.
 ABOVE = View(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 1.0, 0.0]), toward=np.array([0.0, 0.0, 1.0]))
 
-#: Dots an inch of solids in a figure.
+#: Resolution of solids in a figure [dpi].
 SOLIDS_DPI = 200
-#: A hull of no more vertices gets rounder corners.
+#: Maximum number of vertices of a hull that gets rounder corners.
 _FEW = 8
 
 
@@ -98,11 +98,11 @@ def _sphere(count: int) -> Floats:
 
 
 def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: Floats, pixel_m: float) -> Floats:
-    """Render solids that may intersect: each pixel shows the frontmost surface, lit from above.
+    """Renders solids that may intersect: each pixel shows the frontmost surface, lit from above.
 
     Args:
         solids: Hulls with their balls and colours.
-        view: From where.
+        view: The view.
         low: (2,) lower left corner of the picture in the view [m].
         high: (2,) upper right corner [m].
         pixel_m: Edge of a pixel [m].
@@ -138,14 +138,14 @@ def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: 
 def draw_solids(
     ax: Axes, solids: Sequence[RenderedHull], view: View, *, opacity: float = 1.0, line: float = 0.7
 ) -> None:
-    """Draws solids as a viewer sees them, each with a thin line around it, on axes whose window is set.
+    """Draws solids in a view, each with a thin outline, on axes whose window is set.
 
     Args:
-        ax: To draw on.
+        ax: Axes to draw on.
         solids: Hulls with their balls and colours.
-        view: From where.
-        opacity: Of what is seen, in [0, 1].
-        line: Opacity of the lines, which also show what is hidden.
+        view: The view.
+        opacity: Opacity of the surfaces, in [0, 1].
+        line: Opacity of the outlines, which also show hidden solids.
     """
     edges = [solid.outline(view) for solid in solids]
     if not any(len(edge) for edge in edges):
@@ -169,7 +169,7 @@ def volume_solids(limbs: Mapping[str, SweptVolume], moved_m: Floats | None = Non
 
     Args:
         limbs: What to draw.
-        moved_m: (3,) place of the drawing's origin in the world; None where that is the same [m].
+        moved_m: (3,) position of the drawing's origin in the world; None: the world's origin [m].
     """
     origin = np.zeros(3) if moved_m is None else moved_m
     return [
@@ -190,7 +190,7 @@ def draw_outlines(ax: Axes, limbs: Mapping[str, SweptVolume], view: View) -> Non
 
 
 def bounds_of(edges: Sequence[Floats], margin_m: float) -> tuple[Floats, Floats]:
-    """Corners (2,) of the box around flat points (k, 2), with a margin [m]; those that are not known are left out."""
+    """Returns the corners (2,) of the box around points (k, 2), with a margin [m]; unknown points are left out."""
     corners = np.vstack([np.zeros((0, 2)), *edges])
     corners = corners[np.isfinite(corners).all(axis=1)]
     if not len(corners):
@@ -199,7 +199,7 @@ def bounds_of(edges: Sequence[Floats], margin_m: float) -> tuple[Floats, Floats]
 
 
 def bones(points_m: Floats, view: View) -> list[Floats]:
-    """Each (2, 2): the lines of a (20, 3) skeleton in a view [m]; those with a missing end are left out."""
+    """Returns the lines (2, 2) of a (20, 3) skeleton in a view [m]; lines with a missing end are left out."""
     ends = [points_m[[POINTS.index(a), POINTS.index(b)]] for a, b in drawing.BONES]
     return [view.flat(pair) for pair in ends if np.isfinite(pair).all()]
 
@@ -221,8 +221,8 @@ class LinkPose:
     """The robot's capsules at one tick, and the swept volumes of that tick."""
 
     t_ns: int
-    distance_m: float  #: surface to surface, NaN where it is not known [m]
-    bodies: tuple[str, ...]  #: link that each of the s capsules belongs to
+    distance_m: float  #: distance between surfaces, NaN if unknown [m]
+    bodies: tuple[str, ...]  #: link of each of the s capsules
     ends_m: Floats  #: (s, 2, 3) world [m]
     radius_m: Floats  #: (s,) [m]
     volumes: Mapping[str, SweptVolume]  #: by limb
@@ -230,32 +230,32 @@ class LinkPose:
 
 @dataclass(frozen=True)
 class StoryScene:
-    """One programmed instant, as the robot passed it alone and beside the person."""
+    """One programmed instant, as the robot passed it alone and near the person."""
 
     programme_s: float
-    t_ns: tuple[int, int]  #: when it did: alone, beside the person
+    t_ns: tuple[int, int]  #: times of passing: alone, near the person
     ends_m: tuple[Floats, Floats]  #: (s, 2, 3) each: capsules of the links, world
-    tcp_m: tuple[Floats, Floats]  #: (n, 3) each: way of the TCP until then, world
+    tcp_m: tuple[Floats, Floats]  #: (n, 3) each: path of the TCP until then, world
     points_m: Floats  #: (20, 3) the fused person
     volumes: Mapping[str, SweptVolume]  #: of the person, by limb
 
 
 @dataclass(frozen=True)
 class Storyboard:
-    """The same stretch of the programme without and with the person."""
+    """The same part of the programme without and with the person."""
 
     scenes: Sequence[StoryScene]
-    radius_m: Floats  #: (s,) of the links' capsules
+    radius_m: Floats  #: (s,) radii of the links' capsules
     base_m: Floats  #: (3,)
-    reference_m: Floats  #: (n, 3) programmed way of the TCP over that stretch
+    reference_m: Floats  #: (n, 3) programmed path of the TCP in that part
     method: str
 
 
 def storyboard(story: Storyboard, t0_ns: int) -> Figure:
-    """Fig. 15, Fig. 16: rows of the same programmed instant, on the left without the person, on the right with.
+    """Fig. 15, Fig. 16: draws rows of the same programmed instant, on the left without the person, on the right with.
 
     Args:
-        story: What to draw.
+        story: Storyboard to draw.
         t0_ns: Start of the run [ns].
     """
     person = np.mean([v.mean(axis=0) for scene in story.scenes for v, _ in scene.volumes.values()], axis=0)
@@ -264,7 +264,7 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
     bodies = [solid.outline(view) for scene in story.scenes for solid in volume_solids(scene.volumes)]
     low, high = bounds_of([*arms, *bodies], 0.02)
     robot_low = bounds_of(arms, 0.02)[0]
-    low[1] = max(low[1], min(robot_low[1], float(view.flat(story.base_m[None])[0, 1]) - 0.05))  # legs say nothing here
+    low[1] = max(low[1], min(robot_low[1], float(view.flat(story.base_m[None])[0, 1]) - 0.05))  # legs are not needed
     wide_in = (drawing.COLUMN_IN - 0.1) / 2
     tall_in = wide_in * float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.5, 1.2))
     count = len(story.scenes)
@@ -298,7 +298,7 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
 
 
 def _robot(ends_m: Floats, story: Storyboard) -> list[RenderedHull]:
-    """The robot's links, by the ends (s, 2, 3) of their axes [m]."""
+    """Draws the robot's links, from the ends (s, 2, 3) of their axes [m]."""
     return [RenderedHull(e, float(r), to_rgb(drawing.SKY)) for e, r in zip(ends_m, story.radius_m, strict=True)]
 
 
@@ -317,15 +317,15 @@ def _draw_scene(ax: Axes, scene: StoryScene, side: int, story: Storyboard, view:
 
 
 def _beside(person_m: Floats, base_m: Floats) -> float:
-    """The azimuth of who sees robot and person side by side [rad]."""
+    """Returns the azimuth of a view with robot and person side by side [rad]."""
     return float(np.arctan2(person_m[1] - base_m[1], person_m[0] - base_m[0]) - 0.5 * np.pi)
 
 
 def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
-    """The capsules from the side, with the person to one hand, and from above; the swept volumes in outline.
+    """Draws the capsules from the side and from above, with outlines of the swept volumes.
 
     Args:
-        pose: What to draw.
+        pose: Capsules and volumes to draw.
         t0_ns: Start of the run [ns].
         T_world_base: (4, 4) robot base in the world [m].
     """

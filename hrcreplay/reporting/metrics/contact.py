@@ -1,4 +1,4 @@
-"""Metrics of contact with the recorded body, of what the robot was certified for, of why it stood, and the events.
+"""Metrics of contact with the recorded body, of certificates, of reasons for standing, and the events.
 
 An event is a full stop of a method, or a contact of its moving robot with the recorded body.
 """
@@ -17,14 +17,14 @@ from hrcreplay.reporting.metrics.series import MetricTable, durations_s, times, 
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
 
-#: Where the recorded person is from, as contact.parquet has it, and that in words.
+#: Source of the recorded person, as in contact.parquet, and in words.
 PERSONS = {
     "ground truth": "the ground truth of the log",
     "camera points": "the points of every camera and the smoothed person, of which the nearest counts",
     "smoothed estimate": "the smoothed person",
 }
 _NOT_COMPARED = "the run has no table of contact"
-#: What must be known of a recorded person, and the parts of the body that show it.
+#: Limbs that must be known of a recorded person, and the parts of the body that show them.
 SHOWN_PARTS = {
     "legs": ("THIGH_R", "SHANK_R", "THIGH_L", "SHANK_L"),
     "arms": ("URA", "LRA", "ULA", "LLA"),
@@ -34,7 +34,7 @@ SHOWN_PARTS = {
 
 
 def method_prefixes(run: Run) -> dict[str, str]:
-    """Method -> prefix of its metrics; the run's own first, the programme run blind last."""
+    """Method -> prefix of its metrics; the run's own first, ``none`` last."""
     own = str(setting(run.meta.get("settings", {}), "plan", "method"))
     return {
         own: "plan",
@@ -43,19 +43,19 @@ def method_prefixes(run: Run) -> dict[str, str]:
 
 
 def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
-    """Contact of robot and recorded body, and the certificates, of the plan and every baseline.
+    """Adds contact of robot and recorded body, and the certificates, for the plan and every baseline.
 
     Args:
         metrics: Table that the metrics are added to.
         run: The run's tables.
-        slow_m_per_s: A TCP slower than this stands, where no joint turns [m/s].
+        slow_m_per_s: A TCP slower than this counts as stationary if no joint turns [m/s].
     """
     person = None if run.contact is None or not len(run.contact) else str(run.contact["person"].iloc[0])
     metrics.add(
         "contact_person",
         person,
         "name",
-        "where the person is from with whom the robot was compared: the log's ground truth; else the points of every "
+        "source of the recorded person: the log's ground truth; else the points of every "
         "camera and the fused person smoothed over the whole run; else the latter alone",
         reason=_NOT_COMPARED,
     )
@@ -76,13 +76,13 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
 
 
 def _add_people(metrics: MetricTable, run: Run) -> None:
-    """Number of people, limbs of the person that were shown, and missing part of a recorded robot."""
+    """Adds the number of people, the limbs of the person that were seen, and the missing part of a recorded robot."""
     frames = run.counts.get("person_frames_beside_others", 0)
     metrics.add(
         "others_frames",
         frames,
         "1",
-        "frames with at least one body that is not the person: asked for contact, neither planned for nor predicted",
+        "frames with at least one body that is not the person: checked for contact, neither planned for nor predicted",
     )
     metrics.add(
         "programme_gaps_s",
@@ -104,7 +104,7 @@ def _add_people(metrics: MetricTable, run: Run) -> None:
 
 
 def _is_whole(body: pd.DataFrame, part: str) -> Bools:
-    """(n,) whether both ends of a part are known; one that is known at one end alone stands there as a ball."""
+    """(n,) True if both ends of a part are known; a part with one known end is a ball."""
     if f"{part}_0_x" not in body:
         return np.zeros(len(body), dtype=np.bool_)
     first, second = ([numeric_column(body, f"{part}_{end}_{axis}") for axis in "xyz"] for end in (0, 1))
@@ -113,7 +113,7 @@ def _is_whole(body: pd.DataFrame, part: str) -> Bools:
 
 
 def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
-    """Full stops, ticks without a certificate, horizons, and why the robot stood without braking."""
+    """Adds full stops, ticks without a certificate, horizons, and reasons for standing without braking."""
     status, moving = motion["status"].astype(str).to_numpy(), is_moving(motion, slow)
     stops = (status == "braking") & moving
     metrics.add(
@@ -129,9 +129,9 @@ def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: st
         f"{prefix}_uncertified_moving_ticks",
         count,
         "1",
-        f"ticks of {what} with the robot moving without a certificate that its step and the stop after it are clear of "
-        "all that the person was predicted to reach until then",
-        reason="the table of motion does not say",
+        f"ticks of {what} with the robot moving without a certificate that its step and the stop after it are clear "
+        "of the space that the person was predicted to reach until then",
+        reason="the table of motion does not contain it",
     )
     for kind, number in (("median", np.median), ("max", np.max)):
         horizon = numeric_column(motion, "horizon_s") if "horizon_s" in motion else np.zeros(0)
@@ -140,8 +140,8 @@ def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: st
             f"{prefix}_horizon_{kind}_s",
             float(number(horizon)) if len(horizon) else None,
             "s",
-            f"{kind} over all ticks of {what}: how far ahead the person was predicted",
-            reason="the table of motion does not say",
+            f"{kind} over all ticks of {what}: horizon of the prediction",
+            reason="the table of motion does not contain it",
         )
     reasons = motion["reason"].fillna("").astype(str).to_numpy()
     for reason in sorted(set(reasons[status != "braking"]) - {""}):
@@ -156,7 +156,7 @@ def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: st
 
 
 def _add_touch(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str) -> None:
-    """Number, duration and speed of the robot's contacts."""
+    """Adds number, duration and speed of the robot's contacts."""
     distance, moving = numeric_column(rows, "distance_m"), rows["moving"].to_numpy(dtype=bool)
     person, other = (numeric_column(rows, f"{who}_m") for who in ("person", "other"))
     known = np.isfinite(distance)
@@ -206,7 +206,7 @@ def _add_touch(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str)
 
 
 def _add_nearest(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str) -> None:
-    """The smallest distance while moving and at rest, and what was there."""
+    """Adds the smallest distance while moving and at rest, and its link and body part."""
     distance, moving = numeric_column(rows, "distance_m"), rows["moving"].to_numpy(dtype=bool)
     for name, which, state in (("moving", moving, "moving"), ("rest", ~moving, "at rest")):
         k = _least(distance, which)
@@ -232,13 +232,13 @@ def _add_nearest(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: st
 
 
 def _least(distance: Floats, which: Bools) -> int | None:
-    """The row with the smallest known distance among some; None without one."""
+    """Returns the row with the smallest known distance among some; None without one."""
     known = which & np.isfinite(distance)
     return int(np.argmin(np.where(known, distance, np.inf))) if known.any() else None
 
 
 def retreats(motion: pd.DataFrame, t_ns: Ints) -> Bools:
-    """Mark the ticks (n,) at which the motion was a retreat, or the stop of one."""
+    """Marks the ticks (n,) at which the motion was a retreat, or the stop of one."""
     decided = deciding_rows(motion)[np.searchsorted(times(motion), t_ns)]
     return np.asarray((decided >= 0) & (motion["status"].astype(str).to_numpy()[decided] == "retreating"))
 
@@ -246,7 +246,7 @@ def retreats(motion: pd.DataFrame, t_ns: Ints) -> Bools:
 def _add_faults(
     metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str, motion: pd.DataFrame, *, blind: bool
 ) -> None:
-    """Of the contacts while moving: was the person where the prediction said?"""
+    """Classifies the contacts while moving: inside or outside the predicted volumes."""
     touch = (numeric_column(rows, "person_m") <= 0.0) & rows["moving"].to_numpy(dtype=bool)
     outside, retreat = numeric_column(rows, "outside_m")[touch], retreats(motion, times(rows)[touch])
     inside = outside <= 0.0
@@ -254,27 +254,27 @@ def _add_faults(
         (
             "inside",
             inside & ~retreat,
-            "inside the volume by which the motion was certified: the robot is at fault",
+            "inside the volume used to certify the motion: the fault lies with the controller",
         ),
         (
             "retreating",
             inside & retreat,
-            "inside a volume that the robot was moving out of, so that the person came after it",
+            "inside a volume that the robot was moving out of: the person approached it",
         ),
-        ("outside", outside > 0.0, "outside the volume by which the motion was certified: the prediction is at fault"),
-        ("unpredicted", ~np.isfinite(outside), "without a volume by which the motion was certified"),
+        ("outside", outside > 0.0, "outside the volume used to certify the motion: the fault lies with the prediction"),
+        ("unpredicted", ~np.isfinite(outside), "without a volume used to certify the motion"),
     ):
         metrics.add(
             f"{prefix}_touch_{name}_ticks",
             None if blind else int(which.sum()),
             "1",
             f"ticks of {what} with a moving link in contact with a part of the person that was {meaning}",
-            reason="the programme run blind heeds no volumes",
+            reason="the programme without reaction uses no volumes",
         )
 
 
 def _add_left(metrics: MetricTable, contact: pd.DataFrame) -> None:
-    """Number of times the person left the volumes before their horizon, and before the braking time."""
+    """Adds the number of times the person left the volumes before their horizon, and before the braking time."""
     until = {"volumes": ("left", "the tick's horizon"), "volumes_full": ("left_full", "the braking time T_s")}
     for prefix, (column, end) in until.items():
         left = contact[np.isfinite(numeric_column(contact, f"{column}_m"))]
@@ -292,14 +292,14 @@ def _add_left(metrics: MetricTable, contact: pd.DataFrame) -> None:
             f"{prefix}_left_ticks",
             int((out > 0.0).sum()) if len(left) else None,
             "1",
-            "of those, ticks with a recorded point of a limb, the limb's radius about it, outside the limb's volume",
+            "of those, ticks with a recorded point of a limb, limb radius included, outside the limb's volume",
             reason=reason,
         )
         metrics.add(
             f"{prefix}_held_share",
             float((out <= 0.0).mean()) if len(left) else None,
             "1",
-            "share of those ticks at which every limb that was seen stayed whole inside its volume, as audit counts",
+            "share of those ticks at which every limb that was seen stayed entirely inside its volume, as in audit",
             reason=reason,
         )
         never = "no limb left its volume" if len(left) else reason
@@ -307,7 +307,7 @@ def _add_left(metrics: MetricTable, contact: pd.DataFrame) -> None:
             f"{prefix}_left_max_m",
             float(out.max()) if len(left) and out.max() > 0.0 else None,
             "m",
-            "how far at most a limb was outside",
+            "maximum distance of a limb outside",
             reason=never,
         )
         limbs = left[f"{column}_limb"][out > 0.0].astype(str).value_counts()
@@ -316,12 +316,12 @@ def _add_left(metrics: MetricTable, contact: pd.DataFrame) -> None:
             f"{prefix}_left_limbs",
             found or None,
             "name",
-            "the limb that was furthest outside, and at how many of these ticks",
+            "the limb that was furthest outside, and its number of these ticks",
             reason=never,
         )
 
 
-#: Two events of one kind that are nearer to each other are one [s].
+#: Two events of one kind with a shorter gap are merged [s].
 _MERGED_S = 0.2
 
 
@@ -331,10 +331,10 @@ class StopEvent:
 
     kind: str  #: "stop" or "touch"
     at_s: float  #: by the report's clock [s]
-    moving_s: float  #: braking with the robot still moving, or moving in contact [s]
-    rest_s: float  #: at rest after a stop, before it moved again [s]
-    speed_m_per_s: float  #: of the TCP where a stop began; the fastest contact
-    distance_m: float  #: to the volumes where a stop began; to the body, deepest, in a contact; NaN: not known [m]
+    moving_s: float  #: duration of braking with the robot still moving, or of moving in contact [s]
+    rest_s: float  #: time at rest after a stop, before it moved again [s]
+    speed_m_per_s: float  #: speed of the TCP at the start of a stop; maximum speed of a contact
+    distance_m: float  #: from the volumes at the start of a stop; minimum from the body in a contact; NaN: unknown [m]
     link: str
     limb: str
     reason: str
@@ -343,13 +343,13 @@ class StopEvent:
 def stop_events(
     motion: pd.DataFrame, contact: pd.DataFrame | None, t0_ns: int, slow_m_per_s: float
 ) -> tuple[StopEvent, ...]:
-    """The events of a method, in order of time.
+    """Returns the events of a method, in order of time.
 
     Args:
         motion: The method's table.
         contact: Its rows of contact.parquet; None without a comparison.
         t0_ns: Instant of time zero [ns].
-        slow_m_per_s: A TCP slower than this stands, where no joint turns [m/s].
+        slow_m_per_s: A TCP slower than this counts as stationary if no joint turns [m/s].
     """
     found = _stops(motion, t0_ns, slow_m_per_s)
     if contact is not None and len(contact):
@@ -409,7 +409,7 @@ def _touches(contact: pd.DataFrame, t0_ns: int) -> list[StopEvent]:
 
 
 def _merged(mask: Bools, t_ns: Ints) -> list[tuple[int, int]]:
-    """Runs of true as (first, past the last), short breaks between them left out."""
+    """Returns runs of True as (first, past the last), without short gaps between them."""
     found: list[tuple[int, int]] = []
     for first, last in true_runs(mask).tolist():
         if found and t_ns[first] - t_ns[found[-1][1] - 1] <= _MERGED_S * 1e9:

@@ -1,7 +1,7 @@
-"""Metrics of the input data, of which limbs the cameras measured, of the fused state, and of the swept volumes.
+"""Metrics of the input data, of the limbs that the cameras measured, of the fused state, and of the swept volumes.
 
-The fused state is compared with ground truth. An unmeasured limb is where the model supposes it, so a reader has to
-know for how much of the time that was.
+The fused state is compared with ground truth. The position of an unmeasured limb is an assumption of the model, so a
+reader needs its share of the time.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def cameras(run: Run) -> list[str]:
 
 
 def add_quality(metrics: MetricTable, run: Run, gap_s: float) -> None:
-    """Frames, rates and gaps of each camera, what the filter could use of them, and every counter of the reader."""
+    """Adds frames, rates and gaps of each camera, their use by the filter, and every counter of the reader."""
     _add_span(metrics, run)
     for camera in cameras(run):
         _add_frames(metrics, run.measurements, camera, gap_s)
@@ -77,7 +77,7 @@ def _add_frames(metrics: MetricTable, measurements: pd.DataFrame | None, camera:
         longest = float(steps.max()) if len(steps) else None
         reason = "fewer than two frames"
     name = f"camera_{camera}"
-    metrics.add(f"{name}_frames", frames, "1", f"frames of {camera} that hold the person", reason=reason)
+    metrics.add(f"{name}_frames", frames, "1", f"frames of {camera} that contain the person", reason=reason)
     metrics.add(f"{name}_rate_hz", rate, "Hz", f"1 / median time between captures of {camera}", reason=reason)
     metrics.add(f"{name}_gaps", gaps, "1", f"times between captures of {camera} over {gap_s:g} s", reason=reason)
     metrics.add(f"{name}_gap_max_s", longest, "s", f"longest time between captures of {camera}", reason=reason)
@@ -108,10 +108,10 @@ def _add_validity(metrics: MetricTable, state: pd.DataFrame | None, camera: str,
 def _add_heights(metrics: MetricTable, bodies: pd.DataFrame | None, camera: str) -> None:
     found = None if bodies is None else bodies[bodies["camera"] == camera]
     texts = {
-        "floor_m": "how far the person's lowest foot is above the floor z = 0",
+        "floor_m": "height of the person's lowest foot above the floor z = 0",
         "floor_p95_m": "distance of the person's lowest foot from the floor z = 0, 95th percentile",
-        "head_m": "the person's head above the floor, upright",
-        "bones_m": "the person's bones from floor to head added up, upright",
+        "head_m": "height of the person's head above the floor, upright",
+        "bones_m": "sum of the person's bone lengths from floor to head, upright",
     }
     for name, text in texts.items():
         value = None if found is None or found.empty else float(found[name].iloc[0])
@@ -121,7 +121,7 @@ def _add_heights(metrics: MetricTable, bodies: pd.DataFrame | None, camera: str)
 
 
 def add_agreement(metrics: MetricTable, agreement: pd.DataFrame | None) -> None:
-    """Distance between the views of any two cameras of each limb of BODY at the same instants."""
+    """Adds the distance between the views of any two cameras, for each limb of BODY at the same instants."""
     for limb in BODY:
         rows = None if agreement is None else agreement[agreement["limb"] == limb]
         for name, text in (("median_m", "median"), ("p95_m", "95th percentile")):
@@ -165,11 +165,11 @@ def _add_coverage(metrics: MetricTable, state: pd.DataFrame) -> None:
 
 
 def _add_known(metrics: MetricTable, state: pd.DataFrame, fresh_s: float | None) -> None:
-    """At how many of all ticks the person, and each limb, was known from frames that were fresh."""
+    """Adds the share of ticks at which the person, and each limb, was known from fresh frames."""
     known = fresh_s is not None and "frame_age_s" in state
     fresh = state["frame_age_s"].to_numpy(dtype=float) <= fresh_s if known else None
     longest = "fusion.fresh_s" if fresh_s is None else f"{fresh_s:g} s"
-    reason = "the run does not say how old its frames were"
+    reason = "the run does not contain the age of its frames"
     metrics.add(
         "person_known_share",
         None if fresh is None or not len(fresh) else float(fresh.mean()),
@@ -199,7 +199,7 @@ def _add_known(metrics: MetricTable, state: pd.DataFrame, fresh_s: float | None)
 
 
 def _add_watched(metrics: MetricTable, run: Run) -> None:
-    """Share of ticks at which the robot relied on the cell's word that nobody can be there whom no camera shows."""
+    """Adds the share of ticks at which the robot relied on the cell's claim of a completely watched area."""
     watched = (run.meta.get("cell") or {}).get("watched")
     fresh_s = run.meta.get("settings", {}).get("fusion", {}).get("fresh_s")
     state, share, refuting = run.state, None, None
@@ -219,15 +219,15 @@ def _add_watched(metrics: MetricTable, run: Run) -> None:
         "watched_frames_refuting",
         refuting,
         "1",
-        "frames that show somebody further inside the watched area than anybody could have walked since it was vacant",
+        "frames that show a person deeper inside the watched area than people can walk since it was vacant",
         reason=reason,
     )
     speed = None if watched is None else watched["speed_m_per_s"]
-    metrics.add("watched_speed_m_per_s", speed, "m/s", "speed at which people are taken to walk in", reason=reason)
+    metrics.add("watched_speed_m_per_s", speed, "m/s", "assumed speed of people who walk in", reason=reason)
 
 
 def add_occupancy(metrics: MetricTable, occupancy: pd.DataFrame | None) -> None:
-    """Mean swept volume per method and limb, and of all limbs of a tick together."""
+    """Adds the mean swept volume per method and limb, and the sum over all limbs of a tick."""
     if occupancy is None:
         metrics.add("occupancy_ticks", None, "1", "ticks with stored swept volumes", reason="not predicted")
         return
@@ -249,7 +249,7 @@ def add_occupancy(metrics: MetricTable, occupancy: pd.DataFrame | None) -> None:
             f"occupancy_{method}_sum_m3",
             float(total.mean()) if len(total) else None,
             "m^3",
-            f"mean over the stored ticks of the six limbs' swept volumes added up (overlaps count twice), '{method}'",
+            f"mean over the stored ticks of the sum of the six limbs' swept volumes (overlaps count twice), '{method}'",
         )
 
 
@@ -258,20 +258,20 @@ NO_TRUTH = "the log has no ground truth"
 
 @dataclass(frozen=True)
 class Errors:
-    """Estimate minus truth of one source, a row a tick or a frame; NaN where one of the two is missing."""
+    """Estimate minus truth of one source, one row per tick or frame; NaN if one of the two is missing."""
 
-    t_ns: Ints  #: (n,) when the position errors hold [ns]
+    t_ns: Ints  #: (n,) instants of the position errors [ns]
     position: Floats  #: (n, 13) [m, m, rad..., m]
-    velocity_t_ns: Ints  #: (k,) when the velocity errors hold [ns]
+    velocity_t_ns: Ints  #: (k,) instants of the velocity errors [ns]
     velocity: Floats  #: (k, 13) [m/s, m/s, rad/s...]
 
 
 def errors(run: Run, gap_s: float) -> dict[str, Errors]:
-    """Errors of ``fused`` at the ticks and of each camera at its captures; empty without ground truth.
+    """Computes errors of ``fused`` at the ticks and of each camera at its captures; empty without ground truth.
 
     The fused state is compared with the truth interpolated at the tick. A camera's raw angles are compared with the
     truth at the capture; their differences between consecutive captures over the time between, with the truth's
-    velocity half-way between the two, which is the kindest instant for a difference. Pairs further apart than
+    velocity half-way between the two, the instant of the smallest error of a difference. Pairs further apart than
     ``gap_s`` are left out. The truth's velocity is its central difference.
     """
     if run.truth is None or len(run.truth) < 3:
@@ -317,7 +317,7 @@ def median(error: Floats) -> float | None:
 
 
 def add_fusion(metrics: MetricTable, run: Run, gap_s: float) -> None:
-    """RMSE and median error per joint and pooled, and the fused state's share of the better camera's RMSE."""
+    """Adds RMSE and median error per joint and pooled, and the RMSE ratio of fused state and better camera."""
     found = errors(run, gap_s)
     sources = ["fused", *cameras(run)]
     for source in sources:
@@ -386,7 +386,7 @@ def _add_ratio(metrics: MetricTable, found: dict[str, Errors], kind: str, unit: 
 
 
 def _add_seen(metrics: MetricTable, run: Run, found: dict[str, Errors], kind: str, unit: str, gap_s: float) -> None:
-    """The same where cameras can be compared: they have no errors while they do not see the person, the filter has."""
+    """Adds the same at comparable ticks: cameras have no errors while they do not see the person, the filter has."""
     value = None
     if run.state is not None and "fused" in found:
         names = [name for name in run.state.columns if name.startswith("valid_")]
@@ -404,10 +404,11 @@ def _add_seen(metrics: MetricTable, run: Run, found: dict[str, Errors], kind: st
     )
 
 
-#: The tables and columns that this rests on.
+#: The required tables and columns.
 LIMB_COLUMNS = {"state": tuple(f"unseen_{limb}" for limb in LIMBS), "measurements": JOINTS}
 
-#: Joints that place a limb beside those that carry it; a part of an arm has been seen when one of its two has.
+#: Joints that determine a limb, without those that carry it; a part of an arm counts as seen if one of its two joints
+#: is.
 _OWN_JOINTS = {
     "HD": JOINTS[:4],
     "THX": JOINTS[:4],
@@ -419,15 +420,16 @@ _OWN_JOINTS = {
 
 
 def unmeasured_shares(unseen_s: Floats, memory_s: float) -> Floats:
-    """Per limb the share of the ticks with the person in view at which it had not been measured for too long.
+    """Computes, per limb, the share of the ticks with the person in view at which it counted as unmeasured.
 
     Args:
-        unseen_s: (n, 6) since the joints of LIMBS were last measured, as ``HumanStates`` has it; inf before [s].
+        unseen_s: (n, 6) time since the joints of LIMBS were last measured, as in ``HumanStates``; inf before the first
+            time [s].
         memory_s: A limb not measured for longer is lost [s].
 
     Returns:
-        (6,) in [0, 1]; exactly 1 for a limb that was never measured. NaN where nobody ever came into view: the person
-        is in view where any limb has been measured within the memory.
+        (6,) in [0, 1]; exactly 1 for a limb that was never measured. NaN without a person in view: the person is in
+        view if any limb has been measured within the memory.
     """
     lost: Bools = ~(unseen_s <= memory_s)
     in_view = ~lost.all(axis=1)
@@ -437,7 +439,7 @@ def unmeasured_shares(unseen_s: Floats, memory_s: float) -> Floats:
 
 
 def add_limbs(metrics: MetricTable, run: Run) -> None:
-    """Adds for how much of the time each limb was not measured, and which of its joints never were."""
+    """Adds the share of the time at which each limb was not measured, and its joints that never were."""
     names = list(LIMB_COLUMNS["state"])
     shares = np.full(len(LIMBS), np.nan)
     memory_s = float(setting(run.meta.get("settings", {}), "fusion", "memory_s"))
@@ -451,7 +453,7 @@ def add_limbs(metrics: MetricTable, run: Run) -> None:
             "1",
             f"share of the ticks with the person in view at which the {LIMB_NAMES[limb]} had not been measured for "
             f"{memory_s:g} s; 1: never",
-            reason="nobody came into view, or it was not fused",
+            reason="no person came into view, or the run was not fused",
         )
         metrics.add(
             f"limb_{limb}_joints_unmeasured",

@@ -1,9 +1,9 @@
 """Metrics of the robot's motion: separation, stops, path deviation, and progress along the programme.
 
-The reference may be ahead of the robot (by the leash, or without bound where it does not wait), so its time does not
-say how far the robot came. Progress is measured at the foot point of the TCP on the programmed path: the nearest point
-of the next section of the path, which never moves back and never passes the reference. The programmed time at the foot
-point is the time that the robot reached.
+The reference may be ahead of the robot (by plan.max_reference_lead_m, or without bound if it does not wait), so its
+time is not the progress of the robot. Progress is measured at the foot point of the TCP on the programmed path: the
+nearest point of the next section of the path, which never moves back and never passes the reference. The programmed
+time at the foot point is the time that the robot reached.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ import pandas as pd
 from hrcreplay.records import STATUSES, Bools, Floats, Ints
 from hrcreplay.reporting.metrics.series import MetricTable, durations_s, path_feet, times
 
-#: Less way than this is rounding [m].
+#: Shorter distances are rounding [m].
 _ROUNDING_M = 1e-9
-#: Where the programme stands, a TCP this near is there, and its standing counts [m].
+#: Distance of the TCP from a waypoint within which a dwell of the programme counts as reached [m].
 _THERE_M = 1e-3
-#: The foot is sought anew when the TCP has gone so far: a robot that waits costs no time [m].
+#: Motion of the TCP after which the foot is computed again; saves time for a waiting robot [m].
 _STEP_M = 1e-3
 
 
 @dataclass(frozen=True)
 class Programme:
-    """The programmed path as far as the reference went, without the points at which it stood."""
+    """The programmed path up to the last reference, without repeated points of a stationary reference."""
 
     points_m: Floats  #: (m, 3) world [m]
-    way_m: Floats  #: (m,) along the path from its first point [m]
-    from_s: Floats  #: (m,) programmed time of the arrival at a point [s]
-    until_s: Floats  #: (m,) and of the departure; later where the programme stands there [s]
+    way_m: Floats  #: (m,) distance along the path from its first point [m]
+    from_s: Floats  #: (m,) programmed time of arrival at a point [s]
+    until_s: Floats  #: (m,) programmed time of departure; later if the programme dwells there [s]
     at: Ints  #: (n,) the reference's point at each tick
 
 
 def programme(ref_m: Floats, programme_s: Floats) -> Programme:
-    """The path that references (n, 3) [m] of programmed times (n,) [s] went along; at least one row, all finite."""
+    """Makes the path from references (n, 3) [m] at programmed times (n,) [s]; at least one row, all finite."""
     steps = np.linalg.norm(np.diff(ref_m, axis=0), axis=1)
     moved = np.concatenate([[True], steps > _ROUNDING_M])
     first = np.flatnonzero(moved)
@@ -47,16 +47,16 @@ def programme(ref_m: Floats, programme_s: Floats) -> Programme:
 
 
 def foot(path: Programme, tcp_m: Floats, ahead_m: float) -> tuple[int, float]:
-    """Final position of a TCP along the path.
+    """Finds the final position of a TCP along the path.
 
     Args:
         path: The programmed path.
         tcp_m: (n, 3) the TCP at the ticks of ``path.at`` [m].
-        ahead_m: The foot is sought on the next so much of the way, so that it does not pass over a part of the
-            programme that was left out to where the path comes by again [m].
+        ahead_m: Length of the next section of the path that is searched, so that the foot does not jump over a part of
+            the programme to a later passage at the same place [m].
 
     Returns:
-        The point of the path that was passed last, and the share of the way to the next one.
+        The last passed point of the path, and the fraction of the distance to the next one.
     """
     passed, share, before = 0, 0.0, tcp_m[0].tolist()
     for tick, (here, reference) in enumerate(zip(tcp_m.tolist(), path.at.tolist(), strict=True), start=1):
@@ -78,7 +78,7 @@ def foot(path: Programme, tcp_m: Floats, ahead_m: float) -> tuple[int, float]:
 
 
 def reached_s(path: Programme, passed: int, share: float) -> float:
-    """Programmed time from the start to a foot [s]; exactly 0 for a robot that made no way."""
+    """Programmed time from the start to a foot [s]; exactly 0 for a robot without progress."""
     if passed + 1 == len(path.way_m):
         made_m, time_s = path.way_m[passed], path.until_s[passed]
     else:
@@ -91,11 +91,11 @@ def reached_s(path: Programme, passed: int, share: float) -> float:
 
 
 def programme_progress(motion: pd.DataFrame, ahead_m: float) -> tuple[float, float] | None:
-    """Programmed time that the robot reached, and the time that it had [s]; None where its programme only stands.
+    """Returns the programmed time that the robot reached, and the available time [s]; None for a stationary programme.
 
     Args:
         motion: A table of motion.
-        ahead_m: As for ``foot``: the leash [m].
+        ahead_m: As for ``foot``: plan.max_reference_lead_m [m].
     """
     names = ["programme_s", *(f"{what}_{axis}" for what in ("ref", "tcp") for axis in "xyz")]
     rows = motion[names].to_numpy(dtype=float)
@@ -124,20 +124,20 @@ PAPER = {
 
 
 def position_columns(motion: pd.DataFrame, what: str) -> Floats:
-    """(n, 3) ``ref`` or ``tcp`` positions, world [m]."""
+    """Returns (n, 3) ``ref`` or ``tcp`` positions, world [m]."""
     return motion[[f"{what}_x", f"{what}_y", f"{what}_z"]].to_numpy(dtype=float)
 
 
 def numeric_column(motion: pd.DataFrame, name: str) -> Floats:
-    """(n,) one column."""
+    """Returns one column (n,)."""
     return motion[name].to_numpy(dtype=float)
 
 
 def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -> tuple[Bools, Bools]:
-    """Mark the near ticks (separation at most ``near_m``), and all at which the robot stands though it should move.
+    """Marks the near ticks (separation at most ``near_m``), and all ticks at which the robot stands but should move.
 
-    It stands when the TCP is slower than ``stationary_m_per_s``. It should move when the reference is not, and when the
-    reference waits for the robot: at a waypoint it stands itself.
+    The robot stands if the TCP is slower than ``stationary_m_per_s``. It should move if the reference moves, or if the
+    reference waits for the robot: such a reference stands itself at a waypoint.
     """
     near = numeric_column(motion, "distance_m") <= near_m
     stands = numeric_column(motion, "tcp_speed") < stationary_m_per_s
@@ -147,7 +147,7 @@ def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -
 
 
 def is_moving(motion: pd.DataFrame, slow_m_per_s: float) -> Bools:
-    """(n,) ticks at which the robot moves: its TCP, or any joint at 1 mrad/s, for a link can sweep past a still TCP."""
+    """(n,) True if the robot moves: its TCP, or any joint at 1 mrad/s, as links can move while the TCP stands."""
     joints = [name for name in motion.columns if name.startswith("dq")]
     turning = (np.abs(motion[joints].to_numpy(dtype=float)) >= 1e-3).any(axis=1)
     return np.asarray((numeric_column(motion, "tcp_speed") >= slow_m_per_s) | turning)
@@ -160,15 +160,15 @@ def deviation_m(motion: pd.DataFrame) -> Floats:
 
 
 def waited_s(motion: pd.DataFrame) -> Floats:
-    """(n,) how much of each tick the reference waited for the robot instead of going on [s]; 0 after the last tick."""
+    """(n,) time in each tick during which the reference waited for the robot [s]; 0 after the last tick."""
     waited = durations_s(times(motion))
     waited[:-1] -= np.diff(numeric_column(motion, "programme_s"))
-    waited[-1:] = 0.0  # what the reference does after the last tick is not known
+    waited[-1:] = 0.0  # the reference after the last tick is unknown
     return np.clip(waited, 0.0, None)
 
 
 def cycles(motion: pd.DataFrame, *, at_m: float = 0.002, away_m: float = 0.05) -> int:
-    """Number of returns of the reference to its first point (within ``at_m``) after being ``away_m`` from it."""
+    """Counts returns of the reference to its first point (within ``at_m``) after being ``away_m`` from it."""
     reference = position_columns(motion, "ref")
     gap = np.linalg.norm(reference - reference[0], axis=1)
     marks = np.where(gap >= away_m, 1, np.where(gap <= at_m, -1, 0))
@@ -187,22 +187,22 @@ def add_plan(
     max_reference_lead_m: float,
     contact: pd.DataFrame | None = None,
 ) -> None:
-    """Everything about the motion, the baselines' likewise, and the paper's own figures beside them.
+    """Adds all metrics of the motion and of the baselines, and the paper's own figures.
 
     Args:
         metrics: Table that the metrics are added to.
-        motion: Rows of motion.parquet; None where nothing was planned.
+        motion: Rows of motion.parquet; None without a plan.
         baselines: Name of each baseline -> rows of its motion.
         method: Method of the plan.
         near_m: The person is near at a separation of at most this [m].
-        stationary_m_per_s: The robot stands where its TCP is slower than this [m/s].
-        max_reference_lead_m: How far the TCP may be from the reference before the reference waits [m].
-        contact: Rows of contact.parquet; None where the recorded body was not looked for.
+        stationary_m_per_s: A TCP slower than this counts as stationary [m/s].
+        max_reference_lead_m: Distance of the TCP at which the reference waits [m].
+        contact: Rows of contact.parquet; None without a comparison with the recorded body.
     """
     if motion is None:
         metrics.add("plan_method", None, "name", "method of the plan", reason="not planned")
     else:
-        metrics.add("plan_method", method, "name", "method of the plan; baselines ran beside it on the same volumes")
+        metrics.add("plan_method", method, "name", "method of the plan; baselines ran on the same volumes")
     tables = {} if motion is None else {"plan": motion, **{f"baseline_{name}": baselines[name] for name in baselines}}
     for prefix, table in tables.items():
         what = "the plan" if prefix == "plan" else f"the baseline '{prefix.removeprefix('baseline_')}'"
@@ -231,7 +231,7 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
         f"{prefix}_retreating_overlap_max_m",
         float(np.nanmax(deep)) if np.isfinite(deep).any() else None,
         "m",
-        f"how deep, at most, a link was inside a swept volume where a retreating step of {what} began: such a step is "
+        f"maximum depth of a link inside a swept volume at the start of a retreating step of {what}: such a step is "
         "certified to bring no point of the link nearer to any point of the volume, not to be clear of it",
         reason="the table of motion does not say" if (status == "retreating").any() else "it never retreated",
     )
@@ -356,7 +356,7 @@ def _p95(values: Floats) -> float:
 def _add_fastest(
     metrics: MetricTable, prefix: str, motion: pd.DataFrame, contact: pd.DataFrame | None, what: str, near_m: float
 ) -> None:
-    """The greatest speeds: of the TCP at all and near the recorded body, and of the programme."""
+    """Adds the maximum speeds: of the TCP, of the TCP near the recorded body, and of the programme."""
     speeds = {
         "tcp_speed_max": (numeric_column(motion, "tcp_speed"), "speed of the TCP"),
         "ref_speed_max": (
@@ -415,14 +415,14 @@ def _add_progress(
         f"{prefix}_time_lost_s",
         None if found is None else found[1] - found[0],
         "s",
-        f"by how much {what} was behind its programme at the last tick: the way made, in the programme's own time",
+        f"delay of {what} behind its programme at the last tick, by the reached position on the path",
         reason=reason,
     )
     metrics.add(
         f"{prefix}_progress_share",
         None if found is None or found[1] <= 0 else found[0] / found[1],
         "1",
-        f"pace kept: the programmed time of the way that the robot itself made, over the time it had, {what}; 1 is the "
+        f"pace kept: the programmed time of the robot's own progress over the available time, {what}; 1 is the "
         "programme at full speed, 0 a robot that did not move. The reference, which runs ahead, does not count",
         reason=reason,
     )

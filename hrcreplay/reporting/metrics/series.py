@@ -19,20 +19,20 @@ Metric = dict[str, Any]
 
 
 class MetricTable:
-    """Collects metrics. A number that is not finite becomes null, and then the reason is written beside it."""
+    """Collects metrics. A number that is not finite becomes null, with a reason."""
 
     def __init__(self) -> None:
         self._metrics: dict[str, Metric] = {}
 
     def add(self, name: str, value: float | str | None, unit: str, meaning: str, *, reason: str = "no samples") -> None:
-        """Adds one metric; ``reason`` says why it is null, if it is.
+        """Adds one metric; ``reason`` explains a null value.
 
         Args:
             name: Key in metrics.json.
             value: Number or text; None, or not finite: null.
             unit: Unit of the value, ``1`` for a count or a share.
-            meaning: What it says, in a few words.
-            reason: Why it is null, if it is.
+            meaning: Its meaning, in a few words.
+            reason: Reason for a null value.
         """
         if not isinstance(value, str) and value is not None:
             number = value.item() if isinstance(value, np.generic) else value
@@ -50,28 +50,28 @@ class MetricTable:
 #: The ten angles of Eq. (37).
 ANGLES = JOINTS[2:12]
 
-#: Which columns of a (n, 13) table of JOINTS are angles.
+#: True for columns of a (n, 13) table of JOINTS that are angles.
 IS_ANGLE: Bools = np.array([joint in ANGLES for joint in JOINTS])
 
 
 def wrap(angle_rad: Floats) -> Floats:
-    """Angles brought into [-pi, pi) [rad]."""
+    """Wraps angles to [-pi, pi) [rad]."""
     return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def difference(a: Floats, b: Floats) -> Floats:
-    """``a - b`` of rows of JOINTS, (n, 13) [m, m, rad..., m]; arms by the same name, angles the short way round."""
+    """Returns ``a - b`` of rows of JOINTS, (n, 13) [m, m, rad..., m]; arms in the same form, shortest angles."""
     apart = nearest(a, b) - b
     return np.where(IS_ANGLE, wrap(apart), apart)
 
 
 def columns(table: pd.DataFrame, suffix: str = "") -> Floats:
-    """(n, 13) columns of the JOINTS with a suffix."""
+    """Returns the (n, 13) columns of the JOINTS with a suffix."""
     return table[[joint + suffix for joint in JOINTS]].to_numpy(dtype=float)
 
 
 def times(table: pd.DataFrame, name: str = "t_ns") -> Ints:
-    """(n,) a column of instants [ns]."""
+    """Returns a column of instants (n,) [ns]."""
     return table[name].to_numpy(dtype=np.int64)
 
 
@@ -81,17 +81,17 @@ def seconds_from(t_ns: Ints, t0_ns: int) -> Floats:
 
 
 def interpolate(t_ns: Ints, values: Floats, at_ns: Ints, *, angles: bool) -> Floats:
-    """Rows of JOINTS, or of their rates, between the two samples around each instant, linear.
+    """Interpolates rows of JOINTS, or of their rates, linearly between the two samples around each instant.
 
     Args:
         t_ns: (n,) instants of the samples, increasing [ns].
         values: (n, 13) samples [m, m, rad..., m].
-        at_ns: (m,) instants asked for [ns].
-        angles: The columns of angles are angles, which go the short way round; else they are rates.
+        at_ns: (m,) requested instants [ns].
+        angles: True: the columns of angles are angles, interpolated along the shortest way; False: they are rates.
 
     Returns:
-        (m, 13); NaN outside the samples' span and where one of the two samples is NaN. An instant that meets a
-        sample gets that sample, whatever its neighbours are.
+        (m, 13); NaN outside the samples' span and where one of the two samples is NaN. An instant equal to that of a
+        sample gets that sample, for any neighbours.
     """
     if len(t_ns) < 2 or not len(at_ns):
         return np.full((len(at_ns), values.shape[1]), np.nan)
@@ -106,7 +106,7 @@ def interpolate(t_ns: Ints, values: Floats, at_ns: Ints, *, angles: bool) -> Flo
 
 
 def central_differences(t_ns: Ints, values: Floats) -> Floats:
-    """(n, 13) rates of rows of JOINTS by central differences [m/s, m/s, rad/s...]; NaN at both ends."""
+    """Computes (n, 13) rates of rows of JOINTS by central differences [m/s, m/s, rad/s...]; NaN at both ends."""
     rate = np.full(values.shape, np.nan)
     if len(t_ns) > 2:
         rate[1:-1] = difference(values[2:], values[:-2]) / ((t_ns[2:] - t_ns[:-2]) * 1e-9)[:, None]
@@ -114,13 +114,13 @@ def central_differences(t_ns: Ints, values: Floats) -> Floats:
 
 
 def true_runs(mask: Bools) -> Ints:
-    """(k, 2) the runs of true in ``mask``, each as [first, past the last)."""
+    """Returns (k, 2) runs of True in ``mask``, each as [first, past the last)."""
     edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
     return np.column_stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)]).astype(np.int64)
 
 
 def durations_s(t_ns: Ints) -> Floats:
-    """(n,) how long each tick lasts: until the next one; the last as long as the median [s]."""
+    """(n,) duration of each tick until the next one; for the last one the median [s]."""
     if len(t_ns) < 2:
         return np.zeros(len(t_ns))
     steps = np.diff(t_ns) * 1e-9
@@ -128,18 +128,18 @@ def durations_s(t_ns: Ints) -> Floats:
 
 
 def break_at_gaps(x: Floats, y: Floats, gap: float) -> tuple[Floats, Floats]:
-    """A line with a NaN put in wherever its abscissa leaps by more than ``gap``."""
+    """Inserts a NaN into a line at each step of its abscissa above ``gap``."""
     leaps = np.flatnonzero(np.diff(x) > gap) + 1
     return np.insert(x, leaps, x[leaps - 1]), np.insert(y, leaps, np.nan)
 
 
 def envelope(x: Floats, y: Floats, bins: int = 700) -> tuple[Floats, Floats]:
-    """Fewer points that draw the same line: of each bin of rows its lowest and its highest point, in order.
+    """Reduces a line to fewer points with the same appearance: the lowest and the highest of each bin, in order.
 
     Args:
         x: (n,) abscissae, increasing.
         y: (n,) ordinates; NaN breaks the line.
-        bins: How many bins; a table of at most 4 rows a bin is returned as it is.
+        bins: Number of bins; a table of at most 4 rows per bin is returned unchanged.
 
     Returns:
         ``x`` and ``y`` of the points kept. A bin without a finite value keeps one NaN.
@@ -161,7 +161,7 @@ def envelope(x: Floats, y: Floats, bins: int = 700) -> tuple[Floats, Floats]:
 
 
 def thin_path(points: Floats, tolerance: float) -> Floats:
-    """(m, d) a path through fewer of its (n, d) points: one wherever it has moved by ``tolerance``, and the last."""
+    """Returns (m, d) a path with fewer of its (n, d) points: one per motion of ``tolerance``, and the last."""
     if len(points) < 3:
         return points
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
@@ -169,14 +169,15 @@ def thin_path(points: Floats, tolerance: float) -> Floats:
     return points[np.union1d(first, [len(points) - 1])]
 
 
-#: Vertices of a path nearer to each other than this are looked at together, and nearer than that are one [m].
+#: Edge of the cells in which vertices of a path are searched together, and distance below which vertices are merged
+#: [m].
 _CELL_M, _SAME_M = 2e-4, 1e-6
 
 
 def path_feet(points: Floats, path: Floats) -> Floats:
-    """(n, 3) for each of (n, 3) points the nearest one of a (m, 3) polyline, all in one frame [m].
+    """Returns (n, 3) nearest points on a (m, 3) polyline for (n, 3) points, all in one frame [m].
 
-    Searched on the two segments at the nearest vertex, which is exact where vertices are denser than the path bends.
+    Searches the two segments at the nearest vertex, which is exact if vertices are dense relative to the curvature.
     """
     path = thin_path(path[np.isfinite(path).all(axis=1)], _SAME_M)
     feet = np.full(points.shape, np.nan)
@@ -200,10 +201,10 @@ def path_feet(points: Floats, path: Floats) -> Floats:
 
 
 def _nearest_vertices(points: Floats, path: Floats) -> Ints:
-    """(n,) vertices of a (m, 3) path that are nearest to (n, 3) points.
+    """Returns (n,) indices of the vertices of a (m, 3) path nearest to (n, 3) points.
 
-    A programme comes by the same places in each cycle, and a tree of all that vertices is slow: of those in one cell
-    one is looked at, and from there the search goes along the path as long as it comes nearer.
+    A programme passes the same places in each cycle, and a tree of all these vertices is slow: only one vertex per cell
+    is tested, and from there the search follows the path while the distance decreases.
     """
     _, first = np.unique(np.floor(path / _CELL_M).astype(np.int64), axis=0, return_index=True)
     vertices = np.sort(first)
@@ -223,7 +224,7 @@ _ARMS = [i for i, joint in enumerate(JOINTS) if joint.startswith("a")]
 
 
 def start_ns(run: Run) -> int:
-    """The instant that the report's clock counts from: the first tick, else the first frame [ns]."""
+    """Returns the zero of the report's clock: the first tick, else the first frame [ns]."""
     if run.state is not None and len(run.state):
         return int(times(run.state)[0])
     if run.motion is not None and len(run.motion):
@@ -234,16 +235,16 @@ def start_ns(run: Run) -> int:
 
 
 def find_known_ticks(run: Run) -> Ints:
-    """Ticks at which the person is known [ns]."""
+    """Returns the ticks at which the person is known [ns]."""
     if run.state is None:
         return np.zeros(0, dtype=np.int64)
     return times(run.state)[np.isfinite(columns(run.state)).all(axis=1)]
 
 
 def moment_ns(run: Run) -> int | None:
-    """The tick with the smallest separation of the plan or, without one, the fastest arm [ns]; None without a person.
+    """Returns the tick with the smallest separation of the plan or, without one, the fastest arm [ns]; or None.
 
-    The person is known there.
+    The person is known at that tick; None without a person.
     """
     known_ns = find_known_ticks(run)
     if run.state is None or not len(known_ns):
@@ -257,9 +258,9 @@ def moment_ns(run: Run) -> int | None:
 
 
 def instants(run: Run, count: int = 4, step_s: float = 1.0) -> Ints:
-    """(count,) ticks for Fig. 17, ``step_s`` apart, that end one step after the nearest or liveliest moment [ns].
+    """Returns (count,) ticks for Fig. 17, ``step_s`` apart, that end one step after that of ``moment_ns`` [ns].
 
-    Empty where the person is not known at that many ticks.
+    Empty if the person is not known at enough ticks.
     """
     moment, known_ns = moment_ns(run), find_known_ticks(run)
     if moment is None or len(known_ns) < 2:
@@ -273,6 +274,6 @@ def instants(run: Run, count: int = 4, step_s: float = 1.0) -> Ints:
 
 
 def nearest_tick(motion: pd.DataFrame) -> int:
-    """Row of the smallest separation of a plan; the first where none is known."""
+    """Returns the row of the smallest separation of a plan; the first if none is known."""
     distance_m = motion["distance_m"].to_numpy(dtype=float)
     return int(np.argmin(np.where(np.isnan(distance_m), np.inf, distance_m)))

@@ -1,8 +1,8 @@
-"""The 3-D replay on the page: its data, our scripts, the two libraries bundled with it, and a still at one instant.
+"""The 3-D replay on the page: its data, scripts and two bundled libraries, and a still at one instant.
 
-The data are a JSON header and one block of deflated numbers, as small as they can be: positions are whole millimetres,
-joints 0.1 mrad, speeds mm/s, int16, column by column, each as the difference from the one before it, low bytes before
-high bytes. ``static/data.js`` reads it again.
+The data are a JSON header and one compact block of deflated numbers: positions in millimetres, joints in 0.1 mrad,
+speeds in mm/s, as int16, column by column, each as the difference from the previous one, low bytes before high bytes.
+``static/data.js`` reads it again.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from hrcreplay.reporting.replay_scene import (
 )
 from hrcreplay.reporting.tables import part_name_text, reason_text
 
-#: What the browser imports by name, and the file that it is.
+#: Modules that the browser imports by name, and their files.
 MODULES = {
     "three/core": "three/three.core.min.js",
     "three": "three/three.module.min.js",
@@ -53,7 +53,7 @@ MODULES = {
     "replay/plots": "plots.js",
     "replay/app": "app.js",
 }
-#: Key of the scene, colour, words.
+#: Key of the scene, colour, text.
 LAYERS = (
     ("person", "person", "recorded person"),
     ("skeleton", "bones", "fused skeleton"),
@@ -62,15 +62,16 @@ LAYERS = (
     ("paths", "driven", "paths"),
     ("distance", "toBody", "distances"),
 )
-MESHES = ("meshes", "robot", "meshes of the links")  #: the same, where the robot has some
+MESHES = ("meshes", "robot", "meshes of the links")  #: the same, for a robot with meshes
 ROBOT_LEGEND = {
     False: "Orange: the robot as the capsules that its distances are measured from",
     True: "Orange: the robot, in the shell of the capsules that its distances are measured from",
 }
 LEGEND = (
-    "red: where the stop ends that it could begin at that instant, and the way of its TCP until then. Blue: the "
-    "recorded body; the dark lines in it are the person as fused from the cameras. Yellow: all that the person could "
-    "reach until the robot would have stood. Blue line: programmed path; orange line: driven path. Violet: from the "
+    "red: end of the stop that it could begin at that instant, and the path of its TCP until then. Blue: the "
+    "recorded body; the dark lines in it are the person as fused from the cameras. Yellow: space that the person "
+    "could reach until the robot would have stopped. Blue line: programmed path; orange line: driven path. Violet: "
+    "from the "
     "robot to the nearest part of the body; dashed: to the nearest volume."
 )
 
@@ -85,10 +86,10 @@ class ReplayPart:
 
 
 def replay_part(scene: ReplayScene) -> ReplayPart:
-    """The replay of a run, its data and scripts with it."""
+    """Makes the replay of a run, including its data and scripts."""
     header, numbers = replay_data(scene)
     modules = {name: _text(f"static/{path}") for name, path in MODULES.items()}
-    modules["three"] = modules["three"].replace('"./three.core.min.js"', '"three/core"')  # a blob has no neighbours
+    modules["three"] = modules["three"].replace('"./three.core.min.js"', '"three/core"')  # blobs: no relative paths
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     html = environment.from_string(_text("replay.html.j2")).render(
         replay={
@@ -108,7 +109,7 @@ def replay_part(scene: ReplayScene) -> ReplayPart:
 
 
 def script(text: str) -> Markup:
-    """Text that may stand in a script element."""
+    """Checks that a text can be placed in a script element."""
     if "</script" in text.lower() or "<!--" in text:
         raise ValueError("a script must not end its own element")
     return Markup(text)  # noqa: S704  our own file
@@ -121,15 +122,15 @@ def _text(path: str) -> str:
 #: Stored for NaN.
 MISSING = -32768
 _LARGEST = 32767
-#: The block may take so many bytes in base64; the volumes come at the highest of these rates that keeps to it.
+#: Maximum size of the block in base64 [bytes]; the volumes are stored at the highest of these rates that fits.
 BUDGET_BYTES = 9_000_000
 VOLUME_RATES_HZ = (VOLUME_HZ, 5.0, 2.5, 1.0, 0.5, 0.2)
-#: Hulls are hardly ever deflated below this share.
+#: Minimum share to which hulls are usually deflated.
 _AT_BEST = 0.3
 
 
 class NumberBlock:
-    """Arrays of int16 one behind the other, and a list of where each is."""
+    """Concatenated arrays of int16, and a list of their positions."""
 
     def __init__(self) -> None:
         self.entries: dict[str, dict[str, Any]] = {}
@@ -137,9 +138,9 @@ class NumberBlock:
         self._at = 0
 
     def add(self, name: str, values: Floats | Ints, unit: float = 1.0) -> None:
-        """Adds an array whose rows are instants; ``unit`` is the step of one count. NaN stays NaN.
+        """Adds an array whose rows are instants; ``unit`` is the step of one count. NaN is kept.
 
-        Where a value is too large for 16 bits, all steps are larger.
+        If a value is too large for 16 bits, the step is increased.
         """
         table = np.asarray(values).reshape(len(values), math.prod(values.shape[1:]))
         largest = max((float(np.abs(column[np.isfinite(column)]).max(initial=0.0)) for column in table.T), default=0.0)
@@ -150,23 +151,23 @@ class NumberBlock:
         self._at += 2 * steps.size
 
     def deflated(self) -> bytes:
-        """All of it as a zlib stream."""
+        """Returns the whole block as a zlib stream."""
         return zlib.compress(b"".join(self._parts), 6)
 
 
 def _steps(column: NDArray[Any], unit: float) -> NDArray[np.uint16]:
-    """(n,) the differences of a column's counts, modulo 2^16."""
+    """Returns (n,) differences of a column's counts, modulo 2^16."""
     finite = np.isfinite(column)
     counts = np.where(finite, np.round(np.where(finite, column, 0.0) / unit), MISSING).astype(np.int32)
     return np.diff(counts, prepend=0).astype(np.uint16)
 
 
 def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tuple[str, str]:
-    """The header as JSON and the block in base64.
+    """Returns the header as JSON and the block in base64.
 
     Args:
-        scene: What to show.
-        budget_bytes: The block may be so long; the volumes' rate gives way first.
+        scene: Scene to show.
+        budget_bytes: Maximum size of the block; the volumes' rate is reduced to fit.
     """
     block = NumberBlock()
     header = _header(scene)
@@ -228,7 +229,7 @@ def _header(scene: ReplayScene) -> dict[str, Any]:
 
 
 def _event(event: Mapping[str, Any]) -> dict[str, Any]:
-    """An event with rounded numbers; null for what is not known."""
+    """Returns an event with rounded numbers; null for unknown values."""
     found: dict[str, Any] = {}
     for name, value in event.items():
         found[name] = (round(value, 3) if math.isfinite(value) else None) if isinstance(value, float) else value
@@ -247,7 +248,7 @@ def _add_track(block: NumberBlock, name: str, track: MethodTrack) -> None:
 
 
 def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, VolumeTrack, float | None]:
-    """The volumes at the highest rate that fits into so many deflated bytes; None: at no rate."""
+    """Returns the volumes at the highest rate that fits into a number of deflated bytes; None: at no rate."""
     counts = np.diff(volumes.offsets)
     for rate_hz in VOLUME_RATES_HZ if len(volumes.t_ns) else ():
         rows = at_rate(volumes.t_ns, rate_hz)
@@ -262,7 +263,7 @@ def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, Volum
 
 
 def _hulls(hulls: VolumeTrack) -> NumberBlock:
-    """The vertices in order of their height within each hull, which makes their differences small."""
+    """Sorts the vertices of each hull by height, so that their differences are small."""
     block = NumberBlock()
     owner = np.repeat(np.arange(len(hulls.t_ns)), np.diff(hulls.offsets))
     order = np.lexsort((hulls.vertices_m[:, 0], hulls.vertices_m[:, 1], hulls.vertices_m[:, 2], owner))
@@ -275,17 +276,17 @@ def _hulls(hulls: VolumeTrack) -> NumberBlock:
 
 
 _ROBOT, _PERSON = "#d9823b", "#7fb2d9"
-#: Seconds of the paths around the instant that are drawn.
+#: Time around the instant in which paths are drawn [s].
 _PATH_S = 8.0
 _MARGIN_M = 0.12
 
 
 def snapshot(scene: ReplayScene, row: int) -> Figure:
-    """The scene of the run's own method at one of its instants, seen with robot and person side by side.
+    """Draws the scene of the run's own method at an instant, with robot and person side by side.
 
     Args:
-        scene: What moves.
-        row: Which of its instants.
+        scene: The scene.
+        row: Index of the instant.
     """
     name, track = next(iter(scene.methods.items()))
     ends = pose_links(scene.robot, track.q[row : row + 1])[0]
@@ -330,7 +331,7 @@ def _legend() -> list[Patch | Line2D]:
 
 
 def _words(track: MethodTrack, row: int) -> str:
-    """Describe the record at an instant."""
+    """Describes the record at an instant."""
     found = {kind: known[index[row]] if index[row] >= 0 else "" for kind, (known, index) in track.names.items()}
     words = [found["status"] or "no record", f"{track.tcp_speed[row]:.2f} m/s"]
     if np.isfinite(track.body_m[row]):
@@ -357,7 +358,7 @@ def _stored(scene: ReplayScene, row: int) -> dict[str, SweptVolume]:
 
 
 def _beside(scene: ReplayScene, row: int) -> float:
-    """The azimuth of who sees robot and person side by side [rad]."""
+    """Returns the azimuth of a view with robot and person side by side [rad]."""
     known = scene.body_m[row] if len(scene.body_parts) else scene.points_m[row]
     person = known.reshape(-1, 3)
     person = person[np.isfinite(person).all(axis=1)]

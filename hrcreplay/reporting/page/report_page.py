@@ -49,12 +49,12 @@ class PageFigure:
     name: str
     caption: str
     svg: Markup
-    wide: bool = True  #: more than one column of a paper
+    wide: bool = True  #: True: wider than one column of a paper
 
 
 @dataclass(frozen=True)
 class PageSection:
-    """A section of the page; ``missing`` says what it would take to fill it."""
+    """A section of the page; ``missing`` explains how to obtain its content."""
 
     key: str
     title: str
@@ -74,16 +74,16 @@ def render(
     title: str = "",
     scene: ReplayScene | None = None,
 ) -> str:
-    """The page of a run.
+    """Renders the page of a run.
 
     Args:
         run: The run's tables.
-        metrics: What :func:`hrcreplay.commands.report.compute` found.
-        figures_dir: Where :func:`hrcreplay.reporting.figures.catalogue.draw_all` drew.
+        metrics: Result of :func:`hrcreplay.commands.report.compute`.
+        figures_dir: Folder of the figures from :func:`hrcreplay.reporting.figures.catalogue.draw_all`.
         tables: Tables 1 and 2 as used, shown with the prediction.
         stops: The longest stops, shown with the safety.
         title: Name of the session; none: the name of the first input.
-        scene: What the 3-D replay shows; None: the page has none.
+        scene: Content of the 3-D replay; None: without a replay.
 
     Returns:
         HTML without requests, times or paths.
@@ -140,7 +140,7 @@ def _parts(
         PageSection(
             "prediction",
             "Prediction",
-            "What the person could reach until the robot would have stopped, and the bounds that this rests on.",
+            "The space that the person could reach until the robot would have stopped, and the bounds behind it.",
             _figures(figures_dir, "prediction"),
             (*_volumes(metrics), *tables),
             ""
@@ -153,12 +153,12 @@ def _parts(
             "The person as each camera saw them, and as the filter has them.",
             _figures(figures_dir, "fusion"),
             (_fusion_table(metrics, seen),) if with_truth else (),
-            "" if with_truth else "The log has no ground truth, so there is nothing to tell errors by.",
+            "" if with_truth else "The log has no ground truth, so there are no errors.",
         ),
         PageSection(
             "data",
             "Data quality",
-            "What the log held, and what was wrong with it.",
+            "Content of the log, and its defects.",
             _figures(figures_dir, "data"),
             (
                 compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA),
@@ -171,7 +171,7 @@ def _parts(
 
 
 def _figures(folder: Path, section: str) -> tuple[PageFigure, ...]:
-    """Those figures of a section that were drawn."""
+    """Returns the drawn figures of a section."""
     found = [kind for kind in FIGURES if kind.section == section and (folder / f"{kind.name}.svg").is_file()]
     return tuple(
         PageFigure(
@@ -184,7 +184,7 @@ def _figures(folder: Path, section: str) -> tuple[PageFigure, ...]:
 def _plan(
     run: Run, metrics: Mapping[str, Metric], figures_dir: Path, stops: Sequence[PageTable]
 ) -> tuple[PageSection, ...]:
-    """The sections of what the plan and its baselines did: safety, and cost to the task."""
+    """Makes the sections on the plan and its baselines: safety, and cost to the task."""
     plans = {"this plan": "plan", **{name: f"baseline_{name}" for name in sorted(run.baselines)}}
     planned = run.motion is not None
     no_plan = "" if planned else "Not in this run: it moved no robot. Run plan or report on the same log."
@@ -192,7 +192,7 @@ def _plan(
         PageSection(
             "safety",
             "Safety",
-            "How fast the robot moved, how near to what the person could reach, and what held it.",
+            "Speed of the robot, distance from the space that the person could reach, and constraints that slowed it.",
             _figures(figures_dir, "safety"),
             (
                 compare("Safety, per method on the same volumes", metrics, plans, PLAN_SAFETY),
@@ -206,7 +206,7 @@ def _plan(
         PageSection(
             "cost",
             "Cost to the task",
-            "How often it stood, how far it left its path, and how much time that took.",
+            "Share of standstill, deviation from the path, and time lost.",
             _figures(figures_dir, "cost"),
             (compare("Cost, per method on the same volumes", metrics, plans, PLAN_COST, _papers(metrics)),)
             if planned
@@ -217,13 +217,9 @@ def _plan(
 
 
 def _robot(run: Run, drawn: tuple[PageFigure, ...]) -> tuple[PageSection, ...]:
-    """The section of the robot, where the run moved one."""
+    """Makes the section on the robot, if the run has one."""
     tables = (robot_table(run.meta["robot"]),) if "robot" in run.meta else ()
-    return (
-        (PageSection("robot", "Robot", "The capsules that stand for its links.", drawn, tables),)
-        if drawn or tables
-        else ()
-    )
+    return (PageSection("robot", "Robot", "The capsules around its links.", drawn, tables),) if drawn or tables else ()
 
 
 def _papers(metrics: Mapping[str, Metric]) -> str:
@@ -319,7 +315,7 @@ def _settings(settings: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, st
 
 
 def inline_svg(path: Path, name: str, caption: str) -> Markup:
-    """An SVG as part of a page: without prologue and size, its ids made the page's own."""
+    """Embeds an SVG in a page: without prologue and size, with ids unique to the page."""
     svg = path.read_text("utf-8")
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)

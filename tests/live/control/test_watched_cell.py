@@ -146,4 +146,4 @@ def test_a_session_in_a_watched_cell_comes_out_the_same_again(cell: Path, tmp_pa
     run = folder.finish(partial)
     assert verify(run).identical
     page = (run / "report.html").read_text()
-    assert "as the cell says that its cameras see everybody within" in page
+    assert "because the cell states that its cameras see everybody within" in page
