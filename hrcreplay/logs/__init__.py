@@ -1,1 +1,1 @@
-"""Reading of logs: any supported format as one lazy stream of records in order of time; importers; writer."""
+"""Reading of logs: every supported format as one lazy stream of records in order of time; importers; writer."""

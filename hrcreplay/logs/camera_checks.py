@@ -1,6 +1,6 @@
 """Checks of the person in the world, camera by camera and pair by pair: floor, height, disagreement of two cameras.
 
-The same figures serve ``info``, ``calibrate`` and a run; what is out of its bounds becomes one line each.
+``info``, ``calibrate`` and a run use the same figures; each figure out of its bounds gives one line.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.records import BODY, MIRROR, POINTS, Bools, Floats, Ints, SkeletonTrack
 
-#: The points that a limb ends in: each point belongs to one limb, so each is compared once.
+#: The end points of a limb: each point belongs to one limb, so each is compared once.
 LIMB_POINTS = {
     "HD": ("head",),
     "THX": ("pelvis", "chest", "neck", "shoulder_l", "shoulder_r"),
@@ -23,7 +23,7 @@ LIMB_POINTS = {
     **{f"L{s}A": (f"wrist_{s.lower()}", f"hand_{s.lower()}") for s in "RL"},
     "LEGS": tuple(f"{joint}_{s}" for s in "lr" for joint in ("hip", "knee", "ankle", "foot")),
 }
-#: What people call BODY.
+#: Names of BODY for readers.
 LIMB_NAMES = {
     "HD": "head",
     "THX": "trunk",
@@ -33,24 +33,25 @@ LIMB_NAMES = {
     "LLA": "left lower arm",
     "LEGS": "legs",
 }
-#: Two cameras that differ by more at one instant in twenty are told [m].
+#: Maximum difference between two cameras, 95th percentile; a larger one is reported [m].
 APART_M = 0.15
-#: Feet further than this from the floor are told: trackers err by 2 cm (median) on recordings [m].
+#: Maximum distance of feet from the floor; a larger one is reported. Trackers have errors of 2 cm (median) on
+#: recordings [m].
 FLOOR_M = 0.05
-#: A foot point above the floor: Winter's foot with a shoe's sole [m].
+#: Height of a foot point above the floor: Winter's foot with a shoe sole [m].
 SOLE_M = 0.03
-#: An ankle above the floor by Winter's share, with a sole [m].
+#: Height of an ankle above the floor, by Winter's share, with a sole [m].
 _ANKLE_M = 0.08
-#: As trackers give it: Azure Kinects up to 18 cm [m].
+#: The same by trackers: up to 18 cm by Azure Kinects [m].
 _ANKLE_SEEN_M, _ANKLE_ERROR_M = 0.13, 0.10
-#: Head above the floor and sum of the bones differ by less, on recordings by up to 7 cm [m].
+#: Maximum difference between the head's height and the sum of the bones; up to 7 cm on recordings [m].
 _HEIGHT_M = 0.15
-#: Feet of at most this confidence are guesses of the tracker: a floor and a height do not rest on them.
+#: Feet of at most this confidence are guesses of the tracker and are not used for floor and height.
 SURE = 0.5
-_MIRRORED = 0.2  # share of the frames; a tracker mixes up left and right now and then
-_FEW = 10  # frames that are too few to judge by
-_FEW_PAIRS = 100  # points that are too few for a 95th percentile: it would rest on less than five
-_GAP_NS = 100_000_000  # no interpolation across longer silences
+_MIRRORED = 0.2  # share of the frames; a tracker sometimes exchanges left and right
+_FEW = 10  # fewer frames are not judged
+_FEW_PAIRS = 100  # minimum number of points for a 95th percentile, with at least five beyond it
+_GAP_NS = 100_000_000  # no interpolation across longer gaps
 _SCALE_M = 0.05  # by how much two cameras differ at one point
 _UPRIGHT = 0.95  # neck to ankles, straight over along the bones
 _WAIT_NS = 60 * 10**9  # frames arrive out of order of capture by less
@@ -65,25 +66,25 @@ class LimbAgreement:
     limb: str
     median_m: float
     p95_m: float
-    pairs: int  #: pairs of points that it rests on
-    mirrored: float  #: share of all frames of the two in which they see left and right of the body exchanged
+    pairs: int  #: number of pairs of points
+    mirrored: float  #: share of all frames of the two in which they disagree on left and right of the body
 
 
 @dataclass(frozen=True)
 class BodyInWorld:
-    """Height of a camera's person above the floor z = 0; NaN where that was not seen."""
+    """Height of a camera's person above the floor z = 0; NaN if not seen."""
 
     camera: str
     frames: int
     floor_m: float  #: the lowest foot above the floor, median [m]
     floor_p95_m: float  #: its distance from the floor, 95th percentile [m]
-    by_ankles: bool  #: whether no foot was ever seen, and the ankles stand in
-    head_m: float  #: the head above the floor, of who stands upright, median [m]
-    bones_m: float  #: the bones from floor to head added up, of the same frames, median [m]
+    by_ankles: bool  #: True: no foot was ever seen, and the ankles are used
+    head_m: float  #: height of the head above the floor while standing upright, median [m]
+    bones_m: float  #: sum of the bones from floor to head, in the same frames, median [m]
 
 
 def interpolate(track: SkeletonTrack, t_ns: Ints) -> Floats:
-    """(n, 20, 3) points of a track at other instants, linear; NaN across silences and where a neighbour is missing."""
+    """Interpolates (n, 20, 3) points of a track linearly; NaN across gaps and if a neighbour is missing."""
     if len(track) < 2:
         return np.full((len(t_ns), len(POINTS), 3), np.nan)
     after = np.clip(np.searchsorted(track.t_ns, t_ns), 1, len(track) - 1)
@@ -96,13 +97,13 @@ def interpolate(track: SkeletonTrack, t_ns: Ints) -> Floats:
 
 
 def find_mirrored(points_a: Floats, points_b: Floats, weight: Floats, scale_m: float) -> Bools:
-    """(n,) frames that agree far better with left and right of b exchanged.
+    """(n,) True for frames that agree far better with left and right of b exchanged.
 
     Args:
         points_a: (n, 20, 3) [m].
         points_b: (n, 20, 3) in the same frame, at the same instants [m].
-        weight: (n, 20), 0 where a point is missing.
-        scale_m: By how much a point usually differs [m].
+        weight: (n, 20), 0 for a missing point.
+        scale_m: Usual difference of a point [m].
     """
 
     def cost(other: Floats, w: Floats) -> Floats:
@@ -119,7 +120,7 @@ def find_mirrored(points_a: Floats, points_b: Floats, weight: Floats, scale_m: f
 class _CameraPair:
     """Views of two cameras at the same instants so far."""
 
-    apart_m: list[NDArray[np.float32]] = field(default_factory=list)  #: (n, 20), NaN where one lacks a point
+    apart_m: list[NDArray[np.float32]] = field(default_factory=list)  #: (n, 20), NaN for a point that one of them lacks
     mirrored: list[Bools] = field(default_factory=list)
 
     def add(self, a: SkeletonTrack, b: SkeletonTrack) -> None:
@@ -148,7 +149,7 @@ class _BodyHeights:
         self._rows: list[Floats] = []  #: (n, 4): lowest foot, lowest ankle, head, sum of the bones [m]
 
     def add(self, points_m: Floats, confidence: Floats) -> None:
-        """Takes the person (n, 20, 3) in the world [m], and how sure the camera is of the points (n, 20)."""
+        """Adds the person (n, 20, 3) in the world [m], and the confidences of the points (n, 20)."""
         self.posture.add(np.where((confidence > 0)[..., None], points_m, np.nan))
         points_m = np.where((confidence > SURE)[..., None], points_m, np.nan)
         foot, ankle = (np.fmin(*(_at(points_m, f"{name}_{s}")[:, 2] for s in "lr")) for name in ("foot", "ankle"))
@@ -171,7 +172,7 @@ class _BodyHeights:
 
 
 class CameraChecks:
-    """Collects the person of every camera in the world, frame by frame, whole logs in little memory."""
+    """Collects the person of every camera in the world, frame by frame; a whole log needs little memory."""
 
     def __init__(self, cameras: Sequence[str]) -> None:
         self._cameras = tuple(cameras)
@@ -181,11 +182,11 @@ class CameraChecks:
         self._newest_ns = self._compared_ns = np.iinfo(np.int64).min
 
     def add(self, camera: Ints, track: SkeletonTrack) -> None:
-        """Takes frames of any cameras.
+        """Adds frames of any cameras.
 
         Args:
             camera: (n,) index of each frame's camera.
-            track: Of the one person, in the world, by one clock; ``t_ns`` in any order within a minute.
+            track: Track of the person, in the world, on one clock; ``t_ns`` in any order within a minute.
         """
         for c, body in enumerate(self._bodies):
             mine = camera == c
@@ -198,7 +199,7 @@ class CameraChecks:
                 self._compare(self._newest_ns - _WAIT_NS)
 
     def _compare(self, until_ns: int) -> None:
-        """Compares the frames before an instant that were not compared yet; keeps those that others may need."""
+        """Compares the frames before an instant that were not compared yet; keeps those that may still be needed."""
         tracks = [_in_order(parts) for parts in self._waiting]
         for (i, j), pair in self._pairs.items():
             due = (tracks[i].t_ns >= self._compared_ns) & (tracks[i].t_ns < until_ns)
@@ -207,7 +208,7 @@ class CameraChecks:
         self._compared_ns = until_ns
 
     def figures(self) -> tuple[tuple[BodyInWorld, ...], tuple[LimbAgreement, ...]]:
-        """Every camera's person, and every pair of cameras limb by limb; nothing is added after this."""
+        """Returns the figures of every camera's person, and of every pair of cameras limb by limb; call it last."""
         if self._newest_ns >= self._compared_ns and any(len(part) for parts in self._waiting for part in parts):
             self._compare(self._newest_ns + 1)
         bodies = (body.figures(name) for name, body in zip(self._cameras, self._bodies, strict=True))
@@ -220,7 +221,7 @@ class CameraChecks:
         return tuple(bodies), tuple(pairs)
 
     def remarks(self) -> Iterator[str]:
-        """One line for each camera that cannot be right, and for each pair that disagrees."""
+        """Returns one line for each implausible camera, and for each pair that disagrees."""
         bodies, agreements = self.figures()
         for body, seen in zip(bodies, self._bodies, strict=True):
             posture = seen.posture.remark(body.camera)
@@ -229,7 +230,7 @@ class CameraChecks:
 
 
 def height_remarks(body: BodyInWorld) -> Iterator[str]:
-    """Remarks on a wrong floor under a camera's person, or a wrong height of the head."""
+    """Returns remarks on a wrong floor under a camera's person, or a wrong height of the head."""
     found, bound_m = ("ankle", _ANKLE_ERROR_M) if body.by_ankles else ("foot", FLOOR_M)
     if abs(body.floor_m) > bound_m:
         side = "above" if body.floor_m > 0 else "below"
@@ -247,7 +248,7 @@ def height_remarks(body: BodyInWorld) -> Iterator[str]:
 
 
 def pair_remarks(agreements: Sequence[LimbAgreement]) -> Iterator[str]:
-    """The limbs that two cameras show too far apart, and pairs of which one exchanges left and right."""
+    """Reports limbs that two cameras show too far apart, and pairs with exchanged left and right."""
     for a, b in dict.fromkeys((found.a, found.b) for found in agreements):
         limbs = [found for found in agreements if (found.a, found.b) == (a, b) and found.pairs >= _FEW]
         far = [f"{LIMB_NAMES[found.limb]} {found.p95_m:.2f} m" for found in limbs if _is_far(found)]
@@ -264,12 +265,12 @@ def pair_remarks(agreements: Sequence[LimbAgreement]) -> Iterator[str]:
 
 
 def _is_far(found: LimbAgreement) -> bool:
-    """Return whether a limb is reported; a percentile of few points says nothing, so the median has to be that far."""
+    """Returns True if a limb is reported; with few points the median is used in place of the percentile."""
     return (found.p95_m if found.pairs >= _FEW_PAIRS else found.median_m) > APART_M
 
 
 def agreement_lines(agreements: Sequence[LimbAgreement]) -> list[str]:
-    """Every pair and limb as plain text, a line each."""
+    """Returns every pair and limb as plain text, one line each."""
     return [
         f"{found.a} - {found.b}, {LIMB_NAMES[found.limb]}: apart by {1e3 * found.median_m:.0f} mm (median), "
         f"{1e3 * found.p95_m:.0f} mm (p95) at {found.pairs} points"
@@ -278,7 +279,7 @@ def agreement_lines(agreements: Sequence[LimbAgreement]) -> list[str]:
 
 
 def body_line(body: BodyInWorld) -> str:
-    """The heights of a camera's person as plain text."""
+    """Returns the heights of a camera's person as plain text."""
     point = "ankle" if body.by_ankles else "foot"
     floor = (
         "no foot surely seen, so nothing is known of the floor"
@@ -299,7 +300,7 @@ def _at(points_m: Floats, name: str) -> Floats:
 
 
 def _standing_heights(points_m: Floats) -> tuple[Floats, Floats]:
-    """(n,) head above z = 0, and the bones from the floor to the head added up [m]; NaN for who is not upright."""
+    """(n,) height of the head above z = 0, and sum of the bones from floor to head [m]; NaN unless upright."""
     head, neck, pelvis = (_at(points_m, name) for name in ("head", "neck", "pelvis"))
     neck = np.where(np.isfinite(neck), neck, 0.5 * (_at(points_m, "shoulder_l") + _at(points_m, "shoulder_r")))
     knee, ankle, foot = (
@@ -314,12 +315,12 @@ def _standing_heights(points_m: Floats) -> tuple[Floats, Floats]:
 
 
 def _percentile(values: Floats, share: float) -> float:
-    """NaN of too few values."""
+    """Returns a percentile; NaN for too few values."""
     return float(np.percentile(values, share)) if len(values) >= _FEW else float("nan")
 
 
 def _in_order(parts: Sequence[SkeletonTrack]) -> SkeletonTrack:
-    """One track in order of capture, an instant once."""
+    """Returns one track in order of capture, without repeated instants."""
     track = SkeletonTrack.join(parts)
     _, first = np.unique(track.t_ns, return_index=True)
     return track.rows(first.astype(np.int64))

@@ -1,7 +1,7 @@
 """Cleaning of recorded skeletons, and selection of the person of interest among several bodies.
 
 Each kind of defect is handled here and counted under its name in DEFECTS. Body ids change, so the person is the body
-that is nearest to where the person was last.
+nearest to the person's last position.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class LastPosition:
 class PersonMemory:
     """State of the person selection between two tables of frames.
 
-    Cameras with known poses share the space "world"; every other camera is a space of its own.
+    Cameras with known poses share the space "world"; every other camera has its own space.
     """
 
     sightings: tuple[tuple[str, LastPosition], ...] = ()  #: space -> last sighting
@@ -52,21 +52,21 @@ def select_person(
 ) -> tuple[PersonMemory, Bools, Counter[str]]:
     """Finds the one body of each frame that continues the person in space.
 
-    A body further than ``jump_m`` from where the person was last seen is somebody else. After ``memory_s`` without
-    the person, the body nearest to that place becomes the person; the first person is the body nearest to its camera.
+    A body further than ``jump_m`` from the person's last position is another person. After ``memory_s`` without the
+    person, the body nearest to that position becomes the person; the first person is the body nearest to its camera.
 
     Args:
-        frames: All bodies, in order of arrival. The bodies of one frame (camera and capture time) stand in one
-            table; between frames, tables may be cut anywhere.
-        memory: From the table before; ``PersonMemory()`` at the start.
-        T_world_camera: (c, 4, 4), NaN for a camera whose pose is not known.
-        jump_m: [m].
-        memory_s: [s].
+        frames: All bodies, in order of arrival. All bodies of one frame (camera and capture time) are in one table;
+            between frames, tables may be split anywhere.
+        memory: From the previous table; ``PersonMemory()`` at the start.
+        T_world_camera: (c, 4, 4), NaN for a camera of unknown pose.
+        jump_m: Maximum distance from the last position [m].
+        memory_s: Time for which the last position is used [s].
 
     Returns:
-        The new memory; (n,) which rows are the person, at most one a frame; and counts: ``person_bodies_dropped``,
+        The new memory; (n,) True for rows of the person, at most one per frame; and counts: ``person_bodies_dropped``,
         ``person_frames_beside_others`` (frames that show at least one other body), ``person_id_switches`` and
-        ``person_frames_without`` (frames in which nobody was near enough).
+        ``person_frames_without`` (frames without a body near enough).
     """
     known: Bools = np.asarray(np.isfinite(T_world_camera).all(axis=(1, 2)))
     poses = np.where(known[:, None, None], T_world_camera, np.eye(4))
@@ -99,12 +99,12 @@ def select_person(
 
 
 def _nearest(rows: list[int], places_m: list[Place], here_m: Place) -> tuple[float, int]:
-    """Distance of the nearest body from a place [m], inf where none's is known, and its row."""
+    """Returns the distance of the nearest body from a position [m], inf if unknown, and its row."""
     return min((inf if isnan(apart_m := dist(places_m[row], here_m)) else apart_m, row) for row in rows)
 
 
 def _by_frame(frames: CameraFrames) -> dict[tuple[int, int], list[int]]:
-    """Row numbers of each frame, frames in order of their first row."""
+    """Returns the row numbers of each frame, frames in order of their first row."""
     found: dict[tuple[int, int], list[int]] = {}
     for row, frame in enumerate(zip(frames.camera.tolist(), frames.capture_ns.tolist(), strict=True)):
         found.setdefault(frame, []).append(row)
@@ -112,7 +112,7 @@ def _by_frame(frames: CameraFrames) -> dict[tuple[int, int], list[int]]:
 
 
 def _places(frames: CameraFrames, poses: Floats) -> Floats:
-    """(n, 3) middle of each body's torso, of all its points where no torso was seen, by the cameras' poses."""
+    """(n, 3) middle of each body's torso, or of all its points if no torso was seen, by the cameras' poses."""
     seen: Bools = np.asarray(np.isfinite(frames.points_m).all(axis=2) & (frames.confidence > 0))
     torso: Bools = np.asarray(seen & _IN_TORSO)
     use: Bools = np.where(torso.any(axis=1, keepdims=True), torso, seen)
@@ -123,7 +123,7 @@ def _places(frames: CameraFrames, poses: Floats) -> Floats:
     return np.einsum("nij,nj->ni", T[:, :3, :3], middle) + T[:, :3, 3]
 
 
-#: Every name in ``Log.defects``, with what was done about it. <camera> stands for a camera's name.
+#: All names in ``Log.defects``, with the treatment of the defect. <camera> is replaced by a camera's name.
 DEFECTS: Mapping[str, str] = {
     "chunks_unreadable": "damaged chunks of an MCAP file; left out",
     "files_damaged": "files of a ROS 2 bag that are damaged; the messages that can be read are used",
@@ -155,22 +155,22 @@ DEFECTS: Mapping[str, str] = {
     "unindexed": "a ROS 1 bag without a usable index; read by going through it",
 }
 
-#: A coordinate beyond this was not measured by a depth camera in a robot's cell [m].
+#: Maximum coordinate measured by a depth camera in a robot's cell [m].
 FAR_M = 100.0
-#: A person of whom no point moves by more for longer is an old image: on recordings of people who stand, sit and work,
-#: by five trackers, that lasted 0.17 s at most [m], [s].
+#: Maximum motion of all points [m], and minimum time [s], of a repeated old image. In recordings of people who stand,
+#: sit and work, by five trackers, the longest such time was 0.17 s.
 STILL_M, STILL_S = 2e-3, 0.5
-#: Two ends of a bone that are nearer than this are one place [m].
+#: Distance below which the two ends of a bone coincide [m].
 TOGETHER_M = 1e-3
 
-#: What ``CameraClock`` calls a stamp that is not believed -> its name in DEFECTS.
+#: Reason of ``CameraClock`` to reject a stamp -> its name in DEFECTS.
 _REPLACED = {"ahead": "frames_stamp_ahead", "far": "frames_stamp_far", "set back": "frames_stamp_set_back"}
 
 _ALWAYS = ("frames_duplicate", "frames_header_stamp_zero", "frames_out_of_order", "points_not_finite")
 _CHUNK_NS = 10**9
 
-#: The two ends of the bones that the person's model is measured by. Hands, hips and legs are not among them: trackers
-#: that know no hand put it where the wrist is.
+#: The two ends of the bones that measure the person's model. Hands, hips and legs are not included: trackers without
+#: hands place the hand at the wrist.
 _PAIRS = (
     ("shoulder_l", "shoulder_r"),
     ("pelvis", "neck"),
@@ -185,17 +185,16 @@ class CleanedSkeleton(NamedTuple):
     """A cleaned row, and the defects found in its points."""
 
     row: RawSkeleton
-    flaws: tuple[tuple[str, int], ...]  #: name in DEFECTS -> points
+    flaws: tuple[tuple[str, int], ...]  #: name in DEFECTS -> number of points
 
 
 def clean_skeleton(row: RawSkeleton) -> CleanedSkeleton:
-    """Makes every point missing (NaN, confidence 0) that cannot be a point of a body.
+    """Marks every point as missing (NaN, confidence 0) that cannot belong to a body.
 
-    Of two ends of a bone in one place neither can be believed. A point of confidence 0 was said to be missing: it is
-    made so, and not counted.
+    If two ends of a bone coincide, both are rejected. A point of confidence 0 is missing by definition and not counted.
     """
     points, told = row.points_m, row.confidence > 0
-    largest = np.abs(points).max(axis=1)  # NaN where a coordinate is
+    largest = np.abs(points).max(axis=1)  # NaN if a coordinate is
     strange: Bools = np.isinf(points).any(axis=1) | (np.isnan(largest) & told)
     origin: Bools = largest == 0.0
     far: Bools = (largest > FAR_M) & np.isfinite(largest)
@@ -203,7 +202,7 @@ def clean_skeleton(row: RawSkeleton) -> CleanedSkeleton:
     kept = np.where(missing[:, None], np.nan, points)
     together = _together(kept)
     missing |= together
-    confidence = np.where(missing, 0.0, np.fmin(np.fmax(row.confidence, 0.0), 1.0))  # 0 also where it is NaN
+    confidence = np.where(missing, 0.0, np.fmin(np.fmax(row.confidence, 0.0), 1.0))  # 0 also for NaN
     whole = row._replace(points_m=np.where(missing[:, None], np.nan, points), confidence=confidence)
     found = {
         "points_not_finite": strange,
@@ -215,7 +214,7 @@ def clean_skeleton(row: RawSkeleton) -> CleanedSkeleton:
 
 
 def _together(points: Floats) -> Bools:
-    """(20,) points that lie where the other end of one of _PAIRS does."""
+    """(20,) True for points that coincide with the other end of one of _PAIRS."""
     apart = points[_A] - points[_B]
     same = (apart * apart).sum(axis=1) < TOGETHER_M**2
     found = np.zeros(len(points), dtype=np.bool_)
@@ -224,13 +223,13 @@ def _together(points: Floats) -> Bools:
 
 
 def _moved(before_m: Floats, now_m: Floats) -> bool:
-    """Return whether any point (20, 3) has moved by more than STILL_M; no common point counts as moved."""
+    """Returns True if any point (20, 3) has moved by more than STILL_M, or without a common point."""
     by_m = np.linalg.norm(now_m - before_m, axis=1)
     return not np.isfinite(by_m).any() or bool(np.nanmax(by_m) > STILL_M)
 
 
 class RepeatedSkeleton(NamedTuple):
-    """The longest time for which a camera gave one and the same skeleton, exactly or but for noise."""
+    """The longest time for which a camera repeated a skeleton, exactly or up to noise."""
 
     seconds: float
     begin_ns: int  #: its first arrival
@@ -243,17 +242,17 @@ def _keep_longest(found: dict[str, RepeatedSkeleton], camera: str, begin_ns: int
 
 
 class Cleaner:
-    """Cleans rows in order of arrival and returns them as tables of at most a second."""
+    """Cleans rows in order of arrival and returns them as tables of at most one second."""
 
     def __init__(self, cameras: tuple[str, ...], gap_s: float, defects: Counter[str], *, nobody: bool = False) -> None:
-        """Begin before the first row.
+        """Starts before the first row.
 
         Args:
-            cameras: Their names.
-            gap_s: A longer silence of a camera is a gap [s].
-            defects: Where defects are counted.
-            nobody: Whether the tables also tell what only matters for a watched area: frames that show nobody, and, by
-                rows without a point, bodies that are said to be there but not shown anew.
+            cameras: Names of the cameras.
+            gap_s: A longer time without frames of a camera is a gap [s].
+            defects: Receives the counts of defects.
+            nobody: True: also return rows needed only for a watched area: frames without a body, and rows without
+                points for bodies that are reported but not measured again.
         """
         self._cameras = cameras
         self._nobody = nobody
@@ -263,16 +262,16 @@ class Cleaner:
         self._newest: dict[tuple[str, int], int] = {}
         self._last: dict[
             tuple[str, int], tuple[RawSkeleton, int]
-        ] = {}  # of each body: its last new skeleton, and its arrival
+        ] = {}  # per body: its last new skeleton, and its arrival
         self._rows: list[tuple[int, int, RawSkeleton]] = []
         self.arrivals: dict[str, tuple[int, int]] = {}  #: camera -> first and last arrival
-        self.seen: dict[str, Bools] = {}  #: camera -> (20,) points it ever gave a place and a confidence
-        self.points: Counter[str] = Counter()  #: camera -> points with a place and a confidence
-        self.rows: Counter[str] = Counter()  #: camera -> rows that came
-        self.flaws: Counter[tuple[str, str]] = Counter()  #: (camera, name in DEFECTS) -> points or rows
-        self.frozen: dict[str, RepeatedSkeleton] = {}  #: camera -> its longest standstill
+        self.seen: dict[str, Bools] = {}  #: camera -> (20,) True for points that ever had a position and a confidence
+        self.points: Counter[str] = Counter()  #: camera -> number of points with a position and a confidence
+        self.rows: Counter[str] = Counter()  #: camera -> number of rows
+        self.flaws: Counter[tuple[str, str]] = Counter()  #: (camera, name in DEFECTS) -> number of points or rows
+        self.frozen: dict[str, RepeatedSkeleton] = {}  #: camera -> its longest exact repetition
         self.trembling: dict[str, RepeatedSkeleton] = {}  #: camera -> its longest time without a movement
-        self._still: dict[tuple[str, int], tuple[Floats, int]] = {}  # of each body: where it stands, and since when
+        self._still: dict[tuple[str, int], tuple[Floats, int]] = {}  # per body: its position, and since when
         self.clocks = {name: CameraClock() for name in cameras}
         for name in (*_ALWAYS, *(f"{kind}_{camera}" for kind in ("frames", "gaps") for camera in cameras)):
             defects[name] += 0
@@ -285,7 +284,7 @@ class Cleaner:
         self.arrivals[camera] = (first, arrival_ns)
 
     def add(self, row: RawSkeleton, arrival_ns: int) -> CameraFrames | None:
-        """Takes a row; returns the table that is complete before it, if there is one."""
+        """Adds a row; returns the table completed before it, if any."""
         self.note_arrival(row.camera, arrival_ns)
         if row.body == NOBODY:
             return self._add_nobody(row, arrival_ns) if self._nobody else None
@@ -315,7 +314,7 @@ class Cleaner:
         return self._deliver(capture_ns, arrival_ns, whole)
 
     def _add_nobody(self, row: RawSkeleton, arrival_ns: int) -> CameraFrames | None:
-        """Takes a frame that shows nobody; without a stamp it was captured the camera's usual delay ago."""
+        """Adds a frame without a body; without a stamp its capture is the arrival less the camera's usual delay."""
         clock, key = self.clocks[row.camera], (row.camera, NOBODY)
         capture_ns = arrival_ns - clock.usual_ns if row.capture_ns is None else self._captured(row, arrival_ns)
         if capture_ns <= self._newest.get(key, capture_ns - 1):
@@ -324,7 +323,7 @@ class Cleaner:
         return self._deliver(capture_ns, arrival_ns, row)
 
     def _add_unshown(self, row: RawSkeleton, capture_ns: int, arrival_ns: int) -> CameraFrames | None:
-        """Takes a body of which a frame says that it is there, but not where."""
+        """Adds a body that a frame reports without a position."""
         if not self._nobody:
             return None
         points_m, confidence = missing_body()
@@ -336,12 +335,12 @@ class Cleaner:
         return chunk
 
     def _agrees(self, row: RawSkeleton) -> bool:
-        """Return whether a row has the points of the last one of its body."""
+        """Returns True if a row has the points of the last one of its body."""
         before, _ = self._last[(row.camera, row.body)]
         return np.array_equal(before.points_m, clean_skeleton(row).row.points_m, equal_nan=True)
 
     def _captured(self, row: RawSkeleton, arrival_ns: int) -> int:
-        """Capture time of a row; its arrival where its stamp cannot be right."""
+        """Returns the capture time of a row; an estimate from its arrival if the stamp is wrong."""
         if row.capture_ns is None:
             return arrival_ns
         clock = self.clocks[row.camera]
@@ -352,7 +351,7 @@ class Cleaner:
         return capture_ns
 
     def _repeats(self, row: RawSkeleton, arrival_ns: int) -> bool:
-        """Return whether the row shows the very skeleton of the one before it, which no sensor measures twice."""
+        """Returns True if the row repeats the previous skeleton exactly, which no sensor measures twice."""
         key = (row.camera, row.body)
         before = self._last.get(key)
         if (
@@ -368,7 +367,7 @@ class Cleaner:
         return True
 
     def _trembles(self, row: RawSkeleton, arrival_ns: int) -> bool:
-        """Return whether no point of the body has moved for so long that its image must be an old one."""
+        """Returns True if no point of the body has moved for so long that the image must be an old one."""
         key = (row.camera, row.body)
         before = self._still.get(key)
         if before is None or _moved(before[0], row.points_m):
@@ -385,7 +384,7 @@ class Cleaner:
         self.flaws[(camera, name)] += count
 
     def flush(self) -> CameraFrames | None:
-        """The rows that were not returned yet; None without any."""
+        """Returns the remaining rows; None without any."""
         rows, self._rows = self._rows, []
         if not rows:
             return None

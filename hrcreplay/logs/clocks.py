@@ -1,7 +1,7 @@
 """Capture times of one camera, judged by the arrivals of its frames.
 
-A stamp is believed unless it cannot be right: captured after its arrival, further from it than any delay, or of a clock
-that was set back or stands still. Instead of such a stamp the arrival less the camera's usual delay is used.
+A stamp is accepted unless it is impossible: after the arrival, further from it than any delay, or from a clock that was
+set back or stands still. Such a stamp is replaced by the arrival less the camera's usual delay.
 """
 
 from __future__ import annotations
@@ -12,49 +12,49 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-#: A capture further than this from its arrival is no capture time: no robot waits so long, no clock is so wrong [s].
+#: Maximum time between capture and arrival of a valid stamp [s].
 STAMP_FAR_S = 10.0
-#: Delays that differ by more are told as a jump of the clock, and a median delay above it as a late camera [s].
+#: A larger change of the delay is reported as a jump of the clock, and a larger median delay as a late camera [s].
 JUMP_S = 0.1
 LATE_S = 0.3
 
 _FAR_NS, _JUMP_NS = round(STAMP_FAR_S * 1e9), round(JUMP_S * 1e9)
-_SAME_NS = 10_000_000  # rows with one stamp that arrive within this are the bodies of one frame
-_USUAL, _LEAST = 31, 5  # the latest believed frames, whose median delay is the usual one, and how many it takes
-_RUN = 3  # frames with stamps that are not newer, one after the other, that tell a clock from a late frame
-_STILL_NS = 500_000_000  # or such frames for so long
-_SETTLED = 5  # frames of like delay that make a jump
-_FEW = 5  # frames out of order that are not worth a remark, and the share of them that is
+_SAME_NS = 10_000_000  # rows with the same stamp that arrive within this time are the bodies of one frame
+_USUAL, _LEAST = 31, 5  # number of the latest accepted frames for the usual (median) delay, and its minimum
+_RUN = 3  # number of consecutive frames without newer stamps that indicates a clock error, not a late frame
+_STILL_NS = 500_000_000  # or duration of such frames
+_SETTLED = 5  # number of frames of similar delay that confirm a jump
+_FEW = 5  # number of frames out of order without a remark, and share with one
 _MUCH = 0.02
-_MIXED_NS = 1_000_000_000  # messages further apart in time than this stand in a file in order, whatever wrote it
+_MIXED_NS = 1_000_000_000  # messages further apart than this are in order in every file
 _YOUNG_NS = 10**17  # a stamp before 1973 counts from the start of a simulation or of a computer
 
 
 class CameraClock:
-    """The clock of one camera: takes its rows in order of arrival, and says when each was captured."""
+    """The clock of one camera: takes its rows in order of arrival and returns their capture times."""
 
     def __init__(self) -> None:
         self.frames = 0
-        self.replaced: Counter[str] = Counter()  #: why a stamp was not believed ("ahead", "far", "set back") -> frames
+        self.replaced: Counter[str] = Counter()  #: reason to reject a stamp ("ahead", "far", "set back") -> frames
         self.jumps: list[tuple[int, float]] = []  #: the first few jumps: arrival [ns] and change of the delay [s]
         self.jump_count = 0
-        self.far_ns: tuple[int, int] | None = None  #: least and largest stamp that is far from its arrival
+        self.far_ns: tuple[int, int] | None = None  #: smallest and largest stamp far from its arrival
         self._delays_ms: Counter[int] = Counter()
         self._believed: deque[int] = deque(maxlen=_USUAL)
         self._recent: deque[tuple[int, int]] = deque(maxlen=_SETTLED)
         self._level_ns: int | None = None
-        self._newest_ns: int | None = None  # stamp of the newest frame, by the clock as it is now
+        self._newest_ns: int | None = None  # stamp of the newest frame on the present clock
         self._run: list[tuple[int, int]] = []  # arrivals and stamps of frames that are not newer
         self._set_back = False
         self._last = (0, -_FAR_NS, 0)  # stamp, first arrival and capture of the frame before
 
     @property
     def usual_ns(self) -> int:
-        """The usual delay, by the latest frames with a stamp that is believed; 0 while they are few [ns]."""
+        """The usual delay of the latest frames with an accepted stamp; 0 while they are few [ns]."""
         return int(np.median(self._believed)) if len(self._believed) >= _LEAST else 0
 
     def capture_ns(self, stamp_ns: int, arrival_ns: int) -> int:
-        """Capture time of a row."""
+        """Returns the capture time of a row."""
         last_ns, first_ns, capture_ns = self._last
         if stamp_ns == last_ns and arrival_ns - first_ns <= _SAME_NS:
             return capture_ns  # another body of the same frame
@@ -69,7 +69,7 @@ class CameraClock:
         return capture_ns
 
     def _doubt(self, stamp_ns: int, arrival_ns: int) -> str:
-        """Reason not to believe a stamp; empty where it is believed."""
+        """Returns the reason to reject a stamp; empty if it is accepted."""
         delay_ns = arrival_ns - stamp_ns
         if abs(delay_ns) > _FAR_NS:
             low, high = self.far_ns or (stamp_ns, stamp_ns)
@@ -93,9 +93,9 @@ class CameraClock:
         return ""
 
     def _clock_changed(self) -> bool:
-        """Return whether the frames that are not newer look like a clock that was set back or stands still.
+        """Returns True if the frames without newer stamps indicate a clock that was set back or stands still.
 
-        Frames that were held up on their way come all at once, or between others.
+        Delayed frames arrive all at once, or between others.
         """
         if any(later < before for (_, before), (_, later) in zip(self._run, self._run[1:], strict=False)):
             del self._run[:-1]
@@ -118,10 +118,10 @@ class CameraClock:
         self._level_ns = now_ns
 
     def delay_s(self, *percent: float) -> tuple[float, ...]:
-        """Percentiles of arrival minus stamp, to a millisecond; NaN without a stamp near its arrival [s].
+        """Returns percentiles of arrival minus stamp, to a millisecond; NaN without a stamp near its arrival [s].
 
         Args:
-            *percent: Of the frames, in [0, 100].
+            *percent: Percentiles, in [0, 100].
         """
         if not self._delays_ms:
             return tuple(float("nan") for _ in percent)
@@ -132,19 +132,19 @@ class CameraClock:
 
 
 class ArrivalOrder:
-    """Check of the order of a body's messages in the file: a recorder's clock that is set back mixes times.
+    """Checks the order of a body's messages in the file: if a recorder's clock is set back, times are mixed.
 
-    Bodies, topics and files may have been written one after the other; each has an order of its own.
+    Bodies, topics and files may have been written one after the other; each is checked separately.
     """
 
     def __init__(self) -> None:
-        self._waiting: dict[Hashable, deque[tuple[int, int]]] = {}  # of the last second: arrival, position
-        self._furthest: dict[Hashable, int] = {}  # the largest position of all before
-        self._mixed: list[int] = []  # first and last arrival of messages that stand before earlier ones in their file
+        self._waiting: dict[Hashable, deque[tuple[int, int]]] = {}  # arrival and position of the last second
+        self._furthest: dict[Hashable, int] = {}  # the largest earlier position
+        self._mixed: list[int] = []  # first and last arrival of messages that precede earlier ones in their file
         self._count = 0
 
     def add(self, body: Hashable, arrival_ns: int, position: int) -> None:
-        """Takes a message of a body, in order of arrival."""
+        """Adds a message of a body, in order of arrival."""
         waiting = self._waiting.setdefault(body, deque())
         while waiting and arrival_ns - waiting[0][0] > _MIXED_NS:
             self._furthest[body] = max(self._furthest.get(body, 0), waiting.popleft()[1])
@@ -154,7 +154,7 @@ class ArrivalOrder:
         waiting.append((arrival_ns, position))
 
     def remarks(self, start_ns: int) -> Iterator[str]:
-        """Remarks on wrong orders, and where; ``start_ns`` is where the log begins [ns]."""
+        """Returns remarks on wrong orders, with their times; ``start_ns`` is the start of the log [ns]."""
         if self._count < _FEW:
             return
         begin_s = (self._mixed[0] - _MIXED_NS - start_ns) / 1e9
@@ -168,13 +168,13 @@ class ArrivalOrder:
 
 
 def clock_remarks(camera: str, clock: CameraClock, begin_ns: int, late: int) -> Iterator[str]:
-    """Notes on what is wrong with a camera's stamps; none for a clock that may be right.
+    """Returns notes on wrong stamps of a camera; none for a plausible clock.
 
     Args:
-        camera: Its name.
-        clock: After the last of its rows.
-        begin_ns: Where the log begins [ns].
-        late: Rows dropped as captured before an earlier delivered one.
+        camera: Name of the camera.
+        clock: Its clock after the last of its rows.
+        begin_ns: Start of the log [ns].
+        late: Number of rows dropped because they were captured before an earlier delivered one.
     """
     usual = f"arrival less the usual delay ({clock.usual_ns / 1e6:.0f} ms) used" if clock.usual_ns else "arrival used"
     far, ahead, back = (clock.replaced[why] for why in ("far", "ahead", "set back"))
@@ -203,19 +203,19 @@ def clock_remarks(camera: str, clock: CameraClock, begin_ns: int, late: int) -> 
 
 
 def late_remark(camera: str, clock: CameraClock, offset_s: float) -> str | None:
-    """A note on a camera whose frames come long after their capture; None where most of them do not.
+    """Returns a note on a camera whose frames arrive long after their capture; None if most do not.
 
     Args:
-        camera: Its name.
-        clock: After the last of its rows.
-        offset_s: Its clock minus the reference camera's, as the cell has it [s].
+        camera: Name of the camera.
+        clock: Its clock after the last of its rows.
+        offset_s: Its clock minus the reference camera's, from the cell [s].
     """
     (median_s,) = clock.delay_s(50.0)
     return f"camera {camera}: {delay_text(clock, offset_s)}" if median_s + offset_s > LATE_S else None
 
 
 def delay_text(clock: CameraClock, offset_s: float) -> str:
-    """Describe the delay from capture to arrival of a camera's frames, its likely cause, and the remedy."""
+    """Describes the delay from capture to arrival of a camera's frames, its likely cause, and the remedy."""
     median_s, p95_s, least_s, most_s = (s + offset_s for s in clock.delay_s(50.0, 95.0, 0.0, 100.0))
     return (
         f"its frames come {median_s:.2f} s after their capture by their stamps (median; 95 % within {p95_s:.2f} s, "
@@ -225,7 +225,7 @@ def delay_text(clock: CameraClock, offset_s: float) -> str:
 
 
 def _epoch(low_ns: int, high_ns: int) -> str:
-    """Clock that stamps are likely to be of."""
+    """Describes the likely clock of stamps."""
     if 0 <= high_ns < _YOUNG_NS:
         return f"{low_ns / 1e9:.2f} to {high_ns / 1e9:.2f} s: the time of a simulation, or since a computer started"
     try:

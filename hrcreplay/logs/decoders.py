@@ -1,7 +1,7 @@
-"""Decoders of skeleton topics, one class a message format.
+"""Decoders of skeleton topics, one class per message format.
 
-Our own Skeleton message; the transforms of openni_tracker (camera to left_elbow_1 on /tf, one message a joint); and
-message types that the settings describe. The markers of the Azure Kinect ROS driver: ``markers``.
+They read hrcreplay's own Skeleton message, the transforms of openni_tracker (camera to left_elbow_1 on /tf, one message
+per joint), and message types that the settings describe. ``markers`` reads the markers of the Azure Kinect ROS driver.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from hrcreplay.logs.messages import (
 from hrcreplay.records import NOBODY, POINTS, Floats
 from hrcreplay.settings.sections import Decoder
 
-_BODY_BELOW = NOBODY - 1  # a tracker's body with the id of nobody
+_BODY_BELOW = NOBODY - 1  # a tracker's body with the id of an empty frame
 
 
 class OwnDecoder:
-    """Topic /camera/<name>/skeleton of our own log."""
+    """Topic /camera/<name>/skeleton of hrcreplay's own log."""
 
     notes: ClassVar[tuple[str, ...]] = ()
     shows_camera_alive: ClassVar[bool] = False
@@ -45,16 +45,16 @@ class OwnDecoder:
         self.cameras = (camera,)
 
     def fresh_copy(self) -> OwnDecoder:
-        """Itself: it remembers nothing."""
+        """Returns itself, as it has no state."""
         return self
 
     def rows(self, message: Message) -> list[RawSkeleton]:
-        """The one row of a message."""
+        """Returns the one row of a message."""
         return [own_row(message.read(), self.cameras[0], self.topic)]
 
 
 def own_row(skeleton: Any, camera: str, topic: str) -> RawSkeleton:
-    """The row of a camera that a Skeleton message of our own is. Raises Undecodable, with its topic."""
+    """Decodes the row in a Skeleton message of hrcreplay. Raises Undecodable, with its topic."""
     confidence = np.array(skeleton.confidence, dtype=np.float64)
     if len(confidence) != len(POINTS):
         raise Undecodable(f"{topic}: a skeleton of {len(confidence)} confidences; {len(POINTS)} are right")
@@ -63,15 +63,15 @@ def own_row(skeleton: Any, camera: str, topic: str) -> RawSkeleton:
 
 
 def points_of(values: Any, topic: str) -> Floats:
-    """(20, 3) points from the packed values of a message."""
+    """Returns (20, 3) points from the packed values of a message."""
     if len(values) != 3 * len(POINTS):
         raise Undecodable(f"{topic}: a body of {len(values)} numbers; {3 * len(POINTS)} are right")
     return np.array(values, dtype=np.float64).reshape(len(POINTS), 3)
 
 
-_PEEK = 300  # messages by which a topic is described
+_PEEK = 300  # number of messages used to describe a topic
 TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
-_FRAME_NS = 15_000_000  # half a period of 30 Hz: openni_tracker stamps every joint by itself, some ms apart
+_FRAME_NS = 15_000_000  # half a period of 30 Hz: openni_tracker stamps every joint separately, a few ms apart
 _LEAST_JOINTS = 6
 _NAMES = "|".join(sorted(OPENNI_JOINTS))
 _CHILD = re.compile(rf"/?({_NAMES})_(\d+)")
@@ -84,18 +84,18 @@ _WHERE = {joint: [POINTS.index(p) for p, named in OPENNI_POINTS.items() if named
 class _Person:
     """A person's joints of the frame being assembled."""
 
-    known: set[str] = field(default_factory=set)  #: joints ever seen of the person
+    known: set[str] = field(default_factory=set)  #: joints of the person seen so far
     joints: dict[str, Floats] = field(default_factory=dict)
     first_ns: int = 0
 
 
 class TfDecoder:
-    """A tf topic. The camera is the parent frame, the body the number at the end of the child's name.
+    """A tf topic. The camera is the parent frame; the body is the number at the end of the child's name.
 
-    A person's transforms make one frame; it is complete, and arrives, with the last of the joints that this person
-    has had so far, or, where one of them stays away, when the next frame begins: a joint comes again or the stamp
-    moves by more than 15 ms. The capture is the first transform's stamp. Left and right are taken as named. OpenNI has
-    no pelvis: it is the middle of the hips.
+    A person's transforms form one frame. It is complete, and arrives, with the last of the joints seen so far of this
+    person or, if one of them is missing, when the next frame begins: a joint is repeated or the stamp changes by more
+    than 15 ms. The capture is the first transform's stamp. Left and right are taken as named. OpenNI has no pelvis: it
+    is the middle of the hips.
     """
 
     notes: ClassVar[tuple[str, ...]] = (
@@ -110,11 +110,11 @@ class TfDecoder:
         self._people: dict[tuple[str, int], _Person] = defaultdict(_Person)
 
     def fresh_copy(self) -> TfDecoder:
-        """A decoder that has seen nobody yet."""
+        """Returns a decoder without state."""
         return TfDecoder(self.topic, self.cameras, self._unit)
 
     def rows(self, message: Message) -> list[RawSkeleton]:
-        """The frames that this message completes."""
+        """Returns the frames that this message completes."""
         rows: list[RawSkeleton] = []
         if not _JOINT_BYTES.search(message.data):
             return rows
@@ -152,10 +152,9 @@ def _finish(person: _Person, camera: str, body: int) -> RawSkeleton:
 
 
 def find_cameras(messages: Iterable[Message]) -> tuple[str, ...]:
-    """Frames under which people are tracked, in order of appearance.
+    """Finds the parent frames of tracked people, in order of appearance.
 
-    The whole topic is gone through, as a camera may start late, but only messages with a pair of frames not met
-    before are decoded.
+    The whole topic is read, as a camera may start late, but only messages with a new pair of frames are decoded.
     """
     met: set[tuple[bytes, bytes]] = set()
     joints: dict[str, set[str]] = defaultdict(set)
@@ -189,15 +188,15 @@ class GenericDecoder:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The one sensor."""
+        """Name of the sensor."""
         return (self.how.camera,)
 
     def fresh_copy(self) -> GenericDecoder:
-        """Itself: it remembers nothing."""
+        """Returns itself, as it has no state."""
         return self
 
     def rows(self, message: Message) -> list[RawSkeleton]:
-        """The one row of a message; where the array is empty, that of nobody."""
+        """Returns the one row of a message; for an empty array, a row without a body."""
         content = message.read()
         where = f"{self.how.topic} ({message.topic.type})"
         elements = _array(content, self.how.points, where)
@@ -209,7 +208,7 @@ class GenericDecoder:
         scale = METRES[self.how.unit]
         for name, element in self.how.index.items():
             if not 0 <= element < len(elements):
-                continue  # a shorter array has no such point
+                continue  # a shorter array lacks the point
             at, i = elements[element], POINTS.index(name)
             try:
                 points[i] = scale * at.x, scale * at.y, scale * at.z
@@ -247,7 +246,7 @@ _LISTED = 6
 
 
 def describe_transforms(messages: Iterable[Message]) -> str:
-    """The frames of a tf topic, in a few words, by its first messages."""
+    """Describes the frames of a tf topic in a few words, from its first messages."""
     children: dict[str, None] = {}
     for message in islice(messages, _PEEK):
         children.update(dict.fromkeys(str(transform.child_frame_id) for transform in message.read().transforms))
@@ -258,12 +257,12 @@ def describe_transforms(messages: Iterable[Message]) -> str:
     )
 
 
-#: In the description of a topic that settings can make readable.
+#: Phrase in the description of a topic that settings can make readable.
 DECODABLE = "[[logs.decoders]] can read"
 
 
 def describe_arrays(messages: Iterable[Message]) -> str:
-    """The arrays of points that a described decoder could read in a topic, in a few words, by its first messages."""
+    """Describes the arrays of points that a decoder in the settings could read in a topic, from its first messages."""
     found: dict[str, int] = {}
     for message in islice(messages, _PEEK):
         for path, count in _point_arrays(message.read(), ""):
@@ -275,7 +274,7 @@ def describe_arrays(messages: Iterable[Message]) -> str:
 
 
 def _point_arrays(content: Any, path: str) -> Iterator[tuple[str, int]]:
-    """Path and length of each array of points in a message."""
+    """Returns path and length of each array of points in a message."""
     if path.count(".") >= _ARRAY_DEPTH:
         return
     for name in getattr(content, "__dataclass_fields__", ()):

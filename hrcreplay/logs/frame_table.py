@@ -1,4 +1,4 @@
-"""Skeletons as a DataFrame: a row a body a frame, three columns a body point."""
+"""Skeletons as a DataFrame: one row per body and frame, three columns per body point."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import pandas as pd
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import POINTS, CameraFrames
 
-#: Columns that a table has at least, with one body point or another.
+#: Required columns of a table, in addition to at least one body point.
 _COLUMNS = ("arrival_ns", "camera", "pelvis_x", "pelvis_y", "pelvis_z")
 
 
 def frames_of_table(table: pd.DataFrame, cameras: tuple[str, ...]) -> CameraFrames:
-    """The rows of a DataFrame as ``api.frames`` describes it, in order of arrival.
+    """Reads the rows of a DataFrame in the form of ``api.frames``, in order of arrival.
 
     Args:
-        table: A row a body a frame.
+        table: One row per body and frame.
         cameras: Names of the cameras.
 
     Raises:
@@ -57,7 +57,7 @@ def frames_of_table(table: pd.DataFrame, cameras: tuple[str, ...]) -> CameraFram
 
 
 def table_of_frames(parts: list[CameraFrames], cameras: tuple[str, ...]) -> pd.DataFrame:
-    """The same DataFrame from tables of frames of these cameras."""
+    """Makes this DataFrame from tables of frames of some cameras."""
     if not parts:
         return pd.DataFrame(columns=list(_COLUMNS))
     whole = CameraFrames.join(parts)

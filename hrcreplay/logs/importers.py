@@ -1,13 +1,13 @@
 """Importers of skeleton text files: Azure Kinect CSV, Kinect v2 CSV, and KERAAL text files.
 
-Azure Kinect: ``;``, a header row, microseconds, millimetres, one file a camera. Kinect v2: no header, 100-ns ticks,
-metres, a tracking state for each of 25 joints, one file a camera. KERAAL: a Kinect v2 and optical targets of one
-movement, without time stamps. Times may be in another unit where their steps say so.
+Azure Kinect: ``;``, a header row, microseconds, millimetres, one file per camera. Kinect v2: no header, 100-ns ticks,
+metres, a tracking state for each of 25 joints, one file per camera. KERAAL: a Kinect v2 and optical targets of one
+movement, without time stamps. Times in another unit are recognised by their steps.
 
 Optical targets lie on the skin. The joint centre is the point that stays fixed in both neighbouring segments, by the
 symmetrical centre of rotation estimation of Ehrig et al. (2006), A survey of formal methods for determining the centre
-of rotation of ball joints, J. Biomech. 39, 2798-2809. A weak term pulls the centre towards both targets: it decides
-along the axis of a hinge, where the movement does not.
+of rotation of ball joints, J. Biomech. 39, 2798-2809. A weak term pulls the centre towards both targets: it determines
+the position along the axis of a hinge, which the movement does not.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from hrcreplay.logs.writer import (
 )
 from hrcreplay.records import POINTS, Floats
 
-#: K4ABT's joint confidence: none, low, medium, high. 'High' is reserved by the SDK; medium is the most it gives.
+#: K4ABT's joint confidence: none, low, medium, high. 'High' is reserved by the SDK; the maximum in practice is medium.
 _AZURE_CONFIDENCE = {0.0: 0.0, 1.0: 0.5, 2.0: 1.0, 3.0: 1.0}
 
 _JOINTS = {
@@ -59,7 +59,7 @@ _JOINTS = {
 
 
 def import_azure(paths: Mapping[str, Path], out: Path) -> list[str]:
-    """Makes our log from Azure Kinect CSV files (.csv or .csv.gz): ``import_cameras``, with its remarks and errors.
+    """Makes a log from Azure Kinect CSV files (.csv or .csv.gz): ``import_cameras``, with its remarks and errors.
 
     Points stay in each camera's own depth frame (x right, y down, z forward) [m]. Confidence 0, 1, 2, 3 becomes
     0, 0.5, 1, 1. The device's time is the capture time.
@@ -84,7 +84,7 @@ def _azure_rows(path: Path, unit_ns: int) -> Iterator[ImportedSkeleton]:
 
 
 def _joints(where: str, columns: list[str]) -> dict[str, int]:
-    """Body point -> index of its joint among the file's joints."""
+    """Returns, for each body point, the index of its joint among the file's joints."""
     names = [name.removesuffix(" (c)") for name in columns[2::4]]
     missing = [joint for joint in _JOINTS.values() if joint not in names]
     if missing:
@@ -93,7 +93,7 @@ def _joints(where: str, columns: list[str]) -> dict[str, int]:
 
 
 def _places(where: str, columns: list[str]) -> int:
-    """Number of joints, from the names of all columns."""
+    """Returns the number of joints, from the names of all columns."""
     count = (len(columns) - 2) // 4
     wanted = ["timestamp", "body_idx"]
     for name in columns[2::4]:
@@ -124,7 +124,7 @@ def _row(
 #: Confidence of the tracking states 'not tracked', 'inferred' and 'tracked'.
 _KINECT2_CONFIDENCE = np.array([0.0, 0.5, 1.0])
 
-#: Body point -> joint of the Kinect v2. Its SpineShoulder is the middle of the shoulder line, its Neck lies higher.
+#: Body point -> joint of the Kinect v2. Its SpineShoulder is the middle of the shoulder line; its Neck is higher.
 JOINTS = {
     "pelvis": 0,
     "chest": 1,
@@ -142,7 +142,7 @@ _COUNT = 25
 
 
 def import_kinect2(paths: Mapping[str, Path], out: Path) -> list[str]:
-    """Makes our log from Kinect v2 CSV files (.csv or .csv.gz): ``import_cameras``, with its remarks and errors.
+    """Makes a log from Kinect v2 CSV files (.csv or .csv.gz): ``import_cameras``, with its remarks and errors.
 
     Points stay in each camera's own frame (x to the sensor's left, y up, z forward) [m]. Tracking states 0, 1, 2
     become confidence 0, 0.5, 1. The sensor's time is the capture time.
@@ -168,7 +168,7 @@ def _kinect2_rows(path: Path, unit_ns: int) -> Iterator[ImportedSkeleton]:
 
 
 _PULL = 0.04  # skin movement (4 mm) over the usual distance of a target from the centre (0.1 m)
-_SWING = 0.05  # rad: two segments that turn less against one another tell no centre
+_SWING = 0.05  # rad: minimum relative rotation of two segments for a centre
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class Pivot:
     below_m: Floats  # (3,)
 
     def at(self, turn_a: Floats, place_a: Floats, turn_b: Floats, place_b: Floats) -> Floats:
-        """The centre (3,) when the targets have these rotations (3, 3) and places (3,): midway of what both say.
+        """Returns the centre (3,) for poses of the targets: the midpoint of both estimates.
 
         Args:
             turn_a: (3, 3) rotation of the target above the joint.
@@ -191,32 +191,32 @@ class Pivot:
 
 
 def rotations(quaternions: Floats) -> Floats:
-    """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x y z w; NaN where one has no finite length."""
+    """Converts quaternions (n, 4), x y z w, to rotation matrices (n, 3, 3); NaN if one has no finite length."""
     length = np.linalg.norm(quaternions, axis=1)
-    known = np.asarray(np.isfinite(length) & (length > 0))  # scipy refuses the others: a target not seen
+    known = np.asarray(np.isfinite(length) & (length > 0))  # scipy rejects the others, from unseen targets
     matrices = Rotation.from_quat(np.where(known[:, None], quaternions, (0.0, 0.0, 0.0, 1.0))).as_matrix()
     matrices[~known] = np.nan
     return np.asarray(matrices)
 
 
 def find_pivot(turns_a: Floats, places_a: Floats, turns_b: Floats, places_b: Floats) -> Pivot | None:
-    """Centre about which two targets turn, least squares over a recording.
+    """Finds the centre about which two targets turn, by least squares over a recording.
 
     Args:
-        turns_a: (n, 3, 3) rotations of the target above, NaN where not seen.
+        turns_a: (n, 3, 3) rotations of the target above, NaN if not seen.
         places_a: (n, 3) [m].
         turns_b: (n, 3, 3) of the target below.
         places_b: (n, 3) [m].
 
     Returns:
-        The pivot, or None where the segments hardly turn against one another.
+        The pivot, or None if the segments hardly turn relative to each other.
     """
     seen = np.isfinite(places_a).all(axis=1) & np.isfinite(places_b).all(axis=1)
     if seen.sum() < 10:
         return None
     A = np.concatenate([turns_a[seen], -turns_b[seen]], axis=2).reshape(-1, 6)
     y = (places_b[seen] - places_a[seen]).ravel()
-    # A hinge turns two of the three directions: the fifth singular value tells whether there was a swing at all.
+    # A hinge turns two of the three directions: the fifth singular value measures the amount of rotation.
     if np.linalg.svd(A, compute_uv=False)[4] < _SWING * np.sqrt(seen.sum()):
         return None
     pull = _PULL * np.sqrt(seen.sum())
@@ -224,7 +224,7 @@ def find_pivot(turns_a: Floats, places_a: Floats, turns_b: Floats, places_b: Flo
     return Pivot(centre[:3], centre[3:])
 
 
-#: Optical rows for one row of the Kinect.
+#: Number of optical rows per row of the Kinect.
 OPTICAL_RATE = 2
 
 _KINECT_JOINTS = 25
@@ -233,10 +233,10 @@ _TARGETS = (
     *("hand_r", "hand_l", "foot_r", "foot_l", "hips", "head", "tibia_r", "tibia_l"),
 )
 
-#: Body points that a target itself stands for. It sits on the skin, some centimetres off: half confidence.
+#: Body points at a target itself. It is on the skin, a few centimetres off: confidence 0.5.
 _ON_TARGET = {"pelvis": "hips", "head": "head", "hand_l": "hand_l", "hand_r": "hand_r"}
 
-#: Body points in which two segments turn about one another: target above, target below.
+#: Body points about which two segments turn: target above, target below.
 _PIVOTS = {
     f"{point}_{side}": (f"{above}_{side}", f"{below}_{side}")
     for side in "lr"
@@ -249,28 +249,28 @@ _PIVOTS = {
     )
 }
 
-_PIVOT_ROWS = 4000  # rows of the recording that the pivots are found from, evenly spaced
+_PIVOT_ROWS = 4000  # number of rows of the recording, evenly spaced, from which the pivots are found
 
 
 def import_keraal(kinect: Path, optical: Path | None, out: Path, rate_hz: float) -> list[str]:
-    """Makes our log from the Kinect's text file and, as a second sensor, that of the optical targets.
+    """Makes a log from the Kinect's text file and, as a second sensor, that of the optical targets.
 
     Points stay in each sensor's own frame [m]: the Kinect's (x to the sensor's left, y up, z forward), the optical
-    system's (z up). The files have no confidence: what the Kinect gives counts as 1. Targets sit on the skin, so
-    shoulders, elbows, wrists, knees and ankles are the centres about which neighbouring targets turn; where the
-    movement does not tell a centre, the point is missing. The neck is the middle of the shoulders.
+    system's (z up). The files have no confidence: the Kinect's points get 1. Targets are on the skin, so shoulders,
+    elbows, wrists, knees and ankles are the centres about which neighbouring targets turn; if the movement does not
+    determine a centre, the point is missing. The neck is the middle of the shoulders.
 
     Args:
-        kinect: 25 joints a row.
-        optical: 17 rigid targets a row, at twice the Kinect's rate; or None.
+        kinect: 25 joints per row.
+        optical: 17 rigid targets per row, at twice the Kinect's rate; or None.
         out: Log to write.
-        rate_hz: Frames a second of the Kinect [Hz].
+        rate_hz: Frame rate of the Kinect [Hz].
 
     Returns:
         Remarks for the user.
 
     Raises:
-        LogError: A file that cannot be read as this format.
+        LogError: A file cannot be read in this format.
         SettingsError: ``out`` exists or cannot be written, or the rate is not positive.
     """
     if not 0 < rate_hz < np.inf:
@@ -300,13 +300,13 @@ def _kinect_rows(path: Path, rate_hz: float) -> Iterator[ImportedSkeleton]:
 
 
 def _tables(path: Path, count: int) -> Iterator[Floats]:
-    """Rows of (count, 7): position and quaternion x y z w."""
+    """Yields rows of (count, 7): position and quaternion x y z w."""
     for where, text in lines(path):
         yield numbers(where, text.split(), 7 * count).reshape(count, 7)
 
 
 def _poses(path: Path) -> Iterator[tuple[Floats, Floats]]:
-    """Rotations (17, 3, 3) and positions (17, 3) [m] of the targets, NaN where one was not seen."""
+    """Returns rotations (17, 3, 3) and positions (17, 3) [m] of the targets, NaN if one was not seen."""
     for table in _tables(path, len(_TARGETS)):
         lost = (table[:, 3:] == 0).all(axis=1)
         positions = np.where(lost[:, None], np.nan, table[:, :3] * 1e-3)

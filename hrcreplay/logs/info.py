@@ -1,4 +1,4 @@
-"""Summary of a log: what it contains, and what is missing for the next step."""
+"""Summary of a log: its content, and the missing data for the next step."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ class CameraSummary:
 
     name: str
     frames: int  #: instants; several bodies in one frame count once
-    rate_hz: float  #: by the median period between captures [Hz]; NaN below two frames
+    rate_hz: float  #: rate from the median period between captures [Hz]; NaN below two frames
     first_ns: int | None  #: first arrival
     last_ns: int | None  #: last arrival
-    longest_gap_s: float  #: between arrivals of frames with a body in them [s]; NaN below two frames
-    delay_s: float  #: median from capture to arrival, with the offset of the two clocks in it [s]
+    longest_gap_s: float  #: longest time between arrivals of frames with a body [s]; NaN below two frames
+    delay_s: float  #: median delay from capture to arrival, including the offset of the two clocks [s]
     delay_p95_s: float  #: its 95th percentile [s]
-    delay_range_s: tuple[float, float]  #: the least and the largest [s]
-    bodies: dict[int, int]  #: body id -> rows
-    pose_from: str  #: where its extrinsics are from: the log, the cell; none
-    stature_m: float  #: how tall its bodies are by their bones, median [m]; NaN where no bone was seen
-    side_cue: str | None  #: by what its left and right were told apart; None: not checked
+    delay_range_s: tuple[float, float]  #: minimum and maximum [s]
+    bodies: dict[int, int]  #: body id -> number of rows
+    pose_from: str  #: source of its extrinsics: the log, the cell; none
+    stature_m: float  #: stature of its bodies from their bones, median [m]; NaN if no bone was seen
+    side_cue: str | None  #: body part by which left and right were checked; None: not checked
 
     @property
     def posed(self) -> bool:
-        """Return whether its extrinsics are known."""
+        """Returns True if its extrinsics are known."""
         return self.pose_from != "none"
 
 
@@ -60,15 +60,15 @@ class JointSummary:
 
     topic: str
     names: tuple[str, ...]
-    axes: dict[str, int]  #: name in the log -> number of the robot's axis that is read from it, counted from 1
-    rate_hz: float  #: by the median time between arrivals [Hz]; NaN below two messages
-    longest_gap_s: float  #: between arrivals of one joint [s]; NaN below two messages
+    axes: dict[str, int]  #: name in the log -> number of the robot's axis read from it, from 1
+    rate_hz: float  #: rate from the median time between arrivals [Hz]; NaN below two messages
+    longest_gap_s: float  #: longest time between arrivals of one joint [s]; NaN below two messages
     clock: Clock
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Everything that ``hrcreplay info`` prints."""
+    """Content of the output of ``hrcreplay info``."""
 
     path: Path
     kind: str
@@ -81,14 +81,14 @@ class Summary:
     has_truth: bool
     joints: tuple[JointSummary, ...]
     defects: dict[str, int]
-    bodies: tuple[BodyInWorld, ...]  #: the person on the floor, of each camera whose pose is known
-    agreements: tuple[LimbAgreement, ...]  #: limb by limb, of each two such cameras
+    bodies: tuple[BodyInWorld, ...]  #: heights of the person above the floor, for each camera of known pose
+    agreements: tuple[LimbAgreement, ...]  #: agreement limb by limb, for each pair of such cameras
     notes: tuple[str, ...]
-    missing: tuple[str, ...]  #: what the next step needs and the log lacks, each with what to do
+    missing: tuple[str, ...]  #: missing data for the next step, each with a remedy
 
     @property
     def span_s(self) -> float:
-        """First to last arrival [s]."""
+        """Time from first to last arrival [s]."""
         return (self.end_ns - self.start_ns) / 1e9
 
 
@@ -129,14 +129,14 @@ def summarize(
 
     Args:
         log: An open log; also one without skeletons (``open_log(path, options, skeletons=False)``).
-        axes: The robot's joints, to say which joint of the log is which axis; () where they are not known.
-        options: How the person is told from other bodies.
-        T_world_camera: (4, 4) poses of a cell, which have priority over those of the log.
-        clock_offset_s: Each camera's clock minus the reference camera's, of a cell [s].
-        T_world_base: (4, 4) pose of the robot's base of a cell, which has priority over that of the log.
+        axes: The robot's joints, to match the joints of the log to axes; () if unknown.
+        options: Settings of the person selection.
+        T_world_camera: (4, 4) poses from a cell; they have priority over those of the log.
+        clock_offset_s: Each camera's clock minus the reference camera's, from a cell [s].
+        T_world_base: (4, 4) pose of the robot's base from a cell; it has priority over that of the log.
 
     Raises:
-        LogError: The log is broken in a way that cannot be worked around.
+        LogError: The log is damaged beyond recovery.
     """
     header = log.header
     base = header.T_world_base if T_world_base is None else T_world_base
@@ -179,7 +179,7 @@ def summarize(
 
 
 def _late(log: Log, clock_offset_s: Mapping[str, float]) -> Iterator[str]:
-    """Notes on cameras whose frames come long after their capture."""
+    """Returns notes on cameras whose frames arrive long after their capture."""
     for name, clock in log.clocks.items():
         remark = late_remark(name, clock, clock_offset_s.get(name, 0.0))
         if remark is not None:
@@ -187,14 +187,14 @@ def _late(log: Log, clock_offset_s: Mapping[str, float]) -> Iterator[str]:
 
 
 def _strangers(cameras: Sequence[str], cell: Mapping[str, Floats]) -> Iterator[str]:
-    """A note on each camera of a cell that the log lacks."""
+    """Returns a note on each camera of a cell that the log lacks."""
     for name in sorted(set(cell) - set(cameras)):
         there = ", ".join(cameras) or "none"
         yield f"the cell's camera {name} is not in the log; its cameras are {there}; no other command takes such a cell"
 
 
 class _PersonInWorld:
-    """The person as the cameras whose poses are known show them in the world."""
+    """Collects the person in the world from the cameras with known poses."""
 
     def __init__(
         self, log: Log, poses: Mapping[str, Floats], clock_offset_s: Mapping[str, float], options: Logs
@@ -217,7 +217,7 @@ class _PersonInWorld:
 
 
 def _joints(log: Log, axes: Sequence[str]) -> tuple[tuple[JointSummary, ...], tuple[str, ...]]:
-    """The topics of the robot's joints, and remarks: on what reading them tells, or on why they cannot be read."""
+    """Returns the topics of the robot's joints, and remarks on their reading or its failure."""
     states, reading = log.joint_states(), None
     notes: tuple[str, ...] = ()
     if states and axes:
@@ -288,7 +288,7 @@ def _missing(
 
 
 def lines(summary: Summary) -> list[str]:
-    """The summary as plain text, a line an item."""
+    """Returns the summary as plain text, one line per item."""
     begin = datetime.fromtimestamp(summary.start_ns / 1e9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S")
     out = [
         f"{summary.path}",
@@ -311,7 +311,7 @@ def lines(summary: Summary) -> list[str]:
     out += [f"sides    {', '.join(_sided(camera) for camera in summary.cameras) or 'none'}"]
     out += ["floor", *(f"  {body_line(body)}" for body in summary.bodies)] if summary.bodies else ["floor    not known"]
     out += ["agreement", *(f"  {line}" for line in agreement_lines(summary.agreements))] if summary.agreements else []
-    delivered = {f"frames_{camera.name}" for camera in summary.cameras}  # counted with the defects, but none
+    delivered = {f"frames_{camera.name}" for camera in summary.cameras}  # counted with the defects, but not a defect
     found = {name: n for name, n in summary.defects.items() if n and name not in delivered}
     out += ["defects", *(f"  {name}  {n}" for name, n in found.items())] if found else ["defects  none"]
     if summary.notes:

@@ -1,7 +1,7 @@
 """The recorded robot joints: joint states of all topics, joined by name into one track of the robot's axes.
 
-Names decide which joint is which axis, never the order in a message. Each axis is read on its own clock, and all that
-is not as it should be is told in a note.
+Joints are matched to axes by name, never by the order in a message. Each axis is read on its own clock, and each
+irregularity gives a note.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from hrcreplay.settings.sections import Logs
 _ROS, _OWN = "sensor_msgs/JointState", "hrcreplay.JointState"
 _NS = 1_000_000_000
 
-#: A robot whose axis is not heard of for longer has a gap [s].
+#: Time without a position of an axis above which there is a gap [s].
 GAP_S = 0.2
-#: A message stamped so much ahead of its neighbours has a wrong stamp; so far apart may they be on the wire [s].
+#: Lead of a stamp over its neighbours that marks it as wrong; also the tolerated difference in transport time [s].
 _APART_S = 0.1
-#: A message is held up on the way for no longer than this, or its stamp is wrong [s].
+#: Maximum transport delay of a message; above it the stamp is wrong [s].
 _HELD_S = 10.0
-#: A clock that moves on by so much more than the log's between two messages was set anew [s].
+#: Excess of a clock's step over the log's between two messages that marks a reset clock [s].
 _STEP_S = 0.25
-#: A message needs no longer than this from robot to logger, or its stamp is of another clock [s].
+#: Maximum time from robot to logger; above it the stamp is from another clock [s].
 _LATE_S = 0.25
-#: Stamps may be so far ahead of their arrival: two clocks are never quite the same [s].
+#: Maximum lead of stamps over their arrival, as two clocks always differ slightly [s].
 _AHEAD_S = 1e-3
-#: Two clocks are apart by a constant where the least delays all over the log differ by no more [s].
+#: Maximum variation of the smallest delays over the log for a constant clock offset [s].
 _CONSTANT_S = 0.05
-#: Two topics that tell one axis agree where they are nowhere further apart [rad].
+#: Maximum difference between two topics with the same axis [rad].
 _AGREE_RAD = 0.05
-#: A joint that is no axis of the robot rests where it moves by no more [rad or m].
+#: Maximum motion of a resting joint that is not an axis of the robot [rad or m].
 _AT_REST = 1e-3
-#: What stands for the name of a joint that has none, before its place in the message.
+#: Prefix of the name of an unnamed joint, before its index in the message.
 _NAMELESS = "#"
 
 
 @dataclass(frozen=True)
 class JointTrack(Table):
-    """Positions of the robot's axes as the log has them, a row an instant at which one of them is told."""
+    """Positions of the robot's axes in the log, one row per instant with a position of any axis."""
 
     t_ns: Ints  #: (n,) on the log's clock, increasing
     q: Floats  #: (n, nv) [rad]
@@ -69,7 +69,7 @@ class JointTopic:
     name: str
     arrival_ns: Ints  #: (m,)
     stamp_ns: Ints  #: (m,) 0 where a message has none
-    joints: Mapping[str, Samples]  #: by name, in the order in which they are met; without names '#1', '#2', ...
+    joints: Mapping[str, Samples]  #: by name, in order of appearance; unnamed joints are '#1', '#2', ...
 
 
 @dataclass(frozen=True)
@@ -80,25 +80,25 @@ class Clock:
     delay_s: tuple[float, float, float]  #: arrival - stamp: median, 5th and 95th percentile; NaN without stamps [s]
     basis: str  #: "stamps", "stamps, shifted" or "arrival"
     shift_s: float  #: added to the stamps [s]
-    remark: str  #: for the user; empty where all is well
+    remark: str  #: note for the user; empty without a problem
 
 
 @dataclass(frozen=True)
 class JointReading:
-    """The joint track, and how it was read."""
+    """The joint track, and the way it was read."""
 
     track: JointTrack
     sources: Mapping[str, tuple[str, str]]  #: axis -> topic and name in the log
-    clocks: tuple[Clock, ...]  #: of the topics that are read
+    clocks: tuple[Clock, ...]  #: clocks of the topics that are read
     gaps_ns: Ints  #: (g, 2) begin and end of each silence of an axis, in order
     notes: tuple[str, ...]  #: for the user
 
 
 def find_topics(source: LogFiles, name: str | None) -> tuple[str, ...]:
-    """Topics of joint states: that named, else all.
+    """Finds the topics of joint states: the named one, else all.
 
     Raises:
-        LogError: The topic named is not there or carries none.
+        LogError: The named topic is missing or contains none.
     """
     found = dict.fromkeys(t.name for t in source.topics() if t.type in (_ROS, _OWN) and t.count)
     if name is None:
@@ -109,12 +109,12 @@ def find_topics(source: LogFiles, name: str | None) -> tuple[str, ...]:
 
 
 def read_topics(source: LogFiles, names: Sequence[str], defects: Counter[str]) -> list[JointTopic]:
-    """The joint states of the topics that hold positions.
+    """Reads the joint states of the topics with positions.
 
     Args:
         source: The log's files.
         names: Topics of joint states.
-        defects: Counts messages that are left out.
+        defects: Receives the number of messages left out.
     """
     return [topic for name in names if (topic := _read_topic(source, name, defects)).joints]
 
@@ -161,14 +161,14 @@ def _joint_state(message: Message) -> tuple[int, list[str], list[float]]:
 def read_track(
     topics: Sequence[JointTopic], axes: Sequence[str], options: Logs, where: str, defects: Counter[str]
 ) -> JointReading:
-    """One track of the robot's axes.
+    """Makes one track of the robot's axes.
 
     Args:
-        topics: What ``read_topics`` found.
+        topics: Result of ``read_topics``.
         axes: The robot's joints, from the base on.
-        options: How names, unit and clock are set.
-        where: What messages begin with: the log.
-        defects: Counts messages and positions that are left out, and ``joint_gaps_ms`` of all gaps together.
+        options: Settings of names, unit and clock.
+        where: Start of error messages: the log.
+        defects: Receives the numbers of messages and positions left out, and ``joint_gaps_ms``, the sum of all gaps.
 
     Raises:
         LogError: The joints do not fit the robot, two topics contradict each other, or an axis has no position.
@@ -206,21 +206,21 @@ def read_track(
 
 
 def match_names(topics: Sequence[JointTopic], axes: Sequence[str], given: Sequence[str], where: str) -> dict[str, str]:
-    """Axis -> the joint in the log that it is, by name.
+    """Matches axes to joints in the log by name: axis -> joint.
 
-    A joint is the axis of the same name, but for case and what is no letter or digit: joint1 is joint_1. Only where
-    a message has no names at all, and as many positions as the robot has axes, its order is believed. A log that
-    counts its joints from 0, or goes on counting where the robot ends, is of another robot until names are given.
+    A joint is the axis of the same name, ignoring case and characters other than letters and digits: joint1 is joint_1.
+    The order in a message is used only if it has no names and as many positions as the robot has axes. A log that
+    numbers its joints from 0, or beyond the axes of the robot, counts as that of another robot until names are given.
 
     Args:
-        topics: What ``read_topics`` found.
+        topics: Result of ``read_topics``.
         axes: The robot's joints, from the base on.
-        given: The log's names in that order; () where they are the robot's.
-        where: What messages begin with: the log.
+        given: The log's names in that order; () if they equal the robot's.
+        where: Start of error messages: the log.
 
     Raises:
         LogError: The names do not fit.
-        SettingsError: The names given do not fit.
+        SettingsError: The given names do not fit.
     """
     found = dict.fromkeys(name for topic in topics for name in topic.joints)
     if given:
@@ -260,7 +260,7 @@ def _plain(name: str) -> str:
 
 
 def _beyond(found: Sequence[str], axes: Sequence[str]) -> list[str]:
-    """Joints that are numbered like the axes and are none of them."""
+    """Returns joints that are numbered like the axes but are none of them."""
     numbered = [re.fullmatch(r"(.*?)(\d+)", _plain(axis)) for axis in axes]
     stems = {match[1] for match in numbered if match}
     if not all(numbered) or len(stems) != 1:
@@ -293,7 +293,7 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 def _choose(topics: Sequence[JointTopic], names: Mapping[str, str]) -> dict[str, JointTopic]:
-    """Axis -> the topic that it is read from: that with the most axes, then with the most messages."""
+    """Chooses axis -> topic to read: the one with the most axes, then with the most messages."""
 
     def rank(topic: JointTopic) -> tuple[int, int, str]:
         held = [topic.joints[name] for name in names.values() if name in topic.joints]
@@ -310,7 +310,7 @@ def _agree(
     tracks: Mapping[tuple[str, str], tuple[Ints, Floats]],
     where: str,
 ) -> Iterator[str]:
-    """Remarks on axes that several topics tell, which must tell the same."""
+    """Returns remarks on axes in several topics, whose positions must agree."""
     beside: dict[tuple[str, str], float] = {}
     for axis, name in names.items():
         t_ns, q = tracks[(chosen[axis].name, name)]
@@ -337,27 +337,26 @@ def _agree(
 def place_in_time(
     topic: JointTopic, joints: Sequence[str], offset_s: float | None, defects: Counter[str]
 ) -> tuple[Clock, Ints]:
-    """The instants of a topic's messages on the log's clock.
+    """Computes the instants of a topic's messages on the log's clock.
 
-    A stamp is better than an arrival: it knows no delay and no trembling of the network. So stamps are used where
-    they can be on the log's clock: never ahead of their arrival, and as a rule not more than 0.25 s before it. Where
-    they cannot, but are apart from it by a constant, they are shifted so that the quickest messages (the 5th
-    percentile of arrival - stamp) have no delay: that keeps the stamps' even spacing, and is late by no more than the
-    least delay, as arrival itself would be. Where the two clocks are apart by no constant (a clock that was set anew,
-    a simulation at another pace), no shift is right, and arrival is what remains. An offset that the user gives is
-    taken as it is, unless the robot's clock was set anew.
+    A stamp is better than an arrival, as it contains no network delay and jitter. So stamps are used if they can be on
+    the log's clock: never after their arrival, and usually at most 0.25 s before it. If they differ from it by a
+    constant, they are shifted so that the fastest messages (the 5th percentile of arrival - stamp) have no delay: this
+    keeps the even spacing of the stamps, and its error is at most the smallest delay, like that of the arrivals. If the
+    offset between the two clocks is not constant (a clock that was reset, a simulation at another speed), the arrivals
+    are used. An offset given by the user is used unchanged, unless the robot's clock was reset.
 
-    A single stamp ahead of its neighbours, or over 10 s behind them, or none, has the delay of its neighbours. One
-    that comes late keeps its stamp: it was held up on the way.
+    A single missing stamp, or one ahead of its neighbours or over 10 s behind them, gets the delay of its neighbours. A
+    message that arrives late keeps its stamp, as it was delayed on the way.
 
     Args:
         topic: All messages.
-        joints: Joints that are axes; messages with none of them say nothing of the robot's clock.
-        offset_s: The robot's clock minus the log's, where it is given [s].
-        defects: Counts wrong stamps.
+        joints: Joints that are axes; messages without them are not used for the robot's clock.
+        offset_s: The robot's clock minus the log's, if given [s].
+        defects: Receives the number of wrong stamps.
 
     Returns:
-        What was found, and (m,) instants [ns].
+        The clock, and (m,) instants [ns].
     """
     mine = np.unique(np.concatenate([topic.joints[joint].message for joint in joints]))
     arrival, stamp = topic.arrival_ns[mine], topic.stamp_ns[mine]
@@ -379,12 +378,12 @@ def place_in_time(
 
 
 class _Match(NamedTuple):
-    """Stamps against arrivals."""
+    """Comparison of stamps with arrivals."""
 
     delay_s: tuple[float, float, float]  #: arrival - stamp: median, 5th and 95th percentile [s]
     quickest_ns: int  #: the 5th percentile
-    least_s: list[float]  #: what the quickest messages of each part of the log need [s]
-    steps: int  #: how often the robot's clock was set
+    least_s: list[float]  #: smallest delays in the parts of the log [s]
+    steps: int  #: number of resets of the robot's clock
     step_at_s: float  #: the first time, after the first message [s]
     step_by_s: float  #: by so much [s]
 
@@ -405,7 +404,7 @@ def _match_clocks(arrival_ns: Ints, stamp_ns: Ints, delays_ns: Ints, wrong: Bool
 
 
 def _check_track(match: _Match, stamps: str, offset_s: float | None) -> tuple[str, str]:
-    """Basis of the instants (see ``Clock.basis``), and the remark."""
+    """Returns the basis of the instants (see ``Clock.basis``), and the remark."""
     median_s, low_s, high_s = match.delay_s
     least_s, most_s = min(match.least_s), max(match.least_s)
     told = (
@@ -443,13 +442,13 @@ def _seconds(value_s: float) -> str:
 
 
 def _epoch(apart_s: float) -> str:
-    """A word on clocks that are years apart."""
+    """Returns a remark on clocks that differ by years."""
     years = abs(apart_s) > 365 * 86_400
     return ": they count from another epoch, as simulation time or the time since start-up does" if years else ""
 
 
 def _delays(arrival_ns: Ints, stamp_ns: Ints, known: Bools) -> tuple[Ints, Bools]:
-    """(n,) the running median of arrival - stamp over five messages, and which stamps are wrong or missing."""
+    """(n,) running median of arrival - stamp over five messages, and True for wrong or missing stamps."""
     at = np.flatnonzero(known)
     delay = arrival_ns[at] - stamp_ns[at]
     padded = np.pad(delay, 2, mode="reflect" if len(delay) > 2 else "edge")
@@ -463,18 +462,18 @@ def _delays(arrival_ns: Ints, stamp_ns: Ints, known: Bools) -> tuple[Ints, Bools
 
 
 def _steps(arrival_ns: Ints, stamp_ns: Ints) -> Ints:
-    """Messages before which the robot's clock was set: further on than the log's, or back."""
+    """Finds messages before which the robot's clock was reset: ahead of the log's, or back."""
     way, passed = np.diff(stamp_ns), np.diff(arrival_ns)
     return np.flatnonzero((way - passed > _STEP_S * _NS) | (way < -_APART_S * _NS)) + 1
 
 
 def _parts(delay_ns: Ints) -> list[Ints]:
-    """Delays in up to 20 parts of the log of at least 20 messages each."""
+    """Divides delays into up to 20 parts of the log of at least 20 messages each."""
     return np.array_split(delay_ns, int(np.clip(len(delay_ns) // 20, 1, 20)))
 
 
 def _in_order(samples: Samples, t_ns: Ints, scale: float, late: Bools, defects: Counter[str]) -> tuple[Ints, Floats]:
-    """Instants and positions [rad] of a joint, without those that are no number or not later than one before."""
+    """Returns instants and positions [rad] of a joint, without those not finite or not later than earlier ones."""
     finite: Bools = np.isfinite(samples.position)
     defects["joints_not_finite"] += int((~finite).sum())
     messages = samples.message[finite]
@@ -486,12 +485,12 @@ def _in_order(samples: Samples, t_ns: Ints, scale: float, late: Bools, defects: 
 
 
 def _at(t_ns: Ints, known_ns: Ints, q: Floats) -> Floats:
-    """Positions between known ones, on straight lines."""
+    """Interpolates positions linearly."""
     return np.asarray(np.interp((t_ns - known_ns[0]).astype(float), (known_ns - known_ns[0]).astype(float), q))
 
 
 def _join(series: Sequence[tuple[Ints, Floats]], axes: tuple[str, ...], where: str) -> JointTrack:
-    """All axes at each instant at which one is told, from when all are known until one no longer is."""
+    """Joins all axes at each instant with a position of any axis, while all are known."""
     for axis, (times, _) in zip(axes, series, strict=True):
         if not len(times):
             raise LogError(f"{where}: {axis} has no position that is a number; a joint track needs two of every axis")
@@ -505,7 +504,7 @@ def _join(series: Sequence[tuple[Ints, Floats]], axes: tuple[str, ...], where: s
 
 
 def _gaps(series: Sequence[tuple[Ints, Floats]], track: JointTrack) -> Ints:
-    """(g, 2) instants between which an axis is not told for longer than GAP_S, in order."""
+    """(g, 2) instants between which an axis has no position for longer than GAP_S, in order."""
     found: set[tuple[int, int]] = set()
     for times, _ in series:
         at = np.flatnonzero(np.diff(times) > GAP_S * _NS)
@@ -516,7 +515,7 @@ def _gaps(series: Sequence[tuple[Ints, Floats]], track: JointTrack) -> Ints:
 
 
 def _covered_ns(gaps_ns: Ints) -> int:
-    """Total time in which at least one axis is missing [ns], of gaps (g, 2) in order."""
+    """Computes the total time with at least one missing axis [ns], from gaps (g, 2) in order."""
     covered, until = 0, 0
     for begin, end in gaps_ns.tolist():
         covered += max(0, end - max(begin, until))
@@ -525,12 +524,12 @@ def _covered_ns(gaps_ns: Ints) -> int:
 
 
 def coverage_remarks(reading: JointReading, start_ns: int, end_ns: int) -> Iterator[str]:
-    """Remarks on a track with gaps, or that begins later or ends earlier than the log.
+    """Returns remarks on a track with gaps, or one shorter than the log.
 
     Args:
         reading: The track and its gaps.
         start_ns: First arrival of the log.
-        end_ns: Last one.
+        end_ns: Last arrival.
     """
     gaps_ns, times = reading.gaps_ns, reading.track.t_ns
     begin_s, last_s, length_s = ((int(t) - start_ns) / _NS for t in (times[0], times[-1], end_ns))
@@ -553,7 +552,7 @@ def coverage_remarks(reading: JointReading, start_ns: int, end_ns: int) -> Itera
 def _match_names(
     topics: Sequence[JointTopic], names: Mapping[str, str], chosen: Mapping[str, JointTopic]
 ) -> Iterator[str]:
-    """Remarks on names that are not the robot's, and on joints that are no axis."""
+    """Returns remarks on names other than the robot's, and on joints that are not axes."""
     if all(name.startswith(_NAMELESS) for name in names.values()):
         order = ", ".join(names)
         yield f"robot joints: {next(iter(chosen.values())).name} has no names; its order is believed to be {order}"
@@ -573,7 +572,7 @@ def _match_names(
 
 
 def _small_degrees(track: JointTrack, unit: str) -> Iterator[str]:
-    """A remark on degrees that are small enough to be radians."""
+    """Returns a remark on degrees that are small enough to be radians."""
     most_deg = float(np.degrees(np.abs(track.q).max()))
     if unit == "deg" and 0.0 < most_deg <= 2 * np.pi:
         yield (
@@ -583,7 +582,7 @@ def _small_degrees(track: JointTrack, unit: str) -> Iterator[str]:
 
 
 def wait_s(topic: JointTopic, of: Callable[[Ints], float]) -> float:
-    """The median, or the longest, time between two arrivals of a joint [s]; NaN where none arrives twice."""
+    """Returns the median or longest time between two arrivals of a joint [s]; NaN if none arrives twice."""
     waits = [np.diff(topic.arrival_ns[samples.message]) for samples in topic.joints.values()]
     every = np.concatenate(waits) if waits else np.zeros(0, dtype=np.int64)
     return float(of(every)) / _NS if len(every) else float("nan")

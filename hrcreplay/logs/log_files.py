@@ -1,6 +1,6 @@
-"""The files of a log: detection of their format, the files as streams of messages, and what is beside the skeletons.
+"""The files of a log: detection of their format, the files as streams of messages, and data other than skeletons.
 
-That is camera poses, task, robot base, ground truth.
+These data are camera poses, task, robot base, ground truth.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from hrcreplay.logs.ros_bags import Db3Stream, open_bag
 from hrcreplay.logs.unpack import ZSTD_MAGIC, unpack_file
 from hrcreplay.records import Floats, Ints, Table
 
-_TABLES = ("csv", "tsv", "txt")  # endings of what the importers read
+_TABLES = ("csv", "tsv", "txt")  # endings of files for the importers
 _SQLITE = b"SQLite format 3\0"
 _KNOWN = "known are MCAP files, ROS 1 bags (.bag) and ROS 2 bags (a folder with metadata.yaml, or a .db3 file)"
 
@@ -54,7 +54,7 @@ class LogFiles:
     streams: list[MessageStream]
     defects: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
-    folder: Any = None  #: temporary files that live as long as the source
+    folder: Any = None  #: temporary files kept as long as the source
 
     def damage(self) -> Damage:
         """Known damage of the files so far; reading may find more."""
@@ -63,7 +63,7 @@ class LogFiles:
         for number, stream in enumerate(self.streams, start=1):
             last = max(found.defects["truncated_at_ns"], stream.defects["truncated_at_ns"])
             found.defects.update(stream.defects)
-            found.defects["truncated_at_ns"] = last  # an instant, not a count: never summed
+            found.defects["truncated_at_ns"] = last  # an instant, not a count: not summed
             found.notes.extend(f"file {number}: {note}" if several else note for note in stream.notes)
         found.defects = +found.defects
         return found
@@ -79,7 +79,7 @@ class LogFiles:
         return max(stream.end_ns for stream in self.streams)
 
     def topics(self) -> list[Topic]:
-        """Topics of all files, each once, in the order in which they are met."""
+        """Topics of all files, each once, in order of appearance."""
         met: dict[tuple[str, str], Topic] = {}
         for stream in self.streams:
             for topic in stream.topics:
@@ -91,7 +91,7 @@ class LogFiles:
     def messages(
         self, names: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
-        """Messages of all files on these topics with start <= arrival < end, in order of arrival."""
+        """Yields messages of all files on these topics with start <= arrival < end, in order of arrival."""
         chosen = frozenset(names)
         return merge_by_arrival(
             LazyChunk(stream.start_ns, partial(stream.messages, chosen, start_ns, end_ns))
@@ -101,10 +101,10 @@ class LogFiles:
 
 
 def open_source(path: Path) -> LogFiles:
-    """The log at a path: a file, or the folder of a ROS 2 bag.
+    """Opens the log at a path: a file, or the folder of a ROS 2 bag.
 
     Raises:
-        LogError: Nothing is there, it is of no known kind, or it holds no messages.
+        LogError: The path does not exist, is of unknown type, or contains no messages.
     """
     if not path.exists():
         raise LogError(f"{path}: there is no such file or folder; name a log")
@@ -145,7 +145,7 @@ def _file(path: Path) -> MessageStream:
 
 
 def _unpacked(source: LogFiles, file: Path) -> Path:
-    """A file of the log, decompressed where it is zstd's."""
+    """Returns a file of the log, decompressed if compressed by zstd."""
     with file.open("rb") as opened:
         if opened.read(4) != ZSTD_MAGIC:
             return file
@@ -154,7 +154,7 @@ def _unpacked(source: LogFiles, file: Path) -> Path:
 
 
 def _is_text(path: Path) -> bool:
-    """Return whether a file may be a tracker's table: by its name, and by text at its start, plain or gzipped."""
+    """Returns True if a file may be a tracker's table: by its name, and by text at its start, plain or gzipped."""
     if path.name.lower().removesuffix(".gz").rpartition(".")[2] not in _TABLES:
         return False
     try:
@@ -165,13 +165,13 @@ def _is_text(path: Path) -> bool:
     return bool(head) and all(byte >= 32 or byte in b"\t\r\n" for byte in head)
 
 
-#: A metadata.yaml is some kB, with a line or two a file [bytes].
+#: Maximum size of a metadata.yaml; it has a few kB, with one or two lines per file [bytes].
 _METADATA_BYTES = 4 << 20
 _ENDINGS = ("mcap", "db3", "mcap.zstd", "db3.zstd")
 
 
 def _folder(path: Path) -> LogFiles:
-    """A ROS 2 bag. Its files are opened one by one, so that their messages are all there are."""
+    """Opens a ROS 2 bag. Its files are opened one by one, so that all of their messages are found."""
     metadata = path / "metadata.yaml"
     source = LogFiles(path, "ros2", [])
     if not metadata.exists():
@@ -201,7 +201,7 @@ def _folder(path: Path) -> LogFiles:
 
 
 def _open_files(source: LogFiles, files: list[Path]) -> None:
-    """Opens the files of a folder; one that cannot be read is left out and told, unless it is the only one."""
+    """Opens the files of a folder; an unreadable one is left out with a note, unless it is the only one."""
     refused: LogError | None = None
     for file in files:
         if not file.stat().st_size:
@@ -220,7 +220,7 @@ def _open_files(source: LogFiles, files: list[Path]) -> None:
 
 @dataclass(frozen=True)
 class _Metadata:
-    """Files of a ROS 2 bag, by its metadata."""
+    """Files of a ROS 2 bag, from its metadata."""
 
     files: tuple[str, ...]
     messages: int
@@ -244,23 +244,23 @@ def _metadata(path: Path) -> _Metadata:
 
 @dataclass(frozen=True)
 class Header:
-    """Knowledge of a log before its first frame."""
+    """Data of a log before its first frame."""
 
     path: Path
     kind: str  #: "hrcreplay", "mcap", "ros1" or "ros2"
     cameras: tuple[str, ...]
-    T_world_camera: dict[str, Floats]  #: (4, 4); only of the cameras whose extrinsics are in the log
-    task: dict[str, Any] | None  #: programmed task in the log, of the same structure as a task file
-    start_ns: int  #: first arrival of a skeleton, joint state or truth; of anything where there are none
-    end_ns: int  #: last arrival of anything
-    T_world_base: Floats | None  #: (4, 4) robot base, where the log knows it
+    T_world_camera: dict[str, Floats]  #: (4, 4); only for cameras with extrinsics in the log
+    task: dict[str, Any] | None  #: programmed task in the log, structured like a task file
+    start_ns: int  #: first arrival of a skeleton, joint state or truth; of any message without these
+    end_ns: int  #: last arrival of any message
+    T_world_base: Floats | None  #: (4, 4) robot base; None if unknown
     has_truth: bool
-    joint_topics: tuple[str, ...]  #: of the robot's joint states
+    joint_topics: tuple[str, ...]  #: topics of the robot's joint states
 
 
 @dataclass(frozen=True)
 class Truth(Table):
-    """Ground truth of the person, from a reference better than the cameras, a row an instant."""
+    """Ground truth of the person, from a reference better than the cameras, one row per instant."""
 
     t_ns: Ints  #: (n,)
     points_m: Floats  #: (n, 20, 3) POINTS in the world [m]
@@ -269,21 +269,21 @@ class Truth(Table):
 _OWN_TRUTH = "hrcreplay.Truth"
 _OWN_CAMERA, _OWN_TASK, _OWN_BASE = "hrcreplay.Camera", "hrcreplay.Task", "hrcreplay.Base"
 _CHUNK_NS = 10**9
-_RIGID = 1e-2  # of the axes of a pose: those of a recording may have been rounded, those of a cell file not so much
+_RIGID = 1e-2  # tolerance of the axes of a pose: recorded ones may be rounded more than those of a cell file
 
 
 @dataclass(frozen=True)
 class Latched:
     """Values that hold for the whole log: camera poses, task, robot base."""
 
-    cameras: tuple[str, ...]  #: declared, in that order
+    cameras: tuple[str, ...]  #: declared cameras, in order
     T_world_camera: dict[str, Floats]
     task: dict[str, Any] | None
     T_world_base: Floats | None
 
 
 def latched(source: LogFiles) -> Latched:
-    """Reads the messages that hold for a whole log of our own. Raises LogError where one is broken."""
+    """Reads the messages that apply to a whole log of hrcreplay's format. Raises LogError for a damaged one."""
     kinds = (_OWN_CAMERA, _OWN_TASK, _OWN_BASE)
     names = [topic.name for topic in source.topics() if topic.type in kinds]
     cameras: list[str] = []
@@ -327,12 +327,12 @@ def _pose(values: Any, message: Message) -> Floats:
 
 
 def truth_topic(source: LogFiles) -> str | None:
-    """The topic of the ground truth, where the log has one."""
+    """Returns the topic of the ground truth, if the log has one."""
     return next((topic.name for topic in source.topics() if topic.type == _OWN_TRUTH and topic.count), None)
 
 
 def truth(source: LogFiles, topic: str) -> Iterator[Truth]:
-    """The ground truth in chunks of at most a second."""
+    """Yields the ground truth in chunks of at most a second."""
     times: list[int] = []
     rows: list[Floats] = []
     for message in source.messages([topic]):

@@ -1,7 +1,7 @@
-"""Bodies in MarkerArray topics, a marker a joint of the Azure Kinect: how a topic numbers them, and its decoder.
+"""Bodies in MarkerArray topics, one marker per joint of the Azure Kinect: numbering of the markers, and decoder.
 
-Any node publishes markers, and those of bodies are numbered in several ways. The whole topic is gone through before it
-is read: which marker belongs to which camera, body and joint holds for all of its messages, whatever the span.
+Many nodes publish markers, and those of bodies are numbered in several ways. The whole topic is surveyed before it is
+read: the assignment of markers to cameras, bodies and joints is valid for all of its messages, for any span.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from hrcreplay.records import Floats
 
 MARKER_TYPE: Final = "visualization_msgs/MarkerArray"
 _LEAST_MARKERS = 8
-_FEW = 10  # messages that say too little of proportions
+_FEW = 10  # with fewer messages, proportions are not judged
 _GONE = (2, 3)  # actions DELETE and DELETEALL
-#: Types of markers that may be joints, the likeliest first: where spheres are joints, cylinders are bones. Lists of
-#: points (as an octomap's cubes) and texts are none.
+#: Types of markers that may be joints, the most likely first: if spheres are joints, cylinders are bones. Lists of
+#: points (as an octomap's cubes) and texts are not joints.
 _JOINT_TYPES: Final = {2: "spheres", 1: "cubes", 0: "arrows", 3: "cylinders", 10: "meshes"}
 _OTHER_TYPES: Final = {
     4: "line strips",
@@ -47,58 +47,58 @@ _OTHER_TYPES: Final = {
     9: "texts",
     11: "triangle lists",
 }
-#: Ids from one body to the next that are known: the Azure driver's, and those of trackers that count on.
+#: Known numbers of ids per body: that of the Azure driver, and those of trackers with consecutive numbers.
 _STRIDES: Final = (100, 33, 32)
-_STRANGE = 0.1  # of the ids, the most that may be joints which other bodies do not have
-_PEEK = 300  # messages that are decoded in any case: ten seconds of a sensor
+_STRANGE = 0.1  # maximum share of ids that are joints which other bodies lack
+_PEEK = 300  # messages that are always decoded: ten seconds of a sensor
 
 
 @dataclass(frozen=True)
 class MarkerLayout:
     """Numbering of a topic's markers: id = body * ids_per_body + joint."""
 
-    frames: tuple[str, ...] = ()  #: frames in the headers, in order of appearance; () where none was looked for
+    frames: tuple[str, ...] = ()  #: frames in the headers, in order of appearance; () if not searched
     ids_per_body: int = 100
-    given: bool = False  #: whether the settings say so: other ids are no joints then
-    joint_type: int | None = None  #: type of the markers that are joints; None: any that may be
-    has_alpha: bool = False  #: whether the alpha of the colours differs within a body
-    namespaces: tuple[str, ...] = ()  #: that hold joints
+    given: bool = False  #: True: set by the user; then other ids are not joints
+    joint_type: int | None = None  #: type of the markers that are joints; None: any possible type
+    has_alpha: bool = False  #: True: the alpha of the colours differs within a body
+    namespaces: tuple[str, ...] = ()  #: namespaces that contain joints
 
 
 @dataclass(frozen=True)
 class NoBodies:
-    """Reason why the markers of a topic are no bodies."""
+    """Reason for which the markers of a topic are not bodies."""
 
     found: str
-    certain: bool  #: False where there were no markers, or too few to say so
-    layout: MarkerLayout | None = None  #: by which they are numbered, where they may be bodies all the same
+    certain: bool  #: False without markers, or with too few for a decision
+    layout: MarkerLayout | None = None  #: their numbering, if they may still be bodies
 
 
 @dataclass
 class _Survey:
-    """Knowledge of a topic while it is gone through."""
+    """State of the survey of a topic."""
 
     frames: dict[str, None] = field(default_factory=dict)
     types: set[int] = field(default_factory=set)
     ids: dict[tuple[int, str], set[int]] = field(default_factory=lambda: defaultdict(set))  # by type and namespace
-    arrays: list[list[Any]] = field(default_factory=list)  # those with markers, of the first messages
-    most: int = 0  # bytes of the longest message that was decoded
+    arrays: list[list[Any]] = field(default_factory=list)  # first messages with markers
+    most: int = 0  # size of the longest decoded message [bytes]
     has_alpha: bool = False
 
 
 def survey_markers(messages: Iterable[Message], ids_per_body: int | None) -> MarkerLayout | NoBodies:
-    """Find the numbering of a topic's markers, from all its messages.
+    """Finds the numbering of a topic's markers, from all its messages.
 
     Args:
-        messages: All of the topic.
-        ids_per_body: As the settings say; None: to be found.
+        messages: All messages of the topic.
+        ids_per_body: As in the settings; None: determined here.
 
     Returns:
-        The layout, or why there are no bodies.
+        The layout, or the reason for which there are no bodies.
     """
     survey = _Survey()
     for number, message in enumerate(messages):
-        # Only what may be new is decoded: frames not met before, or more markers than ever before.
+        # Only messages with possibly new content are decoded: new frames, or more markers than before.
         if number < _PEEK or len(message.data) > survey.most or not _frames_known(message.data, survey.frames):
             _take(survey, message)
     joint_type = next((kind for kind in _JOINT_TYPES if _has_body(survey, kind)), None)
@@ -132,7 +132,7 @@ def _take(survey: _Survey, message: Message) -> None:
     try:
         markers = [marker for marker in message.read().markers if marker.action not in _GONE]
     except Undecodable:
-        return  # the reader counts it
+        return  # the reader counts the defect
     survey.most = max(survey.most, len(message.data))
     if markers and len(survey.arrays) < _PEEK:
         survey.arrays.append(markers)
@@ -144,7 +144,7 @@ def _take(survey: _Survey, message: Message) -> None:
 
 
 def _frames_known(data: bytes, frames: Iterable[str]) -> bool:
-    """Return whether a message names as many known frames as it has markers, so that none is new."""
+    """Returns True if a message names as many known frames as it has markers, so that none is new."""
     found = sum(data.count(b"%c\0\0\0%b\0" % (len(frame) + 1, frame.encode())) for frame in frames)
     return found > 0 and data[:1] == b"\0" and found == int.from_bytes(data[4:8], "little")  # of ROS 2; else decode
 
@@ -154,7 +154,7 @@ def _has_body(survey: _Survey, kind: int) -> bool:
 
 
 def _stride(ids: list[set[int]]) -> int | None:
-    """Ids from one body to the next under which all bodies have the same joints; None where no known one does."""
+    """Returns the number of ids per body with which all bodies have the same joints; None if no known one fits."""
     fitting = [n for n in _STRIDES if all(at % n < len(AZURE_JOINTS) for found in ids for at in found)]
     if _STRIDES[0] in fitting:
         return _STRIDES[0]
@@ -165,7 +165,7 @@ def _stride(ids: list[set[int]]) -> int | None:
 
 
 def _differing(ids: list[set[int]], stride: int) -> tuple[int, int]:
-    """Joints of bodies that the fullest body does not have, and joints that one of the two does not have."""
+    """Counts joints of bodies that the most complete body lacks, and joints that one of the two lacks."""
     bodies: dict[tuple[int, int], set[int]] = defaultdict(set)
     for namespace, found in enumerate(ids):
         for at in found:
@@ -178,7 +178,7 @@ _Body = tuple[str, str, int]  # frame, namespace and number
 
 
 def _by_body(layout: MarkerLayout, markers: Iterable[Any]) -> dict[_Body, dict[int, Any]]:
-    """The joints' markers by body. Raises LogError for an id that is no body's joint, or one that comes twice."""
+    """The joints' markers by body. Raises LogError for an id that is not a body's joint, or a repeated one."""
     bodies: dict[_Body, dict[int, Any]] = {}
     for marker in markers:
         kind_fits = marker.type in _JOINT_TYPES if layout.joint_type is None else marker.type == layout.joint_type
@@ -203,7 +203,7 @@ def _by_body(layout: MarkerLayout, markers: Iterable[Any]) -> dict[_Body, dict[i
 
 
 def _shapes(layout: MarkerLayout, arrays: list[list[Any]]) -> dict[_Body, Floats]:
-    """Points (n, 20, 3) of each body."""
+    """Returns points (n, 20, 3) of each body."""
     found: dict[_Body, list[Floats]] = defaultdict(list)
     for array in arrays:
         for body, markers in _by_body(layout, array).items():
@@ -212,7 +212,7 @@ def _shapes(layout: MarkerLayout, arrays: list[list[Any]]) -> dict[_Body, Floats
 
 
 def _points(markers: dict[int, Any]) -> tuple[Floats, Floats]:
-    """Points as they are in the message, and 1 for each that is there."""
+    """Returns the points of the message, and 1 for each present one."""
     points, confidence = missing_body()
     for joint, marker in markers.items():
         if joint in AZURE_INDEX:
@@ -229,23 +229,23 @@ def _alpha_differs(markers: dict[int, Any]) -> bool:
 class MarkerDecoder:
     """A MarkerArray topic with a body's joints in the cameras' frames.
 
-    The camera is named after the topic, or, where the headers have several frames, after the frame. Bodies differ by
-    their ids, or by their namespaces. Where the alpha of the colours differs within a body it is the confidence, else
-    that is 1.
+    The camera is named after the topic or, if the headers have several frames, after the frame. Bodies are
+    distinguished by their ids, or by their namespaces. If the alpha of the colours differs within a body, it is the
+    confidence; otherwise the confidence is 1.
     """
 
     def __init__(self, topic: str, layout: MarkerLayout | None = None, *, unit: str) -> None:
         self.topic = topic
         self._layout = layout or MarkerLayout()
         self._scale = METRES[unit]
-        self._only: str | None = None  # the one frame, where none was looked for
+        self._only: str | None = None  # the single frame, if frames were not searched
         several = len(self._layout.frames) > 1
         self.cameras = tuple(map(camera_of, self._layout.frames)) if several else (camera_of(topic),)
         self.shows_camera_alive = not several
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on the reading of the topic."""
+        """Returns remarks on the reading of the topic."""
         return tuple(self._told())
 
     def _told(self) -> Iterator[str]:
@@ -261,11 +261,11 @@ class MarkerDecoder:
             yield f"{self.topic}: bodies by the namespaces of the markers: {', '.join(self._layout.namespaces[:8])}"
 
     def fresh_copy(self) -> MarkerDecoder:
-        """Itself: it remembers nothing between passes."""
+        """Returns itself, as it has no state between passes."""
         return self
 
     def rows(self, message: Message) -> list[RawSkeleton]:
-        """A row a body; that of nobody for an array that shows nothing, where it can only be the one camera's."""
+        """Returns one row per body; for an array without a body, an empty row if the topic has only one camera."""
         try:
             markers = message.read().markers
             if self.shows_camera_alive and all(marker.action in _GONE for marker in markers):
@@ -306,7 +306,7 @@ class MarkerDecoder:
 
 
 def _number_of(namespace: str, number: int, namespaces: tuple[str, ...]) -> int:
-    """A body's number: the one in its namespace, else that of its ids; of several named namespaces one of their own."""
+    """Returns a body's number: that in its namespace, else that of its ids; an own number per named namespace."""
     digits = re.search(r"(\d+)\D*$", namespace)
     if digits and number == 0:
         return int(digits[1][-9:])

@@ -52,7 +52,7 @@ class _Block:
     end_ns: int
     offset: int
     length: int
-    channels: frozenset[int] | None  #: channels with messages in it; None: not known
+    channels: frozenset[int] | None  #: channels with messages in it; None: unknown
 
 
 @dataclass
@@ -61,11 +61,11 @@ class _Index:
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: Counter[int] = field(default_factory=Counter)
     blocks: list[_Block] = field(default_factory=list)
-    foreign: list[str] = field(default_factory=list)  #: of each chunk of an unknown compression, which it is
-    damaged: dict[int, str] = field(default_factory=dict)  #: byte at which a damaged chunk begins -> what is wrong
+    foreign: list[str] = field(default_factory=list)  #: compression methods of chunks with an unknown compression
+    damaged: dict[int, str] = field(default_factory=dict)  #: first byte of a damaged chunk -> its defect
 
     def add(self, records: list[McapRecord], offset: int, length: int) -> None:
-        """Adds what a block holds."""
+        """Adds the content of a block."""
         times, used = [], set()
         for record in records:
             if isinstance(record, Schema):
@@ -98,7 +98,7 @@ class McapStream:
         self.start_ns = min((b.start_ns for b in index.blocks), default=0)
         self.end_ns = max((b.end_ns for b in index.blocks), default=0)
         self.defects, self.notes = damage.defects, damage.notes
-        self._described = len(self.notes)  # behind these, one note on all damaged chunks
+        self._described = len(self.notes)  # after these, one note on all damaged chunks
         self._damaged: dict[int, str] = {}  # as in the index; each chunk is counted once
         for offset, error in index.damaged.items():
             self._leave_out(offset, error)
@@ -115,7 +115,7 @@ class McapStream:
         self.topics = tuple(self._topics.values())
 
     def messages(self, names: Collection[str], start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
-        """Messages on these topics with start <= arrival < end, in order of arrival."""
+        """Yields messages on these topics with start <= arrival < end, in order of arrival."""
         wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
         with self._path.open("rb") as file:
             parts = [
@@ -171,7 +171,7 @@ def _profile(file: IO[bytes], path: Path) -> str:
 
 
 def _summary(file: IO[bytes]) -> _Index | None:
-    """Summary at the end of the file; None where it is missing or too short."""
+    """Reads the summary at the end of the file; None if it is missing or too short."""
     try:
         records = _summary_records(file)
     except (*_BROKEN, OSError, StopIteration):
@@ -199,7 +199,7 @@ def _summary(file: IO[bytes]) -> _Index | None:
 
 
 def _summary_records(file: IO[bytes]) -> list[McapRecord]:
-    """The records at the end of a file to which its footer points; a chunk among them stays packed."""
+    """Returns the records at the end of a file to which its footer points; chunks stay packed."""
 
     def records() -> Iterator[McapRecord]:
         return StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=CHUNK_BYTES).records
@@ -213,7 +213,7 @@ def _summary_records(file: IO[bytes]) -> list[McapRecord]:
 
 
 def _scan(file: IO[bytes], size: int, damage: Damage) -> _Index:
-    """Reads the file once to find what is whole in it."""
+    """Reads the file once to find its complete records."""
     index = _Index()
     run: list[tuple[int, int]] = []  # schemas, channels and messages outside of chunks, adjacent
 
@@ -244,7 +244,7 @@ def _scan(file: IO[bytes], size: int, damage: Damage) -> _Index:
 
 
 def _add_chunk(index: _Index, file: IO[bytes], offset: int, length: int) -> None:
-    """Adds what a chunk holds to the index, or why it cannot be read."""
+    """Adds the content of a chunk to the index, or the reason for which it cannot be read."""
     try:
         index.add(_records(file, offset, length), offset, length)
     except _UnknownCompression as error:
@@ -255,7 +255,7 @@ def _add_chunk(index: _Index, file: IO[bytes], offset: int, length: int) -> None
 
 
 def _walk(file: IO[bytes], size: int) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of every whole record up to the end of the data."""
+    """Yields opcode, start and end of every complete record up to the end of the data."""
     offset = len(MCAP_MAGIC)
     while offset + 9 <= size:
         file.seek(offset)
@@ -270,7 +270,7 @@ def _walk(file: IO[bytes], size: int) -> Iterator[tuple[int, int, int]]:
 
 
 class _UnknownCompression(CannotUnpack):
-    """A chunk is compressed by a method that is not known."""
+    """A chunk is compressed by an unknown method."""
 
     def __init__(self, method: str) -> None:
         super().__init__(f"compressed by {method!r}")
@@ -289,7 +289,7 @@ def _records(file: IO[bytes], offset: int, length: int) -> list[McapRecord]:
         for record in StreamReader(BytesIO(data), skip_magic=True).records:
             found.append(record)  # noqa: PERF402 - what came before the end is kept
     except EndOfFile:
-        pass  # the only end of a stretch from the middle of a file
+        pass  # the only possible end of a section from the middle of a file
     return found
 
 
@@ -302,7 +302,7 @@ def _unpacked_records(chunk: Chunk) -> list[McapRecord]:
 
 
 def _check_count(data: bytes) -> None:
-    """Refuses a chunk of more than CHUNK_RECORDS records, which cost far more memory as objects than as bytes."""
+    """Rejects a chunk of more than CHUNK_RECORDS records, which need far more memory as objects than as bytes."""
     at = count = 0
     while at + 9 <= len(data):
         at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")

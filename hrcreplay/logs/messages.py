@@ -1,7 +1,7 @@
 """Types that all log formats share: messages, topics, skeleton rows, and the interface of a decoder.
 
-Also the topics of our own log (skeleton.proto has its messages), the joints of other trackers that correspond to our
-POINTS (those that a tracker lacks stay missing), and the merging of files and chunks by arrival.
+Also the topics of hrcreplay's own log (skeleton.proto defines its messages), the joints of other trackers that
+correspond to POINTS (those that a tracker lacks are missing), and the merging of files and chunks by arrival.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from hrcreplay.errors import LogError
 from hrcreplay.records import NOBODY, POINTS, Floats
 
-#: How an MCAP file begins and ends.
+#: First and last bytes of an MCAP file.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -31,22 +31,22 @@ class Topic:
 
     name: str
     type: str  #: without the "msg" of ROS 2: tf2_msgs/TFMessage
-    count: int  #: messages in this file
+    count: int  #: number of messages in this file
     parse: Callable[[bytes], Any]  #: bytes of a message -> its fields; raises Undecodable
 
 
 def topic_list(found: Iterable[Topic]) -> str:
-    """Topics and their types in one line."""
+    """Lists topics and their types in one line."""
     return ", ".join(f"{topic.name} ({topic.type})" for topic in found) or "no topics at all"
 
 
 class Message(NamedTuple):
-    """A message as it lies in the file."""
+    """A message as stored in the file."""
 
     arrival_ns: int
     topic: Topic
     data: bytes
-    position: int = 0  #: a number that grows along its file; 0 where the order in the file is not known
+    position: int = 0  #: a number that increases along its file; 0 if the order in the file is unknown
 
     def read(self) -> Any:
         """Decodes the fields. Raises Undecodable."""
@@ -59,7 +59,7 @@ class MessageStream(Protocol):
     topics: tuple[Topic, ...]
     start_ns: int  #: first arrival
     end_ns: int  #: last arrival
-    profile: str  #: who wrote it, where the format says
+    profile: str  #: program that wrote it, if the format contains it
     defects: Counter[str]
     notes: list[str]
 
@@ -75,13 +75,13 @@ class Damage:
     notes: list[str] = field(default_factory=list)
 
     def ends_at(self, last_ns: int, start_ns: int) -> None:
-        """Records that the file breaks off."""
+        """Records that the file is truncated."""
         self.defects["truncated_at_ns"] = last_ns
         self.notes.append(f"the file breaks off {(last_ns - start_ns) / 1e9:.3f} s after its first message")
 
 
 def note_damaged_chunks(damaged: Mapping[int, str]) -> str:
-    """A note on chunks that are left out: byte at which each begins -> what is wrong with it."""
+    """Returns a note on chunks that are left out; ``damaged``: first byte of each -> its defect."""
     offset = min(damaged)
     first = f"at byte {offset} is damaged and left out ({damaged[offset]})"
     return f"the chunk {first}" if len(damaged) == 1 else f"{len(damaged)} chunks are damaged; the first {first}"
@@ -90,12 +90,12 @@ def note_damaged_chunks(damaged: Mapping[int, str]) -> str:
 class LazyChunk(NamedTuple):
     """A sequence of messages that is opened only when the merged stream reaches it."""
 
-    start_ns: int  #: no message in it is earlier
+    start_ns: int  #: earliest possible arrival of its messages
     open: Callable[[], Iterator[Message]]  #: the messages in order of arrival
 
 
 def merge_by_arrival(parts: Iterable[LazyChunk]) -> Iterator[Message]:
-    """Messages of all parts in order of arrival; parts that do not overlap are never open together.
+    """Merges the messages of all parts in order of arrival; parts that do not overlap are never open together.
 
     Messages of one arrival keep the order of their parts.
     """
@@ -120,7 +120,7 @@ def merge_by_arrival(parts: Iterable[LazyChunk]) -> Iterator[Message]:
             heapq.heapreplace(heads, (following.arrival_ns, order, following, messages))
 
 
-PROFILE = "hrcreplay"  #: profile in the MCAP header, by which our logs are known
+PROFILE = "hrcreplay"  #: profile in the MCAP header of hrcreplay's own logs
 TASK = "/task"
 BASE = "/robot/base"
 JOINTS = "/robot/joints"
@@ -128,17 +128,17 @@ TRUTH = "/truth"
 
 
 def skeleton_topic(camera: str) -> str:
-    """Topic of a camera's skeletons."""
+    """Returns the topic of a camera's skeletons."""
     return f"/camera/{camera}/skeleton"
 
 
 def camera_info_topic(camera: str) -> str:
-    """Topic of a camera's description."""
+    """Returns the topic of a camera's description."""
     return f"/camera/{camera}/info"
 
 
 def camera_of_topic(topic: str) -> str:
-    """The camera of a topic of our own log."""
+    """Returns the camera of a topic of hrcreplay's own log."""
     return topic.split("/")[2]
 
 
@@ -168,7 +168,7 @@ AZURE_POINTS: Mapping[str, str] = {"pelvis": "PELVIS", "chest": "SPINE_CHEST", "
     f"{joint}_{s}": f"{joint.upper()}_{side}" for joint in _PAIRED for s, side, _, _ in _SIDES
 }
 
-#: POINTS -> joint of the Kinect v2. Its Neck lies above the shoulder line, where our neck is.
+#: POINTS -> joint of the Kinect v2. Its Neck lies above the shoulder line; the neck of POINTS is on it.
 KINECT2_POINTS: Mapping[str, str] = {
     "pelvis": "SpineBase",
     "chest": "SpineMid",
@@ -176,9 +176,9 @@ KINECT2_POINTS: Mapping[str, str] = {
     "head": "Head",
 } | {f"{joint}_{s}": f"{joint.title()}{side}" for joint in _PAIRED for s, _, side, _ in _SIDES}
 
-#: POINTS -> frame of openni_tracker, taken as named: OpenNI may mirror left and right, which no log tells.
-#: It has no ankle (its foot is the ankle's place) and no wrist: the hand stands for the wrist, or no forearm could
-#: be seen. The pelvis is the middle of its hips.
+#: POINTS -> frame of openni_tracker, taken as named: OpenNI may mirror left and right, which a log does not show. It
+#: has no ankle (its foot is at the ankle) and no wrist: the hand is used as the wrist, as there would otherwise be no
+#: forearm. The pelvis is the middle of its hips.
 OPENNI_POINTS: Mapping[str, str] = {"chest": "torso", "neck": "neck", "head": "head"} | {
     f"{point}_{s}": f"{side}_{joint}"
     for point, joint in (
@@ -209,12 +209,12 @@ METRES: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
 class RawSkeleton(NamedTuple):
     """One body in one frame, not yet cleaned; NOBODY for a frame without one."""
 
-    capture_ns: int | None  #: None: the arrival is the best that is known
+    capture_ns: int | None  #: None: only the arrival is known
     camera: str
     body: int
-    points_m: Floats  #: (20, 3) camera frame [m]; NaN where the sensor has no such point
-    confidence: Floats  #: (20,); 0 where the sensor has no such point
-    stamp_zero: bool = False  #: whether the capture is missing because a ROS header's stamp is zero
+    points_m: Floats  #: (20, 3) camera frame [m]; NaN if the sensor lacks the point
+    confidence: Floats  #: (20,); 0 if the sensor lacks the point
+    stamp_zero: bool = False  #: True: the capture is missing because a ROS header's stamp is zero
 
 
 class SkeletonDecoder(Protocol):
@@ -230,31 +230,31 @@ class SkeletonDecoder(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes for the user on how the topic is read."""
+        """Notes for the user on the reading of the topic."""
 
     @property
     def shows_camera_alive(self) -> bool:
-        """Return whether a message without a body still shows that the camera (the only one) delivers frames."""
+        """Returns True if a message without a body still shows that the only camera delivers frames."""
 
     def fresh_copy(self) -> SkeletonDecoder:
-        """The decoder at the start of a pass, with nothing remembered."""
+        """Returns the decoder without state, for the start of a pass."""
 
     def rows(self, message: Message) -> list[RawSkeleton]:
-        """The rows that are complete with this message. Raises Undecodable, LogError."""
+        """Returns the rows that this message completes. Raises Undecodable, LogError."""
 
 
 def missing_body() -> tuple[Floats, Floats]:
-    """Points and confidence of a body of which nothing is known."""
+    """Returns points and confidence of an unknown body."""
     return np.full((len(POINTS), 3), np.nan), np.zeros(len(POINTS))
 
 
 def nobody(camera: str, capture_ns: int | None = None) -> RawSkeleton:
-    """A frame that shows nobody."""
+    """Makes a frame without a body."""
     return RawSkeleton(capture_ns, camera, NOBODY, *missing_body())
 
 
 def stamp_ns(stamp: Any, where: str) -> int:
-    """A ROS time as nanoseconds."""
+    """Converts a ROS time to nanoseconds."""
     try:
         return int(stamp.sec) * 10**9 + int(stamp.nanosec)
     except AttributeError as error:
@@ -264,5 +264,5 @@ def stamp_ns(stamp: Any, where: str) -> int:
 
 
 def camera_of(name: str) -> str:
-    """A camera's name from a topic or a frame: without slashes, as it is used in names of columns."""
+    """Makes a camera's name from a topic or a frame: without slashes, for names of columns."""
     return name.strip("/").replace("/", "_")

@@ -1,7 +1,7 @@
-"""Checks whether the bodies of a log can be a person: size, bones, left and right, uprightness, limbs never seen.
+"""Checks the bodies of a log for plausibility: size, bones, left and right, uprightness, limbs never seen.
 
-What is unusual becomes a note. What is certainly no person (a wrong unit) is refused, with what would correct it. All
-checks use medians, so that occasional errors of a tracker change nothing.
+Unusual values give a note. Bodies that are certainly not a person (a wrong unit) are rejected, with a remedy. All
+checks use medians, so that occasional errors of a tracker have no effect.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 
 from hrcreplay.records import POINTS, Bools, Floats
 
-#: The stature of people from a toddler to the tallest [m].
+#: Range of the stature of people, from a toddler to the tallest [m].
 PERSON_M = (0.5, 2.3)
-#: Half of the least and twice the largest: no error of a tracker makes a person of that.
+#: Half of the minimum and twice the maximum: outside this range a tracker's error cannot be the cause.
 _CERTAIN = 2.0
-#: Share of a stature that a bone is (Winter, Biomechanics; the trunk as trackers see it, pelvis to neck).
+#: Length of a bone as a share of the stature (Winter, Biomechanics; the trunk as in trackers, pelvis to neck).
 _SHARES = {
     ("pelvis", "neck"): 0.288,
     **{(f"shoulder_{s}", f"elbow_{s}"): 0.186 for s in "lr"},
@@ -30,11 +30,11 @@ _SHARE = np.array(list(_SHARES.values()))
 #: Statures of adults: 5th percentile of women and 95th of men, aged 19 to 65, in the US [m] (City University of Hong
 #: Kong, Online Anthropometry, 2.1 Stature: http://personal.cityu.edu.hk/meachan/online%20anthropometry/Chapter2/Ch2-1.htm)
 ADULT_M = (1.52, 1.87)
-#: Bones of recorded people, as trackers see them, lie up to a fifth outside the shares of a stature.
+#: Tolerance of bones: those of recorded people, as seen by trackers, deviate from the shares by up to a fifth.
 _BONE_MARGIN = 0.25
-#: Trackers after OpenNI give the middle of the hand for the wrist: half of Winter's share of a hand.
+#: Trackers based on OpenNI use the middle of the hand as the wrist: half of Winter's share of a hand.
 _HALF_HAND = 0.054
-#: Left and right of one person differ by less, on recordings by up to a sixth.
+#: Maximum ratio of left and right of one person; on recordings up to a sixth more than 1.
 _UNEQUAL = 1.25
 _BONE_NAMES = {
     "pelvis": "trunk (pelvis to neck)",
@@ -43,9 +43,10 @@ _BONE_NAMES = {
     "hip": "thigh",
     "knee": "shank",
 }
-#: What a body is wrong by where its unit is: factor on metres -> name of the unit that was taken for metres.
+#: Factor of a body's size for a wrong unit -> name of the unit that was read as metres.
 _UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches"}
-#: Points that place the limbs of the model; the volume of a limb without them holds all that its joints allow.
+#: Points that determine the limbs of the model; without them the volume of a limb contains all postures within its
+#: joint limits.
 _PLACED_BY = {
     "HD": ("head",),
     "THX": ("pelvis", "shoulder_l", "shoulder_r"),
@@ -54,12 +55,12 @@ _PLACED_BY = {
     "ULA": ("shoulder_l", "elbow_l"),
     "LLA": ("elbow_l", "wrist_l"),
 }
-_FEW = 10  # rows that say too little for a refusal
+_FEW = 10  # with fewer rows, nothing is rejected
 _BATCH = 256
-_MIRRORED = 0.3  # of the volume that three unit vectors span: feet point out, shoulders turn
-_BENT_M = 0.05  # a knee that is further from the line between hip and ankle shows where ahead is
-_OFTEN = 0.1  # of the frames: a tracker mixes up left and right now and then
-_PELVIS_M = (0.0, 1.6)  # above the floor: of who sits on it, of who stands on a step
+_MIRRORED = 0.3  # minimum volume spanned by three unit vectors, as feet point outwards and shoulders turn
+_BENT_M = 0.05  # minimum distance of a knee from the line between hip and ankle that shows the forward direction
+_OFTEN = 0.1  # share of the frames; a tracker sometimes exchanges left and right
+_PELVIS_M = (0.0, 1.6)  # height above the floor: sitting on it, standing on a step
 _UPRIGHT = np.cos(np.radians(60.0))
 
 
@@ -74,7 +75,7 @@ class BodyShape:
         self._twists: list[Floats] = []
 
     def add(self, points: Floats, confidence: Floats) -> None:
-        """Takes a body (20, 3) in the camera's frame, in what was said to be metres; of confidence 0 is not seen."""
+        """Adds a body (20, 3) in the camera's frame, nominally in metres; points of confidence 0 are not seen."""
         self._waiting.append(np.where((confidence > 0)[:, None], points, np.nan))
         if len(self._waiting) >= _BATCH:
             self._flush()
@@ -84,7 +85,7 @@ class BodyShape:
             points = np.array(self._waiting)
             self._waiting = []
             there = np.isfinite(points).all(axis=2) & (np.abs(points).max(axis=2) > 0.0)
-            points = np.where(there[..., None] & (np.abs(points) < 1e12), points, np.nan)  # so that squares are numbers
+            points = np.where(there[..., None] & (np.abs(points) < 1e12), points, np.nan)  # so that squares are finite
             self._statures.append(statures(points))
             self._bones.append(_heights(points))
             for cue, sides in self._sides.items():
@@ -93,25 +94,25 @@ class BodyShape:
 
     @property
     def ratio(self) -> float:
-        """Ratio of the body's heights by two bones, by medians; 1 where few were seen."""
+        """Ratio of the body's statures by two bones, from medians; 1 if few were seen."""
         self._flush()
         return _ratio(np.concatenate(self._bones)) if self._bones else 1.0
 
     @property
     def stature_m(self) -> float:
-        """Median of the stature by the bones; NaN where no bone was seen."""
+        """Median of the stature from the bones; NaN if no bone was seen."""
         self._flush()
         return _median(self._statures)
 
     @property
     def certain(self) -> bool:
-        """Return whether enough rows show bones for a refusal."""
+        """Returns True if enough rows show bones for a rejection."""
         self._flush()
         return sum(int(np.isfinite(part).sum()) for part in self._statures) >= _FEW
 
     @property
     def bones_m(self) -> dict[tuple[str, str], float]:
-        """Median length of every bone of _SHARES [m]; NaN where it was seen in too few frames."""
+        """Median length of every bone of _SHARES [m]; NaN if seen in too few frames."""
         self._flush()
         heights = np.concatenate(self._bones) if self._bones else np.empty((0, len(_SHARES)))
         columns = [column[np.isfinite(column)] for column in heights.T]
@@ -122,13 +123,13 @@ class BodyShape:
 
     @property
     def side_cue(self) -> str | None:
-        """By what left and right are told apart: the surest of _AHEAD that was seen; None where none was."""
+        """Cue for left and right: the most reliable of _AHEAD that was seen; None if none was."""
         self._flush()
         return next((cue for cue, parts in self._sides.items() if len(_finite(parts)) >= _FEW), None)
 
     def remarks(self, camera: str) -> Iterator[str]:
-        """Notes on bones that no adult has, and on left and right."""
-        if PERSON_M[0] <= self.stature_m <= PERSON_M[1]:  # in another unit every bone is wrong, which is told as such
+        """Returns notes on bones that no adult has, and on left and right."""
+        if PERSON_M[0] <= self.stature_m <= PERSON_M[1]:  # in another unit every bone is wrong; reported separately
             yield from bone_remarks(camera, self.bones_m)
         if self.side_cue is not None:
             yield from mirror_remarks(camera, _finite(self._sides[self.side_cue]), self.side_cue)
@@ -150,7 +151,7 @@ def _median(parts: list[Floats]) -> float:
 
 
 def statures(points: Floats) -> Floats:
-    """(n,) how tall bodies (n, 20, 3) are by the middle one of their bones [m]; NaN where none is seen."""
+    """(n,) statures of bodies (n, 20, 3) from the median over their bones [m]; NaN if none is seen."""
     by_bone = _heights(points)
     found = np.full(len(points), np.nan)
     some = np.isfinite(by_bone).any(axis=1)
@@ -158,18 +159,18 @@ def statures(points: Floats) -> Floats:
     return found
 
 
-#: A person is at most so many times as tall by one bone as by another; trackers' bodies reach 1.6.
+#: Maximum ratio of a person's statures by two bones; trackers' bodies reach 1.6.
 PROPORTION = 2.5
 _FEW_BONES = 4
 
 
 def bone_ratio(points: Floats) -> float:
-    """Ratio of the heights of bodies (n, 20, 3) by two bones, by medians; 1 where few are seen."""
+    """Ratio of the statures of bodies (n, 20, 3) by two bones, from medians; 1 if few are seen."""
     return _ratio(_heights(points))
 
 
 def _heights(points: Floats) -> Floats:
-    """(n, bones) how tall bodies are by each bone; NaN where it is not seen."""
+    """(n, bones) statures of bodies by each bone; NaN if it is not seen."""
     lengths = np.linalg.norm(points[:, _TO] - points[:, _FROM], axis=2)
     return np.asarray(np.where(lengths > 0.0, lengths, np.nan) / _SHARE)
 
@@ -180,7 +181,7 @@ def _ratio(heights: Floats) -> float:
 
 
 def looks_like_person(points: Floats) -> bool:
-    """Return whether bodies (n, 20, 3), in any unit, have the proportions of a person."""
+    """Returns True if bodies (n, 20, 3), in any unit, have the proportions of a person."""
     return bone_ratio(points) <= PROPORTION
 
 
@@ -189,13 +190,13 @@ def _at(points: Floats, name: str) -> Floats:
 
 
 def _feet(points: Floats) -> Floats:
-    """(n, 3) from the ankles to the feet, both sides added [m]."""
+    """(n, 3) vectors from the ankles to the feet, sum of both sides [m]."""
     left, right = (_at(points, f"foot_{s}") - _at(points, f"ankle_{s}") for s in "lr")
     return left + right
 
 
 def _knees(points: Floats) -> Floats:
-    """(n, 3) from the line between hip and ankle to the knee, both sides added [m]; NaN for a straight leg."""
+    """(n, 3) vectors from the line between hip and ankle to the knee, sum of both sides [m]; NaN for a straight leg."""
     total = np.zeros((len(points), 3))
     for s in "lr":
         hip, knee, ankle = (_at(points, f"{name}_{s}") for name in ("hip", "knee", "ankle"))
@@ -205,8 +206,8 @@ def _knees(points: Floats) -> Floats:
     return total
 
 
-#: What shows where a body's front is, the surest first: how it is called -> (n, 3) a direction ahead. Elbows do not:
-#: in two of ten recordings they bend backwards most of the time, by the turning of the upper arm.
+#: Cues for a body's front, the most reliable first: name -> (n, 3) forward direction. Elbows are not used: in two of
+#: ten recordings they bend backwards most of the time, from the rotation of the upper arm.
 _AHEAD: dict[str, Callable[[Floats], Floats]] = {
     "feet point": _feet,
     "knees bend": _knees,
@@ -214,11 +215,11 @@ _AHEAD: dict[str, Callable[[Floats], Floats]] = {
 
 
 def handedness(points: Floats, cue: str = "feet point") -> Floats:
-    """(n,) the volume that ahead, left and up span, of unit vectors: negative in a mirror image.
+    """(n,) volume spanned by the unit vectors forward, left and up: negative in a mirror image.
 
     Args:
         points: (n, 20, 3) in any right-handed frame [m].
-        cue: What shows where ahead is: feet or knees.
+        cue: Cue for the forward direction: feet or knees.
     """
     up = _unit(_at(points, "neck") - _at(points, "pelvis"))
     left = _unit(_at(points, "shoulder_l") - _at(points, "shoulder_r"))
@@ -226,7 +227,7 @@ def handedness(points: Floats, cue: str = "feet point") -> Floats:
 
 
 def twist(points: Floats) -> Floats:
-    """(n,) cosine between left of the shoulders and left of the hips: negative where one of the two is exchanged."""
+    """(n,) cosine between left of the shoulders and left of the hips: negative if one of the two is exchanged."""
     shoulders, hips = (_unit(_at(points, f"{name}_l") - _at(points, f"{name}_r")) for name in ("shoulder", "hip"))
     return np.asarray(np.einsum("ni,ni->n", shoulders, hips))
 
@@ -237,7 +238,7 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def size_remark(camera: str, stature_m: float, mend: str) -> str | None:
-    """A note on a body's size; None where a person may have it. ``mend``: where its unit is set."""
+    """Returns a note on a body's size; None for a plausible one. ``mend``: place of the unit's setting."""
     if np.isnan(stature_m) or PERSON_M[0] <= stature_m <= PERSON_M[1]:
         return None
     text = f"camera {camera}: by its bones the body is {stature_m:.3g} m tall"
@@ -251,7 +252,7 @@ def size_remark(camera: str, stature_m: float, mend: str) -> str | None:
 
 
 def proportion_remark(camera: str, ratio: float) -> str | None:
-    """A note where bones do not belong to one person; None where they may."""
+    """Returns a note on bones that do not belong to one person; None for plausible ones."""
     if ratio <= PROPORTION:
         return None
     return (
@@ -261,17 +262,17 @@ def proportion_remark(camera: str, ratio: float) -> str | None:
 
 
 def impossible_size(stature_m: float) -> bool:
-    """Return whether nobody can be of that size."""
+    """Returns True if no person can have that size."""
     return stature_m > _CERTAIN * PERSON_M[1] or stature_m < PERSON_M[0] / _CERTAIN
 
 
 def mirror_remarks(camera: str, sides: Floats, cue: str) -> Iterator[str]:
-    """A note where a camera sees mirror images, always or often.
+    """Returns a note on a camera that sees mirror images, always or often.
 
     Args:
-        camera: Its name.
+        camera: Name of the camera.
         sides: (n,) ``handedness`` of its frames.
-        cue: By what.
+        cue: Cue for the forward direction.
     """
     often = float((sides < -_MIRRORED).mean())
     always = np.median(sides) < -_MIRRORED
@@ -284,14 +285,14 @@ def mirror_remarks(camera: str, sides: Floats, cue: str) -> Iterator[str]:
 
 
 def bone_range_m(bone: tuple[str, str]) -> tuple[float, float]:
-    """Range of an adult's bone as trackers see it: its share of ADULT_M, and a margin [m]."""
+    """Returns the range of an adult's bone as seen by trackers: its share of ADULT_M, and a margin [m]."""
     share = _SHARES[bone]
     longest = share + _HALF_HAND if bone[0].startswith("elbow") else share
     return share * ADULT_M[0] * (1.0 - _BONE_MARGIN), longest * ADULT_M[1] * (1.0 + _BONE_MARGIN)
 
 
 def bone_remarks(camera: str, bones_m: Mapping[tuple[str, str], float]) -> Iterator[str]:
-    """A note on the bones that are none of an adult, and one on those that differ from left to right."""
+    """Returns a note on bones outside an adult's range, and one on those that differ between left and right."""
     odd = {
         bone: f"{_bone_name(bone)} {length_m:.2f} m (an adult's: {low_m:.2f} to {high_m:.2f})"
         for bone, length_m in bones_m.items()
@@ -323,7 +324,7 @@ def _bone_name(bone: tuple[str, str]) -> str:
 
 
 def unmeasured_limbs(seen: Mapping[str, Bools]) -> Iterator[str]:
-    """The limbs that no camera ever measured, by the points (20,) that each camera ever gave."""
+    """Returns notes on limbs that no camera ever measured, from the points (20,) that each camera ever provided."""
     ever = np.logical_or.reduce([np.zeros(len(POINTS), dtype=np.bool_), *seen.values()])
     if not ever.any():
         return
@@ -336,14 +337,14 @@ def unmeasured_limbs(seen: Mapping[str, Bools]) -> Iterator[str]:
             )
 
 
-_JUMP_M = 0.3  # within _SOON_NS: nobody is so fast
+_JUMP_M = 0.3  # m, minimum jump within _SOON_NS; faster than any person
 _SOON_NS = 80_000_000
-_BACK = 1.0 / 3.0  # of the jump: nearer than this to where the body was before it
-_ALTERNATING = 0.1  # of the rows
+_BACK = 1.0 / 3.0  # maximum distance from the earlier position, as a share of the jump
+_ALTERNATING = 0.1  # share of the rows
 
 
 class Alternation:
-    """Detector of rows of a body that alternate between two places, as of two cameras under one name."""
+    """Detects rows of a body that alternate between two places, as for two cameras under one name."""
 
     def __init__(self) -> None:
         self._before: dict[tuple[str, int], tuple[tuple[int, Floats], ...]] = {}  # a body's last two rows
@@ -352,12 +353,12 @@ class Alternation:
         self._jumps_m: dict[str, list[float]] = defaultdict(list)
 
     def add(self, camera: str, body: int, t_ns: int, points_m: Floats) -> None:
-        """Takes a row.
+        """Adds a row.
 
         Args:
-            camera: Its camera.
+            camera: Camera of the row.
             body: The body's number.
-            t_ns: Its arrival [ns].
+            t_ns: Arrival of the row [ns].
             points_m: (20, 3) in the camera's frame [m].
         """
         self._rows[camera] += 1
@@ -370,12 +371,12 @@ class Alternation:
             return
         others = [row for (of, other), rows in self._before.items() if of == camera and other != body for row in rows]
         if any(t_ns - at_ns < _SOON_NS and _apart(points_m, at) < _BACK * jump_m for at_ns, at in others):
-            return  # two people whose numbers the tracker exchanges
+            return  # two people with numbers exchanged by the tracker
         self._returns[camera] += 1
         self._jumps_m[camera].append(jump_m)
 
     def remarks(self) -> Iterator[str]:
-        """A sentence for each camera whose bodies alternate."""
+        """Returns a sentence for each camera with alternating bodies."""
         for camera, count in self._returns.items():
             if count >= _FEW and count > _ALTERNATING * self._rows[camera]:
                 jump_m = float(np.median(self._jumps_m[camera]))
@@ -386,7 +387,7 @@ class Alternation:
 
 
 def _apart(points_m: Floats, others_m: Floats) -> float:
-    """Median distance of the points that both bodies have; NaN where there are none [m]."""
+    """Returns the median distance of the points that both bodies have; NaN if there are none [m]."""
     away = np.linalg.norm(points_m - others_m, axis=1)
     known = away[np.isfinite(away)]
     return float(np.median(known)) if len(known) else float("nan")
@@ -400,7 +401,7 @@ class BodyPosture:
         self._pelvis: list[Floats] = []
 
     def add(self, points: Floats) -> None:
-        """Takes bodies (n, 20, 3) in the world [m]."""
+        """Adds bodies (n, 20, 3) in the world [m]."""
         pelvis, neck, head, right, left = (
             points[:, POINTS.index(name)] for name in ("pelvis", "neck", "head", "shoulder_r", "shoulder_l")
         )
@@ -409,7 +410,7 @@ class BodyPosture:
         self._pelvis.append(pelvis[:, 2])
 
     def remark(self, camera: str) -> str | None:
-        """A note on a body that cannot stand on the floor like this; None for a plausible one."""
+        """Returns a note on a body that is not upright on the floor; None for a plausible one."""
         up, height_m = _median(self._upright), _median(self._pelvis)
         mend = "would be right: T_world_camera with z up and the floor at z = 0; find it with hrcreplay calibrate"
         if up < -_UPRIGHT:

@@ -29,7 +29,7 @@ from hrcreplay.records import NOBODY, CameraFrames
 from hrcreplay.settings.sections import Logs
 
 _OWN = "hrcreplay.Skeleton"
-_BODIES = "body_tracking"  # in the name of a topic: it carries bodies even where nobody is in sight
+_BODIES = "body_tracking"  # in the name of a topic: it carries bodies, even without a person in view
 _NO_BODIES = (
     "sensor_msgs/JointState",
     "hrcreplay.JointState",
@@ -44,28 +44,28 @@ _NO_SETTING = (
 )
 
 
-#: How to read a log of which the settings say nothing.
+#: Default options for reading a log.
 DEFAULT = Logs()
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """The decoders of a log's skeleton topics, and what is told of topics that have none."""
+    """The decoders of a log's skeleton topics, and remarks on topics without one."""
 
     decoders: list[SkeletonDecoder]
     remarks: list[str]
 
 
 def choose_decoders(source: LogFiles, options: Logs) -> Chosen:
-    """The decoders of a log's skeleton topics.
+    """Chooses the decoders of a log's skeleton topics.
 
     Args:
         source: The log's files.
-        options: The topics that the user named, () for all that a decoder knows; the decoders that settings describe,
-            by which their topics are read; units and numbering of markers.
+        options: Topics named by the user, () for all with a decoder; decoders described in the settings, which read
+            their topics; units and numbering of markers.
 
     Returns:
-        A decoder a topic, none where no topic carries skeletons.
+        One decoder per topic; none if no topic carries skeletons.
 
     Raises:
         LogError: A named topic is not in the log, or carries no skeletons.
@@ -92,7 +92,7 @@ def choose_decoders(source: LogFiles, options: Logs) -> Chosen:
 
 
 def no_skeletons_error(source: LogFiles, remarks: list[str]) -> LogError:
-    """The error for a log in which no topic carries skeletons, with what the user can do."""
+    """Returns the error for a log without skeleton topics, with a remedy."""
     told = "".join(f"\n{remark}." for remark in remarks)
     how = skeletons_remedy(source.topics(), remarks)
     text = f"{source.path}: no skeleton topic; found {topic_list(source.topics())}.{told}\n{how}"
@@ -100,11 +100,11 @@ def no_skeletons_error(source: LogFiles, remarks: list[str]) -> LogError:
 
 
 def skeletons_remedy(topics: Sequence[Topic], remarks: Sequence[str]) -> str:
-    """Remedy for a log without skeletons.
+    """Returns a remedy for a log without skeletons.
 
     Args:
         topics: All topics of the log.
-        remarks: What was told of them.
+        remarks: Remarks on them.
     """
     helped = any(topic.type == MARKER_TYPE for topic in topics) or any(DECODABLE in remark for remark in remarks)
     return _HOW if helped else _NO_SETTING
@@ -124,7 +124,7 @@ def _known(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) ->
 
 
 def _markers(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) -> SkeletonDecoder | None:
-    """The decoder of a marker topic; None, with a remark, where its markers are no bodies."""
+    """Returns the decoder of a marker topic; None, with a remark, if its markers are not bodies."""
     layout = survey_markers(source.messages([topic.name]), options.marker_ids_per_body)
     if isinstance(layout, MarkerLayout):
         return MarkerDecoder(topic.name, layout, unit=options.unit)
@@ -141,7 +141,7 @@ def _markers(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) 
 
 
 def _descriptions(source: LogFiles) -> Iterator[str]:
-    """Describe the topics of a log without skeletons, as far as they may be bodies."""
+    """Describes the topics of a log without skeletons that may contain bodies."""
     for topic in source.topics():
         if not topic.count or topic.type in _NO_BODIES:
             continue
@@ -166,15 +166,15 @@ def _check_cameras(source: LogFiles, decoders: list[SkeletonDecoder]) -> None:
             met[camera] = decoder.topic
 
 
-_LATE_NS = 10**9  # a camera absent for so long at either end of the log is worth a remark
-_CONTRADICTING = 0.05  # of a camera's rows
-_FROZEN_S = 0.5  # so is one that gives the same skeleton for so long
-#: What is told of points that were made missing, and of rows that repeat.
+_LATE_NS = 10**9  # s, minimum absence of a camera at either end of the log for a remark
+_CONTRADICTING = 0.05  # share of a camera's rows
+_FROZEN_S = 0.5  # s, minimum time of a repeated skeleton for a remark
+#: Defects with a remark: points marked as missing, and repeated rows.
 _TOLD = ("points_at_origin", "points_coincident", "points_not_finite", "points_too_far")
 
 
 class Log:
-    """An open log. ``defects`` (names: clean.DEFECTS) and ``notes`` are about the latest pass over its frames."""
+    """An open log. ``defects`` (names: clean.DEFECTS) and ``notes`` refer to the latest pass over its frames."""
 
     def __init__(self, source: LogFiles, chosen: Chosen, options: Logs) -> None:
         self._source = source
@@ -188,24 +188,22 @@ class Log:
         self._refusals: list[str] = []
         self._track: Counter[str] = Counter()
         self.joint_notes: tuple[str, ...] = ()  #: remarks of the latest reading of the joints
-        self.clocks: dict[str, CameraClock] = {}  #: camera -> its clock, of the latest pass
-        self.stature_m: dict[str, float] = {}  #: camera -> how tall its bodies are, of the latest pass; NaN: not known
-        self.side_cue: dict[
-            str, str | None
-        ] = {}  #: camera -> by what left and right were told apart; None: not checked
-        self.points_seen = 0  #: points with a place and a confidence, of the latest pass
+        self.clocks: dict[str, CameraClock] = {}  #: camera -> its clock in the latest pass
+        self.stature_m: dict[str, float] = {}  #: camera -> stature of its bodies in the latest pass; NaN: unknown
+        self.side_cue: dict[str, str | None] = {}  #: camera -> cue for left and right; None: not checked
+        self.points_seen = 0  #: number of points with a position and a confidence in the latest pass
         self.header = _header(source, decoders, self._joint_topics, self._truth, chosen=bool(options.topics))
 
     @property
     def defects(self) -> Counter[str]:
         """Defects found so far: in the files, in the latest pass over the frames and over the joints."""
         found = self._source.damage().defects + self._track
-        found.update(self._reading)  # unlike +, keeps a count of zero
+        found.update(self._reading)  # keeps counts of zero, unlike +
         return Counter(dict(sorted(found.items())))
 
     @property
     def joint_defects(self) -> Counter[str]:
-        """Those of ``defects`` that the latest pass over the joints found."""
+        """The part of ``defects`` from the latest pass over the joints."""
         return Counter(self._track)
 
     @property
@@ -215,7 +213,7 @@ class Log:
 
     @property
     def skeletons_remedy(self) -> str:
-        """Remedy for a log without skeletons."""
+        """Returns a remedy for a log without skeletons."""
         return skeletons_remedy(self.topics, self._topic_remarks)
 
     @property
@@ -226,15 +224,15 @@ class Log:
     def frames(
         self, start_ns: int | None = None, end_ns: int | None = None, *, nobody: bool = False
     ) -> Iterator[CameraFrames]:
-        """Frames with start <= arrival < end in order of arrival, in chunks of at most 1 s of arrival time.
+        """Yields frames with start <= arrival < end in order of arrival, in chunks of at most 1 s of arrival time.
 
         Args:
             start_ns: First arrival [ns]; None: the log's.
-            end_ns: Arrival that is too late [ns]; None: the log's end.
-            nobody: Whether to give the frames that show nobody, too.
+            end_ns: End of the arrivals, exclusive [ns]; None: the log's end.
+            nobody: True: also yield frames without a body.
 
         Raises:
-            LogError: The log is broken in a way that cannot be worked around.
+            LogError: The log is damaged beyond recovery.
         """
         self._reading.clear()
         self._remarks = list(dict.fromkeys(note for decoder in self._decoders for note in decoder.notes))
@@ -271,10 +269,10 @@ class Log:
         self._refuse(order.remarks(self.header.start_ns))
 
     def check(self) -> None:
-        """Refuses a log whose latest complete pass showed bodies that are certainly no person.
+        """Rejects a log whose latest complete pass showed bodies that are certainly not a person.
 
         Raises:
-            LogError: What was found, and what would mend it.
+            LogError: The bodies are not a person; with a remedy.
         """
         if self._refusals:
             raise LogError(f"{self.header.path}: {self._refusals[0]}")
@@ -301,7 +299,7 @@ class Log:
         self._refusals.extend(found)
 
     def _unit_of(self, camera: str) -> str:
-        """Setting that holds the unit of a camera's points."""
+        """Returns the setting of the unit of a camera's points."""
         for decoder in self._decoders:
             if camera in decoder.cameras and isinstance(decoder, GenericDecoder):
                 other = "m" if decoder.how.unit == "mm" else "mm"
@@ -312,7 +310,7 @@ class Log:
         return "would be right: points in metres"
 
     def joints(self, axes: Sequence[str]) -> JointTrack | None:
-        """The recorded track of the robot's axes; None where the log has no joint positions.
+        """Returns the recorded track of the robot's axes; None if the log has no joint positions.
 
         Args:
             axes: The robot's joints, from the base on.
@@ -325,20 +323,20 @@ class Log:
         return self.read_joints(topics, axes).track if topics else None
 
     def read_joints(self, topics: Sequence[JointTopic], axes: Sequence[str]) -> JointReading:
-        """The track of the robot's axes from what ``joint_states`` found; raises as ``joints``."""
+        """Makes the track of the robot's axes from the result of ``joint_states``; raises as ``joints``."""
         reading = joints.read_track(topics, axes, self._options, str(self.header.path), self._track)
         covered = joints.coverage_remarks(reading, self.header.start_ns, self.header.end_ns)
         self.joint_notes = (*reading.notes, *covered)
         return reading
 
     def joint_states(self) -> list[JointTopic]:
-        """The joint states of each topic that has positions, as they are in the log."""
+        """Returns the joint states of each topic with positions, as stored in the log."""
         self._track.clear()
         self.joint_notes = ()
         return joints.read_topics(self._source, self._joint_topics, self._track)
 
     def truth(self) -> Iterator[Truth]:
-        """The true person in order of time, in chunks of at most 1 s; nothing where there is none."""
+        """Yields the true person in order of time, in chunks of at most 1 s; nothing without ground truth."""
         if self._truth is not None:
             yield from log_files.truth(self._source, self._truth)
 
@@ -360,7 +358,7 @@ class Log:
 
 
 def _contradictions(cleaner: Cleaner) -> Iterator[str]:
-    """A sentence for each camera of which many rows say something else than the row before, of the same instant."""
+    """Returns a sentence for each camera with many rows that contradict the previous row of the same instant."""
     for (camera, name), count in sorted(cleaner.flaws.items()):
         if name == "frames_contradicting" and count > _CONTRADICTING * cleaner.rows[camera]:
             yield (
@@ -371,7 +369,7 @@ def _contradictions(cleaner: Cleaner) -> Iterator[str]:
 
 
 def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
-    """Remarks on a camera's points and stamps."""
+    """Returns remarks on a camera's points and stamps."""
     for name in _TOLD:
         count = cleaner.flaws[(camera, name)]
         if count:
@@ -403,11 +401,11 @@ def open_log(path: Path, options: Logs = DEFAULT, *, skeletons: bool = True) -> 
 
     Args:
         path: MCAP file, ROS 1 bag, ROS 2 bag (folder or .db3 file).
-        options: How to read it.
-        skeletons: Whether a log without skeletons is refused.
+        options: Options for reading.
+        skeletons: True: reject a log without skeletons.
 
     Raises:
-        LogError: It cannot be read, holds no messages, lacks a named topic, or has no skeletons.
+        LogError: The log cannot be read, has no messages, lacks a named topic, or has no skeletons.
     """
     source = open_source(path)
     chosen = choose_decoders(source, options)
@@ -421,9 +419,9 @@ def _header(
 ) -> Header:
     known = log_files.latched(source)
     seen = [camera for decoder in decoders for camera in decoder.cameras]
-    declared = [camera for camera in known.cameras if camera in seen or not chosen]  # one may be silent all along
+    declared = [camera for camera in known.cameras if camera in seen or not chosen]  # a camera may never send
     cameras = tuple(dict.fromkeys([*declared, *seen]))
-    # Not the first message of all: recorders stamp with zero what came before a simulation's clock.
+    # Not the first message: recorders use stamp zero before the clock of a simulation starts.
     used = [*(decoder.topic for decoder in decoders), *joint_topics, *([truth] if truth else [])]
     first = next(source.messages(used), None)
     return Header(

@@ -1,7 +1,7 @@
 """ROS 1 bags and sqlite3 files of ROS 2 bags as streams of messages, read without ROS.
 
-Messages are decoded by the definitions in the log, else by those of the known releases. ROS 1 bags without an index, or
-with a broken one, are read by going through their chunks once. Layout: http://wiki.ros.org/Bags/Format/2.0
+Messages are decoded by the definitions in the log, else by those of the known releases. ROS 1 bags without a valid
+index are read by one pass through their chunks. Layout: http://wiki.ros.org/Bags/Format/2.0
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ from hrcreplay.logs.unpack import CHUNK_RECORDS, CannotUnpack, unpack, unpack_me
 
 _IDL_RULE = "=" * 80 + "\n"
 _ROS1 = (Stores.ROS1_NOETIC,)
-_ROS2 = (Stores.LATEST, Stores.ROS2_HUMBLE, Stores.ROS2_GALACTIC, Stores.ROS2_FOXY)  # by what differs in their messages
+_ROS2 = (Stores.LATEST, Stores.ROS2_HUMBLE, Stores.ROS2_GALACTIC, Stores.ROS2_FOXY)  # releases with different messages
 _FAILURES = (SerdeError, TypesysError, KeyError, ValueError, AssertionError)
 
 
 def plain(msgtype: str) -> str:
-    """The name of a type without the "msg" that ROS 2 puts in the middle."""
+    """Returns the name of a type without the "msg" in the middle of ROS 2 names."""
     return msgtype.replace("/msg/", "/")
 
 
 def parser(where: str, msgtype: str, definition: str, form: str, *, cdr: bool) -> Callable[[bytes], Any]:
-    """A function from the bytes of a message to its fields.
+    """Returns a function from the bytes of a message to its fields.
 
     Args:
         where: Start of error messages: file and topic.
         msgtype: Name of the type, of ROS 1 or ROS 2.
-        definition: Text of the type's definition in the log; "" where there is none.
+        definition: Text of the type's definition in the log; "" if missing.
         form: "msg" or "idl".
-        cdr: Whether the bytes are CDR (ROS 2); else they are ROS 1's.
+        cdr: True: the bytes are CDR (ROS 2); False: ROS 1.
 
     Returns:
-        The function. It settles on the first definition that fits its first message and raises Undecodable for a
-        message that fits none.
+        The function. It uses the first definition that fits its first message and raises Undecodable for a message that
+        fits none.
     """
     name = _full(msgtype)
     chosen: list[Typestore] = []
@@ -92,7 +92,7 @@ def _stores(name: str, definition: str, form: str, releases: tuple[Stores, ...])
             store.register(_types(name, definition, form))
             yield store
         except _FAILURES:
-            pass  # some recorders stored definitions without their parts; a release may know the type
+            pass  # some recorders store incomplete definitions; a release may contain the type
     for release in releases:
         store = _release(release)
         if name in store.fielddefs:
@@ -101,7 +101,7 @@ def _stores(name: str, definition: str, form: str, releases: tuple[Stores, ...])
 
 @cache
 def _release(release: Stores) -> Typestore:
-    """The types of a release, which take a while to build."""
+    """Returns the types of a release, which are slow to build."""
     return get_typestore(release)
 
 
@@ -139,7 +139,7 @@ class RecoveredBag:
     """A ROS 1 bag whose index is missing or broken.
 
     Raises:
-        LogError: No whole message is in it.
+        LogError: It contains no complete message.
     """
 
     profile = "ros1"
@@ -150,7 +150,7 @@ class RecoveredBag:
         damage.notes.append("the bag has no usable index: it was read once more to make one (rosbag reindex mends it)")
         damage.defects["unindexed"] = 1
         self._chunks: list[_BagChunk] = []
-        self._damaged: dict[int, str] = {}  # byte at which a chunk begins that is left out -> why
+        self._damaged: dict[int, str] = {}  # first byte of a chunk that is left out -> reason
         connections: dict[int, tuple[str, Fields]] = {}
         counts: Counter[int] = Counter()
         with path.open("rb") as file:
@@ -172,7 +172,7 @@ class RecoveredBag:
         self.topics = tuple(self._topics.values())
 
     def messages(self, names: Collection[str], start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
-        """Messages on these topics with start <= arrival < end, in order of arrival."""
+        """Yields messages on these topics with start <= arrival < end, in order of arrival."""
         wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
         with self._path.open("rb") as file:
             for message in merge_by_arrival(
@@ -185,7 +185,7 @@ class RecoveredBag:
                     yield message
 
     def _scan(self, file: IO[bytes], connections: dict[int, tuple[str, Fields]], counts: Counter[int]) -> bool:
-        """Finds chunks and connections; whether the file ends with a whole record."""
+        """Finds chunks and connections; returns True if the file ends with a complete record."""
         file.seek(len(MAGIC))
         offset = file.tell()
         try:
@@ -213,7 +213,7 @@ class RecoveredBag:
         *,
         whole: bool,
     ) -> None:
-        """Adds what a chunk holds; one that is all there but cannot be unpacked is left out."""
+        """Adds the content of a chunk; a complete chunk that cannot be unpacked is left out."""
         try:
             self._add(offset, unpack(fields["compression"].decode(), data), connections, counts)
         except CannotUnpack as error:
@@ -245,7 +245,7 @@ class RecoveredBag:
 
 
 def _fields(file: IO[bytes]) -> Fields | None:
-    """The header of the next record; None at the end of the file."""
+    """Reads the header of the next record; None at the end of the file."""
     prefix = file.read(4)
     if not prefix:
         return None
@@ -264,7 +264,7 @@ def _fields(file: IO[bytes]) -> Fields | None:
 
 
 def _inner(data: bytes) -> Iterator[tuple[Fields, bytes]]:
-    """Whole records of a chunk; the last chunk of a bag that breaks off may itself break off.
+    """Yields the complete records of a chunk; the last chunk of a truncated bag may itself be truncated.
 
     Raises:
         CannotUnpack: There are more than CHUNK_RECORDS.
@@ -306,17 +306,17 @@ def _topic(path: Path, name: str, fields: Fields, count: int) -> Topic:
     return Topic(name, plain(msgtype), count, parse)
 
 
-#: What helps against a chunk that is damaged or too large.
+#: Remedy for a chunk that is damaged or too large.
 _ANEW = "copy the bag again, or write it anew in small chunks with rosbag decompress"
 _NO_INDEX = (rosbag1.ReaderError, AssertionError, struct.error, ValueError, IndexError)
 _BROKEN = (*_NO_INDEX, RuntimeError, OSError)
 
 
 def open_bag(path: Path) -> MessageStream:
-    """A ROS 1 bag, by its index or, where that is missing or broken, without it.
+    """Opens a ROS 1 bag by its index or, if that is missing or broken, without it.
 
     Raises:
-        LogError: It holds no whole message.
+        LogError: It contains no complete message.
     """
     try:
         return RosStream(path)
@@ -325,17 +325,17 @@ def open_bag(path: Path) -> MessageStream:
 
 
 class _LimitedReader(rosbag1.Reader):
-    """Unpacks no chunk beyond the limit."""
+    """A reader that unpacks no chunk beyond the limit."""
 
     def read_chunk(self) -> Any:
-        """The next chunk, with a decompressor that knows the limit."""
+        """Reads the next chunk, with a decompressor with a limit."""
         chunk = super().read_chunk()
         method = next(name for name, decompress in decompressors.items() if decompress is chunk.decompressor)
         return chunk._replace(decompressor=partial(unpack, method))
 
 
 class RosStream:
-    """A ROS 1 bag that the library rosbags reads."""
+    """A ROS 1 bag read by the library rosbags."""
 
     profile = "ros1"
 
@@ -354,7 +354,7 @@ class RosStream:
         self.topics = tuple(self._topics.values())
 
     def messages(self, names: Collection[str], start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
-        """Messages on these topics with start <= arrival < end, in order of arrival."""
+        """Yields messages on these topics with start <= arrival < end, in order of arrival."""
         try:
             with _LimitedReader(self._path) as opened:
                 wanted = [c for c in opened.connections if c.topic in names]
@@ -365,7 +365,7 @@ class RosStream:
         except CannotUnpack as error:
             raise LogError(f"{self._path}: a chunk of the bag {error}; {_ANEW}") from error
         except _BROKEN as error:
-            found = str(error) or type(error).__name__  # struct and zlib say what they found, EOFError does not
+            found = str(error) or type(error).__name__  # errors of struct and zlib have a text, EOFError has none
             raise LogError(f"{self._path}: broken in the middle ({found}); copy it again") from error
 
 
@@ -373,15 +373,15 @@ def _parser(path: Path, connection: Connection) -> Callable[[bytes], Any]:
     return parser(f"{path}: {connection.topic}", connection.msgtype, connection.msgdef.data, "msg", cdr=False)
 
 
-#: Beyond this many unreadable rows one after the other nothing more is looked for.
+#: Maximum number of consecutive unreadable rows; then the search ends.
 _SEARCH_ROWS = 1 << 20
 
 
 class Db3Stream:
-    """A sqlite3 file of a ROS 2 bag, by itself; a damaged one as far as it can be read.
+    """A single sqlite3 file of a ROS 2 bag; a damaged one is read as far as possible.
 
     Raises:
-        LogError: It is no such file, or nothing in it can be read.
+        LogError: It is not such a file, or nothing in it can be read.
     """
 
     profile = "ros2"
@@ -421,7 +421,7 @@ class Db3Stream:
         return start_ns or 0, end_ns or 0
 
     def _recover(self, damage: Damage, error: sqlite3.Error) -> tuple[int, int]:
-        """Finds the rows that can be read, and tells what is wrong; first and last arrival of them."""
+        """Finds the readable rows and notes the damage; returns their first and last arrival."""
         with closing(_database(self._path)) as database:
             self._found = sorted(_readable_rows(database))
         if not self._found:
@@ -437,7 +437,7 @@ class Db3Stream:
         return Counter(topic for _, _, topic in self._found or ())
 
     def messages(self, names: Collection[str], start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
-        """Messages on these topics with start <= arrival < end, in order of arrival."""
+        """Yields messages on these topics with start <= arrival < end, in order of arrival."""
         wanted = {number: topic for number, topic in self._topics.items() if topic.name in names}
         span = (-(1 << 63) if start_ns is None else start_ns, (1 << 63) - 1 if end_ns is None else end_ns)
         given: tuple[int, int] | None = None  # time and row of the newest message
@@ -472,7 +472,7 @@ class Db3Stream:
 
 
 def _database(path: Path) -> sqlite3.Connection:
-    """A database to read; also one that is shorter than it says, which takes a writable schema to open."""
+    """Opens a database for reading; also a truncated one, which requires a writable schema."""
     database = sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True, check_same_thread=False)
     database.execute("PRAGMA writable_schema = ON")
     database.text_factory = lambda text: text.decode(errors="replace")
@@ -480,7 +480,7 @@ def _database(path: Path) -> sqlite3.Connection:
 
 
 def _definitions(database: sqlite3.Connection) -> dict[str, tuple[str, str]]:
-    """Type -> "msg" or "idl", and its definition, where the recorder stored them."""
+    """Returns type -> "msg" or "idl" and its definition, if the recorder stored them."""
     query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
     try:
         return {
@@ -491,7 +491,7 @@ def _definitions(database: sqlite3.Connection) -> dict[str, tuple[str, str]]:
 
 
 def _readable_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int, int]]:
-    """Time, row and topic of each message that can be read; around damage it searches in ever longer steps."""
+    """Yields time, row and topic of each readable message; searches beyond damage with increasing steps."""
     row, step = 0, 1
     while step <= _SEARCH_ROWS:
         query = "SELECT timestamp, id, topic_id, data FROM messages WHERE id >= ? ORDER BY id"
@@ -506,7 +506,7 @@ def _readable_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int, int
 
 
 def _is_short(path: Path) -> bool:
-    """Return whether a database has fewer bytes than its header says."""
+    """Returns True if a database has fewer bytes than its header gives."""
     with path.open("rb") as file:
         head = file.read(32)
     (page,), (pages,) = struct.unpack_from(">H", head, 16), struct.unpack_from(">L", head, 28)

@@ -1,4 +1,4 @@
-"""Decompression within stated limits: how much a message, a chunk or a file unpacks to is known before it is held."""
+"""Decompression within limits: the unpacked size of a message, a chunk or a file is checked before it is in memory."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import zstandard
 
 from hrcreplay.errors import LogError
 
-#: A chunk of a recorder holds some MB; this is the most that is unpacked of one [bytes].
+#: Maximum unpacked size of a chunk; recorders use a few MB [bytes].
 CHUNK_BYTES: Final = 256 << 20
-#: The most that is unpacked of one message [bytes].
+#: Maximum unpacked size of a message [bytes].
 MESSAGE_BYTES: Final = 64 << 20
-#: The most records in one chunk: each costs some hundred bytes and microseconds.
+#: Maximum number of records in a chunk; each takes some hundred bytes and microseconds.
 CHUNK_RECORDS: Final = 1 << 19
-#: A compressed file unpacks to at most so many times its size, and SPARE_BYTES more.
+#: Maximum unpacked size of a file relative to its size, in addition to SPARE_BYTES.
 FILE_RATIO: Final = 1000
 #: See FILE_RATIO [bytes].
 SPARE_BYTES: Final = 256 << 20
@@ -39,10 +39,10 @@ def unpack(method: str, data: bytes, limit: int = CHUNK_BYTES) -> bytes:
     Args:
         method: One of METHODS.
         data: Compressed bytes.
-        limit: The most bytes that the result may have.
+        limit: Maximum size of the result [bytes].
 
     Raises:
-        CannotUnpack: The method is not known, the data is damaged, or the result is larger than the limit.
+        CannotUnpack: The method is unknown, the data is damaged, or the result is larger than the limit.
     """
     if method not in METHODS:
         raise CannotUnpack(f"compressed by {method!r}; known are {', '.join(KNOWN)}")
@@ -80,7 +80,7 @@ def _zstd(data: bytes, limit: int) -> Iterator[bytes]:
 
 
 def _piecewise(make: Callable[[], Any]) -> Callable[[bytes, int], Iterator[bytes]]:
-    """Blocks from a decompressor with the methods of bz2's, one stream after the other."""
+    """Yields blocks from a decompressor with the interface of bz2's, one stream after the other."""
 
     def blocks(data: bytes, _limit: int) -> Iterator[bytes]:
         while data:
@@ -101,7 +101,7 @@ def _plain(data: bytes, _limit: int) -> Iterator[bytes]:
     yield data
 
 
-#: Method of compression -> from data and the limit, blocks of what it unpacks to.
+#: Method of compression -> function from data and limit to unpacked blocks.
 METHODS: Mapping[str, Callable[[bytes, int], Iterator[bytes]]] = {
     "": _plain,
     "none": _plain,
@@ -115,10 +115,10 @@ KNOWN: Final = ("zstd", "lz4", "bz2")
 
 
 def unpack_message(data: bytes, where: str) -> bytes:
-    """A message of a ROS 2 bag, decompressed where it is zstd's: no serialized message begins as zstd does.
+    """Decompresses a message of a ROS 2 bag if it is zstd's; no serialized message begins like zstd data.
 
     Args:
-        data: Message as it is in the file.
+        data: Message as stored in the file.
         where: Start of error messages.
 
     Raises:
@@ -133,7 +133,7 @@ def unpack_message(data: bytes, where: str) -> bytes:
 
 
 def unpack_file(file: Path, target: Path) -> Path:
-    """Writes the content of a zstd file to ``target``, and returns that.
+    """Writes the content of a zstd file to ``target``; returns ``target``.
 
     Raises:
         LogError: It is damaged, or unpacks to more than FILE_RATIO times its size and SPARE_BYTES.

@@ -1,6 +1,6 @@
-"""Writes a log of our own format: MCAP with the messages of skeleton.proto, complete or not at all.
+"""Writes a log of hrcreplay's own format: MCAP with the messages of skeleton.proto, complete or not at all.
 
-For the importers also: numbers from text lines with their places, and rows of several cameras merged into a log.
+Also helps the importers: numbers from text lines with their positions, and rows of several cameras merged into a log.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from hrcreplay.logs import messages
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.records import POINTS, CameraFrames, Floats, Ints
 
-_CHUNK_BYTES = 256 * 1024  # some ten seconds of two cameras: small enough to seek by, large enough to compress
+_CHUNK_BYTES = 256 * 1024  # about ten seconds of two cameras: small enough for seeking, large enough for compression
 
 
 class LogWriter:
     """A log being written; it appears at ``path`` when the ``with`` block ends without an error.
 
-    Frames, truth and joints may come in chunks, each track in order of time. Cameras keep the order in which they are
-    declared. The same calls give the same bytes.
+    Frames, truth and joints may be added in chunks, each track in order of time. Cameras keep the order in which they
+    are declared. The same calls give the same bytes.
 
     Raises:
         SettingsError: The file exists, or its folder cannot be written.
@@ -63,13 +63,13 @@ class LogWriter:
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(
             profile=messages.PROFILE, library="hrcreplay"
-        )  # the library's version would change the bytes
+        )  # the version of the library would change the bytes
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
     ) -> None:
-        """Finishes the file and puts it in its place, or removes what there is of it after an error."""
+        """Finishes the file and moves it to its path, or removes it after an error."""
         try:
             if kind is None:
                 self._release(self._last_ns)
@@ -83,12 +83,12 @@ class LogWriter:
     def _publish(self) -> None:
         umask = os.umask(0)
         os.umask(umask)
-        self._temporary.chmod(0o666 & ~umask)  # mkstemp's 0600 would hide the log from colleagues
-        _refuse_existing(self._path)  # it may have appeared meanwhile
+        self._temporary.chmod(0o666 & ~umask)  # mkstemp's mode 0600 would make the log unreadable for other users
+        _refuse_existing(self._path)  # the target may have been created meanwhile
         self._temporary.rename(self._path)
 
     def camera(self, name: str, T_world_camera: Floats | None = None) -> None:
-        """Declares a camera, with its pose (4, 4) in the world where that is known."""
+        """Declares a camera, with its pose (4, 4) in the world if known."""
         if name in self._cameras or not name or "/" in name:
             raise SettingsError(f"camera {name!r}: declared twice, empty or with a slash; name each camera once")
         self._cameras.append(name)
@@ -96,7 +96,7 @@ class LogWriter:
         self._latch(messages.camera_info_topic(name), pb.Camera(camera=name, T_world_camera=values))
 
     def task(self, task: dict[str, Any]) -> None:
-        """Adds the programmed task: a dictionary as a task file gives it."""
+        """Adds the programmed task: a dictionary with the content of a task file."""
         self._latch(messages.TASK, pb.Task(json=json.dumps(task, sort_keys=True)))
 
     def base(self, T_world_base: Floats) -> None:
@@ -104,7 +104,7 @@ class LogWriter:
         self._latch(messages.BASE, pb.Base(T_world_base=np.asarray(T_world_base, dtype=np.float64).ravel().tolist()))
 
     def frames(self, frames: CameraFrames) -> None:
-        """Adds camera frames; cameras not declared yet are declared, of unknown pose."""
+        """Adds camera frames; undeclared cameras are declared with unknown pose."""
         for name in frames.cameras:
             if name not in self._cameras:
                 self.camera(name)
@@ -135,7 +135,7 @@ class LogWriter:
         self._latched.append((topic, message))
 
     def _release(self, log_ns: int) -> None:
-        # What holds for the whole log gets the time of the data around it: a time of its own would stretch the span.
+        # Data that apply to the whole log get the time of nearby data, as another time would extend the span.
         latched, self._latched = self._latched, []
         for topic, message in latched:
             self._add(topic, message, log_ns, log_ns)
@@ -157,7 +157,7 @@ class LogWriter:
 
 
 def register_schema(writer: Writer, known: dict[str, int], kind: Any) -> int:
-    """The id of a protobuf message's schema in a log; registered, and put down in ``known``, at its first use."""
+    """Returns the id of a protobuf message's schema in a log; registers it in ``known`` at its first use."""
     name = kind.DESCRIPTOR.full_name
     if name not in known:
         files = FileDescriptorSet()
@@ -171,13 +171,13 @@ def _refuse_existing(path: Path) -> None:
         raise SettingsError(f"{path}: exists already; name another file, or remove it")
 
 
-#: First stamp given to files that have none. Not 0: a stamp of zero means 'no stamp' in the logs of others.
+#: First stamp for files without stamps. Not 0, as a stamp of zero means 'no stamp' in other logs.
 START_NS = 1_000_000_000
 
-#: What is told of every format imported here: none of them knows when a frame reached a computer.
+#: Note on every format imported here: none contains the arrival time of a frame at a computer.
 _ARRIVAL_NOTE = "the files hold capture times only: arrival is taken as capture, as if there were no delay"
 
-_CHUNK = 256  # rows written at once
+_CHUNK = 256  # number of rows written at once
 
 
 class ImportedSkeleton(NamedTuple):
@@ -189,15 +189,15 @@ class ImportedSkeleton(NamedTuple):
     confidence: Floats  # (20,)
 
 
-#: A row of a tracker's file is some kB.
+#: Maximum length of a row; a tracker's row has a few kB [bytes].
 _LINE_CHARACTERS = 1 << 20
 
 
 def lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Lines of a text file, plain or gzipped, each with its place ``file:line``. Blank lines are passed over.
+    """Yields lines of a text file, plain or gzipped, each with its position ``file:line``. Blank lines are skipped.
 
     Raises:
-        LogError: The file is missing, is no text, or holds nothing.
+        LogError: The file is missing, is not text, or is empty.
     """
     number = 0
     try:
@@ -224,10 +224,10 @@ def _open(path: Path) -> IO[str]:
 
 
 def numbers(where: str, fields: list[str], count: int) -> Floats:
-    """The fields as numbers; ``nan`` stands for missing.
+    """Converts the fields to numbers; ``nan`` means missing.
 
     Raises:
-        LogError: Another number of fields, or one that is no number.
+        LogError: The number of fields is wrong, or one is not a number.
     """
     if len(fields) != count:
         raise LogError(f"{where}: found {len(fields)} columns; would be right: {count}")
@@ -248,17 +248,17 @@ def _is_number(text: str) -> bool:
 
 #: Units of time stamps by their length [ns].
 _UNITS: Mapping[int, str] = {1: "ns", 1000: "us", 10**6: "ms", 10**9: "s"}
-_OWN_FRAME_NS = (4_000_000, 250_000_000)  # from a frame to the next, in the format's own unit: 4 to 250 Hz
+_OWN_FRAME_NS = (4_000_000, 250_000_000)  # time between frames in the format's own unit: 4 to 250 Hz
 _FRAME_NS = (15_000_000, 150_000_000)  # in another unit: 7 to 67 Hz
 _ANY_FRAME_NS = (1_000_000, 10_000_000_000)  # in the own unit, where no other fits
-_STAMPS = 400  # by which the unit is found
-_FEW_STEPS = 5  # say too little
+_STAMPS = 400  # number of stamps used to find the unit
+_FEW_STEPS = 5  # with fewer stamps, the unit is not determined
 
 
 def time_unit_ns(path: Path, stamps: Iterable[str], own_ns: int) -> int:
-    """Length of the unit in which a file counts time, by the usual step from one frame to the next [ns].
+    """Determines the unit of time of a file from the usual step between frames [ns].
 
-    The format's own unit has priority where the step is a camera's in it.
+    The format's own unit has priority if the step in it is plausible for a camera.
 
     Args:
         path: File, for messages.
@@ -266,7 +266,7 @@ def time_unit_ns(path: Path, stamps: Iterable[str], own_ns: int) -> int:
         own_ns: The format's own unit [ns].
 
     Raises:
-        LogError: There is no unit in which the steps are those of a camera.
+        LogError: No unit gives plausible steps for a camera.
     """
     times = sorted({float(text) for text in stamps if _is_number(text)})
     steps = [after - before for before, after in itertools.pairwise(times)]
@@ -285,7 +285,7 @@ def time_unit_ns(path: Path, stamps: Iterable[str], own_ns: int) -> int:
 
 
 def time_unit_note(camera: str, unit_ns: int, own_ns: int) -> str | None:
-    """A remark where times are not in the format's own unit."""
+    """Returns a remark on times in another unit than the format's own."""
     if unit_ns == own_ns:
         return None
     taken, usual = _unit_name(unit_ns), _unit_name(own_ns)
@@ -297,16 +297,17 @@ def _unit_name(unit_ns: int) -> str:
 
 
 def time_stamp_ns(where: str, text: str, unit_ns: int, before_ns: int) -> int:
-    """A time stamp [ns], not negative, that must not be before ``before_ns``.
+    """Reads a time stamp [ns], not negative and not before ``before_ns``.
 
     Args:
         where: ``file:line`` for messages.
-        text: Time stamp as the file has it.
+        text: Time stamp in the file.
         unit_ns: Length of its unit [ns].
-        before_ns: Time stamp of the row before [ns].
+        before_ns: Time stamp of the previous row [ns].
 
     Raises:
-        LogError: No number, in units of less than a millisecond no whole one, negative or going backwards.
+        LogError: The text is not a number or, in units below a millisecond, not an integer; or the time is negative or
+            goes backwards.
     """
     try:
         t_ns = int(Decimal(text) * unit_ns) if unit_ns >= 10**6 else int(text) * unit_ns
@@ -322,7 +323,7 @@ def time_stamp_ns(where: str, text: str, unit_ns: int, before_ns: int) -> int:
 def skeleton_row(
     t_ns: int, body: int, found: Mapping[str, int] | list[int], points_m: Floats, confidence: Floats
 ) -> ImportedSkeleton:
-    """A row in the order of POINTS from a sensor's own joints; ``found`` tells where each stands.
+    """Makes a row in the order of POINTS from a sensor's own joints; ``found`` gives their indices.
 
     Args:
         t_ns: Time of the frame [ns].
@@ -339,14 +340,14 @@ def skeleton_row(
 
 
 def write_log(sources: Mapping[str, Iterator[ImportedSkeleton]], out: Path) -> dict[str, tuple[int, int]]:
-    """Writes the rows of all cameras, merged by time, as our log; nothing is left behind when a source fails.
+    """Writes the rows of all cameras, merged by time, as a log; no file is left if a source fails.
 
     Returns:
         Camera -> first and last time [ns].
 
     Raises:
         SettingsError: ``out`` exists or cannot be written.
-        LogError: A source cannot be read or holds no row.
+        LogError: A source cannot be read or has no row.
     """
     spans: dict[str, tuple[int, int]] = {}
     cameras = tuple(sources)
@@ -373,20 +374,20 @@ def import_cameras(
     separator: str,
     own_ns: int,
 ) -> list[str]:
-    """Makes our log from one file a camera, whose times are those of the captures.
+    """Makes a log from one file per camera with capture times.
 
     Args:
         paths: Camera -> file.
         out: Log to write.
-        read: The rows of a file whose time unit has a length [ns].
-        separator: Of the columns; time is the first.
-        own_ns: The unit in which the format counts time [ns].
+        read: Function that yields the rows of a file, given the length of its time unit [ns].
+        separator: Separator of the columns; time is the first.
+        own_ns: The format's unit of time [ns].
 
     Returns:
         Remarks for the user.
 
     Raises:
-        LogError: A file that cannot be read as its format.
+        LogError: A file cannot be read in its format.
         SettingsError: ``out`` exists or cannot be written.
     """
     units = {name: time_unit_ns(path, _first_column(path, separator), own_ns) for name, path in paths.items()}
@@ -396,13 +397,13 @@ def import_cameras(
 
 
 def _first_column(path: Path, separator: str) -> Iterator[str]:
-    """The first column of the first rows."""
+    """Returns the first column of the first rows."""
     for _, text in itertools.islice(lines(path), _STAMPS):
         yield text.partition(separator)[0]
 
 
 def _overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:
-    """A note for every camera whose times lie wholly outside the first one's."""
+    """Returns a note for every camera whose times lie completely outside the first one's."""
     names = list(spans)
     start, end = spans[names[0]]
     return [
