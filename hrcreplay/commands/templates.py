@@ -20,7 +20,7 @@ def write_templates(folder: Path) -> list[Path]:
         SettingsError: One of the files exists or cannot be written.
     """
     shipped = resources.files("hrcreplay.commands")
-    head = "# Settings: take the '# ' away from those to change. Use with --config settings.toml.\n\n"
+    head = "# Settings: remove the '# ' from those to change. Use with --config settings.toml.\n\n"
     texts = {
         "cell.toml": (shipped / "cell_template.toml").read_text("utf-8"),
         "task.toml": (shipped / "task_template.toml").read_text("utf-8"),
