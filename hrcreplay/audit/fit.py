@@ -50,7 +50,7 @@ def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) ->
     ]
     if facts["kept"]:
         told.append(
-            f"too little motion to say (fewer than {fit_limits.EXCURSIONS} horizons with motion), so the bounds of "
+            f"too little motion for a result (under {fit_limits.EXCURSIONS} horizons with motion), so the bounds of "
             f"{facts['kept_from']} stay: {', '.join(facts['kept'])}"
         )
     if len(facts["kept"]) == len(JOINTS):
@@ -79,7 +79,7 @@ def _text(share: dict[str, Any]) -> str:
 
 def _departure_lines(found: dict[str, Any]) -> list[str]:
     gaps = found["not_checked"]
-    told = [f"not checked, so nothing is said of it: {', '.join(gaps)}"] if gaps else []
+    told = [f"not checked, so there is no result: {', '.join(gaps)}"] if gaps else []
     for log in found["logs"]:
         sizes, best = (", ".join(f"{size:.1f}" for size in log[name]) for name in ("union_m3", "fitted_to_it_m3"))
         held = f"{log['name']}: {found['unknown_are']}: {_by_horizon(found, log['shares'])}"

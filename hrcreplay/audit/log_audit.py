@@ -268,9 +268,9 @@ def _remarks(recording: Recording, audited_s: float, horizon_s: float) -> tuple[
         if not went[j] >= LITTLE[j]
     ]
     if still:
-        notes.append(f"hardly moved, so the audit says little of their bounds: {', '.join(still)}")
+        notes.append(f"hardly moved, so the audit hardly tests their bounds: {', '.join(still)}")
     if (went[ARMS] < LITTLE[ARMS]).all():
-        notes.append("no arm motion: the shares of the arms say nothing of a person at work")
+        notes.append("no arm motion: the shares of the arms are not valid for a person at work")
     if audited_s < 10.0 * horizon_s:
         notes.append(f"only {audited_s:.1f} s audited: the intervals are wide")
     return tuple(notes)

@@ -82,7 +82,7 @@ def checked_table(total: Mapping[str, Any], method: str) -> PageTable:
         ("limb, and points beyond its ends", "ticks"),
         tuple(rows),
         "A limb is checked at a tick where its two ends were seen in the last quarter of the horizon, and so is a "
-        "point. What a camera reports with confidence 0 was not seen. Nothing is said of what was not checked.",
+        "point. What a camera reports with confidence 0 was not seen. Unchecked limbs and points have no result.",
     )
 
 
@@ -99,7 +99,7 @@ def checked_cameras(log: Mapping[str, Any]) -> PageTable:
         "No such point is part of the recorded future. Not seen: missing, or of confidence 0. Doubted: the "
         "camera trusts it too little (fusion.confidence_min), or it hangs from such a point, or the person was not "
         "known yet. A point that jumps off the person is rejected with what hangs from it. A dash: the recorded future "
-        "is not from cameras. The fusion's own gate is per tick and knows only what came before.",
+        "is not from cameras. The fusion's own gate works per tick and uses only earlier frames.",
     )
 
 
@@ -324,7 +324,7 @@ def headline_metrics(found: Mapping[str, Any]) -> dict[str, Metric]:
                     f"{name}_covered_share_{end}", share[end], "1", f"its 95 % interval: {end} end", reason=UNCHECKED
                 )
             points = figures["points_share"]["value"]
-            meaning = f"{meaning}, asked of the recorded points alone"
+            meaning = f"{meaning}, for the recorded points alone"
             table.add(f"{name}_points_share", points, "1", meaning, reason=UNCHECKED)
             table.add(f"{name}_ticks", share["samples"], "1", "ticks at which it was checked")
             reason = "no escape" if share["samples"] else UNCHECKED
@@ -341,7 +341,7 @@ def headline_metrics(found: Mapping[str, Any]) -> dict[str, Metric]:
             table.add(f"{name}_union_m3", figures["union_m3"]["value"], "m^3", "mean volume of their union")
     table.add("audit_ticks", found["total"]["ticks"], "1", "audited ticks of all logs")
     gaps = never_checked(found["total"], found["method"])
-    meaning = "limbs, and points of other limbs, of which the audit says nothing: they were never seen"
+    meaning = "limbs, and points of other limbs, without a result: they were never seen"
     table.add("audit_not_checked", ", ".join(gaps) or "nothing", "", meaning)
     return table.sorted()
 

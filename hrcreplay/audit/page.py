@@ -312,7 +312,7 @@ def _data(found: Mapping[str, Any]) -> PageSection:
     return PageSection(
         "data",
         "Logs and escapes",
-        "What each log was held against, what was thrown out, and when somebody left a volume.",
+        "Reference of each log, rejected points, and times at which a person left a volume.",
         (),
         tuple(table for table in tables if table.rows),
     )
@@ -330,7 +330,7 @@ def _first_movements(log: Mapping[str, Any], method: str) -> PageTable:
         for one in log["first_movements"]
     )
     note = (
-        "When an end of the limb was first 10 cm from where it had been: a movement of which the filter knew nothing. "
+        "When an end of the limb was first 10 cm from where it had been: a movement that the filter could not foresee. "
         "Counted are the ticks up to a horizon before and after."
     )
     title = f"{log['log']}: first movements, and {METHODS.get(method, method)} then"

@@ -189,7 +189,7 @@ def explain(folder: Path, at_s: float, method: str | None = None) -> dict[str, A
     found = facts(record, int(np.argmin(np.abs(t_ns - t_ns[0] - round(at_s * 1e9)))))
     if found is None:
         raise SettingsError(
-            f"{folder}: the tick at {at_s:g} s does not come out as recorded, so there is nothing to say about it; run "
+            f"{folder}: the tick at {at_s:g} s could not be reproduced as recorded, so there is no explanation; run "
             "plan or report again with this version"
         )
     return found
@@ -310,7 +310,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"Nearest: {_pair(near)}, {apart}; volumes up to {1e3 * found['horizon_s']:.0f} ms after the tick."
         )
-    lines += [f"Row that holds: {_row(row)}, multiplier {row['multiplier']:.3g}." for row in _weighted(found)[1:]]
+    lines += [f"Active row: {_row(row)}, multiplier {row['multiplier']:.3g}." for row in _weighted(found)[1:]]
     lines += [f"Limit that holds: {_row(row)}." for row in found.get("limits", ())]
     lines += [f"Next row: {_row(row)}, {1e3 * row['margin_m_per_s']:.1f} mm/s left." for row in found.get("next", ())]
     for stop, one in zip(("first", "second"), found.get("refused", ()), strict=False):
@@ -413,7 +413,5 @@ def stop_table(record: Record, slow_m_per_s: float) -> tuple[PageTable, list[dic
         words = reason_text(str(record.motion["reason"].iloc[first] or "")) if found is None else cause(found)
         rows.append((f"{at_s:.2f} s", f"{lasted_s:.2f} s", str(record.motion["status"].iloc[first]), words))
         every.append({"at_s": at_s, "duration_s": lasted_s, "cause": words})
-    note = (
-        "What held the robot at the first tick at which it stood. hrcreplay why RUN --at SECONDS says more of any tick."
-    )
+    note = "Cause at the first tick of each stop. hrcreplay why RUN --at SECONDS explains any tick."
     return PageTable("The longest stops", ("at", "for", "status", "held by"), tuple(rows), note), every

@@ -79,5 +79,5 @@ def initial_overlap(state: Path, motion: Path, rate_hz: float) -> str | None:
     return (
         f"the robot's link {links[near[0]]} stands inside the volume of the person's {limbs[near[0]]} from the first "
         f"tick with a person on, for {len(near) / rate_hz:.2f} s at least; is T_world_base right? "
-        "hrcreplay calibrate tells where the person stood"
+        "hrcreplay calibrate prints the person's position"
     )

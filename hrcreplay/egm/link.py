@@ -252,7 +252,7 @@ class EgmSession:
         return (t_ns - self._last_ns) * 1e-9 + cycles * self._cycle_s
 
     def _reaches(self, q: Floats, lost: int, t_ns: int) -> bool:
-        """Return whether the axes can have come to q (n,) [rad] since then."""
+        """Returns True if the axes can have reached q (n,) [rad] since then."""
         assert self._last is not None  # noqa: S101 - for the type checker
         passed_s = _FASTER * self._passed_s(lost, t_ns)
         moves = zip(q.tolist(), self._last.q.tolist(), self._dq_max.tolist(), strict=True)

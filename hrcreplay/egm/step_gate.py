@@ -61,11 +61,11 @@ class StepGate:
         q, axes = told.q.tolist(), len(self._dq_max)  # plain floats: arrays of six elements take 0.1 ms per tick
         last, last_ns = self._last or (None if measured is None else measured.tolist(), t_ns)
         if last is None:
-            raise UnsafeCommandError("the first command; where the robot is is not known, so none may be sent")
+            raise UnsafeCommandError("the first command; the robot's position is unknown, so none may be sent")
         if len(q) != axes or len(last) != axes:
             raise UnsafeCommandError(f"a command of {len(q)} joints; {axes} would be right")
         if not all(map(isfinite, last)):
-            raise UnsafeCommandError("the first command; the robot says that it is at a joint that is no number")
+            raise UnsafeCommandError("the first command; the robot reports a joint that is not a number")
         self._check_speed(told.dq.tolist())
         passed_s = max(0.0, (t_ns - last_ns) * 1e-9)
         takes_s = [

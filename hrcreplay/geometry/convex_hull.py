@@ -137,7 +137,7 @@ def sphere_swept_volume_m3(points_m: Floats, radius_m: float, faces: Ints | None
     Args:
         points_m: (n, 3), n >= 1, all finite [m].
         radius_m: Radius of the ball [m].
-        faces: What ``hull`` gave with these points; without it the hull is computed here.
+        faces: Result of ``hull`` for these points; without it the hull is computed here.
     """
     if faces is None:
         points_m, faces = hull(points_m)

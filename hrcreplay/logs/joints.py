@@ -545,7 +545,7 @@ def coverage_remarks(reading: JointReading, start_ns: int, end_ns: int) -> Itera
     yield (
         f"robot joints: gaps of more than {GAP_S:g} s: {len(gaps_ns)}, {covered_s:.2f} s in all, the longest of "
         f"{(longest[1] - longest[0]) / _NS:.2f} s from {(longest[0] - start_ns) / _NS:.2f} s of the log on. There the "
-        "programme is a straight line in joint space from the last known position to the next: nobody measured it"
+        "programme is a straight line in joint space from the last known position to the next, without measurements"
     )
 
 
@@ -566,7 +566,7 @@ def _match_names(
                 others[name] = max(others.get(name, 0.0), float(np.ptp(finite)) if len(finite) else 0.0)
     if others:
         moving = {name: f"{name} (moves by {way:.3g})" for name, way in others.items() if way > _AT_REST}
-        carrying = "; if one that moves carries the arm, the robot's base is not where it is taken to be"
+        carrying = "; if a moving one carries the arm, the assumed pose of the robot's base is wrong"
         ignored = _list_names([moving.get(name, name) for name in others])
         yield f"robot joints: ignored, as no axis of the robot: {ignored}{carrying if moving else ''}"
 

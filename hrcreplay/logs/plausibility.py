@@ -332,8 +332,8 @@ def unmeasured_limbs(seen: Mapping[str, Bools]) -> Iterator[str]:
         lacking = [name for name in needed if not ever[POINTS.index(name)]]
         if lacking:
             yield (
-                f"limb {limb} was never measured: no camera gave {' or '.join(lacking)}; its volume holds all that its "
-                "joints allow"
+                f"limb {limb} was never measured: no camera gave {' or '.join(lacking)}; its volume contains all "
+                "postures within the joint limits"
             )
 
 

@@ -391,8 +391,8 @@ def _flaws(camera: str, cleaner: Cleaner, begin_ns: int) -> Iterator[str]:
         begin_s = (still.begin_ns - begin_ns) / 1e9
         yield (
             f"camera {camera} only trembles: for {still.seconds:.2f} s from {begin_s:.2f} s on no point of the body "
-            f"moved by more than {1e3 * STILL_M:g} mm, which nobody can; the {rows} rows after the first {STILL_S:g} s "
-            "count as silence"
+            f"moved by more than {1e3 * STILL_M:g} mm, which is impossible for a person; the {rows} rows "
+            f"after the first {STILL_S:g} s count as silence"
         )
 
 

@@ -108,7 +108,7 @@ def stale_stages(run_config: RunConfig, found: Mapping[str, str]) -> dict[str, s
         elif damage is not None:
             why[stage] = damage
     if "predict" in why and "plan" in run_config.stages and run_config.settings.plan.horizon == "adaptive":
-        why.setdefault("plan", "the volumes to store are those that it asks for")
+        why.setdefault("plan", "the volumes to store are those that it requests")
     return why
 
 
@@ -116,7 +116,7 @@ def _difference(parts: tuple[str, ...], found: Mapping[str, str], meta: Mapping[
     theirs = meta.get("depends_on", {})
     different = [name for name in parts if theirs.get(name) != found[name]]
     if not theirs or not different:  # of a live session, or of an earlier version
-        return f"{earlier} does not say what its tables depend on"
+        return f"{earlier} does not contain the inputs of its tables"
     return f"{', '.join(different)} {'is' if len(different) == 1 else 'are'} not as in {earlier}"
 
 

@@ -231,8 +231,8 @@ def _describe_others(counts: Counter[str]) -> Iterator[str]:
     """Returns a note on bodies other than the person."""
     if others := counts["person_frames_beside_others"]:
         yield (
-            f"{others} frames show at least one other body than the person: it counts for contact, but nothing is "
-            "predicted of it and the robot does not heed it"
+            f"{others} frames show at least one other body than the person: it counts for contact, but there is no "
+            "prediction for it and the robot does not react to it"
         )
 
 

@@ -100,7 +100,12 @@ FIELDS = (
         "1",
         "with the person outside the volumes: the fault lies with the prediction",
     ),
-    Field("touch_unpredicted_ticks", "sum", "1", "with the person, without a volume of that limb for the motion"),
+    Field(
+        "touch_unpredicted_ticks",
+        "sum",
+        "1",
+        "with the person, by a motion not checked against a volume of that limb",
+    ),
     Field("touch_rest_ticks", "sum", "1", "ticks with a link at rest in contact with anybody recorded"),
     Field("touch_speed_m_per_s", "max", "m/s", "largest speed of the touching surface while moving"),
     Field("nearest_moving_m", "min", "m", "smallest distance, surface to surface, while moving; negative in overlap"),
@@ -115,7 +120,7 @@ FIELDS = (
     ),
     Field("tcp_speed_max_m_per_s", "max", "m/s", "greatest speed of the TCP"),
     Field("tcp_speed_near_body_m_per_s", "max", "m/s", "the same within report.near_m of the recorded body"),
-    Field("programme_speed_max_m_per_s", "max", "m/s", "greatest programmed speed of the TCP, where the reference was"),
+    Field("programme_speed_max_m_per_s", "max", "m/s", "maximum programmed speed of the TCP, at the reference"),
     Field("retreating_ticks", "sum", "1", "ticks in retreat: they begin inside a volume"),
     Field("retreating_share", "retreating_ticks / ticks", "1", "retreating ticks / ticks"),
     Field("retreating_overlap_m", "max", "m", "maximum depth of a link inside a volume at these ticks"),
@@ -141,8 +146,8 @@ FIELDS = (
     ),
     Field("held_ticks", "sum", "1", "of these, every limb that was seen stayed whole inside its volume"),
     Field("coverage", "held_ticks / checked_ticks", "1", "held ticks / checked ticks"),
-    Field("left_max_m", "max", "m", "how far a limb left its volume at most"),
-    Field("full_checked_ticks", "sum", "1", "the same until the braking time T_s, as audit asks: ticks"),
+    Field("left_max_m", "max", "m", "maximum distance by which a limb left its volume"),
+    Field("full_checked_ticks", "sum", "1", "the same until the braking time T_s, as in audit: ticks"),
     Field("full_held_ticks", "sum", "1", "of these, every limb that was seen stayed whole inside its volume"),
     Field("full_coverage", "full_held_ticks / full_checked_ticks", "1", "as audit counts it until T_s"),
 )
@@ -401,7 +406,7 @@ def _note(found: Mapping[str, Any]) -> str:
         else ""
     )
     if other:
-        fault += f" At {other:,} of them it was another body than the person, which the robot did not heed."
+        fault += f" At {other:,} of them it was another body than the person, which the robot did not consider."
     still = [label for label, row in found["total"].items() if row["still_logs"]]
     fault += f" No contact of a robot that makes no way is a success: {', '.join(still)}." if still else ""
     programmed = [row["programme_speed_max_m_per_s"] or 0.0 for row in found["total"].values()]

@@ -126,7 +126,7 @@ def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
             f"{text_of(metrics['watched_speed_m_per_s'])}"
         )
     if others := metrics["others_frames"]["value"]:
-        kept += f". Of the other bodies in {others:,} frames nothing was predicted".replace(",", NARROW)
+        kept += f". There was no prediction for the other bodies in {others:,} frames".replace(",", NARROW)
     stops = (
         f"It was in a full stop at {text_of(metrics['plan_braking_moving_ticks'])} ticks "
         f"({percent(metrics['plan_full_stop_share'])}), each of them certified before it began."
@@ -139,8 +139,8 @@ def _by_certificate(metrics: Mapping[str, Metric]) -> tuple[str, str]:
     retreat = metrics["plan_retreating_share"]
     away = (
         f" But at {percent(retreat)} of all ticks it retreated: that step began inside a volume, with a link up to "
-        f"{text_of(metrics['plan_retreating_overlap_max_m'])} deep where the person could reach, and moved so slowly "
-        "and in such a way that no point of it came nearer to any point there."
+        f"{text_of(metrics['plan_retreating_overlap_max_m'])} deep where the person could reach, and moved slowly, so "
+        "that no point of it approached any point there."
         if retreat["value"]
         else ""
     )
@@ -339,7 +339,7 @@ def lines(run: Run, metrics: Metrics) -> list[str]:
 
     Args:
         run: The run's tables.
-        metrics: What :func:`hrcreplay.commands.report.compute` found.
+        metrics: Result of :func:`hrcreplay.commands.report.compute`.
     """
     found = []
     if run.state is not None:

@@ -119,7 +119,7 @@ NOT_CLAIMED = (
         "No margin for clothing, tools and camera errors is added to the limbs' radii, unless the settings add "
         "clearance."
     ),
-    "The robot is assumed to follow its commands exactly, those of a stop among them.",
+    "The robot is assumed to follow its commands exactly, including those of a stop.",
     "The paper's numbers come from experiments whose logs were never published. They are printed for orientation.",
 )
 
@@ -255,7 +255,7 @@ def agreement_table(agreement: pd.DataFrame | None) -> tuple[PageTable, ...]:
         body.append((limb_names_text([limb]), *cells))
     return (
         PageTable(
-            "How far two cameras show a limb apart at the same instant, median / 95th percentile",
+            "Distance between two cameras' views of a limb at the same instant, median / 95th percentile",
             ("", *(f"{a} \u2013 {b}" for a, b in pairs)),
             tuple(body),
             "Over the points in which the limb ends, hands and feet included, clocks corrected; a dash: never shown by "

@@ -65,7 +65,7 @@ def _contact_in_short(metrics: Metrics) -> str:
     """States if the robot would have touched a person, at the ticks at which one is known."""
     touch, near = metrics["plan_touch_moving_ticks"]["value"], metrics["plan_body_distance_min_moving_m"]["value"]
     if touch is None:
-        return "Whether the robot would have touched anybody is not known: the recording shows nobody."
+        return "It is not known whether the robot would have touched anybody: the recording shows nobody."
     if touch:
         speed = text_of(metrics["plan_touch_contact_speed_max_m_per_s"])
         seconds = text_of(metrics["plan_touch_moving_s"])
@@ -90,7 +90,7 @@ def _whom(metrics: Metrics, prefix: str = "plan") -> str:
     person, other = (metrics[f"{prefix}_touch_{who}_ticks"]["value"] for who in ("person", "other"))
     if person and other:
         return f"the person ({_count(person)}) and another body ({_count(other)})"
-    return f"another body than the person it heeds ({_count(other)})" if other else f"the person ({_count(person)})"
+    return f"another body than the considered person ({_count(other)})" if other else f"the person ({_count(person)})"
 
 
 def _count(ticks: int) -> str:
@@ -136,7 +136,7 @@ NOT_CONSIDERED = (
     "objects, table and fixtures",
     "the robot's own links",
     "people whom no camera tracked",
-    "what people would do differently beside another motion",
+    "different reactions of people to another motion",
 )
 
 
@@ -147,8 +147,8 @@ def scope(metrics: Metrics) -> tuple[str, ...]:
     if others:
         frames = f"{others:,} frame{'' if others == 1 else 's'}".replace(",", "\u202f")
         people += (
-            f"; {frames} show at least one other body, which counts for contact, but the robot did not heed it and "
-            "nothing was predicted of it"
+            f"; {frames} show at least one other body, which counts for contact, but the robot did not react to it "
+            "and there was no prediction for it"
         )
     gaps_s, programme = metrics["programme_gaps_s"]["value"], []
     if gaps_s:
@@ -422,8 +422,8 @@ def limb_remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
         begin = f"limb {limb} was never measured"
         if not any(note.startswith(begin) for note in told):
             lines.append(
-                f"{begin}: its points never agreed, or not with the confidence that fusion.confidence_min asks for; "
-                "its volume holds all that its joints allow"
+                f"{begin}: its points never agreed, or not with the confidence fusion.confidence_min; its volume "
+                "contains all postures within the joint limits"
             )
     lines += [
         f"the {limb_names_text([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"

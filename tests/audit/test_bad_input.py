@@ -124,4 +124,4 @@ def test_bad_input_is_one_line_and_leaves_nothing(run: Run, tmp_path: Path, case
 def test_an_audit_of_one_who_does_not_stir_says_so(run: Run) -> None:
     code, out, err = run("audit", "still.mcap", "--out", "still", "--end", 2)
     assert (code, out) == (0, "still\n")
-    assert "hrcreplay: still: no arm motion: the shares of the arms say nothing of a person at work" in err
+    assert "hrcreplay: still: no arm motion: the shares of the arms are not valid for a person at work" in err

@@ -242,7 +242,7 @@ def test_a_person_who_stands_still_is_said_to(tmp_path: Path) -> None:
         writer.frames(frames(standing(60)))
     found = json.loads((audit.run([path], out=tmp_path / "run") / "audit.json").read_text())
     notes = found["logs"][0]["notes"]
-    assert "no arm motion: the shares of the arms say nothing of a person at work" in notes
+    assert "no arm motion: the shares of the arms are not valid for a person at work" in notes
     assert any(note.startswith("hardly moved") and "ar1 (0 deg)" in note and "z (0.00 m)" in note for note in notes)
     assert any("the intervals are wide" in note for note in notes)
     assert found["logs"][0]["recorded_future"] == "camera points"

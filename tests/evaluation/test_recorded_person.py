@@ -133,7 +133,7 @@ def test_a_worker_whom_a_bystander_hides_is_touched_all_the_same(beside: Path, t
         if least_m <= 0.2:
             assert contact["other_m"].iloc[tick] <= least_m + 0.02
     said = summary(tmp_path / "run")[-1]
-    assert f"another body than the person it heeds ({metrics['plan_touch_other_ticks']} ticks)" in said
+    assert f"another body than the considered person ({metrics['plan_touch_other_ticks']} ticks)" in said
     assert f"{metrics['others_frames']} frames show at least one other body" in said
 
 

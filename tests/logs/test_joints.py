@@ -128,7 +128,7 @@ def test_names_that_are_set_wrongly_are_an_error_of_the_settings(
 
 
 def test_one_joint_cannot_be_two_axes() -> None:
-    with pytest.raises(ValueError, match="'lift' stands for two axes"):
+    with pytest.raises(ValueError, match="'lift' is given for two axes"):
         Logs(joint_names=("lift", "lift", "elbow"))
 
 

@@ -218,7 +218,7 @@ def test_a_retreat_begins_inside_a_volume(run: Run) -> None:
     assert found["plan_retreating_overlap_max_m"]["value"] == 0.02
     assert found["plan_retreating_share"]["value"] == pytest.approx(3 / len(status))
     without = metrics_of(dataclasses.replace(run, motion=run.motion.assign(status=status)))
-    assert "does not say" in without["plan_retreating_overlap_max_m"]["reason"]
+    assert "does not contain it" in without["plan_retreating_overlap_max_m"]["reason"]
 
 
 def test_a_robot_whose_programme_waits_for_it_at_a_waypoint_is_stationary(run: Run) -> None:

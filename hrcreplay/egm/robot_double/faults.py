@@ -244,7 +244,7 @@ def fault_of(row: Mapping[str, Any], where: str) -> Fault:
     )
     unknown = sorted(set(row) - known)
     if unknown:
-        raise SettingsError(f"{where}: {kind} knows no {unknown[0]!r}; it has {', '.join(sorted(known))}")
+        raise SettingsError(f"{where}: {kind} has no key {unknown[0]!r}; it has {', '.join(sorted(known))}")
     if "at_s" not in row:
         raise SettingsError(f"{where}: at_s is missing; name the second at which it begins")
     if row.get("direction", "out") not in _DIRECTIONS:
@@ -280,7 +280,7 @@ def _chance_of(table: object, where: str) -> dict[str, Any]:
         raise SettingsError(f"{where} is {table!r}; a table [random] would be right")
     unknown = sorted(set(table) - {"count", "after_s", "kinds"})
     if unknown:
-        raise SettingsError(f"{where}: knows no {unknown[0]!r}; it has after_s, count, kinds")
+        raise SettingsError(f"{where}: has no key {unknown[0]!r}; it has after_s, count, kinds")
     if "count" in table:
         _check_number(table["count"], 1, 100_000, f"{where}: count", whole=True)
     if "after_s" in table:

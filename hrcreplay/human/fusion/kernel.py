@@ -206,7 +206,7 @@ def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
     """Eq. (62)-(65) on the state of all joints (13, 4), then the same for the accelerations, in place.
 
     That is Eq. (61), the solution of Eq. (59a), (59b), (60) for bounds that do not depend on each other.
-    The filter goes on from the saturated state; P is not changed by it. x and y are bounded along and across the
+    The filter continues from the saturated state; P is not changed by it. x and y are bounded along and across the
     body, Eq. (33), and turned back, Eq. (32). A joint's velocity may not carry it over its position bound within dt,
     its acceleration not over its velocity bound; without a dt yet (0) only the plain bounds hold.
 

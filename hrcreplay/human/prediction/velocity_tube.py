@@ -64,7 +64,7 @@ def tubes(
         residual: True: use the distance from the model.
         unknown_m: Value of that distance until it is known [m].
         span_s: Horizon and latency [s].
-        memory_s: How long the filter goes on without a measurement [s].
+        memory_s: Time for which the filter continues without a measurement [s].
     """
     known = limits.departure
     unseen = np.column_stack([states.unseen_s[:, list(carrying)].max(axis=1) for carrying in _CARRIED_BY])
@@ -144,7 +144,7 @@ def tube(
 
     Args:
         limb: Index into BODY.
-        points: (20, 3) where the body's points are [m].
+        points: (20, 3) positions of the body's points [m].
         velocity: (20, 3) of the model's points [m/s].
         span_s: Horizon and latency [s].
         reach_s: Time after the tick until which the limb may depart [s].

@@ -98,7 +98,7 @@ NEEDS: dict[str, tuple[Callable[[Run, Mapping[str, Metric]], bool], str]] = {
     ),
     "horizon": (
         lambda run, _: run.motion is not None and "horizon_s" in run.motion,
-        "its motion.parquet has no horizon_s; make it anew from its log",
+        "its motion.parquet has no horizon_s; make it again from its log",
     ),
     "base": (lambda run, _: run.T_world_base is not None, "the pose of the robot's base is unknown"),
     "joints": (
@@ -180,7 +180,7 @@ FIGURES = (
         ("motion", "path", "deviation"),
         lambda data: planning.deviation(data.motion, data.run.occupancy, data.t0_ns, data.worst),
         "As the paper's Fig. 13(b). The largest deviation from the programmed path with its length, in the vertical "
-        "plane that holds it. The paper's own deviation is 0.221 m.",
+        "plane that contains it. The paper's own deviation is 0.221 m.",
     ),
     FigureKind(
         "fig14_speed",

@@ -168,7 +168,7 @@ def volume_solids(limbs: Mapping[str, SweptVolume], moved_m: Floats | None = Non
     """Swept volumes in the colours of their limbs, above the floor.
 
     Args:
-        limbs: What to draw.
+        limbs: Volumes to draw.
         moved_m: (3,) position of the drawing's origin in the world; None: the world's origin [m].
     """
     origin = np.zeros(3) if moved_m is None else moved_m

@@ -233,7 +233,7 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
         "m",
         f"maximum depth of a link inside a swept volume at the start of a retreating step of {what}: such a step is "
         "certified to bring no point of the link nearer to any point of the volume, not to be clear of it",
-        reason="the table of motion does not say" if (status == "retreating").any() else "it never retreated",
+        reason="the table of motion does not contain it" if (status == "retreating").any() else "it never retreated",
     )
     reasons = motion["reason"].astype(str).to_numpy()
     for reason in sorted(set(reasons[braking])):
@@ -326,7 +326,7 @@ def _add_stationary(
         f"{prefix}_null_speed_ticks",
         null,
         "1",
-        f"near ticks of {what} with the TCP below {slow:g} m/s, whatever its programme does: dwells count",
+        f"near ticks of {what} with the TCP below {slow:g} m/s; dwells of the programme count too",
     )
     metrics.add(
         f"{prefix}_null_speed_share",
@@ -361,7 +361,7 @@ def _add_fastest(
         "tcp_speed_max": (numeric_column(motion, "tcp_speed"), "speed of the TCP"),
         "ref_speed_max": (
             numeric_column(motion, "ref_speed"),
-            "programmed speed of the TCP where the reference is; the programme's own where it went all the way",
+            "programmed speed of the TCP at the reference; that of the whole programme if it was completed",
         ),
     }
     close = np.zeros(0)
@@ -410,7 +410,7 @@ def _add_progress(
         reason="the reference never came back to its first point",
     )
     found = programme_progress(motion, max_reference_lead_m)
-    reason = "the programme stands for all of the time"
+    reason = "the programme is stationary all the time"
     metrics.add(
         f"{prefix}_time_lost_s",
         None if found is None else found[1] - found[0],

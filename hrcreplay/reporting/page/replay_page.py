@@ -58,7 +58,7 @@ LAYERS = (
     ("person", "person", "recorded person"),
     ("skeleton", "bones", "fused skeleton"),
     ("volumes", "volume", "what the person could reach"),
-    ("stop", "stop", "where the robot would stop"),
+    ("stop", "stop", "end of the robot's stop"),
     ("paths", "driven", "paths"),
     ("distance", "toBody", "distances"),
 )

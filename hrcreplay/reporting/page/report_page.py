@@ -291,7 +291,7 @@ def _counters(run: Run) -> tuple[PageTable, ...]:
         rows = tuple(
             (name.replace("_", " "), f"{count:,}".replace(",", "\u202f")) for name, count in sorted(run.counts.items())
         )
-        tables.append(PageTable("What was counted on the way", ("", "count"), rows))
+        tables.append(PageTable("Counters of the run", ("", "count"), rows))
     if run.notes:
         tables.append(PageTable("Remarks", ("",), tuple((note,) for note in run.notes)))
     return tuple(tables)

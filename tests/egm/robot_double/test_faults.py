@@ -142,7 +142,7 @@ BAD: dict[str, Any] = {
     "fault = 1": r"fault is no list of tables",
     '[[fault]]\nkind = "los"\nat_s = 1': r"fault 1: kind is 'los'; one of loss, burst, .* would be right",
     '[[fault]]\nkind = "loss"': r"fault 1: at_s is missing",
-    '[[fault]]\nkind = "loss"\nat_s = 1\naxis = 2': r"fault 1: loss knows no 'axis'; it has at_s, direction, ",
+    '[[fault]]\nkind = "loss"\nat_s = 1\naxis = 2': r"fault 1: loss has no key 'axis'; it has at_s, direction, ",
     '[[fault]]\nkind = "loss"\nat_s = -1': r"fault 1: at_s is -1; a number from 0",
     '[[fault]]\nkind = "loss"\nat_s = nan': r"fault 1: at_s is nan; a number",
     '[[fault]]\nkind = "loss"\nat_s = "1"': r"fault 1: at_s is '1'; a number",
@@ -152,7 +152,7 @@ BAD: dict[str, Any] = {
     '[[fault]]\nkind = "nan"\nat_s = 1\naxis = 7': r"fault 1: axis is 7; a whole number from 1 to 6 would",
     '[[fault]]\nkind = "burst"\nat_s = 1\ncount = 2.5': r"fault 1: count is 2.5; a whole number",
     "random = 3": r"random is 3; a table \[random\] would be right",
-    "[random]\nseed = 3": r"random: knows no 'seed'; it has after_s, count, kinds",
+    "[random]\nseed = 3": r"random: has no key 'seed'; it has after_s, count, kinds",
     '[random]\nkinds = ["x"]': r"random: kinds is \['x'\]; a list of loss,",
 }
 
