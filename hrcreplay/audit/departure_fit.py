@@ -31,8 +31,8 @@ _BELOW = 0.995
 _STEEPEST = 1.25
 #: Maximum common factor of all lines, number of bisection steps, and maximum factor of one line after that.
 _MOST, _HALVINGS, _MOST_AGAIN = 1.5, 12, 1.5
-#: Allowed misses relative to the requested share: of one log that was left out; and in the fit, of one log, of one with
-#: ground truth, and of all logs together. The last is below 1, as unknown people miss more.
+#: Factors on the requested share of misses: for a log that was left out; in the fit, for each log, for each log with
+#: ground truth, and for all logs together. The last is below 1, as people outside the fit have more misses.
 EACH, _FITTED, _TRUE, _TOGETHER = 3.0, 2.25, 0.3, 0.6
 #: Departures, their slopes, and rise and sink are rounded up to multiples of these [m], [1], [m]. With steps this
 #: coarse most folds have the same rise and sink, so that departures are measured only once.

@@ -52,9 +52,9 @@ _MIRRORED = 0.2  # share of the frames; a tracker sometimes exchanges left and r
 _FEW = 10  # fewer frames are not judged
 _FEW_PAIRS = 100  # minimum number of points for a 95th percentile, with at least five beyond it
 _GAP_NS = 100_000_000  # no interpolation across longer gaps
-_SCALE_M = 0.05  # by how much two cameras differ at one point
-_UPRIGHT = 0.95  # neck to ankles, straight over along the bones
-_WAIT_NS = 60 * 10**9  # frames arrive out of order of capture by less
+_SCALE_M = 0.05  # m, usual difference of two cameras at one point
+_UPRIGHT = 0.95  # ratio of the straight distance from neck to ankles to that along the bones
+_WAIT_NS = 60 * 10**9  # maximum delay of frames that arrive out of order of capture
 
 
 @dataclass(frozen=True)

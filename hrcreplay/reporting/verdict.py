@@ -153,8 +153,8 @@ def scope(metrics: Metrics) -> tuple[str, ...]:
     gaps_s, programme = metrics["programme_gaps_s"]["value"], []
     if gaps_s:
         programme.append(
-            f"The programme is the recorded robot's motion; {gaps_s:.2f} s of it were not recorded, and a straight "
-            "line that nobody measured stands for them."
+            f"The programme is the recorded robot's motion; {gaps_s:.2f} s of it were not recorded and are "
+            "replaced by a straight line."
         )
     nothing = f"Not considered: {', '.join((*NOT_CONSIDERED, *unseen_limbs(metrics)))}."
     return (f"{people}.", *_watched(metrics), *programme, nothing)

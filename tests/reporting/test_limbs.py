@@ -128,7 +128,8 @@ def test_fusing_a_log_without_wrists_says_so_on_the_terminal_and_in_the_record(
     wristless: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = [
-        f"limb {limb} was never measured: no camera gave wrist_{side}; its volume contains all postures within the joint limits"
+        f"limb {limb} was never measured: no camera gave wrist_{side}; "
+        "its volume contains all postures within the joint limits"
         for side, limb in (("r", "LRA"), ("l", "LLA"))
     ]
     fused = replay.run("fuse", wristless, out=tmp_path / "fused")

@@ -154,7 +154,7 @@ def _add_coverage(metrics: MetricTable, state: pd.DataFrame) -> None:
         "longest_without_camera_s",
         float(longest) if len(t_ns) else None,
         "s",
-        "longest stretch of ticks whose updates used no camera at all, the time before the first frame included",
+        "longest stretch of ticks whose updates used no camera at all, including the time before the first frame",
     )
     p = columns(state)
     finite: Bools = np.asarray(np.isfinite(p).all(axis=1))
