@@ -347,7 +347,7 @@ def test_a_tick_that_does_not_come_out_as_recorded_is_not_explained(demo_folder:
     u1[6000] = np.nextafter(u1[6000], np.inf)
     pq.write_table(table.set_column(table.column_names.index("u1"), "u1", pa.array(u1)), folder / "motion.parquet")
     assert explain.explain(folder, 0.004 * 5000)["tick"] == 5000
-    with pytest.raises(SettingsError, match=r"the tick at 24 s does not come out as recorded"):
+    with pytest.raises(SettingsError, match=r"the tick at 24 s could not be reproduced as recorded"):
         explain.explain(folder, 24.0)
     with pytest.raises(SettingsError, match=r"--at 61: would be right: seconds from the first tick, 0 to 60.000"):
         explain.explain(folder, 61.0)
