@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 from hrcreplay.records import Floats, Ints, SweptVolume
 from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.drawing import BONES
-from hrcreplay.reporting.figures.scene import RenderedHull, render_hulls, view_from, volume_solids
+from hrcreplay.reporting.figures.scene import RenderedHull, View, bounds_of, render_hulls, view_from, volume_solids
 from hrcreplay.reporting.metrics.series import seconds_from
 from hrcreplay.reporting.replay_scene import (
     RATE_HZ,
@@ -289,38 +290,63 @@ def snapshot(scene: ReplayScene, row: int) -> Figure:
         row: Index of the instant.
     """
     name, track = next(iter(scene.methods.items()))
-    ends = pose_links(scene.robot, track.q[row : row + 1])[0]
-    body = scene.body_m[row]
     view = view_from(_beside(scene, row), 0.18)
+    figure = drawing.new_figure(6.2)
+    axes = drawing.panels(figure, 1, 1, left_in=0.62, top_in=0.62, bottom_in=0.75)[0][0]
+    low, high = bounds_of([solid.outline(view) for solid in (*solids(scene, row), *reach(scene, row))], _MARGIN_M)
+    drawing.set_window(axes, low.tolist(), high.tolist())
+    draw_instant(axes, scene, row, view)
+    axes.set(xlabel="across [m]", ylabel="up [m]")
+    axes.set_title(f"{scene.seconds[row]:.2f} s, {name}: {_words(track, row)}", wrap=True)
+    figure.legend(handles=legend(), loc="lower center", ncols=5, bbox_to_anchor=(0.5, 0.01))
+    return figure
+
+
+def solids(scene: ReplayScene, row: int) -> list[RenderedHull]:
+    """The robot of the run's own method and the recorded person at an instant, as far as they are known."""
+    track = next(iter(scene.methods.values()))
+    ends = pose_links(scene.robot, track.q[row : row + 1])[0]
     robot = [RenderedHull(pair, float(r), to_rgb(_ROBOT)) for pair, r in zip(ends, scene.robot.radius_m, strict=True)]
     person = [
         RenderedHull(pair, float(r), to_rgb(_PERSON))
-        for pair, r in zip(body, scene.body_radius_m, strict=True)
-        if np.isfinite(pair).all()
+        for pair, r in zip(scene.body_m[row], scene.body_radius_m, strict=True)
     ]
-    figure = drawing.new_figure(6.2)
-    axes = drawing.panels(figure, 1, 1, left_in=0.62, top_in=0.62, bottom_in=0.75)[0][0]
-    edges = [solid.outline(view) for solid in (*robot, *person)]
-    reach = [solid.outline(view) for solid in volume_solids(_stored(scene, row))]
-    corners = np.vstack([*edges, *(edge for edge in reach if len(edge))])
-    low, high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
-    drawing.set_window(axes, low.tolist(), high.tolist())
-    for edge in reach:
+    return [solid for solid in (*robot, *person) if np.isfinite(solid.vertices_m).all()]
+
+
+def reach(scene: ReplayScene, row: int) -> list[RenderedHull]:
+    """The swept volumes stored last before an instant."""
+    return volume_solids(_stored(scene, row))
+
+
+def draw_instant(axes: Axes, scene: ReplayScene, row: int, view: View, *, since: int | None = None) -> None:
+    """Draws swept volumes, robot, person and paths at an instant, on axes whose window is set.
+
+    Args:
+        axes: To draw on.
+        scene: What moves.
+        row: Which of its instants.
+        view: From where.
+        since: Instant that the driven path begins with; None: some seconds before.
+    """
+    track = next(iter(scene.methods.values()))
+    for edge in (solid.outline(view) for solid in reach(scene, row)):
         axes.add_patch(Polygon(edge, facecolor=drawing.ORANGE, edgecolor=drawing.ORANGE, alpha=0.16, lw=0.7, zorder=1))
-    image = render_hulls([*robot, *person], view, low, high, float(high[1] - low[1]) / 700.0)
+    shown = solids(scene, row)
+    low, high = bounds_of([solid.outline(view) for solid in shown], _MARGIN_M)
+    image = render_hulls(shown, view, low, high, float(np.diff(axes.get_ylim())[0]) / 700.0)
     limits = axes.get_xlim(), axes.get_ylim()
     extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
     axes.imshow(image, origin="lower", extent=extent, aspect="auto", interpolation="bilinear", zorder=2)
     around = slice(max(0, row - round(_PATH_S * RATE_HZ)), row + round(_PATH_S * RATE_HZ) + 1)
     axes.plot(*view.flat(track.ref_m[around]).T, color=drawing.NOMINAL, lw=1.2, zorder=3)
-    axes.plot(*view.flat(track.tcp_m[around.start : row + 1]).T, color=drawing.ACTUAL, lw=1.4, zorder=4)
-    axes.set(xlim=limits[0], ylim=limits[1], xlabel="across [m]", ylabel="up [m]")
-    axes.set_title(f"{scene.seconds[row]:.2f} s, {name}: {_words(track, row)}", wrap=True)
-    figure.legend(handles=_legend(), loc="lower center", ncols=5, bbox_to_anchor=(0.5, 0.01))
-    return figure
+    driven = slice(around.start if since is None else since, row + 1)
+    axes.plot(*view.flat(track.tcp_m[driven]).T, color=drawing.ACTUAL, lw=1.4, zorder=4)
+    axes.set(xlim=limits[0], ylim=limits[1])
 
 
-def _legend() -> list[Patch | Line2D]:
+def legend() -> list[Patch | Line2D]:
+    """What the colours of ``draw_instant`` mean."""
     return [
         Patch(color=_ROBOT, lw=0, label="robot"),
         Patch(color=_PERSON, lw=0, label="recorded person"),
