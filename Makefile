@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: demo check test bench soundness fuzz readme people deviations lock clean
+.PHONY: demo check test docs bench soundness fuzz readme picture people deviations lock clean
 
 demo: $(VENV)/made
 	@$(BIN)/hrcreplay demo
@@ -17,12 +17,7 @@ test: $(VENV)/made
 	$(BIN)/mypy
 	$(BIN)/pytest --numprocesses $(PROCESSES)
 
-# Format, lint, types and the quick tests, which tests/conftest.py lists.
-check: $(VENV)/made
-	$(BIN)/ruff format --check .
-	$(BIN)/ruff check .
-	$(BIN)/mypy
-	$(BIN)/pytest --quick --numprocesses $(PROCESSES)
+.PHONY: demo check test docs bench soundness fuzz readme picture people deviations lock clean
 
 bench: $(VENV)/made
 	$(BIN)/pytest tests/benchmarks --benchmark-only
@@ -39,6 +34,10 @@ soundness: $(VENV)/made
 ONLY ?=
 readme: $(VENV)/made
 	$(BIN)/python -m tests.tools.readme $(ONLY)
+
+# Draws docs/demo.webp, the README's moving picture, from a stretch of the demo.
+picture: $(VENV)/made
+	$(BIN)/python -m tests.tools.picture
 
 # Fits hrcreplay/limits/people.toml again, byte for byte, to the recordings by others in $HRCREPLAY_DATA and to simulated
 # people who get up and sit down; tells what each recording that was left out gave.
@@ -73,4 +72,4 @@ lock:
 		--extra dev --custom-compile-command 'make lock' pyproject.toml --output-file requirements.lock
 
 clean:
-	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .benchmarks
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .benchmarks .docs-site
