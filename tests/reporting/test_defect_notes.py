@@ -7,8 +7,8 @@ from pathlib import Path
 
 from hrcreplay.logs.cleaning import DEFECTS
 from hrcreplay.reporting.summary_text import defect_notes
+from tests.reporting.reading import read, rendered
 from tests.reporting.synthetic import make_run
-from tests.reporting.test_page import read, rendered
 
 
 def test_every_kind_of_defect_is_told_in_the_words_of_the_reader_and_nothing_else_is() -> None:

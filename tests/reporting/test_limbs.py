@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from hrcreplay.commands import replay
-from hrcreplay.commands.report import compute
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats
@@ -19,8 +18,8 @@ from hrcreplay.reporting import summary_text, verdict
 from hrcreplay.reporting.metrics import fusion
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
-from tests.reporting.synthetic import make_run
-from tests.reporting.test_page import read, rendered
+from tests.reporting.reading import read, rendered
+from tests.reporting.synthetic import make_run, metrics_of
 
 MEMORY_S = 0.5
 
@@ -62,7 +61,7 @@ def kept(run: Run) -> Run:
 
 
 def answered(run: Run) -> summary_text.Answer:
-    return summary_text.answers(run, compute(run, near_m=0.5, stationary_m_per_s=0.001))[0]
+    return summary_text.answers(run, metrics_of(run))[0]
 
 
 def test_the_verdict_says_first_which_limb_nobody_measured() -> None:
@@ -71,9 +70,7 @@ def test_the_verdict_says_first_which_limb_nobody_measured() -> None:
     safe = answered(seen(run, LLA=np.inf, LRA=np.inf))
     assert safe.short == "Not known of the right lower arm (LRA) and left lower arm (LLA): never measured."
     assert "Of what was measured: by the paper's criterion at every moving tick" in safe.words
-    card = summary_text.cards(
-        seen(run, LLA=np.inf), compute(seen(run, LLA=np.inf), near_m=0.5, stationary_m_per_s=0.001)
-    )[0]
+    card = summary_text.cards(seen(run, LLA=np.inf), metrics_of(seen(run, LLA=np.inf)))[0]
     assert card.detail.endswith("; LLA never measured")
 
 

@@ -3,14 +3,11 @@ from __future__ import annotations
 import dataclasses
 import re
 import shlex
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hrcreplay.commands.report import compute
-from hrcreplay.human.model import LimitSet
 from hrcreplay.records import DOF
 from hrcreplay.reporting import summary_text, tables
 from hrcreplay.reporting import tables as wording
@@ -18,77 +15,14 @@ from hrcreplay.reporting.figures import catalogue
 from hrcreplay.reporting.figures.catalogue import FigureData
 from hrcreplay.reporting.page import report_page
 from hrcreplay.robot.control import control_step
-from hrcreplay.store.run_folder import Run
-from tests.reporting.synthetic import make_run
-
-PI = np.pi
-PAPER = LimitSet(
-    name="paper",
-    p_min=np.array([-np.inf, -np.inf, -np.inf, -PI / 6, *([-PI / 20, -PI, -PI, PI / 9] * 2), 0.0]),
-    p_max=np.array([np.inf, np.inf, np.inf, PI / 2, *([8 * PI / 9, PI, PI, PI] * 2), 1.3]),
-    v_min=np.array([0.0, -0.8, -PI / 4, -PI / 10, *([-PI / 2, -PI / 2, -PI / 2, -3 * PI / 10] * 2), 0.0]),
-    v_max=np.array([0.8, 0.8, PI / 4, PI / 10, *([PI / 2, PI / 2, PI / 2, 3 * PI / 10] * 2), 0.0]),
-    a_min=-np.array([0.1, 0.1, PI / 8, PI / 20, *([PI / 4, PI / 4, PI / 4, 3 * PI / 20] * 2), 0.1]),
-    a_max=np.array([0.1, 0.1, PI / 8, PI / 20, *([PI / 4, PI / 4, PI / 4, 3 * PI / 20] * 2), 0.1]),
-    coupled=True,
-)
-RADII = {"head": 0.12, "thorax": 0.15, "upper arm": 0.07, "lower arm": 0.07}
-
-
-class Reader(HTMLParser):
-    """What a browser would take from the page."""
-
-    VOID = frozenset({"meta", "link", "img", "br", "hr", "input"})
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.text: list[str] = []
-        self.ids: list[str] = []
-        self.links: list[str] = []
-        self.tags: set[str] = set()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        if tag not in self.VOID:
-            self.open.append(tag)
-        for name, value in attrs:
-            if name == "id":
-                self.ids.append(str(value))
-            if name in ("href", "src"):
-                self.links.append(str(value))
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.handle_starttag(tag, attrs)
-        if tag not in self.VOID:
-            self.open.pop()
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if not self.open or self.open[-1] not in ("style", "script"):
-            self.text.append(data)
-
-
-def rendered(run: Run, folder: Path) -> str:
-    """The page with the figures that the folder holds."""
-    metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
-    used = [tables.limit_table(PAPER, use="prediction"), tables.radius_table(RADII)]
-    return report_page.render(run, metrics, folder, used)
-
-
-def read(html: str) -> Reader:
-    reader = Reader()
-    reader.feed(html)
-    assert not reader.open
-    return reader
+from tests.reporting.reading import PAPER, RADII, read, rendered
+from tests.reporting.synthetic import make_run, metrics_of
 
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, run = tmp_path_factory.mktemp("figures"), make_run(8.0)
-    metrics = compute(run, near_m=0.5, stationary_m_per_s=0.001)
+    metrics = metrics_of(run)
     assert catalogue.draw_all(FigureData(run, metrics, near_m=0.5, stationary_m_per_s=0.001), folder)
     return folder
 
@@ -118,7 +52,7 @@ def test_page_shows_every_figure_drawn_under_its_caption(html: str, drawn: Path)
 
 
 def test_page_answers_with_the_metrics_values(html: str) -> None:
-    metrics = compute(make_run(8.0), near_m=0.5, stationary_m_per_s=0.001)
+    metrics = metrics_of(make_run(8.0))
     text = " ".join(read(html).text)
     for name in ("plan_braking_moving_ticks", "plan_near_ticks", "plan_separation_min_m", "plan_deviation_max_m"):
         assert tables.text_of(metrics[name]) in text, name
@@ -184,7 +118,7 @@ def test_the_smallest_distance_says_which_it_is() -> None:
     run = make_run(4.0)
     assert run.motion is not None
     touching = dataclasses.replace(run, motion=run.motion.assign(distance_m=0.0, status="limited", reason=""))
-    metrics = compute(touching, near_m=0.5, stationary_m_per_s=0.001)
+    metrics = metrics_of(touching)
     safe, _ = summary_text.answers(touching, metrics)
     assert (
         "The smallest distance while it moved was 0.000 m: from the surface of a link to the surface of all that the "
@@ -266,7 +200,7 @@ def test_a_robot_that_was_never_let_go_is_said_to_have_stood() -> None:
     run = make_run(4.0)
     assert run.motion is not None
     still = dataclasses.replace(run, motion=run.motion.assign(tcp_speed=0.0))
-    safe, _ = summary_text.answers(still, compute(still, near_m=0.5, stationary_m_per_s=0.001))
+    safe, _ = summary_text.answers(still, metrics_of(still))
     assert safe.short == "The robot never moved."
     assert safe.words.startswith("It stood at all 400 ticks.")
 
@@ -274,5 +208,5 @@ def test_a_robot_that_was_never_let_go_is_said_to_have_stood() -> None:
 def test_an_interval_does_not_break_at_its_dash(tmp_path: Path) -> None:
     run = make_run(2.0)
     shown = tables.PageTable("shares", ("", "here"), (("limb", "99.5 (97.1\u2013100.0)"),))
-    html = report_page.render(run, compute(run, near_m=0.5, stationary_m_per_s=0.001), tmp_path, [shown])
+    html = report_page.render(run, metrics_of(run), tmp_path, [shown])
     assert "<td>99.5 (97.1\u2013\u2060100.0)</td>" in html

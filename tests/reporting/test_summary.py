@@ -8,11 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hrcreplay.commands.report import compute
 from hrcreplay.records import LIMBS
 from hrcreplay.reporting.summary_text import lines
 from hrcreplay.store.run_folder import Run
-from tests.reporting.synthetic import make_run
+from tests.reporting.synthetic import make_run, metrics_of
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +22,7 @@ def run() -> Run:
 
 
 def _lines(run: Run) -> dict[str, str]:
-    found = lines(run, compute(run, near_m=0.5, stationary_m_per_s=0.001))
+    found = lines(run, metrics_of(run))
     return dict(line.split(": ", 1) for line in found)
 
 
@@ -63,7 +62,7 @@ def test_plan(run: Run) -> None:
     assert f"standing in {100.0 * stands.sum() / near.sum():.1f} % of the near ticks" in mine
     assert mine.endswith(f", {late} ticks ({100.0 * late / len(motion):.1f} %) in full stops")
     assert other.startswith("scaling: ")
-    pace = compute(run, near_m=0.5, stationary_m_per_s=0.001)["plan_progress_share"]["value"]
+    pace = metrics_of(run)["plan_progress_share"]["value"]
     assert mine.startswith(f"qp: {100.0 * pace:.1f} % of the programmed pace, ")
 
 
