@@ -14,7 +14,7 @@ def facts(*tokens: str) -> str:
     return "(?s)^" + "".join(rf"(?=.*{_whole(token)})" for token in tokens)
 
 
-def told(text: str | Iterable[str], *tokens: str) -> bool:
+def tells(text: str | Iterable[str], *tokens: str) -> bool:
     """Whether the text, or one of several lines, holds all tokens."""
     return any(re.search(facts(*tokens), line) for line in ([text] if isinstance(text, str) else text))
 

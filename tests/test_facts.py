@@ -2,15 +2,15 @@ from __future__ import annotations
 
 import pytest
 
-from tests.facts import told
+from tests.facts import tells
 
 
 @pytest.mark.parametrize("token", ["0.3", "rate", "3 ticks", "a.mcap", "--out", "[2, 1]"])
 def test_a_fact_is_found_anywhere(token: str) -> None:
     for text in (token, f"/there/{token}: found", f"'{token}', then", f"first\n({token})."):
-        assert told(text, token)
-        assert told(["other", text], token)
-        assert not told(text, token, "other")
+        assert tells(text, token)
+        assert tells(["other", text], token)
+        assert not tells(text, token, "other")
 
 
 @pytest.mark.parametrize(
@@ -28,8 +28,8 @@ def test_a_fact_is_found_anywhere(token: str) -> None:
     ],
 )
 def test_a_part_of_a_word_or_number_is_no_fact(token: str, text: str) -> None:
-    assert not told(text, token)
+    assert not tells(text, token)
 
 
 def test_facts_of_two_lines_are_not_those_of_one() -> None:
-    assert not told(["left 3", "right 4"], "left", "4")
+    assert not tells(["left 3", "right 4"], "left", "4")
