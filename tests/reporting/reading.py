@@ -82,8 +82,6 @@ def read(html: str) -> Reader:
 
 
 class _Lines(Reader):
-    """A line for each paragraph, caption and item, and for each row of a table."""
-
     INLINE = frozenset({"a", "code", "b", "span", "strong", "small", "th", "td", "dt", "dd"})
 
     def __init__(self) -> None:
@@ -115,6 +113,14 @@ class _Lines(Reader):
         self.line = ""
 
 
+def page_lines(html: str) -> list[str]:
+    """The visible text: a line for each paragraph, caption and item, and for each row of a table."""
+    reader = _Lines()
+    reader.feed(html)
+    reader.end_line()
+    return reader.lines
+
+
 def golden_text() -> str:
     """The terminal's lines and the page of the made-up run with contacts, its figures left blank."""
     run = contact_run()
@@ -122,6 +128,4 @@ def golden_text() -> str:
         for kind in FIGURES:
             (Path(folder) / f"{kind.name}.svg").write_text('<svg viewBox="0 0 1 1"></svg>')
         html = rendered(run, Path(folder))
-    page = _Lines()
-    page.feed(html)
-    return "\n".join(["= Terminal", *summary_text.lines(run, metrics_of(run)), "", "= Page", *page.lines, ""])
+    return "\n".join(["= Terminal", *summary_text.lines(run, metrics_of(run)), "", "= Page", *page_lines(html), ""])

@@ -13,6 +13,7 @@ from hrcreplay.reporting.figures.prediction import Growth, Sweep, Walk
 from hrcreplay.reporting.figures.scene import ABOVE, RenderedHull, render_hulls, view_from
 from hrcreplay.reporting.metrics.series import instants
 from hrcreplay.store.run_folder import Run
+from tests.facts import tells
 from tests.reporting.moving import moving_run
 from tests.reporting.synthetic import RADII_M, T0_NS, make_run, metrics_of, volumes_at
 
@@ -108,7 +109,7 @@ def test_a_robot_that_kept_to_its_path_left_it_nowhere(tmp_path: Path) -> None:
     kept_run = dataclasses.replace(run, motion=kept)
     (kind,) = catalogue.find("13b")
     why = catalogue.missing(kind, kept_run, data_of(kept_run).metrics)
-    assert why == "its TCP never left the programmed path"
+    assert tells(why, "TCP", "path")
     assert draw(kept_run, tmp_path, predicted=False) >= {"fig13a_path", "fig14_speed"}
     assert not (tmp_path / "fig13b_deviation.png").exists()
 

@@ -69,7 +69,7 @@ def test_the_page_runs_without_network_and_without_trouble(tab: Tab, file: Path)
     assert all(url.startswith(("file:", "blob:", "data:")) for url in tab.requests)
     assert sum(url.startswith("file:") for url in tab.requests) == 1
     html = file.read_text("utf-8")
-    assert all(link.startswith("#") for link in read(html).links)
+    assert {link[:1] for link in read(html).links} == {"#"}
     assert "MIT License" in html
     assert tab.trouble == []
 
