@@ -19,6 +19,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.records import HumanStates
 from hrcreplay.store.run_folder import NOT_DETERMINISTIC
 from tests.commands.arms import ARMS
+from tests.facts import facts
 
 BEGIN_S, END_S = 8.0, 9.2
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
@@ -136,20 +137,20 @@ def test_another_robot_moves_as_by_the_command(people: hr.People, log: hr.Record
 def test_no_report_is_made_of_a_part(log: hr.Recording, people: hr.People, plan: hr.Plan, tmp_path: Path) -> None:
     some = people.rows(slice(0, 20))
     for person, motion in ((some, plan), (people, hr.plan(some, baselines=()))):
-        with pytest.raises(SettingsError, match="some ticks only"):
+        with pytest.raises(SettingsError, match="ticks"):
             hr.report(log, person, motion, tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
 def test_what_cannot_be_used_is_told(log: hr.Recording) -> None:
     table = log.to_pandas().head(5)
-    with pytest.raises(SettingsError, match="column arrival_ns is missing"):
+    with pytest.raises(SettingsError, match=facts("arrival_ns")):
         hr.frames(table.drop(columns="arrival_ns"), log.log.header.T_world_camera)
-    with pytest.raises(SettingsError, match="camera kinect has no pose"):
+    with pytest.raises(SettingsError, match=facts("kinect", "pose")):
         hr.frames(table.assign(camera="kinect"), {"other": np.eye(4)})
     with pytest.raises(SettingsError, match="pelvis_y"):
         hr.frames(table.drop(columns="pelvis_y"), log.log.header.T_world_camera)
-    with pytest.raises(AttributeError, match="no attribute 'wish'"):
+    with pytest.raises(AttributeError, match=facts("'wish'")):
         hr.wish  # noqa: B018
 
 

@@ -74,6 +74,14 @@ def test_the_pages_are_found() -> None:
     assert {LIVE, ROOT / "README.md", ROOT / "CHANGELOG.md"} <= set(PAGES)
 
 
+def test_what_is_looked_for_is_on_the_pages() -> None:
+    texts = [page.read_text() for page in PAGES]
+    named = {span for text in texts for span in spans(text)}
+    assert any(LINK.findall(BLOCK.sub("", text)) for text in texts)
+    assert any(re.match(r"hrcreplay [a-z-]+$", span) for span in named)
+    assert {f"logs.{name}" for name in Settings().logs.model_dump()} & named
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
     for link in LINK.findall(BLOCK.sub("", page.read_text())):

@@ -15,6 +15,7 @@ from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.limits import load_limits
 from hrcreplay.records import DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Prediction
+from tests.facts import facts
 from tests.human.people import random_states, states
 
 RADII_M, HAND_M, HORIZON_S = limb_radii(Prediction()), 0.19, 0.377
@@ -137,5 +138,5 @@ def test_a_person_not_known_yet_has_no_volume(method: str) -> None:
 
 
 def test_an_unknown_peer_is_named() -> None:
-    with pytest.raises(SettingsError, match="peer: found 'magic'; choose one of constant_velocity, v2_a50, iso_13855"):
+    with pytest.raises(SettingsError, match=facts("'magic'", "constant_velocity", "v2_a50", "iso_13855")):
         _predict(random_states(load_limits("paper"), 1, seed=3), "magic")

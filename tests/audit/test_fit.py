@@ -18,6 +18,7 @@ from hrcreplay.records import JOINTS
 from hrcreplay.store import run_folder
 from tests.audit.standing import log_of_one_who_does_not_stir
 from tests.cli.test_app import Run, run
+from tests.facts import facts, tells
 from tests.realdata import data_path
 from tests.test_recordings import SARA, SARA_CELL
 
@@ -65,7 +66,7 @@ def test_the_user_is_told(fitted: tuple[Path, list[str]], provenance: dict[str, 
     for joint in JOINTS:
         assert f"{joint}: velocity" in text or joint in provenance["kept"]
     assert "demo.mcap: training 99." in text
-    assert "recorded postures leave the positions of paper" in text
+    assert tells(fitted[1], "postures", "positions", "paper")
 
 
 def test_a_stage_takes_the_file(tmp_path: Path, fitted: tuple[Path, list[str]]) -> None:
@@ -106,7 +107,7 @@ def test_several_logs_are_each_left_out_once(tmp_path: Path) -> None:
         assert log["left_out"]["ticks"] == log["training"]["ticks"] + log["held_back"]["ticks"]
         assert log["left_out"]["share"] > 0.8
         assert log["end_s"] == 20.0
-    assert sum("fitted to the other logs" in line for line in lines) == 2
+    assert sum(tells(line, log["name"], "other logs") for line in lines for log in logs) == 2
 
 
 @pytest.fixture(scope="module")
@@ -139,20 +140,18 @@ def test_covering_the_limbs_bounds_their_departures(of_limbs: tuple[Path, fit.Fi
         assert max(less) < 1.02 * log["union_m3"][-1]  # fitted to the copy, it is fitted to it
         assert less[0] < 0.95 * log["union_m3"][-1]
     assert report.missed == ""
-    assert report.lines[-1].startswith("fit-limits: limbs: whole limbs, all logs: training 0.02 s ")
-    assert "each log left out once" in report.lines[-1]
+    assert tells(report.lines[-1], "limbs", "all logs", "training 0.02 s", "left out")
 
 
 def test_a_share_that_others_miss_is_told_and_fails(tmp_path: Path, run: Run) -> None:
     """Bounds of somebody who does not stir hold nobody else."""
     still = log_of_one_who_does_not_stir(tmp_path / "still.mcap")
     out = tmp_path / "two.toml"
-    code, printed, told = run("fit-limits", still, replay.demo_log(), "--end", 9, "--out", out)
+    code, printed, err = run("fit-limits", still, replay.demo_log(), "--end", 9, "--out", out)
     assert code == 5
     assert printed.strip() == str(out)
     assert load_limits(out).departure is not None
-    assert "demo.mcap: found" in told.splitlines()[-1]
-    assert "would be right: at least 97.0 %" in told.splitlines()[-1]
+    assert tells(err.splitlines()[-1], "demo.mcap", "97.0 %")
     demo = next(
         one for one in tomllib.loads(out.read_text())["provenance"]["departures"]["logs"] if "demo" in one["name"]
     )
@@ -160,27 +159,27 @@ def test_a_share_that_others_miss_is_told_and_fails(tmp_path: Path, run: Run) ->
 
 
 def test_another_kind_of_coverage_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="--cover toes: would be right: joints, limbs"):
+    with pytest.raises(SettingsError, match=facts("--cover", "toes", "joints", "limbs")):
         fit.run([replay.demo_log()], out=tmp_path / "x.toml", cover="toes")
 
 
 def test_an_existing_file_is_not_written_over(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text("mine")
-    with pytest.raises(SettingsError, match="exists already"):
+    with pytest.raises(SettingsError, match=facts("x.toml", "exists")):
         fit.run([replay.demo_log()], out=tmp_path / "x.toml", cover="joints")
     assert (tmp_path / "x.toml").read_text() == "mine"
 
 
 @pytest.mark.parametrize("end_s", [0.2, 1.0])
 def test_a_log_shorter_than_its_parts_need_is_refused(tmp_path: Path, end_s: float) -> None:
-    with pytest.raises(LogError, match=r"found .* s; .* both need more than the horizon of 0.377 s"):
+    with pytest.raises(LogError, match=facts("0.377 s")):
         fit.run([replay.demo_log()], out=tmp_path / "x.toml", cover="joints", end_s=end_s)
     assert not list(tmp_path.iterdir())
 
 
 def test_no_arm_motion_is_refused_in_one_line(tmp_path: Path) -> None:
     log = log_of_one_who_does_not_stir(tmp_path / "still.mcap")
-    with pytest.raises(LogError, match=r"still.mcap: found no arm motion") as caught:
+    with pytest.raises(LogError, match=facts("still.mcap", "no arm motion")) as caught:
         fit.run([log], out=tmp_path / "x.toml", cover="joints")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "x.toml").exists()
@@ -200,7 +199,7 @@ def test_a_real_recording(tmp_path: Path, name: str) -> None:
     assert found["total"]["held_back"]["share"] > 0.6  # 20 s are few: the interval says so
     assert found["total"]["held_back"]["low"] < 0.8
     assert "rho" in found["kept"]  # the person walks upright
-    assert any("too little motion for a result" in line and "rho" in line for line in lines)
+    assert tells(lines, "too little motion", "rho")
     for joint in found["kept"]:
         j = JOINTS.index(joint)
         assert (limits.v_max[j], limits.a_max[j]) == (human.v_max[j], human.a_max[j])

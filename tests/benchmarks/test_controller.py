@@ -13,16 +13,13 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.control.minimiser import minimise
 from hrcreplay.robot.control.separation import obstacles
-from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.robot.model import RobotModel
 from tests.robot.people import person
-from tests.robot.swinging import DT_S, HOME, SETTINGS, STOP_S, Asked, asked, base, dense, run, step, swing
+from tests.robot.swinging import DT_S, HOME, SETTINGS, Asked, asked, dense, robot, run, step, swing
+
+__all__ = ["robot"]  # the fixture
 
 TICKS = 300
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return irb140(base(), stop_s=STOP_S)
 
 
 @pytest.mark.benchmark

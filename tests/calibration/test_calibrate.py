@@ -16,6 +16,7 @@ from hrcreplay.logs.importers import import_azure, import_keraal, import_kinect2
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import POINTS, CameraFrames, Floats, SkeletonTrack
+from tests.facts import facts, tells
 from tests.realdata import data_path
 from tests.reobserve import POSE, Truth, angle_deg, read_azure, reobserve, walker, write_azure
 
@@ -89,13 +90,13 @@ def test_keraal_pair(tmp_path: Path) -> None:
     position = cell.T_world_camera["kinect"][:3, 3]
     assert 1.0 < position[2] < 2.5
     (note,) = cell.notes  # the Kinect shows the feet of the seated person above the floor of the mocap room
-    assert "camera kinect: the person's lowest foot is 9 cm above" in note
+    assert tells(note, "kinect", "foot", "9 cm")
 
 
 def test_a_seated_person_leaves_up_in_doubt(tmp_path: Path) -> None:
     import_keraal(data_path("keraal_kinect_vicon/G3-Kinect-CTK-P1T1-Unknown-C-0.txt"), None, tmp_path / "k.mcap", 30.0)
     cell = calibrate(open_log(tmp_path / "k.mcap"))
-    assert "give up in the frame of kinect" in cell.notes[0]
+    assert tells(cell.notes[0], "up", "kinect")
     assert cell.T_world_camera["kinect"][2, 1] > 0.95  # y up all the same
 
 
@@ -193,13 +194,13 @@ def test_what_cannot_be_calibrated_is_told(tmp_path: Path) -> None:
     )
     later = SkeletonTrack(a.t_ns + 10**12, a.points_m, a.confidence)
     log = _log(tmp_path / "one.mcap", {"a": a})
-    with pytest.raises(SettingsError, match="reference camera: found 'z'; would be right: a"):
+    with pytest.raises(SettingsError, match=facts("reference", "'z'", "a")):
         calibrate(log, "z")
-    with pytest.raises(SettingsError, match="up: found"):
+    with pytest.raises(SettingsError, match=facts("up", "0")):
         calibrate(log, up=(0, 0, 0))
-    with pytest.raises(LogError, match="camera b hardly saw the person together"):
+    with pytest.raises(LogError, match=facts("camera b", "together")):
         calibrate(_log(tmp_path / "later.mcap", {"a": a, "b": later}))
-    with pytest.raises(LogError, match=r"do not fit each other: \d+ mm apart \(median\)"):
+    with pytest.raises(LogError, match=r"\d{2,} mm apart"):
         calibrate(_log(tmp_path / "strange.mcap", {"a": a, "b": strange}))
     with pytest.raises(LogError, match=r"no feet .*--height"):
         calibrate(_log(tmp_path / "blind.mcap", {"a": blind}))
@@ -208,17 +209,14 @@ def test_what_cannot_be_calibrated_is_told(tmp_path: Path) -> None:
 
 def test_a_log_that_does_not_show_where_up_is_says_so() -> None:
     demo = open_log(Path(__file__).parents[2] / "datasets" / "demo.mcap")
-    with pytest.raises(LogError, match=r"give the reference camera's height above it \(--height\) and up"):
+    with pytest.raises(LogError, match=facts("--height", "up")):
         calibrate(demo, jump_m=0.8, memory_s=2.0)
 
 
 def test_it_tells_where_the_person_stood_and_which_way_x_points(tmp_path: Path) -> None:
     """By the truth of the walker: a figure of eight about (3, 0), before a camera 1.6 m up that looks along x."""
     cell, lines = survey(_log(tmp_path / "log.mcap", {"a": _by_camera_a()}))
-    assert (
-        lines[0]
-        == "world: origin on the floor under a, z up, x points where a looks, along the floor, y to the left of x"
-    )
+    assert tells(lines[0], "world", "under a", "z up", "where a looks", "y to the left")
     found = [float(number) for number in re.findall(r"-?\d+\.\d+", lines[1])]
     pelvis = walker(15.0).points_m[:, 0] + [3.0, 0.0, 0.0]
     low, high = np.percentile(pelvis, [5, 95], axis=0)
@@ -233,16 +231,14 @@ def test_x_of_a_camera_that_looks_down_is_its_own(tmp_path: Path) -> None:
     person = walker(15.0)
     track = SkeletonTrack(person.t_ns, transform(np.asarray(np.linalg.inv(down)), person.points_m), person.confidence)
     _, lines = survey(_log(tmp_path / "log.mcap", {"a": track}))
-    assert "x points along a's own x" in lines[0]
+    assert tells(lines[0], "world", "a's own x")
 
 
 @pytest.mark.parametrize(("a", "b"), [("walking", "squatting"), ("squatting", "walking")])
 def test_recordings_of_different_movements_are_refused(a: str, b: str, tmp_path: Path) -> None:
     files = {name: data_path(f"sevivi_azure_single/{name}_positions_3d.csv.gz") for name in (a, b)}
     import_azure(files, tmp_path / "log.mcap")
-    with pytest.raises(
-        LogError, match=r"do not fit each other: \d+ mm apart \(median\) at a clock offset of"
-    ) as refused:
+    with pytest.raises(LogError, match=r"\d{2,} mm apart .* clock offset of -?\d") as refused:
         calibrate(open_log(tmp_path / "log.mcap"))
     assert refused.value.exit_code == 3
 
@@ -255,7 +251,7 @@ def test_clocks_further_apart_than_searched_are_refused(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hrcreplay.calibration.calibrate.register", lambda *_, **__: far)
         patch.setattr("hrcreplay.calibration.calibrate.disagreement", lambda *_: Disagreement(0.03, 0.1, 1000, 0.0))
-        with pytest.raises(LogError, match=r"30 mm apart \(median\) at a clock offset of -3.10 s; would be right"):
+        with pytest.raises(LogError, match=facts("a", "b", "30 mm", "offset of -3.10 s")):
             calibrate(_log(tmp_path / "log.mcap", {"a": a, "b": b}))
 
 
@@ -269,7 +265,7 @@ def test_cameras_that_hardly_fit_are_doubted(tmp_path: Path) -> None:
     )
     (rest,) = cell.residuals
     assert 0.06 < rest.median_m < 0.15
-    assert f"a and b stay {1e3 * rest.median_m:.0f} mm apart (median), where one movement leaves" in cell.notes[-1]
+    assert tells(cell.notes[-1], "a", "b", f"{1e3 * rest.median_m:.0f} mm")
 
 
 @pytest.mark.parametrize("off_m", [0.0, 0.3])
@@ -300,11 +296,11 @@ def test_limbs_on_which_cameras_differ_are_told_with_floor_and_height(off_m: flo
 def test_millimetres_are_no_person_to_calibrate_by(tmp_path: Path) -> None:
     a = _by_camera_a()
     log = _log(tmp_path / "log.mcap", {"a": SkeletonTrack(a.t_ns, 1e3 * a.points_m, a.confidence)})
-    with pytest.raises(LogError, match="millimetres were taken for metres"):
+    with pytest.raises(LogError, match=facts("millimetres", "metres")):
         calibrate(log)
 
 
 @pytest.mark.parametrize("height_m", [np.nan, np.inf, -0.1])
 def test_a_height_that_is_none_is_refused(height_m: float, tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="would be right: metres above the floor, 0 or more"):
+    with pytest.raises(SettingsError, match=facts("height", f"{height_m:g}", "metres", "0 or more")):
         calibrate(_log(tmp_path / "log.mcap", {"a": _by_camera_a()}), height_m=height_m)

@@ -12,6 +12,7 @@ import pytest
 from hrcreplay import __version__
 from hrcreplay.cli import app
 from hrcreplay.commands import replay
+from tests.facts import tells
 from tests.logs import own
 
 Run = Callable[..., tuple[int, str, str]]
@@ -65,24 +66,24 @@ def test_figures_are_listed_with_what_a_run_lacks_for_them(run: Run) -> None:
     assert code == 0
     state = {line[:17].strip(): line[93:] for line in out.splitlines()}
     assert state["18"] == "there"
-    assert state["14"] == "lacks: it moved no robot; run plan or report on its log"
-    assert state["9"] == "lacks: it has no swept volumes; run predict, plan or report on its log"
-    assert state["17"] == "lacks: the person is not known for three seconds"
+    assert tells(state["14"], "lacks", "robot", "plan", "report")
+    assert tells(state["9"], "lacks", "swept volumes", "predict", "plan", "report")
+    assert tells(state["17"], "lacks", "person", "three seconds")
     code, out, err = run("report", "here", "--figure", 14)
     assert (code, out) == (2, "")
-    assert err.strip() == f"hrcreplay: --figure 14: here lacks what it needs: {state['14'].removeprefix('lacks: ')}"
+    assert tells(err, "--figure 14", "here", state["14"].removeprefix("lacks: "))
     code, out, _ = run("report", "here", "--figure", 18, "--out", "drawn")
     assert (code, out) == (0, "drawn/fig18_coordinate.png\ndrawn/fig18_coordinate.svg\n")
     code, _, err = run("report", "here", "--figure", 18, "--out", "drawn")
     assert code == 2
-    assert "drawn/fig18_coordinate.png: exists already" in err
+    assert tells(err, "drawn/fig18_coordinate.png", "exists")
 
 
 def test_stdout_carries_only_the_run_folder(run: Run) -> None:
     code, out, err = run("fuse", DEMO, "--out", "here", *SHORT)
     assert (code, out) == (0, "here\n")
-    assert err.startswith("hrcreplay: fuse: 101 ticks, person known from fresh frames in ")
-    assert "frames with the person: kinect 13, " in err
+    assert err.startswith("hrcreplay: fuse: ")
+    assert tells(err, "101 ticks", "kinect 13")
     assert len(err.splitlines()) == 1
     assert Path("here/state.parquet").exists()
 
@@ -189,7 +190,7 @@ def test_a_log_without_extrinsics_says_how_to_get_them(run: Run) -> None:
     own.write(Path("unposed.mcap"), own.frames())
     code, _, err = run("fuse", "unposed.mcap")
     assert code == 3
-    assert "find it with: hrcreplay calibrate unposed.mcap --out cell.toml, then give --cell cell.toml" in err
+    assert tells(err, "hrcreplay calibrate unposed.mcap --out cell.toml", "--cell cell.toml")
 
 
 def test_a_run_that_did_not_end_is_refused(run: Run) -> None:
@@ -197,7 +198,7 @@ def test_a_run_that_did_not_end_is_refused(run: Run) -> None:
     Path("half/run.json").write_text('{"complete": false}')
     code, _, err = run("report", "half")
     assert code == 2
-    assert "half: the run did not end (complete is false); run it again" in err
+    assert tells(err, "half", "complete", "run it again")
 
 
 def test_info_tells_what_the_demo_holds(run: Run) -> None:

@@ -20,6 +20,8 @@ from hrcreplay.robot.model import RobotModel, from_urdf
 from hrcreplay.settings.sections import Robot
 from hrcreplay.store import run_folder
 from tests.commands.arms import ARMS, Arm
+from tests.facts import tells
+from tests.reporting.reading import page_lines
 
 COLLADA = "{http://www.collada.org/2005/11/COLLADASchema}"
 
@@ -153,7 +155,7 @@ def test_it_drives_the_demo_to_the_page(name: str, tmp_path: Path) -> None:
     assert any("capsules add" in note for note in meta["notes"])
     if command == "report":
         page = (folder / "report.html").read_text()
-        assert f"Capsules of the links: {run.meta['robot']['name']}" in page
+        assert tells(page_lines(page), "Capsules", run.meta["robot"]["name"])
         assert (folder / "figures" / "robot_links.png").is_file()
         assert "robot_links-" in page
 

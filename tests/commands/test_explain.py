@@ -27,6 +27,7 @@ from hrcreplay.robot.control.active_constraints import LinearRows
 from hrcreplay.robot.control.minimiser import SLACK, Problem
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
+from tests.facts import facts, tells
 from tests.robot.checker import RADII, links
 from tests.robot.distances import axis_distance
 from tests.robot.plain_rows import LinkSegment, approach_rows
@@ -168,14 +169,14 @@ def test_ten_stops_of_the_demo_are_told_as_brute_force_finds_them(
             assert "nearest" not in found
             continue
         assert_nearest(found, record, first)
-        kinds.add(found["status"] + " " + found["reason"])
+        kinds.add((found["status"], found["reason"]))
         if tasks:
             assert_binding(found, tasks[0], record)
         else:
             assert found["reason"] == "inside a volume"
             assert found["nearest"]["overlap_m"] >= record.run_config.settings.plan.retreat_m
             assert "overlap by" in explain.cause(found)
-    assert {"limited inside a volume", "retreating "} <= kinds
+    assert {("limited", "inside a volume"), ("retreating", "")} <= kinds
 
 
 def test_moving_ticks_are_told_as_another_solver_finds_them(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -287,7 +288,7 @@ def test_where_the_printed_method_has_no_solution_the_rows_are_named(
             for row in found["conflict"]
         ]
         assert_minimal(seen[0], plain)
-        assert explain.cause(found).startswith("no velocity keeps all of these: ")
+        assert tells(explain.cause(found), "no velocity")
 
 
 @pytest.mark.parametrize("method", ["scaling", "none"])
@@ -304,7 +305,7 @@ def test_baselines_are_made_again_too(demo_folder: Path, method: str) -> None:
         found = explain.facts(record, tick)
         assert found is not None
         assert found["conflict"][0]["margin_m_per_s"] < 0.0
-        assert "the hardest braking along the path" in explain.cause(found)
+        assert tells(explain.cause(found), "braking", "path")
 
 
 def test_the_longest_stops_stand_in_the_report(demo_folder: Path, record: Record) -> None:
@@ -347,9 +348,9 @@ def test_a_tick_that_does_not_come_out_as_recorded_is_not_explained(demo_folder:
     u1[6000] = np.nextafter(u1[6000], np.inf)
     pq.write_table(table.set_column(table.column_names.index("u1"), "u1", pa.array(u1)), folder / "motion.parquet")
     assert explain.explain(folder, 0.004 * 5000)["tick"] == 5000
-    with pytest.raises(SettingsError, match=r"the tick at 24 s could not be reproduced as recorded"):
+    with pytest.raises(SettingsError, match=facts("24 s", "recorded")):
         explain.explain(folder, 24.0)
-    with pytest.raises(SettingsError, match=r"--at 61: would be right: seconds from the first tick, 0 to 60.000"):
+    with pytest.raises(SettingsError, match=facts("--at 61", "0 to 60.000")):
         explain.explain(folder, 61.0)
-    with pytest.raises(SettingsError, match=r"holds no motion_shield.parquet; give a run folder of plan or report"):
+    with pytest.raises(SettingsError, match=facts("motion_shield.parquet", "plan", "report")):
         explain.explain(folder, 1.0, "shield")

@@ -24,6 +24,7 @@ from hrcreplay.egm.codec import (
     encode_robot,
 )
 from hrcreplay.egm.motion_link_pb2 import MeasuredForceA, MeasuredForceB, RobotMessage, SensorMessage
+from tests.facts import facts
 
 JOINTS_DEG = [0.0, -12.5, 33.25, 179.0, -90.0, 270.5]
 CLOCK_NS = 1_700_000_000_123_456_000
@@ -240,14 +241,14 @@ def test_a_correction_of_more_joints_comes_back(count: int) -> None:
 
 @pytest.mark.parametrize("count", [5, 15])
 def test_no_correction_of_other_numbers_of_joints_leaves_or_is_taken(count: int) -> None:
-    with pytest.raises(ValueError, match="6 to 14 finite joints"):
+    with pytest.raises(ValueError, match=facts("6 to 14")):
         encode_correction(Correction(1, 1, np.zeros(count), np.zeros(count)))
     with pytest.raises(BadPacket, match=r"6 joints are right|at most 14"):
         decode_correction(part(2, joints(1, [0.0] * min(count, 6)) + joints(3, [0.0] * (count - min(count, 6)))))
 
 
 def test_a_robot_of_more_than_fourteen_joints_is_none() -> None:
-    with pytest.raises(BadPacket, match="15 joints; at most 14"):
+    with pytest.raises(BadPacket, match=facts("15 joints", "14")):
         decode_robot(encode_robot(replace(PACKET, q=np.zeros(15))))
 
 

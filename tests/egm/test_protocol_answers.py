@@ -98,10 +98,10 @@ def test_our_counter_and_stamp_go_round() -> None:
 
 def test_one_answer_a_packet() -> None:
     talking = session()
-    with pytest.raises(ValueError, match="no packet is waiting"):
+    with pytest.raises(ValueError, match="no packet"):
         talking.reply(ZERO, ZERO, 0)
     talk(talking, [0])
-    with pytest.raises(ValueError, match="no packet is waiting"):
+    with pytest.raises(ValueError, match="no packet"):
         talking.reply(ZERO, ZERO, 0)
 
 
@@ -148,7 +148,7 @@ def test_a_queue_gets_one_answer_to_its_newest_packet() -> None:
     assert newest is lot[3]
     assert heard == PacketStatus(answer=True, fresh=False, allowed=True, reason="", ended=False, lost=2)
     assert talking.reply(ZERO, ZERO, 0).seqno == 2
-    with pytest.raises(ValueError, match="no packet is waiting"):
+    with pytest.raises(ValueError, match="no packet"):
         talking.reply(ZERO, ZERO, 0)
     assert (talking.counts["no packet"], talking.counts["stale"], talking.counts["duplicate"]) == (2, 2, 1)
 

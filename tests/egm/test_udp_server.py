@@ -13,6 +13,7 @@ import pytest
 from hrcreplay.egm.link import EgmServer
 from hrcreplay.errors import SettingsError
 from tests.egm.talks import server
+from tests.facts import facts
 
 LONG_S = 5.0
 
@@ -164,7 +165,7 @@ def test_it_listens_where_the_robot_is_reached_and_nowhere_else() -> None:
 
 
 def test_a_robot_to_which_no_network_leads_is_a_setting_to_mend() -> None:
-    with pytest.raises(SettingsError, match=r"live\.robot_address: no network leads to 255\.255\.255\.255"):
+    with pytest.raises(SettingsError, match=facts("live.robot_address", "255.255.255.255")):
         EgmServer("", 0, 0.1, robot="255.255.255.255", silence_s=0.1)
 
 
@@ -178,11 +179,11 @@ def test_without_a_robot_yet_the_last_sender_is_heard(link: EgmServer) -> None:
 
 
 def test_a_taken_port_is_a_setting_to_mend(link: EgmServer) -> None:
-    with pytest.raises(SettingsError, match=rf"UDP port {link.port} of 127\.0\.0\.1 cannot be opened.*free port"):
+    with pytest.raises(SettingsError, match=facts(f"UDP port {link.port}", "127.0.0.1", "free port")):
         server(link.port, 0.1)
-    with pytest.raises(SettingsError, match="cannot be opened"):
+    with pytest.raises(SettingsError, match=facts("UDP port 70000")):
         server(70_000, 0.1)
-    with pytest.raises(SettingsError, match="cannot be opened"):
+    with pytest.raises(SettingsError, match=facts("192.0.2.1")):
         EgmServer("192.0.2.1", 0, 0.1, robot="127.0.0.1", silence_s=0.1)  # nobody's address
 
 

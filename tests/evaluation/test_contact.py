@@ -10,13 +10,14 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from hrcreplay.commands import replay
+from hrcreplay.commands import replay, report
 from hrcreplay.evaluation import contact
 from hrcreplay.evaluation.contact import VOLUME_OF, Volumes
 from hrcreplay.evaluation.recorded_person import BodyTrack, from_states
 from hrcreplay.human.model import PARTS
 from hrcreplay.logs import reader
 from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, SweptVolume
+from hrcreplay.reporting import verdict
 from hrcreplay.robot.model import RobotModel, from_urdf
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
@@ -220,7 +221,9 @@ def test_a_report_compares_every_method_with_the_truth(with_truth: Path) -> None
     own = run.contact[run.contact["method"] == "qp"]
     assert own["left_full_m"].notna().sum() == pytest.approx(25 * (1.0 - 0.377), abs=1.5)
     page = (with_truth / "report.html").read_text()
-    assert page.index("Had this controller been running, ") < page.index("Robot against everybody recorded")
+    found = verdict.verdict(run, report.compute(run, near_m=0.5, stationary_m_per_s=0.001))
+    assert found is not None
+    assert page.index(found.sentences[0]) < page.index(found.table.title)
 
 
 def test_without_truth_it_is_the_smoothed_person(

@@ -29,6 +29,7 @@ from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import stop_straight
 from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.model import RobotModel
+from tests.facts import facts, tells
 from tests.live.counted import Cable, CountedLoop, counted
 from tests.live.crashing import BUG, failing
 from tests.live.flights import BEGIN_NS, CYCLE_S, DEMO, Flight
@@ -202,9 +203,7 @@ def test_a_recording_that_cannot_be_read_any_further_is_named() -> None:
     loop = counted(Flight())
     loop.controller.stop = session_controller.PERSON_DEAD
     loop.notes += ["failed log.mcap: no further", "a later remark"]
-    with pytest.raises(
-        LiveStopped, match=r"stopped by: human side dead \(log.mcap: no further\); the record is in run"
-    ):
+    with pytest.raises(LiveStopped, match=facts("human side dead", "log.mcap: no further", "run")):
         session._verdict(loop, Path("run"), [])
 
 
@@ -231,7 +230,7 @@ class Live:
         (line,) = self.err.splitlines()
         said, _, where = line.removeprefix("hrcreplay: ").partition("; ")
         assert self.code == 4
-        assert where == f"not complete: what there is of the record, and the traceback, is in {self.partial}"
+        assert tells(where, "not complete", str(self.partial))
         assert processes.read_crashes(self.partial) == [said]
         assert said.startswith(f"{part}: ZeroDivisionError: put there by a test (")
         meta = json.loads((self.partial / "run.json").read_text())

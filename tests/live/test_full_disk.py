@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from hrcreplay.live.record.folder import NO_END
+from tests.facts import tells
 from tests.live.flights import DEMO
 from tests.live.flown import MOVING, Group, never_stalls, read_json, told
 from tests.live.sessions import Command, free_port
@@ -27,7 +28,7 @@ def test_a_session_without_room_for_its_record_does_not_begin(tmp_path: Path) ->
     with Command(*words) as session:
         assert session.end() == 2
     (line,) = session.err
-    assert "MB are left on its disk; would be right: 1e+09 MB (live.disk_start_mb)" in line
+    assert tells(line, "1e+09 MB", "live.disk_start_mb")
     assert not list(tmp_path.iterdir())
 
 
@@ -52,5 +53,5 @@ def test_a_disk_that_fills_up_stops_the_robot_and_the_last_line_says_so(tmp_path
     assert NO_END in meta["notes"]
     assert (full.folder / "crash_recorder.txt").read_text().startswith(why)
     never_stalls(full)
-    assert told(low).startswith("hrcreplay: stopped by: disk nearly full")
+    assert tells(told(low), "stopped by", "disk nearly full")
     assert NO_END not in read_json(low.folder / "run.json")["notes"]

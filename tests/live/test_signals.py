@@ -15,6 +15,7 @@ from hrcreplay.live import session
 from hrcreplay.live.control.loop import ENDING
 from hrcreplay.live.control.session_controller import SIGNALS
 from hrcreplay.live.record.codec import Signal
+from tests.facts import tells
 from tests.live.flown import MOVING, Group, brakes_for, never_stalls, stops, told
 
 #: What POSIX and Linux let a process catch and what would end or suspend it if it did not.
@@ -51,7 +52,7 @@ def test_a_terminal_that_is_closed_brakes_the_robot(tmp_path: Path) -> None:
         for name, one in flown.items():
             one.end()
             assert one.code == 4
-            assert told(one).startswith(f"hrcreplay: stopped by: {name} after ")
+            assert tells(told(one), "stopped by", name)
             assert list(stops(one.folder)) == [name]
             brakes_for(name, one.folder)
             never_stalls(one)

@@ -21,6 +21,7 @@ from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.live.verify import verify
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.robot.model import irb140
+from tests.facts import tells
 from tests.live.person.test_zenoh import free_endpoint
 from tests.live.sessions import PATIENT, Session, Twin, free_port
 from tests.live.zenoh_worker import MARKERS, OWN, POSES
@@ -92,7 +93,7 @@ def test_a_publisher_that_dies_stops_the_robot_and_one_that_comes_back_does_not_
                 session.interrupt()
                 assert session.end() == 4
             report = twin.report()
-    assert session.err[0].startswith("hrcreplay: stopped by: Ctrl-C after ")
+    assert tells(session.err[0], "stopped by", "Ctrl-C")
     assert report["answers"]["seqno_steps"] == 0
     assert verify(session.folder).identical
     meta = json.loads((session.folder / "run.json").read_text())

@@ -11,6 +11,7 @@ from hrcreplay.logs.cleaning import DEFECTS
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import POINTS, CameraFrames
 from hrcreplay.settings.sections import Logs
+from tests.facts import tells
 from tests.logs import own
 from tests.logs.bags import KINDS, OPENNI, bag, make, marker_array, openni_at, transform, write_openni
 
@@ -102,7 +103,7 @@ def test_points_that_no_body_has_are_missing(tmp_path: Path) -> None:
     assert counted == {"at_origin": 22, "too_far": 2, "coincident": 4, "not_finite": 0}
     origin = f"22 {DEFECTS['points_at_origin']} (19 % of its points)"
     assert f"camera one: {origin}" in log.notes
-    assert any("2 points further away than a camera can see" in note for note in log.notes)
+    assert tells(log.notes, f"2 {DEFECTS['points_too_far']}")
 
 
 def test_a_camera_that_freezes_is_silent(tmp_path: Path) -> None:
@@ -115,8 +116,7 @@ def test_a_camera_that_freezes_is_silent(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames.capture_ns, captures[[0, 1, 2, 3, 43, 44]])
     assert (log.defects["frames_repeated"], log.defects["frames_one"]) == (39, 6)
     (said,) = (note for note in log.notes if "froze" in note)
-    assert said.startswith("camera one froze: for 1.30 s from 0.10 s on it gave one and the same skeleton")
-    assert said.endswith("its 39 rows that repeat count as silence")
+    assert tells(said, "camera one", "1.30 s", "0.10 s", "39 rows")
 
 
 @pytest.mark.parametrize("kind", ["frozen", "trembling", "contradicting"])
@@ -190,8 +190,8 @@ def test_camera_that_starts_late_and_one_that_dies(tmp_path: Path) -> None:
     log = opened(tmp_path, own.frames(300, which=which))
     assert log.header.cameras == ("left", "right")
     own.read(log)
-    assert "camera right starts 3.03 s after the log" in log.notes
-    assert "camera left ends 3.37 s before the log" in log.notes
+    assert tells(log.notes, "right", "3.03 s after")
+    assert tells(log.notes, "left", "3.37 s before")
 
 
 def test_zero_stamps_of_ros_give_way_to_arrival(tmp_path: Path) -> None:
@@ -204,7 +204,7 @@ def test_zero_stamps_of_ros_give_way_to_arrival(tmp_path: Path) -> None:
     expected = BEGIN + np.arange(9) * PERIOD + np.array([1000] * 6 + [0] * 3)
     np.testing.assert_array_equal(frames.capture_ns, expected)
     assert log.defects["frames_header_stamp_zero"] == 6
-    assert "header stamps are zero: arrival times used" in log.notes
+    assert tells(log.notes, "stamps", "zero", "arrival")
 
 
 def test_zero_stamps_on_tf(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from rosbags import rosbag1
 from hrcreplay.errors import LogError
 from hrcreplay.logs.log_files import open_source
 from hrcreplay.logs.reader import open_log
+from tests.facts import facts, tells
 from tests.logs import own
 from tests.logs.bags import bag, write_openni
 from tests.realdata import data_path
@@ -39,21 +40,21 @@ def test_truncated_mcap_gives_what_is_whole(tmp_path: Path, share: float) -> Non
     if share < 0.99:
         assert log.defects["truncated_at_ns"] == table.arrival_ns[n - 1]
         after = (table.arrival_ns[n - 1] - table.arrival_ns[0]) / 1e9
-        assert f"the file breaks off {after:.3f} s after its first message" in log.notes
+        assert tells(log.notes, "breaks off", f"{after:.3f} s")
 
 
 def test_mcap_cut_within_the_header(tmp_path: Path) -> None:
     path = own.write(tmp_path / "a.mcap", own.frames(10))
     for length in (8, 12, 20):
         path.write_bytes(path.read_bytes()[:length])
-        with pytest.raises(LogError, match=r"a\.mcap: (breaks off within the MCAP header|the log holds no messages)"):
+        with pytest.raises(LogError, match=r"a\.mcap: .*(breaks off|no messages)"):
             open_log(path)
 
 
 def test_mcap_cut_before_its_first_whole_chunk(tmp_path: Path) -> None:
     path = own.write(tmp_path / "a.mcap", own.frames(1000))
     path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(LogError, match="the log holds no messages"):
+    with pytest.raises(LogError, match=facts("a.mcap", "no messages")):
         open_log(path)
 
 
@@ -89,7 +90,7 @@ def test_mcap_without_index(tmp_path: Path, *, chunked: bool) -> None:
         writer.finish()  # type: ignore[no-untyped-call]
     log = open_log(path)
     np.testing.assert_array_equal(own.read(log).points_m, table.points_m)
-    assert "the file has no index: it was read once more to make one" in log.notes
+    assert tells(log.notes, "no index")
     window = own.read(log, start_ns=int(table.arrival_ns[1000]), end_ns=int(table.arrival_ns[2000]))
     np.testing.assert_array_equal(window.arrival_ns, table.arrival_ns[1000:2000])
 
@@ -164,7 +165,7 @@ def test_bag_that_breaks_off(tmp_path: Path, index: str) -> None:
     np.testing.assert_array_equal(frames.capture_ns, BEGIN + np.arange(len(frames)) * 33_000_000)
     assert log.defects["unindexed"] == 1
     assert abs(log.defects["truncated_at_ns"] - frames.arrival_ns[-1]) < 40_000_000
-    assert any(note.startswith("the file breaks off ") for note in log.notes)
+    assert tells(log.notes, "breaks off")
 
 
 def test_bag_that_breaks_off_at_once(tmp_path: Path) -> None:
@@ -172,7 +173,7 @@ def test_bag_that_breaks_off_at_once(tmp_path: Path) -> None:
     with bag(path, "ros1") as (write, store):
         write_openni(write, store, frames=20, start_ns=BEGIN)
     path.write_bytes(path.read_bytes()[:4300])
-    with pytest.raises(LogError, match="the log holds no messages that are whole"):
+    with pytest.raises(LogError, match=facts("a.bag", "no messages", "whole")):
         open_log(path)
 
 
@@ -184,10 +185,7 @@ def test_bag_with_a_damaged_chunk(tmp_path: Path, form: rosbag1.Writer.Compressi
     data = bytearray(path.read_bytes())
     data[5000:6000] = b"\xff" * 1000
     path.write_bytes(data)
-    with pytest.raises(
-        LogError,
-        match=r"a\.bag: (broken in the middle|a chunk of the bag holds|the log holds no messages that are whole)",
-    ):
+    with pytest.raises(LogError, match=r"a\.bag: .*(broken|chunk|no messages)"):
         list(open_log(path).frames())
 
 
@@ -200,5 +198,5 @@ def test_a_reader_that_fails_without_a_word_is_named(tmp_path: Path, monkeypatch
         raise OSError
 
     monkeypatch.setattr("rosbags.rosbag1.Reader.messages", fail)
-    with pytest.raises(LogError, match=r"a.bag: broken in the middle \(OSError\); copy it again"):
+    with pytest.raises(LogError, match=facts("a.bag", "OSError", "copy it again")):
         list(source.messages(["/tf"]))

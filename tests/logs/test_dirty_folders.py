@@ -12,6 +12,7 @@ from ruamel.yaml import YAML
 from hrcreplay.errors import LogError
 from hrcreplay.logs.log_files import open_source
 from hrcreplay.logs.reader import open_log
+from tests.facts import facts, tells
 from tests.logs import own
 from tests.logs.bags import bag, write_openni
 from tests.realdata import data_path
@@ -27,7 +28,7 @@ RESOURCES = "ros_bags/rosbag2/rosbag2_py/test/resources"
     "name", ["ros_bags/empty-file.bag", "ros_bags/no-messages.bag", "ros_bags/rosbag2/ros2bag/test/resources/empty_bag"]
 )
 def test_empty_logs(name: str) -> None:
-    with pytest.raises(LogError, match="the log holds no messages"):
+    with pytest.raises(LogError, match=facts(Path(name).name, "no messages")):
         open_log(data_path(name))
 
 
@@ -37,7 +38,7 @@ def test_empty_mcap(tmp_path: Path) -> None:
     writer.start()
     writer.finish()  # type: ignore[no-untyped-call]
     (tmp_path / "a.mcap").write_bytes(buffer.getvalue())
-    with pytest.raises(LogError, match="the log holds no messages"):
+    with pytest.raises(LogError, match=facts("a.mcap", "no messages")):
         open_log(tmp_path / "a.mcap")
 
 
@@ -49,18 +50,17 @@ def test_paths_that_are_no_log(tmp_path: Path) -> None:
     (tmp_path / "wrong" / "metadata.yaml").write_text("a: [")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "metadata.yaml").write_text("a: 1")
-    for name, message in {
-        "none.mcap": "there is no such file or folder; name a log",
-        "notes.txt": "is no log of a known kind; known are MCAP files",
-        "image.bag": "is no log of a known kind",
-        "folder": "is a folder without metadata.yaml; known are MCAP",
-        "wrong": "is not the metadata of a ROS 2 bag",
-        "other": "is not the metadata of a ROS 2 bag",
+    for name, found_and_right in {
+        "none.mcap": ("no such file",),
+        "notes.txt": ("known", "MCAP"),
+        "image.bag": ("known", "MCAP"),
+        "folder": ("metadata.yaml", "MCAP"),
+        "wrong": ("metadata.yaml", "ROS 2 bag"),
+        "other": ("metadata.yaml", "ROS 2 bag"),
     }.items():
-        with pytest.raises(LogError, match=message) as caught:
+        with pytest.raises(LogError, match=facts(str(tmp_path / name), *found_and_right)) as caught:
             open_log(tmp_path / name)
         assert "\n" not in str(caught.value)
-        assert str(tmp_path / name) in str(caught.value)
 
 
 # --- ROS 2 folders that promise more than they hold ---
@@ -90,12 +90,9 @@ def test_promise_of_messages_where_none_are(tmp_path: Path) -> None:
     database = sqlite3.connect(folder / "talker.db3")
     with database:
         database.execute("update messages set topic_id = 99")  # they are there, but belong to nothing
-    assert (
-        "talker.db3-wal beside the file holds messages not yet in it; they are left out"
-        in open_source(folder).damage().notes
-    )
+    assert tells(open_source(folder).damage().notes, "talker.db3-wal", "left out")
     database.close()
-    with pytest.raises(LogError, match=r"metadata\.yaml promises 20 messages, but its files \(1\) give none"):
+    with pytest.raises(LogError, match=facts("metadata.yaml", "20 messages", "none")):
         open_log(folder)
 
 
@@ -106,7 +103,7 @@ def test_promise_of_more_messages_than_there_are(tmp_path: Path, kind: str) -> N
     promise(tmp_path / "a", 320)
     log = open_log(tmp_path / "a")
     assert log.defects["messages_missing"] == 20
-    assert "metadata.yaml promises 320 messages, but the files give 300" in log.notes
+    assert tells(log.notes, "metadata.yaml", "320", "300")
 
 
 def test_split_with_a_file_missing_and_one_broken(tmp_path: Path) -> None:
@@ -120,8 +117,8 @@ def test_split_with_a_file_missing_and_one_broken(tmp_path: Path) -> None:
     source = open_source(folder)
     damage = source.damage()
     assert damage.defects == {"files_missing": 1, "files_empty": 1, "messages_missing": 1240 + 1108}
-    assert "1 of the 5 files in metadata.yaml are not there" in damage.notes
-    assert "wbag_4.mcap: has 0 bytes" in damage.notes
+    assert tells(damage.notes, "metadata.yaml", "1 of the 5 files")
+    assert tells(damage.notes, "wbag_4.mcap", "0 bytes")
     assert source.end_ns == 2623
 
 
@@ -132,7 +129,7 @@ def test_recorder_killed_before_it_wrote_metadata(tmp_path: Path) -> None:
         (tmp_path / kind / "metadata.yaml").unlink()
         log = open_log(tmp_path / kind)
         assert len(own.read(log)) == 20
-        assert log.notes[0] == "metadata.yaml is missing: the files of the folder are read in order of time"
+        assert tells(log.notes[0], "metadata.yaml", "missing")
 
 
 def test_truncated_ros2_mcap(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from hrcreplay.logs.messages import AZURE_INDEX
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import NOBODY, POINTS, CameraFrames, Floats
 from hrcreplay.settings.sections import Decoder, Logs
+from tests.facts import facts, tells
 from tests.logs import own
 from tests.logs.bags import OPENNI, bag, define, header, make, point, transform
 from tests.reobserve import walker
@@ -144,7 +145,7 @@ def test_second_body_that_comes_late_decides_the_ids(tmp_path: Path) -> None:
 def test_ids_that_fit_no_known_number_need_the_setting(tmp_path: Path) -> None:
     bodies = people(2)
     path = written(tmp_path / "a", by_ids(bodies, 40), topic="/body_tracking_data")
-    with pytest.raises(LogError, match=r"ids up to 66.*logs\.marker_ids_per_body"):
+    with pytest.raises(LogError, match=facts("66", "logs.marker_ids_per_body")):
         open_log(path)
     assert_bodies(open_log(path, Logs(marker_ids_per_body=40)), dict(enumerate(bodies)))
 
@@ -184,7 +185,7 @@ def test_two_bodies_under_the_same_ids_are_refused(tmp_path: Path) -> None:
         for points in bodies:
             yield from by_ids([points], 100)(frame)
 
-    with pytest.raises(LogError, match=r"two markers with id \d+ in one message"):
+    with pytest.raises(LogError, match=r"two .*\bid \d+"):
         open_log(written(tmp_path / "a", spec))
 
 
@@ -199,7 +200,7 @@ def test_two_bodies_under_the_same_ids_in_two_messages_are_refused(tmp_path: Pat
     log = open_log(tmp_path / "a")
     own.read(log)
     assert log.defects["frames_contradicting"] == FRAMES
-    with pytest.raises(LogError, match=f"camera people: {FRAMES} of {2 * FRAMES} rows"):
+    with pytest.raises(LogError, match=facts("camera people", f"{FRAMES} of {2 * FRAMES}")):
         log.check()
 
 
@@ -233,7 +234,7 @@ def test_two_cameras_under_one_frame_are_refused(tmp_path: Path) -> None:
 
     log = open_log(written(tmp_path / "a", spec))
     own.read(log)
-    with pytest.raises(LogError, match=r"camera people: a body is in two places by turns, 1\.0\d m apart"):
+    with pytest.raises(LogError, match=r"camera people: .*\b1\.0\d m"):
         log.check()
 
 
@@ -271,9 +272,9 @@ def test_markers_that_are_no_people_are_left_out_and_told(kind: int, tmp_path: P
                 write(topic, TYPE, stamp_ns + 5_000_000, make(store, TYPE, markers=found))
     log = open_log(tmp_path / "a")
     assert log.header.cameras == ("people",)
-    assert "/occupied_cells is left out" in told(log)
+    assert tells(told(log), "/occupied_cells", "left out")
     assert_bodies(log, {0: points})
-    with pytest.raises(LogError, match="no skeletons on /occupied_cells"):
+    with pytest.raises(LogError, match=facts("no skeletons", "/occupied_cells")):
         open_log(tmp_path / "a", Logs(topics=("/occupied_cells",)))
 
 
@@ -281,7 +282,7 @@ def test_joints_in_another_order_are_refused(tmp_path: Path) -> None:
     (points,) = people(1)
     order = np.random.default_rng(5).permutation(20)
     path = written(tmp_path / "a", by_ids([points[:, order]], 100), topic="/body_tracking_data")
-    with pytest.raises(LogError, match="/body_tracking_data: found spheres that are no person"):
+    with pytest.raises(LogError, match=facts("/body_tracking_data", "no person")):
         open_log(path)
 
 
@@ -312,7 +313,7 @@ def test_millimetres_are_refused_and_the_remedy_works(tmp_path: Path) -> None:
     path = written(tmp_path / "a", by_ids([1e3 * points], 100))
     log = open_log(path)
     own.read(log)
-    with pytest.raises(LogError, match=r"millimetres were taken for metres.*logs\.unit=mm"):
+    with pytest.raises(LogError, match=facts("millimetres", "logs.unit=mm")):
         log.check()
     assert_bodies(open_log(path, Logs(unit="mm")), {0: points})
 
@@ -337,7 +338,7 @@ def test_transforms_of_unknown_names_are_told_with_those_that_are_known(tmp_path
                 store, "tf2_msgs/msg/TFMessage", transforms=[transform(store, BEGIN, "cam", joint, [i, 0, 1])]
             )
             write("/tf", "tf2_msgs/msg/TFMessage", BEGIN + i, message)
-    with pytest.raises(LogError, match=r"/tf has the frames Kopf, Hals.*head_1"):
+    with pytest.raises(LogError, match=facts("/tf", "Kopf, Hals", "head_1")):
         open_log(tmp_path / "a")
 
 
@@ -361,7 +362,7 @@ def described(**given: Any) -> Logs:
 
 
 def test_arrays_that_a_decoder_could_read_are_named(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=r"/lab \(lab/Person\) has arrays of points.*'joints' \(up to 20\)"):
+    with pytest.raises(LogError, match=facts("/lab (lab/Person)", "'joints' (up to 20)")):
         open_log(lab_bag(tmp_path / "a", []))
 
 
@@ -374,6 +375,6 @@ def test_no_stamp_takes_the_arrival(tmp_path: Path) -> None:
 
 def test_confidences_in_percent_are_refused(tmp_path: Path) -> None:
     path = lab_bag(tmp_path / "a", [88.0] * 20)
-    with pytest.raises(LogError, match=r"confidence of 88 in 'scores'"):
+    with pytest.raises(LogError, match=facts("88", "'scores'")):
         own.read(open_log(path, described(confidence="scores")))
     assert (own.read(open_log(path, described(confidence="none"))).confidence == 1.0).all()

@@ -21,6 +21,7 @@ from hrcreplay.logs.log_files import open_source
 from hrcreplay.logs.messages import LazyChunk, Message, Topic, merge_by_arrival
 from hrcreplay.logs.reader import open_log
 from hrcreplay.settings.sections import Logs
+from tests.facts import facts, tells
 from tests.logs import own
 from tests.logs.bags import KINDS, Write, bag, header, make, marker_array, transform, write_openni
 from tests.realdata import data_path
@@ -140,7 +141,7 @@ def test_split_files_that_overlap_are_merged(tmp_path: Path) -> None:
     yaml.dump(metadata, tmp_path / "a" / "metadata.yaml")
     log = open_log(tmp_path / "a")
     np.testing.assert_array_equal(own.read(log).points_m[:, 3], people[:, 26])
-    assert log.notes[0] == "markers carry no confidence: 1 for every point"
+    assert tells(log.notes[0], "markers", "confidence", "1")
 
 
 def test_compressed_bag_gives_the_same_messages() -> None:
@@ -212,14 +213,12 @@ def test_topics_can_be_chosen(tmp_path: Path) -> None:
     log = open_log(path, Logs(topics=("/camera/right/skeleton",)))
     assert log.header.cameras == ("right",)
     assert len(own.read(log)) == 50
-    with pytest.raises(LogError, match=r"a\.mcap: no topic /camera/top/skeleton; found /camera/left/info \(hrcreplay"):
+    with pytest.raises(LogError, match=facts("a.mcap", "/camera/top/skeleton", "/camera/left/info")):
         open_log(path, Logs(topics=("/camera/top/skeleton",)))
 
 
 def test_chosen_topic_without_skeletons() -> None:
-    with pytest.raises(
-        LogError, match=r"example\.bag: no skeletons on /rosout \(rosgraph_msgs/Log\)\. Name a topic with"
-    ):
+    with pytest.raises(LogError, match=facts("example.bag", "/rosout (rosgraph_msgs/Log)", "Name a topic")):
         open_log(data_path("ros_bags/example.bag"), Logs(topics=("/rosout",)))
 
 
@@ -227,10 +226,8 @@ def test_log_without_skeletons_is_refused_with_what_it_has() -> None:
     with pytest.raises(LogError) as caught:
         open_log(data_path("sara_human_robot_bags/exp_box.bag"))
     text = str(caught.value)
-    assert ": no skeleton topic; found /SaRA_demo_robot_capsules (reachable_occupancy/ReachableOccupancy), " in text
-    assert text.endswith(
-        "Name a topic with --topic NAME, or a decoder for it in [[logs.decoders]] of the settings file."
-    )
+    assert tells(text, "no skeleton", "/SaRA_demo_robot_capsules (reachable_occupancy/ReachableOccupancy)")
+    assert tells(text, "--topic NAME", "[[logs.decoders]]")
 
 
 def numbers(write: Write, store: Typestore) -> None:
@@ -253,24 +250,23 @@ def one_polygon(write: Write, store: Typestore) -> None:
 
 
 @pytest.mark.parametrize(
-    ("write_bodies", "facts", "helps"),
+    ("write_bodies", "found", "helps"),
     [
-        (numbers, ("/landmarks (std_msgs/Float32MultiArray) has no array of points",), False),
-        (frames_of_another_tracker, ("SpineMid_1, Neck_1, ElbowLeft_1", "publish the joints under these names"), False),
+        (numbers, ("/landmarks (std_msgs/Float32MultiArray)", "points"), False),
+        (frames_of_another_tracker, ("SpineMid_1, Neck_1, ElbowLeft_1", "names"), False),
         (one_polygon, ("'points' (up to 3)",), True),
     ],
 )
 def test_decoders_are_advised_only_where_they_help(
-    write_bodies: Callable[[Write, Typestore], None], facts: tuple[str, ...], helps: bool, tmp_path: Path
+    write_bodies: Callable[[Write, Typestore], None], found: tuple[str, ...], helps: bool, tmp_path: Path
 ) -> None:
     with bag(tmp_path / "a", "mcap") as (write, store):
         write_bodies(write, store)
-    with pytest.raises(LogError, match="no skeleton topic; found") as caught:
+    with pytest.raises(LogError, match=facts("no skeleton", *found)) as caught:
         open_log(tmp_path / "a")
     text = str(caught.value)
-    assert all(fact in text for fact in facts), text
     assert "\n" not in text
-    assert ("Name a topic with --topic" in text) == helps
+    assert tells(text, "--topic") == helps
     assert ("hrcreplay.logs.writer.LogWriter" in text) != helps
     log = open_log(tmp_path / "a", skeletons=False)
     assert text.endswith(log.skeletons_remedy)
@@ -281,7 +277,7 @@ def test_two_topics_of_one_camera_name(tmp_path: Path) -> None:
         for topic in ("/a/body", "/a_body"):
             array = marker_array(store, BEGIN, {1: np.ones((32, 3))})
             write(topic, "visualization_msgs/msg/MarkerArray", BEGIN, array)
-    with pytest.raises(LogError, match="/a/body and /a_body are both camera 'a_body'"):
+    with pytest.raises(LogError, match=facts("/a/body", "/a_body", "'a_body'")):
         open_log(tmp_path / "a.bag")
 
 
@@ -295,5 +291,5 @@ def test_a_topic_of_joint_states_that_is_not_there_is_refused(tmp_path: Path) ->
         sent = make(store, state, header=header(store, BEGIN), name=["a"], position=np.zeros(1))
         write("/robot/joint_states", state, BEGIN, sent)
     assert open_log(tmp_path / "a").header.joint_topics == ("/robot/joint_states",)
-    with pytest.raises(LogError, match=r"no joint states on /tf; found /tf \(tf2_msgs/TFMessage\), /robot/joint"):
+    with pytest.raises(LogError, match=facts("no joint states on /tf", "/robot/joint_states")):
         open_log(tmp_path / "a", Logs(joints_topic="/tf"))

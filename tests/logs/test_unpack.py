@@ -22,6 +22,7 @@ from hrcreplay.logs.messages import MCAP_MAGIC
 from hrcreplay.logs.ros_bags import MAGIC
 from hrcreplay.logs.unpack import CHUNK_RECORDS, CannotUnpack, unpack
 from tests.bounded import MEMORY_BYTES, assert_one_line, run_bounded
+from tests.facts import facts
 from tests.logs import own
 from tests.logs.bags import bag, write_openni
 
@@ -184,7 +185,7 @@ def test_a_chunk_of_an_unindexed_bag_that_cannot_be_unpacked_is_left_out(method:
         assert fact in damage.notes[-1]
     path = ros1_bag(tmp_path, method, packed, indexed=False)
     path.write_bytes(path.read_bytes()[:-100])  # the right chunk breaks off
-    with pytest.raises(LogError, match=r"no messages that are whole: the chunk at byte .* 256 MB.*rosbag decompress"):
+    with pytest.raises(LogError, match=facts("no messages", "256 MB", "rosbag decompress")):
         open_source(path)
 
 
@@ -194,7 +195,7 @@ def test_a_chunk_of_millions_of_records_is_told(tmp_path: Path) -> None:
     packed = zstandard.compress(count * record(128, b""))
     assert len(packed) < 20_000
     (tmp_path / "a.mcap").write_bytes(MCAP_MAGIC + HEADER + mcap_chunk_record(packed, 9 * count) + DATA_END + FOOTER)
-    with pytest.raises(LogError, match=f"more than {CHUNK_RECORDS} records"):
+    with pytest.raises(LogError, match=facts("a.mcap", f"{CHUNK_RECORDS} records")):
         open_source(tmp_path / "a.mcap")
     fields = struct.pack("<L", 8) + struct.pack("<L", 4) + b"op=\x04" + bytes(4)
     path = ros1_bag(tmp_path, "bz2", bz2.compress(count * fields), indexed=False)

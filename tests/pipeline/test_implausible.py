@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from hrcreplay.commands import audit, replay
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.records import POINTS, CameraFrames, Floats
 from hrcreplay.store import run_folder
+from tests.facts import facts, tells
 from tests.logs import own
 from tests.logs.test_plausibility import CAMERA, seen, with_points
 
@@ -37,33 +37,34 @@ def nothing_left(tmp_path: Path) -> bool:
 @pytest.mark.parametrize(
     ("points", "why"),
     [
-        (np.zeros((40, 20, 3)), r"hold 0 points with a place and a confidence \(.*points_at_origin 780"),
-        (np.full((40, 20, 3), np.nan), "hold 0 points with a place and a confidence"),
-        (np.full((40, 20, 3), 3e38), r"points_too_far 780"),
+        (np.zeros((40, 20, 3)), ("0 points", "points_at_origin 780")),
+        (np.full((40, 20, 3), np.nan), ("0 points",)),
+        (np.full((40, 20, 3), 3e38), ("points_too_far 780",)),
     ],
 )
-def test_a_log_in_which_nobody_was_ever_seen(command: str, points: Floats, why: str, tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=r"a\.mcap: nobody was ever seen: 39 bodies in the frames of left") as refused:
+def test_a_log_in_which_nobody_was_ever_seen(
+    command: str, points: Floats, why: tuple[str, ...], tmp_path: Path
+) -> None:
+    with pytest.raises(LogError, match=facts("a.mcap", "nobody", "39 bodies", "left", *why)) as refused:
         ran(tmp_path, with_points(noisy(40), points), command)
     assert refused.value.exit_code == 3
-    assert pd.Series([str(refused.value)]).str.contains(why).all()
     assert nothing_left(tmp_path)
 
 
 def test_nobody_in_sight_refuses_plan_and_report_too(tmp_path: Path) -> None:
     """The demo's person comes later than its first seconds."""
     for command in ("plan", "report"):
-        with pytest.raises(LogError, match="nobody was ever seen: 0 bodies"):
+        with pytest.raises(LogError, match=facts("nobody", "0 bodies")):
             replay.run(command, replay.demo_log(), out=tmp_path / "run", end_s=0.3)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_millimetres_are_refused_with_what_would_mend_them(tmp_path: Path) -> None:
     table = noisy()
-    with pytest.raises(LogError, match=r"m tall; a person is 0.5 to 2.3 m: millimetres were taken for metres"):
+    with pytest.raises(LogError, match=facts("tall", "0.5 to 2.3 m", "millimetres")):
         ran(tmp_path, with_points(table, 1e3 * table.points_m))
     assert nothing_left(tmp_path)
-    with pytest.raises(LogError, match="millimetres were taken for metres"):
+    with pytest.raises(LogError, match=facts("millimetres", "metres")):
         audit.run([tmp_path / "a.mcap"], out=tmp_path / "audit")
     assert nothing_left(tmp_path)
 
@@ -87,7 +88,7 @@ def test_a_coincident_or_lost_start_is_no_crash(tmp_path: Path) -> None:
         "points_coincident": 8 * 3 + 8 * 2 + 8 * 2,
         "points_too_far": 4,
     }
-    assert any("points in one place with the other end of their bone" in note for note in run.notes)
+    assert tells(run.notes, "56 points")
 
 
 def test_a_frozen_camera_no_longer_shows_the_person(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -128,7 +129,7 @@ def test_a_base_inside_the_person_is_told(x: float, inside: bool, tmp_path: Path
 
 
 def test_a_log_of_one_frame(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="holds a single instant; would be right: two frames or more"):
+    with pytest.raises(LogError, match=facts("single", "two frames")):
         ran(tmp_path, noisy(2).rows(slice(0, 1)))
     assert nothing_left(tmp_path)
 
@@ -137,5 +138,5 @@ def test_a_log_of_one_frame(tmp_path: Path) -> None:
 def test_a_span_without_a_tick_names_the_option_that_was_given(
     span: dict[str, float], option: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(SettingsError, match=f"{option}: nothing of the log is left"):
+    with pytest.raises(SettingsError, match=facts(option, "nothing")):
         ran(tmp_path, noisy(), "fuse", **span)

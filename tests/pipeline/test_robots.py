@@ -14,6 +14,7 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.robot import irb140
 from hrcreplay.store import run_folder
+from tests.facts import facts
 
 AXES = [f"q{i}" for i in range(1, 7)]
 
@@ -57,7 +58,7 @@ def test_another_urdf_with_given_links_moves_as_the_built_in_robot(tmp_path: Pat
 
 def test_links_without_a_urdf_are_refused(tmp_path: Path) -> None:
     link = '{name = "a", body = "b", start_m = [0,0,0], end_m = [0,0,1], radius_m = 0.1}'
-    with pytest.raises(SettingsError, match=r"robot\.links: found links for the IRB 140; it goes with a robot\.urdf"):
+    with pytest.raises(SettingsError, match=facts("robot.links", "IRB 140", "robot.urdf")):
         _plan(replay.demo_log(), tmp_path / "x", f"robot.links=[{link}]")
 
 
@@ -110,7 +111,7 @@ def test_a_joint_track_of_another_robot_is_refused(tmp_path: Path) -> None:
 
 def test_no_programme_at_all_says_how_to_give_one(tmp_path: Path) -> None:
     log = _without_task(tmp_path / "bare.mcap")
-    with pytest.raises(SettingsError, match=r"no task and no joint track; name a task file with --set plan\.task"):
+    with pytest.raises(SettingsError, match=facts("task", "joint track", "--set", "plan.task")):
         replay.run("plan", log, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

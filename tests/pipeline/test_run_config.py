@@ -18,6 +18,7 @@ from hrcreplay.errors import LogError
 from hrcreplay.pipeline.run_config import resolve
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import COLUMNS, missing_columns
+from tests.facts import facts, tells
 
 #: What tables of the version before had not.
 NEW = {
@@ -85,8 +86,8 @@ def test_tables_of_an_earlier_version_are_computed_again(
     new = replay.run("plan", old, out=tmp_path / "new")
     said = capsys.readouterr().err
     for stage in ("fuse", "predict", "plan"):
-        outcome = f"{old / table} is of an earlier version, without {NEW[table][0]}; computed again"
-        assert f"{stage}: {outcome if stage in again else f'taken over from {old}'}" in said
+        outcome = (str(old / table), NEW[table][0], "computed again") if stage in again else ("taken over", str(old))
+        assert tells(said.splitlines(), stage, *outcome)
     assert run_folder.read_meta(new)["outputs"] == run_folder.read_meta(planned)["outputs"]
 
 
@@ -97,7 +98,7 @@ def test_states_that_tell_nothing_of_the_legs_are_computed_again(
     assert missing_columns(old / "state.parquet") == ("residual_LEGS",)
     again = replay.run("predict", old, out=tmp_path / "new")
     said = capsys.readouterr().err
-    assert f"{old / 'state.parquet'} is of an earlier version, without residual_LEGS; computed again" in said
+    assert tells(said.splitlines(), str(old / "state.parquet"), "residual_LEGS", "computed again")
     fresh = replay.run("predict", replay.demo_log(), out=tmp_path / "fresh", start_s=9.0, end_s=10.0)
     for name in ("state.parquet", "occupancy.parquet"):
         assert run_folder.sha256(again / name) == run_folder.sha256(fresh / name)
@@ -115,8 +116,7 @@ def test_tables_that_were_changed_since_are_computed_again(
     shutil.copytree(planned, tmp_path / "old")
     harm(tmp_path / "old" / "state.parquet")
     new = replay.run("plan", tmp_path / "old", out=tmp_path / "new")
-    assert "fuse: " in (said := capsys.readouterr().err)
-    assert "state.parquet is not as its run left it; computed again" in said
+    assert tells(capsys.readouterr().err.splitlines(), "fuse", "state.parquet", "computed again")
     assert run_folder.read_meta(new)["outputs"] == run_folder.read_meta(planned)["outputs"]
 
 
@@ -132,6 +132,6 @@ def test_a_run_that_does_not_tell_how_it_was_made_is_refused(planned: Path, tmp_
     meta = run_folder.read_meta(planned)
     del meta[key]
     (tmp_path / "old" / "run.json").write_text(json.dumps(meta))
-    with pytest.raises(LogError, match=rf"old: its run\.json lacks {key}, .*; give the log itself"):
+    with pytest.raises(LogError, match=facts("old", "run.json", key, "log")):
         replay.run("plan", tmp_path / "old", out=tmp_path / "new")
     assert not (tmp_path / "new").exists()

@@ -15,6 +15,7 @@ from hrcreplay.pipeline.run_config import RunConfig, read_urdf, resolve_without_
 from hrcreplay.reporting.tables import remarks, robot_table, summary
 from hrcreplay.robot.model import from_urdf
 from hrcreplay.settings.load import load_settings
+from tests.facts import facts, tells
 from tests.live.flights import DEMO
 from tests.robot.test_model import joint, link, robot_xml
 
@@ -53,7 +54,7 @@ def test_packages_come_from_the_settings_then_beside_the_urdf_then_from_ros(
 ) -> None:
     robot = urdf(tmp_path / "ws" / "my_arm" / "urdf" / "arm.urdf", "package://my_arm/meshes/arm.stl")
     ros = stl(tmp_path / "ros" / "my_arm" / "meshes" / "arm.stl", 0.1)
-    with pytest.raises(SettingsError, match=r"arm.stl of link 'arm' is not in nothing \(robot.packages\), nor beside"):
+    with pytest.raises(SettingsError, match=facts("arm.stl", "'arm'", "robot.packages")):
         found(robot)
     monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path / 'none'}:{tmp_path / 'ros'}")
     assert found(robot) == [str(ros)]
@@ -65,7 +66,7 @@ def test_packages_come_from_the_settings_then_beside_the_urdf_then_from_ros(
     monkeypatch.delenv("ROS_PACKAGE_PATH")
     for name in ("../meshes/arm.stl", str(beside), f"file://{beside}"):
         assert Path(found(urdf(robot, name))[0]).resolve() == beside
-    with pytest.raises(SettingsError, match=r"the mesh x\.stl of link 'arm' is not at .*x\.stl"):
+    with pytest.raises(SettingsError, match=facts("x.stl", "'arm'")):
         found(urdf(robot, "x.stl"))
 
 
@@ -101,22 +102,22 @@ def test_what_the_capsules_add_is_told(tmp_path: Path) -> None:
     model = robot_of(run_config(urdf(tmp_path / "arm.urdf", "", can), "robot.tool_m=0.3"), np.eye(4))
     told = remarks(model)
     # two half balls of the same radius: 4/3 r on a length of 2 r
-    assert told[0].startswith("robot other: 1 axes from base to arm; its 1 capsules add 67 % to the volume of the ")
-    assert told[1].startswith("robot other: the TCP lies 0.100 m outside the capsules of the last link")
+    assert tells(told[0], "robot other", "1 axes", "base", "arm", "1 capsules", "67 %")
+    assert tells(told[1], "robot other", "TCP", "0.100 m")
     assert robot_table(summary(model)).rows == (("arm", "0.200", "0.100", "10.47", "6.28", "+67 %"),)
 
 
 def test_other_settings_of_a_urdf_are_refused_for_the_built_in_robot() -> None:
     for override in ('robot.base_frame="x"', 'robot.packages=["/x"]', 'robot.tcp_frame="x"'):
         settings = load_settings(None, (override,))
-        with pytest.raises(SettingsError, match=r"for the IRB 140; it goes with a robot.urdf"):
+        with pytest.raises(SettingsError, match=facts("IRB 140", "robot.urdf")):
             robot_of(resolve_without_log("plan", DEMO, settings, None), np.eye(4))
 
 
 def test_live_drives_six_to_fourteen_axes_and_says_so(tmp_path: Path) -> None:
     path = urdf(tmp_path / "arm.urdf", "", "<sphere radius='0.1'/>")
     opened, header = live_run_config(DEMO, None, (f"robot.urdf={path}",), None)
-    with pytest.raises(SettingsError, match=r"robot.urdf: other has 1 axes; live drives robots of 6 to 14 over EGM"):
+    with pytest.raises(SettingsError, match=facts("robot.urdf", "other", "1 axes", "6 to 14")):
         start_table(opened, header, sending=True)
 
 

@@ -20,6 +20,7 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline.assembly import robot as build_robot
 from hrcreplay.pipeline.run_config import resolve
 from hrcreplay.records import BORDER
+from tests.facts import facts, tells
 from tests.visits import Visitors, cell_around, visit_log
 
 ALONE = ("plan.baselines=[]", "prediction.store_hz=1")
@@ -62,7 +63,7 @@ def passing(speed: float, back_s: float) -> Visitors:
 
 
 def test_without_a_word_of_the_cell_a_robot_in_an_empty_cell_stands(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="nobody was ever seen"):
+    with pytest.raises(LogError, match=facts("nobody", "seen")):
         run(tmp_path, nobody, 4.0, watched=None)
 
 
@@ -100,15 +101,15 @@ def test_somebody_who_walks_in_is_met_by_a_robot_that_stands(tmp_path: Path) -> 
     assert not (contact["moving"] & (contact["distance_m"] < 0.0)).any()
     assert contact["distance_m"].min() < 0.3  # they came
     fresh = state["frame_age_s"] <= 0.3
-    assert set(motion["limb"][fresh & (motion["s"].between(5.0, 7.0))].dropna()) != {BORDER}
+    assert set(motion["limb"][fresh & (motion["s"].between(5.0, 7.0))].dropna()) - {BORDER}
     assert motion["tcp_speed"][motion["s"] > 10.0].max() > 0.3  # they have gone
     metrics = json.loads((folder / "metrics.json").read_text())
     unseen = ~fresh & (state["nobody_s"] <= 0.3)
     assert metrics["watched_vacant_share"]["value"] == pytest.approx(unseen.mean())
     assert metrics["watched_frames_refuting"]["value"] == 0
     page = (folder / "report.html").read_text()
-    assert "because the cell states that its cameras see everybody within" in page
-    assert "nobody in the watched area in another" in " ".join(report.summary(folder))
+    assert tells(page, "cell", f"{100.0 * unseen.mean():.1f} %")
+    assert tells(report.summary(folder), "watched area", f"{100.0 * unseen.mean():.1f} %")
 
 
 @pytest.mark.parametrize("side", [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.7, -0.7)])
@@ -198,13 +199,13 @@ def test_an_area_that_is_never_without_others_is_told_and_the_robot_stands(tmp_p
     assert np.isinf(state["nobody_else_s"]).all()
     assert (motion["tcp_speed"] == 0.0).all()
     notes = json.loads((folder / "run.json").read_text())["notes"]
-    assert any("another body was in it all along" in note for note in notes)
+    assert tells(notes, "watched", "another body")
 
 
 def test_an_area_without_the_robot_is_refused(tmp_path: Path) -> None:
     log = visit_log(tmp_path / "visit.mcap", nobody, 1.0)
     write_cell(Cell(watched=Watched(corners_m=[[5.0, 5.0], [9.0, 5.0], [9.0, 9.0]])), tmp_path / "far.toml")
-    with pytest.raises(SettingsError, match=r"the robot's base at \[0\.2, 0\.0\] m lies outside"):
+    with pytest.raises(SettingsError, match=facts("watched", "[0.2, 0.0] m")):
         replay.run("plan", log, out=tmp_path / "run", cell_file=tmp_path / "far.toml", overrides=ALONE)
 
 
@@ -214,9 +215,8 @@ def test_why_names_the_border(tmp_path: Path) -> None:
     assert found["nearest"]["limb"] == BORDER
     assert found["watched"]["nobody_s"] == pytest.approx(found["watched"]["nobody_else_s"])
     text = "\n".join(sentences(found))
-    assert "the border of the watched area" in text
-    assert "The watched area was last known to be without anybody" in text
-    assert "Cause: the positions of people were unknown" in "\n".join(sentences(explain(folder, 1.0)))
+    assert tells(text, "border", "watched area", "last known")
+    assert tells(sentences(explain(folder, 1.0)), "Cause", "not known")
 
 
 def test_a_run_of_another_area_is_not_taken_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -228,7 +228,7 @@ def test_a_run_of_another_area_is_not_taken_over(tmp_path: Path, capsys: pytest.
         np.testing.assert_array_equal(one, two)
     other = cell_around(tmp_path / "other.toml", 3.0)
     replay.run("fuse", first, out=tmp_path / "again", cell_file=other)
-    assert "watched is not as in" in capsys.readouterr().err
+    assert tells(capsys.readouterr().err.splitlines(), "fuse", "watched", "computed again")
 
 
 def test_a_plan_from_a_fused_run_is_the_same(tmp_path: Path) -> None:

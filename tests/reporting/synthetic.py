@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from hrcreplay.commands.report import compute
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, Floats, Ints
+from hrcreplay.reporting.metrics.series import Metric
 from hrcreplay.store.run_folder import Run
 
 LENGTHS_M = np.array([0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.27])
@@ -157,3 +160,54 @@ def make_run(seconds: float = 12.0, rate_hz: float = 100.0, *, human: bool = Tru
         counts={"frames_duplicate": 3, "points_not_finite": 17},
         notes=("header stamps are zero: arrival times used",),
     )
+
+
+def contact_table(run: Run, method: str, touching: range, *, person: str = "ground truth") -> pd.DataFrame:
+    """0.3 m away, but for some ticks in contact at a speed of its own each; the robot rests in the first 100 ticks."""
+    assert run.motion is not None
+    n = len(run.motion)
+    tick = np.arange(n)
+    touch = np.isin(tick, touching)
+    distance = np.where(touch, -0.001 * (tick - touching.start), 0.3 + 1e-5 * tick)
+    left_m = np.where(tick % 10 == 0, np.where(tick == 500, 0.04, 0.0), np.nan)
+    return pd.DataFrame(
+        {
+            "t_ns": run.motion["t_ns"],
+            "method": method,
+            "person": person,
+            "moving": tick >= 100,
+            "distance_m": distance,
+            "person_m": distance,
+            "other_m": np.nan,
+            "source": person,
+            "limb": np.where(touch, "LRA", "THX"),
+            "link": np.where(touch, "tool", "forearm"),
+            "tcp_speed": 0.001 * tick,
+            "contact_speed": 0.002 * tick,
+            "outside_m": np.where(touch & (tick >= 100), np.where(tick % 3 == 0, -0.02, 0.01), np.nan),
+            "left_m": left_m,
+            "left_limb": ["ULA" if out_m > 0.0 else None for out_m in left_m],
+            "left_full_m": np.where(tick % 20 == 0, left_m, np.nan),
+            "left_full_limb": ["ULA" if out_m > 0.0 else None for out_m in left_m],
+        }
+    )
+
+
+def contact_run() -> Run:
+    """A certified run with its contacts: the plan touches nobody, its baselines do."""
+    made = make_run()
+    plan = {**made.meta["settings"]["plan"], "certify": True, "horizon": "adaptive"}
+    meta = {**made.meta, "settings": {**made.meta["settings"], "plan": plan}}
+    meta |= {"limits": {"prediction": {"name": "people"}}}
+    assert made.motion is not None
+    motion = made.motion.assign(certified=True, horizon_s=0.02, tau_s=0.012)
+    blind = contact_table(made, "none", range(90, 150))
+    blind["outside_m"] = np.nan
+    contact = pd.concat([contact_table(made, "qp", range(0)), blind, contact_table(made, "scaling", range(95, 125))])
+    baselines = {"none": made.motion, "scaling": made.baselines["scaling"]}
+    return dataclasses.replace(made, meta=meta, motion=motion, baselines=baselines, contact=contact)
+
+
+def metrics_of(run: Run) -> dict[str, Metric]:
+    """What ``hrcreplay report`` computes of it."""
+    return compute(run, near_m=0.5, stationary_m_per_s=0.001)

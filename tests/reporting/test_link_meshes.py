@@ -127,8 +127,7 @@ def test_a_small_mesh_keeps_its_triangles() -> None:
 def test_the_page_draws_a_mesh_where_its_link_is(tmp_path: Path) -> None:
     scene = with_meshes(moving_scene(moving_run(4.0)), {1: box_on(1), 4: box_on(4)})
     part = replay_part(scene)
-    assert "meshes of the links" in part.html
-    assert "in the shell of the capsules" in part.html
+    assert 'data-show="meshes"' in part.html
     file = tmp_path / "page.html"
     file.write_text(f"<html><head><style>{part.style}</style></head><body>{part.html}</body></html>", encoding="utf-8")
     assert PROGRAM is not None
@@ -158,5 +157,5 @@ def test_the_page_draws_a_mesh_where_its_link_is(tmp_path: Path) -> None:
 
 def test_a_robot_without_meshes_has_no_switch_for_them() -> None:
     part = replay_part(moving_scene(moving_run(4.0)))
-    assert "meshes of the links" not in part.html
-    assert "Orange: the robot as the capsules" in part.html
+    assert 'data-show="meshes"' not in part.html
+    assert 'data-show="meshes"' in replay_part(with_meshes(moving_scene(moving_run(4.0)), {1: box_on(1)})).html

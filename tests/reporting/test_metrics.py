@@ -9,18 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hrcreplay.commands.report import compute
 from hrcreplay.records import JOINTS
 from hrcreplay.reporting.metrics.planning import add_plan, cycles, waited_s
 from hrcreplay.reporting.metrics.series import MetricTable, path_feet
 from hrcreplay.store.run_folder import Run
-from tests.reporting.synthetic import T0_NS, make_run
+from tests.reporting.synthetic import T0_NS, make_run, metrics_of
 
 ANGLES = JOINTS[2:12]
-
-
-def metrics_of(run: Run) -> dict[str, dict[str, Any]]:
-    return compute(run, near_m=0.5, stationary_m_per_s=0.001)
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hrcreplay.commands.report import compute
 from hrcreplay.records import Floats
 from hrcreplay.reporting.metrics.planning import programme_progress
-from tests.reporting.synthetic import T0_NS, make_run
+from tests.reporting.synthetic import T0_NS, make_run, metrics_of
 
 HZ = 100.0
 STOPS = np.array([[0.4, -0.3, 0.6], [0.4, -0.3, 0.3], [0.4, -0.3, 0.6], [0.4, 0.3, 0.6], [0.4, -0.3, 0.6]])
@@ -124,10 +123,10 @@ def test_a_programme_that_only_stands_has_no_pace() -> None:
     still = {f"{what}_{axis}": run.motion[f"{what}_{axis}"].iloc[0] for what in ("ref", "tcp") for axis in "xyz"}
     s = 0.01 * np.arange(len(run.motion))
     stands = dataclasses.replace(run, motion=run.motion.assign(**still, programme_s=s))
-    found = compute(stands, near_m=0.5, stationary_m_per_s=0.001)
+    found = metrics_of(stands)
     assert found["plan_progress_share"]["value"] is None
     assert "stands" in found["plan_progress_share"]["reason"]
     held = dataclasses.replace(run, motion=run.motion.assign(**still, programme_s=0.0))
-    found = compute(held, near_m=0.5, stationary_m_per_s=0.001)
+    found = metrics_of(held)
     assert found["plan_progress_share"]["value"] == 0.0
     assert found["plan_time_lost_s"]["value"] == pytest.approx(found["span_s"]["value"])

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
+from tests.facts import facts
 
 STOP_S = 0.377
 AT_ORIGIN = np.eye(4)
@@ -293,45 +294,45 @@ MESH = robot_xml(link("base"), link("arm", "<mesh filename='a.stl'/>"), joint("j
     ("xml", "options", "message"),
     [
         ("<robot", {}, "robot: not a URDF"),
-        ("<sdf><link name='a'/></sdf>", {}, "robot: found <sdf>"),
+        ("<sdf><link name='a'/></sdf>", {}, "robot | <sdf>"),
         (
             MESH,
             {},
-            "link 'arm' is the mesh 'a.stl', whose file is not known; .* robot.packages, or give robot.l",
+            "'arm' | 'a.stl' | robot.packages | robot.links",
         ),
-        (MESH.replace("<mesh filename='a.stl'/>", "<cone/>"), {}, "link 'arm' is cone; .* give robot.links"),
-        (MESH.replace("mesh", "sphere"), {}, "the sphere of link 'arm' has no size"),
-        (ONE_AXIS.replace("radius='0.1'", "radius='-1'"), {}, "the capsule of link 'arm' has no size; give its meas"),
-        (ONE_AXIS.replace("length='0.4'", ""), {}, "the capsule of link 'arm' has no size; give its measures in m"),
-        (MESH.replace("mesh filename='a.stl'", "box size='1 2'"), {}, "the box of link 'arm' has no size"),
-        (MESH.replace("mesh filename='a.stl'", "box size='1 2 0'"), {}, "the box of link 'arm' has no size"),
+        (MESH.replace("<mesh filename='a.stl'/>", "<cone/>"), {}, "'arm' | cone | robot.links"),
+        (MESH.replace("mesh", "sphere"), {}, "sphere | 'arm' | no size"),
+        (ONE_AXIS.replace("radius='0.1'", "radius='-1'"), {}, "capsule | 'arm' | no size"),
+        (ONE_AXIS.replace("length='0.4'", ""), {}, "capsule | 'arm' | no size"),
+        (MESH.replace("mesh filename='a.stl'", "box size='1 2'"), {}, "box | 'arm' | no size"),
+        (MESH.replace("mesh filename='a.stl'", "box size='1 2 0'"), {}, "box | 'arm' | no size"),
         (
             ONE_AXIS.replace("<collision>", "<collision><origin xyz='0 0 x'/>"),
             {},
-            "the capsule of arm cannot be read; check the numbers of its <collision>",
+            "capsule | arm | <collision>",
         ),
-        (robot_xml(link("base"), link("arm"), joint("j", "base", "arm")), {}, "no moving link .* robot.links"),
-        (ONE_AXIS, {"tcp_frame": "tool0"}, "robot.tcp_frame: the URDF has no link 'tool0'; it has base, arm"),
-        (ONE_AXIS, {"tcp_frame": "base"}, "no axis between 'base' and 'base'"),
-        (ONE_AXIS, {"acceleration": [1.0, 2.0]}, "robot.acceleration: found 2 values; other has 1 axes"),
-        (ONE_AXIS, {"segments": [Segment("a", "b", (0, 0, 0), (0, 0, 1), 0.1)]}, "robot.links: a: .* no link 'b'"),
-        (ONE_AXIS.replace("revolute", "prismatic"), {}, "joint 'lift' .* of type prismatic; only axes of rotation"),
-        (ONE_AXIS.replace("</joint>", "<mimic joint='x'/></joint>"), {}, "joint 'lift' .* is a mimic joint"),
-        (ONE_AXIS.replace("velocity='3'", ""), {}, "joint 'lift' has range -2.0 to 1.5 rad and top speed 0.0"),
-        (ONE_AXIS.replace("velocity='3'", "velocity='fast'"), {}, "limits of joint 'lift' are no numbers"),
+        (robot_xml(link("base"), link("arm"), joint("j", "base", "arm")), {}, "moving | robot.links"),
+        (ONE_AXIS, {"tcp_frame": "tool0"}, "robot.tcp_frame | 'tool0' | base, arm"),
+        (ONE_AXIS, {"tcp_frame": "base"}, "axis | 'base'"),
+        (ONE_AXIS, {"acceleration": [1.0, 2.0]}, "robot.acceleration | 2 values | 1 axes"),
+        (ONE_AXIS, {"segments": [Segment("a", "b", (0, 0, 0), (0, 0, 1), 0.1)]}, "robot.links | a | 'b'"),
+        (ONE_AXIS.replace("revolute", "prismatic"), {}, "'lift' | prismatic"),
+        (ONE_AXIS.replace("</joint>", "<mimic joint='x'/></joint>"), {}, "'lift' | mimic"),
+        (ONE_AXIS.replace("velocity='3'", ""), {}, "'lift' | -2.0 to 1.5 rad | 0.0"),
+        (ONE_AXIS.replace("velocity='3'", "velocity='fast'"), {}, "limits | 'lift'"),
         (
             ONE_AXIS.replace("parent link='base'", "parent link='nowhere'"),
             {},
-            "'lift' is between nowhere and arm; name",
+            "'lift' | nowhere | arm",
         ),
         (
             ONE_AXIS.replace("<link name='base'>", "<link name='x'/><link name='base'>"),
             {},
-            "2 links without a parent .x, base",
+            "2 links | x, base",
         ),
-        (ONE_AXIS.replace("0 0 0.5", "0 0 high"), {}, "the URDF of other cannot be read"),
+        (ONE_AXIS.replace("0 0 0.5", "0 0 high"), {}, "URDF | other"),
     ],
 )
 def test_what_cannot_be_used_is_named(xml: str, options: dict[str, object], message: str) -> None:
-    with pytest.raises(SettingsError, match=message):
+    with pytest.raises(SettingsError, match=facts(*message.split(" | "))):
         from_urdf(xml, AT_ORIGIN, stop_s=0.5, **options)  # type: ignore[arg-type]

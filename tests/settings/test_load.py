@@ -7,6 +7,7 @@ import pytest
 from hrcreplay.errors import SettingRenamed, SettingsError
 from hrcreplay.settings.load import Settings, as_overrides, load_settings
 from hrcreplay.settings.sections import setting
+from tests.facts import facts
 
 
 def test_defaults_are_the_papers() -> None:
@@ -25,7 +26,7 @@ def test_the_paper_as_printed_is_one_word_and_the_command_line_wins_over_it(tmp_
     assert (settings.prediction.method, settings.limits.prediction) == ("paper", "paper")
     assert (plan.horizon, plan.certify, plan.rows, plan.constraint_rhs) == ("fixed", False, "soft", "square")
     assert (plan.lead_s, plan.give_way_m, plan.jerk_s, plan.smooth_s) == (0.0, 0.0, 0.0, 0.0)
-    with pytest.raises(SettingsError, match="name a TOML file, or paper"):
+    with pytest.raises(SettingsError, match=facts(str(tmp_path / "paper"), "TOML")):
         load_settings(tmp_path / "paper")
 
 
@@ -69,23 +70,23 @@ def test_settings_that_are_not_the_defaults_as_a_command_line_gives_them() -> No
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[fusion]\nrate = 3\n", r"s\.toml: unknown setting 'fusion\.rate'; known here: rate_hz"),
-        ("[fusio]\nrate_hz = 3\n", r"unknown setting 'fusio'; known here: logs, fusion"),
-        ("[fusion]\nrate_hz = -3\n", r"fusion\.rate_hz: found -3; input should be greater than 0"),
-        ("[fusion]\nrate_hz = nan\n", r"fusion\.rate_hz: found nan"),
-        ("fusion = 3\n", r"fusion: found 3"),
-        ("[fusion\n", r"not TOML"),
-        ("[prediction]\nmethod = 'hopeful'\n", r"prediction\.method: found 'hopeful'; input should be 'paper'"),
+        ("[fusion]\nrate = 3\n", "s.toml | 'fusion.rate' | rate_hz"),
+        ("[fusio]\nrate_hz = 3\n", "'fusio' | logs, fusion"),
+        ("[fusion]\nrate_hz = -3\n", "fusion.rate_hz | -3 | greater than 0"),
+        ("[fusion]\nrate_hz = nan\n", "fusion.rate_hz | nan"),
+        ("fusion = 3\n", "fusion | 3"),
+        ("[fusion\n", "not TOML"),
+        ("[prediction]\nmethod = 'hopeful'\n", "prediction.method | 'hopeful' | 'paper'"),
         (
             "[[logs.decoders]]\ntopic='/a'\ncamera='a'\npoints='p'\nindex={nose=1}\n",
-            r"unknown body point 'nose'; known are pelvis",
+            "'nose' | pelvis",
         ),
     ],
 )
 def test_a_wrong_file_is_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "s.toml"
     file.write_text(text)
-    with pytest.raises(SettingsError, match=message) as caught:
+    with pytest.raises(SettingsError, match=facts(*message.split(" | "))) as caught:
         load_settings(file)
     assert "\n" not in str(caught.value)
     assert caught.value.exit_code == 2
@@ -94,19 +95,19 @@ def test_a_wrong_file_is_one_clear_line(tmp_path: Path, text: str, message: str)
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("fusion", "not of the form section.key=value"),
-        ("fusion.a.b=1", "not of the form section.key=value"),
-        ("fusion.rat=1", "unknown setting 'fusion.rat'"),
-        ("limits.tracking=3", "limits.tracking: found 3"),
+        ("fusion", "section.key=value"),
+        ("fusion.a.b=1", "section.key=value"),
+        ("fusion.rat=1", "'fusion.rat'"),
+        ("limits.tracking=3", "limits.tracking | 3"),
     ],
 )
 def test_a_wrong_override_is_one_clear_line(override: str, message: str) -> None:
-    with pytest.raises(SettingsError, match=message):
+    with pytest.raises(SettingsError, match=facts(*message.split(" | "))):
         load_settings(None, (override,))
 
 
 def test_a_missing_file_says_so(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"none\.toml: cannot be read"):
+    with pytest.raises(SettingsError, match=facts("none.toml", "cannot be read")):
         load_settings(tmp_path / "none.toml")
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.store import run_folder
+from tests.facts import facts
 
 
 def _columns(first: int, last: int) -> dict[str, np.ndarray]:
@@ -73,16 +74,16 @@ def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
 def test_an_existing_folder_is_refused_untouched(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "mine").write_text("precious")
-    with pytest.raises(SettingsError, match=r"run: exists already; name another folder with --out"):
+    with pytest.raises(SettingsError, match=facts("run", "exists", "--out")):
         run_folder.RunWriter(tmp_path / "run").__enter__()
     assert (tmp_path / "run" / "mine").read_text() == "precious"
 
 
 def test_a_run_that_is_under_way_is_not_read_and_not_overwritten(tmp_path: Path) -> None:
     with run_folder.RunWriter(tmp_path / "run") as run:
-        with pytest.raises(SettingsError, match="did not end"):
+        with pytest.raises(SettingsError, match=facts(run.partial.name, "did not end")):
             run_folder.read_meta(run.partial)
-        with pytest.raises(SettingsError, match="under way or was killed"):
+        with pytest.raises(SettingsError, match=facts("run.partial", "under way")):
             run_folder.RunWriter(tmp_path / "run").__enter__()
 
 

@@ -201,8 +201,8 @@ def test_sigterm_ends_it_with_its_report(server: socket.socket) -> None:
     ("call", "text"),
     [
         ({"host": "no such host.invalid", "port": 6510}, "no such address"),
-        ({"host": "127.0.0.1", "port": 99999}, "port is 99999; a whole number from 1 to 65535"),
-        ({"host": "127.0.0.1", "port": 6510, "duration_s": 0.0}, "duration is 0.0 s; a positive number"),
+        ({"host": "127.0.0.1", "port": 99999}, r"port .*99999.* 1 to 65535"),
+        ({"host": "127.0.0.1", "port": 6510, "duration_s": 0.0}, r"duration .*0\.0 s"),
     ],
 )
 def test_what_cannot_be_is_refused(call: dict[str, Any], text: str) -> None:

@@ -10,6 +10,7 @@ from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction.swept_volumes import PRINTED
 from hrcreplay.limits import load_limits
 from hrcreplay.records import DOF, JOINTS, Floats
+from tests.facts import facts
 from tests.human.people import random_states, states
 from tests.human.predictions import reachable
 
@@ -167,5 +168,5 @@ def test_one_row_has_the_bits_of_many() -> None:
 
 
 def test_an_unknown_method_is_named() -> None:
-    with pytest.raises(SettingsError, match=r"occupancy\.method: found 'guess'; choose one of paper, positions"):
+    with pytest.raises(SettingsError, match=facts("prediction.method", "'guess'", "paper", "positions")):
         one(HANGING, np.zeros(DOF), method="guess")

@@ -13,6 +13,7 @@ from hrcreplay.human.prediction.swept_volumes import METHODS, PRINTED, limb_radi
 from hrcreplay.limits import load_limits
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Prediction
+from tests.facts import facts
 from tests.human import predictions
 from tests.human.people import LENGTHS_M, directions, limb_points, random_states, raw_cloud, states
 from tests.human.predictions import reachable
@@ -192,7 +193,7 @@ def test_table_2_and_the_frame_of_the_record() -> None:
 
 
 def test_an_unknown_method_is_named() -> None:
-    with pytest.raises(SettingsError, match=r"occupancy\.method: found 'sphere'"):
+    with pytest.raises(SettingsError, match=facts("prediction.method", "'sphere'")):
         predict(standing(), method="sphere")
 
 

@@ -23,6 +23,7 @@ from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import PHASES
 from hrcreplay.live.verify import verify
 from tests.commands.arms import ARMS
+from tests.facts import facts
 from tests.live import made
 from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, start
 
@@ -148,5 +149,5 @@ def test_an_arm_of_five_axes_is_no_robot_of_egm(tmp_path: Path) -> None:
     links = "[{name='all', body='l4', start_m=[0, 0, 0], end_m=[0, 0, 0.1], radius_m=0.05}]"
     task = tmp_path / "task.toml"
     task.write_text("[[waypoints]]\njoints_deg = [0, 0, 0, 0, 0]\n[[waypoints]]\njoints_deg = [10, 0, 0, 0, 0]\n")
-    with pytest.raises(SettingsError, match="five has 5 axes; live drives robots of 6 to 14"):
+    with pytest.raises(SettingsError, match=facts("five", "5 axes", "6 to 14")):
         start(f"robot.urdf={urdf}", f"robot.links={links}", f"plan.task={task}")

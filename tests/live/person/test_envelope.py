@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hrcreplay.live.person.envelope import Opener, Sealer, UnverifiedError
 from hrcreplay.live.person.source import CameraSubscription
 from hrcreplay.settings.sections import ZenohKey
+from tests.facts import facts, tells
 from tests.live.person.test_zenoh import NOW_NS, notes, own, skeletons
 
 SECRET = b"sixteen bytes or"
@@ -36,7 +37,7 @@ def test_frames_in_order_are_opened_and_none_of_them_twice() -> None:
     sealed = [sealer.seal(b"%d" % n, NOW_NS + n) for n in range(4)]
     assert [one.open(sealed[n], NOW_NS) for n in (0, 1, 3)] == [b"0", b"1", b"3"]
     for n in (0, 1, 2, 3):
-        with pytest.raises(UnverifiedError, match="came twice, or after a later one"):
+        with pytest.raises(UnverifiedError, match="twice"):
             one.open(sealed[n], NOW_NS)
 
 
@@ -77,7 +78,7 @@ def test_no_byte_of_an_envelope_can_be_changed(at: int, by: int) -> None:
 
 @pytest.mark.parametrize("name", ["", "x" * 256])
 def test_a_source_without_a_usable_name_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match="1 to 255 would be right"):
+    with pytest.raises(ValueError, match=facts("1 to 255")):
         Sealer(SECRET, name)
 
 
@@ -86,9 +87,8 @@ def test_a_camera_s_frames_are_used_when_sealed_and_else_counted_and_told() -> N
     camera = CameraSubscription("left", ZenohKey(key="a"), opener("left"))
     messages = [list(camera.take("a", own(NOW_NS - 1000), NOW_NS)) for _ in range(5)]
     assert skeletons([one for lot in messages for one in lot]) == []
-    assert notes([one for lot in messages for one in lot]) == [
-        "live.zenoh.keys.left: 1 not verified, not used: not sealed"
-    ]
+    (note,) = notes([one for lot in messages for one in lot])
+    assert tells(note, "live.zenoh.keys.left", "1 not verified", "not sealed")
     sealed = Sealer(SECRET, "left").seal(own(NOW_NS - 1000), NOW_NS)
     assert len(skeletons(list(camera.take("a", sealed, NOW_NS)))) == 1
     assert skeletons(list(camera.take("a", sealed, NOW_NS))) == []

@@ -22,6 +22,7 @@ from hrcreplay.live.view.foxglove import FoxgloveStream, mesh
 from hrcreplay.live.view.status import Scene, SceneNames, pack, unpack
 from hrcreplay.records import POINTS, SweptVolumes
 from hrcreplay.reporting.scene_messages import upright_to
+from tests.facts import facts
 from tests.live.statuses import status
 
 # --- scene ---
@@ -217,5 +218,5 @@ def test_a_taken_port_is_told() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        with pytest.raises(SettingsError, match=r"--foxglove \d+: .*; name a port that is free"):
+        with pytest.raises(SettingsError, match=facts(f"--foxglove {taken.getsockname()[1]}", "free")):
             FoxgloveStream(taken.getsockname()[1])

@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hrcreplay.records import Floats, SweptVolumes
+from hrcreplay.records import SweptVolumes
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, Step, stop_along_path
 from hrcreplay.robot.control.controllers import ScalingController
 from hrcreplay.robot.control.path_controller import PathState, rates
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import Reference, parse_task
 from hrcreplay.settings.sections import Plan
@@ -21,21 +21,11 @@ from tests.robot.checker import violation
 from tests.robot.distances import by_coal
 from tests.robot.people import person, volumes
 from tests.robot.plain_rows import approach_rows, link_segment
-from tests.robot.swinging import PRINTED
+from tests.robot.swinging import DT_S, PRINTED, STOP_S, base, robot
 
-STOP_S, DT_S = 0.377, 0.004
+__all__ = ["robot"]  # the fixture
+
 SETTINGS = PlanSettings(PRINTED, dt_s=DT_S, stop_s=STOP_S)
-
-
-def base() -> Floats:
-    T_world_base = np.eye(4)
-    T_world_base[2, 3] = 0.65
-    return T_world_base
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return irb140(base(), stop_s=STOP_S)
 
 
 @pytest.fixture(scope="module")

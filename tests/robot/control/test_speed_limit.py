@@ -20,23 +20,20 @@ from hrcreplay.robot.control.control_step import (
 from hrcreplay.robot.control.minimiser import Solution, minimise
 from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, propose
 from hrcreplay.robot.control.separation import obstacles
-from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import approach, smooth_recorded
 from hrcreplay.robot.task import Reference, tcp_speed_cap
 from hrcreplay.settings.sections import Plan
 from tests.robot.checker import links
 from tests.robot.people import cloud, volumes
-from tests.robot.swinging import DT_S, HOME, STOP_S, base
+from tests.robot.swinging import DT_S, HOME, STOP_S, base, robot
+
+__all__ = ["robot"]  # the fixture
 from tests.robot.tasks import BOX, RACK, plan
 from tests.robot.tasks import HOME as HOME_WAYPOINT
 
 SETTINGS = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S, retreat_m=0.03)
 NOBODY = obstacles(volumes([np.full((1, 3), 50.0)]), 0)
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return irb140(base(), stop_s=STOP_S)
 
 
 def speed(q: Floats, dq: Floats) -> float:
