@@ -11,7 +11,7 @@ from hrcreplay.calibration.calibrate import in_window, track_of
 from hrcreplay.calibration.registration import ClockOffset, find_clock_offset, transform
 from hrcreplay.records import CameraFrames, Floats, SkeletonTrack
 
-#: A clock difference above both is reported: in frames of the slower camera, and [s].
+#: A clock difference above both is reported: in frames of the slower camera [frames], and [s].
 _FRAMES, _LEAST_S = 3.0, 0.1
 #: The offset must reduce the distance between the movements by this share, and by this distance.
 _NEARER, _NEARER_M = 0.85, 0.003

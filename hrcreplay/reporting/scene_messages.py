@@ -105,7 +105,7 @@ def surface(vertices_m: Floats, radius_m: float, rgba: Rgba = VOLUME) -> Any:
 
 
 def surface_mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, Ints]:
-    """Returns corners (k, 3) [m] and triangles (f, 3) of the surface of hull + ball above the floor.
+    """Returns corners (k, 3) [m] and triangles (f, 3) of hull + ball, (m, 3) vertices [m], above the floor.
 
     Each corner is the vertex with the largest extent along a direction, plus the ball's radius along it. The corners
     lie on the surface, so between them the drawing may be smaller than the volume, by millimetres.

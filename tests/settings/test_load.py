@@ -54,8 +54,8 @@ def test_settings_that_are_not_the_defaults_as_a_command_line_gives_them() -> No
         'live.zenoh={connect = ["tcp/cell:7447"], mode = "client"}',
         'logs.decoders=[{topic = "/bodies", camera = "left", points = "bodies.points", index = {head = 3}}]',
         'logs.topics=["/tf", "/two words"]',
-        "prediction.method=paper",
         "plan.q_p=[0.2, 0.3]",
+        "prediction.method=paper",
         "robot.urdf=/somewhere/on/disk/arm.urdf",
     )
     settings = load_settings(None, given)

@@ -21,7 +21,8 @@ def test_a_tool_says_what_it_does(
     tool: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", [tool, "--help"])
-    monkeypatch.delitem(sys.modules, f"tests.tools.{tool}", raising=False)  # another tool may have imported it
+    for module in (f"tests.tools.{tool}", f"tests.tools.{tool}.__main__"):  # another tool may have imported it
+        monkeypatch.delitem(sys.modules, module, raising=False)
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(f"tests.tools.{tool}", run_name="__main__", alter_sys=False)
     assert ended.value.code == 0

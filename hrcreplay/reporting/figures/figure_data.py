@@ -84,7 +84,7 @@ def fastest_walk(run_config: RunConfig, run: Run, people: HumanStates) -> Walk |
 
 
 def forearm_sweep(run_config: RunConfig, run: Run, people: HumanStates) -> Sweep | None:
-    """Computes the sweep by elbow and walking of the forearm nearest to the robot, or the right one, Fig. 7, 8."""
+    """Sweeps the forearm nearest to the robot, or the right one, by elbow and walking, Alg. 2 and Fig. 7, 8."""
     moment = moment_ns(run)
     if moment is None:
         return None

@@ -165,7 +165,7 @@ def draw_solids(
 
 
 def volume_solids(limbs: Mapping[str, SweptVolume], moved_m: Floats | None = None) -> list[RenderedHull]:
-    """Swept volumes in the colours of their limbs, above the floor.
+    """Returns coloured swept volumes above the floor, in the world [m].
 
     Args:
         limbs: Volumes to draw.
