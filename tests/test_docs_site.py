@@ -106,7 +106,7 @@ def test_the_api_page_has_every_public_name(site: Path) -> None:
     page = (site / "api.html").read_text()
     assert set(api.__all__) <= set(dir(hr))
     assert [name for name in api.__all__ if f'id="hrcreplay.api.{name}"' not in page] == []
-    assert "what stage 1 found" in page  # a comment beside a field
+    assert "counts and notes of stage 1" in page  # a comment beside a field
 
 
 def test_the_search_finds_equations_settings_and_error_lines(site: Path) -> None:
