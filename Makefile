@@ -17,7 +17,17 @@ test: $(VENV)/made
 	$(BIN)/mypy
 	$(BIN)/pytest --numprocesses $(PROCESSES)
 
-.PHONY: demo check test docs bench soundness fuzz readme picture people deviations lock clean
+# Format, lint, types and the quick tests, which tests/conftest.py lists.
+check: $(VENV)/made
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/pytest --quick --numprocesses $(PROCESSES)
+
+# The documentation as a site that needs no network, with a search and the API; see mkdocs.yml. Prints the page to open.
+docs: $(VENV)/made
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	@echo "$(CURDIR)/.docs-site/index.html"
 
 bench: $(VENV)/made
 	$(BIN)/pytest tests/benchmarks --benchmark-only
