@@ -29,7 +29,7 @@ PAGES = (
     "deviations",
     "changelog",
     "api",
-    "errors",
+    "reference",
     "examples/library",
 )
 #: What a browser loads of a page by itself.
@@ -116,5 +116,5 @@ def test_the_search_finds_equations_settings_and_error_lines(site: Path) -> None
     assert len(names) > 100
     assert [name for name in sorted(names) if not re.search(rf"\b{name}\b", settings)] == []
     assert "(66)" in texts["paper.html#section-5-trajectory-generation"]
-    assert any("choose one of" in text for address, text in texts.items() if address.startswith("errors.html"))
+    assert any("choose one of" in text for address, text in texts.items() if address.startswith("reference.html"))
     assert "max_reference_lead_m" in texts["guide.html#plan"]

@@ -6,7 +6,6 @@ import ast
 import json
 import posixpath
 import re
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -21,13 +20,12 @@ PAGES = {
     "README.md": "index.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
-    "reports/README.md": "reports.md",
     "datasets/README.md": "datasets.md",
     NOTEBOOK: "examples/library.md",
 }
 FILES = {page: file for file, page in PAGES.items()}
 #: How far up the search puts what it finds on a page, where that is not 1.
-BOOST = {"paper.md": 10, "guide.md": 2, "errors.md": 0.05, "deviations.md": 0.02, "changelog.md": 0.05}
+BOOST = {"paper.md": 10, "guide.md": 2, "deviations.md": 0.02, "changelog.md": 0.05}
 API = """# Python API
 
 `import hrcreplay as hr` gives these names; the [example](examples/library.md) uses most of them. Settings are those of
@@ -40,17 +38,6 @@ the [guide](guide.md#settings).
       show_root_heading: false
       show_root_toc_entry: false
 """
-ERRORS = """---
-hide: [toc]
----
-
-# Error lines
-
-Every message with which a command ends, and the file that it comes from; … stands for what was found. Exit code 2 is
-for settings and arguments, 3 for a log, 4 for a live session that stopped. The search finds each by
-its words; quotation marks around words find what has all of them.
-"""
-_EXIT_CODES = {"SettingsError": 2, "LogError": 3, "LiveStopped": 4}
 
 _BLOCK = re.compile(r"(^ *```.*?^ *```$)", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\(([^)\s#:]+)(#[^)\s]*)?\)")
@@ -59,13 +46,12 @@ _SECTION = re.compile(r"(?:\A|(?<=\n\n))(?=(?:# .*\n)*\[([\w.]+)\]$)", re.MULTIL
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds the pages from elsewhere, the API, the error lines, and the source files that pages name."""
+    """Adds the pages from elsewhere, the API, and the source files that pages name."""
     files.remove(files.src_uris[NOTEBOOK.removeprefix("docs/")])
     for file, page in PAGES.items():
         text = (ROOT / file).read_text()
         files.append(File.generated(config, page, content=notebook(text) if file == NOTEBOOK else text))
     files.append(File.generated(config, "api.md", content=API))
-    files.append(File.generated(config, "errors.md", content=error_page()))
     texts = [file.content_string for file in files.documentation_pages()]
     named = {name for text in texts for name in re.findall(r"\bhrcreplay/[\w/]+\.(?:py|toml|proto)\b", text)}
     for name in sorted(name for name in named if (ROOT / name).is_file()):
@@ -158,34 +144,3 @@ def notebook(text: str) -> str:
     cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"]]
     parts = [f"```python\n{source}\n```" if kind == "code" else source for kind, source in cells]
     return "\n\n".join([*parts, "The notebook itself: `docs/examples/library.ipynb`."]) + "\n"
-
-
-def error_page() -> str:
-    """All messages of the errors that a user sees, by file."""
-    lines = [ERRORS]
-    for path in sorted((ROOT / "hrcreplay").rglob("*.py")):
-        text = path.read_text()
-        found = list(dict.fromkeys(_messages(text))) if any(f"{name}(" in text for name in _EXIT_CODES) else []
-        if found:
-            lines += [f"## `{path.relative_to(ROOT / 'hrcreplay').as_posix()}`", ""]
-            lines += [
-                f"#### `` {message} ``\n\nExit code {code}.\n" for code, message in found
-            ]  # headings: titles to search
-    return "\n".join(lines)
-
-
-def _messages(source: str) -> Iterator[tuple[int, str]]:
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args:
-            code, text = _EXIT_CODES.get(node.func.id), _text(node.args[0])
-            if code is not None and any(letter.isalpha() for letter in text):
-                yield code, " ".join(text.split())
-
-
-def _text(node: ast.AST) -> str:
-    """A string as it is written; … for what it is filled with."""
-    if isinstance(node, ast.JoinedStr):
-        return "".join(map(_text, node.values))
-    if isinstance(node, ast.BinOp):
-        return _text(node.left) + _text(node.right)
-    return str(node.value) if isinstance(node, ast.Constant) and isinstance(node.value, str) else "…"
