@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.egm.codec import ARM_JOINTS, MOST_JOINTS, Mci, Motors, Rapid, RobotPacket, encode_robot
 from hrcreplay.egm.link import EgmSession
-from hrcreplay.errors import SettingsError
+from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.fusion.fuse import MEDIAN_LENGTHS_M
 from hrcreplay.human.model import skeleton
 from hrcreplay.live.control.session_controller import SessionController
@@ -127,6 +127,7 @@ def start_table(run_config: RunConfig, header: Header, *, sending: bool) -> dict
     predicted = assembly.prediction_stage(run_config)
     return {
         "hrcreplay": __version__,
+        "record": codec.FORMAT,
         "settings": known["settings"],
         "versions": known["versions"],
         "machine": known["machine"],
@@ -203,8 +204,14 @@ def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfi
     """The run of a session, from its start table.
 
     Raises:
+        LogError: Its record has another format.
         SettingsError: Its settings or its limit sets are not those of this version.
     """
+    if (found := start.get("record", 1)) != codec.FORMAT:
+        raise LogError(
+            f"{log}: its record has format {found}, and this version of hrcreplay reads format {codec.FORMAT}; would be "
+            "right: the version that recorded the session"
+        )
     try:
         settings = Settings.model_validate(with_new_names(start["settings"])[0])
     except ValidationError as error:

@@ -116,6 +116,9 @@ class Perception:
     horizon_s: float  #: how long after ``t_ns`` they hold, the latency aside [s]
 
 
+#: Version of the messages, kept in the start event; records of another one cannot be decoded.
+FORMAT = 2
+
 ROBOT, REPLY, SKELETON, PERCEPTION, VOLUMES, DECISION, TIMEOUT, EVENT = (b"R", b"C", b"F", b"L", b"V", b"A", b"S", b"E")
 
 _HEAD = struct.Struct("<cq")

@@ -11,6 +11,7 @@ import pytest
 
 from hrcreplay.commands import replay
 from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.live.control.setup import run_config_of
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import PHASES, Signal
 from hrcreplay.live.verify import verify
@@ -90,6 +91,14 @@ def test_states_are_those_of_the_session(run: Path, flight: Flight) -> None:
         np.testing.assert_array_equal(getattr(table, name), wanted)
     np.testing.assert_array_equal(table.valid, np.concatenate([state.valid for state in flight.states]))
     assert table.cameras == flight.states[0].cameras
+
+
+def test_a_record_of_another_format_is_refused(flight: Flight) -> None:
+    assert run_config_of(flight.start, Path("log.mcap"), "").command == "live"
+    older = {name: value for name, value in flight.start.items() if name != "record"}
+    for start, found in ((older, "1"), (flight.start | {"record": 99}, "99")):
+        with pytest.raises(LogError, match=facts("log.mcap", f"format {found}", f"format {codec.FORMAT}", "version")):
+            run_config_of(start, Path("log.mcap"), "")
 
 
 def test_motions_are_those_of_the_session(run: Path, flight: Flight) -> None:
