@@ -12,5 +12,5 @@ from hrcreplay.reporting.figures import catalogue
 @contextmanager
 def undrawn() -> Iterator[None]:
     """Makes the folder of the figures, and leaves it empty."""
-    with mock.patch.object(catalogue, "wanted", return_value=()):
+    with mock.patch.object(catalogue, "select_figures", return_value=()):
         yield

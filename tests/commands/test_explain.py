@@ -155,7 +155,7 @@ def assert_nearest(found: dict[str, Any], record: Record, tick: int) -> None:
 def test_ten_stops_of_the_demo_are_told_as_brute_force_finds_them(
     record: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tasks = spied(monkeypatch, "held_by")
+    tasks = spied(monkeypatch, "find_holding_rows")
     stops = explain.longest_stops(record.motion, SLOW)
     assert len(stops) == 10
     kinds = set()
@@ -180,7 +180,7 @@ def test_ten_stops_of_the_demo_are_told_as_brute_force_finds_them(
 
 
 def test_moving_ticks_are_told_as_another_solver_finds_them(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
-    tasks = spied(monkeypatch, "held_by")
+    tasks = spied(monkeypatch, "find_holding_rows")
     status, reason = (record.motion[name].fillna("").astype(str).to_numpy() for name in ("status", "reason"))
     speed = record.motion["tcp_speed"].to_numpy()
     held = 0
