@@ -1,1 +1,1 @@
-"""The robot: model, programmed path, separation, constraints, controllers. Pure."""
+"""The robot: model, programmed path, separation, constraints, controllers. Has no side effects."""

@@ -1,8 +1,8 @@
-"""The ABB IRB 140: axes of the product specification 3HAC041346-001, link capsules of our own.
+"""The ABB IRB 140: axes from the product specification 3HAC041346-001, link capsules from this project.
 
-Zero is the controller's: upper arm up, forearm level; so are the signs. Nothing here is taken from a community URDF.
-The only definition of that robot: the controller's model, the EGM codec and the robot double read it, so this module
-imports nothing that is slow to load.
+Zero position and signs are those of ABB's controller; at zero the upper arm points up and the forearm is level.
+Nothing here comes from a community URDF. This is the only definition of the robot. The controller's model, the EGM
+codec and the robot double read it, so this module imports nothing that is slow to load.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ Vector = tuple[float, float, float]
 class Axis(NamedTuple):
     """One revolute axis."""
 
-    offset_m: Vector  #: from the axis before it, at zero [m]
-    direction: tuple[int, int, int]  #: at zero, x forward, z up
+    offset_m: Vector  #: from the previous axis, at the zero position [m]
+    direction: tuple[int, int, int]  #: at the zero position; x points forward, z up
     range_deg: tuple[int, int]
     speed_deg_per_s: int  #: top speed
 
@@ -54,9 +54,9 @@ def urdf() -> str:
 
 
 def capsules(tool_m: float) -> tuple[tuple[str, str, Vector, Vector, float], ...]:
-    """Its link capsules; the last reaches from the flange to the TCP, ``tool_m`` beyond it [m].
+    """Link capsules of the robot; the last reaches from the flange to the TCP, ``tool_m`` beyond the flange [m].
 
-    The base column does not move and needs none.
+    The base column does not move, so it has no capsule.
     """
     zero = (0.0, 0.0, 0.0)
     return (

@@ -1,4 +1,4 @@
-"""Link segments: the capsules that stand for a robot's links, the smallest around the collision shapes of its URDF."""
+"""Link segments: small capsules that enclose the links of a robot, fitted to the collision shapes of its URDF."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class MeshSurface:
-    """The triangles of a collision mesh, to be drawn; what is computed knows the capsule around them alone."""
+    """The triangles of a collision mesh, for drawing only; all computations use the capsule around them."""
 
     vertices_m: Floats  #: (k, 3) in the frame of the segment's body [m]
-    triangles: Ints  #: (t, 3) which vertices
+    triangles: Ints  #: (t, 3) indices of vertices
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A capsule around one link, whose axis is that of Eq. (4). Both ends are on one body, as Eq. (5) needs.
+    """A capsule around one link, with the axis of Eq. (4). Both ends are on one body, as Eq. (5) requires.
 
-    The settings give one as ``LinkSettings``; here it also knows the collision shape that it was fitted to.
+    ``LinkSettings`` is the same capsule in the settings; this class adds the collision shape it is fitted to.
     """
 
     name: str
@@ -38,8 +38,8 @@ class Segment:
     start_m: Vector  #: first end in the body's frame [m]
     end_m: Vector  #: second end in the body's frame [m]
     radius_m: float
-    shape_m3: float = math.nan  #: volume of the collision shape's convex hull inside it; NaN where it was given [m^3]
-    surface: MeshSurface | None = field(default=None, compare=False, repr=False)  #: of the mesh that it was fitted to
+    shape_m3: float = math.nan  #: volume of the enclosed collision shape's convex hull; NaN for a given capsule [m^3]
+    surface: MeshSurface | None = field(default=None, compare=False, repr=False)  #: the mesh it is fitted to
 
     @property
     def volume_m3(self) -> float:
@@ -47,15 +47,16 @@ class Segment:
         return capsule_m3(math.dist(self.start_m, self.end_m), self.radius_m)
 
 
-#: Ends are rounded to 0.1 mm and the radius up to it: the last bits of the search rarely reach an output.
+#: Ends are rounded to 0.1 mm and the radius is rounded up to 0.1 mm: rounding errors of the search rarely change them.
 _DECIMALS = 4
 
 
 def fit(points_m: Floats) -> tuple[Floats, Floats, float]:
-    """A capsule of small volume that encloses points.
+    """Fits a capsule of small volume that encloses the points.
 
-    Nelder and Mead's simplex over the axis' direction, its place and the radius, from each principal axis of the
-    points; the ends follow, as near to each other as the points allow. The radius is last, and encloses every point.
+    Runs Nelder and Mead's simplex search over direction and position of the axis and over the radius, once from each
+    principal axis of the points. The ends are then placed as near to each other as the points allow. At last the
+    radius is set so that it encloses every point.
 
     Args:
         points_m: (n, 3) [m].
@@ -70,7 +71,7 @@ def fit(points_m: Floats) -> tuple[Floats, Floats, float]:
     simplex = 0.15 * np.vstack([np.zeros(5), np.eye(5)])
     coarse = [_search(shape, simplex, 200) for shape in shapes]
     best = min(range(3), key=lambda i: float(coarse[i].fun))
-    fine = _search(shapes[best], coarse[best].x + 0.3 * simplex, 400)  # the first simplex may have gone flat
+    fine = _search(shapes[best], coarse[best].x + 0.3 * simplex, 400)  # the first simplex may have degenerated
     line, low, high, _ = _on_axis(fine.x, *shapes[best])
     start, end = line[0] + low * line[1], line[0] + high * line[1]
     start, end = np.round(start, _DECIMALS), np.round(end, _DECIMALS)
@@ -99,7 +100,7 @@ def hull_m3(points_m: Floats) -> float:
 
 
 def _corners(points_m: Floats) -> Floats:
-    """The vertices of the hull, which the capsule encloses with all the others; of flat sets the points themselves."""
+    """Vertices of the convex hull, or the points themselves if they lie in a plane. Enclosing them encloses all."""
     points = np.unique(points_m, axis=0)
     try:
         return points[np.sort(ConvexHull(points).vertices)]
@@ -108,14 +109,14 @@ def _corners(points_m: Floats) -> Floats:
 
 
 def _search(shape: tuple[Floats, Floats, Floats, float], simplex: Floats, iterations: int) -> Any:
-    from scipy.optimize import minimize  # takes half a second to import, and a live session's helpers need no meshes
+    from scipy.optimize import minimize  # the import takes 0.5 s; live helper processes do not need it
 
     options = {"initial_simplex": simplex, "xatol": 1e-5, "fatol": 0.0, "maxiter": iterations, "maxfev": 2 * iterations}
     return minimize(_volume, simplex[0], shape, "Nelder-Mead", options=options)
 
 
 def _volume(x: Floats, corners: Floats, centre: Floats, frame: Floats, size: float) -> float:
-    """Volume over the cube of the points' size, so that large and small shapes stop alike."""
+    """Volume divided by the cube of the points' size, so that the search stops alike for large and small shapes."""
     _, low, high, radius = _on_axis(x, corners, centre, frame, size)
     return capsule_m3(high - low, radius) / size**3
 
@@ -124,10 +125,10 @@ def _volume(x: Floats, corners: Floats, centre: Floats, frame: Floats, size: flo
 def _on_axis(
     x: Floats, corners: Floats, centre: Floats, frame: Floats, size: float
 ) -> tuple[Floats, float, float, float]:
-    """The shortest capsule on one axis: direction x[0:2], place x[2:4], radius least where x[4] is zero.
+    """The shortest capsule on one axis: direction x[0:2], position x[2:4], smallest radius if x[4] is zero.
 
     Returns:
-        Origin and direction of the axis (2, 3), where on it the capsule's ends are, and its radius.
+        Origin and direction of the axis (2, 3), positions of the capsule's two ends along it, and the radius.
     """
     line = np.empty((2, 3))
     line[0] = centre + size * (x[2] * frame[1] + x[3] * frame[2])
@@ -143,7 +144,7 @@ def _on_axis(
     radius2 = off2.max() * (1.0 + x[4] * x[4])
     low, high = math.inf, -math.inf
     for i in range(count):
-        half = math.sqrt(radius2 - off2[i])  # a ball centred within this of the corner's foot holds the corner
+        half = math.sqrt(radius2 - off2[i])  # a ball centred within this distance of the corner's foot encloses it
         low, high = min(low, along[i] + half), max(high, along[i] - half)
     if low > high:  # one ball is enough
         low = high = 0.5 * (low + high)
@@ -155,21 +156,21 @@ KINDS = ("box", "capsule", "cylinder", "mesh", "sphere")
 
 @dataclass(frozen=True)
 class Shape:
-    """One collision shape of a link, as the URDF has it."""
+    """One collision shape of a link in the URDF."""
 
-    name: str  #: of the link; numbered where the link has several
+    name: str  #: name of the link, with a number if the link has several shapes
     link: str
     collision: ET.Element
     geometry: ET.Element  #: <box>, <capsule>, <cylinder>, <mesh> or <sphere>
 
     @property
     def kind(self) -> str:
-        """One of KINDS, or what the URDF has instead."""
+        """One of KINDS, or the unknown tag that the URDF contains."""
         return self.geometry.tag
 
     @property
     def mesh(self) -> str | None:
-        """The file that a mesh names."""
+        """File name of a mesh; None for other shapes."""
         return self.geometry.get("filename", "") if self.kind == "mesh" else None
 
 
@@ -177,12 +178,13 @@ class Shape:
 class Extent:
     """Extent of a collision shape in the link's frame.
 
-    Box, mesh: the convex hull of the points. Capsule, cylinder, sphere: what is round about the axis between two.
+    For a box or a mesh, the convex hull of the points. For a capsule, a cylinder or a sphere, the radius around the
+    axis between two points.
     """
 
     points_m: Floats  #: (n, 3) corners or vertices, or (2, 3) ends of the axis [m]
-    radius_m: float  #: 0 where nothing is round [m]
-    triangles: Ints | None = None  #: (t, 3) which vertices of a mesh; None of any other shape
+    radius_m: float  #: 0 for box and mesh [m]
+    triangles: Ints | None = None  #: (t, 3) indices of the vertices of a mesh; None for other shapes
 
 
 def shapes(links: Sequence[ET.Element]) -> tuple[Shape, ...]:
@@ -200,14 +202,14 @@ def shapes(links: Sequence[ET.Element]) -> tuple[Shape, ...]:
 
 
 def capsules(found: Sequence[Shape], extents: Mapping[str, Extent]) -> tuple[Segment, ...]:
-    """A capsule around every shape, named after it.
+    """Fits a capsule around every shape and gives it the name of the shape.
 
     Args:
         found: Collision shapes.
-        extents: Name of each of them -> what it takes up.
+        extents: Name of each shape -> its extent.
 
     Raises:
-        SettingsError: There is none, or one without a size.
+        SettingsError: There is no shape, or a shape has no size.
     """
     if not found:
         raise SettingsError("robot: no moving link of the URDF has a collision shape; give its capsules in robot.links")

@@ -1,8 +1,8 @@
 """The robot's kinematics in the world frame. The only module that imports pinocchio.
 
-It opens no file itself, but pinocchio does where a URDF has meshes: its geometry model takes their paths, not their
-bytes. That happens once, when a robot is made. Shapes, their places and the joints that are held are pinocchio's; what
-it does not tell of a URDF is read in ``robot.urdf``.
+The module opens no file itself. If a URDF has meshes, pinocchio opens their files, because its geometry model takes
+paths and not bytes; this happens once, when the robot is built. pinocchio reads the shapes and their placements and
+locks joints; ``robot.urdf`` reads the parts of a URDF that pinocchio does not report.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = ["RobotModel", "RobotPose", "Segment", "from_urdf", "irb140"]
 
 @dataclass(frozen=True, slots=True)
 class RobotPose:
-    """Everything the controller needs of one instant, world frame. Rows of twists: linear, then angular."""
+    """Kinematics that the controller needs at one instant, world frame. Rows of twists: linear, then angular."""
 
     T_world_tcp: Floats  #: (4, 4)
     J_tcp: Floats  #: (6, nv) velocity of the TCP's origin and angular velocity [m/rad, rad/rad]
@@ -47,24 +47,24 @@ class LinkMotion(NamedTuple):
     """Segments at many instants, in the world frame."""
 
     ends_m: Floats  #: (n, s, 2, 3) ends of the segments [m]
-    twist: Floats  #: (n, s, 6) velocity of the link's point that is now at the world's origin, and angular velocity
+    twist: Floats  #: (n, s, 6) velocity of the link's point at the world's origin, and angular velocity
 
     def speed(self, link: Ints, points_m: Floats) -> Floats:
-        """(n,) speed of a point (n, 3) [m] that is fixed on a link, (n,) indices of segments [m/s]."""
+        """(n,) speed of points (n, 3) [m] that are fixed to links, given as (n,) indices of segments [m/s]."""
         twist = self.twist[np.arange(len(link)), link]
         return np.asarray(np.linalg.norm(twist[:, :3] + np.cross(twist[:, 3:], points_m), axis=1))
 
 
-#: A TCP this far from all capsules is not guarded [m].
+#: A TCP further than this from all capsules is not guarded [m].
 _OUTSIDE_M = 1e-3
-_TOOL_RADIUS_M = 0.05  # a gripper's, of the capsule that the remedy proposes
+_TOOL_RADIUS_M = 0.05  # radius of the capsule that the remark proposes; fits a gripper
 
 
 @dataclass(frozen=True)
 class RobotModel:
     """A serial robot on its base. Arrays are (nv,) [rad] and derivatives; an endless axis has infinite ``q_max``.
 
-    ``pose`` works in buffers that belong to the model: one thread at a time.
+    ``pose`` writes to buffers of the model, so only one thread at a time may call it.
     """
 
     name: str
@@ -76,14 +76,14 @@ class RobotModel:
     segments: tuple[Segment, ...]
     T_world_base: Floats  #: (4, 4)
     shoulder_m: Floats  #: (3,) origin of the first axis, world [m]
-    reach_m: float  #: no pose of the TCP is further from there [m]
-    span_m: float  #: no point of a segment's axis is ever further from the base's origin [m]
+    reach_m: float  #: upper bound of the distance from ``shoulder_m`` to the TCP [m]
+    span_m: float  #: upper bound of the distance from the base's origin to a point of a segment's axis [m]
     base_frame: str  #: link that stands on ``T_world_base``
     tcp_frame: str  #: link that carries the tool
-    locked: tuple[str, ...]  #: joints off the chain, held at zero or the end of their range next to it
+    locked: tuple[str, ...]  #: joints off the chain, locked at zero or at the nearest end of their range
     tcp_in_frame_m: Floats  #: (3,) TCP in the frame of that link [m]
-    tcp_outside_m: float  #: how far the TCP is from the capsules of the last link; 0 inside one, NaN without one [m]
-    axis_reach_m: Floats  #: (nv, s) no point of a segment's axis is ever further than this from an axis of rotation [m]
+    tcp_outside_m: float  #: distance from the TCP to the capsules of the last link; 0 inside one, NaN without one [m]
+    axis_reach_m: Floats  #: (nv, s) upper bound of the distance from an axis of rotation to a segment's axis [m]
     _kinematics: _Kinematics = field(repr=False, compare=False)
 
     @property
@@ -93,7 +93,7 @@ class RobotModel:
 
     @property
     def unguarded_tool(self) -> str | None:
-        """Remark where the TCP is outside of every capsule, with the setting that guards it; else None."""
+        """Remark if the TCP is outside every capsule, with the setting that guards it; else None."""
         if not self.tcp_outside_m > _OUTSIDE_M:
             return None
         end = ", ".join(f"{at:.4g}" for at in (self.tcp_in_frame_m + 0.0).tolist())
@@ -107,7 +107,7 @@ class RobotModel:
     def pose(self, q: Floats, dq: Floats) -> RobotPose:
         """Forward kinematics, Jacobians and Jdot dq of Eq. (66b), corrected, and Eq. (66c) at one instant.
 
-        The print has two dots on J in Eq. (66b); one is right: docs/paper.md.
+        The printed Eq. (66b) has two dots on J; one dot is correct, see docs/paper.md.
 
         Args:
             q: (nv,) [rad].
@@ -120,7 +120,7 @@ class RobotModel:
         return self._kinematics.ends_m(q)
 
     def R_bodies(self, q: Floats) -> Floats:
-        """(s, 3, 3) of the bodies that the segments are on to the world, for joint positions (nv,) [rad]."""
+        """(s, 3, 3) rotations from the segments' bodies to the world, for joint positions (nv,) [rad]."""
         return self._kinematics.R_bodies(q)
 
     def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
@@ -134,7 +134,7 @@ class RobotModel:
 
 
 class _Kinematics:
-    """pinocchio's model and data, and views of the data that stay valid as long as it lives."""
+    """pinocchio's model and data, and views into the data."""
 
     def __init__(self, model: Any, points: Sequence[int], tcp: int) -> None:
         self._model, self._data = model, model.createData()
@@ -178,7 +178,7 @@ class _Kinematics:
 def _jacobians(
     J: Floats, dJ: Floats, dq: Floats, tcp: Floats, points: Floats, moves: Bools
 ) -> tuple[Floats, Floats, Floats]:
-    """Jacobians at points of the world from pinocchio's, which are those of the points now at the world's origin."""
+    """Jacobians at points of the world, from pinocchio's Jacobians, which refer to the world's origin."""
     nv = J.shape[1]
     J_points = np.zeros((len(points), 3, nv))
     for i in range(len(points)):
@@ -193,7 +193,7 @@ def _jacobians(
         J_tcp[3:, j] = J[3:, j]
         twist += J_tcp[:, j] * dq[j]
         dJdq += dJ[:, j] * dq[j]
-    # Jdot dq of Eq. (66b), (66c): acceleration of the TCP itself from the spatial one,
+    # Jdot dq of Eq. (66b), (66c): acceleration of the TCP from the spatial acceleration,
     # d/dt (v_O + w x p) = a_O + dw x p + w x v_p
     dJdq[:3] += _cross(dJdq[3:], tcp) + _cross(twist[3:], twist[:3])
     return J_tcp, dJdq, J_points
@@ -218,9 +218,9 @@ def irb140(
     Args:
         T_world_base: (4, 4) robot base in the world [m].
         stop_s: T_s of Eq. (70) [s].
-        tool_m: [m].
-        T_tool_tcp: (4, 4) TCP from there; none: there itself [m].
-        tool_segments: Capsules of what is mounted there, beside its own.
+        tool_m: Distance from the flange to the tool point along the flange's z axis [m].
+        T_tool_tcp: (4, 4) TCP in the frame of the tool point; none: the tool point [m].
+        tool_segments: Capsules of what is mounted on the flange, in addition to the robot's own.
         acceleration: (6,) limits [rad/s^2]; none: top speed / T_s, so that every axis can stop within T_s.
     """
     return from_urdf(
@@ -248,19 +248,21 @@ def from_urdf(
     acceleration: Sequence[float] = (),
     meshes: Mapping[str, str] | None = None,
 ) -> RobotModel:
-    """A robot from URDF text. Joints that do not lie between base and tool are locked, where they can be at zero.
+    """Builds a robot from URDF text.
+
+    Joints that do not lie between base and tool are locked, at zero if their range contains zero.
 
     Args:
         xml: URDF text.
         T_world_base: (4, 4) robot base in the world [m].
         stop_s: T_s of Eq. (70) [s].
-        tcp_frame: Link that carries the tool; none: the last that revolute joints move.
+        tcp_frame: Link that carries the tool; none: the last link that revolute joints move.
         base_frame: Link that stands on ``T_world_base``; none: the URDF's root.
-        tool_m: TCP beyond the tool's link, along its z axis [m].
-        T_tool_tcp: (4, 4) TCP from there; none: there itself [m].
+        tool_m: Distance from the tool's link to the tool point along the link's z axis [m].
+        T_tool_tcp: (4, 4) TCP in the frame of the tool point; none: the tool point [m].
         segments: Link capsules; none: derived from the collision shapes.
         acceleration: (nv,) limits [rad/s^2]; none: top speed / T_s.
-        meshes: File that a collision mesh names -> its path; pinocchio reads it where there are no segments.
+        meshes: File name in a collision mesh -> its path; pinocchio reads it if ``segments`` is empty.
 
     Raises:
         SettingsError: The URDF, a mesh, a segment's body or the number of accelerations cannot be used.
@@ -306,7 +308,7 @@ def _add_ends(model: Any, segments: Sequence[Segment]) -> list[int]:
 
 
 def _accelerations(robot: Description, given: Sequence[float], stop_s: float) -> Floats:
-    """(nv,) limits, which a URDF does not have [rad/s^2]."""
+    """(nv,) acceleration limits, which a URDF does not contain [rad/s^2]."""
     ddq_max = np.array(given, dtype=float) if len(given) else robot.dq_max / stop_s
     if ddq_max.shape != robot.dq_max.shape:
         raise SettingsError(f"robot.acceleration: found {len(given)} values; {robot.name} has {len(robot.joints)} axes")
@@ -314,7 +316,7 @@ def _accelerations(robot: Description, given: Sequence[float], stop_s: float) ->
 
 
 def _whole(robot: Description) -> Any:
-    """Pinocchio's model of every joint, those off the chain too."""
+    """Pinocchio's model with every joint, including those off the chain."""
     try:
         return pin.buildModelFromXML(robot.text)
     except ValueError as error:
@@ -334,7 +336,7 @@ def _extents(whole: Any, robot: Description, meshes: Mapping[str, str]) -> dict[
     found = {one.name: one for one in geometry.geometryObjects}
     extents = {}
     for shape in robot.shapes:
-        if names[shape.name] not in found:  # pinocchio leaves out what it cannot read, and raises nothing
+        if names[shape.name] not in found:  # pinocchio skips a shape that it cannot read, without an error
             raise unreadable(shape)
         one = found[names[shape.name]]
         T_link_shape = whole.frames[one.parentFrame].placement.inverse() * one.placement
@@ -345,7 +347,7 @@ def _extents(whole: Any, robot: Description, meshes: Mapping[str, str]) -> dict[
 
 
 def _chain(whole: Any, joints: Sequence[str]) -> Any:
-    """The model with the other joints locked where they are zero, or at the end of their range next to it."""
+    """The model with the other joints locked at zero, or at the end of their range that is nearest to zero."""
     others = [i for i in range(1, whole.njoints) if whole.names[i] not in joints]
     q = pin.neutral(whole)
     for i in others:
@@ -359,7 +361,7 @@ def _chain(whole: Any, joints: Sequence[str]) -> Any:
 
 
 def _place_base(model: Any, base: str, T_world_base: Any) -> None:
-    """Moves what hangs on the root so that the base link is where it should be, and pinocchio's world is ours."""
+    """Moves everything below the root so that the base link is at ``T_world_base`` in pinocchio's world."""
     T_world_root = T_world_base * _body(model, base, "robot.base_frame").placement.inverse()
     for joint in range(1, model.njoints):
         if model.parents[joint] == 0:
@@ -370,7 +372,7 @@ def _place_base(model: Any, base: str, T_world_base: Any) -> None:
 
 
 def _add_frame(model: Any, body: str, offset: Any, where: str) -> int:
-    """Index of a new frame fixed on a link (or on a joint's frame)."""
+    """Adds a frame that is fixed to a link (or to a joint's frame) and returns its index."""
     frame = _body(model, body, where)
     name = f"point {model.nframes}"
     return int(model.addFrame(pin.Frame(name, frame.parentJoint, frame.placement * offset, pin.FrameType.OP_FRAME)))
@@ -385,13 +387,13 @@ def _body(model: Any, body: str, where: str) -> Any:
 
 
 def _reach_m(model: Any, tcp: int) -> float:
-    """The arm stretched: the offsets from the second joint to the TCP one after another [m]."""
+    """Length of the stretched arm: the sum of the offsets from the second joint to the TCP [m]."""
     links = (*model.jointPlacements[2:], model.frames[tcp].placement)
     return sum(norm_n(link.translation) for link in links)
 
 
 def _span_m(model: Any, points: Sequence[int], T_world_base: Floats) -> float:
-    """The arm stretched from the base to the furthest end of a segment: the offsets one after another [m]."""
+    """Length of the stretched arm from the base to the furthest end of a segment: the sum of the offsets [m]."""
     most = 0.0
     for point in points:
         frame = model.frames[point]
@@ -404,10 +406,11 @@ def _span_m(model: Any, points: Sequence[int], T_world_base: Floats) -> float:
 
 
 def _axis_reach_m(model: Any, points: Sequence[int]) -> Floats:
-    """(nv, s) largest distance of each segment from each axis, however the axes between them stand [m].
+    """(nv, s) largest distance of each segment from each axis, over all positions of the axes between them [m].
 
-    The offset next to an axis turns about it, so only its part across the axis counts; those further out may point
-    anywhere. The distance from a line is convex, so it is largest at an end of the segment.
+    The offset next to an axis turns about this axis, so only its part perpendicular to the axis counts. The offsets
+    further out may point anywhere, so their full length counts. The distance from a line is convex, so it is largest
+    at an end of the segment.
     """
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
@@ -428,7 +431,7 @@ def _shift(offset_m: Vector) -> Any:
 
 
 def _outside(model: Any, segments: Sequence[Segment], points: Sequence[int], tcp: int) -> float:
-    """Distance of the TCP from the nearest capsule that moves with it; NaN where none does [m]."""
+    """Distance of the TCP from the nearest capsule on the same joint; NaN if there is no such capsule [m]."""
     tool = model.frames[tcp]
     away = [math.nan]
     for i, segment in enumerate(segments):

@@ -1,7 +1,7 @@
-"""Paths that references follow: of a programmed task, of joint positions that a log recorded, and to a path's start.
+"""Paths of references: from a programmed task, from recorded joint positions, and the approach to a path's start.
 
-Every move of a task goes from standstill to standstill on a regular time grid, within the limits of the axes and of the
-TCP.
+Every move of a task starts and ends at rest. It is sampled on a regular time grid and keeps the limits of the axes and
+of the TCP.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import CYCLE_S, STEP_S, Missed, Reference, Task, Waypoint, descend, solve
 
-#: Limits rise to their full acceleration in this time: jerk limit = acceleration limit / RAMP_S [s].
+#: The acceleration rises from zero to its limit in this time: jerk limit = acceleration limit / RAMP_S [s].
 RAMP_S = 0.1
 
-#: On a straight line the TCP turns by at most this for a metre, ABB's 2 pi rad/s for 2.5 m/s [rad/m].
+#: On a straight line the TCP turns by at most this much per metre; ABB allows 2 pi rad/s at 2.5 m/s [rad/m].
 TURN_RAD_PER_M = 2 * math.pi / 2.5
 
-#: A line that must be slower by more than this for the axes' sake passes a singular posture.
+#: If the axis limits slow a straight line down by more than this factor, it passes a singular posture.
 _SLOWEST = 20.0
 
 
@@ -42,7 +42,7 @@ class Pace:
     step_s: float  #: time grid [s]
 
 
-#: The longest move [s].
+#: Longest duration of a move [s].
 MOVE_S = 300.0
 
 
@@ -56,14 +56,14 @@ class _TooSlow(Exception):
 
 @dataclass(frozen=True)
 class JointTrajectory:
-    """Joint positions and velocities on the time grid, first and last at rest."""
+    """Joint positions and velocities on the time grid; the first and the last row are at rest."""
 
     q: Floats  #: (n, nv) [rad]
     dq: Floats  #: (n, nv) [rad/s]
 
 
 def joint_move(model: RobotModel, start: Floats, end: Floats, pace: Pace) -> JointTrajectory:
-    """Every axis at the same share of its way, so that all start and stop together.
+    """Moves all axes in proportion, so that they start and stop together.
 
     Args:
         model: The robot.
@@ -84,14 +84,14 @@ def joint_move(model: RobotModel, start: Floats, end: Floats, pace: Pace) -> Joi
 
 
 def linear_move(model: RobotModel, start: Floats, T_world_end: Floats, pace: Pace, where: str) -> JointTrajectory:
-    """The TCP on a straight line, turning evenly about one axis.
+    """Moves the TCP on a straight line while it turns evenly about one axis.
 
     Args:
         model: The robot.
         start: (nv,) [rad].
         T_world_end: (4, 4) pose of the TCP to reach, world frame [m].
         pace: Limits of axes and TCP.
-        where: What messages begin with.
+        where: Prefix of error messages.
 
     Raises:
         SettingsError: The line leaves the arm's range or passes a singular posture.
@@ -133,10 +133,10 @@ def _paced(
     acceleration: float,
     where: str,
 ) -> JointTrajectory:
-    """A path run by a jerk-limited profile as fast as the axes and the TCP allow.
+    """Runs a path with a jerk-limited profile, as fast as the axes and the TCP allow.
 
-    The profile's own speed and acceleration are lowered by what its axes exceed. Where that does not help against an
-    acceleration, it stems from the path's curvature, which only less speed can mend.
+    While an axis exceeds its limits, speed and acceleration of the profile are divided by the excess. If this does not
+    reduce an axis acceleration, the curvature of the path causes it; then the speed is lowered further.
     """
     slowest, softest, before = speed / _SLOWEST, acceleration / _SLOWEST**2, math.inf
     while True:
@@ -156,12 +156,12 @@ def _paced(
 
 
 def _profile(length: float, speed: float, acceleration: float, step_s: float) -> tuple[Floats, Floats]:
-    """Position and speed along a path on the time grid, stretched to a whole number of its steps.
+    """Position and speed along a path on the time grid; the duration is stretched to a whole number of steps.
 
     Raises:
-        _TooSlow: It would take longer than MOVE_S.
+        _TooSlow: The path takes longer than MOVE_S.
     """
-    least_s = max(length / speed, math.sqrt(length / acceleration))  # before a grid is made, or ruckig gives up
+    least_s = max(length / speed, math.sqrt(length / acceleration))  # before the grid and ruckig
     if not least_s <= MOVE_S:
         raise _TooSlow(least_s)
     task = InputParameter(1)
@@ -182,9 +182,9 @@ def _profile(length: float, speed: float, acceleration: float, step_s: float) ->
 
 
 def _excess(model: RobotModel, track: JointTrajectory, pace: Pace) -> tuple[float, float]:
-    """By which factors the path's speed and its acceleration exceed what axes and TCP allow."""
+    """Largest ratios of the path's speed and acceleration to the limits of axes and TCP."""
     way, first, last = np.diff(track.q, axis=0) / pace.step_s, track.dq[:-1], track.dq[1:]
-    speeds = np.concatenate([track.dq, 1.5 * way - 0.25 * (first + last)])  # of the cubics between grid points
+    speeds = np.concatenate([track.dq, 1.5 * way - 0.25 * (first + last)])  # extremes of the cubics between grid points
     accelerations = np.concatenate([6 * way - 4 * first - 2 * last, 2 * first + 4 * last - 6 * way]) / pace.step_s
     tcp = [model.pose(q, dq).tcp_speed(dq) for q, dq in zip(track.q, track.dq, strict=True)]
     return (
@@ -193,19 +193,19 @@ def _excess(model: RobotModel, track: JointTrajectory, pace: Pace) -> tuple[floa
     )
 
 
-#: A recorded track is smoothed by cubics over this long [s].
+#: Window of the cubics that smooth a recorded track [s].
 _SMOOTH_S = 0.1
 
-#: A recorded position may be this far outside the range: encoders are noisy where an axis rests on its stop [rad].
+#: A recorded position may be this far outside the range, because encoders are noisy at a mechanical stop [rad].
 _NOISE_RAD = math.radians(1.0)
 
-#: A recorded axis may be faster than its limit by this share of it: stamps tremble. It is told.
+#: A recorded axis may exceed its speed limit by this share, because time stamps jitter. A remark reports it.
 _NOISE_SPEED = 0.1
 
-#: Positions look like degrees where more than this share of the rows is outside as radians and none as degrees.
+#: Positions look like degrees if more than this share of the rows is out of range as radians and none as degrees.
 _MOSTLY = 0.1
 
-#: An endless axis that turns further than this on one side was more likely recorded in degrees [rad].
+#: An endless axis that turns further than this in one direction was probably recorded in degrees [rad].
 _TURNS_RAD = 6 * math.pi
 
 
@@ -215,10 +215,11 @@ def plan_programme(task: Task, model: RobotModel, where: str = "task") -> Refere
     Args:
         task: The waypoints.
         model: The robot; the task's poses are in its base frame.
-        where: What messages begin with.
+        where: Prefix of error messages.
 
     Raises:
-        SettingsError: A waypoint is out of reach or range, or a straight line cannot be followed; names the waypoint.
+        SettingsError: A waypoint is out of reach or range, or the robot cannot follow a straight line; the message
+            names the waypoint.
     """
     start = _joints(model, task, 0, np.clip(np.zeros(model.nv), model.q_min, model.q_max), where)
     tracks = [_stand(start, task.waypoints[0].dwell_s)]
@@ -253,20 +254,20 @@ def plan_programme(task: Task, model: RobotModel, where: str = "task") -> Refere
 def smooth_recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
     """The path of a recorded joint track, smoothed by cubics over 0.1 s on a regular time grid.
 
-    Programmed time 0 is ``t_ns[0]``. Gaps are bridged on straight lines. Positions and velocities are held against the
-    robot's limits; accelerations are not, since the controller follows only as fast as its own allow, and
-    ``recorded_remarks`` tells of them.
+    Programmed time 0 is ``t_ns[0]``. Gaps are interpolated linearly. Positions and velocities are checked against the
+    robot's limits. Accelerations are not checked, because the controller keeps its own limits when it follows;
+    ``recorded_remarks`` reports them.
 
     Args:
-        t_ns: (n,) instants, in any order; of rows with the same instant the first counts.
+        t_ns: (n,) instants, in any order; of several rows with the same instant the first is used.
         q: (n, nv) [rad]; rows that are not finite are left out.
-        model: The robot that is to follow.
+        model: The robot that follows the path.
 
     Raises:
-        LogError: Another number of axes, too few rows, or a position more than a degree outside the range of its axis,
-            or a speed more than a tenth above its limit.
+        LogError: The number of axes differs, there are too few rows, a position is more than one degree outside the
+            range of its axis, or a speed is more than 10 % above its limit.
     """
-    from scipy.signal import savgol_filter  # takes a second to import, and few logs have a joint track
+    from scipy.signal import savgol_filter  # the import takes 1 s; few logs have a joint track
 
     if q.ndim != 2 or q.shape[1] != model.nv:
         raise LogError(f"joint track: found {q.shape[-1]} joints; {model.name} has {model.nv} axes")
@@ -295,15 +296,15 @@ def smooth_recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
     return _by_itself(model, smooth, dq, (), fastest)
 
 
-#: Points of an approach at which its TCP is asked for, were it as fast there as in its middle.
+#: Number of points of an approach at which the TCP speed is computed, each with the largest speed of the profile.
 _STATIONS = 9
 
 
 def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Reference:
-    """The way from where a robot stands to where a path begins, all axes together, with the least jerk.
+    """Moves all axes together from the robot's position to the start of a path, with minimum jerk.
 
-    In closed form, since a live robot waits for it: of the quintic 10 r^3 - 15 r^4 + 6 r^5 the largest velocity is
-    15/8 and the largest acceleration 10/sqrt(3).
+    The duration is in closed form, because a live robot waits for it: the quintic 10 r^3 - 15 r^4 + 6 r^5 has the
+    largest velocity 15/8 and the largest acceleration 10/sqrt(3).
 
     Args:
         model: The robot.
@@ -318,7 +319,7 @@ def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Re
     r = np.arange(end + 1) / end
     share, rate = r * r * r * (10 - 15 * r + 6 * r**2), 30 * r**2 * (1 - r) ** 2 / (end * STEP_S)
     q, dq = start + np.outer(share, way), np.outer(rate, way)
-    stations = (start + s * way for s in np.linspace(0.0, 1.0, _STATIONS))  # few: a robot waits
+    stations = (start + s * way for s in np.linspace(0.0, 1.0, _STATIONS))  # few points, because a live robot waits
     fastest = float(rate.max()) * max(model.pose(station, way).tcp_speed(way) for station in stations)
     return _by_itself(model, q, dq, (end * STEP_S,), fastest)
 
@@ -326,7 +327,7 @@ def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Re
 def _by_itself(
     model: RobotModel, q: Floats, dq: Floats, waypoints_s: tuple[float, ...], fastest_m_per_s: float
 ) -> Reference:
-    """A path that runs once, and whose own greatest speed is its speed limit, since nobody programmed one."""
+    """A path that runs once. It has no programmed speed limit, so its greatest speed is the limit."""
     return Reference(
         model,
         q,
@@ -339,10 +340,10 @@ def _by_itself(
 
 
 def recorded_remarks(path: Reference) -> list[str]:
-    """Remarks on a recorded path that the robot cannot follow, or that looks like another unit.
+    """Remarks on a recorded path that the robot cannot follow, or that seems to be in another unit.
 
     Args:
-        path: What ``smooth_recorded`` made.
+        path: Result of ``smooth_recorded``.
     """
     model, found = path.model, []
     turned_rad = np.where(np.isinf(model.q_max), np.abs(path.q).max(axis=0), 0.0)
@@ -352,7 +353,7 @@ def recorded_remarks(path: Reference) -> list[str]:
             f"robot joints: {model.joint_names[axis]} turns to {turned_rad[axis]:.1f} rad; if the log is in degrees, "
             "set logs.joints_unit = deg"
         )
-    lag = min(round(_SMOOTH_S / STEP_S), len(path.dq) - 1)  # cubics overshoot at a kink: mean accelerations are sound
+    lag = min(round(_SMOOTH_S / STEP_S), len(path.dq) - 1)  # cubics overshoot at a kink, so take mean accelerations
     ddq = (path.dq[lag:] - path.dq[:-lag]) / (lag * STEP_S)
     for what, unit, rows, limit, setting in (
         ("move", "rad/s", path.dq, model.dq_max, "limit of the robot"),
@@ -373,7 +374,7 @@ def recorded_remarks(path: Reference) -> list[str]:
 def _check(
     model: RobotModel, t_ns: Ints | Floats, rows: Floats, what: str, unit: str, limits: tuple[Floats, Floats, Floats]
 ) -> None:
-    """Refuses what is further outside the limits (low, high) than the margin, their third."""
+    """Raises if a row is outside its limits by more than the margin; ``limits`` is (low, high, margin)."""
     low, high, margin = limits
     over = np.argwhere((rows < low - margin) | (rows > high + margin))
     if not len(over):
@@ -404,7 +405,7 @@ def _stand(q: Floats, dwell_s: float) -> JointTrajectory:
 def _timed_move(
     model: RobotModel, task: Task, index: int, now: Floats, where: str, goal: Floats | None = None
 ) -> JointTrajectory:
-    """``_move``, and a SettingsError where it would take longer than MOVE_S."""
+    """Plans ``_move`` and raises a SettingsError if it takes longer than MOVE_S."""
     try:
         return _move(model, task, index, now, where, goal)
     except _TooSlow as error:
@@ -421,7 +422,7 @@ def _timed_move(
 def _move(
     model: RobotModel, task: Task, index: int, now: Floats, where: str, goal: Floats | None = None
 ) -> JointTrajectory:
-    """The move to a waypoint, and for the way back to the first, to the joint positions it started with."""
+    """The move to a waypoint; with ``goal``, the move back to the joint positions of the start."""
     waypoint = task.waypoints[index]
     at = f"{where}: {task.label(index)}"
     pace = Pace(
@@ -452,7 +453,7 @@ def _speed_limit(task: Task, index: int) -> float:
 
 
 def _joints(model: RobotModel, task: Task, index: int, near: Floats, where: str) -> Floats:
-    """Joint positions of a waypoint, those nearest to ``near`` where it gives a pose."""
+    """Joint positions of a waypoint; for a waypoint with a pose, the solution nearest to ``near``."""
     waypoint = task.waypoints[index]
     at = f"{where}: {task.label(index)}"
     if waypoint.position_m is not None:

@@ -1,16 +1,16 @@
 """The programmed task: waypoints, joint positions that reach them, and the reference, which is the path over time.
 
-It is what the robot would do if nobody were there.
+The reference is the motion of the robot when no person is present.
 
-The structure of the waypoints is a task file (TOML) and the task that travels inside a log; ``hrcreplay init`` writes
-one that explains every key (``commands/task_template.toml``).
+A task comes from a task file (TOML) or from a log, with the same structure; ``hrcreplay init`` writes a file that
+explains every key (``commands/task_template.toml``).
 
-The robot stops at every waypoint, and stands at the first for its dwell before it starts. ``cycles`` times from the
-first to the last; between two cycles it goes back to the first by the first's own ``move``. On a straight line the TCP
-turns by at most 2 pi rad for every 2.5 m of the TCP speed, so a pure turn takes its time too.
+The robot stops at every waypoint. It stands at the first waypoint for its dwell before it starts. It moves from the
+first to the last waypoint ``cycles`` times; between two cycles it goes back to the first by the ``move`` of the first.
+On a straight line the TCP turns by at most 2 pi rad for every 2.5 m of the TCP speed, so this also limits a pure turn.
 
-Inverse kinematics is damped least squares from fixed seeds, which make it deterministic: the same pose, coming from the
-same place, has the same answer.
+Inverse kinematics is damped least squares from fixed seeds, so it is deterministic: the same pose from the same joint
+positions gives the same solution.
 """
 
 from __future__ import annotations
@@ -122,14 +122,14 @@ class Task(_Strict):
 
 
 def parse_task(table: dict[str, Any], where: str = "task") -> Task:
-    """A task from the structure of its file.
+    """Makes a task from the parsed task file.
 
     Args:
-        table: As ``tomllib`` reads the example above.
-        where: What messages begin with, e.g. the file's path.
+        table: Table that ``tomllib`` reads from a task file.
+        where: Prefix of error messages, e.g. the file's path.
 
     Raises:
-        SettingsError: An unknown key, or a value that cannot be used; names the waypoint.
+        SettingsError: A key is unknown or a value is invalid; the message names the waypoint.
     """
     try:
         return Task.model_validate(table)
@@ -152,7 +152,7 @@ def _first_problem(error: ValidationError) -> str:
 
 
 def _place(loc: tuple[int | str, ...]) -> tuple[str, str]:
-    """'waypoint 3: ' (or nothing) and the key behind it."""
+    """'waypoint 3: ' (or an empty text) and the key after it."""
     if len(loc) > 1 and loc[0] == "waypoints":
         return f"waypoint {int(loc[1]) + 1}: ", ".".join(str(part) for part in loc[2:]) or "waypoint"
     return "", ".".join(str(part) for part in loc)
@@ -169,22 +169,22 @@ _TOLERANCE = 1e-9  # of position [m] and orientation [rad]
 
 @dataclass(frozen=True)
 class Missed:
-    """No joint position was found: how near the best one came."""
+    """Pose error of the best attempt when no joint position reaches the pose [m, rad]."""
 
     position_m: float
     angle_rad: float
 
 
 def solve(model: RobotModel, T_world_tcp: Floats, near: Floats) -> Floats | Missed:
-    """The joint position within the limits that reaches a pose with the least way, in time, from ``near``.
+    """The joint position within the limits that reaches a pose and takes the least time from ``near``.
 
     Args:
         model: The robot.
         T_world_tcp: (4, 4) pose to reach, world frame [m].
-        near: (nv,) where the robot comes from [rad].
+        near: (nv,) joint positions before the move [rad].
 
     Returns:
-        (nv,) [rad], or how near the best attempt came.
+        (nv,) [rad], or the pose error of the best attempt.
     """
     found: list[Floats] = []
     missed = Missed(np.inf, np.inf)
@@ -202,7 +202,7 @@ def solve(model: RobotModel, T_world_tcp: Floats, near: Floats) -> Floats | Miss
 
 
 def descend(model: RobotModel, T_world_tcp: Floats, seed: Floats) -> tuple[Floats, Floats]:
-    """Damped least squares within the limits from one seed.
+    """Runs damped least squares within the limits from one seed.
 
     Args:
         model: The robot.
@@ -210,7 +210,7 @@ def descend(model: RobotModel, T_world_tcp: Floats, seed: Floats) -> tuple[Float
         seed: (nv,) [rad].
 
     Returns:
-        (nv,) where it ended [rad] and the (6,) pose error left there [m, rad].
+        (nv,) last joint positions [rad] and their (6,) pose error [m, rad].
     """
     q, still = seed, np.zeros(model.nv)
     for _ in range(_ITERATIONS):
@@ -226,13 +226,13 @@ def _step(q: Floats, J: Floats, T: Floats, T_goal: Floats, q_min: Floats, q_max:
     error = np.empty(6)
     error[:3] = T_goal[:3, 3] - T[:3, 3]
     error[3:] = turn_between(T, T_goal)
-    damping = 0.1 * dot_n(error, error) + 1e-12  # vanishes at the solution: Newton's speed there
+    damping = 0.1 * dot_n(error, error) + 1e-12  # goes to zero at the solution, for fast convergence
     dq = apply(J.T, small_matrices.solve(multiply(J, J.T) + damping * np.eye(6), error))
     return np.minimum(np.maximum(q + dq, q_min), q_max), error
 
 
 def _seeds(model: RobotModel) -> Floats:
-    """(n, nv) joint positions spread evenly over the ranges by the recurrence of the generalised golden ratio."""
+    """(n, nv) joint positions, spread evenly over the ranges with the generalised golden ratio."""
     ratio = 2.0
     for _ in range(60):
         ratio = (1 + ratio) ** (1 / (model.nv + 1))
@@ -242,7 +242,7 @@ def _seeds(model: RobotModel) -> Floats:
 
 
 def _unwind(model: RobotModel, q: Floats, near: Floats) -> Floats:
-    """The same place with every axis on the turn that is nearest to ``near`` and within its range."""
+    """Shifts every axis by full turns to the position nearest to ``near`` within its range."""
     turn = 2 * np.pi
     turns = np.round((near - q) / turn)
     fewest = np.ceil((model.q_min - q) / turn)
@@ -250,10 +250,10 @@ def _unwind(model: RobotModel, q: Floats, near: Floats) -> Floats:
     return q + turn * np.clip(turns, fewest, most)
 
 
-#: Time grid that a reference is computed on once; between its points it is a cubic [s].
+#: Step of a reference's time grid; between grid points the reference is a cubic [s].
 STEP_S = 0.004
 
-#: A programmed time this near to a grid point is at it, of a step: a reference waits at a waypoint but for rounding.
+#: Rounding tolerance: a programmed time within this share of a step of a grid point counts as that grid point.
 _ON_GRID = 1e-6
 
 
@@ -274,7 +274,7 @@ class ReferencePoint:
 
 
 class Grid(NamedTuple):
-    """A path over time on the grid; see ``Reference``."""
+    """A path on the time grid; see ``Reference``."""
 
     q: Floats  #: (n, nv) [rad]
     dq: Floats  #: (n, nv) [rad/s]
@@ -284,9 +284,9 @@ class Grid(NamedTuple):
 
 @dataclass(frozen=True)
 class Reference:
-    """A path over time that starts at ``q[0]``, runs ``cycles`` times and stands at its end.
+    """A path over time that starts at ``q[0]``, runs ``cycles`` times and stops at its end.
 
-    A cycle is the whole grid; the last one ends at ``end`` of the grid, before the way back to the start.
+    A cycle is the whole grid; the last cycle ends at grid point ``end``, before the move back to the start.
     """
 
     model: RobotModel
@@ -295,21 +295,21 @@ class Reference:
     end: int  #: grid point of the last waypoint
     cycles: float  #: inf: until the log ends
     waypoints_s: tuple[float, ...]  #: arrival at each waypoint of the first cycle [s]
-    tcp_speed_max: Floats  #: (n,) limit of the move, and of the dwell after it, that leads to each grid point [m/s]
+    tcp_speed_max: Floats  #: (n,) limit at each grid point: that of its move, or of the move before its dwell [m/s]
 
     @property
     def q0(self) -> Floats:
-        """(nv,) where the robot starts [rad]."""
+        """(nv,) joint positions at the start [rad]."""
         return self.q[0]
 
     @property
     def cycle_s(self) -> float:
-        """One cycle with the way back [s]."""
+        """Duration of one cycle, including the move back [s]."""
         return (len(self.q) - 1) * STEP_S
 
     @property
     def duration_s(self) -> float:
-        """From the start to the end of the last cycle; inf when it repeats [s]."""
+        """Time from the start to the end of the last cycle; inf if the task repeats [s]."""
         return (self.cycles - 1) * self.cycle_s + self.end * STEP_S
 
     @property
@@ -318,7 +318,7 @@ class Reference:
         return Grid(self.q, self.dq, self.end, self.duration_s)
 
     def next_waypoint(self, s_s: float) -> float:
-        """Programmed time of the first arrival at a waypoint that is not before ``s_s``; inf after the last [s]."""
+        """Programmed time of the next arrival at a waypoint, at or after ``s_s``; inf after the last one [s]."""
         if not self.waypoints_s or s_s > self.duration_s:
             return math.inf
         cycle = math.floor(s_s / self.cycle_s)
@@ -326,9 +326,9 @@ class Reference:
         return next((arrival for arrival in arrivals if arrival >= s_s), math.inf)
 
     def tcp_speed_limit(self, s_s: float) -> float:
-        """Programmed speed limit of the TCP at a programmed time [s]: that of the move until the next one begins [m/s].
+        """Programmed speed limit of the TCP at a programmed time [s]; valid until the next move begins [m/s].
 
-        A task gives it for each move; other paths have their own greatest speed.
+        A task gives a limit for each move; for other paths the limit is their greatest speed.
         """
         if not 0.0 <= s_s < self.duration_s:
             return float(self.tcp_speed_max[0 if s_s < 0.0 else self.end])
@@ -338,9 +338,8 @@ class Reference:
     def sample(self, s_s: float) -> ReferencePoint:
         """The reference ``s_s`` seconds of programmed time after its start.
 
-        Position is a cubic through the grid, velocity and acceleration its derivatives, pose and twist those of
-        position and velocity: each is exactly the derivative of the one before. Before the start and after the end
-        it stands.
+        The position is a cubic through the grid points. Velocity and acceleration are its exact derivatives. Pose and
+        twist of the TCP follow from position and velocity. Before the start and after the end the reference is at rest.
         """
         q, dq, ddq = place(self.grid, s_s)
         pose = self.model.pose(q, dq)
@@ -362,7 +361,7 @@ def place(grid: Grid, s_s: float) -> tuple[Floats, Floats, Floats]:
 def _cubic(
     q0: Floats, q1: Floats, dq0: Floats, dq1: Floats, share: float, step_s: float
 ) -> tuple[Floats, Floats, Floats]:
-    """The cubic with given ends and end velocities, and its derivatives."""
+    """The cubic with the given end positions and end velocities, and its two derivatives."""
     way, m0, m1 = q1 - q0, dq0 * step_s, dq1 * step_s
     b, a = 3 * way - 2 * m0 - m1, m0 + m1 - 2 * way
     q = q0 + share * (m0 + share * (b + share * a))
@@ -371,26 +370,27 @@ def _cubic(
 
 
 def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, plan: Plan) -> tuple[float, float]:
-    """Programmed time after one tick, and the rate at which it ran.
+    """Advances the programmed time by one tick.
 
-    ``time`` runs with the clock: a robot that was held back then faces a reference that ran away.
-    ``path`` runs with the clock while the TCP is within half the leash of the reference, slows down smoothly beyond
-    and stands when the leash is taut (or the error is not known). It stops at every waypoint until the TCP has come
-    as near as ``waypoint_m``: however far the robot evades on the way, it never skips one. Neither runs backwards.
+    With ``time`` the programmed time runs with the clock, so a robot that must wait falls behind the reference.
+    With ``path`` it runs with the clock while the TCP is within half of ``max_reference_lead_m`` of the reference. With
+    a larger error it slows down smoothly, and it stops at ``max_reference_lead_m`` or if the error is unknown. It also
+    stops at every waypoint until the TCP is within ``waypoint_m``, so the robot never skips a waypoint. In both modes
+    the programmed time never runs backwards.
 
     Args:
         reference: The programmed path.
         s_s: Programmed time [s].
         dt_s: Length of the tick [s].
         tcp_error_m: Distance from the TCP to the reference at ``s_s`` [m].
-        plan: When the reference waits.
+        plan: Settings of the reference: its mode and when it waits.
 
     Returns:
         Programmed time at the next tick [s] and the rate in [0, 1]: the reference's velocity is ``rate * twist``.
     """
     if plan.reference == "time":
         return s_s + dt_s, 1.0
-    slack = 2.0 - 2.0 * tcp_error_m / plan.max_reference_lead_m  # 1 at half the leash, 0 where it is taut
+    slack = 2.0 - 2.0 * tcp_error_m / plan.max_reference_lead_m  # 1 at half the allowed lead, 0 at the full lead
     if not slack > 0.0:
         return s_s, 0.0
     rate = 1.0 if slack >= 1.0 else slack * slack * (3.0 - 2.0 * slack)
@@ -401,16 +401,16 @@ def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, p
 
 
 def tcp_speed_cap(reference: Reference, s_s: float, plan: Plan) -> float:
-    """Speed that the TCP of a robot may reach that follows a reference, however far it is behind [m/s].
+    """Largest allowed TCP speed of a robot that follows a reference, also while it catches up [m/s].
 
-    A reference that waits leaves a waypoint only when the TCP has come near, so the robot is on the same move as its
-    reference and keeps the limit of that move. One that runs with the clock may be any number of moves ahead; then the
-    greatest limit of all moves holds.
+    A reference that waits leaves a waypoint only after the TCP is near it. Robot and reference are then on the same
+    move, and the limit of that move applies. A reference that runs with the clock may be several moves ahead; then the
+    greatest limit of all moves applies.
 
     Args:
         reference: The programmed path.
         s_s: Programmed time [s].
-        plan: Whether the reference waits, and what speed is allowed beside the programme's.
+        plan: Settings of the reference: its mode and the allowed speed for catching up.
     """
     if plan.catch_up_speed_m_per_s == "free":
         return math.inf

@@ -1,8 +1,8 @@
-"""Parts of a URDF that are read before pinocchio: the chain from base to tool, its limits, its meshes.
+"""Reads parts of a URDF before pinocchio does: the chain from base to tool, its limits, its meshes.
 
-pinocchio's parser has one sentence for every wrong file, refuses a limit without an effort, forgets which joint mimics
-another, sorts the joints by name, and must have the paths of the meshes. So the tree and the limits are read here, and
-pinocchio gets a text that it can read: without shapes, or with those whose capsules are wanted.
+pinocchio's parser has one error message for every wrong file, rejects a limit without an effort, drops mimic
+relations, sorts the joints by name, and needs the paths of the meshes. Therefore this module reads the tree and the
+limits, and gives pinocchio a text that it can read: without shapes, or with the shapes that need capsules.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from hrcreplay.robot.link_capsules import KINDS, Extent, Shape, shapes
 
 _TURNING = ("revolute", "continuous")
 
-#: The most links that a URDF may have; humanoids with hands have some 150.
+#: Largest number of links of a URDF; humanoids with hands have about 150.
 MOST_LINKS = 500
 
 
 @dataclass(frozen=True)
 class Description:
-    """A URDF seen as one chain of axes; every other joint is locked."""
+    """A URDF reduced to one chain of axes; every other joint is locked."""
 
     name: str
-    text: str  #: URDF without shapes, the endless axes of the chain as revolute joints
+    text: str  #: URDF without shapes; the endless axes of the chain are revolute joints
     base: str  #: link that stands on ``T_world_base``
     tcp: str  #: link that carries the tool
     joints: tuple[str, ...]  #: from the base to the tool
@@ -48,13 +48,14 @@ def describe(xml: str, tcp_frame: str | None = None, base_frame: str | None = No
 
     Args:
         xml: URDF text.
-        tcp_frame: Link (or joint, for the link behind it) that carries the tool; none: the last that revolute joints
-            move. That is, of the links behind the most axes of rotation, one without a shape if there is one, and
-            then the furthest down the tree; where the axes fork into fingers, before the fork.
+        tcp_frame: Link that carries the tool, or the joint that moves it; none: the last link that revolute joints
+            move. This is one of the links with the most axes of rotation before them: a link without a shape if there
+            is one, then the furthest down the tree. If the axes fork into fingers, it is before the fork.
         base_frame: Link (or joint) that stands on the base; none: the root.
 
     Raises:
-        SettingsError: No URDF, no such frame, or a joint on the chain that is no axis of rotation or has no limits.
+        SettingsError: The text is no URDF, the frame does not exist, or a joint of the chain does not rotate or has no
+            limits.
     """
     robot = _parse(xml)
     tree = _Tree(robot)
@@ -88,19 +89,20 @@ def describe(xml: str, tcp_frame: str | None = None, base_frame: str | None = No
 
 
 def with_shapes(robot: Description, paths: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """The URDF with its collision shapes in the words of pinocchio's parser.
+    """The URDF with its collision shapes in a form that pinocchio's parser reads.
 
-    It finds no package:// and knows no <capsule>, but a cylinder has the same measures.
+    The parser does not resolve package:// and does not know <capsule>, so a capsule is written as a cylinder, which
+    has the same dimensions.
 
     Args:
-        robot: As described.
-        paths: File that a mesh names -> its path.
+        robot: Result of ``describe``.
+        paths: File name in a mesh -> its path.
 
     Returns:
-        URDF text, and the name of each shape -> what pinocchio's geometry model calls it.
+        URDF text, and the name of each shape -> its name in pinocchio's geometry model.
 
     Raises:
-        SettingsError: A shape of a kind that URDF does not have, or a mesh whose path is not known.
+        SettingsError: The kind of a shape is unknown, or the path of a mesh is unknown.
     """
     root = ET.fromstring(robot.text)  # noqa: S314  our own text
     links = {str(link.get("name")): link for link in root.findall("link")}
@@ -122,11 +124,11 @@ def own_extent(shape: Shape, geometry: Any) -> Extent:
     """Extent of a shape in its own frame.
 
     Args:
-        shape: As the URDF has it.
-        geometry: As pinocchio has read it.
+        shape: Shape in the URDF.
+        geometry: The same shape, read by pinocchio.
 
     Raises:
-        SettingsError: It has no size.
+        SettingsError: The shape has no size.
     """
     if shape.kind == "mesh":
         triangles = [[geometry.tri_indices(i)[k] for k in range(3)] for i in range(geometry.num_tris)]
@@ -142,7 +144,7 @@ def own_extent(shape: Shape, geometry: Any) -> Extent:
 
 
 def unreadable(shape: Shape) -> SettingsError:
-    """Problem of a shape that pinocchio's parser left out."""
+    """The error for a shape that pinocchio's parser left out."""
     if shape.mesh is None and shape.collision.find("origin") is None:
         return no_size(shape)
     return SettingsError(
@@ -151,7 +153,7 @@ def unreadable(shape: Shape) -> SettingsError:
 
 
 def no_size(shape: Shape) -> SettingsError:
-    """A shape whose measures are missing or not positive."""
+    """The error for a shape whose dimensions are missing or not positive."""
     return SettingsError(f"robot: the {shape.kind} of link {shape.link!r} has no size; give its measures in metres")
 
 
@@ -188,7 +190,7 @@ class _Tree:
         return found[::-1]
 
     def link(self, name: str, where: str) -> str:
-        """The link of that name, or behind the joint of that name."""
+        """The link with this name, or the child link of the joint with this name."""
         behind = {str(joint.get("name")): link for link, joint in self._below.items()}
         if name not in self.links and name not in behind:
             raise SettingsError(f"{where}: the URDF has no link {name!r}; it has {', '.join(self.links)}")
@@ -196,14 +198,14 @@ class _Tree:
 
 
 def _last_turned(tree: _Tree) -> str:
-    """The link that carries the tool where the user names none; see ``describe``."""
+    """The link that carries the tool if the user names none; see ``describe``."""
     axes: dict[str, tuple[ET.Element, ...]] = {}
     for name in tree.links:
         moving = [joint for joint in tree.joints(name) if joint.get("type") != "fixed"]
-        if not moving or moving[-1].get("type") in _TURNING:  # behind a sliding finger is no place for a tool
+        if not moving or moving[-1].get("type") in _TURNING:  # no tool behind a sliding finger
             axes[name] = tuple(joint for joint in moving if joint.get("type") in _TURNING)
     most = max(len(turning) for turning in axes.values())
-    if most == 0:  # the chain says what it is instead
+    if most == 0:  # the check of the chain then reports the other joint types
         return max(tree.links, key=lambda name: len(tree.joints(name)))
     ends = [name for name, turning in axes.items() if len(turning) == most]
     shared = axes[ends[0]]
@@ -255,7 +257,7 @@ def _parse(xml: str) -> ET.Element:
 
 
 def _bare(robot: ET.Element, axes: Mapping[ET.Element, Sequence[float]]) -> str:
-    """URDF text of the kinematics alone: no shapes, and every axis of the chain an angle, endless or not."""
+    """URDF text of the kinematics only: without shapes, and with every axis of the chain as a revolute joint."""
     for link in robot.findall("link"):
         for shape in (*link.findall("visual"), *link.findall("collision")):
             link.remove(shape)
