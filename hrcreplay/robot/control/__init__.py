@@ -1,1 +1,1 @@
-"""Control of the robot in the next tick: separation, safety rows, the QP, speed scaling, the stop."""
+"""Control of the robot for the next tick: separation, safety rows, the QP, speed scaling, the stop."""

@@ -1,7 +1,7 @@
-"""Constraints that hold a step: rows active in Eq. (66), rows that contradict each other, and refused stops.
+"""Constraints that limit a step: active rows of Eq. (66), rows that contradict each other, and refused stops.
 
-Nothing is taken from the solver but its solution: multipliers come from the rows by non-negative least squares, and
-rows that contradict each other from linear programs.
+From the solver only the solution is used. Non-negative least squares computes the multipliers from the rows, and
+linear programs find rows that contradict each other.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, minimise
 from hrcreplay.robot.control.separation import Approach, Obstacles, tick_rows
 from hrcreplay.robot.model import RobotModel
 
-#: A row whose link could approach faster by no more than this is one that the solution lies on [m/s].
+#: A row is active if its link could approach faster by no more than this [m/s].
 ACTIVE = 1e-6
-#: A row whose multiplier is smaller does not hold the robot back, of the largest.
+#: A row whose multiplier is below this share of the largest one does not hold the robot back.
 SHARE = 1e-3
-#: By how much rows must contradict each other, each scaled to length 1.
+#: Rows, scaled to length 1, contradict each other if their smallest violation is larger than this.
 APART = 1e-9
-#: Weight on the multipliers themselves, relative to the rows.
+#: Weight of the multipliers, relative to the rows.
 RIDGE = 1e-6
-#: Rows told beside those that hold.
+#: Number of further rows that are reported in addition to the binding ones.
 NEXT = 3
 
 
@@ -51,7 +51,7 @@ class TickContext(NamedTuple):
 
 
 class LinearRows(NamedTuple):
-    """Bounds ``A @ w <= b`` on the next joint velocity, each with what it stands for."""
+    """Bounds ``A @ w <= b`` on the next joint velocity, each with the name of its constraint."""
 
     A: Floats  #: (m, nv)
     b: Floats  #: (m,)
@@ -62,7 +62,7 @@ def propose_explained(controller: Controller, context: TickContext) -> tuple[Pro
     """Proposals of a method at a tick, and the constraints that bound them.
 
     Args:
-        controller: Its robot, which is brought back to the tick.
+        controller: The controller; its state is set back to the tick.
         context: The tick.
     """
     controller.stop, controller.u, controller.s_s = context.current_stop, context.u_before, context.s_s
@@ -76,7 +76,7 @@ def propose_explained(controller: Controller, context: TickContext) -> tuple[Pro
         dq = context.current_stop.rest().dq[0] if isinstance(proposals, int) else proposals[0].stop.dq[0]
         margins = margins_of(_rows(controller, context.seen, 0.0), dq, 0.0)
         broken = [row for row in margins if row["margin_m_per_s"] < -ACTIVE]
-        if isinstance(proposals, int):  # even the hardest braking along the path breaks a row
+        if isinstance(proposals, int):  # even the hardest braking along the path violates a row
             stop = {"kind": "path", "what": "the hardest braking along the path"}
             return proposals, {"conflict": [*broken[:1], stop], "next": margins[len(broken) :][:NEXT]}
         active = [row for row in margins if row["margin_m_per_s"] <= 1e-4]
@@ -85,7 +85,7 @@ def propose_explained(controller: Controller, context: TickContext) -> tuple[Pro
 
 
 def _by_program(controller: QpController, seen: Observation) -> tuple[Proposals, dict[str, Any]]:
-    """The proposals of Eq. (66), the rows that its solution lies on, or those that leave none."""
+    """The proposals of Eq. (66), and the active rows of its solution or the rows that exclude a solution."""
     settings = controller.settings
     with np.errstate(all="ignore"):
         qp = controller.qp_context(seen)
@@ -110,7 +110,7 @@ def _rows(controller: Controller, seen: Observation, give_way_m: float) -> Appro
 
 
 def _protective(controller: SsmController, seen: Observation) -> dict[str, Any]:
-    """Distances that speed and separation monitoring compares: the present one, and the protective one."""
+    """Distances that speed and separation monitoring compares: the present and the protective distance."""
     proposals = PathController.propose(controller, seen)
     if isinstance(proposals, int):
         return {}
@@ -120,7 +120,7 @@ def _protective(controller: SsmController, seen: Observation) -> dict[str, Any]:
 
 
 def find_holding_rows(task: Problem, solved: Solution) -> dict[str, Any]:
-    """The rows of people that a solution lies on, by their multipliers, the limits of the robot, and the next rows.
+    """Active rows of people, sorted by their multipliers, active limits of the robot, and the next rows.
 
     Args:
         task: Eq. (66).
@@ -133,7 +133,7 @@ def find_holding_rows(task: Problem, solved: Solution) -> dict[str, Any]:
     A, pull = every.A[active], task.H @ w + task.g
     if task.soft:
         A, pull = np.column_stack([A, -loose[active]]), np.append(pull, SLACK * slack)
-        if slack <= ACTIVE:  # which is no less than 0
+        if slack <= ACTIVE:  # the slack is at its bound 0
             A = np.vstack([A, -np.eye(len(pull))[-1]])
     weights = _least_weights(A, -pull)[: len(active)] if len(A) else np.zeros(0)
     limits, weight_of, vertex_of = [], dict[tuple[int, int, int], float](), dict[tuple[int, int, int], Any]()
@@ -158,21 +158,21 @@ def find_holding_rows(task: Problem, solved: Solution) -> dict[str, Any]:
 
 
 def _least_weights(A: Floats, pull: Floats) -> Floats:
-    """(m,) the smallest multipliers, 0 or more, of rows (m, n) that add up to a pull (n,).
+    """(m,) the smallest non-negative multipliers of rows (m, n) whose weighted sum is a pull (n,).
 
-    Of rows that repeat each other there are many; these are unique.
+    If rows repeat each other, many multipliers give the same sum; the smallest are unique.
     """
     small = RIDGE * np.abs(A).max()
     return np.asarray(nnls(np.vstack([A.T, small * np.eye(len(A))]), np.append(pull, np.zeros(len(A))))[0])
 
 
 def margins_of(rows: Approach, w: Floats, slack: float) -> list[dict[str, Any]]:
-    """For each link, limb and row of Eq. (12): its worst vertex, and by how much faster the link might approach it.
+    """Worst vertex and speed margin of the link towards it, for each link, limb and row of Eq. (12).
 
     Args:
-        rows: Of the tick.
+        rows: Approach rows of the tick.
         w: (nv,) next joint velocity [rad/s].
-        slack: By which all rows are loosened [m/s].
+        slack: Slack that is added to the bound of every row [m/s].
     """
     found = []
     for link in range(len(rows.ends_m)):
@@ -208,7 +208,7 @@ def _limits(task: Problem) -> tuple[Floats, Floats, tuple[dict[str, Any], ...]]:
 
 
 def all_rows(task: Problem) -> LinearRows:
-    """Every row of Eq. (66), those of all vertices written down."""
+    """Every row of Eq. (66), including the rows of all vertices."""
     A, b, names = _limits(task)
     rows, bounds, named = [A], [b], list(names)
     of = task.rows
@@ -229,7 +229,7 @@ def all_rows(task: Problem) -> LinearRows:
 
 
 def conflict(rows: LinearRows) -> list[dict[str, Any]]:
-    """Rows that no velocity keeps together, none of which can be left out; empty where all can be kept.
+    """A minimal set of rows that no velocity satisfies together; empty if a velocity satisfies all rows.
 
     Args:
         rows: All rows.
@@ -245,7 +245,7 @@ def conflict(rows: LinearRows) -> list[dict[str, Any]]:
     if broken <= APART:
         return []
     chosen = [i for i in chosen if weights[i] > 0.0]
-    if _least_broken(A, b, chosen)[0] <= APART:  # the solver's multipliers left out one that counts
+    if _least_broken(A, b, chosen)[0] <= APART:  # the multipliers missed a necessary row
         chosen = list(range(len(A)))
     for i in list(chosen):
         fewer = [j for j in chosen if j != i]
@@ -255,12 +255,12 @@ def conflict(rows: LinearRows) -> list[dict[str, Any]]:
 
 
 def _least_broken(A: Floats, b: Floats, chosen: Sequence[int]) -> tuple[float, Floats]:
-    """By how much the worst of some rows is broken at least, and the rows' multipliers.
+    """The smallest possible violation of the worst of the chosen rows, and the multipliers of the rows.
 
     Args:
         A: (m, nv) rows of length 1.
-        b: (m,) their bounds.
-        chosen: Which rows.
+        b: (m,) bounds of the rows.
+        chosen: Indices of the chosen rows.
     """
     n = A.shape[1]
     cost = np.append(np.zeros(n), 1.0)
@@ -284,11 +284,11 @@ def explain_refusal(
 
     Args:
         robot: The manipulator.
-        current_stop: Its row 0 is where the robot is.
-        proposal: That was not certified.
+        current_stop: The current stop; its row 0 is the present state of the robot.
+        proposal: The proposal that was not certified.
         obstacles: The swept volumes of the tick.
-        horizon_s: Until when they hold [s].
-        settings: Of the method.
+        horizon_s: Time from the tick on for which the volumes are valid [s].
+        settings: Settings of the method.
     """
     stop, last = proposal.stop, proposal.stop.q[-1]
     ends_s = (stop.ticks + 1) * settings.dt_s
@@ -304,7 +304,7 @@ def explain_refusal(
     turned = np.maximum(np.abs(np.diff(q, axis=0)), settings.dt_s * np.maximum(dq[:-1], dq[1:]))
     travel_m = np.vstack((turned @ robot.axis_reach_m, np.zeros((1, len(radius)))))
     worst = np.inf, 0, 0, 0, 0, 0.0
-    for i in range(len(q)):  # a link moves by its travel at most until the next tick
+    for i in range(len(q)):  # until the next tick a link moves by at most its travel
         low, _, near = distances(robot.ends_m(q[i]), obstacles.vertices_m, obstacles.offsets)
         left = low - keep_m - travel_m[i][:, None]
         link, limb = divmod(int(np.argmin(left)), left.shape[1])

@@ -1,7 +1,7 @@
-"""The border of a watched area as obstacles: walls that come in from its sides as fast as people walk.
+"""The border of a watched area as obstacles: walls that move inwards from its sides at walking speed.
 
-Behind a wall is a half-space. A robot only reaches a part of it, and the vertices of a volume bound its speed the more
-the further away they are, Eq. (16), so a wall is a box that is as large as the robot's reach and no larger.
+Everything behind a wall is a half-space, but the robot reaches only a part of it. By Eq. (16) a vertex bounds the
+robot's speed more if it is further away. Therefore a wall is a box that is only as large as the robot's reach.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _CORNERS = np.array([(across, up) for across in (-1.0, 1.0) for up in (-1.0, 1.0
 
 @dataclass(frozen=True)
 class Border:
-    """The sides of a convex polygon around a robot, each a wall from below its reach to above."""
+    """The sides of a convex polygon around a robot; each side is a wall as high as the robot's reach."""
 
     normals: Floats  #: (k, 3) unit vectors that point outwards, horizontal
-    room_m: Floats  #: (k,) from the robot's base to each side; negative where the base is outside [m]
+    room_m: Floats  #: (k,) distance from the robot's base to each side; negative if the base is outside [m]
     base_m: Floats  #: (3,) world [m]
-    reach_m: float  #: no point of a link's axis is further from the base [m]
+    reach_m: float  #: upper bound of the distance from the base to a point of a link's axis [m]
 
     @classmethod
     def around(cls, robot: RobotModel, polygon: ConvexPolygon) -> Border:
@@ -37,9 +37,9 @@ class Border:
         return cls(normals, np.asarray(polygon.offsets_m - normals @ base_m), base_m, robot.span_m)
 
     def walls(self, depth_m: float) -> Floats:
-        """(8 k, 3) vertices, wall after wall, that have come in by ``depth_m`` [m].
+        """(8 k, 3) vertices of the walls, wall after wall, after they have moved inwards by ``depth_m`` [m].
 
-        A wall is deep enough that no point which the robot can reach lies behind it, wherever it has come to.
+        Every wall is so thick that the robot cannot reach a point behind it.
         """
         front = self.room_m - depth_m
         back = np.maximum(front + THIN_M, self.reach_m)
@@ -49,17 +49,17 @@ class Border:
         return np.asarray((self.base_m + ends + faces[:, None]).reshape(-1, 3))
 
     def obstacles(self, depth_m: float, horizon_s: float, person: Obstacles | int) -> Obstacles:
-        """The walls alone, or behind the volumes of a person.
+        """The walls as obstacles, alone or after the volumes of a person.
 
         Args:
-            depth_m: How far they have come in. One that has come to the robot's base says no more than that nothing is
-                known [m].
-            horizon_s: Until when that holds, from the tick on [s].
-            person: The person's volumes; or how many of them there would be, where nobody is there.
+            depth_m: Distance by which the walls have moved inwards; if a wall reaches the robot's base, the obstacles
+                are unknown [m].
+            horizon_s: Time from the tick on for which the walls are valid [s].
+            person: The person's volumes; without a person, the number of volumes that a person has.
         """
         count = len(self.normals)
         if not depth_m < self.room_m.min():
-            depth_m = np.nan  # and so are the vertices
+            depth_m = np.nan  # the vertices become NaN, too
         vertices, offsets, radius = self.walls(depth_m), np.arange(0, 8 * count + 1, 8), np.zeros(count)
         if isinstance(person, int):
             return _obstacles(vertices, offsets, radius, horizon_s, person)
@@ -73,7 +73,7 @@ class Border:
 
 
 def _obstacles(vertices: Floats, offsets: Ints, radius: Floats, horizon_s: float, first: int) -> Obstacles:
-    for array in (vertices, radius):  # as those of a person alone, or numba would compile all kernels again
+    for array in (vertices, radius):  # like those of a person; otherwise numba compiles all kernels again
         array.setflags(write=False)
     around, known = boxes(vertices, offsets, radius)
     return Obstacles(vertices, offsets, radius, around, known, horizon_s, first)

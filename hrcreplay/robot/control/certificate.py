@@ -1,17 +1,17 @@
-"""Certificate that a motion keeps clear of the swept volumes at every instant, and the decision by it.
+"""Certificate that a motion keeps clear of the swept volumes at every instant, and the decision based on it.
 
-By conservative advancement (Mirtich, 1996): between two positions of the axes no point of a link moves by more than the
-sum over the axes of its largest distance from the axis times the angle the axis turns. Where the link is further than
-that from a volume, the motion between is clear. The distance at a position is bounded from below by a plane between
-link and volume, found by coal; one pass over the vertices proves it, wherever the plane came from. Nothing is shared
-with the distances of the rows of Eq. (66i), so that a fault in them is no fault here.
+The certificate uses conservative advancement (Mirtich, 1996). Between two positions of the axes, a point of a link
+moves by at most the sum over the axes of its largest distance from the axis times the angle that the axis turns. If the
+distance between link and volume is larger, the motion between the two positions is clear. A plane between link and
+volume bounds the distance from below. coal finds the plane, and one pass over the vertices proves the bound for any
+plane. The certificate shares no code with the distances in the rows of Eq. (66i), so an error there does not affect it.
 
-By induction from standstill no link touches the person while the robot moves, as long as it does not retreat and the
-person stays inside the volumes of each tick until their horizon, the end of the stop that would follow.
+By induction from standstill, no link touches the person while the robot moves, under two conditions: the robot does
+not retreat, and the person stays inside the volumes of each tick until their horizon, the end of the stop that follows.
 
-A robot that a volume has reached may retreat. A retreating step begins inside a volume, so that the link may touch the
-person already: it is not clear of them. What is certified is that no point of the link comes nearer to any point of the
-volume, and slowly, so that who touched it at rest is let go.
+A robot inside a volume may retreat. The link may already touch the person when a retreating step begins, so the step is
+not clear of the person. Instead the certificate proves that no point of the link comes nearer to any point of the
+volume and that the link moves slowly. A link at rest that touches a person therefore only moves away.
 """
 
 from __future__ import annotations
@@ -42,40 +42,40 @@ from hrcreplay.robot.control.control_step import (
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel
 
-#: Rounding that moving away allows for [m^2/s].
+#: Rounding tolerance of the check that a link moves away [m^2/s].
 AWAY = 1e-9
 
-#: Distance that a motion must keep beyond what it needs: more than all rounding on the way [m].
+#: Additional distance that a motion must keep; larger than the sum of all rounding errors [m].
 MARGIN_M = 1e-9
 
-#: coal searches a polytope of up to this many points one by one, so it needs no hull's edges, and points in a plane,
-#: on a line or all in one are as good as any.
+#: Up to this many points coal searches a polytope point by point. Then it needs no edges of the hull, and the points
+#: may lie in a plane, on a line or in one place.
 MOST_POINTS = 32
 
-#: What an axis may turn beyond its velocities at the ends of a tick [rad], and share of its acceleration limit that it
-#: may need: a path bends within a tick.
+#: Tolerances because a path bends within a tick: additional angle of an axis beyond its velocities at the ends of the
+#: tick [rad], and largest share of its acceleration limit.
 LEAP_RAD, LEAP = 1e-4, 1.05
 
-#: Rows of a motion that a plane must prove at a time, lest coal be asked for a better one.
+#: If a plane proves fewer rows of a motion than this, coal searches a better plane.
 FEW = 4
 
-#: A plane is as good as it gets when it proves all but this of the distance that coal found [m].
+#: The search for a plane ends when the plane proves the distance that coal found up to this difference [m].
 ENOUGH_M = 1e-3
 
 _PLACE = coal.Transform3s()
 _NO_FACE = coal.StdVec_Triangle()
-_NO_FACE.append(coal.Triangle(0, 0, 0))  # a polytope must have one; the search over points does not look at it
+_NO_FACE.append(coal.Triangle(0, 0, 0))  # coal requires a face; the search over points does not use it
 
 
-#: Planes between links and limbs before any was found.
+#: Planes between links and limbs before the first tick.
 NO_PLANES: Floats = np.zeros((0, 0, 3))
 
 
-#: What `clear` finds: not certified; clear of every volume; away from those that a link is inside of, and clear of all
-#: others.
+#: Verdicts of `clear`: not certified; clear of every volume; moving away from the volumes that a link is inside, and
+#: clear of all others.
 REFUSED, CLEAR, OPENING = range(3)
 
-#: Speed at which a robot may leave a volume that it is inside of: the reduced speed of ISO 10218 [m/s].
+#: Speed limit of a robot that moves out of a volume: the reduced speed of ISO 10218 [m/s].
 RETREAT_SPEED = 0.25
 
 
@@ -89,24 +89,25 @@ def clear(
     planes: Floats,
     retreat_m: float = 0.0,
 ) -> tuple[int, Floats]:
-    """Check that a step and the stop after it keep every link clear of every volume at all times.
+    """Checks that a step and the stop after it keep every link clear of every volume at all times.
 
-    A link that begins inside a volume may move if no point of it comes nearer to any point of the volume, wherever the
-    person is inside it.
+    A link that begins inside a volume may move if no point of the link comes nearer to any point of the volume. This
+    holds for every position of the person inside the volume.
 
     Args:
         robot: The manipulator.
-        current_stop: Its row 0 is where the step begins.
-        stop: From the end of the step on.
+        current_stop: The current stop; the step begins at its row 0.
+        stop: The stop that begins at the end of the step.
         obstacles: The swept volumes, valid until the stop has ended.
-        clearance_m: Beyond limb radius + link radius [m].
+        clearance_m: Clearance beyond limb radius + link radius [m].
         dt_s: Length of a tick [s].
-        planes: (s, l, 3) directions from link to limb of the tick before, which seldom turn by much; or NO_PLANES.
-        retreat_m: A link that begins inside a volume by no more than this may move out of it [m].
+        planes: (s, l, 3) directions from link to limb of the previous tick, which are good initial values; or
+            NO_PLANES.
+        retreat_m: Largest depth inside a volume from which a link may move out of it [m].
 
     Returns:
-        The verdict, REFUSED as well where a number is not finite, the stop would leave the range of an axis, an axis
-        would have to leap, or coal finds no distance; and the planes for the next tick.
+        The verdict and the planes for the next tick. The verdict is also REFUSED if a number is not finite, the stop
+        leaves the range of an axis, an axis jumps, or coal finds no distance.
     """
     q, dq = np.vstack((current_stop.q[:1], stop.q)), np.vstack((current_stop.dq[:1], stop.dq))
     last = stop.q[-1]
@@ -141,14 +142,15 @@ def clear(
 
 @njit(cache=True)
 def _moves_away(ends: Floats, twist: Floats, vertices: Floats) -> bool:
-    """Check that no point of a link's axis comes nearer to a point of a hull at any tick of a motion, and none is fast.
+    """Checks at every tick that no point of a link's axis comes nearer to a point of a hull, and that none is fast.
 
-    (r - p) @ v <= 0 for a point p of the axis with velocity v and every vertex r; it is linear along the axis, Eq.
-    (11), and in r, so the ends and the vertices speak for all. Between two ticks the link moves by 1 mm at most.
+    The condition is (r - p) @ v <= 0 for a point p of the axis with velocity v and every vertex r. It is linear along
+    the axis, Eq. (11), and in r, so the check of the ends and the vertices covers all points. Between two ticks the
+    link moves by at most 1 mm.
 
     Args:
-        ends: (n, 2, 3) of the link's axis at each tick [m].
-        twist: (n, 6) as of `LinkMotion` [m/s, rad/s].
+        ends: (n, 2, 3) ends of the link's axis at each tick [m].
+        twist: (n, 6) as in `LinkMotion` [m/s, rad/s].
         vertices: (m, 3) [m].
     """
     for i in range(len(ends)):
@@ -171,21 +173,21 @@ def _moves_away(ends: Floats, twist: Floats, vertices: Floats) -> bool:
 
 
 def _keeps_off(ends: _Ends, link: int, travel: Floats, vertices: Floats, keep_m: float, plane: Floats) -> bool:
-    """Conservative advancement of one link towards one limb; writes the last plane between them.
+    """Checks one link against one limb by conservative advancement; writes the last plane to ``plane``.
 
     Args:
-        ends: Of the links at each row of the motion.
-        link: Which one.
-        travel: (n,) of `_travel` [m].
-        vertices: (m, 3) of the limb [m].
+        ends: Ends of the links at each row of the motion.
+        link: Index of the link.
+        travel: (n,) result of `_travel` for the link [m].
+        vertices: (m, 3) vertices of the limb [m].
         keep_m: Distance to keep [m].
-        plane: (3,) to begin with.
+        plane: (3,) initial direction from link to limb.
     """
     row, last = 0, len(travel) - 1
     while True:
         a, b = ends.at(row)[link]
         there = _proven(travel, row, _gap(a, b, plane, vertices) - keep_m)
-        if there < min(row + FEW, last):  # the plane of before proves little
+        if there < min(row + FEW, last):  # the previous plane proves too few rows
             normal = separating_normal(a, b, vertices)
             if normal is None:
                 return False
@@ -199,14 +201,14 @@ def _keeps_off(ends: _Ends, link: int, travel: Floats, vertices: Floats, keep_m:
 
 
 class _Ends:
-    """Ends of the links along a motion, each row computed when it is first asked for."""
+    """Ends of the links along a motion; each row is computed at its first use."""
 
     def __init__(self, robot: RobotModel, q: Floats) -> None:
         self._robot, self._q = robot, q
         self._rows: dict[int, Floats] = {}
 
     def at(self, row: int) -> Floats:
-        """(s, 2, 3) at a row of the motion [m]."""
+        """(s, 2, 3) ends of the links at a row of the motion [m]."""
         if row not in self._rows:
             self._rows[row] = self._robot.ends_m(self._q[row])
         return self._rows[row]
@@ -214,7 +216,7 @@ class _Ends:
 
 @njit(cache=True)
 def _proven(travel: Floats, row: int, gap: float) -> int:
-    """The last row before which a link cannot have bridged a gap that it has at a row; -1 where there is no gap."""
+    """The last row up to which a link moves by less than its gap at ``row``; -1 if there is no gap."""
     there = row if gap > 0.0 else -1
     while 0 <= there < len(travel) - 1 and travel[there + 1] - travel[row] < gap:
         there += 1
@@ -223,12 +225,12 @@ def _proven(travel: Floats, row: int, gap: float) -> int:
 
 @njit(cache=True)
 def _can_be_done(q: Floats, dq: Floats, gain: Floats, dt_s: float) -> bool:
-    """Check that no axis leaps from a row of a motion to the next; false where a number is not finite.
+    """Checks that no axis jumps from a row of a motion to the next; false if a number is not finite.
 
     Args:
         q: (n, nv) [rad].
         dq: (n, nv) [rad/s].
-        gain: (nv,) change of velocity that an axis manages in a tick [rad/s].
+        gain: (nv,) largest change of velocity of an axis in a tick [rad/s].
         dt_s: Length of a tick [s].
     """
     for i in range(1, len(q)):
@@ -241,9 +243,9 @@ def _can_be_done(q: Floats, dq: Floats, gain: Floats, dt_s: float) -> bool:
 
 @njit(cache=True)
 def _travel(q: Floats, dq: Floats, reach: Floats, dt_s: float) -> Floats:
-    """(n, s) how far a point of each link can have moved until each row of a motion [m].
+    """(n, s) upper bound of the travel of a point of each link until each row of a motion [m].
 
-    Within a tick an axis does not turn by more than the larger of the speeds at its ends allows.
+    Within a tick an axis turns by at most the larger of its speeds at the ends of the tick times the tick's length.
 
     Args:
         q: (n, nv) [rad].
@@ -264,7 +266,7 @@ def _travel(q: Floats, dq: Floats, reach: Floats, dt_s: float) -> Floats:
 
 @njit(cache=True)
 def _undecided(ends: Floats, vertices: Floats, offsets: Ints, boxes: Floats, normals: Floats, far: Floats) -> Ints:
-    """(n, 2) pairs of link and limb that neither their boxes nor their planes show to be further apart than ``far``."""
+    """(n, 2) pairs of link and limb whose boxes and planes do not prove a distance larger than ``far``."""
     links, limbs = far.shape
     pairs = np.empty((links * limbs, 2), np.int64)
     n = 0
@@ -286,12 +288,12 @@ def _undecided(ends: Floats, vertices: Floats, offsets: Ints, boxes: Floats, nor
 
 @njit(cache=True)
 def _gap(a: Floats, b: Floats, normal: Floats, vertices: Floats) -> float:
-    """Lower bound of the distance between a segment and the hull of points: the gap across a direction [m].
+    """Lower bound of the distance between a segment and the hull of points: the gap along a direction [m].
 
     Args:
         a: (3,) end of the segment [m].
         b: (3,) other end [m].
-        normal: (3,) unit vector from the segment towards the hull; zero bounds nothing.
+        normal: (3,) unit vector from the segment towards the hull; a zero vector gives no bound.
         vertices: (m, 3) [m].
     """
     depth = np.inf
@@ -306,10 +308,10 @@ def _gap(a: Floats, b: Floats, normal: Floats, vertices: Floats) -> float:
 
 
 def separating_normal(a: Floats, b: Floats, vertices_m: Floats) -> Floats | None:
-    """Direction from a segment to the convex hull of points across which they are furthest apart, by coal's GJK.
+    """Direction along which a segment and the convex hull of points are furthest apart, by coal's GJK.
 
-    coal measures the distance to few of the vertices. While another one lies nearer across the direction found, it
-    joins in.
+    coal measures the distance to a few of the vertices. While another vertex is nearer along the direction found, it is
+    added to them.
 
     Args:
         a: (3,) end of the segment [m].
@@ -317,7 +319,7 @@ def separating_normal(a: Floats, b: Floats, vertices_m: Floats) -> Floats | None
         vertices_m: (m, 3) [m].
 
     Returns:
-        (3,) unit vector; None in penetration and where coal finds no direction.
+        (3,) unit vector; None in penetration or if coal finds no direction.
     """
     segment = _polytope(np.stack((a, b)))
     chosen = [int(np.argmin(((vertices_m - 0.5 * (a + b)) ** 2).sum(axis=1)))]
@@ -337,7 +339,7 @@ def separating_normal(a: Floats, b: Floats, vertices_m: Floats) -> Floats | None
             best, most = normal, below
         if above - below <= ENOUGH_M * min(1.0, above) or furthest in chosen:
             return best
-        if len(chosen) == MOST_POINTS:  # those far from the plane do not carry the nearest point
+        if len(chosen) == MOST_POINTS:  # the nearest point does not depend on points far from the plane
             order = np.argsort(along[chosen], kind="stable")[: MOST_POINTS // 2]
             chosen = [chosen[i] for i in order]
         chosen.append(furthest)
@@ -369,19 +371,19 @@ def decide(
     planes: Floats,
     settings: PlanSettings,
 ) -> tuple[Taken, Floats]:
-    """Takes a proposal that is certified, or goes on with the stop.
+    """Takes the first certified proposal, or continues the current stop.
 
     Args:
         robot: The manipulator.
-        current_stop: The stop that goes on where nothing else is taken; its row 0 is where the robot is.
-        proposals: The proposals of the method, the one it would like best first; or the reason why there is none.
+        current_stop: The stop that continues if no proposal is certified; its row 0 is the present state of the robot.
+        proposals: The proposals of the method, best first; or the reason why there is none.
         obstacles: The swept volumes of the tick.
-        horizon_s: Until when they hold [s].
-        planes: (s, l, 3) planes between links and limbs, of the tick before.
-        settings: Of the method.
+        horizon_s: Time from the tick on for which the volumes are valid [s].
+        planes: (s, l, 3) planes between links and limbs of the previous tick.
+        settings: Settings of the method.
 
     Returns:
-        What is executed, and the planes for the next tick.
+        The executed motion, and the planes for the next tick.
     """
     certify, reason = settings.certified, proposals if isinstance(proposals, int) else NOT_CERTIFIED
     for stop, status in () if isinstance(proposals, int) else proposals:

@@ -1,9 +1,8 @@
-"""Input and output of one tick of a controller, the stops in them, and what comes first: how near the people are.
+"""Input and output of one tick of a controller, the stops in them, and the observation of people.
 
-A stop is a motion to rest in whole ticks, every position of which is known before it begins, so that it can be
-certified. Eq. (67) lets every axis brake for itself, so that the links leave the direction they moved in and come
-nearer to people that they passed by. A straight stop lets all axes come to rest together, along a straight line in
-joint space.
+A stop is a motion to rest in whole ticks. All its positions are known before it begins, so it can be certified. By
+Eq. (67) every axis brakes independently; the links then leave their direction of motion and may come nearer to people
+beside them. In a straight stop all axes come to rest together, along a straight line in joint space.
 
 Corrections to the paper: docs/paper.md.
 """
@@ -26,32 +25,32 @@ from hrcreplay.settings.sections import Plan
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A motion to rest, a row a tick; row 0 is where it begins. What is certified is what is executed, bit for bit."""
+    """A motion to rest, one row per tick; it begins at row 0. The robot executes exactly the certified numbers."""
 
     q: Floats  #: (n + 1, nv) [rad]
     dq: Floats  #: (n + 1, nv); the last row is zero [rad/s]
-    along: Floats  #: (n + 1, 2) programmed time [s] and rate of a robot that stays on its path; NaN for any other
+    along: Floats  #: (n + 1, 2) programmed time [s] and rate of a robot that stays on its path; otherwise NaN
 
     @property
     def ticks(self) -> int:
-        """Number of ticks until the robot is at rest; 0 at rest."""
+        """Number of ticks until the robot is at rest; 0 if it is at rest."""
         return len(self.q) - 1
 
     def rest(self) -> Stop:
-        """Remainder of the stop one tick later; at rest, the same."""
+        """Remainder of the stop one tick later; at rest, the stop itself."""
         return Stop(self.q[1:], self.dq[1:], self.along[1:]) if self.ticks else self
 
 
 def stop_straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
-    """The stop in which all axes come to rest together, as soon as the slowest of them can.
+    """The stop in which all axes come to rest together, as soon as the slowest axis can.
 
-    The velocity falls by the same share of itself in each of n ticks, so that no axis turns back, none decelerates by
-    more than its limit, and the path is the straight line in joint space of length n dt / 2 times the velocity. Each
-    tick is that of Eq. (68), (69).
+    In each of n ticks the velocity falls by the same share of its initial value. Hence no axis turns back, no axis
+    decelerates by more than its limit, and the path is a straight line in joint space, n dt / 2 times the velocity.
+    Each tick follows Eq. (68), (69).
 
     Args:
-        q: (nv,) where it begins [rad].
-        dq: (nv,) velocity there, finite [rad/s].
+        q: (nv,) initial position [rad].
+        dq: (nv,) initial velocity, finite [rad/s].
         ddq_max: (nv,) [rad/s^2].
         dt_s: Length of a tick [s].
     """
@@ -78,8 +77,8 @@ def stop_axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> St
     """The stop of Eq. (67): every axis comes to rest as soon as it can.
 
     Args:
-        q: (nv,) where it begins [rad].
-        dq: (nv,) velocity there; an axis of unknown velocity counts as standing [rad/s].
+        q: (nv,) initial position [rad].
+        dq: (nv,) initial velocity; an axis with unknown velocity counts as at rest [rad/s].
         ddq_max: (nv,) [rad/s^2].
         dt_s: Length of a tick [s].
     """
@@ -103,9 +102,9 @@ def _stop_axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> t
     return rows_q, rows_dq
 
 
-#: Ticks after which a stop along a path counts as none: the path allows no lower rate.
+#: Largest number of ticks of a stop along a path; if it takes longer, there is no stop along the path.
 MOST_TICKS = 2000
-#: Rounds of looking for a rate, and how near the limit of an axis it must be found.
+#: Largest number of iterations in the search for a rate, and the tolerance of the rate.
 _ROUNDS, _SHARE = 30, 1e-9
 
 
@@ -114,13 +113,13 @@ def stop_along_path(grid: Grid, s_s: float, rate: float, ddq_max: Floats, dt_s: 
 
     Args:
         grid: The path.
-        s_s: Programmed time where it begins [s].
-        rate: Share of the programmed speed there, in [0, 1].
+        s_s: Programmed time at the start of the stop [s].
+        rate: Share of the programmed speed at the start, in [0, 1].
         ddq_max: (nv,) [rad/s^2].
         dt_s: Length of a tick [s].
 
     Returns:
-        None where the path does not let the robot come to rest.
+        The stop; None if the robot cannot come to rest along the path.
     """
     q, dq, along, ticks = _stop_along_path(grid, s_s, rate, ddq_max * dt_s, dt_s)
     return Stop(q[: ticks + 1], dq[: ticks + 1], along[: ticks + 1]) if ticks < MOST_TICKS else None
@@ -158,7 +157,7 @@ def _stop_along_path(
 
 @njit(cache=True)
 def _least_rate(towards: Floats, dq: Floats, gain: Floats) -> float:
-    """Smallest rate, 0 or more, with which no axis loses more than ``gain`` of its velocity."""
+    """Smallest non-negative rate at which no axis changes its velocity by more than ``gain``."""
     least = 0.0
     for j in range(len(dq)):
         if towards[j] > 0.0:
@@ -169,16 +168,16 @@ def _least_rate(towards: Floats, dq: Floats, gain: Floats) -> float:
 
 
 def at_rest(q: Floats, along: Floats | None = None) -> Stop:
-    """A robot that stands.
+    """The stop of a robot at rest.
 
     Args:
         q: (nv,) [rad].
-        along: (2,) programmed time and rate on its path; None: it is not on one.
+        along: (2,) programmed time and rate on its path; None: the robot is not on a path.
     """
     return Stop(q[None], np.zeros((1, len(q))), np.full((1, 2), math.nan) if along is None else along[None])
 
 
-#: Why a robot braked, or stood where it was. The first is that of ticks in which it did neither.
+#: Reasons why a robot braked or stood still. The first one is for ticks without braking or standing still.
 REASONS = (
     "",
     "no human state",
@@ -205,24 +204,24 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """Section 5 without the robot."""
+    """Settings of Section 5, without the robot."""
 
     plan: Plan
     dt_s: float  #: length of a tick [s]
     stop_s: float  #: T_s of Eq. (70) [s]
     latency_s: float = 0.0  #: from the newest capture to the robot's reaction [s]
-    spare_ticks: int = 0  #: ticks for which the volumes of a tick must serve beyond their own
+    spare_ticks: int = 0  #: number of further ticks in which the volumes of a tick may be used
     certified: bool = True  #: whether a step must be certified
-    retreat_m: float = 0.0  #: a robot that is inside a volume by no more than this may move out of it [m]
+    retreat_m: float = 0.0  #: largest depth inside a volume from which a robot may move out of it [m]
 
     def horizon_s(self, stop: Stop) -> float:
-        """Required horizon of a tick's volumes: the end of the stop that would follow the step [s].
+        """Required horizon of a tick's volumes: the end of the stop that follows the step [s].
 
-        Beside the stop from the present velocity that is the step itself, and the tick more that a stop takes from
-        the velocity it may have gained.
+        It is the duration of the stop from the present velocity, plus one tick for the step, plus one tick because
+        the step may increase the velocity.
 
         Args:
-            stop: From the present velocity.
+            stop: The stop from the present velocity.
         """
         needed = (stop.ticks + 2 + self.spare_ticks) * self.dt_s
         if self.plan.horizon == "adaptive":
@@ -230,22 +229,22 @@ class PlanSettings:
         return max(self.stop_s, needed) if self.certified else self.stop_s
 
     def retreats(self, overlap_m: float) -> bool:
-        """Return whether a robot with a link so deep inside a volume may move out of it, slowly [m]."""
+        """Return whether a robot whose link is ``overlap_m`` [m] inside a volume may slowly move out of it."""
         return 0.0 < overlap_m < self.retreat_m
 
     def without_jerk(self) -> PlanSettings:
-        """The same where the acceleration may change by any amount in a tick."""
+        """The same settings without the limit on changes of the acceleration."""
         return replace(self, plan=self.plan.model_copy(update={"jerk_s": 0.0}))
 
 
 class Proposal(NamedTuple):
-    """A step that a method would like to take."""
+    """A step that a method proposes."""
 
-    stop: Stop  #: the stop after it; its row 0 is where the step leads
+    stop: Stop  #: the stop after the step; its row 0 is the end of the step
     status: int  #: index into ``records.STATUSES``
 
 
-#: Steps that a method would take, best first; or the index into REASONS of why there are none.
+#: Steps that a method proposes, best first; or the index into REASONS of the reason why there are none.
 Proposals = list[Proposal] | int
 
 
@@ -257,28 +256,28 @@ class Step:
     u: Floats  #: (nv,) applied from the tick on [rad/s^2]
     next: RobotState  #: one tick later, Eq. (68), (69)
     distance_m: float  #: surface to surface, smallest over all pairs; 0 in contact, NaN where not known [m]
-    overlap_m: float  #: how deep the link is inside the volume, as far as their radii go; NaN where not known [m]
+    overlap_m: float  #: depth of the link inside the volume, radii included; NaN where not known [m]
     limb: int  #: of the nearest pair; -1 without one
     link: int  #: of the nearest pair; -1 without one
     status: int  #: index into ``records.STATUSES``
     reason: int  #: index into ``REASONS``
-    horizon_s: float  #: until when the volumes held that it was decided with [s]
-    tau_s: float  #: how long the stop from the velocity of the tick takes [s]
-    certified: bool  #: whether the step, or the stop that it continues, was found clear of volumes that still hold
-    stop: Stop  #: what goes on from the next tick where no better step is certified
+    horizon_s: float  #: horizon of the volumes used, from the tick on [s]
+    tau_s: float  #: duration of the stop from the velocity of the tick [s]
+    certified: bool  #: whether the step, or the stop that it continues, is clear of volumes that are still valid
+    stop: Stop  #: the stop that continues at the next tick if no better step is certified
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """The robot and the people of one tick."""
+    """The robot and the people at one tick."""
 
     pose: RobotPose
-    pairs: Separation | None  #: none where ``reason`` says why
-    distance_m: float  #: surface to surface, smallest over all pairs; NaN where there is none [m]
+    pairs: Separation | None  #: None if ``reason`` is not 0
+    distance_m: float  #: surface to surface, smallest over all pairs; NaN if there is no pair [m]
     limb: int
     link: int
-    reason: int  #: index into ``REASONS``; 0 where nothing is wrong
-    overlap_m: float = 0.0  #: how deep the link is inside the volume, as far as their radii go [m]
+    reason: int  #: index into ``REASONS``; 0 if there is no problem
+    overlap_m: float = 0.0  #: depth of the link inside the volume, radii included [m]
 
 
 def observe(
@@ -290,10 +289,10 @@ def observe(
 
     Args:
         robot: The manipulator.
-        state: At the tick.
+        state: State of the robot at the tick.
         obstacles: The swept volumes of the tick.
         clearance_m: Clearance beyond limb radius + link radius [m].
-        pose: Of the robot in that state, where it has been computed already.
+        pose: Pose of the robot in that state, if it is already computed.
     """
     pose = robot.pose(state.q, state.dq) if pose is None else pose
     finite = math.isfinite(state.q.sum()) and math.isfinite(pose.J_tcp.sum() + pose.dJdq_tcp.sum())
@@ -312,18 +311,18 @@ def observe(
 class Taken(NamedTuple):
     """Motion executed in a tick."""
 
-    stop: Stop  #: from the end of the step on; its row 0 is where the step leads
+    stop: Stop  #: the stop after the step; its row 0 is the end of the step
     status: int  #: index into ``records.STATUSES``
     reason: int  #: index into ``REASONS``
-    certified: bool  #: whether step and stop were found clear of volumes that still hold
+    certified: bool  #: whether step and stop are clear of volumes that are still valid
 
 
 def standstill_reason(sight: Sight, settings: PlanSettings) -> int:
-    """Reason to propose no step: people are not known, or the robot is inside a volume; 0 where neither holds.
+    """Reason to propose no step: people are not known, or the robot is inside a volume; 0 if there is no reason.
 
     Args:
         sight: The robot's distances from people.
-        settings: Of the method.
+        settings: Settings of the method.
     """
     if sight.reason:
         return sight.reason
@@ -336,12 +335,12 @@ def motion_row(
     """The row of a tick.
 
     Args:
-        state: Of the robot at the tick.
-        step: What was decided.
+        state: State of the robot at the tick.
+        step: The decision of the controller.
         ref_m: (3,) programmed TCP position, world [m].
-        ref_speed: Of the reference [m/s].
+        ref_speed: TCP speed of the reference [m/s].
         programme_s: Programmed time of the reference [s].
-        reason: Why it braked or stood, in place of the step's own reason.
+        reason: Why the robot braked or stood still, instead of the step's reason.
     """
     return MotionRow(
         q=state.q,
@@ -368,10 +367,10 @@ def make_step(sight: Sight, current_stop: Stop, taken: Taken, horizon_s: float, 
     """The record of a tick.
 
     Args:
-        sight: What was seen at the tick.
-        current_stop: Its row 0 is where the robot is.
-        taken: What is executed.
-        horizon_s: Until when the volumes of the tick hold [s].
+        sight: The observation at the tick.
+        current_stop: The current stop; its row 0 is the present state of the robot.
+        taken: The executed motion.
+        horizon_s: Time from the tick on for which its volumes are valid [s].
         dt_s: Length of a tick [s].
     """
     after = RobotState(taken.stop.q[0], taken.stop.dq[0])

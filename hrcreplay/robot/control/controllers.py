@@ -1,4 +1,4 @@
-"""Stage 3: a method that follows its reference tick by tick, beside the people of each tick."""
+"""Stage 3: methods that follow their reference tick by tick, near the people of each tick."""
 
 from __future__ import annotations
 
@@ -41,27 +41,27 @@ class ControllerTick(NamedTuple):
     """State, reference and decision of a method at one tick."""
 
     state: RobotState
-    point: ReferencePoint  #: of the reference
-    programme_s: float  #: its programmed time [s]
+    point: ReferencePoint  #: the reference at the tick
+    programme_s: float  #: programmed time of the reference [s]
     step: Step
 
 
-#: The swept volumes of a tick that hold until so many seconds after it.
+#: Horizon from the tick on [s] -> the swept volumes of the tick that are valid until then.
 Predict = Callable[[float], Obstacles]
 
 
 class Observation(NamedTuple):
     """Observation of people at a tick."""
 
-    sight: Sight  #: its pose, and its distances from people
+    sight: Sight  #: the robot's pose, and its distances from people
     obstacles: Obstacles  #: the swept volumes
-    horizon_s: float  #: until when they hold [s]
+    horizon_s: float  #: time from the tick on for which the volumes are valid [s]
     predict: Predict  #: the volumes for any horizon
 
 
 @dataclass
 class Controller(ABC):
-    """A robot that follows a reference by a method: it takes a step that is certified, or its last stop goes on."""
+    """A robot that follows a reference by a method; without a certified step it continues its last stop."""
 
     robot: RobotModel
     reference: Reference
@@ -78,7 +78,7 @@ class Controller(ABC):
         return RobotState(self.stop.q[0], self.stop.dq[0])
 
     def take_over(self, stop: Stop) -> None:
-        """Goes on from where another controller has brought the robot: with the stop that was certified."""
+        """Takes over the robot from another controller, together with its certified stop."""
         self.stop = stop if stop.ticks else at_rest(stop.q[0], np.array([self.s_s, 0.0]))
         self.u = np.zeros(self.robot.nv)
         self.planes = NO_PLANES
@@ -87,7 +87,7 @@ class Controller(ABC):
         """One tick."""
         settings, current_stop = self.settings, self.stop
         state, point, now_s = self.state, self.point, self.s_s
-        with np.errstate(all="ignore"):  # numbers beyond reason end as a reason to brake, not as a warning
+        with np.errstate(all="ignore"):  # invalid numbers lead to braking, not to warnings
             seen = self.observe(predict)
             proposals = self.propose(seen)
             taken, self.planes = decide(
@@ -99,10 +99,10 @@ class Controller(ABC):
         return ControllerTick(state, point, now_s, step)
 
     def observe(self, predict: Predict) -> Observation:
-        """The people of the tick, with the volumes that hold until the stop after its step would have ended."""
+        """The people at the tick, with volumes that are valid until the end of the stop after the step."""
         horizon_s = self.settings.horizon_s(self.stop)
         obstacles = predict(horizon_s)
-        horizon_s = min(horizon_s, obstacles.horizon_s)  # in a live session those of an earlier look may have to do
+        horizon_s = min(horizon_s, obstacles.horizon_s)  # a live session may reuse older volumes
         return Observation(
             observe(self.robot, self.state, obstacles, self.settings.plan.clearance_m), obstacles, horizon_s, predict
         )
@@ -113,19 +113,19 @@ class Controller(ABC):
 
     @abstractmethod
     def _move_on(self) -> None:
-        """Takes over the reference of the tick that follows."""
+        """Moves the reference to the next tick."""
 
 
 class QpController(Controller):
-    """The trajectory generator of Section 5 along a reference that waits for it or not."""
+    """The trajectory generator of Section 5, along a reference that waits for the robot or runs with the clock."""
 
     def propose(self, seen: Observation) -> Proposals:
-        """The step that Eq. (66) finds best, and the stop after it."""
+        """The best step by Eq. (66), and the stop after it."""
         context = self.qp_context(seen)
         return standstill_reason(seen.sight, self.settings) or qp_controller.propose(context, self.settings)
 
     def qp_context(self, seen: Observation) -> QpContext:
-        """Input of Eq. (66). Its target is the reference one tick later, to which the reference moves on."""
+        """Advances the reference by one tick and returns the input of Eq. (66), whose target it is."""
         error_m = norm_n(seen.sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3])
         self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
         self.point = self.reference.sample(self.s_s)
@@ -134,23 +134,23 @@ class QpController(Controller):
         return QpContext(self.robot, self.state, self.u, target, seen.sight, seen.obstacles, seen.horizon_s)
 
     def _move_on(self) -> None:
-        """The reference has moved already: the program is solved for where it will be."""
+        """Does nothing: ``qp_context`` has already advanced the reference."""
 
 
 class PathController(Controller):
     """A robot that stays on the programmed path: the baselines of ``path_controller``."""
 
-    #: Whether the method looks at people at all, and whether the rows of Eq. (66i) bound its rate.
+    #: Whether the method takes people into account, and whether the rows of Eq. (66i) bound its rate.
     careful, by_rows = True, False
 
     def propose(self, seen: Observation) -> Proposals:
-        """The largest rate along the path that is allowed, and the stop after it."""
+        """The step with the largest allowed rate along the path, and the stop after it."""
         sight = seen.sight
         reason = standstill_reason(sight, self.settings) if self.careful else 0
         if reason or sight.reason == NOT_FINITE:
             return reason or sight.reason
         if np.isnan(self.stop.along[0, 0]):
-            return NO_SOLUTION  # the stop of another method goes on
+            return NO_SOLUTION  # continue the stop of another method
         rows = seen.obstacles if self.by_rows else None
         return path_controller.propose(
             self.robot, self.reference, self.stop, sight, rows, seen.horizon_s, self.settings
@@ -171,16 +171,16 @@ class ScalingController(PathController):
 
 
 class BlindController(PathController):
-    """The programme, whoever is there."""
+    """Follows the programme and ignores people."""
 
     careful = False
 
 
 class SsmController(PathController):
-    """Speed and separation monitoring, ISO/TS 15066: goes while the protective separation distance is kept."""
+    """Speed and separation monitoring, ISO/TS 15066: moves while the protective separation distance is kept."""
 
     def propose(self, seen: Observation) -> Proposals:
-        """The same, while the protective separation distance is kept."""
+        """The proposals along the path, while the protective separation distance is kept."""
         proposals = super().propose(seen)
         if isinstance(proposals, int):
             return proposals
@@ -188,7 +188,7 @@ class SsmController(PathController):
         return proposals if present.distance_m >= needed_m else TOO_NEAR
 
     def protective(self, seen: Observation, proposal: Proposal) -> tuple[Sight, float]:
-        """The people where they are now, and the protective separation distance of a step [m]."""
+        """The observation of the people's present volumes, and the protective separation distance of a step [m]."""
         pose, settings = seen.sight.pose, self.settings
         present = observe(self.robot, self.state, seen.predict(0.0), settings.plan.clearance_m, pose)
         return present, path_controller.protective_distance_m(
@@ -196,7 +196,7 @@ class SsmController(PathController):
         )
 
 
-#: Method -> how it follows.
+#: Method -> its controller.
 CONTROLLERS: dict[str, type[Controller]] = {
     "qp": QpController,
     "scaling": ScalingController,
@@ -208,7 +208,7 @@ CONTROLLERS: dict[str, type[Controller]] = {
 
 @dataclass
 class Planner:
-    """One method beside the people of each tick."""
+    """Runs one method near the people of each tick."""
 
     controller: Controller
     chosen: bool  #: the run's method, not a baseline
@@ -219,7 +219,7 @@ class Planner:
         return self.controller.settings.dt_s
 
     def follow(self, t_ns: Ints, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
-        """The motion of a batch of ticks, beside what is predicted for each; ``limbs`` names all that can be there."""
+        """The motion of a batch of ticks with the predicted volumes of each; ``limbs`` names all possible volumes."""
         robot = self.controller.robot
         ticks = [self.controller.step(predict) for predict in around]
         rows = [

@@ -1,8 +1,8 @@
-"""The quadratic program of Eq. (66) in the metric of its cost, where a solver has the least trouble with it.
+"""The quadratic program of Eq. (66) in the metric of its cost, in which it is well conditioned for a solver.
 
 With ``H = L @ L.T`` and ``y = L.T @ x`` the cost is ``y @ y / 2 + y @ b``, and every row is scaled to length 1. x is
 the next joint velocity w [rad/s] and, where the approach rows are soft, the slack [m/s]. The eigenvalues of H may
-differ by a factor of 10^6 (a stretched wrist); here a residual of the size r means an error of about r.
+differ by a factor of 10^6 (a stretched wrist); in the metric a residual of size r means an error of about r.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from hrcreplay.robot.control.separation import Approach, worst_rows
 
 #: Marks a missing bound.
 NONE = 1e20
-#: Rows broken by no more than this hold, in the metric; and where a row does not depend on the velocity [m/s].
+#: A row holds if it is violated by no more than this, in the metric; [m/s] if it does not depend on the velocity.
 HELD = 1e-9
-#: Length in the metric below which a row does not depend on the velocity.
+#: A row whose length in the metric is below this does not depend on the velocity.
 EMPTY = 1e-9
-#: By how much a combination of rows must be broken everywhere to prove that there is no solution.
+#: A combination of rows proves that there is no solution if its violation is everywhere larger than this.
 DENIED = 1e-9
 
-#: What `next_row` finds: no broken row; broken ones that are all known; one that is new; one that nothing can help.
+#: Outcomes of `next_row`: no violated row; all violated rows are known; a new one; one that no velocity satisfies.
 CLEAR, KNOWN, NEW, HOPELESS = range(4)
 
 
@@ -52,25 +52,25 @@ class Metric(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Constraint that a candidate breaks."""
+    """Constraint that a candidate violates."""
 
     outcome: int  #: CLEAR, KNOWN, NEW or HOPELESS
     w: Floats  #: (nv,) the candidate, within the axes' bounds [rad/s]
     slack: float  #: [m/s]
-    row: Floats  #: (n,) the row that it breaks most of those that are new
-    high: float  #: its bound
-    key: Ints  #: (4,) which one it is, as of `worst_rows`
+    row: Floats  #: (n,) the new row that it violates most
+    high: float  #: upper bound of the row
+    key: Ints  #: (4,) indices of the row, as in `worst_rows`
 
 
 @njit(cache=True, error_model="numpy")
 def are_numbers_known(H: Floats, g: Floats, limits: Limits, rows: Approach) -> bool:
-    """Return whether nothing is NaN, and nothing infinite but for bounds that do not exist.
+    """Return whether no number is NaN and only missing bounds are infinite.
 
     Args:
         H: (nv, nv).
         g: (nv,).
-        limits: Of axes and TCP.
-        rows: Of people.
+        limits: Limits of axes and TCP.
+        rows: Approach rows of people.
     """
     total = H.sum() + g.sum() + limits.J.sum() + rows.ends_m.sum() + rows.J_ends.sum() + rows.vertices_m.sum()
     total += rows.boxes_m.sum() + rows.per_speed.sum() + rows.stop_s
@@ -82,14 +82,14 @@ def are_numbers_known(H: Floats, g: Floats, limits: Limits, rows: Approach) -> b
 
 @njit(cache=True, error_model="numpy")
 def build_metric(H: Floats, g: Floats, limits: Limits, soft: bool, slack_weight: float) -> Metric:
-    """The problem without approach rows; NaN where H is not positive definite.
+    """Builds the problem without approach rows; NaN if H is not positive definite.
 
     Args:
         H: (nv, nv) positive definite.
         g: (nv,).
-        limits: Of axes and TCP.
+        limits: Limits of axes and TCP.
         soft: Whether there is a slack.
-        slack_weight: Its cost is half of this times its square.
+        slack_weight: Weight of the slack; its cost is half of this times its square.
     """
     nv = len(g)
     n = nv + 1 if soft else nv
@@ -117,15 +117,15 @@ def build_metric(H: Floats, g: Floats, limits: Limits, soft: bool, slack_weight:
 
 @njit(cache=True)
 def descend(problem: Metric, z: Floats, sweeps: int) -> tuple[Floats, Floats]:
-    """A start for a solver: a candidate and multipliers after some sweeps of coordinate descent over the multipliers.
+    """Initial values for a solver: candidate and multipliers after coordinate descent over the multipliers.
 
-    Hildreth's method: a row after the other is met as if it were alone. It mostly finds the rows that the minimiser
-    lies on, which saves the solver most of its steps.
+    Hildreth's method satisfies one row after the other, each without regard to the others. It usually finds the active
+    rows of the minimiser and so saves the solver most of its steps.
 
     Args:
-        problem: In its metric.
-        z: (m,) multipliers to begin with; positive for upper bounds, negative for lower ones.
-        sweeps: How often every row is met.
+        problem: The problem in its metric.
+        z: (m,) initial multipliers; positive for upper bounds, negative for lower bounds.
+        sweeps: Number of passes over all rows.
     """
     _, b, E, low, high = problem
     y, z = -b, z.copy()
@@ -144,7 +144,7 @@ def descend(problem: Metric, z: Floats, sweeps: int) -> tuple[Floats, Floats]:
                     y[k] -= change * E[i, k]
         if most < 1e-12:
             break
-    for i in range(len(E)):  # a solver would keep a multiplier of a row that does not hold y
+    for i in range(len(E)):  # a solver would keep the multiplier of an inactive row
         if z[i] != 0.0 and abs(dot_n(E[i], y) - (high[i] if z[i] > 0.0 else low[i])) > 1e-9:
             z[i] = 0.0
     return y, z
@@ -152,7 +152,7 @@ def descend(problem: Metric, z: Floats, sweeps: int) -> tuple[Floats, Floats]:
 
 @njit(cache=True)
 def residual(problem: Metric, y: Floats, z: Floats) -> float:
-    """By how much y and z miss the conditions of Karush, Kuhn and Tucker, which prove a minimiser; NaN for NaN."""
+    """Residual of y and z in the Karush-Kuhn-Tucker conditions, which prove a minimiser; NaN for NaN."""
     _, b, E, low, high = problem
     gradient, most = y + b, 0.0
     for i in range(len(E)):
@@ -168,15 +168,15 @@ def residual(problem: Metric, y: Floats, z: Floats) -> float:
 
 @njit(cache=True)
 def denied(problem: Metric, z: Floats, limits: Limits) -> bool:
-    """Return whether multipliers prove that no velocity keeps all rows (Farkas).
+    """Return whether the multipliers prove that no velocity satisfies all rows (Farkas).
 
-    The rows of TCP and people are added up with them as weights; no velocity within the axes' bounds keeps the sum.
-    Beside a slack that is never so: it loosens all rows of people.
+    The rows of TCP and people are added with the multipliers as weights. The proof holds if no velocity within the
+    axes' bounds satisfies the sum. With a slack, rows of people cannot contribute, because the slack loosens them.
 
     Args:
-        problem: In its metric.
-        z: (m,) positive for upper bounds, negative for lower ones.
-        limits: Of axes and TCP.
+        problem: The problem in its metric.
+        z: (m,) multipliers; positive for upper bounds, negative for lower bounds.
+        limits: Limits of axes and TCP.
     """
     L, _, E, low, high = problem
     nv, n = len(limits.low), len(L)
@@ -193,7 +193,7 @@ def denied(problem: Metric, z: Floats, limits: Limits) -> bool:
             total[k] += weight * E[i, k]
     least = 0.0
     for j in range(n):
-        a = dot_n(L[j], total)  # of x, since y = L.T @ x
+        a = dot_n(L[j], total)  # coefficient of x, since y = L.T @ x
         if j >= nv:
             least = least if abs(a) < EMPTY else -np.inf
         elif a != 0.0:
@@ -203,14 +203,14 @@ def denied(problem: Metric, z: Floats, limits: Limits) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: Ints) -> Found:
-    """The approach row that a candidate breaks most, in the metric, of those that are not among the known ones.
+    """Finds the new approach row that a candidate violates most, in the metric.
 
     Args:
-        problem: In its metric.
+        problem: The problem in its metric.
         y: (n,) the candidate.
-        limits: Of axes and TCP.
-        rows: Of the people.
-        known: (k, 4) which ones are known.
+        limits: Limits of axes and TCP.
+        rows: Approach rows of people.
+        known: (k, 4) indices of the known rows, as in `worst_rows`.
     """
     L, nv, n = problem.L, len(limits.low), len(y)
     x = solve_transposed(L, y)
@@ -247,21 +247,21 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
 def gather(
     problem: Metric, z: Floats, limits: Limits, rows: Approach, known: Ints, sweeps: int, most: int
 ) -> tuple[Metric, Floats, Ints]:
-    """The problem with the approach rows that its minimiser is likely to lie on, found by coordinate descent alone.
+    """Adds the approach rows that are probably active at the minimiser, found by coordinate descent only.
 
-    A row too many costs a solver little, a row that is missing costs another call of it.
+    An unnecessary row costs the solver little; a missing row costs another call of the solver.
 
     Args:
-        problem: In its metric.
-        z: (m,) multipliers to begin with.
-        limits: Of axes and TCP.
-        rows: Of the people.
-        known: (k, 4) which rows the problem has, as of `worst_rows`.
-        sweeps: How often every row is met before the next one joins in.
-        most: Rows that may join in.
+        problem: The problem in its metric.
+        z: (m,) initial multipliers.
+        limits: Limits of axes and TCP.
+        rows: Approach rows of people.
+        known: (k, 4) indices of the approach rows in the problem, as in `worst_rows`.
+        sweeps: Number of passes over all rows before the next row is added.
+        most: Largest number of rows to add.
 
     Returns:
-        The problem, the multipliers, and which rows it has.
+        The problem, the multipliers, and the indices of its approach rows.
     """
     for _ in range(most):
         y, z = descend(problem, z, sweeps)
@@ -274,13 +274,13 @@ def gather(
 
 @njit(cache=True)
 def join(problem: Metric, z: Floats, known: Ints, found: Found) -> tuple[Metric, Floats, Ints]:
-    """The problem with the approach row found, its multiplier 0, and which rows it has then.
+    """Adds an approach row with multiplier 0; returns the problem, the multipliers and the indices of its rows.
 
     Args:
-        problem: In its metric.
+        problem: The problem in its metric.
         z: (m,) multipliers.
-        known: (k, 4) which rows the problem has, as of `worst_rows`.
-        found: A row that is new.
+        known: (k, 4) indices of the approach rows in the problem, as in `worst_rows`.
+        found: The new row.
     """
     E, low = np.concatenate((problem.E, found.row.reshape(1, -1))), np.append(problem.low, -NONE)
     more = Metric(problem.L, problem.b, E, low, np.append(problem.high, found.high))

@@ -1,12 +1,12 @@
-"""The minimiser of Eq. (66) under its rows, by proxqp. The only user of proxsuite.
+"""The minimiser of Eq. (66) under its rows, by ProxQP. The only user of proxsuite.
 
-Every vertex of every limb has rows and the minimiser lies on few of them. So rows join in while a candidate breaks
-any: first while that of coordinate descent does, then while proxqp's does. Where the rows are soft, one slack [m/s]
-loosens all of them, so that the people leave a solution.
+Every vertex of every limb has rows, and few of them are active at the minimiser. Therefore rows are added only while a
+candidate violates them: first the candidate of coordinate descent, then that of ProxQP. If the rows are soft, one slack
+[m/s] loosens all of them, so that the rows of people always leave a solution.
 
-Proxqp claims solutions that are none and misses others, in about one tick in a hundred near people. So it works in the
-metric of the cost, begins near the solution, is asked again with other penalties where it fails, and what it finds
-counts only when its multipliers prove it.
+In about one of a hundred ticks near people, ProxQP returns a wrong solution or misses an existing one. Therefore it
+works in the metric of the cost and starts near the solution. If it fails, it runs again with other penalties. A
+solution is accepted only if its multipliers prove it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Problem:
     g: Floats  #: (nv,)
     limits: Limits
     rows: Approach  #: Eq. (66i)
-    soft: bool  #: whether the rows of Eq. (66i) may be broken at a cost
+    soft: bool  #: whether the rows of Eq. (66i) may be violated at a cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,41 +58,41 @@ class Solution:
 
     dq_next: Floats  #: (nv,) [rad/s]
     held: bool  #: whether an approach row holds the robot back
-    slack: float  #: speed by which a link approaches a limb faster than its row allows; 0 where the rows are hard [m/s]
+    slack: float  #: speed by which a link may approach a limb faster than its row allows; 0 if the rows are hard [m/s]
 
 
 @dataclass(frozen=True, slots=True)
 class Unsolved:
     """There is no minimiser, or none was found."""
 
-    status: str  #: what went wrong: "not finite", "infeasible" (proven), or how the search for a solution ended
+    status: str  #: the problem: "not finite", "infeasible" (proven), or the last status of the search
 
 
-#: Weight of the squared slack: a row is broken by 1 mm/s rather than that the TCP is slower by 1 m/s.
+#: Weight of the squared slack: the cost prefers a row violation of 1 mm/s to a TCP that is slower by 1 m/s.
 SLACK = 1000.0
-#: Rounds of finding rows and solving before the problem counts as unsolved: a late step is worth less than the stop.
+#: Largest number of rounds of adding rows and solving; then the robot stops instead of taking a late step.
 ROUNDS = 16
-#: Sweeps of coordinate descent before a row joins in, and rows that may join in before proxqp is asked again.
+#: Sweeps of coordinate descent before a row is added, and largest number of rows added before each run of ProxQP.
 SWEEPS, JOIN = 10, 40
 #: Multiplier, in the metric, above which a row holds the robot back.
 BINDING = 1e-8
-#: Largest residual, in the metric, with which multipliers prove a solution; proxqp is asked for a tenth.
+#: Largest residual, in the metric, with which multipliers prove a solution; the tolerance of ProxQP is a tenth of it.
 PROVEN = 2e-10
-#: Bounds of the TCP broken by no more than this hold [m/s, rad/s].
+#: Bounds of the TCP hold if they are violated by no more than this [m/s, rad/s].
 KEPT = 1e-8
-#: Tries of proxqp, one after the other: sweeps of coordinate descent before it begins, its inverse penalty, and how
-#: many times it may change the multipliers. Which, and in which order, was tried on replays. The second one (-1) begins
-#: at what non-negative least squares find: deep inside people rows are nearly dependent, and ProxQP fails.
+#: Tries of ProxQP, one after the other: sweeps of coordinate descent before the try, inverse penalty, and largest
+#: number of multiplier updates. Values and order were chosen on replays. The second try (-1) starts at the result of
+#: non-negative least squares: deep inside people the rows are nearly dependent, and ProxQP fails.
 TRIES = ((100, 1e-6, 6), (-1, 1e-6, 6), (0, 1e-6, 20), (0, 1e-5, 20), (5000, 1e-3, 40), (0, 1e-7, 40))
-#: Newton steps between them.
+#: Largest number of Newton steps between two updates of the multipliers.
 INNER = 20
 
 
 def _load_proxqp() -> Any:
-    """Proxsuite's ProxQP, by its AVX2 library where the processor would do AVX-512, too.
+    """Loads proxsuite's ProxQP, in its AVX2 library also on a processor with AVX-512.
 
-    It comes in three, takes the widest and rounds otherwise in each: a robot would move otherwise by the last bits on
-    every other computer. Without the name of one of them it takes the next.
+    proxsuite has three libraries, loads the one with the widest vectors, and each rounds differently. The last bits of
+    a robot's motion would then depend on the computer. If the AVX-512 library is hidden, proxsuite loads the next one.
     """
     forgo("proxsuite.proxsuite_pywrap_avx512")
     import proxsuite
@@ -105,7 +105,7 @@ _dense = _proxqp.dense
 
 
 def minimise(task: Problem) -> Solution | Unsolved:
-    """The minimiser over all rows. Never raises for numbers."""
+    """Finds the minimiser over all rows. Raises no error for any numbers."""
     limits, rows = task.limits, task.rows
     if not are_numbers_known(task.H, task.g, limits, rows):
         return Unsolved("not finite")
@@ -134,7 +134,7 @@ def minimise(task: Problem) -> Solution | Unsolved:
 
 
 def compile_second_tries() -> None:
-    """Compiles what is asked only after a try of proxqp has failed, so that no session is the first to ask."""
+    """Compiles the kernels that run only after a try of ProxQP has failed, so that no session compiles them."""
     none, rows = np.zeros(1), np.zeros(2)
     problem = Metric(np.eye(1), none, np.zeros((2, 1)), rows, rows)
     denied(problem, rows, Limits(none, none, np.zeros((6, 1)), np.zeros(6), np.zeros(6)))
@@ -142,18 +142,18 @@ def compile_second_tries() -> None:
 
 
 def _keeps(limits: Limits, w: Floats) -> bool:
-    """Return whether a velocity, rounded into the axes' bounds, also keeps those of the TCP."""
+    """Return whether a velocity, clipped to the axes' bounds, also keeps the bounds of the TCP."""
     twist = apply(limits.J, w)
     return bool(np.all((limits.J_low - KEPT <= twist) & (twist <= limits.J_high + KEPT)))
 
 
 def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] | Unsolved:
-    """The minimiser in the metric and the rows' multipliers, proven by them.
+    """The minimiser in the metric and the multipliers of the rows, which prove it.
 
     Args:
-        problem: In its metric.
-        z: (m,) multipliers to begin with.
-        limits: Of axes and TCP.
+        problem: The problem in its metric.
+        z: (m,) initial multipliers.
+        limits: Limits of axes and TCP.
     """
     status = ""
     for sweeps, penalty, rounds in TRIES:
@@ -172,7 +172,7 @@ def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] 
 def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
     """The minimiser as the point nearest to -b, by non-negative least squares (Lawson and Hanson).
 
-    Where no point keeps the rows: -b itself, and multipliers that may prove it (``denied``).
+    If no point satisfies the rows, returns -b and multipliers that may prove this (``denied``).
     """
     _, b, E, low, high = problem
     n, m = len(b), len(E)
@@ -180,7 +180,7 @@ def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
     G = np.concatenate((-E[above], E[below]))
     at = apply(E, b)
     f = np.concatenate((-(high + at)[above], (low + at)[below]))
-    columns = np.ascontiguousarray(np.vstack((G.T, f)))  # one order in memory, so one compiled kernel
+    columns = np.ascontiguousarray(np.vstack((G.T, f)))  # one memory layout needs one kernel
     pull, found = nonnegative_least_squares(columns, np.append(np.zeros(n), 1.0), 3 * m)
     if not found:
         return -b, np.zeros(m)
@@ -197,12 +197,12 @@ def _least_distance(problem: Metric) -> tuple[Floats, Floats]:
 def _by_proxqp(problem: Metric, y: Floats, z: Floats, penalty: float, rounds: int) -> tuple[Floats, Floats, str]:
     """Solution of ProxQP, and its status."""
     n, m = len(y), len(z)
-    # the last bits of what its other backend returns depend on where its memory happens to lie
+    # with the other backend the last bits of the result depend on memory addresses
     qp = _dense.QP(n, 0, m, False, _dense.HessianType.Dense, _dense.DenseBackend.PrimalLDLT)
     settings = qp.settings
     settings.initial_guess = _proxqp.InitialGuess.WARM_START
     settings.eps_abs, settings.eps_rel = 0.1 * PROVEN, 0.0
-    settings.eps_primal_inf = settings.eps_dual_inf = 0.0  # with its own tests it denies problems that have solutions
+    settings.eps_primal_inf = settings.eps_dual_inf = 0.0  # its own tests reject solvable problems
     settings.max_iter, settings.max_iter_in = rounds, INNER
     qp.init(np.eye(n), problem.b, None, None, problem.E, problem.low, problem.high, False, mu_in=penalty)
     qp.solve(y, None, z)

@@ -1,9 +1,9 @@
 """Methods that stay on the programmed path and choose the speed along it: the baselines of the trajectory generator.
 
 - ``scaling`` [24]: the largest share of the programmed speed that meets the rows of Eq. (66i).
-- ``shield``: the programmed speed while the next stop is certified, else the stop.
+- ``shield``: the programmed speed while the next stop is certified, otherwise the stop.
 - ``ssm``: stop and go by the protective separation distance of ISO/TS 15066, 5.5.4.
-- ``none``: the programmed speed, whoever is there.
+- ``none``: the programmed speed, without regard to people.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from hrcreplay.robot.control.separation import Obstacles, tick_rows, worst_rows
 from hrcreplay.robot.model import RobotModel, RobotPose
 from hrcreplay.robot.task import Reference, place
 
-#: Rates that differ by no more are one.
+#: Rates that differ by no more than this are equal.
 SAME = 1e-7
 
 #: Largest residual of an approach row that counts as held [m^2].
 HELD = 1e-11
 
-#: Rounds of looking for a rate.
+#: Largest number of iterations in the search for a rate.
 ROUNDS = 40
 
 
@@ -51,24 +51,23 @@ def propose(
     horizon_s: float,
     settings: PlanSettings,
 ) -> Proposals:
-    """One tick: the largest rate in [0, 1] that meets the limits of the robot and, where asked for, Eq. (66i).
+    """One tick: the largest rate in [0, 1] that meets the limits of the robot and, with ``obstacles``, Eq. (66i).
 
-    The robot is where the path is, to the last bit: position and velocity one tick later are those of the path, and
-    ``u`` leads from this tick's velocity to that one, so the safety rows hold for ``dq + dt u`` as they do for the
-    QP; Eq. (69) then gives the next position but for the third order in dt. Rates change as fast as the axes'
-    acceleration limits allow along the path.
+    The robot is exactly on the path. Position and velocity one tick later are those of the path, and ``u`` leads from
+    this tick's velocity to the next one, so the safety rows hold for ``dq + dt u`` as in the QP. Eq. (69) gives the
+    next position up to the third order in dt. The rate changes as fast as the axes' acceleration limits allow.
 
     Args:
         robot: The manipulator.
         reference: The programmed path.
-        current_stop: The stop that goes on where nothing else is taken; its row 0 is where the robot is.
+        current_stop: The stop that continues without a better step; its row 0 is the present state of the robot.
         sight: The robot's pose, and its distances from people.
-        obstacles: The swept volumes of the tick, whose rows bound the rate; None: nothing but the robot does.
-        horizon_s: Until when they hold [s].
+        obstacles: The swept volumes of the tick, whose rows bound the rate; None: only the robot's limits bound it.
+        horizon_s: Time from the tick on for which the volumes are valid [s].
         settings: Limits; weights are not used.
 
     Returns:
-        The step and the stop after it, along the path; a reason where there is none.
+        The step and the stop after it, along the path; or the reason why there is none.
     """
     state, slowest = PathState(*current_stop.along[0].tolist()), current_stop.rest().along[0, 1]
     fastest, slowed = _fastest(robot, reference, state, sight, obstacles, horizon_s, settings)
@@ -81,16 +80,16 @@ def propose(
 
 
 def protective_distance_m(pose: RobotPose, stop: Stop, human_speed: float, latency_s: float, dt_s: float) -> float:
-    """S_p of ISO/TS 15066, Eq. (3): what the person and the robot cover until the robot stands [m].
+    """S_p of ISO/TS 15066, Eq. (3): way of the person and the robot until the robot is at rest [m].
 
-    S_h + S_r + S_s with the present speed of the robot. C, Z_d and Z_r are in the distance it is compared with, which
-    is that to the person's present volume, hand and uncertainties of the measurement included.
+    It is S_h + S_r + S_s with the present speed of the robot. C, Z_d and Z_r are part of the distance that is compared
+    with it: the distance to the person's present volume, which includes the hand and the measurement uncertainty.
 
     Args:
-        pose: Of the robot.
-        stop: From the end of the step.
-        human_speed: At which the person may approach [m/s].
-        latency_s: Reaction time T_r beside the tick [s].
+        pose: Pose of the robot.
+        stop: The stop that begins at the end of the step.
+        human_speed: Speed at which the person may approach [m/s].
+        latency_s: Reaction time T_r in addition to the tick [s].
         dt_s: Length of a tick [s].
     """
     speeds = apply(pose.J_ends.reshape(-1, pose.J_ends.shape[3]), stop.dq[0]).reshape(-1, 3)
@@ -108,9 +107,9 @@ def _fastest(
     horizon_s: float,
     settings: PlanSettings,
 ) -> tuple[PathState | None, bool]:
-    """The largest rate that meets all constraints, and whether an approach row is what bounds it.
+    """The largest rate that meets all constraints, and whether an approach row bounds it.
 
-    Every bound is linear in the next velocity, which is the rate times the path's direction where it leads to.
+    Every bound is linear in the next velocity, which is the rate times the path's derivative at the next position.
     """
     dt_s, gain, pose, grid = settings.dt_s, robot.ddq_max * settings.dt_s, sight.pose, reference.grid
     dq = state.rate * place(grid, state.s_s)[1]
@@ -138,7 +137,7 @@ def _fastest(
 
 
 def _largest(top: float, bound: Callable[[float], float]) -> float | None:
-    """Largest x in [0, top] with ``x <= bound(x)``, for a bound that changes little with x; or none."""
+    """Largest x in [0, top] with ``x <= bound(x)``, for a bound that changes little with x; None without one."""
     found, low, high, x = None, -1.0, top, top
     for _ in range(ROUNDS):
         most = bound(x)
@@ -158,7 +157,7 @@ def _largest(top: float, bound: Callable[[float], float]) -> float | None:
 def _safe_rate(
     sight: Sight, obstacles: Obstacles, towards: Floats, rate: float, ahead_s: float, settings: PlanSettings
 ) -> float:
-    """The largest rate up to a given one with which all approach rows hold, Eq. (16)."""
+    """The largest rate, up to ``rate``, for which all approach rows hold, Eq. (16)."""
     pairs = sight.pairs
     if pairs is None:
         return math.nan
@@ -174,7 +173,7 @@ def _safe_rate(
 
 @njit(cache=True)
 def rates(towards: Floats, low: Floats, high: Floats) -> tuple[float, float]:
-    """Smallest and largest factor with ``low <= factor * towards <= high``; empty where the first is larger.
+    """Smallest and largest factor with ``low <= factor * towards <= high``; no factor if the first is larger.
 
     Args:
         towards: (m,).

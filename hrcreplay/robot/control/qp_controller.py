@@ -1,13 +1,13 @@
 """The trajectory generator: the quadratic program of Eq. (66).
 
-The variable is the joint velocity of the next tick: it has the cost of Eq. (66a)-(66c), the limits of the axes and of
-the TCP, Eq. (66d)-(66h), as bounds, and the approach rows of Eq. (66i). What is corrected in the printed equations, and
-why: docs/paper.md. With ``plan.smooth_s`` it is the velocity that the robot heads for, and the next tick's is a share
-of the way there: the swept volumes tremble by millimetres, and a robot that followed at once would tremble with them.
+The variable is the joint velocity of the next tick. The cost is Eq. (66a)-(66c), the bounds are the limits of the axes
+and of the TCP, Eq. (66d)-(66h), and the approach rows are Eq. (66i). docs/paper.md lists the corrections of the printed
+equations and their reasons. With ``plan.smooth_s`` the variable is a target velocity, and the velocity of the next tick
+moves a share of the way to it. This filters the jitter of the swept volumes, which is some millimetres.
 
-What is proposed here is not yet safe: (66i) bounds speeds at the present posture and says nothing of the stop. The
-certificate decides. So the rows may be soft, and look further ahead than the stop takes (``plan.lead_s``): a robot that
-brakes early seldom has to stop.
+A proposal of this module is not yet safe: (66i) bounds speeds at the present posture and does not consider the stop.
+The certificate decides. Therefore the rows may be soft, and they may look further ahead than the stop takes
+(``plan.lead_s``), because a robot that brakes early rarely has to stop.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ def joint_bounds(
 ) -> tuple[Floats, Floats]:
     """Next velocities from which an axis can still stop before its position limit, Eq. (66d)-(66f), corrected.
 
-    An axis at v that brakes by Eq. (67) travels S(v): the braking parabola v^2 / (2 u_max), sampled at whole steps
-    v = n u_max dt and linear between them. A state with q + S(dq) <= q_max (and likewise below) is admissible; the
-    returned interval holds exactly the velocities whose next state, Eq. (69), is admissible again. From an
-    admissible state it always contains the braking step, so the limits never make the QP infeasible; from any other
-    it still contains that step, the best an axis can do.
+    An axis with velocity v that brakes by Eq. (67) travels S(v): the braking parabola v^2 / (2 u_max), sampled at whole
+    steps v = n u_max dt and linear between them. A state with q + S(dq) <= q_max is admissible, likewise for q_min. The
+    returned interval contains exactly the velocities whose next state, Eq. (69), is admissible again. From an
+    admissible state it always contains the braking step, so the limits never make the QP infeasible. From any other
+    state it also contains the braking step, the hardest that an axis can do.
 
     Args:
         q: (nv,) [rad].
@@ -81,8 +81,8 @@ def fastest(room: float, gain: float, dt_s: float) -> float:
     """Largest w with S(w) + dt w / 2 <= room, the inverse of a piecewise linear function [rad/s].
 
     Args:
-        room: Way left beyond what the present velocity covers within this tick [rad].
-        gain: Change of velocity an axis manages in a tick [rad/s].
+        room: Remaining way after the way that the present velocity covers within this tick [rad].
+        gain: Largest change of velocity of an axis in a tick [rad/s].
         dt_s: Length of the tick [s].
     """
     if room <= 0.0 or room == np.inf:
@@ -102,8 +102,8 @@ def cartesian_bounds(
         J: (6, nv) Jacobian of the TCP, linear first [m/rad, rad/rad].
         dJdq: (6,) Jdot dq [m/s^2, rad/s^2].
         dq: (nv,) [rad/s].
-        speed_max: Of each axis of the world [m/s]; rotation in the proportion ``RAD_PER_M``.
-        acceleration_max: Likewise [m/s^2].
+        speed_max: Speed limit along each axis of the world [m/s]; times ``RAD_PER_M`` for rotation.
+        acceleration_max: Acceleration limit, likewise [m/s^2].
         dt_s: Length of the tick [s].
 
     Returns:
@@ -123,8 +123,8 @@ def cartesian_bounds(
 
 
 #: Weight on the squared joint velocities, relative to the mean curvature of the cost. It makes the minimiser unique
-#: where the paper's cost is flat (a stretched wrist: axes 4 and 6 turn against each other) and is too small to be
-#: seen anywhere else.
+#: where the paper's cost is flat (a stretched wrist: axes 4 and 6 turn against each other). Elsewhere its effect is
+#: negligible.
 DAMPING = 1e-6
 
 
@@ -133,24 +133,24 @@ class Target(NamedTuple):
 
     T_world_tcp: Floats  #: (4, 4)
     twist: Floats  #: (6,) velocity in the world, linear first [m/s, rad/s]
-    q: Floats  #: (nv,) joint positions that the programme has there [rad]
-    tcp_speed_max: float = math.inf  #: on the way there, however far it is [m/s]
+    q: Floats  #: (nv,) joint positions of the programme [rad]
+    tcp_speed_max: float = math.inf  #: speed limit of the TCP on the way to the target [m/s]
 
 
 class QpContext(NamedTuple):
-    """Input of Eq. (66) at one tick, the settings aside."""
+    """Input of Eq. (66) at one tick, without the settings."""
 
     robot: RobotModel
     state: RobotState  #: at the tick
-    u_before: Floats  #: (nv,) acceleration of the tick before [rad/s^2]
+    u_before: Floats  #: (nv,) acceleration of the previous tick [rad/s^2]
     target: Target  #: the reference one tick later
     sight: Sight  #: the robot's pose, and its distances from people
     obstacles: Obstacles  #: the swept volumes of the tick
-    horizon_s: float  #: until when they hold [s]
+    horizon_s: float  #: time from the tick on for which the volumes are valid [s]
 
 
 def pose_error(T_world_tcp: Floats, T_world_ref: Floats) -> Floats:
-    """(6,) from the reference to the TCP: way [m], then rotation vector in the world [rad]."""
+    """(6,) error of the TCP relative to the reference: translation [m], then rotation vector in the world [rad]."""
     turn = turn_between(T_world_ref, T_world_tcp)
     return np.concatenate([T_world_tcp[:3, 3] - T_world_ref[:3, 3], turn])
 
@@ -167,12 +167,13 @@ def tracking_cost(
     path_gain_per_s: float,
     dt_s: float,
 ) -> tuple[Floats, Floats]:
-    """Eq. (66a), corrected, as ``w @ H @ w / 2 + g @ w`` (and a constant, and a factor of 2) of the next velocity w.
+    """Eq. (66a), corrected, as ``w @ H @ w / 2 + g @ w`` of the next velocity w, without a constant and a factor of 2.
 
     The variable is w = dq + dt u instead of the acceleration u, so Eq. (66b), (66c) are linear in w.
 
-    With the printed weights a position error changes the velocity by dt q_p / q_v of it, that is, it never decays; so
-    ``path_gain_per_s`` times the error at this tick is taken off the reference velocity.
+    With the printed weights a position error changes the velocity by only dt q_p / q_v times the error, so the error
+    practically never decays. Therefore ``path_gain_per_s`` times the error at this tick is subtracted from the
+    reference velocity.
 
     Args:
         error: (6,) `pose_error` of the TCP at the tick and the reference one tick later [m, rad].
@@ -182,7 +183,7 @@ def tracking_cost(
         twist_ref: (6,) velocity of the reference, linear first [m/s, rad/s].
         q_p: Weights of the errors in position, translation and rotation, Eq. (71).
         q_v: Weights of the errors in velocity, Eq. (72).
-        path_gain_per_s: 0 as printed [1/s].
+        path_gain_per_s: Gain on the position error; 0 gives the printed equation [1/s].
         dt_s: Length of the tick [s].
 
     Returns:
@@ -214,29 +215,28 @@ def tracking_cost(
 
 @njit(cache=True)
 def with_posture(H: Floats, g: Floats, away: Floats, weight: float) -> tuple[Floats, Floats]:
-    """The cost with a weight on the velocities that lead back to the programmed posture, at 1/s of the way.
+    """Adds a cost that pulls the joints back to the programmed posture, with a gain of 1/s.
 
-    A TCP that detours around people past a stretched wrist may come back with the wrist turned over; axis 4 then winds
-    up to its limit, where the robot stands. The programme knows in which posture it is to be.
+    A TCP that detours around people past a stretched wrist may come back with the wrist turned over. Axis 4 then winds
+    up to its limit, and the robot stops there. The cost leads the robot back to the posture of the programme.
 
     Args:
         H: (nv, nv) of `tracking_cost`.
         g: (nv,) likewise.
         away: (nv,) joint positions minus those of the reference [rad].
-        weight: Relative to the mean curvature of the cost.
+        weight: Weight relative to the mean curvature of the cost.
     """
     mean = max(np.trace(H) / len(g), 1e-6)
     return H + weight * mean * np.eye(len(g)), g + weight * mean * away
 
 
 def problem(context: QpContext, settings: PlanSettings) -> Problem:
-    """Eq. (66) at one instant; building it is separate from solving it.
+    """Builds Eq. (66) at one instant, without solving it.
 
-    Beside what is printed the posture counts a little (`with_posture`), the TCP keeps the programme's speed limit
-    (`add_speed_row`), and the acceleration may be bound to change by
-    a share of its limit in a tick (``plan.jerk_s``). Where the variable is the velocity that the robot heads for
-    (``plan.smooth_s``), cost and rows are as printed, and the bounds lie further out by as much as it goes beyond the
-    next tick's velocity (`dq_after`).
+    In addition to the printed equation the posture has a small weight (`with_posture`), the TCP keeps the programme's
+    speed limit (`add_speed_row`), and ``plan.jerk_s`` can limit the change of the acceleration in a tick. If the
+    variable is a target velocity (``plan.smooth_s``), cost and rows stay as printed. The bounds are then extended by
+    the factor by which the target velocity is further away than the velocity of the next tick (`dq_after`).
 
     Args:
         context: Robot, reference and people of the tick.
@@ -275,27 +275,27 @@ def problem(context: QpContext, settings: PlanSettings) -> Problem:
     return Problem(H, g, limits, rows, plan.rows == "soft")
 
 
-#: A TCP that is slower than this has no direction [m/s].
+#: A TCP that is slower than this has no direction of motion [m/s].
 SLOW_M_PER_S = 1e-6
-#: Rounds of looking for a velocity that keeps the speed limit: the arm at the end of the tick hardly depends on it.
+#: Iterations of the search for a velocity that keeps the speed limit; few, as the posture hardly depends on it.
 SPEED_ROUNDS = 4
 
 
 @njit(cache=True)
 def add_speed_row(limits: Limits, twist: Floats, drift: Floats, speed_max: float, low: Floats, high: Floats) -> Limits:
-    """Bounds the TCP's velocity along the direction in which it moves: the bound on its speed, linearised.
+    """Bounds the TCP's velocity along its direction of motion: the linearised bound on its speed.
 
-    What is bounded is the velocity that the robot heads for, so that the TCP nears the bound smoothly. The bound is
-    never lower than what the axes can do, nor than what Eq. (66h) lets the TCP do, so that it never forbids to brake.
-    `limit_speed` sees to what the linearisation misses.
+    The bound applies to the target velocity, so the TCP approaches the bound smoothly. The bound is never lower than
+    the lowest value that the axes and Eq. (66h) allow, so braking is always allowed. `limit_speed` corrects the error
+    of the linearisation.
 
     Args:
-        limits: Of axes and TCP.
+        limits: Limits of axes and TCP.
         twist: (6,) velocity of the TCP at the tick, linear first [m/s, rad/s].
-        drift: (6,) by which it changes at constant joint velocities until the velocity headed for [m/s, rad/s].
-        speed_max: [m/s].
-        low: (nv,) least velocities that the axes can head for [rad/s].
-        high: (nv,) largest ones [rad/s].
+        drift: (6,) change of the TCP's velocity at constant joint velocities until the target [m/s, rad/s].
+        speed_max: Speed limit of the TCP [m/s].
+        low: (nv,) smallest target velocities of the axes [rad/s].
+        high: (nv,) largest target velocities of the axes [rad/s].
     """
     nv, speed = len(low), norm_n(twist[:3])
     row, bound, least, least_tcp = np.zeros((1, nv)), speed_max, 0.0, 0.0
@@ -315,21 +315,21 @@ def add_speed_row(limits: Limits, twist: Floats, drift: Floats, speed_max: float
 def limit_speed(
     robot: RobotModel, state: RobotState, J: Floats, dq_next: Floats, speed_max: float, settings: PlanSettings
 ) -> Floats:
-    """The velocity between a proposed one and that of the hardest braking with which the TCP keeps a speed limit.
+    """Moves a proposed velocity towards that of the hardest braking until the TCP keeps its speed limit.
 
-    It holds at the end of the tick, where the arm is then. A TCP that is faster already, since a slower move begins or
-    its stop let it be, slows down with the time constant ``plan.smooth_s``.
+    The limit holds at the end of the tick, with the posture at that time. The TCP may already be faster, because a
+    slower move begins or because of its stop; then it slows down with the time constant ``plan.smooth_s``.
 
     Args:
         robot: The manipulator.
-        state: At the tick.
-        J: (6, nv) of the TCP at the tick [m/rad, rad/rad].
-        dq_next: (nv,) proposed for the end of the tick [rad/s].
-        speed_max: Of the TCP [m/s].
+        state: State of the robot at the tick.
+        J: (6, nv) Jacobian of the TCP at the tick [m/rad, rad/rad].
+        dq_next: (nv,) velocity proposed for the end of the tick [rad/s].
+        speed_max: Speed limit of the TCP [m/s].
         settings: Length of a tick, and the time constant.
 
     Returns:
-        (nv,) the proposed one itself where it keeps the limit [rad/s].
+        (nv,) velocity at the end of the tick; ``dq_next`` itself if it keeps the limit [rad/s].
     """
     if not math.isfinite(speed_max):
         return dq_next
@@ -352,7 +352,7 @@ def limit_speed(
 def _speed_and_share(J: Floats, brake: Floats, way: Floats, share: float, allowed: float) -> tuple[float, float]:
     """Speed of the TCP at ``brake + share * way``, and the share in [0, 1] up to which it is at most ``allowed``.
 
-    Where it is faster at every share, that of the lowest speed.
+    If the TCP is faster at every share, the share of the lowest speed.
     """
     aa, ab, bb, square = 0.0, 0.0, 0.0, 0.0
     for i in range(3):
@@ -366,20 +366,20 @@ def _speed_and_share(J: Floats, brake: Floats, way: Floats, share: float, allowe
 
 
 def dq_after(dq: Floats, aim: Floats, settings: PlanSettings) -> Floats:
-    """(nv,) velocity one tick later of a robot at ``dq`` that heads for ``aim`` [rad/s]."""
+    """(nv,) velocity one tick later of a robot with velocity ``dq`` and target velocity ``aim`` [rad/s]."""
     smooth_s = settings.plan.smooth_s
     return dq + (aim - dq) / (1.0 + smooth_s / settings.dt_s) if smooth_s else aim
 
 
 @njit(cache=True)
 def smooth_bounds(low: Floats, high: Floats, steady: Floats, change: Floats) -> tuple[Floats, Floats]:
-    """Bounds within which the acceleration changes little, but for what the limits of the axes ask for.
+    """Bounds within which the acceleration changes little, unless the limits of the axes require a larger change.
 
     Args:
         low: (nv,) lower bounds on the next velocity [rad/s].
         high: (nv,) upper bounds [rad/s].
-        steady: (nv,) next velocity at the acceleration of the tick before [rad/s].
-        change: (nv,) how far it may be from there [rad/s].
+        steady: (nv,) next velocity at the acceleration of the previous tick [rad/s].
+        change: (nv,) largest difference from ``steady`` [rad/s].
     """
     near_low, near_high = np.empty_like(low), np.empty_like(high)
     for j in range(len(low)):
@@ -389,7 +389,7 @@ def smooth_bounds(low: Floats, high: Floats, steady: Floats, change: Floats) -> 
 
 
 def propose(context: QpContext, settings: PlanSettings) -> Proposals:
-    """One tick of Section 5: the step that Eq. (66) finds best, and the stop after it; a reason where there is none.
+    """One tick of Section 5: the best step by Eq. (66) and the stop after it; or the reason why there is none.
 
     Args:
         context: Robot, reference and people of the tick.
@@ -398,17 +398,17 @@ def propose(context: QpContext, settings: PlanSettings) -> Proposals:
     robot, state, target, sight = context.robot, context.state, context.target, context.sight
     task = problem(context, settings)
     found = minimise(task)
-    if not isinstance(found, Solution) and settings.plan.jerk_s > 0.0:  # a limit may ask for a sudden change
+    if not isinstance(found, Solution) and settings.plan.jerk_s > 0.0:  # a limit may require a sudden change
         found = minimise(problem(context, settings.without_jerk()))
     if not isinstance(found, Solution):
         if found.status == "not finite":
             return control_step.NOT_FINITE
-        too_fast = settings.retreats(sight.overlap_m)  # for a retreat
+        too_fast = settings.retreats(sight.overlap_m)  # too fast for a retreat
         return control_step.INSIDE if too_fast else control_step.NO_SOLUTION
     dq_next = dq_after(state.dq, found.dq_next, settings)
     dq_next = limit_speed(robot, state, sight.pose.J_tcp, dq_next, target.tcp_speed_max, settings)
     q_next = state.q + 0.5 * settings.dt_s * (state.dq + dq_next)  # Eq. (68), (69)
     status = control_step.LIMITED if found.held else control_step.TRACKING
-    # a straight stop may leave the range of an axis, one by Eq. (67) does not
+    # a straight stop may leave the range of an axis, a stop by Eq. (67) does not
     stops = (stop_straight, stop_axis_by_axis) if settings.certified else (stop_axis_by_axis,)
     return [Proposal(stop(q_next, dq_next, robot.ddq_max, settings.dt_s), status) for stop in stops]

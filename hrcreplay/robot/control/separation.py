@@ -1,7 +1,7 @@
 """Distances between the robot's links and the swept volumes of one tick, and the speed limits from them, Eq. (12)-(16).
 
-The right-hand side of the safety constraints is corrected as docs/paper.md says. Every vertex of every limb has rows;
-none is written down before a velocity breaks it.
+The right-hand side of the safety constraints is corrected as docs/paper.md explains. Every vertex of every limb has
+rows; a row is computed only when a velocity violates it.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ class Obstacles:
     """The swept volumes of one tick: per limb the convex hull of its vertices + a ball. Built once per tick."""
 
     vertices_m: Floats  #: (m, 3) world, limb after limb [m]
-    offsets: Ints  #: (l + 1,) where each limb's vertices begin
+    offsets: Ints  #: (l + 1,) index of each limb's first vertex
     radius_m: Floats  #: (l,) of the balls [m]
     boxes_m: Floats  #: (l, 2, 3) lowest and highest corner around each limb's vertices [m]
-    known: bool  #: False where a limb could not be predicted: whoever plans against it must brake
-    horizon_s: float = math.inf  #: until when they hold, from their tick on [s]
-    first: int = 0  #: number of the first of them among all that there can be: the person's limbs, then walls
+    known: bool  #: False if a limb could not be predicted; the robot must then brake
+    horizon_s: float = math.inf  #: time for which the volumes are valid, from their tick on [s]
+    first: int = 0  #: index of the first volume among all possible volumes: the person's limbs, then the walls
 
 
 def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> Obstacles:
     """The obstacles of one tick.
 
     Args:
-        volumes: Any number of ticks.
-        tick: Row of ``volumes``.
-        horizon_s: Until when they hold, from that tick on [s].
+        volumes: Swept volumes of any number of ticks.
+        tick: Index of the tick in ``volumes``.
+        horizon_s: Time for which the volumes are valid, from that tick on [s].
     """
     limbs = len(volumes.limbs)
     offsets = volumes.offsets[tick * limbs : (tick + 1) * limbs + 1]
@@ -75,9 +75,10 @@ class Separation:
         """(s, l) right-hand side of Eq. (14), corrected (docs/paper.md), Eq. (6), (10) [m^2].
 
         Args:
-            form: ``square`` is (distance - clearance)^2, as printed; what (3) needs is no more than ``product``,
-                distance (distance - clearance).
-            give_way_m: product: less than this short of a volume it is negative, so the link must move away [m].
+            form: ``square`` is (distance - clearance)^2, as printed; ``product`` is distance (distance - clearance),
+                which is sufficient for (3).
+            give_way_m: For ``product``: if the gap to a volume is smaller than this, the right-hand side is negative
+                and the link must move away [m].
         """
         gap = self.distance_m - self.clearance_m
         if form == "square":
@@ -85,17 +86,17 @@ class Separation:
         return np.asarray(self.distance_m * (np.maximum(0.0, gap) - give_way_m))
 
     def nearest(self) -> tuple[float, int, int]:
-        """Smallest distance between surfaces, negative where they overlap, NaN where one is [m]; link and limb."""
+        """Smallest distance between surfaces, negative if they overlap, NaN if any is NaN [m]; its link and limb."""
         surface = self.distance_m - self.clearance_m
         link, limb = divmod(int(np.argmin(surface)), surface.shape[1])
         return float(surface[link, limb]), link, limb
 
 
 def separation(pose: RobotPose, obstacles: Obstacles, clearance_m: Floats) -> Separation:
-    """Distances of all pairs: what is proven to be free between them.
+    """Proven lower bounds of the distances of all pairs.
 
-    A plane between link and limb bounds their distance from below however far the search for the distance came, so
-    every pair has a bound and one in doubt costs only what is in doubt.
+    A plane between link and limb bounds their distance from below, even if the search for the distance has not
+    converged. Thus every pair has a bound; without convergence the bound is only less tight.
 
     Args:
         pose: The robot.
@@ -112,26 +113,26 @@ class Approach(NamedTuple):
     ends_m: Floats  #: (s, 2, 3) ends of the links' axes [m]
     J_ends: Floats  #: (s, 2, 3, nv) their position Jacobians [m/rad]
     vertices_m: Floats  #: (m, 3) of all limbs [m]
-    offsets: Ints  #: (l + 1,) where each limb's vertices begin
-    boxes_m: Floats  #: (l, 2, 3) around each limb's vertices [m]
+    offsets: Ints  #: (l + 1,) index of each limb's first vertex
+    boxes_m: Floats  #: (l, 2, 3) lowest and highest corner around each limb's vertices [m]
     rhs_m2: Floats  #: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2]
-    per_speed: Floats  #: (s, l) what a link approaching at 1 m/s adds to the left-hand side of Eq. (14) [m s]
-    stop_s: float  #: T_s of Eq. (70), or how far ahead the rows look [s]
+    per_speed: Floats  #: (s, l) left-hand side of Eq. (14) for a link that approaches at 1 m/s [m s]
+    stop_s: float  #: T_s of Eq. (70), or the time that the rows look ahead [s]
 
 
-#: A link and a limb that are nearer count as this far apart where a speed is made of a row [m].
+#: Smallest distance between link and limb that is used to convert a row to a speed [m].
 _LEAST_M = 1e-3
 
 
 def tick_rows(pose: RobotPose, obstacles: Obstacles, rhs_m2: Floats, distance_m: Floats, stop_s: float) -> Approach:
-    """The approach rows of a tick, none of them written down.
+    """The data of the approach rows of a tick; the rows themselves are not computed.
 
     Args:
         pose: The robot.
         obstacles: The swept volumes, all known.
         rhs_m2: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2].
         distance_m: (s, l) between the link's axis and the limb's hull [m].
-        stop_s: T_s of Eq. (70), or how far ahead the rows look [s].
+        stop_s: T_s of Eq. (70), or the time that the rows look ahead [s].
     """
     per_speed = stop_s * np.maximum(distance_m, _LEAST_M)
     around = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
@@ -140,19 +141,19 @@ def tick_rows(pose: RobotPose, obstacles: Obstacles, rhs_m2: Floats, distance_m:
 
 @njit(cache=True)
 def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, Floats, Floats]:
-    """The row of Eq. (16) that a velocity breaks most, for every pair and either end of the link; Eq. (66i), corrected.
+    """The row of Eq. (16) that a velocity violates most, for every pair and each end of the link; Eq. (66i), corrected.
 
-    The rows are linear in the vertex, so the worst vertex is the one furthest along the end's velocity: one pass
-    over the vertices checks them all, without any row being written down. For a vertex r and an end's velocity v,
-    Eq. (15), (16) times the joint velocity is T_s (r @ v + rest), and rest does not depend on r.
+    The rows are linear in the vertex, so the worst vertex is the one furthest along the end's velocity. One pass over
+    the vertices checks all rows without computing them. For a vertex r and an end's velocity v, Eq. (15), (16) times
+    the joint velocity is T_s (r @ v + rest), and rest does not depend on r.
 
     Args:
-        rows: Of the tick.
+        rows: Approach rows of the tick.
         dq_next: (nv,) [rad/s].
         above_m2: Rows that exceed their right-hand side by no more than this hold [m^2].
 
     Returns:
-        For the n broken ones: ``which`` (n, 4) link, limb, row of Eq. (12), row of ``vertices_m``; ``A`` (n, nv)
+        For the n violated rows: ``which`` (n, 4) link, limb, row of Eq. (12), row of ``vertices_m``; ``A`` (n, nv)
         [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2].
     """
     ends, J_ends, vertices, offsets, boxes, rhs_m2, _, stop_s = rows
