@@ -1,1 +1,1 @@
-"""Live sessions: the stages of the replay at the cycle time of a real robot, with inputs and outputs recorded."""
+"""Live sessions: run the stages of the replay at the cycle time of a real robot, and record inputs and outputs."""

@@ -1,7 +1,7 @@
-"""Differences between what a run recorded and what comes out when it is computed again.
+"""Differences between the recorded results of a run and the results when it is computed again.
 
-Two processors round differently, so the last bits of a number may differ where nothing else does. A decision, a count
-or a name never may; a number may by TOLERANCE, and only where another machine recorded the run.
+Two processors round differently, so the last bits of a number may differ. A decision, a count or a name must never
+differ. A number may differ by TOLERANCE, but only if another machine recorded the run.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from google.protobuf.message import DecodeError, Message
 
 from hrcreplay.records import Bools, Floats
 
-#: By how much a number may differ between two machines, in its SI unit; above 1, by this share of it.
+#: Largest difference of a number between two machines, in its SI unit; for numbers above 1, as a share of the number.
 TOLERANCE = 1e-9
-#: An acceleration counts by what it changes of a velocity within a tick [s].
+#: An acceleration is compared by the change of velocity that it causes within a tick of this length [s].
 _TICK_S = 0.004
-#: Numbers of a table that decide: of these no bit may differ.
+#: Columns of a table that are decisions: no bit may differ.
 _DECIDING = ("certified", "horizon_s")
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One quantity that is not the same again."""
+    """One quantity that differs."""
 
-    text: str  #: where, and both values
-    size: float  #: by how much, as TOLERANCE counts it; inf where no difference may be
+    text: str  #: place, and both values
+    size: float  #: size of the difference, in the unit of TOLERANCE; inf if no difference is allowed
 
     @property
     def tolerable(self) -> bool:
@@ -41,17 +41,17 @@ class Difference:
         return self.size <= TOLERANCE
 
     def at(self, where: str) -> Difference:
-        """The same with the place before it."""
+        """The difference with ``where`` before its text."""
         return replace(self, text=f"{where}{self.text}")
 
 
 def differing(name: str, recorded: Any, again: Any) -> Difference:
-    """Two values that may not differ, and do."""
+    """The difference of two values that must be equal."""
     return Difference(f"{name}: recorded {recorded!r}, again {again!r}", math.inf)
 
 
 def decisions_differing(names: Sequence[str], recorded: Sequence[Any], again: Sequence[Any]) -> list[Difference]:
-    """Values of which none may differ, that do."""
+    """Differences between values that must be equal."""
     if len(recorded) != len(again):
         return [_counts_differing(names, len(recorded), len(again))]
     pairs = zip(names, recorded, again, strict=True)
@@ -59,7 +59,7 @@ def decisions_differing(names: Sequence[str], recorded: Sequence[Any], again: Se
 
 
 def numbers_differing(names: Sequence[str], recorded: Floats, again: Floats) -> list[Difference]:
-    """Numbers that differ by a bit; any NaN is like any other. Names are those of columns."""
+    """Numbers that differ in any bit; all NaN are equal. ``names`` are column names."""
     if len(recorded) != len(again):
         return [_counts_differing(names, len(recorded), len(again))]
     different = np.flatnonzero(_bits_differ(recorded, again)).tolist()
@@ -71,7 +71,7 @@ def _counts_differing(names: Sequence[str], recorded: int, again: int) -> Differ
 
 
 def _bits_differ(recorded: Floats, again: Floats) -> Bools:
-    """Mark the elements of two arrays that differ by a bit; any NaN equals any other."""
+    """Marks the elements of two arrays that differ in any bit; all NaN are equal."""
     mine, yours = (np.ascontiguousarray(values, dtype=np.float64) for values in (recorded, again))
     return np.asarray((mine.view(np.int64) != yours.view(np.int64)) & ~(np.isnan(mine) & np.isnan(yours)))
 
@@ -83,7 +83,7 @@ def _apart(name: str, recorded: float, again: float, *, column: str | None = Non
 
 
 def _sizes(name: str, recorded: Floats, again: Floats) -> Floats:
-    """By how much numbers differ, as TOLERANCE counts it; inf for those that decide, and for NaN beside a number."""
+    """Sizes of the differences, in the unit of TOLERANCE; inf for decisions, and for NaN against a number."""
     if name in _DECIDING:
         return np.where(_bits_differ(recorded, again), np.inf, 0.0)
     unit = _TICK_S if name[:1] == "u" and name[1:].isdigit() else 1.0
@@ -93,7 +93,7 @@ def _sizes(name: str, recorded: Floats, again: Floats) -> Floats:
 
 
 def messages_differing(kind: Callable[[], Message], recorded: bytes, again: bytes) -> list[Difference]:
-    """Fields of two protobuf messages that differ; all of them in one where they cannot be told apart by field."""
+    """Fields of two protobuf messages that differ; the whole message if fields cannot be compared."""
     if recorded == again:
         return []
     whole = differing("reply", f"{len(recorded)} bytes", f"{len(again)} bytes, others")
@@ -104,12 +104,12 @@ def messages_differing(kind: Callable[[], Message], recorded: bytes, again: byte
     except DecodeError:
         return [whole]
     if mine.SerializeToString() != recorded or yours.SerializeToString() != again:
-        return [whole]  # in another order, or with fields that nobody knows
+        return [whole]  # fields in another order, or unknown fields
     return _fields_differing("reply", _plain(mine), _plain(yours)) or [whole]
 
 
 def _plain(message: Message) -> dict[str, Any]:
-    """Fields of a message that are there, by name."""
+    """Fields that are set in a message, by name."""
     found: dict[str, Any] = {}
     for field, value in message.ListFields():
         parts = [
@@ -120,7 +120,7 @@ def _plain(message: Message) -> dict[str, Any]:
 
 
 def _fields_differing(where: str, recorded: Any, again: Any) -> list[Difference]:
-    """Leaves of two nested structures, as of JSON, that differ."""
+    """Leaves of two nested structures, like those of JSON, that differ."""
     if isinstance(recorded, dict) and isinstance(again, dict) and recorded.keys() == again.keys():
         return [found for key in recorded for found in _fields_differing(f"{where}.{key}", recorded[key], again[key])]
     if isinstance(recorded, list) and isinstance(again, list) and len(recorded) == len(again):
@@ -142,7 +142,7 @@ def json_differing(recorded: Path, again: Path) -> list[Difference]:
 
 
 def tables_differing(recorded: Path, again: Path) -> list[Difference]:
-    """Columns of two parquet files that differ: by row of the first difference, and the worst of each column."""
+    """Differences of two parquet files, sorted by row: the first and the worst difference of each column."""
     try:
         tables = pq.read_table(recorded), pq.read_table(again)
     except (OSError, pa.ArrowException):
@@ -162,7 +162,7 @@ def tables_differing(recorded: Path, again: Path) -> list[Difference]:
 
 
 def _column_differing(name: str, recorded: pa.ChunkedArray, again: pa.ChunkedArray) -> Iterator[tuple[int, Difference]]:
-    """Rows and differences of two columns: the first and, of numbers, the worst; none where they are the same."""
+    """Rows and differences of two columns: the first one and, for numbers, the worst one; none if they are equal."""
     if recorded.type != again.type:
         yield 0, differing(f"type of {name}", str(recorded.type), str(again.type))
         return
@@ -189,6 +189,6 @@ def _column_differing(name: str, recorded: pa.ChunkedArray, again: pa.ChunkedArr
 
 
 def worst(found: Sequence[Difference]) -> Difference:
-    """The first that may not be, else the largest."""
+    """The first difference that is not tolerable, otherwise the largest difference."""
     first = next((one for one in found if not one.tolerable), None)
     return first or max(found, key=lambda one: one.size)

@@ -1,12 +1,13 @@
-"""The helper processes of a live session: their start, their sockets, and the files that their crashes leave.
+"""The helper processes of a live session: their start, their sockets, and their crash files.
 
-Messages between control and a helper are whole, and neither waits for the other: a message that the other does not
-take is dropped and counted. Each helper runs as ``python -m hrcreplay.live.processes FOLDER PART MODULE arguments``.
+Messages between control and a helper are never split, and neither side waits for the other. A message that the other
+side does not receive is dropped and counted. Each helper runs as
+``python -m hrcreplay.live.processes FOLDER PART MODULE arguments``.
 
-An exception that ends a part of the session is kept with its traceback in the run folder and not shown on the user's
-terminal; control sees that the process is gone, brakes the robot and reports it. The first line of
-``crash_<part>.txt`` says which part failed, with what exception and where; the user is told the same line, and run.json
-has it. A part may also be a process that ended without an exception.
+An exception that ends a part of the session is written with its traceback to the run folder and not shown on the
+user's terminal. Control detects that the process has ended, brakes the robot and reports the crash. The first line of
+``crash_<part>.txt`` names the part, the exception and its place; the user's message and run.json contain the same line.
+A crash may also be a process that ended without an exception.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ import hrcreplay
 #: The parts of a session. The first three processes are helpers of control.
 PERSON, RECORDER, SCREEN, CONTROL, FOLDER = "human side", "recorder", "screen", "control", "run folder"
 
-#: What the names of the files begin with.
+#: Prefix of the names of crash files.
 PREFIX = "crash_"
 
 _PACKAGE = Path(hrcreplay.__file__).parent
 
 
 def describe_exception(error: BaseException) -> str:
-    """An exception in one line: its kind, its message, and where in our code it arose."""
+    """An exception in one line: its type, its message, and its place in the code of hrcreplay."""
     message = " ".join(str(error).split())
     frames = traceback.extract_tb(error.__traceback__)
     ours = [frame for frame in frames if Path(frame.filename).is_relative_to(_PACKAGE)]
@@ -52,7 +53,7 @@ def describe_exception(error: BaseException) -> str:
 
 
 def describe_exit(code: int) -> str:
-    """Describe the end of a process that left no other trace: killed, or by an exit code."""
+    """Describes the end of a process without a crash file: its signal or its exit code."""
     if code >= 0:
         return f"ended with exit code {code}"
     with suppress(ValueError):
@@ -61,10 +62,10 @@ def describe_exit(code: int) -> str:
 
 
 def write_crash(folder: Path, part: str, error: BaseException | str) -> str:
-    """Keeps a crash; one of the same part that came first stays first.
+    """Writes a crash to the crash file of a part, after earlier crashes of the same part.
 
     Returns:
-        What to say of it, as ``read_crashes`` gives it.
+        Description of the crash in one line, as in ``read_crashes``.
     """
     said = f"{part}: {error if isinstance(error, str) else describe_exception(error)}"
     trace = "" if isinstance(error, str) else "".join(traceback.format_exception(error))
@@ -72,16 +73,16 @@ def write_crash(folder: Path, part: str, error: BaseException | str) -> str:
         with _file(folder, part).open("a") as file:
             file.write(f"{said}\n\n{trace}")
     except OSError:
-        with suppress(OSError):  # of a full disk there is a file, and nothing in it
+        with suppress(OSError):  # a full disk leaves an empty file
             if not _file(folder, part).stat().st_size:
                 _file(folder, part).unlink()
-        sys.stderr.write(f"{said}\n{trace}")  # better there than nowhere
+        sys.stderr.write(f"{said}\n{trace}")  # the only place left
         sys.stderr.flush()
     return said
 
 
 def read_crashes(folder: Path) -> list[str]:
-    """Describe the crashes that a session's folder holds, a line each."""
+    """Describes the crashes in a session's folder, one line per part."""
     lines = []
     for path in sorted(folder.glob(f"{PREFIX}*.txt")):
         text = path.read_text(errors="replace").splitlines()
@@ -90,7 +91,7 @@ def read_crashes(folder: Path) -> list[str]:
 
 
 def has_crash_file(folder: Path, part: str) -> bool:
-    """Return whether a part has left a crash file."""
+    """Return whether a part has a crash file."""
     return _file(folder, part).exists()
 
 
@@ -98,16 +99,16 @@ def _file(folder: Path, part: str) -> Path:
     return folder / f"{PREFIX}{part.replace(' ', '_')}.txt"
 
 
-_LARGEST = 1 << 20  #: no message is larger; one that is would be cut, never split
-_LARGEST_RECORD = 1 << 22  #: nor one to the recorder
+_LARGEST = 1 << 20  #: largest size of a message [bytes]; a larger message would be cut off
+_LARGEST_RECORD = 1 << 22  #: largest size of a message to the recorder [bytes]
 
 
-#: Begins the last message of a helper that cannot go on: why, in UTF-8.
+#: First byte of the last message of a helper that has failed; the reason in UTF-8 follows.
 LAST_WORDS = b"X"
 
 
 class ControlGoneError(Exception):
-    """The control process closed its end, or is dead: the helper has nothing left to do."""
+    """The control process has closed its end or has died; the helper must end."""
 
 
 class ControlChannel:
@@ -116,13 +117,13 @@ class ControlChannel:
     def __init__(self, fd: int) -> None:
         self._socket = socket.socket(fileno=fd)
         self._socket.setblocking(False)
-        self.dropped = 0  #: messages that control's full socket did not take
+        self.dropped = 0  #: number of messages that were dropped because control's socket was full
 
     def send(self, kind: bytes, payload: bytes = b"") -> bool:
-        """Sends a message, or drops and counts it where control does not read; tells which.
+        """Sends a message; if control does not read, drops and counts it and returns False.
 
         Raises:
-            ControlGoneError: Nobody is at the other end.
+            ControlGoneError: Control has ended.
         """
         try:
             self._socket.send(kind + payload)
@@ -134,10 +135,10 @@ class ControlChannel:
         return True
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """The next message, None where none comes in time.
+        """The next message; None if no message comes in time.
 
         Raises:
-            ControlGoneError: Nobody is at the other end.
+            ControlGoneError: Control has ended.
         """
         readable, _, _ = select.select([self._socket], [], [], max(0.0, timeout_s))  # unlike poll, finer than 1 ms
         if not readable:
@@ -154,7 +155,7 @@ class ControlChannel:
 
 
 class Inbox:
-    """Messages from control that are not written yet. A thread empties the socket, so that no disk makes it fill up."""
+    """Messages from control that are not written yet; a thread empties the socket even if the disk is slow."""
 
     def __init__(self, control: socket.socket) -> None:
         self._control = control
@@ -172,15 +173,15 @@ class Inbox:
         self.ended.set()
 
     def take(self) -> list[bytes]:
-        """Messages that have come since the last call."""
+        """Messages that have arrived since the last call."""
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
 
 #: Module through which every helper starts; see ``main``.
 ENTRY = "hrcreplay.live.processes"
 
-_BUFFER = 4 << 20  #: of messages under way: seconds of them
-_AT_ONCE = 256  #: messages taken at once, so that a flood does not hold up the loop
+_BUFFER = 4 << 20  #: socket buffer [bytes], for some seconds of messages
+_AT_ONCE = 256  #: largest number of messages read at once, so that many messages do not delay the loop
 
 
 class HelperProcess:
@@ -189,14 +190,14 @@ class HelperProcess:
     def __init__(
         self, part: str, module: str, arguments: Sequence[str], folder: Path, expected: tuple[int, ...] = ()
     ) -> None:
-        """Starts ``module --fd N arguments`` in a session of its own: Ctrl-C is for control alone.
+        """Starts ``module --fd N arguments`` in a separate process session, so that only control gets Ctrl-C.
 
         Args:
-            part: Which part of the session it is: PERSON, RECORDER or SCREEN.
+            part: Part of the live session: PERSON, RECORDER or SCREEN.
             module: Module to run.
-            arguments: Of it, beside the socket.
-            folder: Where it leaves its traceback if it crashes.
-            expected: Exit codes beside 0 of a process that has said why it ends: no crash.
+            arguments: Arguments of the module, without the socket.
+            folder: Folder for its crash file.
+            expected: Exit codes besides 0 that are no crash, because the process has reported its reason.
         """
         self.part = part
         self._folder = folder
@@ -207,9 +208,9 @@ class HelperProcess:
         near.setblocking(False)
         self._socket = near
         self.alive = True
-        self.dropped = 0  #: messages that it did not take
-        self.last_words = ""  #: why it ends, where it has said so
-        self.crash = ""  #: what there is to say of its crash, once it is closed
+        self.dropped = 0  #: number of messages that were dropped
+        self.last_words = ""  #: the reason for its end, if it has sent one
+        self.crash = ""  #: description of its crash, after ``close``
         with far:
             self.process = subprocess.Popen(  # noqa: S603 - our own modules
                 [sys.executable, "-m", ENTRY, str(folder), part, module, "--fd", str(far.fileno()), *arguments],
@@ -219,7 +220,7 @@ class HelperProcess:
             )
 
     def send(self, message: bytes) -> None:
-        """Hands a message over, or drops and counts it."""
+        """Sends a message, or drops and counts it."""
         if not self.alive:
             self.dropped += 1
             return
@@ -250,16 +251,16 @@ class HelperProcess:
                 yield message
 
     def crashed(self) -> bool:
-        """Return whether it has ended with an unexpected exit code; False while it runs or is about to end."""
+        """Return whether it has ended with an unexpected exit code; False while it runs or is ending."""
         return not self.alive and self.process.poll() not in (None, *self._told)
 
     def close(self, patience_s: float) -> int | None:
-        """Closes the socket, which ends the process; its exit code, None where it had to be killed.
+        """Closes the socket, which ends the process; returns its exit code, None if it had to be killed.
 
-        A process that crashed has left a file in the run folder; of one that could not, this leaves it.
+        If the process crashed and could not write a crash file, this method writes it.
         """
         for _ in self.messages():
-            pass  # last words may be among them
+            pass  # the last message may contain the reason
         self._socket.close()
         self.alive = False
         try:
@@ -274,7 +275,7 @@ class HelperProcess:
 
 
 def _enlarge(end: socket.socket) -> None:
-    """As large a buffer as we are permitted."""
+    """Sets the send buffer to the largest size that the system permits."""
     forced = getattr(socket, "SO_SNDBUFFORCE", 32)
     with contextlib.suppress(OSError):
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
@@ -301,7 +302,7 @@ def raise_priority() -> list[str]:
 
 
 def restore_priority() -> None:
-    """Ends what ``raise_priority`` asked for."""
+    """Undoes ``raise_priority``."""
     import ctypes
 
     with contextlib.suppress(OSError, AttributeError):
@@ -310,7 +311,7 @@ def restore_priority() -> None:
         ctypes.CDLL(None).munlockall()
 
 
-#: Exit code of a process that crashed, as sysexits.h has it for internal errors.
+#: Exit code of a process that crashed; in sysexits.h it means an internal error.
 CRASHED = 70
 
 
@@ -320,13 +321,13 @@ def main() -> None:
 
     def die(error: BaseException) -> NoReturn:
         write_crash(Path(folder), part, error)
-        os._exit(CRASHED)  # other threads may wait for one that is gone
+        os._exit(CRASHED)  # other threads may wait for the failed thread forever
 
     threading.excepthook = lambda raised: die(raised.exc_value or SystemError("a thread ended without a reason"))
     sys.argv = [module, *arguments]
     try:
         runpy.run_module(module, run_name="__main__", alter_sys=True)
-    except Exception as error:  # whatever it is
+    except Exception as error:  # write every crash to its file
         die(error)
 
 

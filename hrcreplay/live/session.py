@@ -37,10 +37,10 @@ from hrcreplay.live.record.recorder import free_bytes
 from hrcreplay.live.view.status import StatusPublisher
 from hrcreplay.settings.load import Settings
 
-#: Longest wait for a packet before the loop turns to everything else [s].
+#: Longest wait for a packet before the loop does its other work [s].
 WAIT_S = 0.02
 
-#: Longest wait for the recording to be opened, and for the record to be finished [s].
+#: Longest wait until the recording is opened, and until the record is finished [s].
 PATIENCE_S = 60.0
 
 
@@ -62,7 +62,7 @@ class Request:
 
 
 def run(request: Request) -> Path:
-    """A whole session.
+    """Runs a complete session.
 
     Returns:
         The run folder.
@@ -70,7 +70,8 @@ def run(request: Request) -> Path:
     Raises:
         SettingsError: A setting, the cell, the task, the port or the output folder cannot be used.
         LogError: The recording of the person cannot be read.
-        LiveStopped: The session ended by a stop reason, or a part of it crashed; then its record is not complete.
+        LiveStopped: The session ended by a stop reason, or a part of it crashed; after a crash its record is not
+            complete.
     """
     partial = folder.make_partial(request.out)
     try:
@@ -81,9 +82,9 @@ def run(request: Request) -> Path:
         raise _broken_off(partial, processes.read_crashes(partial)) from None
     except (HrcReplayError, KeyboardInterrupt, SystemExit):
         if not (partial / folder.LOG).exists():
-            shutil.rmtree(partial, ignore_errors=True)  # there is nothing in it
+            shutil.rmtree(partial, ignore_errors=True)  # the folder has no record
         raise
-    except Exception as error:  # whatever it is
+    except Exception as error:  # an internal error
         raise _broken_off(partial, [processes.write_crash(partial, processes.CONTROL, error)]) from None
     done = _finish(partial, crashes)
     _verdict(loop, done, crashes)
@@ -91,7 +92,7 @@ def run(request: Request) -> Path:
 
 
 def _finish(partial: Path, crashes: list[str]) -> Path:
-    """The run folder of a session that is over."""
+    """Makes the run folder of a session that is over."""
     try:
         return folder.finish(partial)
     except KeyboardInterrupt:
@@ -103,18 +104,18 @@ def _finish(partial: Path, crashes: list[str]) -> Path:
         if not crashes:
             raise
         raise _broken_off(partial, crashes) from None
-    except Exception as error:  # whatever it is
+    except Exception as error:  # an internal error
         raise _broken_off(partial, [*crashes, processes.write_crash(partial, processes.FOLDER, error)]) from None
 
 
 def _broken_off(partial: Path, crashes: list[str]) -> LiveStopped:
-    """Describe a session that no run folder can be made of; what there is of it says the same."""
+    """The error for a session without a run folder; also writes the crashes to its partial folder."""
     folder.keep_incomplete(partial, crashes)
     return LiveStopped(f"{crashes[0]}; not complete: what there is of the record, and the traceback, is in {partial}")
 
 
 class _CrashedError(Exception):
-    """A helper crashed before the session began; its file says how."""
+    """A helper crashed before the session began; its crash file has the details."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ class _Prepared:
 
 
 def _prepare(request: Request, partial: Path, stack: ExitStack) -> _Prepared:
-    """Settings, controller, port, space on the disk; every kernel compiled."""
+    """Prepares settings, controller and port, checks the space on the disk, and compiles every kernel."""
     run_config, header = live_run_config(request.human, request.config, request.overrides, request.cell)
     port = run_config.settings.live.port if request.port is None else request.port
     start = start_table(run_config, header, sending=request.send)
@@ -145,7 +146,7 @@ def _prepare(request: Request, partial: Path, stack: ExitStack) -> _Prepared:
 
 
 def _check_disk(partial: Path, least_mb: float) -> None:
-    """Refuses to begin where the record may not find room.
+    """Raises if the disk may be too small for the record.
 
     Raises:
         SettingsError: There is less space than ``least_mb`` [MB].
@@ -159,7 +160,7 @@ def _check_disk(partial: Path, least_mb: float) -> None:
 
 
 def _run_processes(request: Request, prepared: _Prepared, partial: Path) -> tuple[Loop, list[str]]:
-    """The loop with the processes around it; the loop, which is over, and what is to be said of crashes."""
+    """Starts the processes and runs the loop; returns the finished loop and the descriptions of crashes."""
     settings = prepared.settings
     anchor_ns = time.time_ns() - time.monotonic_ns()
     to_record = ["--path", str(partial / folder.LOG), "--low", str(round(settings.live.disk_low_mb * 1e6))]
@@ -185,13 +186,13 @@ def _run_processes(request: Request, prepared: _Prepared, partial: Path) -> tupl
         if recorder.close(PATIENCE_S) is None:
             recorder.crash = processes.write_crash(partial, processes.RECORDER, f"did not finish in {PATIENCE_S:g} s")
         if not begun:
-            (partial / folder.LOG).unlink(missing_ok=True)  # there is nothing in it
-    told = [helper.crash for helper in (recorder, person, screen) if helper.crash]  # a full disk keeps no file of them
+            (partial / folder.LOG).unlink(missing_ok=True)  # the record is empty
+    told = [helper.crash for helper in (recorder, person, screen) if helper.crash]  # a full disk has no crash files
     return loop, list(dict.fromkeys([*crashes, *processes.read_crashes(partial), *told]))
 
 
 def _run_loop(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bool, in_3d: bool) -> list[str]:
-    """The loop, alone with the robot: no garbage collector, no waiting for anybody. Returns its crashes."""
+    """Runs the loop without the garbage collector and without waiting for other processes. Returns its crashes."""
     found: list[Exception] = []
     with _signals(loop):
         gc.collect()
@@ -204,7 +205,7 @@ def _run_loop(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bo
             loop.begin()
             while loop.run_cycle():
                 publisher.publish()
-        except Exception as error:  # whatever it is, the robot is braked first
+        except Exception as error:  # on any error, brake the robot first
             found.append(error)
             bring_to_rest(loop, processes.describe_exception(error))
         finally:
@@ -214,7 +215,7 @@ def _run_loop(loop: Loop, start: dict[str, Any], partial: Path, *, real_time: bo
         try:
             loop.recorder.send(codec.encode_event(loop.now_ns(), {"what": "end", **outcome(loop)}))
             publisher.publish(last=True)
-        except Exception as error:  # whatever it is
+        except Exception as error:  # report it as a crash
             found.append(error)
     if loop.controller.fault is not None:
         found.insert(0, loop.controller.fault)
@@ -255,7 +256,7 @@ def _verdict(loop: Loop, done: Path, crashes: list[str]) -> None:
         raise LiveStopped(f"stopped by: {reason}{why}{when}; the record is in {done}")
 
 
-#: Signals that end a session as the one of their name says.
+#: Signals of the operating system -> signals of the loop, which end the session.
 _MEANING: dict[int, Signal] = {
     signal.SIGINT: Signal.INTERRUPT,
     signal.SIGTERM: Signal.TERMINATE,
@@ -263,7 +264,7 @@ _MEANING: dict[int, Signal] = {
     signal.SIGQUIT: Signal.QUIT,
     signal.SIGTSTP: Signal.SUSPEND,
 }
-#: Signals that end or suspend no process by themselves, and those of a process that cannot go on.
+#: Signals without a handler: those that do not end or suspend a process, and those after which it cannot continue.
 _LEFT_ALONE = {
     *("SIGCHLD", "SIGCONT", "SIGURG", "SIGWINCH", "SIGPIPE", "SIGXFSZ"),
     *("SIGKILL", "SIGSTOP", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT", "SIGTRAP", "SIGSYS"),
@@ -272,7 +273,7 @@ _LEFT_ALONE = {
 
 @contextmanager
 def _signals(loop: Loop) -> Iterator[None]:
-    """Turn signals of the process into signals of the loop: the robot brakes before anything ends."""
+    """Converts signals of the process to signals of the loop, so that the robot brakes before the process ends."""
 
     def catch(number: int, _frame: FrameType | None) -> None:
         loop.caught |= _MEANING.get(number, Signal.OTHER)
@@ -337,6 +338,6 @@ def _screen_arguments(request: Request) -> list[str]:
 
 
 def default_out(human: Path | None) -> Path:
-    """Default folder of a session."""
+    """Default run folder of a session."""
     name = "zenoh" if human is None else human.stem
     return Path("reports") / name / f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-live"

@@ -1,8 +1,8 @@
 """The command ``verify``: computes a recorded run again and compares it with the record.
 
-A live session is computed again from its log, message by message; a replay by running its command from its run.json.
-Every bit is compared. On another machine numbers may differ by ``differences.TOLERANCE``, and the verdict is then
-another one: the same decisions.
+A live session is computed again from its log, message by message. A replay is computed again by its command and its
+run.json. Every bit is compared. On another machine numbers may differ by ``differences.TOLERANCE``; the verdict is then
+``same decisions``.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from hrcreplay.store.columns import state_columns
 from hrcreplay.store.machine import describe_machine, name_machine
 
 COMMANDS = ("fuse", "predict", "plan", "report")
-_CONTEXT = ("versions", "limits", "task", "cell")  #: of run.json: what else may make a difference
+_CONTEXT = ("versions", "limits", "task", "cell")  #: entries of run.json that may explain a difference
 
 
 class Agreement(IntEnum):
@@ -62,11 +62,11 @@ class Verdict:
 
     @property
     def identical(self) -> bool:
-        """Return whether every bit was the same."""
+        """Return whether every bit is equal."""
         return self.agreement is Agreement.IDENTICAL
 
 
-#: What run.json says of a machine, as a message calls it.
+#: Entry of a machine in run.json -> its name in messages.
 _PARTS = {
     **dict.fromkeys(("processor", "architecture", "features"), "processor"),
     "blas": "BLAS kernels",
@@ -78,9 +78,10 @@ _PARTS = {
 
 
 def find_other_parts(recorded: dict[str, Any]) -> str:
-    """Parts of the machine that differ from the record's, in words; empty where none does, or the record names none.
+    """Parts of this machine that differ from the recorded machine, in words.
 
-    Other versions come with it, but do not alone explain a difference.
+    Empty if no part differs or the record has no machine. Other versions are listed only with another part, because
+    other versions alone do not explain a difference.
     """
     machine, now = recorded.get("machine"), describe_machine()
     if not isinstance(machine, dict):
@@ -108,8 +109,8 @@ def _replay(run: Path) -> Verdict:
     """Runs a replay again and compares its outputs.
 
     Raises:
-        SettingsError: No complete run of a replay.
-        LogError: The log of the run is gone.
+        SettingsError: The folder is no complete run of a replay.
+        LogError: The log of the run is missing.
     """
     meta = run_folder.read_meta(run)
     if meta["command"] not in COMMANDS:
@@ -123,7 +124,7 @@ def _replay(run: Path) -> Verdict:
         line = f"{log}: is not the log of this run: SHA-256 recorded {digest}, now {now}"
         return Verdict(Agreement.DIFFERS, (line, *_changed(run)))
     with TemporaryDirectory(prefix="hrcreplay-") as temporary:
-        # A run folder that says all of itself and holds nothing, so that nothing can be taken over from it.
+        # A run folder with a complete run.json and no outputs, so that the new run reuses no results.
         plan = Path(temporary) / "plan"
         plan.mkdir()
         (plan / "run.json").write_text(json.dumps({**meta, "stages": {}, "outputs": {}}))
@@ -161,7 +162,7 @@ def _compared(run: Path, meta: dict[str, Any], made: Path) -> Verdict:
 def _output_differing(
     name: str, run: Path, made: Path, recorded: dict[str, str], again: dict[str, str]
 ) -> list[Difference]:
-    """Differences within an output whose bytes differ; none for a drawn one, of which the bytes are all there is."""
+    """Differences within an output whose bytes differ; none for a drawn output, which has no numbers to compare."""
     if name not in again:
         return [Difference("recorded, but not made again", np.inf)]
     if name not in recorded:
@@ -197,21 +198,21 @@ class DecisionMaker(Protocol):
         """Decision for the robot."""
 
     def silence(self, t_ns: int, signals: Signal) -> None:
-        """The robot said nothing."""
+        """Handles a time-out without a packet from the robot."""
 
 
 ControllerFactory = Callable[[dict[str, Any]], DecisionMaker]
 
 
 def verify(run: Path, build: ControllerFactory = setup.build_controller) -> Verdict:
-    """Runs a live session or a replay again from what its folder holds, and compares.
+    """Computes a live session or a replay again from its run folder, and compares the results.
 
     Args:
-        run: Run folder; also that of a session under way or killed.
+        run: Run folder; the session may still be running or may have been killed.
         build: Makes a session's controller from its start event.
 
     Raises:
-        SettingsError: No run folder, or one of a command that cannot be run again.
+        SettingsError: The folder is no run folder, or its command cannot be run again.
         LogError: The log of the run cannot be read.
     """
     return _session(run, build) if (run / LOG).exists() else _replay(run)
@@ -253,11 +254,11 @@ def _session(run: Path, build: ControllerFactory) -> Verdict:
 
 
 def _changed(run: Path) -> Iterator[str]:
-    """The files of a complete run that are not those it left."""
+    """Describes the files of a complete run that have changed since."""
     try:
         meta = run_folder.read_meta(run, broken_off=True)
     except SettingsError as error:
-        if run.suffix != ".partial":  # of which only the log counts
+        if run.suffix != ".partial":  # a partial folder only needs its log
             yield str(error)
         return
     for name, digest in sorted(meta.get("outputs", {}).items()):
@@ -274,17 +275,17 @@ class SessionRecomputation:
     def __init__(self, controller: DecisionMaker) -> None:
         self.ticks = 0  #: answers so far
         self.looks = 0
-        self.by_digest = 0  #: volumes with other bits that are the same on a grid, and not recorded whole
+        self.by_digest = 0  #: number of volumes with other bits, equal on a grid and not recorded completely
         self.ended = False
-        self.crashed = ""  #: how control crashed, after which no controller answered
+        self.crashed = ""  #: crash of control; after it no controller answered
         self._pilot = controller
         self._start_ns: int | None = None
         self._last_ns = 0
         self._frames: list[bytes] = []
         self._datagrams: list[bytes] = []
-        self._reply: bytes | None = None  # due as the next message
+        self._reply: bytes | None = None  # expected as the next message
         self._perception: Perception | None = None
-        self._suspects: list[Difference] = []  # limbs whose volume is not that of the record; perhaps it follows whole
+        self._suspects: list[Difference] = []  # limbs with another digest; the complete volume may follow
         self._take: dict[bytes, Callable[[bytes], list[Difference]]] = {
             codec.ROBOT: self._robot,
             codec.REPLY: self._replied,
@@ -297,7 +298,7 @@ class SessionRecomputation:
         }
 
     def differences_at(self, message: bytes) -> list[Difference]:
-        """Differences in a message, or in what was due before it; in the order of the record."""
+        """Differences in a message, or in messages that were expected before it; in the order of the record."""
         kind, t_ns = codec.kind(message), codec.clock_ns(message)
         if self._start_ns is None:
             self._start_ns = t_ns
@@ -315,11 +316,11 @@ class SessionRecomputation:
         return due + self._at(t_ns, self._take[kind](message))
 
     def pending_differences(self) -> list[Difference]:
-        """Differences that the message after the last one would have shown."""
+        """Differences that the next message would show, for use after the last message."""
         return self._at(self._last_ns, self._unproven())
 
     def _unproven(self) -> list[Difference]:
-        """Volumes that only their digests tell of."""
+        """Differences of volumes whose digests alone are recorded."""
         found, self._suspects = self._suspects, []
         self.by_digest += sum(one.tolerable for one in found)
         return found
@@ -380,7 +381,7 @@ class SessionRecomputation:
             *numbers_differing(["horizon_s"], np.array([held_s]), np.array([horizon_s])),
             *_volumes_differing(recorded, volumes),
         ]
-        # the record's own digests: of volumes that are whole in it, they must be those
+        # the digests of the recorded volumes must give the same differences as the recorded digests
         digests = _digests_differing(codec.volume_digests(recorded), volumes) if suspects else []
         return found if [one.text for one in digests] == [one.text for one in suspects] else [*found, *suspects]
 
@@ -420,14 +421,14 @@ def _decision(found: codec.RecordedDecision) -> list[Any]:
 
 
 def _numbers(found: codec.RecordedDecision) -> tuple[list[str], Floats]:
-    """The numbers of a decision that are no decisions themselves, with their names."""
+    """The numbers of a decision with their names, without the integers, which are decisions."""
     names = codec.number_names_of(len(found.measured)) if found.row is not None else ()
     kept = [i for i, name in enumerate(names) if name not in codec.INTEGERS]
     return [names[i] for i in kept], codec.numbers_of(found)[kept]
 
 
 def _digests_differing(recorded: tuple[bytes, ...], volumes: SweptVolumes) -> list[Difference]:
-    """Limbs whose volume has another digest; tolerable where its numbers are the same on a grid."""
+    """Limbs whose volume has another digest; tolerable if its numbers are equal on a grid."""
     again = codec.volume_digests(volumes)
     names = [f"volume of {limb} (digest)" for limb in volumes.limbs]
     found = decisions_differing(names, [one.hex() for one in recorded], [one.hex() for one in again])

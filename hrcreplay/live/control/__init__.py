@@ -1,1 +1,1 @@
-"""The control process of a live session: receive a packet, answer it, update the perception of the person."""
+"""The control process of a live session: receives a packet, answers it, updates the perception of the person."""

@@ -1,12 +1,12 @@
 """The control loop: receives a packet, answers it, updates the perception, and hands records to the other processes.
 
-The loop waits for no other process. A perception update that lasts into the next packet delays the answer to it. The
-update after that answer is left out, so that the next answer is on time again; the swept volumes are then one cycle
-older, which `live.reaction_s` allows for.
+The loop does not wait for other processes. If a perception update is not finished when the next packet arrives, the
+answer to this packet is late. The loop then skips the next update, so that the next answer is on time. The swept
+volumes are then one cycle older, which `live.reaction_s` allows for.
 
-After a crash of the control process a fallback brakes the robot from the last reply until it stands. It uses neither
-controller nor stages, nor the protocol's state machine or codec, because any of them may have failed; its numbers are
-in degrees as they go over the link.
+After a crash of the control process a fallback brakes the robot from the last reply until it is at rest. It does not
+use the controller, the stages, the protocol's state machine or the codec, because any of them may have failed. Its
+numbers are in degrees, as on the link.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from hrcreplay.records import MotionRow
 from hrcreplay.robot.control.control_step import BRAKING, Stop
 
 _BIN_NS = 5_000
-_BINS = 20_000  # up to 0.1 s; the last one holds all that took longer
+_BINS = 20_000  # up to 0.1 s; the last bin counts all longer durations
 
 
 class DurationHistogram:
-    """Histogram of durations in steps of 5 us: quantiles of any number of them in constant memory."""
+    """Histogram of durations in steps of 5 us; it gives quantiles of any number of durations in constant memory."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, dtype=np.int64)
@@ -48,7 +48,7 @@ class DurationHistogram:
         self._counts[min(max(duration_ns, 0) // _BIN_NS, _BINS - 1)] += 1
 
     def quantiles_us(self, *shares: float) -> list[float] | None:
-        """Upper ends of the steps in which these shares of all lie; None where there is nothing [us]."""
+        """Quantiles for the shares, rounded up to the next step; None without durations [us]."""
         total = np.cumsum(self._counts)
         if not total[-1]:
             return None
@@ -56,7 +56,7 @@ class DurationHistogram:
         return [float((place + 1) * _BIN_NS / 1e3) for place in places]
 
 
-#: Signals after which the session ends as soon as the robot stands. A process that is gone does not come back.
+#: Signals that end the session as soon as the robot is at rest. A process that has ended is not started again.
 ENDING = (
     Signal.INTERRUPT
     | Signal.TERMINATE
@@ -72,7 +72,7 @@ ENDING = (
     | Signal.SCREEN_DEAD
 )
 
-#: Answers at speed 0 before we leave: a robot keeps obeying the last one.
+#: Number of answers with speed 0 before the session ends, because a robot keeps following the last answer.
 FINAL_ANSWERS = 5
 
 
@@ -80,12 +80,12 @@ FINAL_ANSWERS = 5
 class LoopSettings:
     """Settings of the control loop; see ``settings.sections.Live``."""
 
-    duration_s: float  #: inf: until it is stopped
+    duration_s: float  #: inf: until the user stops it
     sending: bool
     person_late_s: float
     overrun_s: float
     keep_recorder: bool
-    store_every_s: float  #: between two perception updates whose volumes are recorded complete
+    store_every_s: float  #: interval between two perception updates whose volumes are recorded completely
 
 
 @dataclass
@@ -101,19 +101,19 @@ class Loop:
     anchor_ns: int
     start_ns: int
     screen: HelperProcess | None = None
-    caught: Signal = Signal.NONE  #: by the handlers of the operating system's signals
-    signals: Signal = Signal.NONE  #: of the latest cycle
+    caught: Signal = Signal.NONE  #: signals of the operating system
+    signals: Signal = Signal.NONE  #: signals of the latest cycle
     notes: list[str] = field(default_factory=list)
     reply_times: DurationHistogram = field(default_factory=DurationHistogram)
     answers: int = 0
-    skipped: int = 0  #: perception updates left out
+    skipped: int = 0  #: number of skipped perception updates
     robot: str | None = None
     last: Decision | None = None
-    sent: bytes | None = None  #: the latest reply that went to the robot
-    stop: Stop | None = None  #: what goes on after it
-    sender: Address | None = None  #: where the robot's packets come from
-    pending: Received | None = None  #: what is not answered yet
-    stored: bytes | None = None  #: the latest swept volumes that were recorded complete
+    sent: bytes | None = None  #: the latest reply that was sent to the robot
+    stop: Stop | None = None  #: the stop that continues after it
+    sender: Address | None = None  #: source address of the robot's packets
+    pending: Received | None = None  #: packets that are not answered yet
+    stored: bytes | None = None  #: the latest swept volumes that were recorded completely
     _bodies: list[bytes] = field(default_factory=list)
     _beat_ns: int = 0
     _late: bool = False
@@ -121,20 +121,20 @@ class Loop:
     _ended: bool = False
     _stored_ns: int = 0
     _low_disk: bool = False
-    _strangers: int = 0  # senders beside the robot that were told of
+    _strangers: int = 0  # number of other senders that have been reported
 
     def now_ns(self) -> int:
-        """The session's clock: monotonic, beginning at the time of day."""
+        """The session's clock [ns]: monotonic, and set to Unix time at the start."""
         return time.monotonic_ns() + self.anchor_ns
 
     def begin(self) -> None:
-        """Starts the human side."""
+        """Starts the flow of skeletons."""
         self.link.clear()
         self._beat_ns = self.now_ns()
         self.person.send(b"G" + self.start_ns.to_bytes(8, "little"))
 
     def run_cycle(self) -> bool:
-        """Runs one cycle: answers a packet and updates the perception; False when the session is over."""
+        """Runs one cycle: answers a packet and updates the perception; returns False when the session is over."""
         received = self.pending = self.link.newest()
         self._tell_strangers()
         signals = self.signals = self._signals()
@@ -172,10 +172,10 @@ class Loop:
         self.last = answer
 
     def send(self, datagram: bytes, received: Received | None) -> None:
-        """Sends a command to where the robot's packets come from: the only way out of the process.
+        """Sends a command to the source address of the robot's packets; no other code sends to the robot.
 
         Raises:
-            UnsafeCommandError: It leads further than the axes can go.
+            UnsafeCommandError: The command requires a longer way than the axes can travel.
         """
         measured = None
         if received is not None and self.sent is None:
@@ -209,7 +209,7 @@ class Loop:
             kind = message[:1]
             if kind in (b"f", b"F"):
                 self._bodies.append(message[1:])
-                if kind == b"F":  # the last body of its frame: half a frame could be somebody else's
+                if kind == b"F":  # the frame is complete; an incomplete frame could lack the person
                     skeletons += self._bodies
                     self._bodies = []
             elif kind == b"N":
@@ -224,7 +224,7 @@ class Loop:
         self.recorder.send(codec.encode_event(self.now_ns(), {"what": "note", "text": text}))
 
     def _tell_strangers(self) -> None:
-        """Says who else sends to the robot's port: the first few senders, each once."""
+        """Reports other senders to the robot's port: the first few senders, each once."""
         for address, port in self.link.strangers_seen()[self._strangers :]:
             self._strangers += 1
             robot = self.link.robot
@@ -259,7 +259,7 @@ class Loop:
         return ending and (self.controller.standing >= FINAL_ANSWERS or not self.controller.connected)
 
 
-#: A robot that says nothing for so many waits of the link has stopped listening; it stops by itself.
+#: After this many waits of the link without a packet, the robot no longer listens; it stops by itself.
 _SILENCES = 25
 
 _COUNTER = 2**32
@@ -267,35 +267,33 @@ _COUNTER = 2**32
 
 @dataclass
 class FallbackBrake:
-    """Goes on with the stop that was certified with the last reply, and where that is not known brakes by Eq. (67).
+    """Continues the certified stop of the last reply; if that stop is unknown, brakes by Eq. (67).
 
-    Joints are in the order of EGM.
-
-    Positions of Eq. (67) stay within limits; those of the stop do.
+    Joints are in the order of EGM. Positions by Eq. (67) are clipped to the limits; those of the stop are within them.
     """
 
     ddq_max: Sequence[float]  #: [deg/s^2]
     q_min: Sequence[float]  #: [deg]
     q_max: Sequence[float]  #: [deg]
     cycle_s: float
-    tracking: float  #: a robot further than this from what it was told begins anew where it is [deg]
-    q: list[float]  #: told last [deg]
-    dq: list[float]  #: told last [deg/s]
+    tracking: float  #: if the robot is further than this from the last command, braking starts at its position [deg]
+    q: list[float]  #: last command [deg]
+    dq: list[float]  #: last command [deg/s]
     seqno: int  #: of the last reply
-    stop: list[tuple[list[float], list[float]]]  #: what is left of it: joints [deg], speeds [deg/s], a row a cycle
+    stop: list[tuple[list[float], list[float]]]  #: rest of the stop: joints [deg], speeds [deg/s], one row per cycle
 
     @property
     def at_rest(self) -> bool:
-        """Return whether the robot has been told to stand."""
+        """Return whether the last command is standstill."""
         return not any(self.dq)
 
     def update_position(self, measured: Sequence[float]) -> None:
-        """Takes the measured joints [deg]; starts again from them where they are too far from the last reply."""
+        """Takes the measured joints [deg]; if they are too far from the last reply, starts again from them."""
         if max(abs(m - q) for m, q in zip(measured, self.q, strict=True)) > self.tracking:
             self.q, self.dq, self.stop = list(measured), [0.0] * len(measured), []
 
     def step(self, tm_ms: int) -> bytes:
-        """The reply of one cycle, with our own stamp [ms]."""
+        """The reply of one cycle, with the session's time stamp ``tm_ms`` [ms]."""
         if self.stop:
             self.q, self.dq = self.stop.pop(0)
         else:
@@ -319,13 +317,13 @@ class FallbackBrake:
 
 
 def bring_to_rest(loop: Loop, why: str) -> None:
-    """Answers the robot until it stands. Does nothing where nothing was sent: then it has not been moved.
+    """Answers the robot until it is at rest. Without an earlier reply it does nothing, because the robot has not moved.
 
-    Where not even the link can be read, the replies go at the robot's pace to where its packets last came from.
+    If the link cannot be read, the replies go to the last address of the robot, one per cycle of the robot.
 
     Args:
-        loop: That crashed.
-        why: What the record is to say of it.
+        loop: The loop that has crashed.
+        why: Reason of the crash, for the record.
     """
     with suppress(Exception):
         if loop.controller.stop != FAULT:
@@ -340,7 +338,7 @@ def bring_to_rest(loop: Loop, why: str) -> None:
     while standing < FINAL_ANSWERS and silences < _SILENCES:
         try:
             received = received or loop.link.newest()
-        except Exception:  # whatever it is
+        except Exception:  # any error: the robot must still be braked
             time.sleep(brake.cycle_s)
         else:
             if received is None:
@@ -355,7 +353,7 @@ def bring_to_rest(loop: Loop, why: str) -> None:
             with suppress(Exception):
                 loop.send(data, received)
                 sent = True
-            with suppress(Exception):  # the record is worth less than the stop
+            with suppress(Exception):  # the stop has priority over the record
                 _record(loop, received, measured, before, brake, data, sent=sent)
             standing = standing + 1 if brake.at_rest else 0
         received = None
@@ -378,12 +376,12 @@ def _brake(loop: Loop) -> FallbackBrake | None:
 
 
 def _joints(place: Any) -> list[float]:
-    """Joints of one part of a message, external ones last."""
+    """Joints of one part of a message, external joints last."""
     return [*place.joints.joints, *place.external_joints.joints]
 
 
 def _measured(data: bytes, axes: int) -> list[float] | None:
-    """Joint positions of a robot of so many axes [deg]; None of a datagram without them."""
+    """Joint positions in a datagram of a robot with ``axes`` axes [deg]; None for a datagram without them."""
     try:
         joints = _joints(messages.RobotMessage.FromString(data).feed_back)
     except DecodeError:
@@ -401,7 +399,7 @@ def _record(
     *,
     sent: bool,
 ) -> None:
-    """Records a row of the motion; what only the stages know is missing in it."""
+    """Records a row of the motion; the values of the stages are unknown in it."""
     t_ns = loop.now_ns() if received is None else received.t_ns + loop.anchor_ns
     datagrams = () if received is None else (*received.older, received.data)
     for datagram in datagrams:

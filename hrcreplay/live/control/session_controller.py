@@ -1,7 +1,7 @@
-"""The controller of a live session: decides what the robot is told in each cycle; its watchdog says when it must stop.
+"""The controller of a live session: decides the command of each cycle; its watchdog decides when the robot must stop.
 
-Pure: the same events in the same order give the same bits, so a recorded session can be computed again. Every condition
-that must stop a live robot has the name of its stop reason.
+The controller depends only on its events: the same events in the same order give the same bits, so a recorded session
+can be computed again. Every condition that must stop a live robot has the name of its stop reason.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hrcreplay.robot.control.control_step import RobotState, at_rest, motion_row
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.settings.sections import Live
 
-#: What ends a session as it should; every other reason ends it as a stop.
+#: Reasons that end a session normally; every other reason ends it as a stop.
 SESSION_OVER, RECORDING_OVER = "session over", "recording of the person over"
 
 INTERRUPTED, TERMINATED, HUNG_UP, QUIT, SUSPENDED = "Ctrl-C", "SIGTERM", "SIGHUP", "SIGQUIT", "Ctrl-Z"
@@ -36,13 +36,13 @@ OVERRUN, SILENT = "tick overrun", "robot silent"
 NO_FRAME, UNCERTAIN, NOT_FINITE, TRACKING = "no fresh frame", "state uncertain", "not finite", "tracking error"
 FAULT = "internal error"
 
-#: What ends a session whose robot may have been stopped for another reason.
+#: Reasons that end a session, also after the robot has stopped for another reason.
 _ENDINGS = (SESSION_OVER, RECORDING_OVER, INTERRUPTED, TERMINATED, HUNG_UP, QUIT, SUSPENDED, OTHER_SIGNAL)
 
-#: What a robot does not move after, whatever the settings.
+#: Reasons after which the robot never moves again, for all settings.
 _FINAL = (PERSON_DEAD, RECORDER_DEAD, SCREEN_DEAD, DISK_FULL, FAULT)
 
-#: Robots that are not answered at all.
+#: Reasons for which a robot is not answered at all.
 REFUSED = ("radians", "axes")
 
 #: Reasons by signal, the most important first.
@@ -67,25 +67,25 @@ _BASE = 4  #: x, y, heading and bend: the joints that carry the whole person
 
 
 def reason_of_signals(signals: Signal) -> str:
-    """The reason that the loop itself has found, or none."""
+    """The stop reason from the signals of the loop; empty without one."""
     return next((reason for signal, reason in SIGNALS.items() if signal in signals), "")
 
 
 def reason_of_robot(packet_status: PacketStatus) -> str:
-    """The reason that lies with the robot, or none."""
+    """The stop reason from the state of the robot; empty without one."""
     if packet_status.reason:
         return packet_status.reason
     return "" if packet_status.allowed else "robot not ready"
 
 
 def reason_of_person(perception: Perception | None, age_s: float, fresh_s: float, bounds: Live) -> str:
-    """The reason that lies with what is known of the person, or none.
+    """The stop reason from the knowledge of the person; empty without one.
 
     Args:
-        perception: The last look; None before the first.
-        age_s: How old the newest frame of the person is by now [s].
-        fresh_s: The oldest that may be relied on [s].
-        bounds: Of the person's uncertainty.
+        perception: The last perception update; None before the first.
+        age_s: Present age of the person's newest frame [s].
+        fresh_s: Largest allowed age of the newest frame [s].
+        bounds: Settings with the bounds of the person's uncertainty.
     """
     if perception is None or not age_s <= fresh_s:
         return NO_FRAME
@@ -97,7 +97,7 @@ def reason_of_person(perception: Perception | None, age_s: float, fresh_s: float
 
 
 def _reason_of_tracking(measured: Floats, commanded: Floats, bounds: Live) -> str:
-    """The reason that the robot is not where it was told to be, or none; both (n,) [rad]."""
+    """The stop reason from the difference of measured and commanded joints, (n,) each [rad]; empty without one."""
     return "" if np.abs(measured - commanded).max() <= bounds.tracking_rad else TRACKING
 
 
@@ -108,14 +108,13 @@ _UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.emp
 class SessionController:
     """Answers the robot's packets: waits, approaches, follows its programme, stops and holds.
 
-    Between two answers ``update_perception`` brings in what the cameras saw. The robot moves only while the watchdog
-    has no reason against it. A reason that appears is kept until the session ends, or, where ``resume`` is set, until
-    it has been gone for ``resume_s``. A robot that stands starts to move in one way only: from where it stands, at
-    approach speed.
+    Between two answers ``update_perception`` processes the frames of the cameras. The robot moves only while the
+    watchdog has no stop reason. A stop reason is kept until the session ends or, with ``resume``, until it has been
+    absent for ``resume_s``. A robot at rest always starts with an approach from its position, at approach speed.
 
-    The step of the next answer depends only on the last answer and the last perception update, so it is computed at
-    the end of that update, and the answer only decides whether it is used. Where a cycle has no time for an update,
-    ``prepare`` computes the step without one.
+    The step of the next answer depends only on the last answer and the last perception update. Therefore it is
+    computed at the end of that update, and the answer only decides whether to use it. If a cycle has no time for an
+    update, ``prepare`` computes the step without one.
     """
 
     def __init__(self, setup: ControlSetup, observer: Observer, session: EgmSession) -> None:
@@ -126,18 +125,18 @@ class SessionController:
         self._reorders = not np.array_equal(setup.joint_order, np.arange(setup.robot.nv))
         self.perception: Perception | None = None
         self.phase = codec.WAITING
-        self.stop = ""  #: why the robot was stopped; empty while it may move
+        self.stop = ""  #: reason why the robot was stopped; empty while it may move
         self.stops: list[tuple[int, str]] = []  #: every stop: instant [ns] and reason
-        self.waiting = ""  #: why it does not start
-        self.fault: Exception | None = None  #: a bug that stopped it; to be raised once it stands
-        self.standing = 0  #: answers since it stands
-        self._motion: MotionState | None = None  # None: no robot is there
+        self.waiting = ""  #: reason why the robot does not start
+        self.fault: Exception | None = None  #: an error that stopped the robot; raised when the robot is at rest
+        self.standing = 0  #: number of answers since the robot is at rest
+        self._motion: MotionState | None = None  # None: no robot is connected
         self._ready: tuple[MotionState, MotionStep] | None = None
-        self._late = False  # whether the last look is too old for a certificate
-        self._programme_s = 0.0  # of the robot that was there last
+        self._late = False  # whether the last perception update is too old for a certificate
+        self._programme_s = 0.0  # programmed time of the last connected robot
         self._heard_ns: int | None = None
         self._clear_ns: int | None = None
-        self._behind_ns: int | None = None  # since when every event has packets of several cycles: we are too slow
+        self._behind_ns: int | None = None  # start of an overrun: since then every event has packets of several cycles
 
     @property
     def connected(self) -> bool:
@@ -146,7 +145,7 @@ class SessionController:
 
     @property
     def outlook(self) -> str:
-        """Reason for which a standing robot waits; empty where it moves, or where the session ends."""
+        """Condition on which a robot at rest moves again; empty if it moves or if the session ends."""
         if self.phase == codec.WAITING and self.waiting:
             return "it moves as soon as that is over"
         if self.phase != codec.HOLDING or self.stop in (*_ENDINGS, *_FINAL):
@@ -160,33 +159,33 @@ class SessionController:
         return self.observer.counts + Counter({f"robot {what}": n for what, n in self._session.counts.items()})
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
-        """Stages 1 and 2 up to ``t_ns`` [ns, session clock]; None where they failed, which stops the robot."""
+        """Updates stages 1 and 2 to ``t_ns`` [ns, session clock]; None if they failed, which stops the robot."""
         self._ready, self._late = None, False
         try:
             self.perception = self.observer.update_perception(t_ns, skeletons, self._horizon_s())
             if self._motion is not None:
                 self._ready = self._motion, self._step(self._motion)
-        except Exception as error:  # whatever it is, the robot must go on being answered
+        except Exception as error:  # on any error the robot still needs answers
             self.fault = self.fault or error
             self.perception = self.perception if self.perception is not None and self.perception.t_ns == t_ns else None
         return self.perception
 
     def prepare(self) -> None:
-        """Computes the step of the next answer from the last perception; changes no answer."""
+        """Computes the step of the next answer in advance from the last perception update; changes no answer."""
         if self._motion is not None:
-            with suppress(Exception):  # the answer fails in the same way, and says so
+            with suppress(Exception):  # the answer fails in the same way and reports it
                 self._ready = self._motion, self._step(self._motion)
 
     def silence(self, t_ns: int, signals: Signal) -> None:
-        """Nothing came from the robot within the time-out."""
+        """Handles a time-out without a packet from the robot."""
         self._check_silence(t_ns)
         why = reason_of_signals(signals)
         if why and not self.stop:
             self._stop(t_ns, why)
 
     def answer(self, event: TickEvent) -> Decision:
-        """The reply to what the robot sent, and why it is that one."""
-        self._check_silence(event.t_ns)  # also where the packet that ends a silence comes before its time-out is seen
+        """The reply to the robot's packets, and its reason."""
+        self._check_silence(event.t_ns)  # a packet may end a silence before its time-out is handled
         packets = [self._decoded(data) for data in event.datagrams]
         cycles = {packet.clock_ns for packet in packets if packet is not None}
         self._behind_ns = (self._behind_ns or event.t_ns) if len(cycles) > 1 else None
@@ -206,7 +205,7 @@ class SessionController:
         result = self._next_step(before)
         phase = self.phase
         reply = self._session.reply(result.step.next.q, result.step.next.dq, event.t_ns)
-        told = RobotState(reply.q, reply.dq)  # which is an echo while the robot may not move
+        told = RobotState(reply.q, reply.dq)  # an echo while the robot must not move
         stop = result.after.stop
         if not (np.array_equal(told.q, stop.q[0]) and np.array_equal(told.dq, stop.dq[0])):
             stop = self.setup.stop_from(told)
@@ -219,7 +218,7 @@ class SessionController:
         return Decision(event.t_ns, look_ns, self._encoded(reply), phase, measured, row, "", stop)
 
     def _decoded(self, data: bytes) -> RobotPacket | None:
-        """A packet, its joints in the order of the robot's axes; of another number of axes as it is."""
+        """A packet with its joints in the order of the robot's axes; unchanged if the number of axes differs."""
         try:
             packet = decode_robot(data)
         except BadPacket:
@@ -232,14 +231,14 @@ class SessionController:
         return replace(packet, q=by_axis)
 
     def _encoded(self, reply: Correction) -> bytes:
-        """A reply, its joints in the order of EGM."""
+        """A reply with its joints in the order of EGM."""
         if not self._reorders:
             return encode_correction(reply)
         order = self.setup.joint_order
         return encode_correction(replace(reply, q=reply.q[order], dq=reply.dq[order]))
 
     def _settle(self) -> None:
-        """The phase after an answer that left the robot standing, or not."""
+        """Updates the phase after an answer, depending on whether the robot is at rest."""
         moving = self._motion is not None and bool(np.any(self._motion.state.dq))
         self.standing = 0 if moving else self.standing + 1
         if self.phase == codec.ECHO:
@@ -250,7 +249,7 @@ class SessionController:
             self.phase = codec.FOLLOWING
 
     def _refuse(self, t_ns: int, packet_status: PacketStatus) -> None:
-        """Handles datagrams without an answer: a robot that must not be moved at all, or at once no further."""
+        """Handles datagrams without an answer: from a robot that must not move at all or must stop at once."""
         if packet_status.reason in REFUSED and not self.stop:
             self._stop(t_ns, packet_status.reason)
             self._motion, self.phase = None, codec.HOLDING
@@ -259,7 +258,7 @@ class SessionController:
         self._check_silence(t_ns)
 
     def _check_silence(self, t_ns: int) -> None:
-        """Check whether the robot was silent for too long: it no longer listens, so it begins anew where it stands."""
+        """Resets the motion if the robot was silent for too long; it no longer listens and then starts at rest."""
         if self._heard_ns is None or t_ns - self._heard_ns <= self.setup.bounds.silent_s * 1e9:
             return
         if self.phase in (codec.APPROACH, codec.FOLLOWING, codec.STOPPING):
@@ -268,7 +267,7 @@ class SessionController:
         self.phase = codec.HOLDING if self.stop else codec.WAITING
 
     def _begin_session(self, measured: Floats) -> None:
-        """Starts a new session of the robot from its measured joints, whatever was commanded before."""
+        """Starts a new session of the robot from its measured joints, independent of earlier commands."""
         self._motion = MotionState(RobotState(measured, self._still), self._programme_s, at_rest(measured))
         self.phase = codec.ECHO
 
@@ -284,13 +283,13 @@ class SessionController:
             if self._clear_ns is not None and event.t_ns - self._clear_ns >= self.setup.bounds.resume_s * 1e9:
                 self.stop, self.phase = "", codec.WAITING
             elif why and why not in _ENDINGS:
-                self.stop = why  # what holds it now
+                self.stop = why  # the present reason
         self.waiting = why if self.phase == codec.WAITING else ""
         if self.phase == codec.WAITING and not why and self._motion is not None:
             self._motion, self.phase = start_approach(self.setup, self._motion), codec.APPROACH
 
     def _stop_reason(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> str:
-        """The watchdog's reason against moving; empty without one."""
+        """The stop reason of the watchdog; empty without one."""
         if self.fault is not None:
             return FAULT
         why = reason_of_signals(event.signals) or reason_of_robot(packet_status)
@@ -301,7 +300,7 @@ class SessionController:
             age_s, fresh_s = self.observer.age_s(event.t_ns), self.setup.fresh_s
             why = reason_of_person(self.perception, age_s, fresh_s, self.setup.bounds)
             if why == NO_FRAME and self.observer.vacant_s(self.perception, event.t_ns) <= fresh_s:
-                why = ""  # nobody needs to be known where nobody can be
+                why = ""  # in an empty area no frame of a person is needed
         if not why and self.setup.sending and self._motion is not None and self.phase != codec.ECHO:
             why = _reason_of_tracking(measured, self._motion.state.q, self.setup.bounds)
         return why
@@ -313,20 +312,20 @@ class SessionController:
             self._motion = replace(self._motion, controller=None)
 
     def _next_step(self, motion: MotionState) -> MotionStep:
-        """The step of this tick: the precomputed one where it is still valid, else a new one."""
+        """The step of this tick: the precomputed step if it is still valid, otherwise a new one."""
         if self._ready is not None and self._ready[0] is motion:
             result = self._ready[1]
         else:
             try:
                 result = self._step(motion)
-            except Exception as error:  # whatever it is, the robot must brake
+            except Exception as error:  # on any error the robot must brake
                 self.fault = self.fault or error
                 return self._fallback_stop(motion, FAULT)
         finite = math.isfinite(result.step.next.q.sum() + result.step.next.dq.sum())
         return result if finite else self._fallback_stop(motion, NOT_FINITE)
 
     def _fallback_stop(self, motion: MotionState, why: str) -> MotionStep:
-        """The stop of a robot whose step cannot be taken; once, however often it fails while the robot brakes."""
+        """The stop of a robot whose step failed; repeated failures while it brakes count as one stop."""
         if not self.stop or self.phase in (codec.APPROACH, codec.FOLLOWING):
             self._stop(self._heard_ns or 0, why)
         return brake(self.setup, motion, lambda _: _UNSEEN)
@@ -335,20 +334,20 @@ class SessionController:
         return (brake if motion.controller is None else follow)(self.setup, motion, self._obstacles)
 
     def _look_late(self, t_ns: int) -> None:
-        """Return whether the volumes are older than the reaction time allows: then only the certified stop is."""
+        """Checks whether the volumes are too old for a new certificate; then only the certified stop is allowed."""
         age_s = math.inf if self.perception is None else (t_ns - self.perception.t_ns) * 1e-9
         self._late = self.setup.plan.certified and age_s > self.setup.bounds.perception_max_age_s
         if self._late:
             self._ready = None
 
     def _horizon_s(self) -> float:
-        """Time until which the volumes of the next look must hold."""
+        """Time for which the volumes of the next perception update must be valid [s]."""
         return self.setup.plan.horizon_s(self._motion.stop if self._motion is not None else at_rest(self._still))
 
     def _obstacles(self, horizon_s: float) -> Obstacles:
-        """Swept volumes to keep clear of; unknown where nobody has been seen for too long.
+        """Swept volumes to keep clear of; unknown if the last perception update is too old.
 
-        Those of ``ssm`` for no horizon are predicted anew; all others are those of the look.
+        For horizon 0 (``ssm``) they are predicted again; for every other horizon they are those of the update.
         """
         if self.perception is None:
             return _UNSEEN

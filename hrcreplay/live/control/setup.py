@@ -1,7 +1,7 @@
-"""Set-up of a live session: from its settings to the session controller, by way of a table that is recorded.
+"""Set-up of a live session: from its settings to a table that is recorded, and from the table to the controller.
 
-The table holds everything that the decisions depend on, so that the record alone suffices to build the controller
-again. ``compile_kernels`` compiles every kernel and loads every library before the robot waits for an answer.
+The table contains everything that the decisions depend on, so the record is sufficient to build the controller again.
+``compile_kernels`` compiles every kernel and loads every library before the robot waits for an answer.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def live_run_config(
     """Settings and cameras of a session.
 
     Args:
-        human: Recording of the person; None: the cameras are those of live.zenoh.keys, their poses the cell's.
+        human: Recording of the person; None: the cameras are in live.zenoh.keys, their poses in the cell.
         config: Settings file.
         overrides: ``section.key=value``.
         cell_file: Poses of cameras and robot.
@@ -102,10 +102,10 @@ def _header(
 
 
 def start_table(run_config: RunConfig, header: Header, *, sending: bool) -> dict[str, Any]:
-    """Everything that the session's decisions depend on beside its inputs, as JSON.
+    """Everything that the session's decisions depend on, apart from its inputs, as JSON.
 
     Raises:
-        SettingsError: There is no task, or it is not known where the robot stands.
+        SettingsError: There is no task, or the pose of the robot's base is not known.
         LogError: The pose of a camera is not known.
     """
     task = run_config.task or header.task
@@ -145,15 +145,16 @@ def start_table(run_config: RunConfig, header: Header, *, sending: bool) -> dict
 
 
 def joint_order(robot: str, names: Sequence[str], given: tuple[int, ...]) -> Ints:
-    """(n,) axis of the robot, 0 next to the base, that each joint of EGM is.
+    """(n,) index of the robot's axis for each joint of EGM; axis 0 is next to the base.
 
     Args:
-        robot: Its name.
-        names: Of its axes, from the base on.
-        given: ``live.joint_order``; empty: the joints of EGM are the axes as they stand.
+        robot: Name of the robot.
+        names: Names of its axes, from the base on.
+        given: ``live.joint_order``; empty: the joints of EGM are in the order of the axes.
 
     Raises:
-        SettingsError: Not every axis once; or none is given, and the joints' names count otherwise.
+        SettingsError: The order does not contain every axis once; or it is empty, and the numbers in the joints' names
+            give another order.
     """
     axes = list(range(1, len(names) + 1))
     if given and sorted(given) != axes:
@@ -205,7 +206,7 @@ def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfi
 
     Raises:
         LogError: Its record has another format.
-        SettingsError: Its settings or its limit sets are not those of this version.
+        SettingsError: This version cannot read the settings or the limit sets of the table.
     """
     if (found := start.get("record", 1)) != codec.FORMAT:
         raise LogError(
@@ -262,9 +263,9 @@ _FRAME_EVERY = 8
 
 
 def compile_kernels(start: dict[str, Any]) -> None:
-    """Compiles every kernel by a simulated session of 1.6 s with a person who walks up to the robot.
+    """Compiles every kernel with a simulated session of 1.6 s in which a person walks up to the robot.
 
-    The person is the only one whom the robot needs to know, or it would not move: no area is watched.
+    The session has no watched area. With one, the robot would also need to know about other people and would not move.
     """
     compile_second_tries()
     cell = {name: part for name, part in (start["cell"] or {}).items() if name != "watched"}
@@ -290,7 +291,7 @@ def compile_kernels(start: dict[str, Any]) -> None:
 
 
 def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int) -> bytes:
-    """Somebody at a place, arms half bent."""
+    """Skeleton message of a person at a position, with half bent arms."""
     joints = np.array([[place_m[0], place_m[1], np.pi, 0.1, *(0.1, 0.5, 0.0, 1.8) * 2, 0.94]])
     points = skeleton(joints, np.array([MEDIAN_LENGTHS_M]))[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
     message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=1)

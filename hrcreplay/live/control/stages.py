@@ -1,10 +1,10 @@
 """The stages of a live session, one update at a time: skeletons to swept volumes, and the next step of the robot.
 
-The robot goes along the approach, along the programme, or to a stop; its steps are pure functions.
+The robot follows the approach, follows the programme, or stops; its steps are pure functions.
 
-The skeletons that are decoded here are those that are recorded, and they are cleaned as a reader of the log will clean
-them. What the process of the person has cleaned before is not enough: the message rounds to 32 bits, by which a
-skeleton may become that of the frame before it, and a capture is judged by the session's clock only here.
+This module decodes exactly the recorded skeletons and cleans them like a reader of the log. The cleaning in the
+person's process is not sufficient, for two reasons: the message rounds to 32 bits, so a skeleton may become equal to
+that of the previous frame; and only here a capture is compared with the session's clock.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from hrcreplay.settings.sections import Live
 
 
 class Observer:
-    """Stages 1 and 2, updated with the skeletons that have come since the update before."""
+    """Stages 1 and 2; each update uses the skeletons that have arrived since the previous update."""
 
     def __init__(
         self, fusion_stage: FusionStage, surroundings: Surroundings, cameras: tuple[str, ...], gap_s: float
@@ -58,16 +58,16 @@ class Observer:
         self._cameras = cameras
         self.counts: Counter[str] = Counter()
         self._cleaner = Cleaner(cameras, gap_s, self.counts, nobody=fusion_stage.watched is not None)
-        self.newest_ns: dict[str, int] = {}  #: per camera: when it last took the person, by the reference's clock
+        self.newest_ns: dict[str, int] = {}  #: per camera: last capture of the person, in the reference clock [ns]
         self._look_ns, self._frame_age_s = 0, float("inf")  # of the last update
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes], horizon_s: float) -> Perception:
-        """Fused person and swept volumes at ``t_ns``, which must be later than that of the update before.
+        """Fused person and swept volumes at ``t_ns``, which must be later than that of the previous update.
 
         Args:
-            t_ns: By the session's clock; the arrival of all skeletons of this update [ns].
-            skeletons: Serialised Skeleton messages. What cannot be read is counted and left out.
-            horizon_s: Until when the volumes must hold, the latency aside [s].
+            t_ns: Session clock; it counts as the arrival of all skeletons of this update [ns].
+            skeletons: Serialised Skeleton messages; unreadable ones are counted and left out.
+            horizon_s: Time from ``t_ns`` on for which the volumes must be valid, without the latency [s].
         """
         (states, events, _), seen = self._fuser.update(np.array([t_ns]), self._frames(t_ns, skeletons))
         self.counts.update(seen.counts)
@@ -79,12 +79,12 @@ class Observer:
         return Perception(t_ns, states, volumes, obstacles(volumes, 0, horizon_s), horizon_s)
 
     def around(self, look: Perception, horizon_s: float, *, believed: bool) -> Obstacles:
-        """Obstacles that the robot keeps clear of, by a look.
+        """Obstacles that the robot keeps clear of, from a perception update.
 
         Args:
-            look: The last one.
-            horizon_s: 0 for where people may be now, as ``ssm`` asks; every other horizon is the look's [s].
-            believed: Whether the look is recent enough.
+            look: The last perception update.
+            horizon_s: 0 for the present volumes of people, for ``ssm``; otherwise the horizon of the update [s].
+            believed: Whether the update is recent enough.
         """
         person = look.obstacles
         if not horizon_s:
@@ -93,7 +93,7 @@ class Observer:
         return found if believed else replace(found, known=False)
 
     def vacant_s(self, look: Perception | None, t_ns: int) -> float:
-        """Time since nobody can have been in the watched area, by a look; inf where that is not known [s]."""
+        """Time since the watched area was last known to be empty, from a perception update; inf if unknown [s]."""
         if look is None or look.states.nobody_s is None:
             return math.inf
         return float(look.states.nobody_s[0]) + (t_ns - look.t_ns) / NS
@@ -114,30 +114,30 @@ class Observer:
                 self.counts["skeletons_of_unknown_cameras"] += 1
                 continue
             if self._fuser.stage.watched is None and not row.confidence.any():
-                continue  # a body without a point only matters for a watched area
+                continue  # a body without points is only relevant for a watched area
             self._cleaner.add(row, t_ns)
         return self._cleaner.flush()
 
 
 @dataclass(frozen=True)
 class ControlSetup:
-    """Everything that the decisions of a session depend on beside its inputs."""
+    """Everything that the decisions of a session depend on, apart from its inputs."""
 
     robot: RobotModel
     programme: Reference
     plan: PlanSettings
-    follow: Callable[[Reference, float], Controller]  #: a robot at a programmed time of a path
-    waypoint_m: float  #: the approach is over when the TCP is this close to its end [m]
-    approach_speed: float  #: share of the axes' top speeds on the way to the programme
+    follow: Callable[[Reference, float], Controller]  #: path and programmed time -> controller
+    waypoint_m: float  #: the approach ends when the TCP is this close to its end [m]
+    approach_speed: float  #: share of the axes' top speeds during the approach
     bounds: Live
-    fresh_s: float  #: a person whose newest frame is older is not known, which stops the robot [s]
+    fresh_s: float  #: if the newest frame is older than this, the person is unknown and the robot stops [s]
     sending: bool  #: False in shadow mode: the robot does not follow
-    joint_order: Ints  #: (n,) axis that each joint of EGM is, the external ones last
+    joint_order: Ints  #: (n,) axis of the robot for each joint of EGM, external joints last
 
     def stop_from(self, state: RobotState) -> Stop:
-        """The stop of a robot whose last one ended elsewhere: it was held at a limit, or only echoed."""
+        """A new stop for a robot that is not at the start of its last stop, because of a limit or an echo."""
         brake = stop_straight if self.plan.certified else stop_axis_by_axis
-        # a copy: for an array that is read-only numba would compile the kernel anew, while the robot waits
+        # copies: for a read-only array numba would compile the kernel again while the robot waits
         return brake(state.q.copy(), state.dq.copy(), self.robot.ddq_max, self.plan.dt_s)
 
 
@@ -146,10 +146,10 @@ class MotionState:
     """State of the commanded motion after an answer."""
 
     state: RobotState
-    programme_s: float  #: of the programme
-    stop: Stop  #: what goes on where no better step is certified; its row 0 is ``state``
-    controller: Controller | None = None  #: None: it stands, or brakes
-    arrived: bool = False  #: whether it follows the programme, not the way to it
+    programme_s: float  #: time in the programme [s]
+    stop: Stop  #: the stop that continues if no better step is certified; its row 0 is ``state``
+    controller: Controller | None = None  #: None: the robot stands or brakes
+    arrived: bool = False  #: whether the robot follows the programme, and not the approach
 
 
 class MotionStep(NamedTuple):
@@ -162,7 +162,7 @@ class MotionStep(NamedTuple):
 
 
 def start_approach(setup: ControlSetup, motion: MotionState) -> MotionState:
-    """Starts the approach from where the robot stands to the point that its programme has reached."""
+    """Starts the approach from the robot's position to the current point of the programme."""
     goal = setup.programme.sample(motion.programme_s).q
     controller = setup.follow(approach(setup.robot, motion.state.q, goal, setup.approach_speed), 0.0)
     controller.take_over(motion.stop)
@@ -173,7 +173,7 @@ def follow(setup: ControlSetup, motion: MotionState, predict: Predict) -> Motion
     """One tick along the approach or the programme.
 
     Raises:
-        ValueError: No approach was started.
+        ValueError: The approach has not started.
     """
     if motion.controller is None:
         raise ValueError("follow: the robot has not set out")
@@ -190,7 +190,7 @@ def follow(setup: ControlSetup, motion: MotionState, predict: Predict) -> Motion
 
 
 def _at_the_end(setup: ControlSetup, controller: Controller) -> bool:
-    """Return whether the approach has come to its end."""
+    """Return whether the approach has ended."""
     if controller.s_s < controller.reference.duration_s:
         return False
     goal = controller.reference.sample(controller.s_s).T_world_tcp[:3, 3]
@@ -199,7 +199,7 @@ def _at_the_end(setup: ControlSetup, controller: Controller) -> bool:
 
 
 def brake(setup: ControlSetup, motion: MotionState, predict: Predict) -> MotionStep:
-    """The stop that was certified goes on; a robot that stands stays."""
+    """One tick of the certified stop; a robot at rest stays at rest."""
     robot, plan, state = setup.robot, setup.plan, motion.state
     horizon_s = plan.horizon_s(motion.stop)
     with np.errstate(all="ignore"):

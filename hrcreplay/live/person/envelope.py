@@ -1,7 +1,7 @@
-"""The envelope of a frame that crosses a network: who sealed it, in which order, when, and with which secret.
+"""The envelope of a frame on a network: it proves the source, the order, the time and the shared secret.
 
-A frame that is not sealed by a named source with the shared secret, or that comes twice, late or out of order, must not
-say where a person is. This file needs Python's standard library alone, so that a camera's computer can use it as it is:
+The session uses a frame only if a named source sealed it with the shared secret, and if it is not repeated, late or out
+of order. This file needs only Python's standard library, so a camera's computer can use it without hrcreplay:
 
     sealer = Sealer(Path("secret").read_bytes(), "left camera")
     session.put("cell/left", sealer.seal(data, time.time_ns()))
@@ -26,19 +26,19 @@ SHORTEST_SECRET: Final = 16
 
 
 class UnverifiedError(ValueError):
-    """A frame that must not be used; the text says why."""
+    """A frame that must not be used; the text gives the reason."""
 
 
 class Sealer:
     """Seals the frames of one source."""
 
     def __init__(self, secret: bytes, source: str, first: int = 0) -> None:
-        """Begin.
+        """Creates the sealer of a source.
 
         Args:
-            secret: Shared with whoever opens the frames.
+            secret: Secret that is shared with the opener of the frames.
             source: Name of the source, at most 255 bytes in UTF-8.
-            first: Number of its first frame. A source that starts again may begin anew: its time tells.
+            first: Number of the first frame. After a restart a source may count from 0, because its time has advanced.
         """
         self._secret, self._name, self._number = secret, source.encode(), first
         if not 0 < len(self._name) <= 255:
@@ -55,12 +55,12 @@ class Opener:
     """Opens the envelopes of one camera: each frame once, in order, and not later than ``late_s``."""
 
     def __init__(self, secret: bytes, sources: Collection[str], late_s: float) -> None:
-        """Begin.
+        """Creates the opener of a camera.
 
         Args:
-            secret: Shared with the sources.
-            sources: Names of those that may send; empty: whoever has the secret.
-            late_s: Greatest difference of the envelope's time from ours, either way [s].
+            secret: Secret that is shared with the sources.
+            sources: Names of the allowed sources; empty: every source that has the secret.
+            late_s: Largest absolute difference between the envelope's time and the session's time [s].
         """
         self._secret, self._sources = secret, frozenset(sources)
         self._late_ns = round(late_s * 1e9)
@@ -71,10 +71,10 @@ class Opener:
 
         Args:
             data: The envelope.
-            now_ns: Our Unix time [ns].
+            now_ns: Present Unix time of this computer [ns].
 
         Raises:
-            UnverifiedError: It must not be used.
+            UnverifiedError: The frame must not be used.
         """
         head, mac, frame, name = _parts(data)
         if not hmac.compare_digest(mac, _mac(self._secret, head + frame)):

@@ -20,13 +20,13 @@ from hrcreplay.settings.sections import Logs
 
 _SEAM_NS = 40_000_000  # between the end of a recording and its repetition: about one frame
 _AHEAD = 16  # chunks of at most a second each that wait decoded
-_RETRY_NS = 1_000_000  # when reading has fallen behind
+_RETRY_NS = 1_000_000  # wait if the reading thread is behind
 
 Outgoing = tuple[bytes, bytes]  #: kind and payload
 
 
 class Frame(NamedTuple):
-    """A body in a frame, still in the recording's time."""
+    """A body in a frame, in the recording's time."""
 
     arrival_ns: int
     skeleton: Any  #: hrcreplay.Skeleton
@@ -41,19 +41,19 @@ class Opened(NamedTuple):
 
 
 class Note(NamedTuple):
-    """A note for the user, sent when its place in the recording is reached."""
+    """A note for the user, sent when the playback reaches its place in the recording."""
 
     text: str
 
 
-Item = Opened | Note | list[Frame] | Exception | None  #: None: nothing will follow
+Item = Opened | Note | list[Frame] | Exception | None  #: None: nothing follows
 
 
 def playback_items(log: Log, *, repeat: bool) -> Iterator[Item]:
-    """Read a recording: its span, its frames chunk by chunk (again and again with ``repeat``), notes."""
+    """Reads a recording: its span, its frames chunk by chunk, and notes; in an endless loop with ``repeat``."""
     header = log.header
     yield Opened(header.cameras, header.start_ns, header.end_ns)
-    newest: dict[str, int] = {}  # last capture of each camera in the passes before
+    newest: dict[str, int] = {}  # last capture of each camera in the previous passes
     later_ns = 0
     while True:
         captured = dict(newest)
@@ -74,13 +74,16 @@ def playback_items(log: Log, *, repeat: bool) -> Iterator[Item]:
 
 
 def _rises(frame: Frame, newest: dict[str, int]) -> bool:
-    """Return whether a frame is captured after the pass before; delays of the first frames may differ from the last."""
+    """Return whether a frame is captured after the last frame of the previous passes.
+
+    The first frames of a pass may be captured earlier, because their delays may differ from those of the last frames.
+    """
     before = newest.get(frame.skeleton.camera)
     return before is None or frame.skeleton.capture_ns > before
 
 
 def frames_of(table: CameraFrames, later_ns: int = 0) -> Iterator[Frame]:
-    """The rows of a table as messages, arrival and capture put off by ``later_ns``."""
+    """The rows of a table as messages; arrival and capture are delayed by ``later_ns`` [ns]."""
     points = table.points_m.reshape(len(table), -1)
     for i in range(len(table)):
         skeleton = pb.Skeleton(
@@ -94,23 +97,23 @@ def frames_of(table: CameraFrames, later_ns: int = 0) -> Iterator[Frame]:
 
 
 def same_frame(one: Frame, two: Frame) -> bool:
-    """Return whether two bodies are of one frame. The shift to session time comes when the first of them is sent."""
+    """Return whether two bodies belong to the same frame; both must still be in the recording's time."""
     return (one.skeleton.camera, one.skeleton.capture_ns) == (two.skeleton.camera, two.skeleton.capture_ns)
 
 
 def ready_note(cameras: tuple[str, ...]) -> Outgoing:
-    """The note that tells control that frames can come, and from whom."""
+    """The note that tells control that the source is ready, with the names of its cameras."""
     return b"N", b"ready " + json.dumps({"cameras": list(cameras)}).encode()
 
 
 class Playback:
-    """Hands out a recording's messages when they are due. A thread reads ahead; ``due`` never waits for it."""
+    """Returns a recording's messages when they are due. A thread reads ahead; ``due`` never waits for it."""
 
     def __init__(self, reading: Callable[[], Iterator[Item]]) -> None:
         self._queue: Queue[Item] = Queue(_AHEAD)
         self._waiting: deque[Frame | Note] = deque()
         self._opened: Opened | None = None
-        self._shift_ns: int | None = None  # from the recording's time to session time, once that is known
+        self._shift_ns: int | None = None  # from the recording's time to session time; None before ``go``
         self._end_ns = 0  # in the recording's time
         self._exhausted = self._ended = self._behind = False
         Thread(target=self._read, args=(reading,), name="reading ahead", daemon=True).start()
@@ -119,20 +122,20 @@ class Playback:
         try:
             for item in reading():
                 self._queue.put(item)
-        except Exception as error:  # raised again where the process can tell of it
+        except Exception as error:  # ``due`` raises it again
             self._queue.put(error)
 
     def go(self, start_ns: int) -> None:
-        """Lets the recording's first instant be ``start_ns`` of session time."""
+        """Starts the playback: the first instant of the recording is ``start_ns`` in session time."""
         if self._opened is None:
             raise RuntimeError("go before ready")
         self._shift_ns = start_ns - self._opened.start_ns
 
     def due(self, now_ns: int) -> Iterator[Outgoing]:
-        """The messages whose time has come.
+        """The messages that are due.
 
         Raises:
-            LogError: The recording cannot be read, or no further.
+            LogError: The recording, or the rest of it, cannot be read.
         """
         if self._opened is None:
             yield from self._open()
@@ -158,7 +161,7 @@ class Playback:
             yield b"Z", b""
 
     def next_ns(self, now_ns: int) -> int | None:
-        """Session time at which the next message is due; None where nothing is to come or nothing is known yet."""
+        """Session time at which the next message is due; None before the start and after the end."""
         if self._shift_ns is None or self._ended:
             return None
         if self._waiting:
@@ -177,7 +180,7 @@ class Playback:
             yield ready_note(opened.cameras)
 
     def _fill(self) -> bool:
-        """Return whether a message waits, taking what has been read where none does."""
+        """Return whether a message is waiting; if none is, first takes the messages that have been read."""
         while not self._waiting and not self._exhausted:
             try:
                 item = self._take()
@@ -205,7 +208,7 @@ def play(path: Path, options: dict[str, Any], *, repeat: bool) -> Playback:
     Args:
         path: The log.
         options: The settings' section ``logs``; may be empty.
-        repeat: Whether it starts again at its end.
+        repeat: Whether the playback starts again at the end.
     """
     chosen = Logs.model_validate(options)
     return Playback(lambda: playback_items(open_log(path, chosen), repeat=repeat))

@@ -45,9 +45,9 @@ from hrcreplay.settings.sections import Decoder, Zenoh, ZenohKey
 _OWN = "hrcreplay.Skeleton"
 _RMW_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")  # in the keys of rmw_zenoh: <domain>/<topic>/<type>/<hash>
 _KNOWN = (MARKER_TYPE, *decoders.TF_TYPES)
-_AHEAD_NS = 10**9  # a capture further in the future would make all that follow look late
+_AHEAD_NS = 10**9  # after a capture further in the future, all following captures would look late
 _FAR_NS = round(STAMP_FAR_S * 1e9)
-_OLD_NS = 10**9  # an older capture hints at clocks that are not set
+_OLD_NS = 10**9  # an older capture indicates clocks that are not synchronised
 _GAP_S = 0.2
 
 
@@ -55,7 +55,7 @@ class CameraSubscription:
     """The keys of one camera: payloads in, cleaned skeletons out."""
 
     def __init__(self, camera: str, settings: ZenohKey, opener: Opener | None = None) -> None:
-        """Begin before the first payload; with an opener none is believed that is not sealed."""
+        """Creates the subscription; with an opener only sealed payloads are used."""
         self._camera = camera
         self._opener = opener
         self._settings = settings
@@ -67,7 +67,7 @@ class CameraSubscription:
         self._unusable: Counter[str] = Counter()
 
     def prepare(self) -> None:
-        """Makes the readers of the types that may come, which takes too long for the first message to wait for."""
+        """Makes the readers of all possible types in advance, because this would delay the first message too long."""
         given = self._settings
         types = (_OWN,) if given.payload == "hrcreplay" else (given.type,) if given.type else _KNOWN
         for msgtype in types:
@@ -75,13 +75,13 @@ class CameraSubscription:
                 self._reader(given.key, ros_bags.plain(msgtype))[0].parse(b"")
 
     def take(self, key: str, data: bytes, now_ns: int) -> Iterator[Outgoing]:
-        """Messages to control for one payload: its bodies, and notes, each once."""
+        """Messages to control for one payload: its bodies, and notes; each note is sent only once."""
         try:
             rows = self._rows(key, data if self._opener is None else self._opener.open(data, now_ns), now_ns)
         except UnverifiedError as error:
             yield from self._refuse("not verified, not used", error)
             return
-        except Exception as error:  # whatever a stranger sends: it is not worth more than a remark
+        except Exception as error:  # an invalid payload must not end the process
             yield from self._refuse("undecodable", error)
             return
         for row in rows:
@@ -162,7 +162,7 @@ def _own(data: bytes) -> Any:
 
 
 class ZenohSource:
-    """Subscribes to the cameras' keys. Zenoh's threads decode and send at once; ``due`` only tells of a failure."""
+    """Subscribes to the cameras' keys. Zenoh's threads decode and send at once; ``due`` only reports a failure."""
 
     def __init__(
         self, settings: Mapping[str, Any], send: Callable[[bytes, bytes], object], clock: Callable[[], int]
@@ -172,7 +172,7 @@ class ZenohSource:
         self._clock = clock
         self._going = False
         self._failure: Exception | None = None
-        self._open: list[Any] = []  # what must live as long as the source
+        self._open: list[Any] = []  # keeps session and subscribers alive
         Thread(target=self._begin, name="opening zenoh", daemon=True).start()
 
     def go(self, start_ns: int) -> None:  # noqa: ARG002 - live frames have no start of their own
@@ -180,17 +180,17 @@ class ZenohSource:
         self._going = True
 
     def due(self, now_ns: int) -> Iterator[Outgoing]:  # noqa: ARG002
-        """Nothing: frames go by themselves.
+        """Returns no messages, because Zenoh's threads send the frames.
 
         Raises:
-            SettingsError: There is no session, or a key is none.
+            SettingsError: The session cannot be opened, or a key is no key expression.
         """
         if self._failure is not None:
             raise self._failure
         return iter(())
 
     def next_ns(self, now_ns: int) -> int | None:  # noqa: ARG002
-        """Not known."""
+        """None: the time is not known."""
         return None
 
     def _begin(self) -> None:
@@ -206,8 +206,8 @@ class ZenohSource:
                 self._open.append(_subscribe(session, name, given, self._taker(stream)))
             self._send(*ready_note(tuple(wanted.keys)))
         except ControlGoneError:
-            pass  # the main thread sees it too
-        except Exception as error:  # raised again where the process can tell of it
+            pass  # the main thread detects this, too
+        except Exception as error:  # ``due`` raises it in the main thread
             self._failure = error
 
     def _taker(self, stream: CameraSubscription) -> Callable[[Any], None]:
@@ -225,7 +225,7 @@ class ZenohSource:
 
 
 def open_session(settings: Mapping[str, Any]) -> Any:
-    """A Zenoh session that talks to the endpoints that settings name, and to nobody else unless ``scouting`` is on.
+    """Opens a Zenoh session with the endpoints in the settings only, unless ``scouting`` is on.
 
     Raises:
         SettingsError: Zenoh is not installed, or the session cannot be opened.
@@ -259,7 +259,7 @@ def open_session(settings: Mapping[str, Any]) -> Any:
 
 
 def _validated(settings: Mapping[str, Any]) -> Zenoh:
-    """The settings of the section; raises SettingsError."""
+    """Validates the settings of the section; raises SettingsError."""
     try:
         return Zenoh.model_validate(settings)
     except ValidationError as error:
@@ -271,10 +271,10 @@ def _validated(settings: Mapping[str, Any]) -> Zenoh:
 
 
 def _secret(path: Path) -> bytes:
-    """The secret in a file, without the line's end.
+    """The secret in a file, without the line break at its end.
 
     Raises:
-        SettingsError: It cannot be read, or is too short.
+        SettingsError: The file cannot be read, or the secret is too short.
     """
     try:
         secret = path.read_bytes().rstrip(b"\r\n")
@@ -297,8 +297,8 @@ def _subscribe(session: Any, camera: str, given: ZenohKey, take: Callable[[Any],
 
 
 BEAT_NS = 20_000_000
-_NICE = -10  # where that is permitted: right after control, before recorder and screen
-_SWITCH_S = 0.0005  # a thread that decodes gives way to one whose time has come after this long
+_NICE = -10  # if permitted: priority after control, before recorder and screen
+_SWITCH_S = 0.0005  # longest time that a decoding thread delays another thread
 
 
 class SkeletonSource(Protocol):
@@ -311,11 +311,11 @@ class SkeletonSource(Protocol):
         """The messages to send now. Raises LogError, SettingsError."""
 
     def next_ns(self, now_ns: int) -> int | None:
-        """Time at which the next message is due; None: not known, or woken otherwise."""
+        """Time at which the next message is due; None: not known."""
 
 
 class SendSchedule:
-    """Schedule of the messages to control: heartbeats at fixed instants, and what is due. No clock, no socket."""
+    """Schedule of the messages to control: heartbeats at fixed instants and due messages. Uses no clock, no socket."""
 
     def __init__(self, source: SkeletonSource, now_ns: int) -> None:
         self._source = source
@@ -327,24 +327,24 @@ class SendSchedule:
             self._source.go(int.from_bytes(message[1:], "little"))
 
     def send(self, now_ns: int) -> Iterator[Outgoing]:
-        """Send all that is due. Raises LogError, SettingsError."""
+        """The messages that are due, with heartbeats. Raises LogError, SettingsError."""
         if now_ns >= self._beat_ns:
-            self._beat_ns += BEAT_NS * ((now_ns - self._beat_ns) // BEAT_NS + 1)  # missed beats are not made up for
+            self._beat_ns += BEAT_NS * ((now_ns - self._beat_ns) // BEAT_NS + 1)  # skip missed beats
             yield b"H", b""
         yield from self._source.due(now_ns)
 
     def next_ns(self, now_ns: int) -> int:
-        """Time at which something is due again."""
+        """Time at which the next message is due."""
         due_ns = self._source.next_ns(now_ns)
         return self._beat_ns if due_ns is None else min(self._beat_ns, due_ns)
 
 
 def run(channel: ControlChannel, source: SkeletonSource, anchor_ns: int) -> NoReturn:
-    """Serves until control is gone.
+    """Serves until control has ended.
 
     Raises:
-        ControlGoneError: It is.
-        HrcReplayError: The source cannot go on.
+        ControlGoneError: Control has ended.
+        HrcReplayError: The source has failed.
     """
     pace = SendSchedule(source, time.monotonic_ns() + anchor_ns)
     told = 0
@@ -362,7 +362,7 @@ def run(channel: ControlChannel, source: SkeletonSource, anchor_ns: int) -> NoRe
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The process; returns its exit code."""
+    """Runs the process and returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m hrcreplay.live.person.source", description=__doc__)
     parser.add_argument("--fd", type=int, required=True, help="socket to control")
     parser.add_argument("--anchor", type=int, required=True, help="session time minus monotonic time [ns]")
@@ -396,4 +396,4 @@ def _source(given: argparse.Namespace, channel: ControlChannel) -> SkeletonSourc
 if __name__ == "__main__":
     code = main()
     sys.stderr.flush()
-    os._exit(code)  # Zenoh's threads may be about to call back; an interpreter that unwinds meanwhile aborts
+    os._exit(code)  # a callback of Zenoh's threads during the interpreter's shutdown would abort

@@ -1,1 +1,1 @@
-"""The record of a live session: its messages, the process that writes them, and the run folder made from them."""
+"""The record of a live session: its messages, the process that writes them, and the run folder."""

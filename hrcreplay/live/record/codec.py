@@ -1,21 +1,21 @@
-"""Messages of a session's record: what control sends to the recorder, and on which topics the log holds them.
+"""Messages of a session's record, which control sends to the recorder, and their topics in the log.
 
-The first byte is the kind, the next eight the session's clock [ns]; numbers are little-endian. Everything that decides
-a tick is recorded, so the log alone suffices to compute the session again (see ``live.verify``).
+The first byte is the kind, the next eight bytes are the session's clock [ns]; numbers are little-endian. Everything
+that decides a tick is recorded, so the log is sufficient to compute the session again (see ``live.verify``).
 
 ======  ==========================================================================================================
-``R``   a datagram of the robot, as it came
-``C``   our reply, as it was sent (in shadow mode nothing is sent, and ``sent`` is 0)
+``R``   a datagram of the robot, unchanged
+``C``   the reply to the robot, unchanged (in shadow mode nothing is sent, and ``sent`` is 0)
 ``F``   a skeleton that a perception update used: the serialised Skeleton message, with the clock of the update
 ``L``   a perception update: state of the person, digests of the swept volumes
 ``V``   the swept volumes of some perception updates, complete
-``A``   a decision: the loop's signals in, what the robot was told out
-``S``   no packet came from the robot within the time-out
+``A``   a decision: the loop's signals and the command to the robot
+``S``   a time-out: no packet came from the robot
 ``E``   JSON: the settings at the start, notes, the end
 ======  ==========================================================================================================
 
-The log has our own format, so every reader of logs reads it: skeletons, cameras, task and base are on their usual
-topics. All other messages are on topics of their own, with the session's clock as log_time.
+The log has hrcreplay's own format, so every reader of logs reads it: skeletons, cameras, task and base are on their
+usual topics. All other messages are on separate topics, with the session's clock as log_time.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ import numpy as np
 from hrcreplay.logs import messages
 from hrcreplay.records import STATUSES, Floats, HumanStates, MotionRow, SweptVolumes, number_names
 
-if TYPE_CHECKING:  # recorder and screen need nothing of the robot, whose imports take three quarters of their start
+if TYPE_CHECKING:  # recorder and screen do not need the robot's imports, which take 3/4 of their start-up time
     from hrcreplay.robot.control.control_step import Stop
     from hrcreplay.robot.control.separation import Obstacles
 
-#: Where a session is: nobody may move yet, the first answers, on the way to the programme, the programme itself,
-#: braking for a reason of the watchdog, standing because of one.
+#: Phases of a session: the robot must not move yet, the first answers, the approach to the programme, the programme,
+#: braking for a stop reason, standing still for a stop reason.
 PHASES = ("waiting", "echo", "approach", "following", "stopping", "holding")
 WAITING, ECHO, APPROACH, FOLLOWING, STOPPING, HOLDING = range(len(PHASES))
 
@@ -50,24 +50,24 @@ class Signal(IntFlag):
     TERMINATE = 2  #: SIGTERM
     DURATION = 4  #: the session's time is over
     PERSON_DEAD = 8  #: the human side's process has ended
-    PERSON_LATE = 16  #: the human side gave no sign of life for too long
+    PERSON_LATE = 16  #: the last heartbeat of the human side is too old
     PERSON_ENDED = 32  #: the recording of the person is over
     RECORDER_DEAD = 64  #: the recorder's process has ended
-    OVERRUN = 128  #: the answer before this one came too late
+    OVERRUN = 128  #: the previous answer was too late
     SCREEN_DEAD = 256  #: the screen's process has crashed
-    HANGUP = 512  #: SIGHUP: the terminal was closed, or its connection lost
+    HANGUP = 512  #: SIGHUP: the terminal was closed, or its connection was lost
     QUIT = 1024  #: SIGQUIT
-    SUSPEND = 2048  #: SIGTSTP: a process that is suspended answers no robot
-    OTHER = 4096  #: another signal that would have ended the process
-    DISK = 8192  #: there is too little space for the record
+    SUSPEND = 2048  #: SIGTSTP: a suspended process cannot answer the robot
+    OTHER = 4096  #: another signal that would end the process
+    DISK = 8192  #: the disk has too little space for the record
 
 
 @dataclass(frozen=True, slots=True)
 class TickEvent:
     """One wake-up of the control loop by the robot."""
 
-    t_ns: int  #: session clock when the first of the datagrams was taken
-    datagrams: tuple[bytes, ...]  #: all that lay in the queue, in order of arrival
+    t_ns: int  #: session clock when the first datagram was received
+    datagrams: tuple[bytes, ...]  #: all datagrams in the queue, in order of arrival
     signals: Signal
 
 
@@ -76,13 +76,13 @@ class Decision:
     """Decision of the controller on an event."""
 
     t_ns: int  #: of the event
-    look_ns: int  #: of the perception update whose volumes it kept clear of
-    datagram: bytes | None  #: reply to the robot; None where none is due
+    look_ns: int  #: of the perception update with the volumes used
+    datagram: bytes | None  #: reply to the robot; None without a reply
     phase: int  #: index into PHASES
-    measured: Floats  #: (nv,) where the robot said it was [rad]; empty where no reply was due
-    row: MotionRow | None  #: the commanded motion; None where no reply was due
-    refusal: str  #: why no reply was due
-    stop: Stop | None  #: what goes on after the reply if nobody decides any more; not recorded
+    measured: Floats  #: (nv,) joints measured by the robot [rad]; empty without a reply
+    row: MotionRow | None  #: the commanded motion; None without a reply
+    refusal: str  #: reason why there is no reply
+    stop: Stop | None  #: the stop that continues after the reply without further decisions; not recorded
 
     @property
     def status(self) -> int:
@@ -91,7 +91,7 @@ class Decision:
 
     @property
     def reason(self) -> str:
-        """Why it braked, by the controller or by the watchdog; empty where it did not."""
+        """Reason of the controller or the watchdog for braking; empty if the robot did not brake."""
         return self.refusal if self.row is None else self.row.reason
 
     @property
@@ -112,8 +112,8 @@ class Perception:
     t_ns: int
     states: HumanStates  #: one row
     volumes: SweptVolumes  #: one row
-    obstacles: Obstacles  #: the same
-    horizon_s: float  #: how long after ``t_ns`` they hold, the latency aside [s]
+    obstacles: Obstacles  #: the same volumes
+    horizon_s: float  #: time after ``t_ns`` for which they are valid, without the latency [s]
 
 
 #: Version of the messages, kept in the start event; records of another one cannot be decoded.
@@ -128,9 +128,9 @@ _VOLUMES = struct.Struct("<cqHId")
 _ANSWER = struct.Struct("<cqqIIBHB")
 _SILENCE = struct.Struct("<cqI")
 _DIGEST = 8
-_DIGESTS = 3  #: of a limb: of its bits, and of its numbers on the two grids
-#: Width of both grids [m]; the second lies half of it further, so that a number between two cells of the one is in the
-#: midst of a cell of the other.
+_DIGESTS = 3  #: per limb: one of its bits, and one of its numbers on each of the two grids
+#: Cell width of both grids [m]. The second grid is shifted by half a cell, so a number near the border of a cell in one
+#: grid is near the middle of a cell in the other.
 GRID_M = 1e-7
 
 
@@ -195,14 +195,14 @@ class RecordedPerception:
     """A perception update as it is recorded."""
 
     t_ns: int
-    skeletons: int  #: used by it: the SKELETON messages right before it
+    skeletons: int  #: number of skeletons used, which are the SKELETON messages right before it
     state: Floats  #: all numbers of the state's row, in the order of the record's fields
-    valid: bytes  #: a byte a camera
-    digests: tuple[bytes, ...]  #: of vertices and radius, a limb each, as of ``volume_digests``
+    valid: bytes  #: one byte per camera
+    digests: tuple[bytes, ...]  #: one per limb, of vertices and radius, from ``volume_digests``
 
 
 def encode_perception(states: HumanStates, volumes: SweptVolumes, skeletons: int) -> bytes:
-    """Encodes a perception update that used so many skeletons."""
+    """Encodes a perception update; ``skeletons`` is the number of skeletons that it used."""
     state = state_numbers(states)
     digests = volume_digests(volumes)
     valid = states.valid[0].tobytes()
@@ -232,11 +232,11 @@ def state_numbers(states: HumanStates) -> Floats:
 def volume_digests(volumes: SweptVolumes) -> tuple[bytes, ...]:
     """Hashes of each limb's volume at a single tick: of its bits, and of its numbers on two grids.
 
-    Where a hash on a grid is the same, no coordinate is further off than the grid is wide.
+    If two volumes have the same hash on a grid, their coordinates differ by no more than the cell width of the grid.
     """
     points, radius = np.ascontiguousarray(volumes.vertices_m, dtype=np.float64), volumes.radius_m[0]
     grids = [
-        (np.floor(points / GRID_M + shift) + 0.0, np.floor(radius / GRID_M + shift) + 0.0)  # + 0.0: there is no -0.0
+        (np.floor(points / GRID_M + shift) + 0.0, np.floor(radius / GRID_M + shift) + 0.0)  # + 0.0 removes -0.0
         for shift in (0.0, 0.5)
     ]
     return tuple(
@@ -261,13 +261,13 @@ def same_on_a_grid(recorded: bytes, again: bytes) -> bool:
 
 
 def encode_volumes(volumes: SweptVolumes, horizon_s: float) -> bytes:
-    """Encodes the swept volumes of one perception update, which hold for ``horizon_s`` [s]."""
+    """Encodes the swept volumes of one perception update, which are valid for ``horizon_s`` [s]."""
     head = _VOLUMES.pack(VOLUMES, int(volumes.t_ns[0]), len(volumes.limbs), len(volumes.vertices_m), horizon_s)
     return b"".join([head, volumes.offsets.tobytes(), volumes.radius_m.tobytes(), volumes.vertices_m.tobytes()])
 
 
 def decode_volumes(message: bytes, limbs: tuple[str, ...], method: str) -> tuple[SweptVolumes, float]:
-    """Decodes swept volumes, and how long they hold [s]; names of limbs and method are in the session's start event."""
+    """Decodes swept volumes and their horizon [s]; names of limbs and method are in the session's start event."""
     _, t_ns, count, vertices, horizon_s = _VOLUMES.unpack_from(message)
     at = _VOLUMES.size
     offsets = np.frombuffer(message, "<i8", count + 1, at)
@@ -280,16 +280,16 @@ def decode_volumes(message: bytes, limbs: tuple[str, ...], method: str) -> tuple
 
 @dataclass(frozen=True, slots=True)
 class RecordedDecision(Decision):
-    """A decision as it is recorded; its reply is the REPLY message right after it, where one was due."""
+    """A decision as it is recorded; its reply, if there is one, is the REPLY message right after it."""
 
-    took_us: int  #: from the datagram's arrival to the reply's departure; not part of what must come out the same
+    took_us: int  #: from the datagram's arrival to the reply's departure; ``verify`` does not compare it
     signals: Signal
-    datagrams: int  #: the ROBOT messages right before it
+    datagrams: int  #: number of datagrams, which are the ROBOT messages right before it
 
 
-#: Fields of a MotionRow that are recorded as numbers: all but the text.
+#: Fields of a MotionRow that are recorded as numbers: all except the reason.
 _NUMBERS = tuple(name for name in MotionRow._fields if name != "reason")
-#: Those of them that are decisions.
+#: Number fields that are decisions.
 INTEGERS = ("limb", "link", "status")
 
 
@@ -301,7 +301,7 @@ def numbers_of(found: Decision) -> Floats:
 
 
 def number_names_of(axes: int) -> tuple[str, ...]:
-    """Names of ``numbers_of`` a robot of so many axes, as in motion.parquet."""
+    """Names of the numbers of ``numbers_of`` for a robot with ``axes`` axes, as in motion.parquet."""
     measured = (f"q_measured{axis}" for axis in range(1, axes + 1))
     return (*measured, *(one for name in _NUMBERS for one in number_names(name, axes)))
 
@@ -310,8 +310,8 @@ def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: i
     """Encodes a decision.
 
     Args:
-        found: What the controller decided.
-        signals: What the loop had found outside the stages.
+        found: Decision of the controller.
+        signals: Conditions that the loop found outside the stages.
         datagrams: Number of the robot's datagrams that the decision answers.
         took_us: From the first datagram's arrival to the reply's departure [us].
     """
@@ -334,7 +334,7 @@ def decode_decision(message: bytes) -> RecordedDecision:
 
 
 def _row(numbers: Floats, axes: int, reason: str) -> MotionRow:
-    """The inverse of ``numbers_of``, the measured joints aside."""
+    """The inverse of ``numbers_of``, without the measured joints."""
     values: dict[str, Any] = {"reason": reason}
     at = 0
     for name in _NUMBERS:
@@ -345,13 +345,13 @@ def _row(numbers: Floats, axes: int, reason: str) -> MotionRow:
     return MotionRow(**values | {"certified": values["certified"] != 0.0})
 
 
-ROBOT_TOPIC = "/egm/robot"  #: datagrams of the robot, whatever is in them
-SENT_TOPIC = "/egm/correction"  #: datagrams that went to the robot
-UNSENT_TOPIC = "/egm/correction/unsent"  #: datagrams that would have gone: shadow mode
-STRAY_TOPIC = "/live/frame"  #: skeletons of no camera of the session, or not to be read
+ROBOT_TOPIC = "/egm/robot"  #: datagrams of the robot, readable or not
+SENT_TOPIC = "/egm/correction"  #: datagrams that were sent to the robot
+UNSENT_TOPIC = "/egm/correction/unsent"  #: replies in shadow mode, which are not sent
+STRAY_TOPIC = "/live/frame"  #: skeletons of unknown cameras, and unreadable skeletons
 EVENT_TOPIC = "/live/event"  #: JSON
 
-ENCODING = "hrcreplay.live"  #: of the messages that only the record has
+ENCODING = "hrcreplay.live"  #: encoding of the messages that occur only in the record of a session
 
 _BY_KIND = {
     ROBOT: ROBOT_TOPIC,
@@ -365,7 +365,7 @@ _KINDS = {topic: kind for kind, topic in _BY_KIND.items()} | {STRAY_TOPIC: SKELE
 
 
 def topic_and_data(message: bytes) -> tuple[str, bytes]:
-    """The topic of a message and what lies there; of a frame, the topic of those that belong to no camera."""
+    """The topic of a message and its data; for every skeleton the topic is STRAY_TOPIC."""
     found = kind(message)
     if found == REPLY:
         sent, datagram = decode_reply(message)
@@ -374,7 +374,7 @@ def topic_and_data(message: bytes) -> tuple[str, bytes]:
 
 
 def message_on(topic: str, t_ns: int, data: bytes) -> bytes | None:
-    """The message of the record that lies on a topic; None for what the log has beside the record."""
+    """The message of the record from its topic and data; None for topics that are not part of the record."""
     if topic in (SENT_TOPIC, UNSENT_TOPIC):
         return encode_reply(t_ns, data, sent=topic == SENT_TOPIC)
     if topic in _KINDS:

@@ -1,4 +1,4 @@
-"""The run folder of a live session: made from its log when the session has ended or was killed."""
+"""The run folder of a live session, which is made from its log after the session has ended or was killed."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ _BATCH = TableWriter.ROWS
 
 @dataclass
 class SessionTables:
-    """Writes state, occupancy and motion of the messages it is given; counts them, and keeps what was remarked."""
+    """Writes the tables of state, occupancy and motion from messages; counts the messages, and keeps the events."""
 
     run: RunWriter
     cameras: tuple[str, ...]
     links: tuple[str, ...]
-    limbs: tuple[str, ...]  #: that have a swept volume
-    neighbours: tuple[str, ...]  #: what the robot keeps clear of: those, then the sides of a watched area
+    limbs: tuple[str, ...]  #: limbs with a swept volume
+    neighbours: tuple[str, ...]  #: all volumes that the robot avoids: limbs, then the sides of a watched area
     method: str  #: of the swept volumes
     counts: Counter[str] = field(default_factory=Counter)
-    took_us: list[int] = field(default_factory=list)  #: of every reply
-    events: list[dict[str, Any]] = field(default_factory=list)  #: beside the start
+    took_us: list[int] = field(default_factory=list)  #: duration of every reply
+    events: list[dict[str, Any]] = field(default_factory=list)  #: all recorded events
     _looks: list[codec.RecordedPerception] = field(default_factory=list)
     _answers: list[codec.RecordedDecision] = field(default_factory=list)
 
@@ -75,12 +75,12 @@ class SessionTables:
         self._looks, self._answers = [], []
 
     def _answered(self, answered: codec.RecordedDecision) -> None:
-        if answered.row is not None:  # else there was no packet to answer
+        if answered.row is not None:  # otherwise there was no packet to answer
             self._answers.append(answered)
             self.took_us.append(answered.took_us)
 
     def timing(self) -> dict[str, Any]:
-        """From a packet's arrival to the departure of its reply, as timing.json has it."""
+        """Quantiles of the time from a packet's arrival to its reply, in the format of timing.json."""
         took = np.array(self.took_us, dtype=np.float64)
         if not len(took):
             return {}
@@ -138,18 +138,18 @@ def _motion(answers: list[codec.RecordedDecision], neighbours: tuple[str, ...], 
 
 
 LOG = "log.mcap"
-#: Of a session that was killed, or whose recorder was.
+#: Note for a session that was killed, or whose recorder was killed.
 NO_END = "the record has no end: how the robot came to rest after it is not on it"
 _PARTIAL = ".partial"
 
 
 def make_partial(out: Path) -> Path:
-    """Makes the folder that a session's log goes to; it gets its own name from ``finish``.
+    """Makes the folder for a session's log; ``finish`` gives the folder its final name.
 
     Raises:
         SettingsError: The folder exists, or cannot be made.
     """
-    return RunWriter(out).__enter__().partial  # and never left: whatever comes of the session, its record stays
+    return RunWriter(out).__enter__().partial  # no __exit__, so the record is always kept
 
 
 def finish(partial: Path) -> Path:
@@ -159,8 +159,8 @@ def finish(partial: Path) -> Path:
         The run folder.
 
     Raises:
-        SettingsError: No such session, or the run folder is there already.
-        LogError: The record cannot be read, or lacks the session's start.
+        SettingsError: The folder is no unfinished session, or the run folder exists already.
+        LogError: The record cannot be read, or has no start event.
     """
     if partial.suffix != _PARTIAL or not (partial / LOG).is_file():
         raise SettingsError(f"{partial}: no session to be finished; those end in {_PARTIAL} and hold {LOG}")
@@ -189,7 +189,7 @@ def finish(partial: Path) -> Path:
 
 
 def keep_incomplete(partial: Path, crashes: list[str]) -> None:
-    """Reduces a session without a run folder to its log and its crash files, and says so in run.json."""
+    """Reduces a session without a run folder to its log and its crash files, and marks it in run.json."""
     for path in sorted(partial.iterdir()):
         if path.is_dir():
             shutil.rmtree(path)
@@ -198,12 +198,12 @@ def keep_incomplete(partial: Path, crashes: list[str]) -> None:
     found = _crashed(crashes) | {"command": "live", "complete": False}
     if _breaks_off(partial / LOG):
         found["notes"] = [NO_END]
-    with suppress(OSError):  # a full disk: the log says by itself that it has no end
+    with suppress(OSError):  # full disk: the log itself shows that it has no end
         (partial / "run.json").write_text(run_folder.to_json(found))
 
 
 def _breaks_off(log: Path) -> bool:
-    """Return whether there is a record without the session's end."""
+    """Return whether a record exists and has no end event."""
     if not log.exists():
         return False
     try:
@@ -219,7 +219,7 @@ def _crashed(crashes: list[str]) -> dict[str, Any]:
 
 
 def _measure(run_config: RunConfig, writer: RunWriter) -> None:
-    """The table of measurements: what each frame says by itself."""
+    """Writes the table of measurements, one row per frame."""
     log = open_log(writer.partial / LOG, run_config.settings.logs, skeletons=False)
     fusion_stage, memory = assembly.fusion_stage(run_config, log), PersonMemory()
     for frames in log.frames():
@@ -228,7 +228,7 @@ def _measure(run_config: RunConfig, writer: RunWriter) -> None:
 
 
 def _compare(run_config: RunConfig, writer: RunWriter, start: dict[str, Any]) -> None:
-    """The table of contact: robot against recorded person."""
+    """Writes the table of contact between the robot and the recorded person."""
     log = open_log(writer.partial / LOG, run_config.settings.logs, skeletons=False)
     write_contact(run_config, log, writer, np.array(start["T_world_base"]))
 
@@ -249,9 +249,9 @@ def _meta(
     return {
         **run_config.meta(),
         "versions": start["versions"],
-        "machine": start.get("machine"),  # of the session, wherever its folder is made
-        "inputs": [{"path": LOG, "sha256": run_config.log_sha256}],  # beside it, wherever the folder is moved to
-        "stages": {},  # a replay of the log has ticks of its own: it takes nothing over
+        "machine": start.get("machine"),  # the machine of the session, not of this process
+        "inputs": [{"path": LOG, "sha256": run_config.log_sha256}],  # a relative path, so the folder can be moved
+        "stages": {},  # a replay of the log has other ticks, so it reuses no results
         "T_world_base": start["T_world_base"],
         "sending": start["sending"],
         "created": f"{datetime.fromtimestamp(log.first_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}",

@@ -1,12 +1,12 @@
 """The recorder process, which writes the messages of control to a session's log, and the reader of such a log.
 
-From control: the messages of ``codec``. To control: ``K`` once, when the file is open; ``L`` once, when there is little
-space left on its disk; ``X`` + why, in UTF-8, when the file cannot be written: then it ends at once with exit code 1.
-Ends else when control does, after it has finished the file.
-Chunks are closed and handed to the operating system several times a second, so that a kill loses no more than that.
+From control: the messages of ``codec``. To control: ``K`` once, when the file is open; ``L`` once, when the disk has
+little space left; ``X`` + the reason in UTF-8, if the file cannot be written. In this case the recorder ends at once
+with exit code 1. Otherwise it ends after control has ended and the file is finished.
+Chunks are closed and passed to the operating system several times per second, so a kill loses only the last chunk.
 
-Every byte of a finished file is under a checksum, and the messages are numbered. Of an unfinished file all but the
-indices is, and those follow from the messages. So nothing can change or be missing without a flaw that says where.
+Every byte of a finished file has a checksum, and the messages are numbered. In an unfinished file only the indices have
+no checksum, and they follow from the messages. Therefore every change and every gap gives a flaw with its place.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from hrcreplay.logs.writer import register_schema
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<BQQQQI8sQ")  #: all before the data
-_ZSTD = struct.pack("<I", 4) + b"zstd"  #: the compression of our chunks, and what they are found by
+_CHUNK = struct.Struct("<BQQQQI8sQ")  #: the part of a chunk before its data
+_ZSTD = struct.pack("<I", 4) + b"zstd"  #: compression of the chunks; also used to find chunks
 _ZSTD_AT = _CHUNK.size - 8 - len(_ZSTD)
 _FOOTER = struct.Struct("<BQQQI")
 _DATA_END = struct.Struct("<BQI")
@@ -56,15 +56,15 @@ _UNREADABLE = (McapError, zstandard.ZstdError, struct.error, ValueError, Overflo
 
 @dataclass
 class Flaw:
-    """Something wrong with the file."""
+    """A defect of the file."""
 
     at_byte: int
     what: str
-    after_s: float  #: into the session: of the last message before it that is whole
-    before_s: float | None  #: of the first message behind it; None where there is none
+    after_s: float  #: session time of the last complete message before the flaw [s]
+    before_s: float | None  #: session time of the first message after the flaw [s]; None without one
 
     def __str__(self) -> str:
-        """Path and reason."""
+        """Place and description of the flaw."""
         end = "the end" if self.before_s is None else f"{self.before_s:.3f} s"
         return f"byte {self.at_byte}, between {self.after_s:.3f} s and {end}: {self.what}"
 
@@ -77,34 +77,34 @@ class _CutError(ValueError):
 class _McapChunk:
     """Content of a chunk."""
 
-    end: int  #: offset of what follows
+    end: int  #: offset after the chunk
     messages: list[tuple[int, int, int, bytes]]  #: channel, number, log time, content
-    index: bytes  #: the records that must follow
+    index: bytes  #: the index records that must follow the chunk
 
 
 class SessionLogReader:
-    """The log of a live session. ``flaws`` and ``finished`` are about the latest pass over its messages."""
+    """Reads the log of a live session. ``flaws`` and ``finished`` refer to the latest pass over its messages."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.flaws: list[Flaw] = []  #: found so far, in order
-        self.finished = False  #: whether the recorder came to its end
+        self.flaws: list[Flaw] = []  #: flaws found so far, in order
+        self.finished = False  #: whether the recorder finished the file
         self._reset()
 
     def _reset(self) -> None:
         self.flaws, self.finished = [], False
-        self._open: list[Flaw] = []  # their end is not known yet
+        self._open: list[Flaw] = []  # flaws whose end is not known yet
         self._channels: dict[int, str] = {}
         self._number: int | None = 0  #: of the next message; None after a gap
         self._first_ns = self._last_ns = -1
 
     def messages(self) -> Iterator[bytes]:
-        """The messages of ``codec`` as they were recorded, without what a flaw spoils.
+        """The recorded messages of ``codec``, without messages that a flaw has damaged.
 
-        A flaw is in ``flaws`` before the message that follows it.
+        A flaw is added to ``flaws`` before the next message is returned.
 
         Raises:
-            LogError: The file cannot be read, or has nothing of a session in it.
+            LogError: The file cannot be read, or contains no part of a session.
         """
         self._reset()
         try:
@@ -123,10 +123,10 @@ class SessionLogReader:
         return self._first_ns
 
     def start(self) -> dict[str, Any]:
-        """The event that the session started with.
+        """The start event of the session.
 
         Raises:
-            LogError: The file cannot be read, or does not begin with it.
+            LogError: The file cannot be read, or does not begin with the start event.
         """
         message = next(self.messages(), b"")
         if codec.kind(message) == codec.EVENT and "cameras" in (found := codec.decode_event(message)):
@@ -162,7 +162,7 @@ class SessionLogReader:
         return self._resume(data, 0, ValueError("the head of the file is not what the recorder writes"))
 
     def _chunk(self, data: mmap.mmap, offset: int) -> _McapChunk:
-        """Reads a chunk with all that must hold of it. Raises one of _UNREADABLE."""
+        """Reads a chunk and checks it. Raises one of _UNREADABLE."""
         if offset + _CHUNK.size > len(data):
             raise _CutError("the chunk is cut short")
         _, length, start_ns, end_ns, size, crc, compression, packed = _CHUNK.unpack_from(data, offset)
@@ -193,10 +193,10 @@ class SessionLogReader:
                 yield message
 
     def _indices(self, data: mmap.mmap, chunk: _McapChunk, offset: int) -> int:
-        """The offset behind the indices of a chunk, which must be those of its messages."""
+        """The offset after the indices of a chunk; checks that the indices agree with its messages."""
         end = chunk.end + len(chunk.index)
         found = data[chunk.end : end]
-        if found != chunk.index and not chunk.index.startswith(found):  # the last one may be cut short
+        if found != chunk.index and not chunk.index.startswith(found):  # the last index may be cut short
             self._flaw(chunk.end, f"the index of the chunk at byte {offset} does not agree with it")
         return end
 
@@ -215,7 +215,7 @@ class SessionLogReader:
             self._flaw(behind, "the index at the end of the file does not agree with its CRC")
 
     def _resume(self, data: mmap.mmap, offset: int, error: Exception) -> int:
-        """The offset of the next chunk after something unreadable, or of the end."""
+        """The offset of the next chunk after an unreadable part, or of the end of the file."""
         found = data.find(_ZSTD, offset + _ZSTD_AT + 1)
         self.finished = data[-len(own.MCAP_MAGIC) :] == own.MCAP_MAGIC
         if found >= 0 or self.finished or not isinstance(error, (_CutError, struct.error)):
@@ -232,7 +232,7 @@ class SessionLogReader:
 
 
 def _contents(content: bytes, channels: dict[int, str]) -> tuple[list[tuple[int, int, int, bytes]], bytes]:
-    """Messages of a chunk and the indices that they need; adds the chunk's channels."""
+    """Messages of a chunk and their index records; adds the chunk's channels to ``channels``."""
     messages = []
     indices: dict[int, list[tuple[int, int]]] = {}
     offset = 0
@@ -258,8 +258,8 @@ def _contents(content: bytes, channels: dict[int, str]) -> tuple[list[tuple[int,
 READY, LOW = b"K", b"L"
 FLUSH_S = 0.2
 _BATCH_S = 0.05
-_CHUNK_BYTES = 1 << 20  # time closes chunks, not size
-_NICE = 5  # control and the person come first
+_CHUNK_BYTES = 1 << 20  # large, because chunks are closed by time
+_NICE = 5  # lower priority than control and the person's process
 
 _TYPES = {
     codec.ROBOT_TOPIC: egm.RobotMessage,
@@ -269,7 +269,7 @@ _TYPES = {
 
 
 class SessionLogWriter:
-    """The log of a session under way. Every message carries its number, so that a hole in the record shows."""
+    """Writes the log of a running session. Every message has a number, so that a gap in the record is detected."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
@@ -280,7 +280,7 @@ class SessionLogWriter:
         self._count = 0
 
     def add(self, message: bytes) -> None:
-        """Writes a message of ``codec``; the first event with cameras also fills the topics of the whole session."""
+        """Writes a message of ``codec``; after the first event with cameras, also cameras, task and base."""
         t_ns = codec.clock_ns(message)
         topic, data = codec.topic_and_data(message)
         if topic == codec.STRAY_TOPIC:
@@ -291,7 +291,7 @@ class SessionLogWriter:
             self._latch(t_ns, codec.decode_event(message))
 
     def flush(self) -> None:
-        """Closes the chunk and hands all to the system. Raises OSError."""
+        """Closes the chunk and passes all data to the operating system. Raises OSError."""
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def finish(self) -> None:
@@ -304,14 +304,14 @@ class SessionLogWriter:
         except DecodeError:
             skeleton = pb.Skeleton()
         if skeleton.camera in self._cameras:
-            capture_ns = max(0, skeleton.capture_ns)  # MCAP has no time before 1970
+            capture_ns = max(0, skeleton.capture_ns)  # MCAP has no times before 1970
             self._write(own.skeleton_topic(skeleton.camera), t_ns, capture_ns, data, pb.Skeleton)
         else:
             self._write(codec.STRAY_TOPIC, t_ns, t_ns, data)
 
     def _latch(self, t_ns: int, start: dict[str, Any]) -> None:
         cameras: dict[str, Any] = start.get("cameras", {})
-        self._cameras = frozenset(name for name in cameras if "/" not in name)  # of a topic's name
+        self._cameras = frozenset(name for name in cameras if "/" not in name)  # the name is part of a topic
         latched: list[tuple[str, Any]] = [
             (own.camera_info_topic(name), pb.Camera(camera=name, T_world_camera=_flat(pose)))
             for name, pose in cameras.items()
@@ -339,27 +339,27 @@ def _flat(pose: list[list[float]] | None) -> list[float]:
 
 
 def free_bytes(folder: Path) -> int:
-    """Space on the disk of a folder that we may use."""
+    """Free space for the user on the disk of a folder [bytes]."""
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize
 
 
 def record(control: socket.socket, path: Path, low_bytes: int) -> None:
-    """Writes a new log until control is gone.
+    """Writes a new log until control has ended.
 
     Args:
-        control: Socket to it.
-        path: Of the log.
-        low_bytes: With less space left on the disk, control is told.
+        control: Socket to control.
+        path: Path of the log.
+        low_bytes: If the disk has less space than this, control gets a message [bytes].
 
     Raises:
-        OSError: The file exists or cannot be written; what is written stays.
+        OSError: The file exists or cannot be written; the part that is written is kept.
     """
     inbox = Inbox(control)
     with path.open("xb") as stream:
         writer = SessionLogWriter(stream)
         writer.flush()
-        with suppress(BrokenPipeError):  # whoever is gone already may have left messages
+        with suppress(BrokenPipeError):  # control may have ended already and left messages
             control.send(READY)
         due_s, told = time.monotonic() + FLUSH_S, False
         while not inbox.ended.wait(_BATCH_S):
@@ -383,7 +383,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--low", type=int, default=0, help="space on the disk below which control is told [bytes]")
     options = parser.parse_args(arguments)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
-        signal.signal(number, signal.SIG_IGN)  # the record ends when the session does, and not before
+        signal.signal(number, signal.SIG_IGN)  # the recorder must not end before the session
     os.nice(_NICE)
     control = socket.socket(fileno=options.fd)
     try:
@@ -391,7 +391,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         with suppress(OSError):
             control.send(LAST_WORDS + f"{options.path}: the record cannot be written ({error.strerror})".encode())
-        os._exit(1)  # the interpreter would try to write the rest once more, and complain
+        os._exit(1)  # at a normal exit the interpreter would write the rest again and fail
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from hrcreplay.live.view.status import Scene, SceneNames, Status, unpack
 from hrcreplay.records import FLOOR_Z_M, Floats, Ints
 from hrcreplay.reporting.scene_messages import ROBOT, VOLUME, bones, capsule, colour, entity, points
 
-_BALL = 24  # directions in which a hull is grown by its radius
+_BALL = 24  # number of directions in which a hull is extended by its radius
 
 
 class FoxgloveStream:
@@ -31,7 +31,7 @@ class FoxgloveStream:
     """
 
     def __init__(self, port: int) -> None:
-        self._context = context = foxglove.Context()  # it does not live through its channels
+        self._context = context = foxglove.Context()  # keep a reference: its channels do not keep it alive
         self._status = foxglove.Channel("/status", message_encoding="json", context=context)
         self._channels = {
             name: channels.SceneUpdateChannel(f"/{name}", context=context) for name in ("person", "volumes", "robot")
@@ -44,21 +44,21 @@ class FoxgloveStream:
         self._cast = SceneNames(limbs=[], links=[], radii_m=[])
 
     def cast(self, cast: SceneNames) -> None:
-        """Takes what stays the same."""
+        """Takes the names and radii, which are constant in a session."""
         self._cast = cast
 
     def watched(self) -> set[str]:
-        """Topics that somebody has subscribed to, without their slash."""
+        """Topics with at least one subscriber, without their slash."""
         every: dict[str, Any] = {**self._channels, "status": self._status}
         return {name for name, channel in every.items() if channel.has_sinks()}
 
     def status(self, status: Status) -> None:
-        """Sends a status."""
+        """Sends a status if a client has subscribed to it."""
         if "status" in self.watched():
             self._status.log(json.dumps(status).encode())
 
     def scene(self, packed: bytes) -> None:
-        """Sends what of a scene somebody watches."""
+        """Sends the parts of a scene that clients have subscribed to."""
         build = {"person": self._person, "volumes": self._volumes, "robot": self._robot}
         wanted = build.keys() & self.watched()
         if not wanted:
@@ -90,9 +90,9 @@ class FoxgloveStream:
 
 
 def mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, Ints]:
-    """Surface of hull + ball above the floor, as ``hull`` gives it; empty where there is no volume.
+    """Surface of hull + ball above the floor, in the format of ``hull``; empty if there is no volume.
 
-    The ball is a polyhedron around it, so the picture is never smaller than the volume.
+    A polyhedron around the ball replaces the ball, so the picture is never smaller than the volume.
     """
     if not len(vertices_m) or not np.isfinite(vertices_m).all():
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)

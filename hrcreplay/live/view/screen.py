@@ -27,7 +27,7 @@ from hrcreplay.live.processes import ControlChannel, ControlGoneError
 from hrcreplay.live.view.status import CameraStatus, Status
 
 _COLOUR = {"tracking": "green", "limited": "yellow", "braking": "bold red", "retreating": "magenta"}
-_STALE_S = 0.2  # as logs.gap_s: a camera silent for longer has a gap
+_STALE_S = 0.2  # as logs.gap_s: a longer pause of a camera is a gap
 _WIDTH = 84
 
 
@@ -76,7 +76,7 @@ def line(status: Status) -> str:
 
 
 def clock(t_s: float) -> str:
-    """Minutes and seconds, down to a tenth, never rounded up."""
+    """Minutes and seconds with one decimal, rounded down."""
     tenths = int(t_s * 10)
     return f"{tenths // 600}:{tenths // 10 % 60:02d}.{tenths % 10}"
 
@@ -163,7 +163,7 @@ Show = Callable[[Status], None]
 
 
 class Lines:
-    """A line a second, and one whenever the session's phase or reason is another; each remark once."""
+    """Writes one line per second and one at every change of phase or reason; writes each remark once."""
 
     def __init__(self, write: Callable[[str], object]) -> None:
         self._write = write
@@ -172,7 +172,7 @@ class Lines:
         self._told = ("", "")
 
     def show(self, status: Status) -> None:
-        """Writes what is due."""
+        """Writes the lines that are due."""
         told = (status["note"], status["outlook"])
         for text in (new for new, old in zip(told, self._told, strict=True) if new and new != old):
             self._write(f"{clock(status['t_s'])}  {text}\n")
@@ -185,7 +185,7 @@ class Lines:
 
 
 def serve(channel: ControlChannel, show: Show, stream: FoxgloveStream | None) -> None:
-    """Shows what comes until control is gone; of what has piled up, the newest."""
+    """Shows messages until control has ended; of several waiting messages it shows only the newest."""
     newest: dict[bytes, bytes] = {}
 
     def flush() -> None:
@@ -204,15 +204,15 @@ def serve(channel: ControlChannel, show: Show, stream: FoxgloveStream | None) ->
             message = channel.receive(0.0 if newest else _WAIT_S)
             if message is None:
                 flush()
-                newest.clear()  # of kinds that nobody knows
+                newest.clear()  # drop messages of unknown kinds
             else:
                 newest[message[:1]] = message[1:]
     except ControlGoneError:
-        flush()  # the last word
+        flush()  # show the last messages
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The process; returns its exit code."""
+    """Runs the process and returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m hrcreplay.live.view.screen", description=__doc__)
     parser.add_argument("--fd", type=int, required=True, help="socket to control")
     parser.add_argument("--json", action="store_true", help="one JSON object a line instead of a panel")
@@ -231,7 +231,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
             serve(channel, lambda status: live.update(panel(status), refresh=True), stream)
     except BrokenPipeError:
-        return 0  # whoever read has had enough
+        return 0  # the reader of the pipe has closed it
     return 0
 
 
@@ -250,7 +250,7 @@ def _stream(port: int | None) -> FoxgloveStream | None:
         return None
     from hrcreplay.live.view import foxglove
 
-    logging.getLogger("foxglove").addHandler(logging.NullHandler())  # what viewers do is not for the panel's terminal
+    logging.getLogger("foxglove").addHandler(logging.NullHandler())  # keep viewers' messages off the panel's terminal
     logging.getLogger("foxglove").propagate = False
     try:
         return foxglove.FoxgloveStream(port)

@@ -1,7 +1,7 @@
-"""The status and the 3-D scene of a session: messages from control to the screen process, and what sends them.
+"""The status and the 3-D scene of a session: messages from control to the screen process, and their publisher.
 
-``S`` + a Status as JSON, ten times a second; what is not known is null, never NaN. For the scene ``J`` + its
-SceneNames as JSON once, and ``P`` + a packed Scene.
+``S`` + a Status as JSON, ten times per second; unknown values are null, never NaN. For the scene ``J`` + its SceneNames
+as JSON once, and ``P`` + a packed Scene.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES
 from hrcreplay.records import POINTS, STATUSES, Floats, SweptVolumes
 
-if TYPE_CHECKING:  # the screen process needs nothing of the loop, whose imports take most of its start
+if TYPE_CHECKING:  # the screen process does not need the loop's imports, which take most of its start-up time
     from hrcreplay.live.control.loop import Loop
 
 
 class Latency(TypedDict):
-    """From the robot's packet in to our reply out, over the whole session so far [us]."""
+    """Quantiles of the time from the robot's packet to the reply, over the session so far [us]."""
 
     p50: float
     p99: float
@@ -35,7 +35,7 @@ class CameraStatus(TypedDict):
     """A camera of the session."""
 
     name: str
-    age_s: float | None  #: from the capture of its newest frame until now
+    age_s: float | None  #: time since the capture of its newest frame
     rate_hz: float  #: frames in the last second
 
 
@@ -43,14 +43,14 @@ class RecorderStatus(TypedDict):
     """State of the recorder process."""
 
     alive: bool
-    dropped: int  #: messages that it could not take
+    dropped: int  #: number of messages that were not delivered
 
 
 class Status(TypedDict):
     """A session at one instant."""
 
     t_s: float  #: since the session's start
-    phase: str  #: of records.PHASES
+    phase: str  #: one of codec.PHASES
     sending: bool  #: False: shadow mode, nothing goes to the robot
     robot: str | None  #: address of the robot
     rate_hz: float  #: answers in the last second
@@ -59,12 +59,12 @@ class Status(TypedDict):
     limb: str | None  #: of the nearest pair
     link: str | None
     tcp_speed: float | None  #: commanded [m/s]
-    status: str | None  #: of hrcreplay.records.STATUSES
-    reason: str  #: why it brakes; empty where it does not
+    status: str | None  #: one of hrcreplay.records.STATUSES
+    reason: str  #: why the robot brakes; empty if it does not
     cameras: list[CameraStatus]
-    stops: dict[str, int]  #: reasons of the session's stops so far, in order of their first time, with their number
+    stops: dict[str, int]  #: reason -> number of stops in the session so far, in order of first occurrence
     recorder: RecorderStatus
-    outlook: str  #: what a robot that stands waits for; empty where it moves or the session ends
+    outlook: str  #: condition on which a robot at rest moves again; empty if it moves or the session ends
     note: str  #: the latest remark
 
 
@@ -72,7 +72,7 @@ _HEAD = struct.Struct("<qH")
 
 
 class SceneNames(TypedDict):
-    """Names and radii that stay the same for a session."""
+    """Names and radii that are constant in a session."""
 
     limbs: list[str]  #: of the swept volumes
     links: list[str]  #: of the robot's segments
@@ -84,17 +84,17 @@ class Scene:
     """An instant of a session, in the world."""
 
     t_ns: int
-    points_m: Floats  #: (20, 3) the fused person; NaN where the model has no say
-    ends_m: Floats  #: (s, 2, 3) both ends of the robot's segments, as RobotPose has them
+    points_m: Floats  #: (20, 3) the fused person; NaN for points that the model does not have
+    ends_m: Floats  #: (s, 2, 3) both ends of the robot's segments, as in RobotPose
     volumes: SweptVolumes  #: of a single tick
 
 
 def pack(t_ns: int, points_m: Floats, ends_m: Floats, volumes: bytes) -> bytes:
-    """The payload of ``P``, of the fields of a Scene.
+    """The payload of ``P`` from the fields of a Scene.
 
     Args:
         t_ns: Instant of the perception [ns].
-        points_m: (20, 3) fused person, world [m]; NaN where the model has no such point.
+        points_m: (20, 3) fused person, world [m]; NaN for points that the model does not have.
         ends_m: (s, 2, 3) both ends of the robot's s segments, world [m].
         volumes: Swept volumes of one tick, as ``codec.encode_volumes`` packs them for the record.
     """
@@ -102,7 +102,7 @@ def pack(t_ns: int, points_m: Floats, ends_m: Floats, volumes: bytes) -> bytes:
 
 
 def unpack(data: bytes, limbs: tuple[str, ...]) -> Scene:
-    """The inverse of ``pack``; the volumes' method does not travel."""
+    """The inverse of ``pack``; the method of the volumes is not transmitted."""
     t_ns, segments = _HEAD.unpack_from(data)
     at = _HEAD.size
     points = np.frombuffer(data, "<f8", 3 * len(POINTS), at).reshape(-1, 3)
@@ -117,7 +117,7 @@ _SECOND_NS = 1_000_000_000
 
 
 class StatusPublisher:
-    """Sends status and scene to the screen process; does nothing between two messages."""
+    """Sends status and scene to the screen process at fixed intervals."""
 
     def __init__(self, loop: Loop, names: dict[str, Any], *, in_3d: bool) -> None:
         self._loop = loop
@@ -133,7 +133,7 @@ class StatusPublisher:
             self._send(b"J" + json.dumps(cast).encode())
 
     def publish(self, *, last: bool = False) -> None:
-        """Sends the status where it is due."""
+        """Sends status and scene if they are due, or if ``last`` is set."""
         now_ns = self._loop.now_ns()
         if now_ns - self._told_ns < _EVERY_NS and not last:
             return
@@ -148,18 +148,18 @@ class StatusPublisher:
             self._loop.screen.send(message)
 
     def _show(self) -> None:
-        """The person, the volumes and the robot, for whoever draws them."""
+        """Sends the person, the volumes and the robot for the 3-D view."""
         perception, answer, volumes = self._loop.controller.perception, self._loop.last, self._loop.stored
         if perception is None or answer is None or answer.row is None or volumes is None:
             return
-        from hrcreplay.human.model import skeleton  # of the process that sends alone, which has it already
+        from hrcreplay.human.model import skeleton  # only needed here; control has it loaded
 
         points = skeleton(perception.states.p, perception.states.lengths_m)[0]
         pose = self._loop.controller.setup.robot.pose(answer.row.q, answer.row.dq)
         self._send(b"P" + pack(perception.t_ns, points, pose.ends_m, volumes))
 
     def _count(self, now_ns: int) -> None:
-        """Rates of the last second."""
+        """Updates the rates once per second."""
         passed_ns = now_ns - self._counted_ns
         if passed_ns < _SECOND_NS:
             return
