@@ -1,8 +1,8 @@
-"""The nouns that pass between stages. Read this first.
+"""The records that the stages exchange. Read this module first.
 
-Every record is a table of ticks (or of frames): arrays whose first axis is time. A live tick is a table of one
-row, so each stage is written once. Arrays are read-only; what is missing is NaN, never 0.
-Instants are int nanoseconds, durations float seconds; everything else is SI.
+Every record is a table of ticks or of frames: its arrays have time as their first axis. A live tick is a table of one
+row, so live session and replay use the same stages. Arrays are read-only. Missing values are NaN, never 0.
+Instants are int nanoseconds, durations are float seconds; all other quantities are in SI units.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ Bools = NDArray[np.bool_]
 #: Height of the floor in the world, whose z axis is up [m].
 FLOOR_Z_M = 0.0
 
-#: Joints of the human model in the order of Eq. (37), right arm before left; then the pelvis's height above the floor,
-#: which the paper counts among the lengths: people squat, sit down and get up.
+#: Joints of the human model in the order of Eq. (37), right arm before left; then the height of the pelvis above the
+#: floor. The paper counts this height among the lengths, but it changes when people squat, sit down and get up.
 JOINTS = ("x", "y", "theta", "rho", "ar1", "ar2", "ar3", "ar4", "al1", "al2", "al3", "al4", "z")
-#: How many they are.
+#: Number of joints.
 DOF = len(JOINTS)
 
 #: Limb lengths pi that the filter estimates with the joints [m].
@@ -38,10 +38,10 @@ LENGTHS = (
     "pi_forearm_r",
 )
 
-#: Limbs of Alg. 2 whose swept volumes are predicted.
+#: Limbs of Alg. 2 with predicted swept volumes.
 LIMBS = ("HD", "THX", "URA", "LRA", "ULA", "LLA")
 
-#: The same and the lower body, of which the model only knows where the pelvis is.
+#: The limbs and the lower body; of the lower body the model only contains the position of the pelvis.
 BODY = (*LIMBS, "LEGS")
 
 #: Body points of a camera's skeleton. A camera that lacks one leaves it NaN with confidence 0.
@@ -68,10 +68,10 @@ POINTS = (
     "foot_r",
 )
 
-#: Body id of a frame that shows nobody: all its points are missing.
+#: Body id in a frame without a person: all its points are missing.
 NOBODY = -1
 
-#: The border of a watched area among the volumes that a robot keeps clear of: one name for all its sides.
+#: Name of the border of a watched area among the volumes that a robot keeps clear of; all sides have this name.
 BORDER = "BORDER"
 
 #: POINTS with left and right exchanged.
@@ -82,7 +82,7 @@ MIRROR = tuple(
 
 
 def _protect(record: Any) -> None:
-    """Gives a record that is being made views of its arrays through which nobody writes."""
+    """Replaces the arrays of a new record by read-only views."""
     own = vars(record)
     for name, value in own.items():
         if isinstance(value, np.ndarray):
@@ -92,7 +92,7 @@ def _protect(record: Any) -> None:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows over time: every array field has time as its first axis, every other field belongs to the whole table."""
+    """Rows over time: every array field has time as its first axis; every other field applies to the whole table."""
 
     def __post_init__(self) -> None:
         _protect(self)
@@ -109,7 +109,7 @@ class Table:
 
     @classmethod
     def join(cls, tables: Sequence[Self]) -> Self:
-        """One table of all the rows, in the given order; whole-table fields are those of the first."""
+        """One table with the rows of all tables, in the given order; fields without rows are those of the first."""
         first = tables[0]
         names = [name for name, value in vars(first).items() if isinstance(value, np.ndarray)]
         return replace(first, **{name: np.concatenate([getattr(t, name) for t in tables]) for name in names})
@@ -117,12 +117,12 @@ class Table:
 
 @dataclass(frozen=True)
 class CameraFrames(Table):
-    """Skeletons as the cameras saw them, a row a body a frame, in order of arrival."""
+    """Skeletons measured by the cameras, one row per body and frame, in order of arrival."""
 
-    capture_ns: Ints  #: (n,) when the camera took it
-    arrival_ns: Ints  #: (n,) when it reached the logger; no tick before this may use it
+    capture_ns: Ints  #: (n,) capture time of the frame
+    arrival_ns: Ints  #: (n,) arrival time at the logger; no earlier tick may use the frame
     camera: Ints  #: (n,) index into ``cameras``
-    body: Ints  #: (n,) the tracker's body id, which may change in mid-recording; or NOBODY
+    body: Ints  #: (n,) the tracker's body id, which may change during a recording; or NOBODY
     points_m: Floats  #: (n, 20, 3) POINTS in that camera's own frame [m]
     confidence: Floats  #: (n, 20) in [0, 1]
     cameras: tuple[str, ...]
@@ -130,7 +130,7 @@ class CameraFrames(Table):
 
 @dataclass(frozen=True)
 class SkeletonTrack(Table):
-    """One person as one camera saw them, a row a frame, in order of capture."""
+    """One person measured by one camera, one row per frame, in order of capture."""
 
     t_ns: Ints  #: (n,) capture time
     points_m: Floats  #: (n, 20, 3) POINTS in one frame, the camera's or the world's [m]
@@ -140,7 +140,7 @@ class SkeletonTrack(Table):
 
 @dataclass(frozen=True)
 class Measurements(Table):
-    """Joint angles and limb lengths of camera frames, a row a frame, in order of arrival."""
+    """Joint angles and limb lengths from camera frames, one row per frame, in order of arrival."""
 
     capture_ns: Ints  #: (n,)
     arrival_ns: Ints  #: (n,)
@@ -174,7 +174,7 @@ class Measurements(Table):
 
 @dataclass(frozen=True)
 class HumanStates(Table):
-    """The fused person, a row a tick. Rows before the first measurement are NaN."""
+    """The fused person, one row per tick. Rows before the first measurement are NaN."""
 
     t_ns: Ints  #: (n,)
     p: Floats  #: (n, 13) JOINTS [m, m, rad..., m]; heading is unwrapped
@@ -185,14 +185,14 @@ class HumanStates(Table):
     v_std: Floats  #: (n, 13) standard deviation of ``v``
     lengths_m: Floats  #: (n, 7) LENGTHS [m]
     lengths_std_m: Floats  #: (n, 7) [m]
-    valid: Bools  #: (n, c) whether a row of this camera entered the update of this tick
-    residual_m: Floats  #: (n, 7) high quantile of how far BODY was from the model lately [m]; NaN until known
-    unseen_s: Floats  #: (n, 7) since a camera last saw the joints of BODY, of the legs [s]; inf before the first time
-    frame_age_s: Floats  #: (n,) since the newest frame that entered the filter was captured [s]; inf before the first
-    points_m: Floats  #: (n, 20, 3) POINTS where cameras show them beside the model, world [m]; NaN: not shown lately
+    valid: Bools  #: (n, c) whether a row of this camera is used in the update of this tick
+    residual_m: Floats  #: (n, 7) high quantile of the recent distances of BODY from the model [m]; NaN until known
+    unseen_s: Floats  #: (n, 7) time since a camera last saw the joints of BODY [s]; inf before the first time
+    frame_age_s: Floats  #: (n,) time since the capture of the newest frame in the filter [s]; inf before the first
+    points_m: Floats  #: (n, 20, 3) recent POINTS that cameras show away from the model, world [m]; otherwise NaN
     cameras: tuple[str, ...]
-    nobody_s: Floats | None = None  #: (n,) since the watched area was last without anybody [s]; None: none is watched
-    nobody_else_s: Floats | None = None  #: the same without anybody but the person; inf before the first time [s]
+    nobody_s: Floats | None = None  #: (n,) time since the watched area was last empty [s]; None: no watched area
+    nobody_else_s: Floats | None = None  #: (n,) the same, apart from the person [s]; inf before the first time
 
 
 class SweptVolume(NamedTuple):
@@ -203,7 +203,7 @@ class SweptVolume(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Return whether all its numbers are finite, so that the limb could be predicted."""
+        """Return whether all numbers are finite; otherwise the limb could not be predicted."""
         return bool(np.isfinite(self.vertices_m).all() and np.isfinite(self.radius_m))
 
 
@@ -212,7 +212,7 @@ class SweptVolumes:
     """Reachable space within the horizon: per tick and limb the convex hull of ``vertices`` + a ball.
 
     ``vertices_m[offsets[i * len(limbs) + l] : offsets[i * len(limbs) + l + 1]]`` belong to tick i, limb l.
-    A limb that cannot be predicted (no state yet) has one NaN vertex: whoever plans against it must brake.
+    A limb that cannot be predicted (no state yet) has one NaN vertex; the robot must then brake.
     """
 
     t_ns: Ints  #: (n,)
@@ -241,14 +241,14 @@ class SweptVolumes:
         }
 
 
-#: What a tick of the plan was: free tracking, held by a safety constraint or a limit, a stop, or a way out of a volume.
+#: Status of a tick: free tracking, limited by a safety constraint or a limit, a stop, or a motion out of a volume.
 STATUSES = ("tracking", "limited", "braking", "retreating")
 
 
 class MotionRow(NamedTuple):
-    """Commanded motion of one tick: what a controller decides, ``Motion`` collects and a session records.
+    """Commanded motion of one tick. A controller decides it, ``Motion`` collects it, and a session records it.
 
-    This is the one schema of a tick. Tables, the session's record and ``verify`` take its fields in this order.
+    This class is the only schema of a tick. Tables, the session's record and ``verify`` use its fields in this order.
     """
 
     q: Floats  #: (nv,) at the tick [rad]
@@ -264,13 +264,13 @@ class MotionRow(NamedTuple):
     limb: int  #: of the nearest pair; -1 without one
     link: int  #: of the nearest pair; -1 without one
     status: int  #: index into STATUSES
-    reason: str  #: why it braked or stood; empty where it did neither
+    reason: str  #: why the robot braked or stood still; otherwise empty
     horizon_s: float  #: horizon of the volumes used, from the tick on [s]
     tau_s: float  #: duration of the stop from the tick's velocity [s]
-    certified: bool  #: whether the step, or the stop it continues, has a certificate that holds
+    certified: bool  #: whether the step, or the stop it continues, has a valid certificate
 
 
-#: Fields of a MotionRow with a number an axis of the robot, and those with one an axis of the world.
+#: Fields of a MotionRow with one number per axis of the robot, and those with one number per axis of the world.
 _OF_AXES, _OF_POINTS = ("q", "dq", "u"), ("ref_m", "tcp_m")
 
 
@@ -285,7 +285,7 @@ def number_names(field: str, axes: int) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Motion(Table):
-    """Commanded motion of the robot, a row a tick: the fields of ``MotionRow`` as arrays."""
+    """Commanded motion of the robot, one row per tick: the fields of ``MotionRow`` as arrays."""
 
     t_ns: Ints  #: (n,)
     q: Floats  #: (n, nv) at the tick [rad]
@@ -295,16 +295,16 @@ class Motion(Table):
     tcp_m: Floats  #: (n, 3) TCP position, world [m]
     tcp_speed: Floats  #: (n,) [m/s]
     ref_speed: Floats  #: (n,) [m/s]
-    programme_s: Floats  #: (n,) programmed time of the reference; behind the clock by what it has waited [s]
+    programme_s: Floats  #: (n,) programmed time of the reference; behind the clock by its waiting time [s]
     distance_m: Floats  #: (n,) surface to surface, smallest over all pairs; 0 in contact [m]
-    overlap_m: Floats  #: (n,) how deep that link is inside that volume, as far as their radii go; NaN: not known [m]
+    overlap_m: Floats  #: (n,) depth of the link inside the volume, radii included; NaN where not known [m]
     limb: Ints  #: (n,) index into ``limbs`` of the nearest pair; -1 without one
     link: Ints  #: (n,) index into ``links`` of the nearest pair; -1 without one
     status: Ints  #: (n,) index into STATUSES
-    reason: Ints  #: (n,) index into ``reasons``: why it braked or stood, 0 where it did neither
+    reason: Ints  #: (n,) index into ``reasons``: why the robot braked or stood still; otherwise 0
     horizon_s: Floats  #: (n,) horizon of the volumes used at the tick, from the tick on [s]
-    tau_s: Floats  #: (n,) how long the stop from the tick's velocity takes [s]
-    certified: Bools  #: (n,) whether this tick's step, or the stop it continues, has a certificate that holds
+    tau_s: Floats  #: (n,) duration of the stop from the tick's velocity [s]
+    certified: Bools  #: (n,) whether this tick's step, or the stop it continues, has a valid certificate
     limbs: tuple[str, ...]
     links: tuple[str, ...]
     reasons: tuple[str, ...]
@@ -319,7 +319,7 @@ class Motion(Table):
         links: tuple[str, ...],
         reasons: tuple[str, ...],
     ) -> Self:
-        """Collect rows into a table.
+        """Collects rows into a table.
 
         Args:
             t_ns: (n,) ticks of the rows [ns].
