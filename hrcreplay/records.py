@@ -187,7 +187,7 @@ class HumanStates(Table):
     lengths_std_m: Floats  #: (n, 7) [m]
     valid: Bools  #: (n, c) whether a row of this camera is used in the update of this tick
     residual_m: Floats  #: (n, 7) high quantile of the recent distances of BODY from the model [m]; NaN until known
-    unseen_s: Floats  #: (n, 7) time since a camera last saw the joints of BODY [s]; inf before the first time
+    unseen_s: Floats  #: (n, 7) time since a camera last saw the joints of each of BODY [s]; inf before the first time
     frame_age_s: Floats  #: (n,) time since the capture of the newest frame in the filter [s]; inf before the first
     points_m: Floats  #: (n, 20, 3) recent POINTS that cameras show away from the model, world [m]; otherwise NaN
     cameras: tuple[str, ...]

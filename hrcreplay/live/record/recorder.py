@@ -3,7 +3,8 @@
 From control: the messages of ``codec``. To control: ``K`` once, when the file is open; ``L`` once, when the disk has
 little space left; ``X`` + the reason in UTF-8, if the file cannot be written. In this case the recorder ends at once
 with exit code 1. Otherwise it ends after control has ended and the file is finished.
-Chunks are closed and passed to the operating system several times per second, so a kill loses only the last chunk.
+Chunks are closed and passed to the operating system several times per second, so a kill loses only the messages of a
+fraction of a second.
 
 Every byte of a finished file has a checksum, and the messages are numbered. In an unfinished file only the indices have
 no checksum, and they follow from the messages. Therefore every change and every gap gives a flaw with its place.

@@ -124,7 +124,7 @@ def find_holding_rows(task: Problem, solved: Solution) -> dict[str, Any]:
 
     Args:
         task: Eq. (66).
-        solved: Its minimiser.
+        solved: Minimiser of Eq. (66).
     """
     w, slack = solved.dq_next, solved.slack
     every, margins = all_rows(task), margins_of(task.rows, w, slack)

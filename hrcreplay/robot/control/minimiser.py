@@ -63,14 +63,14 @@ class Solution:
 
 @dataclass(frozen=True, slots=True)
 class Unsolved:
-    """There is no minimiser, or none was found."""
+    """The problem has no minimiser, or the search did not find it."""
 
     status: str  #: the problem: "not finite", "infeasible" (proven), or the last status of the search
 
 
 #: Weight of the squared slack: the cost prefers a row violation of 1 mm/s to a TCP that is slower by 1 m/s.
 SLACK = 1000.0
-#: Largest number of rounds of adding rows and solving; then the robot stops instead of taking a late step.
+#: Largest number of rounds of adding rows and solving; then the problem counts as unsolved, and the robot stops.
 ROUNDS = 16
 #: Sweeps of coordinate descent before a row is added, and largest number of rows added before each run of ProxQP.
 SWEEPS, JOIN = 10, 40

@@ -27,7 +27,7 @@ from hrcreplay.robot.task import Reference, place
 #: Rates that differ by no more than this are equal.
 SAME = 1e-7
 
-#: Largest residual of an approach row that counts as held [m^2].
+#: An approach row holds if it is violated by no more than this [m^2].
 HELD = 1e-11
 
 #: Largest number of iterations in the search for a rate.
