@@ -22,7 +22,7 @@ _CORNERS = np.array([(across, up) for across in (-1.0, 1.0) for up in (-1.0, 1.0
 
 @dataclass(frozen=True)
 class Border:
-    """The sides of a convex polygon around a robot; each side is a wall over the full height of its reach."""
+    """The sides of a convex polygon around a robot, as walls over the full height of the robot's reach."""
 
     normals: Floats  #: (k, 3) unit vectors that point outwards, horizontal
     room_m: Floats  #: (k,) distance from the robot's base to each side; negative if the base is outside [m]
