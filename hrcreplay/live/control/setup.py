@@ -210,8 +210,8 @@ def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfi
     """
     if (found := start.get("record", 1)) != codec.FORMAT:
         raise LogError(
-            f"{log}: its record has format {found}, and this version of hrcreplay reads format {codec.FORMAT}; would be "
-            "right: the version that recorded the session"
+            f"{log}: its record has format {found}, and this version of hrcreplay reads format {codec.FORMAT}; "
+            "would be right: the version that recorded the session"
         )
     try:
         settings = Settings.model_validate(with_new_names(start["settings"])[0])
