@@ -297,7 +297,7 @@ def test_described_decoder_takes_units_stamp_and_confidence(tmp_path: Path, kind
         ({"points": "positons"}, ("'positons'", "header, positions, velocities")),
         ({"points": "delta_t"}, ("delta_t", "array")),
         ({"points": "header.stamp"}, ("header.stamp", "array")),
-        ({"stamp": "header.frame_id"}, ("header.frame_id", "type time")),
+        ({"stamp": "header.frame_id"}, ("''", "type time")),
         ({"topic": "/nobody"}, ("/nobody", "/SaRA_demo_robot_capsules")),
     ],
 )
