@@ -205,7 +205,7 @@ def test_an_area_that_is_never_without_others_is_told_and_the_robot_stands(tmp_p
 def test_an_area_without_the_robot_is_refused(tmp_path: Path) -> None:
     log = visit_log(tmp_path / "visit.mcap", nobody, 1.0)
     write_cell(Cell(watched=Watched(corners_m=[[5.0, 5.0], [9.0, 5.0], [9.0, 9.0]])), tmp_path / "far.toml")
-    with pytest.raises(SettingsError, match=facts("watched", "[0.2, 0.0] m")):
+    with pytest.raises(SettingsError, match=facts("watched.corners_m", "[0.2, 0.0] m")):
         replay.run("plan", log, out=tmp_path / "run", cell_file=tmp_path / "far.toml", overrides=ALONE)
 
 
