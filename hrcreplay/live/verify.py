@@ -36,7 +36,7 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.pipeline.run_config import versions
-from hrcreplay.records import STATUSES, Floats, SweptVolumes
+from hrcreplay.records import STATUSES, SweptVolumes
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import state_columns
 from hrcreplay.store.machine import describe_machine, name_machine
@@ -398,7 +398,7 @@ class SessionRecomputation:
         names = ("phase", "status", "reason", "look_ns", "limb", "link")
         return [
             *decisions_differing(names, _decision(recorded), _decision(said)),
-            *numbers_differing(*_numbers(recorded), _numbers(said)[1]),
+            *numbers_differing(codec.number_names_of(len(recorded.numbers)), recorded.numbers, said.numbers),
         ]
 
     def _replied(self, message: bytes) -> list[Difference]:
@@ -418,13 +418,6 @@ def _decision(found: codec.RecordedDecision) -> list[Any]:
         found.limb,
         found.link,
     ]
-
-
-def _numbers(found: codec.RecordedDecision) -> tuple[list[str], Floats]:
-    """The numbers of a decision with their names, without the integers, which are decisions."""
-    names = codec.number_names_of(len(found.measured)) if found.row is not None else ()
-    kept = [i for i, name in enumerate(names) if name not in codec.INTEGERS]
-    return [names[i] for i in kept], codec.numbers_of(found)[kept]
 
 
 def _digests_differing(recorded: tuple[bytes, ...], volumes: SweptVolumes) -> list[Difference]:

@@ -95,8 +95,8 @@ def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messa
     [
         (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * (DOF + 3), "rho_vel: recorded "),
         (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * (6 * DOF + 6), "pi_forearm_r: recorded "),
-        (codec.DECISION, 7, struct.calcsize("<cqqIIBHB") + 8 * 17, "dq6: recorded "),
-        (codec.DECISION, 7, struct.calcsize("<cqqIIBHB") + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
+        (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhHB") + 8 * 17, "dq6: recorded "),
+        (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhHB") + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
         (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
         (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 5), "radius of LLA: recorded 1.1, again 0.1"),
     ],
@@ -320,20 +320,20 @@ def test_another_machine_may_round_otherwise(tmp_path: Path, messages: list[byte
     assert _verdict(tmp_path, elsewhere).agreement is Agreement.IDENTICAL
 
 
-_ANSWER = struct.calcsize("<cqqIIBBhhH")
+_ANSWER = struct.calcsize("<cqqIIBBhhHB")
 _LOOKED = struct.calcsize("<cqHHHH")
 
 
 @pytest.mark.parametrize(
     ("kind", "number", "offset", "change", "name"),
     [
-        (codec.DECISION, 7, _ANSWER + 1 + 8 * 8, 1e-6, "q3"),
-        (codec.DECISION, 7, _ANSWER + 1 + 8 * 14, 1e-6, "dq3"),
-        (codec.DECISION, 7, _ANSWER + 1 + 8 * 20, 1e-3, "u3"),
-        (codec.DECISION, 7, _ANSWER + 1 + 8 * 33, 1e-6, "distance_m"),
-        (codec.DECISION, 7, _ANSWER + 1 + 8 * 34, 1e-12, "horizon_s"),
-        (codec.DECISION, 7, _ANSWER + 1 + 8 * 36, 1e-12, "certified"),
-        (codec.DECISION, 7, _ANSWER + 1 + 8 * 33, np.nan, "distance_m"),
+        (codec.DECISION, 7, _ANSWER + 8 * 8, 1e-6, "q3"),
+        (codec.DECISION, 7, _ANSWER + 8 * 14, 1e-6, "dq3"),
+        (codec.DECISION, 7, _ANSWER + 8 * 20, 1e-3, "u3"),
+        (codec.DECISION, 7, _ANSWER + 8 * 33, 1e-6, "distance_m"),
+        (codec.DECISION, 7, _ANSWER + 8 * 35, 1e-12, "horizon_s"),
+        (codec.DECISION, 7, _ANSWER + 8 * 37, 1e-12, "certified"),
+        (codec.DECISION, 7, _ANSWER + 8 * 33, np.nan, "distance_m"),
         (codec.PERCEPTION, 7, _LOOKED + 8 * 3, 1e-6, "theta"),
         (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 6) + 8 * 4, 1e-6, "vertex 1 of HD, y"),
         (codec.VOLUMES, 1, struct.calcsize("<cqHI"), 1e-12, "horizon_s"),

@@ -23,7 +23,7 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any
 
@@ -125,7 +125,7 @@ _HEAD = struct.Struct("<cq")
 _REPLY = struct.Struct("<cqB")
 _LOOK = struct.Struct("<cqHHHH")
 _VOLUMES = struct.Struct("<cqHId")
-_ANSWER = struct.Struct("<cqqIIBHB")
+_ANSWER = struct.Struct("<cqqIIBBhhHB")
 _SILENCE = struct.Struct("<cqI")
 _DIGEST = 8
 _DIGESTS = 3  #: per limb: one of its bits, and one of its numbers on each of the two grids
@@ -285,25 +285,19 @@ class RecordedDecision(Decision):
     took_us: int  #: from the datagram's arrival to the reply's departure; ``verify`` does not compare it
     signals: Signal
     datagrams: int  #: number of datagrams, which are the ROBOT messages right before it
+    numbers: Floats  #: as recorded: ``number_names_of`` says which
 
 
-#: Fields of a MotionRow that are recorded as numbers: all except the reason.
-_NUMBERS = tuple(name for name in MotionRow._fields if name != "reason")
-#: Number fields that are decisions.
-INTEGERS = ("limb", "link", "status")
+#: Fields of a MotionRow that the head of a message holds, and those recorded as numbers; the reason is its text.
+_IN_HEAD = ("status", "limb", "link")
+_NUMBERS = tuple(name for name in MotionRow._fields if name not in (*_IN_HEAD, "reason"))
 
 
-def numbers_of(found: Decision) -> Floats:
-    """All numbers of a decision's motion, measured joints first; empty without a motion."""
-    if found.row is None:
-        return np.empty(0)
-    return np.concatenate([found.measured, *(np.atleast_1d(getattr(found.row, name)) for name in _NUMBERS)])
-
-
-def number_names_of(axes: int) -> tuple[str, ...]:
-    """Names of the numbers of ``numbers_of`` for a robot with ``axes`` axes, as in motion.parquet."""
+def number_names_of(numbers: int) -> tuple[str, ...]:
+    """Names of so many numbers of a recorded decision, as in motion.parquet: measured joints first."""
+    axes = (numbers - sum(len(number_names(name, 0)) for name in _NUMBERS)) // 4  # measured, q, dq, u
     measured = (f"q_measured{axis}" for axis in range(1, axes + 1))
-    return (*measured, *(one for name in _NUMBERS for one in number_names(name, axes)))
+    return (*measured, *(one for name in _NUMBERS for one in number_names(name, axes))) if numbers else ()
 
 
 def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: int) -> bytes:
@@ -315,34 +309,28 @@ def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: i
         datagrams: Number of the robot's datagrams that the decision answers.
         took_us: From the first datagram's arrival to the reply's departure [us].
     """
-    head = _ANSWER.pack(
-        DECISION, found.t_ns, found.look_ns, took_us, signals, found.phase, datagrams, len(found.measured)
-    )
-    return b"".join([head, numbers_of(found).tobytes(), found.reason.encode()])
+    instants, decided = (found.t_ns, found.look_ns, took_us), (found.status, found.limb, found.link)
+    head = _ANSWER.pack(DECISION, *instants, signals, found.phase, *decided, datagrams, len(found.measured))
+    if found.row is None:
+        return head + found.reason.encode()
+    numbers = [found.measured, *(np.atleast_1d(getattr(found.row, name)) for name in _NUMBERS)]
+    return b"".join([head, np.concatenate(numbers).tobytes(), found.reason.encode()])
 
 
 def decode_decision(message: bytes) -> RecordedDecision:
     """Decodes a decision."""
-    _, t_ns, look_ns, took_us, signals, phase, datagrams, axes = _ANSWER.unpack_from(message)
-    names = number_names_of(axes) if axes else ()
-    text_at = _ANSWER.size + 8 * len(names)
-    numbers, text = np.frombuffer(message, "<f8", len(names), _ANSWER.size), message[text_at:].decode()
-    found = RecordedDecision(
-        t_ns, look_ns, None, phase, numbers[:axes], None, text, None, took_us, Signal(signals), datagrams
-    )
-    return replace(found, row=_row(numbers[axes:], axes, text), refusal="") if axes else found
-
-
-def _row(numbers: Floats, axes: int, reason: str) -> MotionRow:
-    """The inverse of ``numbers_of``, without the measured joints."""
-    values: dict[str, Any] = {"reason": reason}
-    at = 0
-    for name in _NUMBERS:
-        names = number_names(name, axes)
-        part = numbers[at : at + len(names)]
-        at += len(names)
-        values[name] = part if names != (name,) else int(part[0]) if name in INTEGERS else float(part[0])
-    return MotionRow(**values | {"certified": values["certified"] != 0.0})
+    _, t_ns, look_ns, took_us, signals, phase, *decided, datagrams, axes = _ANSWER.unpack_from(message)
+    widths = [len(number_names(name, axes)) for name in _NUMBERS] if axes else []
+    count = axes + sum(widths)
+    numbers, text = np.frombuffer(message, "<f8", count, _ANSWER.size), message[_ANSWER.size + 8 * count :].decode()
+    row = None
+    if axes:
+        values: dict[str, Any] = dict(zip(_IN_HEAD, decided, strict=True)) | {"reason": text}
+        for name, width, part in zip(_NUMBERS, widths, np.split(numbers[axes:], np.cumsum(widths)[:-1]), strict=True):
+            values[name] = part if name in ("q", "dq", "u") or width > 1 else float(part[0])
+        row = MotionRow(**values | {"certified": values["certified"] != 0.0})
+    recorded = (took_us, Signal(signals), datagrams, numbers)
+    return RecordedDecision(t_ns, look_ns, None, phase, numbers[:axes], row, "" if axes else text, None, *recorded)
 
 
 ROBOT_TOPIC = "/egm/robot"  #: datagrams of the robot, readable or not
