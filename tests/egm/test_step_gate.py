@@ -30,7 +30,7 @@ def gate() -> StepGate:
 def test_the_first_command_is_where_the_robot_is() -> None:
     with pytest.raises(UnsafeCommandError, match=facts("joint 1", "2.0769 rad")):
         StepGate(DQ_MAX, CYCLE_S).check(command(np.full(6, np.radians(119.0))), ZERO, 0)
-    with pytest.raises(UnsafeCommandError, match="not known"):
+    with pytest.raises(UnsafeCommandError, match="unknown"):
         StepGate(DQ_MAX, CYCLE_S).check(command(ZERO), None, 0)
 
 

@@ -216,7 +216,7 @@ def test_why_names_the_border(tmp_path: Path) -> None:
     assert found["watched"]["nobody_s"] == pytest.approx(found["watched"]["nobody_else_s"])
     text = "\n".join(sentences(found))
     assert tells(text, "border", "watched area", "last known")
-    assert tells(sentences(explain(folder, 1.0)), "Cause", "not known")
+    assert tells(sentences(explain(folder, 1.0)), "Cause", "unknown")
 
 
 def test_a_run_of_another_area_is_not_taken_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -311,7 +311,7 @@ def test_pace_is_that_of_the_robot_whatever_the_reference_does(run: Run, found: 
     for prefix in ("plan", "baseline_scaling"):
         lost, pace = found[f"{prefix}_time_lost_s"]["value"], found[f"{prefix}_progress_share"]["value"]
         assert lost == pytest.approx((1 - pace) * found["span_s"]["value"])
-        assert "itself made" in found[f"{prefix}_progress_share"]["meaning"]
+        assert "own progress" in found[f"{prefix}_progress_share"]["meaning"]
     settings = {**run.meta["settings"], "plan": {"method": "qp", "reference": "time"}}
     other = metrics_of(dataclasses.replace(run, meta={**run.meta, "settings": settings}))
     assert other["plan_progress_share"] == found["plan_progress_share"]

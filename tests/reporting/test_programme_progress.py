@@ -125,7 +125,7 @@ def test_a_programme_that_only_stands_has_no_pace() -> None:
     stands = dataclasses.replace(run, motion=run.motion.assign(**still, programme_s=s))
     found = metrics_of(stands)
     assert found["plan_progress_share"]["value"] is None
-    assert "stands" in found["plan_progress_share"]["reason"]
+    assert "stationary" in found["plan_progress_share"]["reason"]
     held = dataclasses.replace(run, motion=run.motion.assign(**still, programme_s=0.0))
     found = metrics_of(held)
     assert found["plan_progress_share"]["value"] == 0.0
