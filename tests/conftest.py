@@ -34,7 +34,17 @@ GROUPS = {
 #: Files and folders of the quick tests (``make check``): those that need no whole run and compile little.
 QUICK = (
     *("tests/test_docs.py", "tests/test_docstrings.py", "tests/test_import_law.py", "tests/test_paper.py"),
-    *("tests/settings", "tests/limits", "tests/geometry", "tests/egm/test_codec.py", "tests/egm/test_protocol.py"),
+    *("tests/settings", "tests/limits", "tests/store", "tests/egm", "tests/commands/test_templates.py"),
+    *(f"tests/geometry/test_{name}.py" for name in ("hull_reduction", "polygon", "rotation", "visible_front")),
+    *(f"tests/human/fusion/test_{name}.py" for name in ("body_points", "fuse", "gating", "inverse_kinematics")),
+    *(
+        f"tests/human/{name}.py"
+        for name in ("test_model", "fusion/test_rts_smoother", "prediction/test_reachable_sets")
+    ),
+    *(f"tests/robot/control/test_{name}.py" for name in ("separation", "stopping", "stops", "tracking_cost", "border")),
+    *(f"tests/robot/test_{name}.py" for name in ("model", "task", "track", "urdf")),
+    *(f"tests/logs/test_{name}.py" for name in ("dirty", "importers", "info", "plausibility", "poses", "writer")),
+    *(f"tests/reporting/test_{name}.py" for name in ("defect_notes", "golden", "limbs", "summary")),
 )
 WHOLE_RUNS = {"demo_folder", "printed"}
 
