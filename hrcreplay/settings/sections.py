@@ -467,7 +467,7 @@ def setting(recorded: Mapping[str, Any], section: str, key: str) -> Any:
     return known.get(section, {}).get(key, getattr(getattr(Settings(), section), key))
 
 
-#: Names of sections and settings before version 0.9; accepted for one more version.
+#: Old names of sections and settings, accepted in this version only.
 RENAMED = {
     "occupancy": "prediction",
     "plan.leash_m": "plan.max_reference_lead_m",

@@ -34,6 +34,14 @@ def test_the_first_command_is_where_the_robot_is() -> None:
         StepGate(DQ_MAX, CYCLE_S).check(command(ZERO), None, 0)
 
 
+def test_a_first_command_beside_a_joint_that_is_no_number_does_not_pass() -> None:
+    for axis in range(6):
+        for value in (np.nan, np.inf):
+            measured = np.where(np.arange(6) == axis, value, 0.0)
+            with pytest.raises(UnsafeCommandError, match="first command"):
+                StepGate(DQ_MAX, CYCLE_S).check(command(ZERO), measured, 0)
+
+
 @pytest.mark.parametrize("axis", range(6))
 def test_a_step_of_a_cycle_passes_and_one_beyond_it_does_not(axis: int) -> None:
     step = np.where(np.arange(6) == axis, STEP, 0.0)

@@ -346,7 +346,7 @@ def draw_instant(axes: Axes, scene: ReplayScene, row: int, view: View, *, since:
 
 
 def legend() -> list[Patch | Line2D]:
-    """What the colours of ``draw_instant`` mean."""
+    """Returns the legend of the colours of ``draw_instant``."""
     return [
         Patch(color=_ROBOT, lw=0, label="robot"),
         Patch(color=_PERSON, lw=0, label="recorded person"),
