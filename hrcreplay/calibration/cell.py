@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
 
 from hrcreplay.calibration.registration import rigid
-from hrcreplay.errors import SettingsError, shown
+from hrcreplay.errors import shown
 from hrcreplay.geometry.polygon import ConvexPolygon
 from hrcreplay.logs.camera_checks import SOLE_M, SURE
 from hrcreplay.records import POINTS, Bools, Floats, SkeletonTrack
 from hrcreplay.store.run_folder import write_whole
-from hrcreplay.toml_file import read_toml
+from hrcreplay.toml_file import read_toml, validate
 
 _TOLERANCE = 1e-6
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
-_POSE = "4 rows of 4 numbers, a rotation and a place [m], last row 0 0 0 1"
+_POSE = "4 rows of 4 finite numbers, a rotation and a place [m], last row 0 0 0 1"
 _AREA = "3 or more corners [x, y] of a convex area, one after another around it [m]"
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -110,10 +110,7 @@ class Cell:
         Raises:
             SettingsError: A key or value is invalid.
         """
-        try:
-            file = _CellFile.model_validate(dict(table))
-        except ValidationError as error:
-            raise SettingsError(_first_problem(error, table, where)) from error
+        file = validate(_CellFile, dict(table), where, _RIGHT)
         base = file.T_world_base
         if isinstance(base, _Upright):
             base = pose_from_position(np.array(base.position_m), np.radians(base.yaw_deg)).tolist()
@@ -234,7 +231,7 @@ class _CellFile(BaseModel):
     notes: list[str] = []
 
 
-#: Description of a valid value by the name of the key; for a number, a finite one.
+#: Description of a valid value by the name of the key.
 _RIGHT = {
     "cameras": "a table",
     "T_world_camera": _POSE,
@@ -248,32 +245,6 @@ _RIGHT = {
     "residuals": f"tables with {', '.join(Residual.model_fields)}",
     "notes": "a list of texts",
 }
-
-
-def _first_problem(error: ValidationError, table: Mapping[str, Any], where: str) -> str:
-    problems = error.errors()
-    # An unknown key is reported first: it may be a misspelled missing one.
-    problem = next((one for one in problems if one["type"] == "extra_forbidden"), problems[0])
-    kind, loc, found = problem["type"], list(problem["loc"]), problem["input"]
-    if loc[0] in ("residuals", "notes"):
-        kind, loc, found = "value", loc[:1], table[str(loc[0])]
-    elif loc[0] == "T_world_base":
-        del loc[1]  # the tag of the variant
-    keys = [str(key) for key in loc if not isinstance(key, int)]
-    at = f"{where}: {'.'.join(keys)}"
-    right = "a table" if keys[0] == "cameras" and len(keys) == 2 else _RIGHT.get(keys[-1])
-    if kind == "extra_forbidden":
-        models: dict[str, type[BaseModel]] = {"cameras": _Camera, "T_world_base": _Upright, "watched": Watched}
-        model = models[keys[0]] if len(keys) > 1 else _CellFile
-        above = ": ".join([where, *filter(None, [".".join(keys[:-1])])])
-        return f"{above}: found {shown(keys[-1])}; would be right: {', '.join(model.model_fields)}"
-    if kind == "value_error":
-        return f"{at}: {problem['ctx']['error']}"
-    if kind == "missing" and keys[-1] == "T_world_camera":
-        return f"{where}: {'.'.join(keys[:-1])}: no T_world_camera; would be right: {right}"
-    if kind in ("float_type", "finite_number"):
-        right = "a finite number"
-    return f"{at}: found {None if kind == 'missing' else shown(found)}; would be right: {right}"
 
 
 _LEG = ("knee", "ankle", "foot")

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import Departure, LimitSet, alpha_2_bounds, alpha_3_bounds
 from hrcreplay.records import BODY, JOINTS, Floats
 from hrcreplay.store.run_folder import write_whole
-from hrcreplay.toml_file import read_toml
+from hrcreplay.toml_file import read_toml, validate
 
 _HERE = Path(__file__).parent
 NAMES = ("paper", "human", "people")
@@ -21,17 +21,19 @@ _QUANTITIES = ("position", "velocity", "acceleration")
 _COUPLED = ("ar2", "ar3", "al2", "al3")
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _PAIR = "[low, high] with low <= high"
-_ROW = f"a row with {', '.join(_QUANTITIES)}"
-_LIMB_ROW = "a row with beyond_m, residuals"
 #: Rows of departures that do not belong to a limb.
 _OF_BODY = ("horizon_s", "rise_m", "sink_m")
 #: Description of a valid value, by the key.
 _RIGHT = {
     "coupled": "true or false",
     "joints": "a table with a row for each joint",
+    **dict.fromkeys(JOINTS, f"a row with {', '.join(_QUANTITIES)}"),
+    **dict.fromkeys(_QUANTITIES, _PAIR),
     "departure": f"horizon_s, rise_m, sink_m and a row for each of {', '.join(BODY)}, or leave it out",
     "horizon_s": "[s...], above 0 and increasing",
     **dict.fromkeys(("rise_m", "sink_m"), "a number for each horizon, at least 0"),
+    **dict.fromkeys(BODY, "a row with beyond_m, residuals"),
+    **dict.fromkeys(("beyond_m", "residuals"), "a number for each horizon"),
     "provenance": "a table, or leave it out",
 }
 
@@ -57,11 +59,7 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
     known = f"name one of {', '.join(NAMES)} or a file"
     if not path.exists():
         raise SettingsError(f"{name_or_path}: no limit set (there is no such file); {known}")
-    table = read_toml(path, known)
-    try:
-        file = _LimitFile.model_validate(table).model_dump()
-    except ValidationError as error:
-        raise SettingsError(_first_problem(error, table, str(path))) from error
+    file = validate(_LimitFile, read_toml(path, known), path, _RIGHT).model_dump()
     rows, coupled = file["joints"], file["coupled"]
     rows["z"] = rows["z"] or read_toml(_HERE / "human.toml", "")["joints"]["z"]
     bounds = np.array([_bounds(rows[joint], joint, f"{path}: joints.{joint}", coupled) for joint in JOINTS])
@@ -77,13 +75,15 @@ def _departure(table: dict[str, Any] | None, where: str) -> Departure | None:
     horizon_s = np.array(table["horizon_s"])
     grows = len(horizon_s) > 0 and (np.diff(horizon_s, prepend=0.0) > 0.0).all()
     if not (grows and np.isfinite(horizon_s).all()):
-        raise SettingsError(f"{where}: departure.horizon_s: found {table['horizon_s']}; write {_RIGHT['horizon_s']}")
+        raise SettingsError(
+            f"{where}: departure.horizon_s: found {table['horizon_s']}; would be right: {_RIGHT['horizon_s']}"
+        )
     rows = {f"{limb}.{name}": table[limb][name] for limb in BODY for name in ("beyond_m", "residuals")}
     for name, row in {**rows, "rise_m": table["rise_m"], "sink_m": table["sink_m"]}.items():
         if len(row) != len(horizon_s) or not (np.array(row) >= 0.0).all() or not np.isfinite(row).all():
             raise SettingsError(
-                f"{where}: departure.{name}: found {row}; write {len(horizon_s)} numbers, one for each horizon, at "
-                "least 0"
+                f"{where}: departure.{name}: found {row}; would be right: {len(horizon_s)} numbers, one for each "
+                "horizon, at least 0"
             )
     beyond, residuals = (np.array([table[limb][name] for limb in BODY]) for name in ("beyond_m", "residuals"))
     return Departure(horizon_s, beyond, residuals, np.array(table["rise_m"]), np.array(table["sink_m"]))
@@ -177,24 +177,6 @@ _LimitFile = create_model(
 )
 
 
-def _first_problem(error: ValidationError, table: dict[str, Any], where: str) -> str:
-    problems = error.errors()
-    # An unknown key is reported first: it may be a misspelled missing one.
-    problem = next((one for one in problems if one["type"] == "extra_forbidden"), problems[0])
-    keys = [str(key) for key in problem["loc"][:3]]  # a bound in a pair is reported with its pair
-    if problem["type"] == "extra_forbidden":
-        of_limbs = ((*_OF_BODY, *BODY), tuple(_LimbRow.model_fields))
-        rows = of_limbs if keys[0] == "departure" else (JOINTS, _QUANTITIES)
-        known = (tuple(_LimitFile.model_fields), *rows)[len(keys) - 1]
-        above = ".".join(keys[:-1])
-        return f"{where}{above and ': '}{above}: unknown key {keys[-1]!r}; known here: {', '.join(known)}"
-    found: Any = table
-    for key in keys:
-        found = found.get(key)
-    row, pair = (_LIMB_ROW, "a number for each horizon") if keys[0] == "departure" else (_ROW, _PAIR)
-    return f"{where}: {'.'.join(keys)}: found {found!r}; write {_RIGHT.get(keys[-1], pair if len(keys) > 2 else row)}"
-
-
 def _bounds(row: dict[str, Any], joint: str, where: str, coupled: bool) -> list[list[float]]:
     """Returns the three pairs of bounds of one joint; positions from Eq. (34) are set in ``_enclose``."""
     enclosed = coupled and joint in _COUPLED
@@ -202,10 +184,10 @@ def _bounds(row: dict[str, Any], joint: str, where: str, coupled: bool) -> list[
     if enclosed and position is not None:
         raise SettingsError(f"{where}: found a position; Eq. (34) gives it where coupled = true, leave it out")
     if not enclosed and position is None:
-        raise SettingsError(f"{where}.position: found None; write {_PAIR}")
+        raise SettingsError(f"{where}.position: found None; would be right: {_PAIR}")
     pairs = [position or [0.0, 0.0], row["velocity"], row["acceleration"]]
     if joint == "theta" and pairs[0] != [-np.inf, np.inf]:
-        raise SettingsError(f"{where}.position: found {pairs[0]}; heading has no stop, write [-inf, inf]")
+        raise SettingsError(f"{where}.position: found {pairs[0]}; heading has no stop, so [-inf, inf] would be right")
     if joint not in JOINTS[:3] and not np.isfinite(pairs[0]).all():
         raise SettingsError(f"{where}.position: found {pairs[0]}; an angle or a height of the body needs finite bounds")
     if not np.isfinite(pairs[1:]).all():

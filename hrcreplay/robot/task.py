@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from hrcreplay.errors import SettingsError, shown
 from hrcreplay.geometry import small_matrices
 from hrcreplay.geometry.small_matrices import apply, multiply
 from hrcreplay.geometry.vectors import dot_n, norm_n, turn_between
@@ -30,6 +29,7 @@ from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import Plan
+from hrcreplay.toml_file import validate
 
 #: The longest cycle of a task [s].
 CYCLE_S = 7200.0
@@ -131,31 +131,7 @@ def parse_task(table: dict[str, Any], where: str = "task") -> Task:
     Raises:
         SettingsError: A key is unknown or a value is invalid; the message names the waypoint.
     """
-    try:
-        return Task.model_validate(table)
-    except ValidationError as error:
-        raise SettingsError(f"{where}: {_first_problem(error)}") from error
-
-
-def _first_problem(error: ValidationError) -> str:
-    problem = error.errors()[0]
-    at, key = _place(problem["loc"])
-    if problem["type"] == "extra_forbidden":
-        known = Waypoint.model_fields if at else Task.model_fields
-        return f"{at}unknown key {shown(key)}; known here: {', '.join(known)}"
-    if problem["type"] == "missing":
-        return f"{at}{key} is missing; the task needs it"
-    if problem["type"] == "value_error":
-        return f"{at}{problem['ctx']['error']}"
-    wanted = problem["msg"].removeprefix("Input ").replace("valid tuple", "list").replace("valid dictionary", "table")
-    return f"{at}{key}: found {shown(problem['input'])}; it {wanted}"
-
-
-def _place(loc: tuple[int | str, ...]) -> tuple[str, str]:
-    """'waypoint 3: ' (or an empty text) and the key after it."""
-    if len(loc) > 1 and loc[0] == "waypoints":
-        return f"waypoint {int(loc[1]) + 1}: ", ".".join(str(part) for part in loc[2:]) or "waypoint"
-    return "", ".".join(str(part) for part in loc)
+    return validate(Task, table, where)
 
 
 def _listed(names: list[str]) -> str:

@@ -13,11 +13,11 @@ from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
-from hrcreplay.errors import SettingRenamed, SettingsError, shown
+from hrcreplay.errors import SettingRenamed, SettingsError
 from hrcreplay.settings.sections import Settings, with_new_names
-from hrcreplay.toml_file import read_toml
+from hrcreplay.toml_file import read_toml, validate
 
 __all__ = ["SHIPPED", "Settings", "as_overrides", "load_settings"]
 
@@ -67,10 +67,7 @@ def load_settings(
     _merge(table, given or {})
     for override in overrides:
         _merge(table, _renamed(_override(override), f"--set {override}"))
-    try:
-        return Settings.model_validate(table)
-    except ValidationError as error:
-        raise SettingsError(f"{where}: {_first_problem(error)}") from error
+    return validate(Settings, table, where)
 
 
 def _renamed(table: dict[str, Any], where: str) -> dict[str, Any]:
@@ -155,18 +152,3 @@ def _override(text: str) -> dict[str, Any]:
     except RecursionError as error:
         raise SettingsError(f"--set {key}=...: nested too deep; at most some hundred brackets are read") from error
     return {parts[0]: {parts[1]: parsed}}
-
-
-def _first_problem(error: ValidationError) -> str:
-    problem = error.errors()[0]
-    loc = [str(part) for part in problem["loc"]]
-    if problem["type"] == "extra_forbidden":
-        known = Settings.model_fields if len(loc) == 1 else _section_keys(loc[0])
-        return f"unknown setting {shown('.'.join(loc))}; known here: {', '.join(known)}"
-    return f"{'.'.join(loc)}: found {shown(problem['input'])}; {problem['msg'][0].lower()}{problem['msg'][1:]}"
-
-
-def _section_keys(name: str) -> list[str]:
-    field = Settings.model_fields.get(name)
-    section = field.annotation if field else None
-    return list(section.model_fields) if isinstance(section, type) and issubclass(section, BaseModel) else []

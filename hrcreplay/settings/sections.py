@@ -103,7 +103,7 @@ class Logs(Section):
         """Rejects a joint name that is given for two axes."""
         twice = [name for name in self.joint_names if self.joint_names.count(name) > 1]
         if twice:
-            raise ValueError(f"logs.joint_names: {twice[0]!r} is given for two axes; name each joint once")
+            raise ValueError(f"found {twice[0]!r} for two axes in joint_names; name each joint once")
 
 
 class Fusion(Section):

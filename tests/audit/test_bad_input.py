@@ -59,7 +59,7 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
         f"{command} with min over max": (
             (command, DEMO, "--limits", "crossed.toml", *SHORT),
             2,
-            "crossed.toml: joints.ar1.velocity: found [2.0, 1.0]; write [low, high] with low <= high",
+            "crossed.toml: joints.ar1.velocity: found [2.0, 1.0]; would be right: [low, high] with low <= high",
         )
         for command in ("audit", "predict", "plan", "report")
     },

@@ -116,7 +116,7 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
     "unknown setting": (
         ("fuse", DEMO, "--set", "fusion.rate=3"),
         2,
-        "unknown setting 'fusion.rate'; known here: rate_hz",
+        "fusion: unknown key 'rate'; known here: rate_hz",
     ),
     "unknown limit set": (("fuse", DEMO, "--set", "limits.tracking=robot"), 2, "robot: no limit set"),
     "settings file missing": (("fuse", DEMO, "--config", "none.toml"), 2, "none.toml: cannot be read"),

@@ -85,7 +85,7 @@ def test_a_file_of_the_users_own(tmp_path: Path) -> None:
             "'speed' | coupled, joints, departure, provenance",
         ),
         ("human", "\nar4 ", "\nar5 ", "joints | 'ar5' | x, y, theta"),
-        ("human", "\nar4 ", "\n#ar4 ", "joints.ar4 | None"),
+        ("human", "\nar4 ", "\n#ar4 ", "joints.ar4 | missing | position, velocity"),
         ("human", "{ position = [-inf, inf], velocity = [-1.3, 2.5]", "{ speed = 1", "joints.x | 'speed'"),
         ("human", "velocity = [-1.3, 2.5]", "velocity = [2.5, -1.3]", "joints.x.velocity | [2.5, -1.3]"),
         ("human", "velocity = [-1.3, 2.5]", "velocity = [2.5]", "joints.x.velocity | [2.5]"),

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.egm.codec import ARM_JOINTS, MOST_JOINTS, Mci, Motors, Rapid, RobotPacket, encode_robot
@@ -37,6 +36,7 @@ from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.task import Reference
 from hrcreplay.settings.load import Settings, load_settings
 from hrcreplay.settings.sections import with_new_names
+from hrcreplay.toml_file import validate
 from hrcreplay.version import __version__
 
 
@@ -213,12 +213,8 @@ def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfi
             f"{log}: its record has format {found}, and this version of hrcreplay reads format {codec.FORMAT}; "
             "would be right: the version that recorded the session"
         )
-    try:
-        settings = Settings.model_validate(with_new_names(start["settings"])[0])
-    except ValidationError as error:
-        raise SettingsError(
-            f"{log}: recorded by {start.get('hrcreplay')}, whose settings are not ours: {error}"
-        ) from error
+    recorded, _ = with_new_names(start["settings"])
+    settings = validate(Settings, recorded, f"{log}: its settings, by hrcreplay {start.get('hrcreplay')}")
     return RunConfig(
         command="live",
         log=log,

@@ -27,7 +27,6 @@ from threading import Thread
 from typing import Any, NoReturn, Protocol
 
 from google.protobuf.message import DecodeError
-from pydantic import ValidationError
 
 from hrcreplay.errors import HrcReplayError, LogError, SettingsError
 from hrcreplay.live.person.envelope import SHORTEST_SECRET, Opener, UnverifiedError
@@ -41,8 +40,10 @@ from hrcreplay.logs.decoders import GenericDecoder, OwnDecoder, TfDecoder
 from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder
 from hrcreplay.logs.messages import Message, RawSkeleton, SkeletonDecoder, Topic, Undecodable
 from hrcreplay.settings.sections import Decoder, Zenoh, ZenohKey
+from hrcreplay.toml_file import validate
 
 _OWN = "hrcreplay.Skeleton"
+_SECTION = "live.zenoh"  # start of error messages about its settings
 _RMW_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")  # in the keys of rmw_zenoh: <domain>/<topic>/<type>/<hash>
 _KNOWN = (MARKER_TYPE, *decoders.TF_TYPES)
 _AHEAD_NS = 10**9  # after a capture further in the future, all following captures would look late
@@ -195,7 +196,7 @@ class ZenohSource:
 
     def _begin(self) -> None:
         try:
-            wanted = _validated(self._settings)
+            wanted = validate(Zenoh, self._settings, _SECTION)
             secret = None if wanted.secret is None else _secret(wanted.secret)
             session = open_session(self._settings)
             self._open.append(session)
@@ -236,7 +237,7 @@ def open_session(settings: Mapping[str, Any]) -> Any:
         raise SettingsError(
             "live.zenoh: eclipse-zenoh is not installed; would be right: pip install 'hrcreplay[zenoh]'"
         ) from error
-    wanted = _validated(settings)
+    wanted = validate(Zenoh, settings, _SECTION)
     try:
         if wanted.config is not None:
             return zenoh.open(zenoh.Config.from_file(str(wanted.config)))
@@ -256,18 +257,6 @@ def open_session(settings: Mapping[str, Any]) -> Any:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise SettingsError(f"live.zenoh: no session ({error}); check mode, connect and listen") from error
-
-
-def _validated(settings: Mapping[str, Any]) -> Zenoh:
-    """Validates the settings of the section; raises SettingsError."""
-    try:
-        return Zenoh.model_validate(settings)
-    except ValidationError as error:
-        found = error.errors()[0]
-        where = ".".join(map(str, found["loc"])) or "config"
-        raise SettingsError(
-            f"live.zenoh: no session ({where}: {found['msg']}); check mode, connect and listen"
-        ) from error
 
 
 def _secret(path: Path) -> bytes:

@@ -280,10 +280,10 @@ def check(sent: list[Any]) -> None:
     [
         ({"keys": {"left": {"key": "no//key"}}}, b"failed live.zenoh.keys.left: 'no//key' is no key expression"),
         ({"listen": ["tcp/somewhere"]}, b"failed live.zenoh: no session"),
-        ({"mode": "pear"}, b"failed live.zenoh: no session"),
+        ({"mode": "pear"}, b"failed live.zenoh: mode: found 'pear'"),
         ({"secret": "/nowhere"}, b"failed live.zenoh.secret: /nowhere cannot be read"),
         ({"secret": "/dev/null"}, b"failed live.zenoh.secret: /dev/null holds 0 bytes"),
-        ({"config": "/nowhere"}, b"failed live.zenoh: no session (config:"),
+        ({"config": "/nowhere"}, b"failed live.zenoh: config has mode, connect, listen and scouting in it"),
         ({"config": "/nowhere", "listen": []}, b"failed live.zenoh.config: /nowhere cannot be used"),
     ],
 )

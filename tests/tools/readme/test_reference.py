@@ -29,7 +29,7 @@ SEVERAL = {
 }
 
 #: Words of lines that a function puts together before they are raised.
-_PUT_TOGETHER = ("unknown setting", "no skeleton topic")
+_PUT_TOGETHER = ("unknown key", "no skeleton topic")
 
 
 def _rows(heading: str) -> list[list[str]]:
