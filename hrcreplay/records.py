@@ -81,6 +81,33 @@ MIRROR = tuple(
 )
 
 
+class Neighbours(NamedTuple):
+    """The two samples around each of m instants; the same one twice if an instant is that of a sample."""
+
+    before: Ints  #: (m,) row of the earlier one
+    after: Ints  #: (m,) row of the later one
+    share: Floats  #: (m,) of the way from the earlier to the later one, 0 to 1
+    known: Bools  #: (m,) False: outside the samples' span or in a gap; the rows are then no neighbours
+
+
+def find_neighbours(t_ns: Ints, at_ns: Ints, gap_s: float | None = None) -> Neighbours:
+    """Finds the samples to interpolate between.
+
+    Args:
+        t_ns: (n,) instants of the samples, increasing, at least one [ns].
+        at_ns: (m,) requested instants [ns].
+        gap_s: Maximum time between two samples for interpolation; None: no maximum [s].
+    """
+    after = np.clip(np.searchsorted(t_ns, at_ns), 0, len(t_ns) - 1)
+    before = np.where(t_ns[after] > at_ns, np.maximum(after - 1, 0), after)
+    step_ns = t_ns[after] - t_ns[before]
+    known: Bools = np.asarray((t_ns[before] <= at_ns) & (at_ns <= t_ns[after]))
+    if gap_s is not None:
+        known &= step_ns <= round(gap_s * 1e9)
+    share = np.where(known, (at_ns - t_ns[before]) / np.maximum(step_ns, 1), 0.0)
+    return Neighbours(before, after, share, known)
+
+
 def _protect(record: Any) -> None:
     """Replaces the arrays of a new record by read-only views."""
     own = vars(record)

@@ -6,7 +6,7 @@ import numpy as np
 
 from hrcreplay.evaluation.recorded_person import LIMB_POINTS, Recording
 from hrcreplay.human.model import SHOWN_BY
-from hrcreplay.records import POINTS, Floats, Ints
+from hrcreplay.records import POINTS, Floats, Ints, find_neighbours
 from hrcreplay.reporting.metrics.series import difference
 
 #: Distance of a limb's end from its first position that counts as a movement [m], and number of sightings whose median
@@ -28,9 +28,9 @@ def first_movements_ns(recording: Recording) -> dict[str, int | None]:
     return found
 
 
-#: Time difference for recorded velocities [ns], maximum gap between their recorded joints [ns], and maximum time since
+#: Time difference for recorded velocities [ns], maximum gap between their recorded joints [s], and maximum time since
 #: a camera saw the limb [s].
-_ACROSS_NS, _GAP_NS, _SEEN_S = 40_000_000, 100_000_000, 0.25
+_ACROSS_NS, _GAP_S, _SEEN_S = 40_000_000, 0.1, 0.25
 
 
 def errors_in_deviations(recording: Recording, ticks: Ints) -> Floats:
@@ -46,11 +46,7 @@ def errors_in_deviations(recording: Recording, ticks: Ints) -> Floats:
     t_ns, joints, states = recording.joints_t_ns, recording.joints, recording.states.rows(ticks)
 
     def recorded(at_ns: Ints) -> Floats:
-        before = np.clip(np.searchsorted(t_ns, at_ns, side="right") - 1, 0, max(0, len(t_ns) - 2))
-        after = np.minimum(before + 1, len(t_ns) - 1)
-        apart = np.maximum(t_ns[after] - t_ns[before], 1)
-        share = (at_ns - t_ns[before]) / apart
-        known = (share >= 0.0) & (share <= 1.0) & (apart <= _GAP_NS)
+        before, after, share, known = find_neighbours(t_ns, at_ns, _GAP_S)
         between = joints[before] + share[:, None] * difference(joints[after], joints[before])
         return np.where(known[:, None], between, np.nan)
 

@@ -20,7 +20,17 @@ from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline.assembly import FusionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.stages import StretchSmoother, batches
-from hrcreplay.records import LENGTHS, POINTS, Bools, CameraFrames, Floats, HumanStates, Ints, Measurements
+from hrcreplay.records import (
+    LENGTHS,
+    POINTS,
+    Bools,
+    CameraFrames,
+    Floats,
+    HumanStates,
+    Ints,
+    Measurements,
+    find_neighbours,
+)
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
 
@@ -130,15 +140,12 @@ def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float, hold_s:
     """
     if not len(t_ns):
         return np.full((len(at_ns), *points_m.shape[1:]), np.nan)
-    right = np.clip(np.searchsorted(t_ns, at_ns, side="left"), 0, len(t_ns) - 1)
-    left = np.where(t_ns[right] > at_ns, np.maximum(right - 1, 0), right)
-    step_ns = t_ns[right] - t_ns[left]
-    inside: Bools = np.asarray((at_ns >= t_ns[left]) & (at_ns <= t_ns[right]) & (step_ns * 1e-9 <= gap_s))
-    share = np.where(step_ns > 0, (at_ns - t_ns[left]) / np.maximum(step_ns, 1), 0.0)[:, None, None]
-    found = np.where(share > 0.0, (1.0 - share) * points_m[left] + share * points_m[right], points_m[left])
-    found[~inside] = np.nan
+    before, after, share, known = find_neighbours(t_ns, at_ns, gap_s)
+    share = share[:, None, None]
+    found = np.where(share > 0.0, (1.0 - share) * points_m[before] + share * points_m[after], points_m[before])
+    found[~known] = np.nan
     if hold_s > 0.0:
-        for side in (left, right):
+        for side in (before, after):
             near = np.abs(at_ns - t_ns[side]) * 1e-9 <= hold_s
             found = np.where(np.isnan(found) & near[:, None, None], points_m[side], found)
     return found

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hrcreplay.logs.plausibility import BodyPosture
-from hrcreplay.records import BODY, MIRROR, POINTS, Bools, Floats, Ints, SkeletonTrack
+from hrcreplay.records import BODY, MIRROR, POINTS, Bools, Floats, Ints, SkeletonTrack, find_neighbours
 
 #: The end points of a limb: each point belongs to one limb, so each is compared once.
 LIMB_POINTS = {
@@ -85,14 +85,12 @@ class BodyInWorld:
 
 def interpolate(track: SkeletonTrack, t_ns: Ints) -> Floats:
     """Interpolates (n, 20, 3) points of a track linearly; NaN across gaps and if a neighbour is missing."""
-    if len(track) < 2:
+    if not len(track):
         return np.full((len(t_ns), len(POINTS), 3), np.nan)
-    after = np.clip(np.searchsorted(track.t_ns, t_ns), 1, len(track) - 1)
-    gap_ns = track.t_ns[after] - track.t_ns[after - 1]
-    share = ((t_ns - track.t_ns[after - 1]) / np.maximum(gap_ns, 1))[:, None, None]
-    points = (1 - share) * track.points_m[after - 1] + share * track.points_m[after]
-    seen = (track.confidence[after - 1] > 0) & (track.confidence[after] > 0)
-    seen &= ((t_ns >= track.t_ns[0]) & (t_ns <= track.t_ns[-1]) & (gap_ns <= _GAP_NS))[:, None]
+    before, after, share, known = find_neighbours(track.t_ns, t_ns, _GAP_NS * 1e-9)
+    share = share[:, None, None]
+    points = (1 - share) * track.points_m[before] + share * track.points_m[after]
+    seen = (track.confidence[before] > 0) & (track.confidence[after] > 0) & known[:, None]
     return np.where(seen[..., None], points, np.nan)
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from hrcreplay.human.model import nearest
-from hrcreplay.records import JOINTS, Bools, Floats, Ints
+from hrcreplay.records import JOINTS, Bools, Floats, Ints, find_neighbours
 from hrcreplay.store.run_folder import Run
 
 Metric = dict[str, Any]
@@ -93,16 +93,11 @@ def interpolate(t_ns: Ints, values: Floats, at_ns: Ints, *, angles: bool) -> Flo
         (m, 13); NaN outside the samples' span and where one of the two samples is NaN. An instant equal to that of a
         sample gets that sample, for any neighbours.
     """
-    if len(t_ns) < 2 or not len(at_ns):
+    if not len(t_ns):
         return np.full((len(at_ns), values.shape[1]), np.nan)
-    left = np.clip(np.searchsorted(t_ns, at_ns, side="right") - 1, 0, len(t_ns) - 2)
-    step = t_ns[left + 1] - t_ns[left]
-    fraction = ((at_ns - t_ns[left]) / step)[:, None]
-    change = difference(values[left + 1], values[left]) if angles else values[left + 1] - values[left]
-    found = values[left] + fraction * change
-    found = np.where(fraction == 0.0, values[left], np.where(fraction == 1.0, values[left + 1], found))
-    outside = (at_ns < t_ns[0]) | (at_ns > t_ns[-1])
-    return np.where(outside[:, None], np.nan, found)
+    before, after, share, known = find_neighbours(t_ns, at_ns)
+    change = difference(values[after], values[before]) if angles else values[after] - values[before]
+    return np.where(known[:, None], values[before] + share[:, None] * change, np.nan)
 
 
 def central_differences(t_ns: Ints, values: Floats) -> Floats:
