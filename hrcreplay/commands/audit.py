@@ -48,6 +48,7 @@ from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import print_note
+from hrcreplay.reporting.tables import percent
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
@@ -126,8 +127,8 @@ def _summary(found: dict[str, Any]) -> list[str]:
         whole = log["methods"][method]["all"]
         share, room, deepest = whole["covered_share"], whole["union_m3"]["value"], whole["escape_max_m"]
         words = f"audit: {log['log']}: {method}, {log['limits']}: every whole limb that was checked "
-        words += f"({checked_scope(log, method)}) inside in {100.0 * share['value']:.1f} % of "
-        words += f"{share['samples']:,} ticks (its points alone: {100.0 * whole['points_share']['value']:.1f} %)"
+        words += f"({checked_scope(log, method)}) inside in {percent(share)} of "
+        words += f"{share['samples']:,} ticks (its points alone: {percent(whole['points_share'])})"
         words += "" if room is None else f"; union {room:.1f} m3"
         lines.append(words + ("" if deepest is None else f"; deepest escape {1e3 * deepest:.0f} mm"))
     return lines

@@ -24,7 +24,7 @@ from hrcreplay.reporting.figures import drawing, planning
 from hrcreplay.reporting.metrics.contact import PERSONS, add_contact
 from hrcreplay.reporting.metrics.planning import PAPER, add_plan, is_moving
 from hrcreplay.reporting.metrics.series import Metric, MetricTable, times, true_runs
-from hrcreplay.reporting.tables import PageTable
+from hrcreplay.reporting.tables import PageTable, share_text
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
 
@@ -343,7 +343,10 @@ _COLUMNS = (
 
 def _cell(value: float | None, factor: int, decimals: int) -> str:
     """Formats a figure for readers."""
-    return "\u2013" if value is None else f"{factor * value:,.{decimals}f}".replace("-", "\u2212")
+    if value is None:
+        return "\u2013"
+    text = share_text(value, decimals).removesuffix(" %") if factor == 100 else f"{factor * value:,.{decimals}f}"
+    return text.replace("-", "\u2212")
 
 
 def stillness(row: Mapping[str, Any], logs: int) -> str:
@@ -396,7 +399,7 @@ def _note(found: Mapping[str, Any]) -> str:
     known, ticks = (
         sum(next(iter(log["methods"].values()))[name] for log in found["logs"]) for name in ("known_ticks", "ticks")
     )
-    qp, scaling = (f"{100 * found['paper'][name]['value']:.2f} %" for name in ("qp", "scaling"))
+    qp, scaling = (share_text(found["paper"][name]["value"], 2) for name in ("qp", "scaling"))
     outside, other = (
         sum(row[f"touch_{of}_ticks"] or 0 for row in found["total"].values()) for of in ("outside", "other")
     )

@@ -13,7 +13,7 @@ from hrcreplay.records import BODY
 from hrcreplay.reporting import verdict
 from hrcreplay.reporting.metrics.fusion import cameras
 from hrcreplay.reporting.metrics.series import Metric
-from hrcreplay.reporting.tables import limb_names_text, percent, reason_text, text_of
+from hrcreplay.reporting.tables import counted, limb_names_text, percent, reason_text, share_text, text_of
 from hrcreplay.reporting.verdict import unmeasured
 from hrcreplay.settings.sections import setting, with_new_names
 from hrcreplay.store.run_folder import Run
@@ -84,7 +84,7 @@ def _with_unmeasured(safe: Answer, metrics: Mapping[str, Metric]) -> Answer:
         return safe
     parts = [f"the {limb_names_text(never)}: never measured"] if never else []
     parts += [
-        f"the {limb_names_text([limb])}: not measured at {100 * share:.0f} % of the ticks"
+        f"the {limb_names_text([limb])}: not measured at {share_text(share, 0)} of the ticks"
         for limb, share in mostly.items()
     ]
     short = f"Not known of {'; '.join(parts)}."
@@ -171,12 +171,12 @@ def _by_inequality(metrics: Mapping[str, Metric]) -> tuple[str, str]:
         short = "By the paper's criterion at every moving tick, against what was predicted."
         words = f"At each of the {moving} ticks (of {ticks}) at which the robot moved, {kept}."
     else:
-        share = 100 * late / metrics["plan_moving_ticks"]["value"]
+        share = share_text(late / metrics["plan_moving_ticks"]["value"], 2)
         short = (
             f"Not at every tick: at {text_of(metrics['plan_braking_moving_ticks'])} of {moving}, it was still braking."
         )
         words = (
-            f"At {share:.2f} % of the ticks at which the robot moved it was still braking, as hard as its joints can. "
+            f"At {share} of the ticks at which the robot moved it was still braking, as hard as its joints can. "
             f"At the other ticks, {kept}."
         )
     return short, words
@@ -215,13 +215,13 @@ def _braked(metrics: Mapping[str, Metric]) -> str:
     mark, stood = "plan_braking_ticks_", "plan_standing_share_"
     held = [(m["value"], name.removeprefix(stood)) for name, m in metrics.items() if name.startswith(stood)]
     why = [
-        f"{100 * share:.1f} % of the ticks {reason_text(slug.replace('_', ' '))}"
+        f"{share_text(share)} of the ticks {reason_text(slug.replace('_', ' '))}"
         for share, slug in sorted(held, key=lambda part: (-part[0], part[1]))
     ]
     rest = f" Why it stood at rest: at {'; at '.join(why)}." if why else ""
     found = [(m["value"], name.removeprefix(mark)) for name, m in metrics.items() if name.startswith(mark)]
     parts = [
-        f"at {text_of(metrics[mark + slug])} tick{'' if count == 1 else 's'} {reason_text(slug.replace('_', ' '))}"
+        f"at {counted(count, 'tick')} {reason_text(slug.replace('_', ' '))}"
         for count, slug in sorted(found, key=lambda part: (-part[0], part[1]))
     ]
     return ((f"Why it braked, moving or standing: {'; '.join(parts)}." if parts else "") + rest).strip()
@@ -275,7 +275,7 @@ def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
         )
     return (
         Card(
-            _floor_percent(1 - late / ticks) if ticks else "\u2013",
+            share_text(1 - late / ticks, 2) if ticks else "\u2013",
             kept,
             f"{text_of(metrics['plan_braking_moving_ticks'])} of {text_of(metrics['plan_ticks'])} ticks still braking"
             + (f"; {never} never measured" if never else ""),
@@ -298,11 +298,6 @@ def cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
             (f"{stood}; " if stood else "") + "the paper's own: 30.06 %, scaling 86.44 %",
         ),
     )
-
-
-def _floor_percent(share: float) -> str:
-    """Formats a share rounded down, so that 100 % means all."""
-    return f"{int(share * 10000) / 100:.2f} %" if share < 1 else "100 %"
 
 
 def _human_cards(run: Run, metrics: Mapping[str, Metric]) -> tuple[Card, ...]:
@@ -362,7 +357,7 @@ def _fuse(run: Run, metrics: Metrics) -> str:
     known = metrics["person_known_share"]["value"]
     limbs = {limb: metrics[f"limb_{limb}_known_share"]["value"] for limb in BODY}
     less = [
-        f"{limb} {100 * share:.1f} %" for limb, share in limbs.items() if share is not None and share < known - 0.005
+        f"{limb} {share_text(share)}" for limb, share in limbs.items() if share is not None and share < known - 0.005
     ]
     of_limbs = f" ({', '.join(less)})" if less else ""
     frames = ", ".join(f"{name} {text_of(metrics[f'camera_{name}_frames'])}" for name in cameras(run))

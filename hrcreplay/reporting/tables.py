@@ -211,7 +211,19 @@ def percent(metric: Metric | None, decimals: int = 1) -> str:
     """Formats a share as percent; a dash if it does not apply."""
     if metric is None or metric["value"] is None:
         return "\u2013"
-    return f"{100 * metric['value']:.{decimals}f} %"
+    return share_text(metric["value"], decimals)
+
+
+def share_text(share: float, decimals: int = 1) -> str:
+    """Formats a share as percent. Only all is written as 100 and only none as 0: 0.99997 becomes 99.9 %."""
+    least = 10.0**-decimals
+    value = min(100.0 - least, max(least, 100 * share)) if 0.0 < share < 1.0 else 100 * share
+    return f"{value:.{decimals}f} %"
+
+
+def counted(number: int, what: str) -> str:
+    """Formats a number with its noun: "1 tick", "1 200 ticks"."""
+    return f"{number:,} {what}{'' if number == 1 else 's'}".replace(",", "\u202f")
 
 
 def compare(

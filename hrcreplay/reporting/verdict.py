@@ -12,7 +12,7 @@ from hrcreplay.records import LIMBS
 from hrcreplay.reporting.metrics.contact import PERSONS, SHOWN_PARTS, method_prefixes
 from hrcreplay.reporting.metrics.fusion import add_limbs
 from hrcreplay.reporting.metrics.series import Metric, MetricTable
-from hrcreplay.reporting.tables import PageTable, limb_names_text, part_name_text, percent, text_of
+from hrcreplay.reporting.tables import PageTable, counted, limb_names_text, part_name_text, percent, share_text, text_of
 from hrcreplay.settings.sections import setting, with_new_names
 from hrcreplay.store.run_folder import Run
 
@@ -21,7 +21,6 @@ Metrics = Mapping[str, Metric]
 TRUTH = "ground truth"
 #: Minimum share of the time at which a limb counts as always seen.
 _WHOLE = 0.995
-_HAD = "Had this controller been running, "
 _COLUMNS = (
     "",
     "touched while moving",
@@ -52,17 +51,17 @@ def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
     if run.motion is None or metrics["contact_person"]["value"] is None:
         return None
     return ContactSummary(
-        (_contact_in_short(metrics), _cost_in_short(run, metrics)),
+        (_contact(metrics), _cost_in_short(run, metrics)),
         _speeds(run, metrics),
         scope(metrics),
         _held(metrics),
-        (_touched(metrics), _cost(run, metrics)),
+        (_contact(metrics, detailed=True), _cost(run, metrics)),
         _table(run, metrics),
     )
 
 
-def _contact_in_short(metrics: Metrics) -> str:
-    """States if the robot would have touched a person, at the ticks at which one is known."""
+def _contact(metrics: Metrics, *, detailed: bool = False) -> str:
+    """States if the robot would have touched a person, at the ticks at which one is known; detailed: also where."""
     touch, near = metrics["plan_touch_moving_ticks"]["value"], metrics["plan_body_distance_min_moving_m"]["value"]
     if touch is None:
         return "It is not known whether the robot would have touched anybody: the recording shows nobody."
@@ -70,12 +69,20 @@ def _contact_in_short(metrics: Metrics) -> str:
         speed = text_of(metrics["plan_touch_contact_speed_max_m_per_s"])
         seconds = text_of(metrics["plan_touch_moving_s"])
         words = f"With this controller the moving robot would have touched {_whom(metrics)}: {seconds}, up to {speed}"
+        if detailed:
+            words += f"; the deepest contact was of its {_pair(metrics)}, {_when(metrics)}{_fault(metrics)}"
     elif near is None:
         words = "With this controller the robot would not have moved while anybody was known to be there"
     else:
+        kept = f"it kept {_centimetres(near)} away or more"
+        if detailed:
+            nearest = text_of(metrics["plan_body_distance_min_moving_m"])
+            speed = text_of(metrics["plan_body_distance_min_moving_contact_speed_m_per_s"])
+            kept = f"the smallest distance was {nearest}, between its {_pair(metrics)}, {_when(metrics)}"
+            kept += f"; that link then moved at {speed}"
         words = (
             f"With this controller{_as_far_as(metrics)} the moving robot would not have touched anybody "
-            f"{_at_known_ticks(metrics)}: it kept {_centimetres(near)} away or more"
+            f"{_at_known_ticks(metrics)}: {kept}"
         )
     return f"{words}.{_at_rest(metrics)}"
 
@@ -94,7 +101,7 @@ def _whom(metrics: Metrics, prefix: str = "plan") -> str:
 
 
 def _count(ticks: int) -> str:
-    return f"{ticks:,} tick{'' if ticks == 1 else 's'}".replace(",", "\u202f")
+    return counted(ticks, "tick")
 
 
 def _at_known_ticks(metrics: Metrics) -> str:
@@ -145,10 +152,9 @@ def scope(metrics: Metrics) -> tuple[str, ...]:
     others = metrics["others_frames"]["value"]
     people = "One person is planned for"
     if others:
-        frames = f"{others:,} frame{'' if others == 1 else 's'}".replace(",", "\u202f")
         people += (
-            f"; {frames} show at least one other body, which counts for contact, but the robot did not react to it "
-            "and there was no prediction for it"
+            f"; {counted(others, 'frame')} show at least one other body, which counts for contact, but the robot did "
+            "not react to it and there was no prediction for it"
         )
     gaps_s, programme = metrics["programme_gaps_s"]["value"], []
     if gaps_s:
@@ -172,10 +178,9 @@ def _watched(metrics: Metrics) -> list[str]:
         "only on this statement"
     )
     if refuting:
-        frames = f"{refuting:,} frame{'' if refuting == 1 else 's'}".replace(",", "\u202f")
         words += (
-            f". The recording contradicts it: {frames} show a person deeper inside than people can walk since all "
-            "cameras showed the area without people"
+            f". The recording contradicts it: {counted(refuting, 'frame')} show a person deeper inside than people can "
+            "walk since all cameras showed the area without people"
         )
     return [f"{words}."]
 
@@ -189,7 +194,7 @@ def unseen_limbs(metrics: Metrics) -> list[str]:
         found |= {f"the {part_name_text(limb)}": 0.0 for limb in never}
         found |= {f"the {part_name_text(limb)}": 1.0 - share for limb, share in mostly.items()}
     return [
-        f"{limb} (never seen)" if share == 0.0 else f"{limb} (not seen {100 * (1 - share):.0f} % of the time)"
+        f"{limb} (never seen)" if share == 0.0 else f"{limb} (not seen {share_text(1 - share, 0)} of the time)"
         for limb, share in found.items()
     ]
 
@@ -197,17 +202,29 @@ def unseen_limbs(metrics: Metrics) -> list[str]:
 def _cost_in_short(run: Run, metrics: Metrics) -> str:
     """Describes the cost to the task, and contacts without a controller."""
     pace = metrics["plan_progress_share"]["value"]
-    cost = "What it would have cost the task is not known"
+    cost = _UNKNOWN_COST
     if pace is not None:
-        cost = f"The task would have run at {100 * pace:.0f} % of its pace"
+        cost = f"The task would have run at {share_text(pace, 0)} of its pace"
         if 0.05 < pace < 0.95:
-            cost = f"The task would have taken {1 / pace:.1f} times as long ({100 * pace:.0f} % of its pace)"
+            cost = f"The task would have taken {1 / pace:.1f} times as long ({share_text(pace, 0)} of its pace)"
+    return f"{cost}{_without_controller(run, metrics)}."
+
+
+#: Cost of a run without a programme.
+_UNKNOWN_COST = "What it would have cost the task is not known"
+
+
+def _without_controller(run: Run, metrics: Metrics) -> str:
+    """Returns the part of a sentence on contacts of the programme without reaction; empty if it was not compared."""
     if "none" not in run.baselines or metrics["baseline_none_touch_moving_ticks"]["value"] is None:
-        return f"{cost}."
+        return ""
     if not metrics["baseline_none_touch_moving_ticks"]["value"]:
-        return f"{cost}; without a controller the robot would not have touched anybody at these ticks either."
-    speed = text_of(metrics["baseline_none_touch_contact_speed_max_m_per_s"])
-    return f"{cost}; without a controller the robot would have hit {_whom(metrics, 'baseline_none')} at up to {speed}."
+        return "; without a controller the robot would not have touched anybody at these ticks either"
+    seconds, speed = (
+        text_of(metrics[f"baseline_none_touch_{name}"]) for name in ("moving_s", "contact_speed_max_m_per_s")
+    )
+    whom = _whom(metrics, "baseline_none")
+    return f"; without a controller the robot would have touched {whom}: {seconds}, up to {speed}"
 
 
 def _held(metrics: Metrics) -> str:
@@ -216,7 +233,7 @@ def _held(metrics: Metrics) -> str:
     for prefix, until in (("volumes", "their horizon"), ("volumes_full", "the braking time")):
         checked, left = metrics[f"{prefix}_checked_ticks"]["value"], metrics[f"{prefix}_left_ticks"]["value"]
         if checked and left is not None:
-            share = f"all {checked}" if left == 0 else f"{_floor_percent(1 - left / checked)} of {checked}"
+            share = f"all {checked}" if left == 0 else f"{share_text(1 - left / checked)} of {checked}"
             parts.append(f"until {until} at {share} checked ticks")
     if not parts:
         return ""
@@ -224,37 +241,9 @@ def _held(metrics: Metrics) -> str:
     return f"The predicted volumes held every limb that was seen ({judge}) {', and '.join(parts)}."
 
 
-def _floor_percent(share: float) -> str:
-    """Formats a share rounded down, so that only a complete one is 100 %."""
-    return f"{int(1000 * share) / 10:.1f} %"
-
-
 def _centimetres(metres: float) -> str:
     """Formats a distance rounded down, so that it is never too large."""
     return f"{int(100 * metres)} cm"
-
-
-def _touched(metrics: Metrics) -> str:
-    """Returns the first sentence: contact of the moving robot with people."""
-    touch = metrics["plan_touch_moving_ticks"]["value"]
-    if touch is None:
-        return f"{_HAD}it is not known whether the robot would have touched anybody: nobody is known."
-    if touch:
-        words = (
-            f"the moving robot would have touched {_whom(metrics)} for {text_of(metrics['plan_touch_moving_s'])} in "
-            f"all, at up to {text_of(metrics['plan_touch_contact_speed_max_m_per_s'])}; the deepest contact was of its "
-            f"{_pair(metrics)} {_when(metrics)}"
-        )
-        return f"{_HAD}{words}{_fault(metrics)}."
-    if metrics["plan_body_distance_min_moving_m"]["value"] is None:
-        return f"{_HAD}the robot would not have moved while anybody was known to be there."
-    seen = "as far as the person was seen, " if unseen_limbs(metrics) else ""
-    nearest = text_of(metrics["plan_body_distance_min_moving_m"])
-    speed = text_of(metrics["plan_body_distance_min_moving_contact_speed_m_per_s"])
-    return (
-        f"{_HAD}{seen}no moving part of the robot would have touched anybody {_at_known_ticks(metrics)}: the smallest "
-        f"distance was {nearest}, between its {_pair(metrics)}, {_when(metrics)}; that link then moved at {speed}."
-    )
 
 
 def _pair(metrics: Metrics) -> str:
@@ -298,16 +287,8 @@ def _cost(run: Run, metrics: Metrics) -> str:
         words.append(f"kept {percent(metrics['plan_progress_share'])} of the programmed pace")
     if metrics["plan_stationary_share"]["value"] is not None:
         words.append(f"stood still in {percent(metrics['plan_stationary_share'])} of the time near the person")
-    cost = f"It would have {' and '.join(words)}" if words else "What it would have cost the task is not known"
-    if "none" not in run.baselines or metrics["baseline_none_touch_moving_ticks"]["value"] is None:
-        return f"{cost}."
-    touch, speed = (metrics[f"baseline_none_touch_{name}"] for name in ("moving_s", "contact_speed_max_m_per_s"))
-    if touch["value"]:
-        return (
-            f"{cost}; without any controller the robot would have touched {_whom(metrics, 'baseline_none')} for "
-            f"{text_of(touch)} in all, at up to {text_of(speed)}."
-        )
-    return f"{cost}; without any controller the robot would not have touched anybody at these ticks either."
+    cost = f"It would have {' and '.join(words)}" if words else _UNKNOWN_COST
+    return f"{cost}{_without_controller(run, metrics)}."
 
 
 def _table(run: Run, metrics: Metrics) -> PageTable:
@@ -338,7 +319,7 @@ def _signed(metric: Metric) -> str:
 
 
 def _ticks(metric: Metric) -> str:
-    return f"{text_of(metric)} tick{'' if metric['value'] == 1 else 's'}" if metric["value"] is not None else "\u2013"
+    return "\u2013" if metric["value"] is None else _count(metric["value"])
 
 
 def _note(run: Run, metrics: Metrics) -> str:
@@ -426,7 +407,7 @@ def limb_remarks(run: Run, told: Sequence[str] = ()) -> list[str]:
                 "contains all postures within the joint limits"
             )
     lines += [
-        f"the {limb_names_text([limb])} was not measured at {100 * share:.0f} % of the ticks with the person in view"
+        f"the {limb_names_text([limb])} was not measured at {share_text(share, 0)} of the ticks with the person in view"
         for limb, share in mostly.items()
     ]
     for limb in LIMBS:

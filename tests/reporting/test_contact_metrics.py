@@ -93,10 +93,10 @@ def test_the_first_sentences_of_a_robot_that_touched_nobody(run: Run, tmp_path: 
     assert [row[1] for row in found.table.rows] == ["0 ticks", "25 ticks", "50 ticks"]
     assert found.table.rows[1][2:6] == ("0.248 m/s", "\u22120.029 m", "0.248 / 0.124 m/s", "\u22120.004 m")
     html = rendered(run, tmp_path)
-    assert html.index(found.sentences[0]) < html.index(touched[:40])
-    assert html.index(found.sentences[1]) < html.index(found.held) < html.index(touched[:40])
+    assert html.index(found.sentences[0]) < html.index(touched[-40:])
+    assert html.index(found.sentences[1]) < html.index(found.held) < html.index(touched[-40:])
     answer = summary_text.answers(run, metrics_of(run))[0]
-    assert html.index(touched[:40]) < html.index(found.table.title) < html.index(summary_text.COST) < len(html)
+    assert html.index(touched[-40:]) < html.index(found.table.title) < html.index(summary_text.COST) < len(html)
     assert html.index(answer.short) > html.index(summary_text.SAFE)
     assert tells(answer.short, "Certified", "every")
 
@@ -126,7 +126,7 @@ def test_how_often_the_prediction_held_the_person_stands_beside_the_verdict(run:
     assert found is not None
     checked, out = int(run.contact["left_m"].notna().sum()), int((run.contact["left_m"] > 0.0).sum())
     assert 0 < out < checked
-    share = np.floor(1000.0 * (1.0 - out / checked)) / 10.0
+    share = round(100.0 * (1.0 - out / checked), 1)
     assert tells(found.held, f"{share:.1f} %", f"{checked} checked")
     full = int(run.contact["left_full_m"].notna().sum())
     assert tells(found.held, f"{full} checked")

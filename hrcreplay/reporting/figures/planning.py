@@ -19,6 +19,7 @@ from hrcreplay.reporting.figures.prediction import Limbs, stored_at
 from hrcreplay.reporting.figures.scene import ABOVE, View, bounds_of, draw_outlines, view_from
 from hrcreplay.reporting.metrics.planning import numeric_column, position_columns, stationary
 from hrcreplay.reporting.metrics.series import Metric, envelope, path_feet, seconds_from, thin_path, times, true_runs
+from hrcreplay.reporting.tables import share_text
 
 SIDE = view_from(-0.5 * np.pi, 0.0)
 #: Time before and after the largest deviation in which the path is drawn in bold [s].
@@ -312,7 +313,7 @@ def stationary_share(metrics: Mapping[str, Metric]) -> Figure:
     for y, (_, prefix, colour) in enumerate(rows):
         share = metrics[f"{prefix}_stationary_share"]["value"]
         ticks = metrics[f"{prefix}_near_ticks"]["value"]
-        text = "never that near" if share is None else f"{100 * share:.2f} % of {ticks} ticks"
+        text = "never that near" if share is None else f"{share_text(share, 2)} of {ticks} ticks"
         ax.barh(y, 100 * (share or 0.0), height=0.62, color=colour)
         ax.annotate(
             text, (100 * (share or 0.0), y), xytext=(3, 0), textcoords="offset points", va="center", fontsize=6.5

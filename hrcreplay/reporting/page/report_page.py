@@ -239,10 +239,7 @@ def _reasons(metrics: Mapping[str, Metric], plans: Mapping[str, str]) -> tuple[P
     body = [
         (
             label,
-            *(
-                f"{100 * metrics[f'{p}_{suffix}']['value']:.2f} %" if f"{p}_{suffix}" in metrics else "\u2013"
-                for p in plans.values()
-            ),
+            *(percent(metrics.get(f"{p}_{suffix}"), 2) for p in plans.values()),
         )
         for label, suffix in rows
     ]

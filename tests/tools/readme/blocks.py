@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hrcreplay import limits
+from hrcreplay.reporting.tables import share_text
 from tests.tools.readme.measurements import BASELINES, HORIZONS_MS, MARGINS, PLACES, RECORDINGS, VARIANTS, Figures
 
 Facts = Mapping[str, Any]
@@ -223,7 +224,7 @@ def _share(value: float | None) -> str:
         return "\u2013"
     if value in (0.0, 1.0):
         return f"{100 * value:.0f} %"
-    return f"{min(99.9, max(0.1, 100 * value)):.1f} %"
+    return share_text(value)
 
 
 def _cm(value: float | None) -> str:
