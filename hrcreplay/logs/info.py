@@ -139,10 +139,11 @@ def summarize(
         LogError: The log is damaged beyond recovery.
     """
     header = log.header
-    base = header.T_world_base if T_world_base is None else T_world_base
+    known, known_base = header.poses_beside(T_world_camera or {})
+    base = known_base if T_world_base is None else T_world_base
     tallies = [_Tally() for _ in header.cameras]
     cell = T_world_camera or {}
-    poses = {**header.T_world_camera, **cell}
+    poses = {**known, **cell}
     person = _PersonInWorld(log, poses, clock_offset_s or {}, options)
     for frames in log.frames():
         _count(frames, tallies)

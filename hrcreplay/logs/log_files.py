@@ -10,7 +10,7 @@ import json
 import tempfile
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path, PurePath
@@ -256,6 +256,16 @@ class Header:
     T_world_base: Floats | None  #: (4, 4) robot base; None if unknown
     has_truth: bool
     joint_topics: tuple[str, ...]  #: topics of the robot's joint states
+    static_poses: bool = False  #: True: the poses are those of /tf_static, in its own world
+
+    def poses_beside(self, T_world_camera: Mapping[str, Floats]) -> tuple[Mapping[str, Floats], Floats | None]:
+        """Returns the log's poses of cameras and robot base that count beside a cell's poses of cameras.
+
+        Poses of /tf_static are in a world of their own: beside a cell that places a camera, they do not count.
+        """
+        if self.static_poses and T_world_camera:
+            return {}, None
+        return self.T_world_camera, self.T_world_base
 
 
 @dataclass(frozen=True)

@@ -244,6 +244,11 @@ class MarkerDecoder:
         self.shows_camera_alive = not several
 
     @property
+    def frames(self) -> dict[str, str]:
+        """Frame of each camera's markers."""
+        return dict(zip(self.cameras, self._layout.frames, strict=False))
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Returns remarks on the reading of the topic."""
         return tuple(self._told())

@@ -203,7 +203,7 @@ KINECT2_INDEX: Mapping[int, int] = {
 
 
 #: Units of points -> metres.
-METRES: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
+METRES: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 
 class RawSkeleton(NamedTuple):
@@ -227,6 +227,10 @@ class SkeletonDecoder(Protocol):
     @property
     def cameras(self) -> tuple[str, ...]:
         """Cameras on it."""
+
+    @property
+    def frames(self) -> Mapping[str, str]:
+        """Camera -> tf frame of its points, where known."""
 
     @property
     def notes(self) -> tuple[str, ...]:

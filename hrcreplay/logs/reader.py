@@ -4,29 +4,41 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 from hrcreplay.errors import LogError
-from hrcreplay.logs import joints, log_files, messages, plausibility
+from hrcreplay.logs import joints, log_files, messages, plausibility, presets
 from hrcreplay.logs.cleaning import DEFECTS, STILL_M, STILL_S, Cleaner
 from hrcreplay.logs.clocks import ArrivalOrder, CameraClock, clock_remarks
 from hrcreplay.logs.decoders import (
     DECODABLE,
-    TF_TYPES,
     GenericDecoder,
     OwnDecoder,
-    TfDecoder,
     describe_arrays,
-    describe_transforms,
-    find_cameras,
+    frame_of,
+    points_lacking,
 )
 from hrcreplay.logs.joints import JointReading, JointTopic, JointTrack
 from hrcreplay.logs.log_files import Header, LogFiles, Truth, open_source
 from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder, MarkerLayout, survey_markers
 from hrcreplay.logs.messages import SkeletonDecoder, Topic, Undecodable, topic_list
+from hrcreplay.logs.transforms import (
+    TF_TYPES,
+    FrameNames,
+    Link,
+    StaticPoses,
+    TfDecoder,
+    describe_transforms,
+    find_poses,
+    static_links,
+    survey_people,
+)
 from hrcreplay.records import NOBODY, CameraFrames
-from hrcreplay.settings.sections import Logs
+from hrcreplay.settings.sections import Decoder, Logs
 
 _OWN = "hrcreplay.Skeleton"
 _BODIES = "body_tracking"  # in the name of a topic: it carries bodies, even without a person in view
@@ -37,6 +49,8 @@ _NO_BODIES = (
     "hrcreplay.Task",
     "rcl_interfaces/Log",
 )
+_PEEK = 300  # number of messages in which bodies by a preset are looked at
+_FEW = 10  # with fewer bodies, proportions are not judged
 _HOW = "Name a topic with --topic NAME, or a decoder for it in [[logs.decoders]] of the settings file."
 _NO_SETTING = (
     "No setting makes bodies of these topics: write the bodies into a log of ours with "
@@ -54,6 +68,7 @@ class Chosen:
 
     decoders: list[SkeletonDecoder]
     remarks: list[str]
+    static: dict[str, Link] = field(default_factory=dict)  #: child -> its static transform
 
 
 def choose_decoders(source: LogFiles, options: Logs) -> Chosen:
@@ -69,17 +84,21 @@ def choose_decoders(source: LogFiles, options: Logs) -> Chosen:
 
     Raises:
         LogError: A named topic is not in the log, or carries no skeletons.
+        SettingsError: A decoder names an unknown preset or order of points.
     """
     found = {topic.name: topic for topic in source.topics()}
     for name in (*options.topics, *(decoder.topic for decoder in options.decoders)):
         if name not in found:
             raise LogError(f"{source.path}: no topic {name}; found {topic_list(found.values())}")
-    by_topic = {decoder.topic: GenericDecoder(decoder) for decoder in options.decoders}
-    chosen = Chosen([], [])
+    static = static_links(source.messages(names)) if (names := _static_topics(source)) else {}
+    chosen = Chosen([], [], static)
+    by_topic = {
+        decoder.topic: _described(source, found[decoder.topic], decoder, static) for decoder in options.decoders
+    }
     for topic in found.values():
         if options.topics and topic.name not in options.topics:
             continue
-        decoder = by_topic.get(topic.name) or _known(source, topic, options, chosen.remarks)
+        decoder = by_topic.get(topic.name) or _known(source, topic, options, chosen)
         if decoder is not None:
             chosen.decoders.append(decoder)
         elif options.topics:
@@ -110,16 +129,65 @@ def skeletons_remedy(topics: Sequence[Topic], remarks: Sequence[str]) -> str:
     return _HOW if helped else _NO_SETTING
 
 
-def _known(source: LogFiles, topic: Topic, options: Logs, remarks: list[str]) -> SkeletonDecoder | None:
+def _static_topics(source: LogFiles) -> list[str]:
+    return [topic.name for topic in source.topics() if topic.type in TF_TYPES and topic.name.endswith("tf_static")]
+
+
+def _described(source: LogFiles, topic: Topic, decoder: Decoder, static: dict[str, Link]) -> SkeletonDecoder:
+    """Returns the decoder that a description of the settings stands for."""
+    hows = presets.variants(decoder)
+    if not hows[0].frames:
+        lacks = points_lacking(hows, source.messages([topic.name])) if decoder.preset is not None else ""
+        return GenericDecoder(hows, frame_of(source.messages([topic.name])), lacks)
+    people = _people(source, topic, hows[0], static)
+    if people is None:
+        text = describe_transforms(source.messages([topic.name]))
+        raise LogError(
+            f"{source.path}: {topic.name}: found no frame with six joints by logs.decoders; {topic.name} {text}"
+        )
+    return people
+
+
+def _people(source: LogFiles, topic: Topic, how: Decoder, static: dict[str, Link]) -> TfDecoder | None:
+    """Returns the decoder of people in a tf topic; None if there are none by these names."""
+    survey = survey_people(source.messages([topic.name]), FrameNames(how), static)
+    cameras = tuple(survey.frames)
+    return TfDecoder(topic.name, cameras, how.unit, how, survey, static) if cameras else None
+
+
+def _known(source: LogFiles, topic: Topic, options: Logs, chosen: Chosen) -> SkeletonDecoder | None:
     if not topic.count:
         return None
     if topic.type == _OWN:
         return OwnDecoder(topic.name, messages.camera_of_topic(topic.name))
-    if topic.type in TF_TYPES:
-        cameras = find_cameras(source.messages([topic.name]))
-        return TfDecoder(topic.name, cameras, options.unit) if cameras else None
     if topic.type == MARKER_TYPE:
-        return _markers(source, topic, options, remarks)
+        return _markers(source, topic, options, chosen.remarks)
+    described = presets.of_type(topic.type, topic.name, options.unit)
+    if topic.type in TF_TYPES:
+        if topic.name in _static_topics(source):
+            return None
+        people = [_people(source, topic, hows[0], chosen.static) for hows in described]
+        return max((found for found in people if found is not None), key=lambda found: found.joints, default=None)
+    return _preset(source, topic, described[0], chosen.remarks) if described else None
+
+
+def _preset(source: LogFiles, topic: Topic, hows: tuple[Decoder, ...], remarks: list[str]) -> SkeletonDecoder | None:
+    """Returns the decoder of a topic by a preset; None, with a remark, if it gives no bodies of people."""
+    try:
+        lacks = points_lacking(hows, source.messages([topic.name]))
+        decoder = GenericDecoder(hows, frame_of(source.messages([topic.name])), lacks)
+        peek = islice(source.messages([topic.name]), _PEEK)
+        rows = [row.points_m for message in peek for row in decoder.rows(message) if row.body != NOBODY]
+    except LogError as error:
+        remarks.append(f"{topic.name} ({topic.type}) is left out: {error}")
+        return None
+    ratio = plausibility.bone_ratio(np.array(rows)) if len(rows) >= _FEW else 1.0
+    if ratio <= plausibility.PROPORTION:
+        return decoder
+    remarks.append(
+        f"{topic.name} ({topic.type}) is left out: its points in the order of preset {hows[0].preset!r} are no person, "
+        f"{ratio:.1f} times as tall by one bone as by another; another order {DECODABLE} by topic, preset and index"
+    )
     return None
 
 
@@ -179,7 +247,8 @@ class Log:
     def __init__(self, source: LogFiles, chosen: Chosen, options: Logs) -> None:
         self._source = source
         self._decoders = decoders = chosen.decoders
-        self._topic_remarks = chosen.remarks
+        poses = _static_poses(source, chosen, options)
+        self._topic_remarks = [*chosen.remarks, *poses.notes]
         self._options = options
         self._joint_topics = joints.find_topics(source, options.joints_topic)
         self._truth = log_files.truth_topic(source)
@@ -192,7 +261,7 @@ class Log:
         self.stature_m: dict[str, float] = {}  #: camera -> stature of its bodies in the latest pass; NaN: unknown
         self.side_cue: dict[str, str | None] = {}  #: camera -> cue for left and right; None: not checked
         self.points_seen = 0  #: number of points with a position and a confidence in the latest pass
-        self.header = _header(source, decoders, self._joint_topics, self._truth, chosen=bool(options.topics))
+        self.header = _header(source, decoders, self._joint_topics, self._truth, poses, chosen=bool(options.topics))
 
     @property
     def defects(self) -> Counter[str]:
@@ -302,8 +371,9 @@ class Log:
         """Returns the setting of the unit of a camera's points."""
         for decoder in self._decoders:
             if camera in decoder.cameras and isinstance(decoder, GenericDecoder):
-                other = "m" if decoder.how.unit == "mm" else "mm"
-                return f'would be right, in its [[logs.decoders]]: unit = "{other}", or points in {decoder.how.unit}'
+                unit = decoder.hows[0].unit
+                other = "m" if unit == "mm" else "mm"
+                return f'would be right, in its [[logs.decoders]]: unit = "{other}", or points in {unit}'
             if camera in decoder.cameras and not isinstance(decoder, OwnDecoder):
                 other = "m" if self._options.unit == "mm" else "mm"
                 return f"would be right: --set logs.unit={other}, or points in {self._options.unit}"
@@ -414,8 +484,28 @@ def open_log(path: Path, options: Logs = DEFAULT, *, skeletons: bool = True) -> 
     return Log(source, chosen, options)
 
 
+def _static_poses(source: LogFiles, chosen: Chosen, options: Logs) -> StaticPoses:
+    """Returns the poses of cameras and robot base in /tf_static. Raises LogError if it lacks a frame that is named."""
+    given = {"world_frame": options.world_frame, "base_frame": options.base_frame}
+    known = {name for link in chosen.static.values() for name in (link.parent, link.child)}
+    for setting, frame in given.items():
+        if frame is not None and frame.lstrip("/") not in known:
+            raise LogError(
+                f"{source.path}: logs.{setting}: found {frame!r}; would be right: a frame of /tf_static: "
+                f"{', '.join(sorted(known)) or 'it has none'}"
+            )
+    frames = {camera: frame for decoder in chosen.decoders for camera, frame in decoder.frames.items()}
+    return find_poses(chosen.static, frames, options.world_frame, options.base_frame)
+
+
 def _header(
-    source: LogFiles, decoders: list[SkeletonDecoder], joint_topics: tuple[str, ...], truth: str | None, *, chosen: bool
+    source: LogFiles,
+    decoders: list[SkeletonDecoder],
+    joint_topics: tuple[str, ...],
+    truth: str | None,
+    poses: StaticPoses,
+    *,
+    chosen: bool,
 ) -> Header:
     known = log_files.latched(source)
     seen = [camera for decoder in decoders for camera in decoder.cameras]
@@ -428,11 +518,13 @@ def _header(
         path=source.path,
         kind=source.kind,
         cameras=cameras,
-        T_world_camera={camera: T for camera, T in known.T_world_camera.items() if camera in cameras},
+        T_world_camera=poses.T_world_camera
+        | {camera: T for camera, T in known.T_world_camera.items() if camera in cameras},
         task=known.task,
         start_ns=first.arrival_ns if first else source.start_ns,
         end_ns=source.end_ns,
-        T_world_base=known.T_world_base,
+        T_world_base=known.T_world_base if known.T_world_base is not None else poses.T_world_base,
         has_truth=truth is not None,
         joint_topics=joint_topics,
+        static_poses=bool(poses.notes) and not known.T_world_camera and known.T_world_base is None,
     )

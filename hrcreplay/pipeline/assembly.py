@@ -225,7 +225,7 @@ def fusion_stage(run_config: RunConfig, log: LogLike) -> FusionStage:
         LogError: A camera's pose is in neither of them.
     """
     cell = run_config.cell or Cell()
-    poses = {**log.header.T_world_camera, **cell.T_world_camera}
+    poses = {**log.header.poses_beside(cell.T_world_camera)[0], **cell.T_world_camera}
     for camera in log.header.cameras:
         if camera not in poses:
             raise LogError(
@@ -293,7 +293,7 @@ def known_robot_base(run_config: RunConfig, log: LogLike) -> Floats | None:
     """(4, 4) pose of the robot's base in the world: from the cell file, else from the log; None if both lack it."""
     if run_config.cell is not None and run_config.cell.T_world_base is not None:
         return run_config.cell.T_world_base
-    return log.header.T_world_base
+    return log.header.poses_beside(run_config.cell.T_world_camera if run_config.cell is not None else {})[1]
 
 
 def robot(run_config: RunConfig, T_world_base: Floats) -> RobotModel:

@@ -46,29 +46,73 @@ class Section(BaseModel):
         return {name: None if value == "none" and name in optional else value for name, value in given.items()}
 
 
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+
+
 class Decoder(Section):
-    """Decoder of skeletons from an unknown message type."""
+    """Description of a topic with skeletons of people, from the message down to a body's points.
+
+    A path is fields joined by dots. A number in it takes an element of a list; a name behind a list is taken from each
+    element, and lists in lists are joined. Alternatives stand with | between: the first that exists counts.
+    """
 
     topic: str
     """Topic of the messages."""
-    camera: str
-    """Name for the sensor."""
-    points: str
-    """Path to the array of points in the message, fields joined by dots; the elements have x, y, z."""
-    index: dict[str, int]
-    """Body point -> index of its element in the array."""
-    unit: Literal["m", "mm"] = "m"
+    camera: str | None = None
+    """Name for the sensor; none: the topic's, or for transforms that of the frame in which they are."""
+    preset: str | None = None
+    """Shipped description to begin with; keys given here replace its keys. none: none."""
+    bodies: str | None = None
+    """Path to the list of bodies in the message; none: the message is one body."""
+    only: dict[str, bool | int | str] = Field(default_factory=dict)
+    """Path in a body -> value that it must have; other bodies are left out."""
+    points: str | None = None
+    """Path to the array of points, in a body or, without bodies, in the message."""
+    numbers: Annotated[int, Field(ge=3)] | None = None
+    """Numbers per point, where the array is one of numbers; the first three are the position."""
+    body: str | None = None
+    """Path in a body to its number or name; without bodies, in a point: points of one value are a body. none: bodies
+    are numbered as in the list."""
+    name: str | None = None
+    """Path in a point to its name or number; none: its place in the array."""
+    position: str | None = None
+    """Path in a point to its position: x, y, z, a pose, or three numbers; none: the point itself."""
+    frames: tuple[str, ...] = ()
+    """Transforms: patterns of the joints' frames; {joint} is the joint, {user} digits, {id} five letters, * any."""
+    index: dict[str, int | str] | str = Field(default_factory=dict)
+    """Body point -> place or name of its point; a + b: their middle; a | b: the first that exists. Names compare
+    without case, spaces and underscores. Or the name of a shipped order: points, names, azure, kinect2, mediapipe..."""
+    unit: Literal["m", "cm", "mm"] = "m"
     """Unit of the points."""
+    axes: tuple[Axis, Axis, Axis] = ("x", "y", "z")
+    """The message's axes along which x, y and z of the log lie, as ["x", "-z", "y"]; no mirror image."""
     stamp: str | None = "header.stamp"
     """Path to the capture time; "none": the arrival time."""
-    confidence: str | None = None
-    """Path to an array of confidences in [0, 1], one per point; none: every finite point has confidence 1."""
+    confidence: str | float | None = None
+    """Path in a point, or to a number or an array of numbers, one per point, in a body or message; or a constant. none:
+    every finite point has confidence 1."""
+    confidence_max: Positive = 1.0
+    """The value of a confidence that means certain."""
 
     def model_post_init(self, _context: Any) -> None:
-        """Rejects body points that are not in POINTS."""
-        unknown = sorted(set(self.index) - set(POINTS))
-        if unknown:
-            raise ValueError(f"unknown body point {unknown[0]!r}; known are {', '.join(POINTS)}")
+        """Rejects unknown body points, axes that mirror, and a description of nothing."""
+        if isinstance(self.index, dict):
+            unknown = sorted(set(self.index) - set(POINTS))
+            if unknown:
+                raise ValueError(f"unknown body point {unknown[0]!r}; known are {', '.join(POINTS)}")
+        if not is_rotation(self.axes):
+            raise ValueError(f"axes: found {', '.join(self.axes)}; would be right: each axis once, and no mirror image")
+        if self.preset is None and self.points is None and not self.frames:
+            raise ValueError("found neither points, frames nor preset; name the points of a body")
+
+
+def is_rotation(axes: tuple[Axis, Axis, Axis]) -> bool:
+    """Returns True if the axes are those of a right-handed system, each once."""
+    order = tuple("xyz".index(axis[-1]) for axis in axes)
+    if sorted(order) != [0, 1, 2]:
+        return False
+    even = order in ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+    return even == (sum(axis.startswith("-") for axis in axes) % 2 == 0)
 
 
 class Logs(Section):
@@ -78,8 +122,13 @@ class Logs(Section):
     """Skeleton topics to read; none: all with a decoder."""
     decoders: tuple[Decoder, ...] = ()
     """Decoders for message types that the package cannot read itself."""
-    unit: Literal["m", "mm"] = "m"
-    """Unit of the positions in markers and transforms."""
+    unit: Literal["m", "cm", "mm"] = "m"
+    """Unit of the positions in markers, transforms and topics of a shipped preset."""
+    world_frame: str | None = None
+    """Frame of /tf_static that is the world, with z up and the floor at 0; none: world or map. Poses of cameras and
+    robot base in it are taken where the cell gives none."""
+    base_frame: str | None = None
+    """Frame of /tf_static that is the robot's base; none: base_link, base or robot_base."""
     marker_ids_per_body: Annotated[int, Field(ge=1)] | None = None
     """Number of marker ids per body; the first ids of each body are the joints; none: 100, or 33 or 32 if only that
     fits the ids in the log."""

@@ -236,6 +236,12 @@ def numbers(write: Write, store: Typestore) -> None:
     write("/landmarks", "std_msgs/msg/Float32MultiArray", BEGIN, array)
 
 
+def few_numbers(write: Write, store: Typestore) -> None:
+    """Numbers that are too few for a body."""
+    array = make(store, "std_msgs/msg/Float32MultiArray", data=np.zeros(6, dtype=np.float32))
+    write("/landmarks", "std_msgs/msg/Float32MultiArray", BEGIN, array)
+
+
 def frames_of_another_tracker(write: Write, store: Typestore) -> None:
     """Transforms whose names are no body points of openni_tracker."""
     for name in ("SpineMid_1", "Neck_1", "ElbowLeft_1"):
@@ -252,8 +258,9 @@ def one_polygon(write: Write, store: Typestore) -> None:
 @pytest.mark.parametrize(
     ("write_bodies", "found", "helps"),
     [
-        (numbers, ("/landmarks (std_msgs/Float32MultiArray)", "points"), False),
-        (frames_of_another_tracker, ("SpineMid_1, Neck_1, ElbowLeft_1", "names"), False),
+        (numbers, ("/landmarks (std_msgs/Float32MultiArray)", "'data'"), True),
+        (few_numbers, ("/landmarks (std_msgs/Float32MultiArray)", "points"), False),
+        (frames_of_another_tracker, ("SpineMid_1, Neck_1, ElbowLeft_1", "names"), True),
         (one_polygon, ("'points' (up to 3)",), True),
     ],
 )

@@ -32,20 +32,21 @@ from hrcreplay.errors import HrcReplayError, LogError, SettingsError
 from hrcreplay.live.person.envelope import SHORTEST_SECRET, Opener, UnverifiedError
 from hrcreplay.live.person.log_playback import Outgoing, frames_of, play, ready_note, same_frame
 from hrcreplay.live.processes import ControlChannel, ControlGoneError
-from hrcreplay.logs import decoders, ros_bags
+from hrcreplay.logs import presets, ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
 from hrcreplay.logs.cleaning import DEFECTS, Cleaner
 from hrcreplay.logs.clocks import STAMP_FAR_S
-from hrcreplay.logs.decoders import GenericDecoder, OwnDecoder, TfDecoder
+from hrcreplay.logs.decoders import GenericDecoder, OwnDecoder
 from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder
 from hrcreplay.logs.messages import Message, RawSkeleton, SkeletonDecoder, Topic, Undecodable
+from hrcreplay.logs.transforms import TF_TYPES, TfDecoder
 from hrcreplay.settings.sections import Decoder, Zenoh, ZenohKey
 from hrcreplay.toml_file import validate
 
 _OWN = "hrcreplay.Skeleton"
 _SECTION = "live.zenoh"  # start of error messages about its settings
 _RMW_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")  # in the keys of rmw_zenoh: <domain>/<topic>/<type>/<hash>
-_KNOWN = (MARKER_TYPE, *decoders.TF_TYPES)
+_KNOWN = (MARKER_TYPE, *TF_TYPES)
 _AHEAD_NS = 10**9  # after a capture further in the future, all following captures would look late
 _FAR_NS = round(STAMP_FAR_S * 1e9)
 _OLD_NS = 10**9  # an older capture indicates clocks that are not synchronised
@@ -140,11 +141,14 @@ class CameraSubscription:
         topic = Topic(key, msgtype, 1, ros_bags.parser(self._where, msgtype, given.definition, "msg", cdr=True))
         if given.points is not None:
             how = {name: getattr(given, name) for name in ("points", "index", "unit", "stamp", "confidence")}
-            return topic, GenericDecoder(Decoder(topic=key, camera=self._camera, **how))
-        if msgtype in decoders.TF_TYPES:
+            return topic, GenericDecoder((Decoder(topic=key, camera=self._camera, **how),))
+        if msgtype in TF_TYPES:
             return topic, TfDecoder(key, (self._camera,), given.unit)
         if msgtype == MARKER_TYPE:
             return topic, MarkerDecoder(key, unit=given.unit)
+        described = presets.of_type(msgtype, key, given.unit)
+        if described:
+            return topic, GenericDecoder(described[0])
         raise LogError(f"no decoder for {msgtype}; describe it with points and index, as in [[logs.decoders]]")
 
     def _note(self, text: str) -> Outgoing:
