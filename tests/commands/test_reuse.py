@@ -33,6 +33,8 @@ STALE = {
     "logs.topics": ALL,
     "logs.decoders": ALL,
     "logs.unit": ALL,
+    "logs.world_frame": ALL,
+    "logs.base_frame": ALL,
     "logs.marker_ids_per_body": ALL,
     "logs.joints_topic": "plan",  # where the log has no task
     "logs.joint_names": "plan",
@@ -164,6 +166,8 @@ OTHER: dict[str, Any] = {
     "robot.links": ({"name": "a", "body": "b", "start_m": (0, 0, 0), "end_m": (0, 0, 1), "radius_m": 0.1},),
     "robot.acceleration": (10.0,) * 6,
     "robot.tool_links": ({"name": "t", "body": "b", "start_m": (0, 0, 0), "end_m": (0, 0, 1), "radius_m": 0.1},),
+    "logs.world_frame": "cell",
+    "logs.base_frame": "robot_stand",
     "plan.method": "scaling",
     "plan.baselines": (),
     "plan.task": "task.toml",
